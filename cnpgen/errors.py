@@ -122,12 +122,7 @@ class MissingExtraError(MachineError, ImportError):
 
 @contextmanager
 def requires_extra(extra: str, package: str) -> Iterator[None]:
-    """Raise MissingExtraError if an import in the block fails.
-
-    Args:
-        extra: Name of the extra in pyproject.toml.
-        package: Name of the package, for the message.
-    """
+    """Raise MissingExtraError if an import of a package in the block fails, with the extra that installs it."""
     try:
         yield
     except (ImportError, OSError, AttributeError) as error:  # broken installations raise any of them
@@ -155,10 +150,7 @@ SYNONYMS = {  # words of other projects -> the word of a name here
 def nearest(name: str, known: Iterable[str], *, similarity: float = 0.5) -> str:
     """Return ``" (did you mean 'x'?)"`` for a synonym or the most similar known name, or an empty string.
 
-    Args:
-        name: The unknown name.
-        known: Known names.
-        similarity: Minimum share of equal letters.
+    ``similarity`` is the minimum share of equal letters.
     """
     names = list(known)
     meant = "-".join(SYNONYMS.get(word, word) for word in name.split("-"))

@@ -1,4 +1,12 @@
-"""``cnpgen benchmark``: compare planners on the problems of a suite."""
+"""Compare planners on the problems of a suite.
+
+Each planner solves one problem after the other, in its own process and on one thread. Pinocchio and Coal judge the
+answers, and with --simulate MuJoCo executes them. Every finished problem is written to DIR at once, one file per
+planner. After an interruption the same command resumes; more --planners or --plant extend the results. If a planner
+crashes, times out or returns an invalid result, only that problem is marked as failed. With --engine several workers
+plan at once, so compare CPU times only. 'cnpgen docs benchmark' describes suites and planners. The exit code is 0 if
+the benchmark is complete, also if planners failed.
+"""
 
 import argparse
 import json
@@ -9,26 +17,15 @@ from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.interruption import resumable
-from cnpgen.cli.parser import ENGINE, Commands, Parser, add_command, add_engine, add_json, options_of
-from cnpgen.cli.progress import Meter
+from cnpgen.cli.parser import ENGINE, Parser, add_engine, add_json, options_of
+from cnpgen.cli.terminal import Meter, table
 from cnpgen.errors import CnpgenError, UsageError
 
 if TYPE_CHECKING:
     from cnpgen.benchmark.run_suite import Benchmark
 
-_TEXT = """\
-Each planner solves one problem after the other, in its own process and on one thread. Pinocchio and Coal judge the
-answers, and with --simulate MuJoCo executes them. Every finished problem is written to DIR at once, one file per
-planner. After an interruption the same command resumes; more --planners or --plant extend the results. If a planner
-crashes, times out or returns an invalid result, only that problem is marked as failed. With --engine several workers
-plan at once, so compare CPU times only. 'cnpgen docs benchmark' describes suites and planners. The exit code is 0 if
-the benchmark is complete, also if planners failed.
-"""
 
-
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "benchmark", run, title="compare planners on the problems of a suite", text=_TEXT)
+def add_options(parser: Parser) -> None:
     option = parser.add_argument
     text = "a suite (see --list), or a dataset for random problems"
     option("suite", metavar="SUITE", nargs="?", type=recipe_names.suite, help=text)
@@ -42,9 +39,7 @@ def add(commands: "Commands[Parser]") -> None:
     option("--environment", metavar="PATH", type=Path, help=text)
     option("--video", action="store_true", help="film the first plan of every planner for the report")
     option("--time-limit", metavar="S", type=values.seconds, default=60.0, help="time limit per problem (default: 60s)")
-    text = "processes for execution, and with --engine for planning; default one per available core"
-    option("--workers", metavar="W", type=values.positive, help=text)
-    add_engine(parser)
+    add_engine(parser, "processes for execution, and with --engine for planning; default one per available core")
     option("--seed", metavar="SEED", type=values.seed, default=0, help="seed of random planners (default: 0)")
     option("--repeat", metavar="K", type=values.positive, default=1, help="repetitions of every problem (default: 1)")
     text = "largest distance of the mallet of a successful hit from the table plane (default: 20mm)"
@@ -85,21 +80,21 @@ def parameter_range(text: str) -> tuple[str, str, tuple[float, float]]:
     return name, key, (low, high)
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
+def run(arguments: argparse.Namespace) -> None:
     from cnpgen.benchmark.benchmark_report import save_benchmark_figures, save_benchmark_report
     from cnpgen.benchmark.result_tables import save_benchmark_tables
 
     if arguments.list:
         print(_listing(as_json=arguments.json))
-        return 0
+        return
     if arguments.suite is None:
         raise UsageError("the argument SUITE is missing; 'cnpgen benchmark --list' lists suites")
     for name in ("plant", "environment", "video"):
         if getattr(arguments, name) and not arguments.simulate:
             raise UsageError(f"--{name} needs --simulate")
     if arguments.search:
-        return _search(arguments)
+        _search(arguments)
+        return
     folder = arguments.out or Path(f"{Path(arguments.suite).stem}-results")
     found = _run(arguments, folder)
     save_benchmark_tables(found, folder)
@@ -107,10 +102,9 @@ def run(arguments: argparse.Namespace) -> int:
     report = save_benchmark_report(found, folder / "report.html", video=arguments.video)
     print(json.dumps(_facts(found, folder), indent=2) if arguments.json else _text(found))
     print(f"report: {report}", file=sys.stderr)
-    return 0
 
 
-def _search(arguments: argparse.Namespace) -> int:
+def _search(arguments: argparse.Namespace) -> None:
     """Search for parameters of one planner and print the trials, the best one first."""
     from cnpgen.benchmark.parameter_search import SEARCH_FILE, csv_of, search_parameters
 
@@ -124,13 +118,14 @@ def _search(arguments: argparse.Namespace) -> int:
     documents = json.dumps([asdict(trial) for trial in trials], indent=2) + "\n"
     sys.stdout.write(documents if arguments.json else csv_of(trials, list(ranges)))
     print(f"trials: {folder / SEARCH_FILE}", file=sys.stderr)
-    return 0
 
 
 def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
     from cnpgen.benchmark.run_suite import FASTEST, run_benchmark
 
     meter, doing = Meter(noun="problem"), [""]
+    planners = {name for name, _, _ in arguments.set}
+    parameters = {each: {key: value for name, key, value in arguments.set if name == each} for each in planners}
 
     def progress(what: str, total: int, done: int) -> None:
         if what != doing[0]:
@@ -145,7 +140,7 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
             planners=arguments.planners or FASTEST,
             repeat=arguments.repeat,
             reference=arguments.reference,
-            parameters=_parameters(arguments.set),
+            parameters=parameters,
             progress=progress,
             **_options(arguments),
         )
@@ -156,14 +151,6 @@ def _options(arguments: argparse.Namespace) -> dict[str, Any]:
     names = ("n", "environment", "time_limit", "seed", "plane_tolerance", *ENGINE, "replan", "force")
     plants = (arguments.plant or ("nominal",)) if arguments.simulate else ()
     return {"plants": plants, **options_of(arguments, *names)}
-
-
-def _parameters(fields: list[tuple[str, str, Any]]) -> dict[str, dict[str, Any]]:
-    """Group fields by planner."""
-    grouped: dict[str, dict[str, Any]] = {}
-    for name, key, value in fields:
-        grouped.setdefault(name, {})[key] = value
-    return grouped
 
 
 def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:
@@ -188,7 +175,6 @@ def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:
 def _text(found: "Benchmark") -> str:
     """Format one table per plant with a column per planner."""
     from cnpgen.benchmark.result_tables import failure_summaries, notes, table_rows
-    from cnpgen.cli.describe import table
 
     head = f"{found.suite.name} {found.suite.version}: {len(found.problems)} problems"
     tables = [table([(*row, "") for row in table_rows(found, plant)], indent="  ") for plant in found.executions]
@@ -200,7 +186,6 @@ def _listing(*, as_json: bool) -> str:
     """List suites, planners with their fields, and plants."""
     from cnpgen.benchmark.simulator.plant import PLANTS
     from cnpgen.benchmark.suite import load_suite
-    from cnpgen.cli.describe import table
     from cnpgen.schema.catalogue import list_recipes
 
     planners, fields = _planners()

@@ -1,22 +1,5 @@
-"""``cnpgen complete``: compute boundary problems for tasks in the workspace."""
+"""Compute boundary problems for tasks in the workspace.
 
-import argparse
-import json
-import sys
-import textwrap
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-from cnpgen.cli import recipe_names
-from cnpgen.cli.parser import Commands, Parser, add_command, add_json
-from cnpgen.errors import counted, listed
-
-if TYPE_CHECKING:
-    from cnpgen.make.complete import Completed
-
-MAX_LISTED_TASKS = 10  # tasks without an answer that are listed by number
-
-_TEXT = """\
 The stages of the pipeline compute everything that the tasks do not give: 'goal_xyz.x,goal_xyz.y,hit_angle' is enough
 to hit a puck. Columns have the names of dataset fields, with components after a dot, in SI units. The start is given by
 joints (start_q.*, start_dq.*, start_ddq.*) or by position (start_xyz.*); the default is the problem's base at rest. The
@@ -28,11 +11,24 @@ sample_id is the index of the task. Tasks without an answer are left out, with t
 if no task has an answer.
 """
 
+import argparse
+import json
+import sys
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    title = "compute boundary problems for tasks in the workspace"
-    parser = add_command(commands, "complete", run, title=title, text=_TEXT)
+from cnpgen.cli import recipe_names
+from cnpgen.cli.parser import Parser, add_json
+from cnpgen.errors import counted, listed
+
+if TYPE_CHECKING:
+    from cnpgen.make.complete import Completed
+
+MAX_LISTED_TASKS = 10  # tasks without an answer that are listed by number
+
+
+def add_options(parser: Parser) -> None:
     option = parser.add_argument
     text = "a pipeline, dataset or problem by name, or a recipe file"
     option("pipeline", metavar="NAME|FILE", type=recipe_names.tasks_of, help=text)
@@ -44,8 +40,7 @@ def add(commands: "Commands[Parser]") -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
-    from cnpgen.cli.refine_options import check_place
+    from cnpgen.cli.refine_command import check_place
     from cnpgen.make.complete import complete
     from cnpgen.plans import save_plans
 

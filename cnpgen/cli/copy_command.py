@@ -1,4 +1,9 @@
-"""``cnpgen copy``: copy a shipped recipe with all files that it refers to, for editing."""
+"""Copy a recipe for editing.
+
+A dataset is copied as DIR/dataset.toml with its DIR/pipeline.toml and DIR/problem.toml, a pipeline with its problem.
+The copies have the name of the folder and refer to each other; the URDF is copied unless it belongs to a package. The
+path of the first file is printed on stdout. Existing files are replaced only with --force.
+"""
 
 import argparse
 import re
@@ -7,17 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names
-from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.cli.parser import Parser
 from cnpgen.errors import UsageError
 
 if TYPE_CHECKING:
     from cnpgen.cli.describe import Recipe
 
-_TEXT = """\
-A dataset is copied as DIR/dataset.toml with its DIR/pipeline.toml and DIR/problem.toml, a pipeline with its problem.
-The copies have the name of the folder and refer to each other; the URDF is copied unless it belongs to a package. The
-path of the first file is printed on stdout. Existing files are replaced only with --force.
-"""
 _NEXT = {
     "dataset": "cnpgen make-dataset {0}",
     "pipeline": "cnpgen make-dataset {0} --n 1000",
@@ -25,9 +25,7 @@ _NEXT = {
 }
 
 
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "copy", run, title="copy a recipe for editing", text=_TEXT)
+def add_options(parser: Parser) -> None:
     text = "a shipped dataset, pipeline or problem (see 'cnpgen list')"
     parser.add_argument("recipe", metavar="NAME", type=recipe_names.shipped, help=text)
     parser.add_argument("folder", metavar="DIR", help="folder of the copies; its name becomes theirs")
@@ -35,34 +33,26 @@ def add(commands: "Commands[Parser]") -> None:
     parser.add_argument("--force", action="store_true", help="replace existing files")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
+def run(arguments: argparse.Namespace) -> None:
     from cnpgen.cli.show_command import load_any
+    from cnpgen.schema.keys import NAME
     from cnpgen.store.files.atomic import check_writable, write_file
 
     folder = Path(arguments.folder)
-    texts = copied_texts(load_any(arguments.recipe, arguments.kind), _name(folder))
-    existing = [str(folder / name) for name in texts if (folder / name).exists()]
+    recipe, name = load_any(arguments.recipe, arguments.kind), folder.resolve().name
+    if not re.match(NAME, name):
+        raise UsageError(f"DIR must be lower-case letters, digits and hyphens, such as my-hits; got {name!r}")
+    texts = copied_texts(recipe, name)
+    existing = [str(folder / file) for file in texts if (folder / file).exists()]
     if existing and not arguments.force:
         raise UsageError(f"{', '.join(existing)} exists already: --force writes over it")
     check_writable(folder)
-    for name, text in texts.items():
+    for file, text in texts.items():
         folder.mkdir(parents=True, exist_ok=True)
-        write_file(folder / name, text)
+        write_file(folder / file, text)
     first = folder / next(iter(texts))
     print(first)
     print(f"next: edit the files in {folder}, then: {_NEXT[first.stem].format(first)}", file=sys.stderr)
-    return 0
-
-
-def _name(folder: Path) -> str:
-    """Return the name of recipes in a folder."""
-    from cnpgen.schema.keys import NAME
-
-    name = folder.resolve().name
-    if not re.match(NAME, name):
-        raise UsageError(f"DIR must be lower-case letters, digits and hyphens, such as my-hits; got {name!r}")
-    return name
 
 
 def copied_texts(recipe: "Recipe", name: str) -> dict[str, str]:

@@ -1,11 +1,11 @@
 """Output of ``cnpgen show``: recipes in words and numbers."""
 
+import math
 from collections.abc import Sequence
-from pathlib import Path
-from textwrap import TextWrapper, wrap
+from textwrap import wrap
 from typing import Any
 
-from cnpgen.cli.shape_rows import link_rows, pair_rows, shape_to_dict
+from cnpgen.cli.terminal import LINE_WIDTH, table
 from cnpgen.make.recipe import DatasetRecipe, recipe_digest
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.stages.stage import Stage
@@ -15,11 +15,11 @@ from cnpgen.problems.problem import Problem, resolved
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.inline import corners_of
+from cnpgen.robots.shape.link_pairs import LinkPair
+from cnpgen.robots.shape.shape import Shape
 from cnpgen.schema import registry
 from cnpgen.schema.keys import PerJoint, Range, keys
 from cnpgen.store.joint_units import unit_of
-
-LINE_WIDTH = 100
 
 Recipe = Problem | Pipeline | DatasetRecipe
 
@@ -33,12 +33,15 @@ LIMITS = {  # with their units at joints that turn
 }
 
 
-def describe(recipe: Recipe) -> str:
-    """Describe a recipe of any kind, with everything that it refers to.
+_LEFT_OUT = {
+    "adjacent": "ignored: joined by a joint",
+    "always": "ignored: always in contact",
+    "disabled": "ignored: disabled by the SRDF or by ignored_pairs",
+}
 
-    Raises:
-        RecipeError: The robot's URDF does not fit the problem.
-    """
+
+def describe(recipe: Recipe) -> str:
+    """Describe a recipe, with everything that it refers to; raise RecipeError if the URDF does not fit the problem."""
     if isinstance(recipe, DatasetRecipe):
         return f"{describe_dataset(recipe)}\n\n{describe(recipe.pipeline)}"
     if isinstance(recipe, Pipeline):
@@ -68,11 +71,7 @@ def describe_pipeline(pipeline: Pipeline) -> str:
 
 
 def describe_problem(problem: Problem) -> str:
-    """Describe a problem: its robot, limits and constraints.
-
-    Raises:
-        RecipeError: The robot's URDF does not fit the problem.
-    """
+    """Describe a problem: its robot, limits and constraints; raise RecipeError if the URDF does not fit."""
     spec = problem.robot
     facts = [("robot", f"{spec.urdf}, {len(spec.joints)} planned joints, tip {spec.tip!r}")]
     facts += [("object", numbers(problem.object))] if problem.object else []
@@ -122,6 +121,60 @@ def _shape(problem: Problem, robot: Robot) -> list[str]:
         *table(pair_rows(robot.shape), indent="    ", right=(2, 3)),
         *([] if gap is None else ["", f"  gap: {gap:.2%} {states}"]),
     ]
+
+
+def link_rows(shape: Shape) -> list[tuple[str, ...]]:
+    """List the links: numbers of convex parts and corners, and the capsule that covers them."""
+    head = ("link", "convex parts", "corners", "capsule length [mm]", "radius [mm]", "overhang [mm]", "joint")
+    rows: list[tuple[str, ...]] = [head]
+    for capsule in shape.capsules:
+        parts = [part for part in shape.convex_parts if part.link == capsule.link]
+        corners, length = sum(len(part.vertices) for part in parts), math.dist(capsule.first, capsule.second)
+        lengths = (f"{1e3 * value:.1f}" for value in (length, capsule.radius, capsule.overhang))
+        joint = shape.joints[capsule.link]
+        rows.append((capsule.link, str(len(parts)), str(corners), *lengths, str(joint) if joint else "none"))
+    return rows
+
+
+def pair_rows(shape: Shape) -> list[tuple[str, ...]]:
+    """List the pairs of links: share of random states in which they collide, and their users."""
+    head = ("links", "", "colliding", "false capsule contacts", "checked by")
+    return [head, *((pair.first, pair.second, *_shares(pair), _use(pair)) for pair in shape.pairs)]
+
+
+def _shares(pair: LinkPair) -> tuple[str, str]:
+    return ("", "") if math.isnan(pair.colliding) else (f"{pair.colliding:.2%}", f"{pair.mistaken:.2%}")
+
+
+def _use(pair: LinkPair) -> str:
+    if pair.left_out:
+        return _LEFT_OUT[pair.left_out]
+    return "judges and solvers" if pair.for_solvers else "judges"
+
+
+def shape_to_dict(shape: Shape) -> dict[str, Any]:
+    """Return links and pairs for JSON, in SI units."""
+    capsules = [
+        {
+            "link": each.link,
+            "joint": shape.joints[each.link],
+            "convex_parts": sum(part.link == each.link for part in shape.convex_parts),
+            "capsule": {"first": each.first.tolist(), "second": each.second.tolist(), "radius": each.radius},
+            "overhang": each.overhang,
+        }
+        for each in shape.capsules
+    ]
+    pairs = [
+        {
+            "links": [pair.first, pair.second],
+            "left_out": pair.left_out,
+            "colliding": None if math.isnan(pair.colliding) else pair.colliding,
+            "mistaken": None if math.isnan(pair.mistaken) else pair.mistaken,
+            "for_solvers": pair.for_solvers,
+        }
+        for pair in shape.pairs
+    ]
+    return {"links": capsules, "pairs": pairs}
 
 
 def _limit_rows(problem: Problem, robot: Robot) -> list[tuple[str, ...]]:
@@ -191,11 +244,7 @@ def kind_name(item: Stage | Constraint) -> str:
 
 
 def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
-    """Describe a recipe for JSON: everything it refers to resolved, in SI units, with derived values.
-
-    Raises:
-        RecipeError: The robot's URDF does not fit the problem.
-    """
+    """Describe a recipe for JSON: everything it refers to resolved, in SI units, with derived values."""
     pipeline = recipe.pipeline if isinstance(recipe, DatasetRecipe) else recipe
     problem = pipeline.problem if isinstance(pipeline, Pipeline) else pipeline
     robot = load_robot(problem)
@@ -211,36 +260,3 @@ def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
         name: {"unit": robot.units(unit), "values": list(getattr(robot, name))} for name, unit in LIMITS.items()
     }
     return content
-
-
-def table(
-    rows: Sequence[Sequence[Any]],
-    *,
-    indent: str = "",
-    right: Sequence[int] = (),
-    one_line: bool = False,
-    width: int = LINE_WIDTH,
-) -> list[str]:
-    """Lay out rows as aligned columns.
-
-    Args:
-        rows: The cells, in rows of the same length. A path in the last column stays in one piece, for scripts.
-        indent: Put before every line.
-        right: The columns that are aligned to the right.
-        one_line: Whether to cut what does not fit into the last column; it is wrapped by default.
-        width: Maximum length of a line.
-
-    Returns:
-        The lines.
-    """
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]) - 1)]
-    hanging = indent + " " * (sum(widths) + 2 * len(widths))
-    space, count = max(width - len(hanging), 30), 1 if one_line else None
-    wrapper = TextWrapper(space, break_on_hyphens=False, break_long_words=one_line, max_lines=count, placeholder=" ...")
-    lines = []
-    for *cells, last in rows:
-        pairs = enumerate(zip(cells, widths, strict=True))
-        head = indent + "".join(f"{text.rjust(w) if i in right else text.ljust(w)}  " for i, (text, w) in pairs)
-        parts = [str(last)] if isinstance(last, Path) else wrapper.wrap(last)
-        lines += [(head + (parts[0] if parts else "")).rstrip(), *(hanging + part for part in parts[1:])]
-    return lines

@@ -6,7 +6,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any, get_args
 
 from cnpgen.benchmark.suite import Suite
-from cnpgen.cli.describe import quantity, table, title_lines
+from cnpgen.cli.describe import quantity, title_lines
+from cnpgen.cli.terminal import table
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.stages.stage import Stage

@@ -1,4 +1,8 @@
-"""``cnpgen docs``: the documentation of this version, without a network."""
+"""Print a page of the documentation as Markdown.
+
+Without PAGE it lists all pages. --search lists the lines that contain TEXT. Pictures are on the site and in the
+repository only.
+"""
 
 import argparse
 import re
@@ -6,20 +10,13 @@ from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.parser import Parser, add_json
 from cnpgen.errors import CnpgenError, MachineError, UsageError, lacks
 
 KINDS = ("tutorials", "how-to", "concepts", "reference", "benchmarks")
 
-_TEXT = """\
-Without PAGE it lists all pages. --search lists the lines that contain TEXT. Pictures are on the site and in the
-repository only.
-"""
 
-
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "docs", run, title="print a page of the documentation as Markdown", text=_TEXT)
+def add_options(parser: Parser) -> None:
     what = parser.add_mutually_exclusive_group()
     what.add_argument("page", metavar="PAGE", nargs="?", help="name of a page, such as hit-a-puck")
     what.add_argument("--search", metavar="TEXT", help="list the lines with TEXT on all pages, in any case")
@@ -28,7 +25,6 @@ def add(commands: "Commands[Parser]") -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
     pages = list_pages()
     name = None if arguments.page is None else page_name(arguments.page, pages)
     if arguments.search is not None:
@@ -52,10 +48,7 @@ def docs_folder() -> Path:
 
 
 def list_pages() -> dict[str, Path]:
-    """List the pages in the order of the index; those of benchmarks are named with their folder.
-
-    Returns:
-        Name -> file; the first is "index".
+    """List the pages, name -> file, in the order of the index, which is the first.
 
     Raises:
         MachineError: The installation lacks the pages.
@@ -73,22 +66,13 @@ def list_pages() -> dict[str, Path]:
 
 
 def page_name(text: str, pages: dict[str, Path]) -> str:
-    """Return the name of a page from its name, its path, or a link to it on another page.
-
-    Raises:
-        UsageError: There is no such page.
-    """
+    """Return the name of a page from its name, its path, or a link to it; raise UsageError for other texts."""
     path = PurePosixPath(text.partition("#")[0].removesuffix(".md"))
     folder = path.parent.name
     name = f"benchmarks/{path.name}" if folder == "benchmarks" else path.name
     if name not in pages or folder not in {"", "..", pages[name].parent.name}:
         raise UsageError(f"documentation {lacks('page', text, pages)}")
     return name
-
-
-def page_title(page: Path) -> str:
-    """Return the heading of a page."""
-    return _text(page).partition("\n")[0].removeprefix("# ")
 
 
 def page_url(page: Path) -> str:
@@ -113,7 +97,8 @@ def _text(page: Path) -> str:
 
 def _list(pages: dict[str, Path], *, as_json: bool) -> None:
     listed = {name: file for name, file in pages.items() if name != "index"}
-    rows = [{"page": name, "kind": file.parent.name, "title": page_title(file)} for name, file in listed.items()]
+    titles = {name: _text(file).partition("\n")[0].removeprefix("# ") for name, file in listed.items()}
+    rows = [{"page": name, "kind": file.parent.name, "title": titles[name]} for name, file in listed.items()]
     if as_json:
         _print_json(rows)
         return

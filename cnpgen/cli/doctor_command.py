@@ -1,31 +1,27 @@
-"""``cnpgen doctor``: check this machine."""
+"""Check this machine.
+
+Results are printed on stdout, warnings and problems with their remedies on stderr. The exit code is 3 if a required
+library does not work. Without a C compiler cnpgen works 10 to 20 times slower. 'cnpgen docs troubleshooting' has
+more remedies.
+"""
 
 import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.parser import Parser, add_json
+from cnpgen.cli.terminal import table
 from cnpgen.errors import MachineError, counted
 
 if TYPE_CHECKING:
     from cnpgen.validate.machine import MachineReport
 
 
-_TEXT = """\
-Results are printed on stdout, warnings and problems with their remedies on stderr. The exit code is 3 if a required
-library does not work. Without a C compiler cnpgen works 10 to 20 times slower. 'cnpgen docs troubleshooting' has
-more remedies.
-"""
-
-
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    title = "check this machine"
-    add_json(add_command(commands, "doctor", run, title=title, text=_TEXT))
+def add_options(parser: Parser) -> None:
+    add_json(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
     import json
 
     from cnpgen.validate.machine import check_machine
@@ -58,7 +54,7 @@ def machine_text(report: "MachineReport") -> str:
         "free disk": f"{report.free_bytes / 1e9:,.1f} GB here",
         "verdict": _verdict(report),
     }
-    return "\n".join(f"{name:<10} {_folded(value)}" for name, value in facts.items())
+    return "\n".join(table(list(facts.items())))
 
 
 def _cache(report: "MachineReport") -> str:
@@ -72,9 +68,3 @@ def _verdict(report: "MachineReport") -> str:
         return f"cnpgen does not work here: {counted(len(report.problems), 'problem')}, below"
     text = "all requirements are met"
     return f"{text}; {counted(len(report.notes), 'warning')}, below" if report.notes else text
-
-
-def _folded(text: str) -> str:
-    import textwrap
-
-    return ("\n" + " " * 11).join(textwrap.wrap(text, 89, break_long_words=False, break_on_hyphens=False))

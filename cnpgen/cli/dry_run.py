@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from cnpgen.cli.describe import table
+from cnpgen.cli.terminal import table
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.make.recipe_file import load_notes

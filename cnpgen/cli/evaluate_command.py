@@ -1,4 +1,13 @@
-"""``cnpgen evaluate``: judge plans or sampled trajectories of a file with Pinocchio and Coal."""
+"""Judge plans or sampled trajectories.
+
+Every plan is checked on a fine time grid and between its samples ('cnpgen docs verdict'). The exit code is 0 if every
+plan is valid, and 1 if a plan is invalid, if the file holds no plans, or if it is damaged. It is 2 for files of
+another kind. --workers changes only the time.
+
+With --problem, FILE may also hold sampled trajectories: CSV, JSON, YAML, NPZ, HDF5 or Parquet, messages of ROS and
+MoveIt, or a folder of such files ('cnpgen docs trajectories'). Each trajectory and condition is valid, invalid or
+undecided. The exit code is then 0 if all are valid, otherwise 1; 2 for damaged files and files of other kinds.
+"""
 
 import argparse
 import json
@@ -6,10 +15,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Commands, Parser, add_command, add_json
-from cnpgen.cli.plan_files import read_plans
-from cnpgen.cli.progress import Meter
+from cnpgen.cli import recipe_names, values, verdict_text
+from cnpgen.cli.parser import Parser, add_json
+from cnpgen.cli.terminal import Meter
 from cnpgen.cli.trajectory_options import (
     add_trajectory_options,
     listing_text,
@@ -25,20 +33,8 @@ if TYPE_CHECKING:
     from cnpgen.plans.evaluate import Evaluation
     from cnpgen.plans.evaluate_trajectories import TrajectoryEvaluation
 
-_TEXT = """\
-Every plan is checked on a fine time grid and between its samples ('cnpgen docs verdict'). The exit code is 0 if every
-plan is valid, and 1 if a plan is invalid, if the file holds no plans, or if it is damaged. It is 2 for files of
-another kind. --workers changes only the time.
 
-With --problem, FILE may also hold sampled trajectories: CSV, JSON, YAML, NPZ, HDF5 or Parquet, messages of ROS and
-MoveIt, or a folder of such files ('cnpgen docs trajectories'). Each trajectory and condition is valid, invalid or
-undecided. The exit code is then 0 if all are valid, otherwise 1; 2 for damaged files and files of other kinds.
-"""
-
-
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "evaluate", run, title="judge plans or sampled trajectories", text=_TEXT)
+def add_options(parser: Parser) -> None:
     option = parser.add_argument
     option("file", metavar="FILE", type=Path, help="plan file, .h5, or sampled trajectories")
     text = "the problem of the plans; its tolerances are used"
@@ -66,7 +62,6 @@ def add(commands: "Commands[Parser]") -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
     from cnpgen.plans.trajectory_tables import holds_trajectories
 
     if arguments.plan is not None and not arguments.plot:
@@ -78,11 +73,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         _write_json(arguments.file, found)
     else:
-        from cnpgen.cli.verdict_text import listing_text, summary_text
-
-        print(summary_text(arguments.file, found))
+        print(verdict_text.summary_text(arguments.file, found))
         if arguments.list:
-            print(f"\n{listing_text(found)}")
+            print(f"\n{verdict_text.listing_text(found)}")
     if arguments.plot:
         _draw(found, arguments.plot, arguments.plan)
     return 0 if found.valid.all() else 1
@@ -125,7 +118,7 @@ def _run_trajectories(arguments: argparse.Namespace) -> int:
 def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
     from cnpgen.plans.evaluate import evaluate_plans
 
-    plans = read_plans(arguments.file, problem=arguments.problem)
+    plans = recipe_names.read_plans(arguments.file, problem=arguments.problem)
     if arguments.plan is not None and arguments.plan >= len(plans):
         raise UsageError(f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0")
     with Meter(quiet=not sys.stderr.isatty(), noun="plan") as meter:

@@ -1,4 +1,13 @@
-"""``cnpgen export``: plans as sampled trajectories for robots and simulators."""
+"""Write plans as sampled trajectories.
+
+npz, parquet and mpd (B-splines of the paths) are one file. csv, joint-trajectory (a message of ROS 2, as JSON) and
+ros2-control (the goal of a trajectory controller, as YAML) are a folder with one file per plan. lerobot is a
+dataset in a folder (LeRobotDataset v3), with --rate frames per second.
+'cnpgen list exporters' shows all formats, including those of installed packages. 'cnpgen docs plan-format' shows how to
+read them. The path of the output is printed on stdout. Plans that cannot be sampled are left out and listed on
+stderr; the exit code is then 1. With --join, positions, velocities and accelerations must be
+continuous from plan to plan (1e-9 in SI); otherwise nothing is written.
+"""
 
 import argparse
 import sys
@@ -6,8 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Commands, Parser, add_command
-from cnpgen.cli.plan_files import read_plans
+from cnpgen.cli.parser import Parser
 from cnpgen.errors import UsageError, counted, listed
 
 if TYPE_CHECKING:
@@ -18,20 +26,8 @@ if TYPE_CHECKING:
 MAX_LISTED_PLANS = 10  # invalid plans that are listed by number
 NO_OBSTACLES = "the output lacks the obstacles of the plans: only a problem with these obstacles judges it among them"
 
-_TEXT = """\
-npz, parquet and mpd (B-splines of the paths) are one file. csv, joint-trajectory (a message of ROS 2, as JSON) and
-ros2-control (the goal of a trajectory controller, as YAML) are a folder with one file per plan. lerobot is a
-dataset in a folder (LeRobotDataset v3), with --rate frames per second.
-'cnpgen list exporters' shows all formats, including those of installed packages. 'cnpgen docs plan-format' shows how to
-read them. The path of the output is printed on stdout. Plans that cannot be sampled are left out and listed on
-stderr; the exit code is then 1. With --join, positions, velocities and accelerations must be
-continuous from plan to plan (1e-9 in SI); otherwise nothing is written.
-"""
 
-
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "export", run, title="write plans as sampled trajectories", text=_TEXT)
+def add_options(parser: Parser) -> None:
     option = parser.add_argument
     option("file", metavar="FILE", type=recipe_names.present, help="plan file, .h5")
     text = "format: npz, csv, parquet, lerobot, mpd, ... ('cnpgen list exporters')"
@@ -49,7 +45,6 @@ def add(commands: "Commands[Parser]") -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
     from cnpgen.plans.export import export_plans, load_exporter
     from cnpgen.problems.problem_record import open_problem
 
@@ -75,13 +70,13 @@ def _plans(arguments: argparse.Namespace) -> "Plans | JoinedPlans":
     """Read the plans, and join them with the following ones."""
     from cnpgen.plans.join import join_plans
 
-    plans: Plans | JoinedPlans = read_plans(arguments.file)
+    plans: Plans | JoinedPlans = recipe_names.read_plans(arguments.file)
     following, times = arguments.join or [], arguments.at or []
     if times and len(times) != len(following):
         given = f"--at is given {counted(len(times), 'time')}, --join {counted(len(following), 'time')}"
         raise UsageError(f"{given}: expected one for each")
     for file, time in zip(following, times or [None] * len(following), strict=True):
-        plans = join_plans(plans, read_plans(file), at=time)
+        plans = join_plans(plans, recipe_names.read_plans(file), at=time)
     return plans
 
 

@@ -1,4 +1,9 @@
-"""``cnpgen import``: fit plans to sampled trajectories of any planner."""
+"""Make plans of sampled trajectories.
+
+The plans are initial guesses: 'cnpgen refine' optimizes them and keeps their ends, and 'cnpgen evaluate' judges them.
+Formats and columns are those of 'cnpgen evaluate' ('cnpgen docs trajectories'). The ends are moved onto the
+constraints by a change of positions of at most three times the noise, or 1 mrad. The plan file is printed on stdout.
+"""
 
 import argparse
 import sys
@@ -6,23 +11,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.cli.parser import Parser
 from cnpgen.cli.trajectory_options import add_trajectory_options, load_file, problem_of
 from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:
     from cnpgen.plans import Plans
 
-_TEXT = """\
-The plans are initial guesses: 'cnpgen refine' optimizes them and keeps their ends, and 'cnpgen evaluate' judges them.
-Formats and columns are those of 'cnpgen evaluate' ('cnpgen docs trajectories'). The ends are moved onto the
-constraints by a change of positions of at most three times the noise, or 1 mrad. The plan file is printed on stdout.
-"""
 
-
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "import", run, title="make plans of sampled trajectories", text=_TEXT)
+def add_options(parser: Parser) -> None:
     option = parser.add_argument
     option("file", metavar="FILE", type=recipe_names.present, help="file of trajectories, or a folder of them")
     text = "the problem of the trajectories"
@@ -38,11 +35,10 @@ def add(commands: "Commands[Parser]") -> None:
     option("--stay-within", metavar="E", type=values.angle, help=text)
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
+def run(arguments: argparse.Namespace) -> None:
     import numpy as np
 
-    from cnpgen.cli.refine_options import check_place
+    from cnpgen.cli.refine_command import check_place
     from cnpgen.plans.import_trajectories import import_trajectories
     from cnpgen.plans.save import save_plans
     from cnpgen.store.files.kind import PLANS
@@ -74,7 +70,6 @@ def run(arguments: argparse.Namespace) -> int:
     largest = float(np.nanmax(imported.snapped)) if len(failed) < len(imported.plans) else 0.0
     print(f"ends moved by at most {largest:.2g} rad to meet the constraints", file=sys.stderr)
     print(arguments.out)
-    return 0
 
 
 def _refined(plans: "Plans", distance: float) -> "Plans":

@@ -1,15 +1,5 @@
-"""``cnpgen init``: write a problem, a pipeline and a dataset for an arm, or a package with a planner."""
+"""Write recipes for your own arm, or a planner.
 
-import argparse
-import sys
-import warnings
-from collections.abc import Iterable, Mapping
-from pathlib import Path
-
-from cnpgen.cli.parser import Commands, Parser, add_command
-from cnpgen.errors import UsageError
-
-_TEXT = """\
 The command writes NAME/problem.toml, NAME/pipeline.toml and NAME/dataset.toml: motions from rest to rest between two
 boxes of positions in front of the robot, within its limits and without self-collision. Comments explain every key. The
 head of problem.toml lists findings about the robot: joints, masses, frames, link pairs, the free space that convex
@@ -18,10 +8,17 @@ are decomposed. 'cnpgen docs your-arm' continues from there. With --planner the 
 module with a planner for 'cnpgen benchmark', which uses limits, kinematics and the table through the public interface.
 """
 
+import argparse
+import sys
+import warnings
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "init", run, title="write recipes for your own arm, or a planner", text=_TEXT)
+from cnpgen.cli.parser import Parser
+from cnpgen.errors import UsageError
+
+
+def add_options(parser: Parser) -> None:
     option = parser.add_argument
     option("name", metavar="NAME", type=_folder, help="name of the recipes and of their folder")
     kind = parser.add_mutually_exclusive_group(required=True)
@@ -36,8 +33,7 @@ def add(commands: "Commands[Parser]") -> None:
     option("--force", action="store_true", help="overwrite existing files")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
+def run(arguments: argparse.Namespace) -> None:
     from cnpgen.cli.init.arm import read_arm
     from cnpgen.cli.init.initial_recipes import dataset_of, problem_of
     from cnpgen.cli.init.write import FILES, problem_text, sampling_texts
@@ -45,7 +41,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     folder = arguments.name
     if arguments.planner:
-        return _write_planner(folder, force=arguments.force)
+        _write_planner(folder, force=arguments.force)
+        return
     _check_place(folder, FILES, force=arguments.force)
     arm = read_arm(arguments.urdf, arguments.tip)
     packages = (*arguments.packages, *packages_of_environment(arm.meshes, arm.urdf, arguments.packages))
@@ -56,24 +53,25 @@ def run(arguments: argparse.Namespace) -> int:
         sys.stderr.writelines(f"note: {note}\n" for note in initial.notes)
         recipe, share = dataset_of(initial, folder)
     _write(folder, sampling_texts(recipe, share))
-    _print_next(
+    print(
+        "next:",
         f"cnpgen show {folder}/dataset.toml               what is in them",
         f"cnpgen make-dataset {folder}/dataset.toml --n 1000",
         f"cnpgen solve {folder}/pipeline.toml --n 10 -o {folder.name}-plans.h5",
         f"cnpgen view {folder}/problem.toml -o {folder.name}.html",
+        sep="\n  ",
+        file=sys.stderr,
     )
-    return 0
 
 
-def _write_planner(folder: Path, *, force: bool) -> int:
+def _write_planner(folder: Path, *, force: bool) -> None:
     from cnpgen.cli.init.planner_package import planner_texts
 
     texts = planner_texts(folder.name)
     _check_place(folder, texts, force=force)
     _write(folder, texts)
     test = f"cnpgen benchmark hits-81 --planners {folder.name} cnpgen --n 2"
-    _print_next(f"pip install -e {folder}", test, "cnpgen docs benchmark")
-    return 0
+    print("next:", f"pip install -e {folder}", test, "cnpgen docs benchmark", sep="\n  ", file=sys.stderr)
 
 
 def _write(folder: Path, texts: Mapping[str, str]) -> None:
@@ -103,7 +101,3 @@ def _check_place(folder: Path, names: Iterable[str], *, force: bool) -> None:
     there = [str(folder / name) for name in names if (folder / name).exists()]
     if there and not force:
         raise UsageError(f"{', '.join(there)} exist{'s' if len(there) == 1 else ''} already: --force writes over it")
-
-
-def _print_next(*lines: str) -> None:
-    print("next:", *lines, sep="\n  ", file=sys.stderr)

@@ -1,11 +1,17 @@
-"""``cnpgen inspect``: summarize a dataset and its sampling."""
+"""Summarize a dataset and its sampling.
+
+The command reads documents and shard records, not samples, so it is fast for large datasets and works for unfinished
+ones; 'cnpgen validate' verifies the samples. "accepts" is the share of candidates that pass a condition, "left" the
+share of all candidates that remain after it. The exit code is 1 if the dataset is damaged, 0 if it is unfinished.
+"""
 
 import argparse
 import sys
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.parser import Parser, add_json
+from cnpgen.cli.terminal import table
 
 if TYPE_CHECKING:
     from cnpgen.store.field import Field
@@ -14,24 +20,13 @@ if TYPE_CHECKING:
     from cnpgen.store.statistics import FieldStatistics
 
 
-_TEXT = """\
-The command reads documents and shard records, not samples, so it is fast for large datasets and works for unfinished
-ones; 'cnpgen validate' verifies the samples. "accepts" is the share of candidates that pass a condition, "left" the
-share of all candidates that remain after it. The exit code is 1 if the dataset is damaged, 0 if it is unfinished.
-"""
-
-
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    title = "summarize a dataset and its sampling"
-    parser = add_command(commands, "inspect", run, title=title, text=_TEXT)
+def add_options(parser: Parser) -> None:
     parser.add_argument("folder", metavar="DIR", type=recipe_names.dataset, help="folder of a dataset, finished or not")
     parser.add_argument("--plot", metavar="FILE", type=values.plot_file, help="also draw it: .png, .pdf or .svg")
     add_json(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
     from cnpgen.store.files.documents import render
     from cnpgen.store.inspection import inspect_dataset
 
@@ -47,8 +42,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def inspection_text(found: "Inspection") -> str:
     """Lay out an inspection for people."""
-    from cnpgen.cli.describe import table
-
     spec = found.spec
     sections = [[f"{spec.name} {spec.version}  {spec.title}".rstrip(), *table(_facts(found), indent="  ")]]
     if found.sampling.tried:
@@ -83,8 +76,6 @@ def _facts(found: "Inspection") -> list[tuple[str, str]]:
 
 def _yield_lines(sampling: "SamplingStatistics") -> list[str]:
     """Lay out the sampling statistics of the draws, in pipeline order."""
-    from cnpgen.cli.describe import table
-
     rows = [("stage", "rejects because", "draws", "accepts", "left"), ("", "", f"{sampling.tried:,}", "", "100.00 %")]
     left, before = sampling.tried, ""
     for reason, count in sampling.rejections.items():

@@ -44,10 +44,6 @@ def _interrupt(number: int) -> None:
     raise_if_interrupted()
 
 
-def _end(number: int) -> None:
-    os._exit(128 + number)
-
-
 @contextmanager
 def interruptible() -> Iterator[None]:
     """Raise ``KeyboardInterrupt`` or ``Terminated`` in this block at the first signal; at a later one, end at once.
@@ -57,7 +53,7 @@ def interruptible() -> Iterator[None]:
     """
     if threading.current_thread() is threading.main_thread():
         _interruptions.clear()
-    with signals_handled(_interrupt, _end, stay=True):
+    with signals_handled(_interrupt, lambda number: os._exit(128 + number), stay=True):
         try:
             yield
         except Exception:

@@ -1,16 +1,13 @@
-"""``cnpgen list``: shipped recipes and models, and the kinds of stages, constraints, objectives and exporters."""
+"""List datasets, models, pipelines, problems, stages, constraints, objectives and exporters."""
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.parser import Parser, add_json
+from cnpgen.cli.terminal import table
 from cnpgen.errors import RecipeError
-
-if TYPE_CHECKING:
-    from cnpgen.schema.toml import Kind
-
-WHAT = ("datasets", "models", "pipelines", "problems", "stages", "constraints", "objectives", "exporters")
+from cnpgen.schema.toml import Kind
 
 _HOW = {
     "datasets": "cnpgen make-dataset NAME",
@@ -22,22 +19,19 @@ _HOW = {
     "objectives": "cnpgen train DIR -o MODEL --objective NAME=WEIGHT",
     "exporters": "cnpgen export PLANS --to NAME",
 }
+WHAT = tuple(_HOW)
 
 
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "list", run, title=f"list {', '.join(WHAT[:-1])} and {WHAT[-1]}")
+def add_options(parser: Parser) -> None:
     parser.add_argument("what", nargs="?", choices=WHAT, metavar="WHAT", help=f"one of {', '.join(WHAT)}; default all")
     add_json(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
+def run(arguments: argparse.Namespace) -> None:
     from cnpgen.store.files.documents import plain, render
 
     found = {what: list_all(what) for what in ([arguments.what] if arguments.what else WHAT)}
     print(render(plain(found)) if arguments.json else "\n\n".join(_section(*item) for item in found.items()))
-    return 0
 
 
 def list_all(what: str) -> list[dict[str, Any]]:
@@ -100,7 +94,5 @@ def _summary(group: str, name: str) -> str:
 
 
 def _section(what: str, entries: list[dict[str, Any]]) -> str:
-    from cnpgen.cli.describe import table
-
     rows = [(entry["name"], *([entry["size"]] if "size" in entry else []), entry["title"]) for entry in entries]
     return "\n".join([f"{what}  ({_HOW[what]})", *(table(rows, indent="  ", one_line=True) if rows else ["  none"])])

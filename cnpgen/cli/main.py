@@ -39,38 +39,38 @@ from cnpgen.cli import (
     view_command,
 )
 from cnpgen.cli.interruption import Terminated, exit_code, interruptible
-from cnpgen.cli.parser import Parser, add_debug
+from cnpgen.cli.parser import Parser, add_command, add_debug
 from cnpgen.cli.terminal import printing_safely
 from cnpgen.errors import CnpgenError, MachineError, RecipeError, Spelling, python_spelling
 from cnpgen.machine.threads import prefer_one_thread
 from cnpgen.machine.versions import DOCUMENTATION_URL, installed_version
 
-_COMMANDS = (
-    make_command,
-    merge_command,
-    extend_command,
-    init_command,
-    copy_command,
-    list_command,
-    show_command,
-    inspect_command,
-    validate_command,
-    train_command,
-    plan_command,
-    make_scenes_command,
-    complete_command,
-    solve_command,
-    refine_command,
-    evaluate_command,
-    import_command,
-    view_command,
-    simulate_command,
-    benchmark_command,
-    export_command,
-    publish_command,
-    doctor_command,
-    docs_command,
-)
+_COMMANDS = {
+    "make-dataset": make_command,
+    "merge": merge_command,
+    "extend": extend_command,
+    "init": init_command,
+    "copy": copy_command,
+    "list": list_command,
+    "show": show_command,
+    "inspect": inspect_command,
+    "validate": validate_command,
+    "train": train_command,
+    "plan": plan_command,
+    "make-scenes": make_scenes_command,
+    "complete": complete_command,
+    "solve": solve_command,
+    "refine": refine_command,
+    "evaluate": evaluate_command,
+    "import": import_command,
+    "view": view_command,
+    "simulate": simulate_command,
+    "benchmark": benchmark_command,
+    "export": export_command,
+    "publish": publish_command,
+    "doctor": doctor_command,
+    "docs": docs_command,
+}
 
 _DESCRIPTION = "Generate and verify datasets for kinodynamic motion planning, train planners and optimize plans."
 
@@ -167,7 +167,7 @@ def _run(words: list[str], given: argparse.Namespace) -> int:
         parser.print_help(sys.stderr)
         return 2
     with notices(quiet=getattr(arguments, "quiet", False)):
-        code: int = arguments.run(arguments)
+        code: int = arguments.run(arguments) or 0  # most commands return nothing
     return code
 
 
@@ -177,8 +177,8 @@ def build_parser() -> Parser:
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version")
     add_debug(parser)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=_LinkedParser)
-    for command in _COMMANDS:
-        command.add(commands)
+    for name, module in _COMMANDS.items():
+        add_command(commands, name, module)
     return parser
 
 

@@ -1,4 +1,15 @@
-"""``cnpgen make-dataset``: make a dataset, or resume one."""
+"""Make a dataset, or resume one.
+
+The same recipe, seed and backend give the same samples. --workers, --shard-size and --part decide which process makes
+which samples, never their content; a smaller --n gives the first samples of each split. With --certify every sample is
+planned (about 30 ms each). Samples without a valid plan are rejected as "no plan found", and the control points of the
+plans are stored. With --model certification starts from a planner's plans, in half the time, with the same judge.
+The folder of the dataset is printed on stdout.
+
+Shards of the same dataset in the folder are kept: they are compared with their recorded sha256 (at 0.3 to 1 GB/s per
+core), and damaged ones are made again. Another dataset is replaced only with --force, or if it has no shards. After
+Ctrl-C (exit code 130), SIGTERM (143), kill -9 or a full disk the same command resumes.
+"""
 
 import argparse
 import sys
@@ -7,8 +18,8 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.interruption import raise_if_interrupted
-from cnpgen.cli.parser import ENGINE, Commands, Parser, add_command, add_engine, options_of
-from cnpgen.cli.progress import Meter
+from cnpgen.cli.parser import ENGINE, Parser, add_engine, options_of
+from cnpgen.cli.terminal import Meter
 from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:
@@ -21,28 +32,13 @@ if TYPE_CHECKING:
 _SETTINGS = ("n", "seed", "shard_size", "dtype", "backend", "force")
 INTERRUPTED_TEXT = "finished shards are kept; run the same command again to resume"
 
-_TEXT = """\
-The same recipe, seed and backend give the same samples. --workers, --shard-size and --part decide which process makes
-which samples, never their content; a smaller --n gives the first samples of each split. With --certify every sample is
-planned (about 30 ms each). Samples without a valid plan are rejected as "no plan found", and the control points of the
-plans are stored. With --model certification starts from a planner's plans, in half the time, with the same judge.
-The folder of the dataset is printed on stdout.
 
-Shards of the same dataset in the folder are kept: they are compared with their recorded sha256 (at 0.3 to 1 GB/s per
-core), and damaged ones are made again. Another dataset is replaced only with --force, or if it has no shards. After
-Ctrl-C (exit code 130), SIGTERM (143), kill -9 or a full disk the same command resumes.
-"""
-
-
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "make-dataset", run, title="make a dataset, or resume one", text=_TEXT)
+def add_options(parser: Parser) -> None:
     option = parser.add_argument
     option("recipe", metavar="NAME|FILE", help="a shipped dataset or pipeline (see 'cnpgen list'), or a recipe file")
     option("--n", metavar="N", type=values.rows, help="total number of samples; default the recipe's")
     option("--seed", metavar="S", type=values.seed, help="root seed; default the recipe's")
     option("-o", "--out", metavar="DIR", help="folder of the dataset; default NAME-vMAJOR here")
-    option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
     add_engine(parser)
     text = "rows per file; default 8192 to 65536, with --certify 64 to 1024"
     option("--shard-size", metavar="R", type=values.positive, help=text)
@@ -57,8 +53,7 @@ def add(commands: "Commands[Parser]") -> None:
     option("--quiet", action="store_true", help="no progress and no summary")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
+def run(arguments: argparse.Namespace) -> None:
     from cnpgen.make.recipe_file import load_dataset_recipe
 
     recipe_names.check_recipe(arguments.recipe, of_dataset="'cnpgen make-dataset NAME --out {0}' resumes it")
@@ -75,12 +70,11 @@ def run(arguments: argparse.Namespace) -> int:
         from cnpgen.cli.dry_run import spec_text
 
         print(spec_text(recipe, arguments.out, **options_of(arguments, *_SETTINGS)))
-        return 0
+        return
     from cnpgen.make.make_dataset import make_dataset
 
     options = options_of(arguments, *_SETTINGS, *ENGINE, "part")
     make_metered(partial(make_dataset, recipe, arguments.out, **options), quiet=arguments.quiet, part=arguments.part)
-    return 0
 
 
 def make_metered(

@@ -1,4 +1,11 @@
-"""``cnpgen make-scenes``: planning problems in scenes of a family, written as a scene file."""
+"""Make planning problems in random scenes.
+
+A family draws furniture and objects around the robot. Goals are grasp-like poses, for which inverse kinematics finds
+collision-free joint positions; starts are neutral, at other grasps or random. Nine of ten straight lines between them
+collide. 'cnpgen solve OUT --robot NAME' solves the problems. The format follows from OUT: HDF5 as of MPiNets (.h5,
+.hdf5), or a folder of planning scenes and requests of MoveIt in YAML. --list prints the families with their parameters.
+'cnpgen docs scene-files' describes the formats. The same arguments give the same problems.
+"""
 
 import argparse
 import json
@@ -7,22 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Commands, Parser, add_command, add_json
-from cnpgen.cli.progress import Meter
+from cnpgen.cli.parser import Parser, add_json
+from cnpgen.cli.terminal import Meter
 from cnpgen.errors import UsageError
 
-_TEXT = """\
-A family draws furniture and objects around the robot. Goals are grasp-like poses, for which inverse kinematics finds
-collision-free joint positions; starts are neutral, at other grasps or random. Nine of ten straight lines between them
-collide. 'cnpgen solve OUT --robot NAME' solves the problems. The format follows from OUT: HDF5 as of MPiNets (.h5,
-.hdf5), or a folder of planning scenes and requests of MoveIt in YAML. --list prints the families with their parameters.
-'cnpgen docs scene-files' describes the formats. The same arguments give the same problems.
-"""
 
-
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "make-scenes", run, title="make planning problems in random scenes", text=_TEXT)
+def add_options(parser: Parser) -> None:
     option = parser.add_argument
     text = "family of scenes, such as tabletop (see --list)"
     option("family", metavar="FAMILY", nargs="?", type=recipe_names.family, help=text)
@@ -48,14 +45,13 @@ def family_parameter(text: str) -> tuple[str, Any]:
     return key, values.toml_value(value)
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
+def run(arguments: argparse.Namespace) -> None:
     from cnpgen.pipelines.families.scene_generator import make_scenes
     from cnpgen.problems.scenes.scene_files import save_scenes
 
     if arguments.list:
         print(_listing(as_json=arguments.json))
-        return 0
+        return
     needed = {"FAMILY": arguments.family, "--robot": arguments.robot, "--n": arguments.n}
     missing = [name for name, value in needed.items() if value is None]
     if missing:
@@ -80,7 +76,6 @@ def run(arguments: argparse.Namespace) -> int:
         text = f"{len(scenes)} problems in {facts['scenes']} scenes with {min(obstacles)} to {max(obstacles)} obstacles"
         print(text, file=sys.stderr)
     print(json.dumps(facts, indent=2) if arguments.json else out)
-    return 0
 
 
 def _check_place(out: Path, *, force: bool) -> None:

@@ -1,20 +1,18 @@
 """argparse with errors of one line that suggest the nearest known name.
 
 argparse has no public names for the error of a choice, the width of the command column, the known options and some
-types. Only this module uses the private ones; others import ``Commands`` and ``Options`` from here. Tests of the errors
-detect changes of argparse.
+types. Only this module uses the private ones; others import ``Options`` from here. Tests of the errors detect changes
+of argparse.
 """
 
 import argparse
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from types import ModuleType
 from typing import Any, NoReturn
 
+from cnpgen.cli import values
 from cnpgen.errors import UsageError, nearest
-
-Command = Callable[[argparse.Namespace], int]
-"""What a command runs: a function of the parsed arguments that returns the exit code."""
-
 
 _NEGATIVE = re.compile(r"-\.?[0-9]")  # how values begin: -5ms; before Python 3.14 argparse takes it for an option
 
@@ -63,12 +61,18 @@ Commands = argparse._SubParsersAction  # what ``add_subparsers`` returns: comman
 Options = argparse._ActionsContainer  # a parser or a group of its options: options are added to it
 
 
-def add_command(commands: "Commands[Parser]", name: str, run: Command, *, title: str, text: str = "") -> Parser:
-    """Add a command with a title for the list of commands and a text for its help; return the parser of its options."""
-    parser = commands.add_parser(name, help=title, description=f"{title[0].upper()}{title[1:]}.", epilog=text or None)
+def add_command(commands: "Commands[Any]", name: str, module: ModuleType) -> None:
+    """Add the command of a module, whose docstring is the help.
+
+    Its function ``add_options`` adds arguments and options to a parser. ``run`` runs the command with the parsed
+    arguments, and returns the exit code if it can be another one than 0.
+    """
+    title, _, text = (module.__doc__ or "").partition("\n\n")
+    summary = f"{title[:1].lower()}{title[1:]}".rstrip(".\n")
+    parser = commands.add_parser(name, help=summary, description=title, epilog=text or None)
     add_debug(parser, default=argparse.SUPPRESS)  # keep an option before the command
-    parser.set_defaults(run=run, parser=parser)
-    return parser
+    module.add_options(parser)
+    parser.set_defaults(run=module.run, parser=parser)
 
 
 def add_debug(parser: Parser, *, default: Any = False) -> None:
@@ -79,8 +83,9 @@ def add_debug(parser: Parser, *, default: Any = False) -> None:
 ENGINE = ("workers", "engine", "address")
 
 
-def add_engine(parser: Options) -> None:
-    """Add ``--engine`` and ``--address``."""
+def add_engine(parser: Options, workers: str = "processes; default one per available core") -> None:
+    """Add the options of ``ENGINE``, with a help for ``--workers``."""
+    parser.add_argument("--workers", metavar="W", type=values.positive, help=workers)
     text = "engine of the workers: local processes (loky, default), or a cluster ('cnpgen docs scale')"
     parser.add_argument("--engine", choices=("loky", "dask", "ray"), help=text)
     text = "address of the cluster, such as tcp://host:8786; without it a local cluster is started"
@@ -90,6 +95,12 @@ def add_engine(parser: Options) -> None:
 def options_of(arguments: argparse.Namespace, *names: str) -> dict[str, Any]:
     """Return options of a command as keyword arguments."""
     return {name: getattr(arguments, name) for name in names}
+
+
+def refuse(arguments: argparse.Namespace, names: Sequence[str], why: str) -> None:
+    """Raise UsageError if one of some options was passed."""
+    if any(getattr(arguments, name) is not None for name in names):
+        raise UsageError(why)
 
 
 def add_json(parser: Parser) -> None:

@@ -1,20 +1,5 @@
-"""``cnpgen plan``: plan with a trained model."""
+"""Plan with a trained model.
 
-import argparse
-import sys
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import ENGINE, Commands, Parser, add_command, add_engine, add_json, options_of
-from cnpgen.cli.refine_options import LARGE_ANGLES, REFINING, WORKERS, add_refining, check_place, refine_and_save
-from cnpgen.errors import UsageError, counted
-
-if TYPE_CHECKING:
-    from cnpgen.planner.model import Model
-    from cnpgen.planner.plan_requests import Requests
-
-_TEXT = """\
 The problems are samples of a dataset, fresh draws of a recipe as 'cnpgen solve' makes them, scenes ('cnpgen docs
 scene-files') for a model that was trained on scenes, or boundary conditions in an HDF5 file (a shard, a plan file, or
 any other): start_q and goal_q of shape (N, joints), optionally start_dq, start_ddq and goal_dq, and goal_ddq for models
@@ -24,10 +9,22 @@ the end. Finished plans are kept in PLANS.part, and the same command resumes. Th
 existing one is replaced only with --force.
 """
 
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "plan", run, title="plan with a trained model", text=_TEXT)
+from cnpgen.cli import recipe_names, values
+from cnpgen.cli.parser import ENGINE, Parser, add_engine, add_json, options_of, refuse
+from cnpgen.cli.refine_command import LARGE_ANGLES, REFINING, WORKERS, add_refining, check_place, refine_and_save
+from cnpgen.errors import UsageError, counted
+
+if TYPE_CHECKING:
+    from cnpgen.planner.model import Model
+    from cnpgen.planner.plan_requests import Requests
+
+
+def add_options(parser: Parser) -> None:
     option = parser.add_argument
     text = "a dataset's folder; a dataset or pipeline by name, or a recipe file; boundary conditions in HDF5; or scenes"
     option("problems", metavar="DIR|NAME|FILE", type=recipe_names.problems, help=text)
@@ -47,13 +44,11 @@ def add(commands: "Commands[Parser]") -> None:
     add_json(parser)
     option("--refine", action="store_true", help="optimize the plans")
     refining = parser.add_argument_group("with --refine")
-    refining.add_argument("--workers", metavar="W", type=values.positive, help=WORKERS)
-    add_engine(refining)
+    add_engine(refining, WORKERS)
     add_refining(refining)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
     import json
     import time
 
@@ -112,8 +107,7 @@ def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
 
     if recipe_names.is_recipe(arguments.problems):
         return _draws(arguments, model)
-    if arguments.seed is not None:
-        raise UsageError(f"--seed is for fresh draws of a recipe, got {arguments.problems}")
+    refuse(arguments, ["seed"], f"--seed is for fresh draws of a recipe, got {arguments.problems}")
     problems = Path(arguments.problems)
     if problems.exists() and holds_scenes(problems):
         return _scenes(arguments, model)
@@ -126,8 +120,7 @@ def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
             n=arguments.n,
             other=arguments.other_rows,
         )
-    if arguments.split is not None or arguments.first is not None or arguments.n is not None:
-        raise UsageError("--split, --first and --n need the folder of a dataset, got a file")
+    refuse(arguments, ["split", "first", "n"], "--split, --first and --n need the folder of a dataset, got a file")
     return read_file(problems, model, other=arguments.other_rows, allow_large_angles=arguments.allow_large_angles)
 
 
@@ -151,8 +144,8 @@ def _draws(arguments: argparse.Namespace, model: "Model") -> "Requests":
     from cnpgen.store.files.documents import plain
 
     name = arguments.problems
-    if arguments.split is not None or arguments.first is not None:
-        raise UsageError("--split and --first need the folder of a dataset; samples drawn from a recipe have --seed")
+    of_rows = "--split and --first need the folder of a dataset; samples drawn from a recipe have --seed"
+    refuse(arguments, ["split", "first"], of_rows)
     if arguments.n is None:
         raise UsageError(f"--n is required: the number of fresh problems of the recipe {name}")
     recipe = load_dataset_recipe(name)

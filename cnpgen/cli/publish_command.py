@@ -1,23 +1,19 @@
-"""``cnpgen publish``: a dataset as a repository of the Hugging Face Hub."""
+"""Publish a dataset on the Hugging Face Hub (extra: hub).
+
+The repository has a card, a Parquet view and the dataset itself in hdf5/. License, creator and citation are those of
+the recipe's keys; a dataset without a license is refused. The same command continues an interrupted upload. 'hf auth
+login' stores the token of the upload. The path of the folder, or the address of the repository, is printed on stdout.
+"""
 
 import argparse
 import sys
 from pathlib import Path
 
 from cnpgen.cli import recipe_names
-from cnpgen.cli.parser import Commands, Parser, add_command
-
-_TEXT = """\
-The repository has a card, a Parquet view and the dataset itself in hdf5/. License, creator and citation are those of
-the recipe's keys; a dataset without a license is refused. The same command continues an interrupted upload. 'hf auth
-login' stores the token of the upload. The path of the folder, or the address of the repository, is printed on stdout.
-"""
+from cnpgen.cli.parser import Parser
 
 
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    title = "publish a dataset on the Hugging Face Hub (extra: hub)"
-    parser = add_command(commands, "publish", run, title=title, text=_TEXT)
+def add_options(parser: Parser) -> None:
     option = parser.add_argument
     option("folder", metavar="DIR", type=recipe_names.dataset, help="folder of a finished dataset")
     option("--to", metavar="USER/NAME", required=True, help="repository of the Hub; it is created if it does not exist")
@@ -26,8 +22,7 @@ def add(commands: "Commands[Parser]") -> None:
     option("--dry-run", action="store_true", help="write the folder, but upload nothing")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
+def run(arguments: argparse.Namespace) -> None:
     from cnpgen.make.publish import publish_dataset
 
     folder = arguments.folder
@@ -37,4 +32,3 @@ def run(arguments: argparse.Namespace) -> int:
     if published.url:
         print(f"cnpgen: uploaded {published.folder}", file=sys.stderr)
     print(published.url or published.folder)
-    return 0

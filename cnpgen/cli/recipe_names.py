@@ -5,9 +5,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.errors import UsageError, either
+from cnpgen.errors import DatasetError, UsageError, either
 
 if TYPE_CHECKING:
+    from cnpgen.plans import Plans
     from cnpgen.schema.toml import Kind
 
 _TEXTS = {".toml", ".yaml", ".yml"}  # suffixes of recipes, and of scenes
@@ -50,29 +51,6 @@ def is_recipe(what: str) -> bool:
     return path.suffix == ".toml" or (not path.exists() and what in _shipped("dataset", "pipeline"))
 
 
-def check_there(what: str, *kinds: str) -> None:
-    """Refuse an argument that is neither a path nor the name of a recipe, by default of a dataset or a pipeline."""
-    from cnpgen.store.files.atomic import check_readable
-    from cnpgen.store.files.kind import kind_of_content
-    from cnpgen.store.paths import similar_path
-
-    kinds = kinds or ("dataset", "pipeline")
-    names = _shipped(*kinds)
-    path = Path(what)
-    check_readable(path)
-    if path.suffix.lower() not in _TEXTS and path.is_file() and kind_of_content(path) == "a text file":
-        check_recipe(what)  # has a hint for tables
-        raise UsageError(f"{what} is a text file, expected a recipe (.toml) or an HDF5 file")
-    if path.exists() or what in names:
-        return
-    hint = similar_path(path, names)
-    if path.suffix:
-        raise UsageError(f"no such file: {what}{hint}")
-    raise UsageError(
-        f"{what} is neither a folder nor a file, {either(kinds)}{hint}: 'cnpgen list' names those that ship"
-    )
-
-
 def _shipped(*kinds: str) -> set[str]:
     from cnpgen.schema.catalogue import list_recipes
     from cnpgen.schema.toml import MARKS
@@ -83,16 +61,29 @@ def _shipped(*kinds: str) -> set[str]:
 # Types of arguments, which argparse reads before it reports missing options.
 
 
-def problems(text: str) -> str:
-    """Read the folder of a dataset, the name of a dataset or a pipeline, or a file."""
-    check_there(text)
-    return text
+def _recipe_or_path(kinds: tuple[str, ...], text: str) -> str:
+    """Read a path, or the name of a recipe of one of several kinds."""
+    from cnpgen.store.files.atomic import check_readable
+    from cnpgen.store.files.kind import kind_of_content
+    from cnpgen.store.paths import similar_path
+
+    names, path = _shipped(*kinds), Path(text)
+    check_readable(path)
+    if path.suffix.lower() not in _TEXTS and path.is_file() and kind_of_content(path) == "a text file":
+        check_recipe(text)  # has a hint for tables
+        raise UsageError(f"{text} is a text file, expected a recipe (.toml) or an HDF5 file")
+    if path.exists() or text in names:
+        return text
+    hint = similar_path(path, names)
+    if path.suffix:
+        raise UsageError(f"no such file: {text}{hint}")
+    raise UsageError(
+        f"{text} is neither a folder nor a file, {either(kinds)}{hint}: 'cnpgen list' names those that ship"
+    )
 
 
-def viewed(text: str) -> str:
-    """Read the name of a recipe of any kind with a problem, or a path."""
-    check_there(text, "problem", "pipeline", "dataset")
-    return text
+problems = partial(_recipe_or_path, ("dataset", "pipeline"))
+viewed = partial(_recipe_or_path, ("problem", "pipeline", "dataset"))
 
 
 def shipped(text: str) -> str:
@@ -154,6 +145,16 @@ def present(text: str) -> Path:
     _refuse_shipped(text)
     require_path(Path(text), "a file or a folder")
     return Path(text)
+
+
+def read_plans(path: Path, *, problem: str | None = None) -> "Plans":
+    """Read the plans of a file, as ``cnpgen.load_plans`` does; refuse files without plans."""
+    from cnpgen.plans import load_plans
+
+    plans = load_plans(path, problem=problem)
+    if not len(plans):
+        raise DatasetError(f"no plans in {path}")
+    return plans
 
 
 def _refuse_shipped(text: str) -> None:

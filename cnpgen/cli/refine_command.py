@@ -1,39 +1,188 @@
-"""``cnpgen refine``: polish the plans of a file."""
+"""Optimize the plans of a file.
 
-import argparse
-import sys
-from pathlib import Path
-
-from cnpgen.cli import recipe_names
-from cnpgen.cli.parser import Commands, Parser, add_command
-from cnpgen.cli.plan_files import checksum_text, read_plans
-from cnpgen.cli.refine_options import TEXT, add_options, refine_and_save
-
-_TEXT = (
-    """\
 The plans may come from any planner; 'cnpgen docs plan-format' shows how to write a plan file, and how trajectories
 that are sampled in time become plans. No plan comes back worse than it was given: violations count first, then the
 objective. Plans whose control points are no numbers, or that take longer than a minute, are made from nothing.
 """
-    + TEXT
-)
+
+import argparse
+import json
+import sys
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cnpgen.cli import recipe_names, values
+from cnpgen.cli.interruption import resumable
+from cnpgen.cli.parser import ENGINE, Options, Parser, add_engine, add_json, options_of
+from cnpgen.cli.terminal import Meter
+from cnpgen.cli.verdict_text import checksum_text
+from cnpgen.errors import UsageError, counted
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from cnpgen.machine.times import Times
+    from cnpgen.make.solve_scenes import SolvedScenes
+    from cnpgen.plans import Plans
+    from cnpgen.refine.refinement import Refinement
+
+REFINING = ("objective", "weight", "max_iterations", "tolerance", "deadline", "stay_within")  # what add_refining adds
+LARGE_ANGLES = "accept boundary conditions in a file that are probably in degrees or millimetres"
+WORKERS = "processes; default one per available core, or one for up to 60 plans"
+LISTED = 10  # plans without success that are listed
+
+TEXT = """\
+Every plan is handled for itself: --workers and the order of the plans change nothing but the time. Pinocchio and Coal
+decide what is valid, as in 'cnpgen evaluate'. What is finished is written to OUT.part at once, by several workers in
+fours: after Ctrl-C, kill -9 or a full disk the same command goes on. An existing OUT is replaced only with --force,
+and only if it is a file of plans. The exit code is 0 if every plan is valid, and 1 if any is not; the file is written
+in either case.
+'cnpgen docs refiner' has the formulation.
+"""
 
 
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "refine", run, title="optimize the plans of a file", text=_TEXT)
+def add_options(parser: Parser) -> None:
     parser.add_argument("file", metavar="FILE", type=Path, help="plan file, .h5")
     text = "output file (default: FILE-refined.h5 beside it)"
     parser.add_argument("-o", "--out", metavar="OUT", type=Path, help=text)
     text = "the problem of the plans; its tolerances are used"
     parser.add_argument("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
-    add_options(parser)
+    add_refine_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
-    plans = read_plans(arguments.file, problem=arguments.problem)
+    plans = recipe_names.read_plans(arguments.file, problem=arguments.problem)
     out = arguments.out or arguments.file.with_name(f"{arguments.file.stem}-refined.h5")
     if not arguments.quiet:
         print(f"{arguments.file}: {checksum_text(plans)}", file=sys.stderr)
     return refine_and_save(arguments, plans, out, title=f"refining {arguments.file}")
+
+
+def add_refine_options(parser: Parser) -> None:
+    """Add the options of both commands, and complete the help."""
+    parser.epilog = f"{parser.epilog or ''}{TEXT}"
+    add_refining(parser)
+    add_engine(parser, WORKERS)
+    parser.add_argument("--force", action="store_true", help="replace OUT, and discard another run's OUT.part")
+    parser.add_argument("--quiet", action="store_true", help="no progress and no summary")
+    add_json(parser)
+
+
+def add_refining(parser: Options) -> None:
+    """Add the options that say how plans are refined: ``REFINING``."""
+    option = parser.add_argument
+    text = "objective: that of the problem file (time, default), or the duration with terms such as effort=0.5 or"
+    text += " effort=1,jerk=0.1 ('cnpgen list objectives')"
+    option("--objective", metavar="TERMS", default="time", help=text)
+    option("--weight", metavar="X", type=float, help="weight of these terms (default: as in the problem or 1)")
+    option("--max-iterations", metavar="I", type=values.natural, help="steps of the coarse level (default: 40)")
+    text = "relative change of the objective at which the iteration converges (default: 1e-3; without an initial"
+    text += " guess a tenth of it, among obstacles a twentieth)"
+    option("--tolerance", metavar="X", type=float, help=text)
+    text = "time per plan, such as 10ms: returns the best plan until then, never worse than the input"
+    option("--deadline", metavar="S", type=values.seconds_with_unit, help=text)
+    text = "largest difference of every joint from the input path, such as 2deg (default: only the ends are kept)"
+    option("--stay-within", metavar="E", type=values.angle, help=text)
+    text = "report for every invalid plan whether its problem is proven infeasible"
+    option("--explain", action="store_true", help=text)
+
+
+def refine_and_save(
+    arguments: argparse.Namespace,
+    plans: "Plans | None",
+    out: Path,
+    *,
+    title: str,
+    make: "Callable[..., Refinement | SolvedScenes] | None" = None,
+) -> int:
+    """Refine plans, save them, print a summary; return the exit code.
+
+    ``make`` is ``refine_plans`` by default, ``solve_plans``, or a function that solves scenes and has no plans.
+    """
+    from cnpgen.plans import save_plans
+    from cnpgen.refine.options import RefineOptions
+    from cnpgen.refine.refine_plans import refine_plans
+
+    given = options_of(arguments, *REFINING)
+    options = RefineOptions(**{name: value for name, value in given.items() if value is not None})
+    check_place(out, force=arguments.force)
+    journal = out.with_name(out.name + ".part")
+    finished = [0, 0]
+
+    def progress(plans: int, valid: int) -> None:
+        finished[0], finished[1] = finished[0] + plans, finished[1] + valid
+        meter(plans)
+        meter.note(f"{finished[1] / finished[0]:.1%} valid")
+
+    run: Callable[..., Refinement | SolvedScenes] = make or refine_plans
+    with resumable(journal), Meter(quiet=arguments.quiet, noun="plan") as meter:
+        found = run(
+            plans,
+            options=options,
+            journal=journal,
+            discard=arguments.force,
+            begin=lambda total, there: meter.begin(title, total, there),
+            progress=progress,
+            **options_of(arguments, *ENGINE),
+        )
+        facts = found.summary()
+        if arguments.explain and any("finding" not in failure for failure in facts["not_valid"]):
+            _explain(facts, found, meter)
+    save_plans(out, found.plans)
+    journal.unlink(missing_ok=True)
+    if not arguments.quiet:
+        lines = _summary(facts, found.times, listed=facts["plans"] if arguments.explain else LISTED)
+        print("\n".join(lines), file=sys.stderr)
+    print(json.dumps({"file": str(out), **facts}, indent=2) if arguments.json else out)
+    return 0 if found.valid.all() else 1
+
+
+def check_place(out: Path, *, force: bool) -> None:
+    """Refuse an output path before any work if it cannot be written or exists."""
+    from cnpgen.plans.save import check_replaceable
+    from cnpgen.store.files.atomic import check_writable
+
+    if out.suffix != ".h5" or out.is_dir() or not out.parent.is_dir():
+        raise UsageError(f"{out} must be a file that ends in .h5, in a folder that exists")
+    if out.exists() and not force:
+        raise UsageError(f"{out} exists: --force replaces it, -o names another file")
+    check_replaceable(out)
+    check_writable(out)
+
+
+def _explain(facts: dict[str, Any], found: "Refinement | SolvedScenes", meter: Meter) -> None:
+    """Add proofs of infeasibility to the results of invalid plans."""
+    from cnpgen.refine.proof.explain import explain_plans
+
+    meter.begin("explaining", len(facts["not_valid"]))
+    for failure in facts["not_valid"]:
+        (finding,) = explain_plans(found.plans, [failure["plan"]]).values()
+        failure |= {"finding": str(finding.kind), "explanation": finding.text}
+        meter(1)
+
+
+def _summary(facts: dict[str, Any], times: "Times", *, listed: int) -> list[str]:
+    """Summarize the refined plans."""
+    from cnpgen.refine.task import Outcome
+
+    mean = facts["mean_duration_s"]
+    mean_text = "" if mean is None else f"; mean motion time {mean:.4f} s"
+    lines = [f"{facts['valid']:,} of {counted(facts['plans'], 'plan')} valid in {times}{mean_text}"]
+    lines += [f"  {count:,} {Outcome[name.upper()].text}" for name, count in facts["outcomes"].items()]
+    for failure in facts["not_valid"][:listed]:
+        lines += textwrap.wrap(_failure_text(failure), 110, subsequent_indent="  ")
+    if len(facts["not_valid"]) > listed:
+        lines.append(f"... and {len(facts['not_valid']) - listed} more: 'cnpgen evaluate' lists them with --list")
+    if any("finding" not in failure for failure in facts["not_valid"]):
+        lines.append("--explain checks whether a problem is infeasible; 'cnpgen docs troubleshooting' lists causes")
+    return lines
+
+
+def _failure_text(failure: dict[str, Any]) -> str:
+    """Describe why one plan is invalid, with the proof of its problem if requested."""
+    why = f"{failure['finding']}: {failure['explanation']}" if "finding" in failure else failure["outcome"]
+    if failure.get("finding") == "gave up":
+        why = f"{why}; {failure['outcome']}"
+    name = f"scene {failure['scene']!r}" if "scene" in failure else f"sample {failure['sample_id']}"
+    return f"plan {failure['plan']} ({name}): {failure['reason']}; {why}"

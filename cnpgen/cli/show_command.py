@@ -1,9 +1,13 @@
-"""``cnpgen show``: a recipe, or a kind of stage or constraint, in words and numbers."""
+"""Describe a recipe, a kind of stage or constraint, or the keys of recipe files.
+
+A dataset is shown with its pipeline and its problem, a pipeline with its problem. Mistakes in a file are
+reported on stderr with file and key, one per line, and the exit code is 2.
+"""
 
 import argparse
 from typing import TYPE_CHECKING
 
-from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.parser import Parser, add_json
 from cnpgen.cli.recipe_names import check_recipe
 from cnpgen.errors import UsageError
 from cnpgen.schema.toml import MARKS, Kind, kind_of_file
@@ -14,16 +18,7 @@ if TYPE_CHECKING:
 KINDS: tuple[Kind, ...] = ("dataset", "pipeline", "problem")  # a dataset includes the other two
 
 
-_TEXT = """\
-A dataset is shown with its pipeline and its problem, a pipeline with its problem. Mistakes in a file are
-reported on stderr with file and key, one per line, and the exit code is 2.
-"""
-
-
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    title = "describe a recipe, a kind of stage or constraint, or the keys of recipe files"
-    parser = add_command(commands, "show", run, title=title, text=_TEXT)
+def add_options(parser: Parser) -> None:
     what = parser.add_mutually_exclusive_group(required=True)
     text = "a shipped dataset, pipeline or problem (see 'cnpgen list'), or a recipe file"
     what.add_argument("recipe", metavar="NAME|FILE", nargs="?", help=text)
@@ -35,8 +30,7 @@ def add(commands: "Commands[Parser]") -> None:
     add_json(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
+def run(arguments: argparse.Namespace) -> None:
     from cnpgen.cli import describe
     from cnpgen.store.files.documents import plain, render
 
@@ -44,11 +38,10 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.kind:
             raise UsageError("--kind needs NAME or FILE")
         print(_about_kinds(arguments))
-        return 0
+        return
     check_recipe(arguments.recipe)
     recipe = load_any(arguments.recipe, arguments.kind)
     print(render(plain(describe.recipe_to_dict(recipe))) if arguments.json else describe.describe(recipe))
-    return 0
 
 
 def _about_kinds(arguments: argparse.Namespace) -> str:

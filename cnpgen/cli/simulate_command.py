@@ -1,4 +1,10 @@
-"""``cnpgen simulate``: execute the plans of a file in MuJoCo."""
+"""Execute the plans of a file in MuJoCo.
+
+Every plan is executed separately by computed torque at 1 kHz on a robot with friction that its controller does not
+model. On a table, a plan that ends with a velocity is a hit: the puck lies 7 cm ahead of its end.
+'cnpgen docs benchmark' describes the simulation and its results. The exit code is 0 if every plan succeeds (it scores
+without touching the puck early, or reaches its goal without collision), and 1 otherwise.
+"""
 
 import argparse
 import json
@@ -7,9 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Commands, Parser, add_command, add_json
-from cnpgen.cli.plan_files import read_plans
-from cnpgen.cli.progress import Meter
+from cnpgen.cli.parser import Parser, add_json
+from cnpgen.cli.terminal import Meter, table
 from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:
@@ -19,12 +24,6 @@ if TYPE_CHECKING:
 
 PLANTS = ("nominal", "heavier", "delayed")
 
-_TEXT = """\
-Every plan is executed separately by computed torque at 1 kHz on a robot with friction that its controller does not
-model. On a table, a plan that ends with a velocity is a hit: the puck lies 7 cm ahead of its end.
-'cnpgen docs benchmark' describes the simulation and its results. The exit code is 0 if every plan succeeds (it scores
-without touching the puck early, or reaches its goal without collision), and 1 otherwise.
-"""
 _NAMES = {
     "success": "success",
     "finished": "at the goal at the end of the plan",
@@ -43,9 +42,7 @@ _FIGURES = {
 }
 
 
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "simulate", run, title="execute the plans of a file in MuJoCo", text=_TEXT)
+def add_options(parser: Parser) -> None:
     option = parser.add_argument
     option("file", metavar="FILE", type=Path, help="plan file, .h5")
     option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help="the problem of the plans")
@@ -62,10 +59,9 @@ def add(commands: "Commands[Parser]") -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
     from cnpgen.benchmark.simulator.simulate import simulate_plans
 
-    plans = read_plans(arguments.file, problem=arguments.problem)
+    plans = recipe_names.read_plans(arguments.file, problem=arguments.problem)
     if arguments.plan >= len(plans):
         raise UsageError(f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0")
     with Meter(quiet=not sys.stderr.isatty(), noun="plan") as meter:
@@ -86,8 +82,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _text(file: Path, found: "Simulation") -> str:
     """Lay out what came of all plans together."""
-    from cnpgen.cli.describe import table
-
     summary, count = found.summary(), len(found.executed)
     head = f"{file}: {counted(count, 'plan')} of {found.plans.problem.name}, executed by the {found.plant.name} plant"
     counts = {text: summary[name] for name, text in _NAMES.items() if name in summary}

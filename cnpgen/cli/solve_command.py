@@ -1,22 +1,5 @@
-"""``cnpgen solve``: make plans for boundary problems of a dataset, of a file, or fresh draws, from nothing."""
+"""Plan without an initial guess.
 
-import argparse
-import math
-from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Commands, Parser, add_command
-from cnpgen.cli.refine_options import LARGE_ANGLES, TEXT, add_options, check_place, refine_and_save
-from cnpgen.errors import DatasetError, UsageError
-
-if TYPE_CHECKING:
-    from cnpgen.make.solve_scenes import SolvedScenes
-    from cnpgen.plans import Plans
-
-_TEXT = (
-    """\
 A folder of a dataset gives its rows, a recipe gives fresh draws, which no split of the dataset holds. Rows of a
 certified dataset have plans already: these are refined. An HDF5 file gives boundary conditions: a shard, a file of
 plans, whose plans are not looked at, or any other with start_q and goal_q of shape (N, joints), and start_dq,
@@ -25,15 +8,24 @@ start_ddq and goal_dq where they are not zero. --problem names the problem if th
 With --robot, files of scenes are solved: planning scenes and requests of MoveIt or robometrics in YAML, MPiNets or
 Avoid Everything in HDF5, or a folder of them ('cnpgen docs scene-files'). All plans of one call are written to one
 file; the column obstacle_poses contains the obstacles of each. Unsolved scenes are listed with a reason.
-
 """
-    + TEXT
-)
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cnpgen.cli import recipe_names, values
+from cnpgen.cli.parser import Parser, refuse
+from cnpgen.cli.refine_command import LARGE_ANGLES, add_refine_options, check_place, refine_and_save
+from cnpgen.errors import DatasetError, UsageError
+
+if TYPE_CHECKING:
+    from cnpgen.make.solve_scenes import SolvedScenes
+    from cnpgen.plans import Plans
 
 
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "solve", run, title="plan without an initial guess", text=_TEXT)
+def add_options(parser: Parser) -> None:
     option = parser.add_argument
     text = "a dataset's folder; a dataset or pipeline by name, or a recipe file; boundary conditions in HDF5;"
     text += " or, with --robot, scenes"
@@ -48,11 +40,11 @@ def add(commands: "Commands[Parser]") -> None:
     option("--robot", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     option("-o", "--out", metavar="OUT", type=Path, help="output file (default: DIR-plans.h5 or NAME-plans.h5)")
     option("--allow-large-angles", action="store_true", help=LARGE_ANGLES)
-    add_options(parser)
+    parser.epilog = f"{parser.epilog or ''}\n"
+    add_refine_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
     from cnpgen.refine.refine_plans import refine_plans, solve_plans
 
     what = Path(arguments.what)
@@ -70,7 +62,7 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
     from cnpgen.problems.problem_record import as_problem
     from cnpgen.problems.scenes.scene_files import load_scenes
 
-    _refuse(arguments, ["split", "seed", "problem"], "--robot is for scenes, which have --first and --n")
+    refuse(arguments, ["split", "seed", "problem"], "--robot is for scenes, which have --first and --n")
     scenes = load_scenes(arguments.what, start=arguments.first or 0, n=arguments.n)
     problem = as_problem(arguments.robot)
 
@@ -99,8 +91,8 @@ def _problems(arguments: argparse.Namespace) -> "Plans":
 def _rows(arguments: argparse.Namespace) -> "Plans":
     from cnpgen.plans.boundary_problems import load_boundary_problems
 
-    _refuse(arguments, ["seed"], "--seed is for fresh draws of a recipe; rows of a folder have --split and --first")
-    _refuse(arguments, ["problem"], "--problem is for boundary conditions in HDF5; a dataset contains its problem")
+    refuse(arguments, ["seed"], "--seed is for fresh draws of a recipe; rows of a folder have --split and --first")
+    refuse(arguments, ["problem"], "--problem is for boundary conditions in HDF5; a dataset contains its problem")
     split = arguments.split or "validation"
     return load_boundary_problems(arguments.what, split=split, start=arguments.first, n=arguments.n)
 
@@ -108,8 +100,8 @@ def _rows(arguments: argparse.Namespace) -> "Plans":
 def _conditions(arguments: argparse.Namespace) -> "Plans":
     from cnpgen.plans.boundary_problems import load_boundary_problems
 
-    _refuse(arguments, ["split", "first", "n"], "--split, --first and --n need the folder of a dataset, got a file")
-    _refuse(arguments, ["seed"], "--seed is for fresh draws of a recipe, got a file of boundary conditions")
+    refuse(arguments, ["split", "first", "n"], "--split, --first and --n need the folder of a dataset, got a file")
+    refuse(arguments, ["seed"], "--seed is for fresh draws of a recipe, got a file of boundary conditions")
     problems = load_boundary_problems(
         arguments.what, problem=arguments.problem, allow_large_angles=arguments.allow_large_angles
     )
@@ -125,14 +117,8 @@ def _draws(arguments: argparse.Namespace) -> "Plans":
     recipe_names.check_recipe(arguments.what)
     recipe = load_dataset_recipe(arguments.what)
     of_rows = "--split and --first need the folder of a dataset; samples drawn from a recipe have --seed"
-    _refuse(arguments, ["split", "first"], of_rows)
-    _refuse(arguments, ["problem"], "--problem is for boundary conditions in HDF5; a recipe contains its problem")
+    refuse(arguments, ["split", "first"], of_rows)
+    refuse(arguments, ["problem"], "--problem is for boundary conditions in HDF5; a recipe contains its problem")
     if arguments.n is None:
         raise UsageError(f"--n is required: the number of fresh problems of the recipe {arguments.what}")
     return draw_boundary_problems(recipe, arguments.n, seed=arguments.seed)
-
-
-def _refuse(arguments: argparse.Namespace, options: Sequence[str], why: str) -> None:
-    """Refuse options that mean nothing here."""
-    if any(getattr(arguments, name) is not None for name in options):
-        raise UsageError(why)

@@ -3,7 +3,7 @@
 import argparse
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import values
@@ -12,23 +12,6 @@ from cnpgen.errors import UsageError
 
 if TYPE_CHECKING:
     from cnpgen.training.settings import TrainingSettings
-
-
-@dataclass(frozen=True)
-class _Setting:
-    """Option that sets the field of the same name in ``TrainingSettings``.
-
-    Attributes:
-        read: Function that reads the value; None for a flag.
-        metavar: Placeholder of the value.
-        help: Help text.
-        choices: Allowed values; None for any.
-    """
-
-    read: Callable[[str], Any] | None
-    metavar: str | None
-    help: str
-    choices: tuple[str, ...] | None = None
 
 
 def _real(text: str) -> float:
@@ -41,62 +24,61 @@ def _real(text: str) -> float:
         raise argparse.ArgumentTypeError(f"expected a number, inf or pi, got {text!r}") from None
 
 
-_OPTIONS: dict[str, _Setting] = {
-    "hidden": _Setting(values.positive, "W", "width of the network's layers (default: 128)"),
-    "layers": _Setting(values.positive, "L", "depth of its trunk (default: 5)"),
-    "features": _Setting(
-        str, None, "inputs: all features; all but those of obstacles that samples place; the boundary states,"
-        " standardized; or divided by pi and by the limits (default: full)", ("full", "no-scene", "states", "paper"),
+# Options that set the field of the same name: reader of the value, choices, or None for a flag; placeholder; help.
+_OPTIONS: dict[str, tuple[Callable[[str], Any] | tuple[str, ...] | None, str | None, str]] = {
+    "hidden": (values.positive, "W", "width of the network's layers (default: 128)"),
+    "layers": (values.positive, "L", "depth of its trunk (default: 5)"),
+    "features": (
+        ("full", "no-scene", "states", "paper"), None, "inputs: all features; all but those of obstacles that samples"
+        " place; the boundary states, standardized; or divided by pi and by the limits (default: full)",
     ),
-    "path_scale": _Setting(_real, "RAD", "factor of the configuration head's output (default: 0.5; pi in the paper)"),
-    "head_scale": _Setting(_real, "X", "factor of the first weights of both heads (default: 0.1; 1 in the paper)"),
-    "rate_bias": _Setting(_real, "X", "logarithm of the first guess of the duration factor (default: -0.5)"),
-    "expected_time": _Setting(
-        str, None, "unit of the network's durations: the distance over the velocity limits, at least 0.2 s; the same"
-        " without a minimum (travel); or the time in which joints reach their goal states (default: distance)",
-        ("distance", "reach", "travel"),
+    "path_scale": (_real, "RAD", "factor of the configuration head's output (default: 0.5; pi in the paper)"),
+    "head_scale": (_real, "X", "factor of the first weights of both heads (default: 0.1; 1 in the paper)"),
+    "rate_bias": (_real, "X", "logarithm of the first guess of the duration factor (default: -0.5)"),
+    "expected_time": (
+        ("distance", "reach", "travel"), None, "unit of the network's durations: the distance over the velocity"
+        " limits, at least 0.2 s; the same without a minimum (travel); or the time in which joints reach their goal"
+        " states (default: distance)",
     ),
-    "line_projection_steps": _Setting(
-        values.natural, "N", "Gauss-Newton steps that project the line onto the manifold (default: 1; 0 for none)"
+    "line_projection_steps": (
+        values.natural, "N", "Gauss-Newton steps that project the line onto the manifold (default: 1; 0 for none)",
     ),
-    "projection_steps": _Setting(values.natural, "N", "the same for the network's path (default: 1; 0 for none)"),
-    "within_limits": _Setting(
+    "projection_steps": (values.natural, "N", "the same for the network's path (default: 1; 0 for none)"),
+    "within_limits": (
         None, None, "keep control points within the joint limits in these steps; without equalities, in plans"
     ),
-    "iterations": _Setting(
+    "iterations": (
         values.positive, "N", "evaluations of the network; each after the first corrects the path of the one before"
         " (default: 1)",
     ),
-    "time_parametrized": _Setting(None, None, "fit the rates to the limits after the network"),
-    "path_control_points": _Setting(values.positive, "C", "control points of the path (default: those of the problem)"),
-    "rate_control_points": _Setting(values.positive, "R", "control points of the rate (default: those of the problem)"),
-    "objective": _Setting(
+    "time_parametrized": (None, None, "fit the rates to the limits after the network"),
+    "path_control_points": (values.positive, "C", "control points of the path (default: those of the problem)"),
+    "rate_control_points": (values.positive, "R", "control points of the rate (default: those of the problem)"),
+    "objective": (
         str, "TERMS", "objective: the duration with terms such as effort=2 or effort=1,jerk=0.1; 'cnpgen list"
         " objectives' has their names (default: that of the problem)",
     ),
-    "loss_form": _Setting(
-        str, None, "form of orientation and collision losses (default: paper with --metric learned, else signed)",
-        ("signed", "paper"),
+    "loss_form": (
+        ("signed", "paper"), None,
+        "form of orientation and collision losses (default: paper with --metric learned, else signed)",
     ),
-    "constraint_terms": _Setting(
-        str, None, "constraints in the loss: all, or those with a budget, which the paper has (default: all)",
-        ("all", "budgeted"),
+    "constraint_terms": (
+        ("all", "budgeted"), None,
+        "constraints in the loss: all, or those with a budget, which the paper has (default: all)",
     ),
-    "nodes": _Setting(values.positive, "K", "quadrature nodes of the loss (default: 32)"),
-    "shifts": _Setting(values.positive, "N", "shifted sets of these nodes, used in turn (default: 16)"),
-    "precision": _Setting(str, None, "precision of the loss (default: float32)", ("float32", "float64")),
-    "batch_size": _Setting(values.positive, "B", "rows per step, or all there are (default: 64)"),
-    "learning_rate": _Setting(_real, "X", "largest learning rate of Adam (default: 1e-3)"),
-    "final_rate": _Setting(_real, "X", "last learning rate as a fraction of the largest one (default: 0.01)"),
-    "warm_up": _Setting(values.natural, "N", "steps until the largest learning rate (default: 200)"),
-    "sample_clip": _Setting(_real, "X", "largest gradient of a sample, in running medians (default: 30; inf for any)"),
-    "batch_clip": _Setting(_real, "X", "largest gradient of a batch, in running norms (default: 2; inf for any)"),
-    "memory": _Setting(_real, "X", "decay of the average of the parameters (default: 0.999; 0 for no average)"),
-    "keep": _Setting(str, None, "model to keep, of all validations (default: best)", ("best", "last")),
-    "validations": _Setting(values.positive, "N", "number of validations (default: 10)"),
-    "seed": _Setting(
-        values.seed, "S", "seed of the initial parameters and of the order of samples (default: 0)"
-    ),
+    "nodes": (values.positive, "K", "quadrature nodes of the loss (default: 32)"),
+    "shifts": (values.positive, "N", "shifted sets of these nodes, used in turn (default: 16)"),
+    "precision": (("float32", "float64"), None, "precision of the loss (default: float32)"),
+    "batch_size": (values.positive, "B", "rows per step, or all there are (default: 64)"),
+    "learning_rate": (_real, "X", "largest learning rate of Adam (default: 1e-3)"),
+    "final_rate": (_real, "X", "last learning rate as a fraction of the largest one (default: 0.01)"),
+    "warm_up": (values.natural, "N", "steps until the largest learning rate (default: 200)"),
+    "sample_clip": (_real, "X", "largest gradient of a sample, in running medians (default: 30; inf for any)"),
+    "batch_clip": (_real, "X", "largest gradient of a batch, in running norms (default: 2; inf for any)"),
+    "memory": (_real, "X", "decay of the average of the parameters (default: 0.999; 0 for no average)"),
+    "keep": (("best", "last"), None, "model to keep, of all validations (default: best)"),
+    "validations": (values.positive, "N", "number of validations (default: 10)"),
+    "seed": (values.seed, "S", "seed of the initial parameters and of the order of samples (default: 0)"),
 }  # fmt: skip
 _METRIC: dict[str, str] = {
     "growth": "factor by which ramped weights grow (default: 30), or by which budgets shrink (default: 1; bounded 400)",
@@ -108,12 +90,14 @@ _METRIC: dict[str, str] = {
 def add_settings(parser: Parser) -> None:
     """Add the options."""
     option = parser.add_argument
-    for name, setting in _OPTIONS.items():
+    for name, (read, metavar, text) in _OPTIONS.items():
         flag = f"--{name.replace('_', '-')}"
-        if setting.read is None:
-            option(flag, action="store_true", default=None, help=setting.help)
+        if read is None:
+            option(flag, action="store_true", default=None, help=text)
+        elif isinstance(read, tuple):
+            option(flag, choices=read, help=text)
         else:
-            option(flag, metavar=setting.metavar, type=setting.read, choices=setting.choices, help=setting.help)
+            option(flag, metavar=metavar, type=read, help=text)
     metrics = ("ramped", "fixed", "learned", "bounded")
     option("--metric", choices=metrics, help="weights of the constraints (default: ramped)")
     for name, text in _METRIC.items():

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import values
 from cnpgen.cli.parser import Options, options_of
+from cnpgen.cli.terminal import table
+from cnpgen.cli.verdict_text import margin_cells, margin_head
 from cnpgen.errors import UsageError, listed
 
 if TYPE_CHECKING:
@@ -80,9 +82,6 @@ def write_json(file: Path, found: "TrajectoryEvaluation", labels: tuple[str, ...
 
 def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
     """Return the counts, and for every condition the decisions with the worst margin."""
-    from cnpgen.cli.describe import table
-    from cnpgen.cli.verdict_text import margin_cells, margin_head
-
     counts = ", ".join(f"{count:,} {decision}" for decision, count in found.counts.items())
     lines = [f"{file}: trajectories of {found.problem.name}: {counts}", ""]
     decided: list[tuple[str, ...]] = [

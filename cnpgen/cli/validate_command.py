@@ -1,14 +1,5 @@
-"""``cnpgen validate``: verify a dataset."""
+"""Verify a dataset.
 
-import argparse
-from pathlib import Path
-
-from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import ENGINE, Commands, Parser, add_command, add_engine, add_json, options_of
-from cnpgen.cli.progress import Meter
-from cnpgen.errors import DatasetError
-
-_TEXT = """\
 The command always checks that every file exists and matches its sha256, the specification and the manifest. --deep
 checks every sample: constraints, positions, hits and their maximum speeds, torque ratios, clearances, ranges,
 statistics, counts and duplicates; of "attempts" only the sum per shard. It judges the plans of a certified dataset as
@@ -22,23 +13,27 @@ findings only. A line that begins with "note:" is no finding. Exit codes: 0 no f
 the plug-ins of the dataset.
 """
 
+import argparse
+from pathlib import Path
 
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "validate", run, title="verify a dataset", text=_TEXT)
+from cnpgen.cli import recipe_names, values
+from cnpgen.cli.parser import ENGINE, Parser, add_engine, add_json, options_of
+from cnpgen.cli.terminal import Meter
+from cnpgen.errors import DatasetError
+
+
+def add_options(parser: Parser) -> None:
     option = parser.add_argument
     option("folder", metavar="DIR", type=recipe_names.dataset, help="folder of a dataset")
     option("--deep", action="store_true", help="check every row, its constraints with Pinocchio and Coal")
     text = "make K random blocks again from the seed and compare them"
     option("--regenerate", metavar="K", type=values.natural, default=0, help=text)
-    option("--workers", metavar="W", type=values.positive, help="processes for --deep; default one per available core")
-    add_engine(parser)
+    add_engine(parser, "processes for --deep; default one per available core")
     option("--quiet", action="store_true", help="print findings only")
     add_json(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
     from cnpgen.store.files.documents import plain, render
     from cnpgen.validate.validate_dataset import validate_dataset
 

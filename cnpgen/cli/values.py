@@ -12,9 +12,8 @@ from typing import Any
 
 from cnpgen.errors import either
 
-_PLAIN = re.compile(r"[+-]?[0-9]+(_[0-9]+)*")
-_SCIENTIFIC = re.compile(r"[+-]?[0-9]+(\.[0-9]+)?[eE]\+?[0-9]{1,2}")
-MAX_ROWS_ARGUMENT = 10**12  # make.MAX_ROWS, and
+_WHOLE = re.compile(r"[+-]?[0-9]+(?:(?:_[0-9]+)*|(?:\.[0-9]+)?[eE]\+?[0-9]{1,2})")
+MAX_ROWS_ARGUMENT = 10**12  # make.MAX_ROWS
 _MAX_DIGITS = 30  # digits; no number here has more, and very long ones take long to read
 MAX_ERROR = 1.0  # rad or m; larger ones are probably in degrees
 MAX_SELECTED = 10**7  # of the numbers in a range
@@ -22,51 +21,31 @@ MAX_SELECTED = 10**7  # of the numbers in a range
 
 def whole(text: str) -> int:
     """Read a whole number: ``120000``, ``120_000``, or ``1e6`` if it is exact; raise ValueError for other texts."""
-    if len(text) <= _MAX_DIGITS and _PLAIN.fullmatch(text):
-        return int(text)
-    if len(text) <= _MAX_DIGITS and _SCIENTIFIC.fullmatch(text):
+    if len(text) <= _MAX_DIGITS and _WHOLE.fullmatch(text):
         number = Decimal(text)
         if number == number.to_integral_value():
             return int(number)
     raise ValueError(f"no whole number: {text[:_MAX_DIGITS]!r}")
 
 
-def _at_least(low: int, example: str, text: str) -> int:
+def _whole_in_range(low: int, example: str, text: str, *, high: float = math.inf, expected: str = "") -> int:
+    """Read a whole number from ``low`` to ``high``; ``expected`` is the message for larger ones."""
     try:
         number = whole(text)
     except ValueError:
         number = low - 1
     if number < low:
         raise ArgumentTypeError(f"expected a whole number of at least {low}, such as {example}; got {text!r}")
+    if number > high:
+        raise ArgumentTypeError(f"expected {expected}, got {text!r}")
     return number
 
 
-positive = partial(_at_least, 1, "4")
-natural = partial(_at_least, 0, "7")
-
-
-def rows(text: str) -> int:
-    """Read a number of rows, 1 to 10^12."""
-    number = _at_least(1, "120000, 120_000 or 1e6", text)
-    if number > MAX_ROWS_ARGUMENT:
-        raise ArgumentTypeError(f"expected at most {MAX_ROWS_ARGUMENT:.0e} rows, got {text!r}")
-    return number
-
-
-def port(text: str) -> int:
-    """Read the number of a port, 0 for any that is free."""
-    number = natural(text)
-    if number > 65535:
-        raise ArgumentTypeError(f"expected a port, 0 to 65535, got {text!r}")
-    return number
-
-
-def seed(text: str) -> int:
-    """Read a root seed, 0 to 2^63 - 1."""
-    number = natural(text)
-    if number >= 2**63:
-        raise ArgumentTypeError(f"expected a seed below 2^63, got {text!r}")
-    return number
+positive = partial(_whole_in_range, 1, "4")
+natural = partial(_whole_in_range, 0, "7")
+rows = partial(_whole_in_range, 1, "120000, 120_000 or 1e6", high=MAX_ROWS_ARGUMENT, expected="at most 1e+12 rows")
+port = partial(natural, high=65535, expected="a port, 0 to 65535")  # 0 is any free port
+seed = partial(natural, high=2**63 - 1, expected="a seed below 2^63")
 
 
 def part(text: str) -> tuple[int, int]:
@@ -161,21 +140,25 @@ def _one_or_several(found: Sequence[float]) -> float | tuple[float, ...]:
     return found[0] if len(found) == 1 else tuple(found)
 
 
-def _numbers(text: str) -> tuple[float, ...]:
-    """Read numbers separated by commas; none if one of them is no number."""
+def _real_numbers(text: str, expected: str, accepts: Callable[[tuple[float, ...]], bool]) -> tuple[float, ...]:
+    """Read numbers separated by commas that meet a condition."""
     try:
-        return tuple(float(part) for part in text.split(","))
+        found = tuple(float(part) for part in text.split(","))
     except ValueError:
-        return ()
+        found = ()
+    if not found or not accepts(found):
+        raise ArgumentTypeError(f"expected {expected}; got {text[:60]!r}")
+    return found
 
 
 def errors(text: str) -> float | tuple[float, ...]:
     """Read one number or three, at least 0: ``1e-3`` or ``1e-3,1e-2,0.5``."""
-    found = _numbers(text)
-    if len(found) not in {1, 3} or not all(0 <= value < math.inf for value in found):
-        expected = "one number or three, at least 0, such as 1e-3 or 1e-3,1e-2,0.5"
-        raise ArgumentTypeError(f"expected {expected}; got {text[:60]!r}")
-    return _one_or_several(found)
+
+    def accepts(found: tuple[float, ...]) -> bool:
+        return len(found) in {1, 3} and all(0 <= value < math.inf for value in found)
+
+    expected = "one number or three, at least 0, such as 1e-3 or 1e-3,1e-2,0.5"
+    return _one_or_several(_real_numbers(text, expected, accepts))
 
 
 def tracking_errors(text: str) -> float | tuple[float, ...]:
@@ -214,11 +197,12 @@ def parameters(text: str) -> dict[str, float]:
 
 def payload(text: str) -> tuple[float, ...]:
     """Read a mass [kg], or a mass and the centre of mass in the tip frame [m]: ``2`` or ``2,0,0,0.1``."""
-    found = _numbers(text)
-    if len(found) not in {1, 4} or not all(map(math.isfinite, found)) or found[0] <= 0:
-        expected = "a mass above 0, with or without the centre of mass, such as 2 or 2,0,0,0.1"
-        raise ArgumentTypeError(f"expected {expected}; got {text[:60]!r}")
-    return found
+
+    def accepts(found: tuple[float, ...]) -> bool:
+        return len(found) in {1, 4} and all(map(math.isfinite, found)) and found[0] > 0
+
+    expected = "a mass above 0, with or without the centre of mass, such as 2 or 2,0,0,0.1"
+    return _real_numbers(text, expected, accepts)
 
 
 def angle(text: str) -> float:
@@ -231,7 +215,5 @@ def angle(text: str) -> float:
 
 def amounts(text: str) -> float | tuple[float, ...]:
     """Read positive numbers separated by commas: ``500`` or ``7500,3750,5000``."""
-    found = _numbers(text)
-    if not found or not all(0 < value < math.inf for value in found):
-        raise ArgumentTypeError(f"expected numbers above 0, such as 500 or 7500,3750; got {text[:60]!r}")
-    return _one_or_several(found)
+    expected = "numbers above 0, such as 500 or 7500,3750"
+    return _one_or_several(_real_numbers(text, expected, lambda found: all(0 < value < math.inf for value in found)))

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.cli.describe import table
-from cnpgen.cli.plan_files import checksum_text
+from cnpgen.cli.terminal import table
 from cnpgen.errors import counted
 
 if TYPE_CHECKING:
     from cnpgen.judges.plans import Verdict
+    from cnpgen.plans import Plans
     from cnpgen.plans.evaluate import Evaluation
 
 METRICS = {  # metric -> what it is called, in a summary and in a list, and its format
@@ -45,6 +45,11 @@ def summary_text(file: Path, found: "Evaluation") -> str:
     tables = (_reasons(found, summary), (1,)), (_figures(summary), range(1, 7)), (_margins(summary), (1, 2, 3, 5, 6))
     sections += [table(rows, indent="  ", right=tuple(right)) for rows, right in tables if len(rows) > 1]
     return "\n\n".join("\n".join(lines) for lines in sections)
+
+
+def checksum_text(plans: "Plans") -> str:
+    """Return whether the source of the plans has a checksum, as text."""
+    return "the file's checksum is right" if plans.has_checksum else "the file has no checksum"
 
 
 def _reasons(found: "Evaluation", summary: dict[str, Any]) -> list[tuple[str, ...]]:

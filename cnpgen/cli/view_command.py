@@ -1,4 +1,13 @@
-"""``cnpgen view``: show a robot, a plan or a sample in a browser."""
+"""Show a robot, a plan or a sample in a browser.
+
+The page is one file that needs no network: the arm, obstacles, puck, path and frame of the tip, a time slider and a
+slider for every joint. Curves show the joints relative to their limits and the other conditions with their bounds. The
+verdict lists the smallest margin of every condition; for a rejected plan, a click shows the place and time of a
+violation. A sample without a plan is shown at its start and goal, a problem in its base configuration. --rows puts
+several plans on one page. Sampled trajectories need --problem ('cnpgen docs trajectories'). Plans and datasets contain
+collision geometry only; --problem locates the visual meshes. --serve serves the page locally until Ctrl-C and reloads
+it when a file changes; ?row=I shows another sample. Needs MeshCat's viewer: pip install 'cnpgen[view]'.
+"""
 
 import argparse
 import math
@@ -8,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.cli.parser import Parser, refuse
 from cnpgen.cli.trajectory_options import add_trajectory_options, load_file, problem_of, refuse_trajectory_options
 from cnpgen.errors import DatasetError, UsageError
 
@@ -19,20 +28,8 @@ if TYPE_CHECKING:
 
 MAX_ROWS_OF_PAGE = 50  # each adds about 0.3 MB
 
-_TEXT = """\
-The page is one file that needs no network: the arm, obstacles, puck, path and frame of the tip, a time slider and a
-slider for every joint. Curves show the joints relative to their limits and the other conditions with their bounds. The
-verdict lists the smallest margin of every condition; for a rejected plan, a click shows the place and time of a
-violation. A sample without a plan is shown at its start and goal, a problem in its base configuration. --rows puts
-several plans on one page. Sampled trajectories need --problem ('cnpgen docs trajectories'). Plans and datasets contain
-collision geometry only; --problem locates the visual meshes. --serve serves the page locally until Ctrl-C and reloads
-it when a file changes; ?row=I shows another sample. Needs MeshCat's viewer: pip install 'cnpgen[view]'.
-"""
 
-
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "view", run, title="show a robot, a plan or a sample in a browser", text=_TEXT)
+def add_options(parser: Parser) -> None:
     option = parser.add_argument
     text = "a problem by name or file, the folder of a dataset, a plan file, or sampled trajectories"
     option("what", metavar="PROBLEM|DIR|FILE", type=recipe_names.viewed, help=text)
@@ -52,25 +49,23 @@ def add(commands: "Commands[Parser]") -> None:
     add_trajectory_options(parser.add_argument_group("sampled trajectories"))
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
+def run(arguments: argparse.Namespace) -> None:
     from cnpgen.cli.view.page import page_of
     from cnpgen.store.files.atomic import check_writable, write_file
 
     what = Path(arguments.what)
     if arguments.serve is not None:
-        return _serve(arguments)
+        _serve(arguments)
+        return
     out = Path(arguments.out or f"{what.resolve().name if what.is_dir() else what.stem}.html")
     check_writable(out)
     write_file(out, page_of(_scene(arguments)))
     print(out)
-    return 0
 
 
-def _serve(arguments: argparse.Namespace) -> int:
+def _serve(arguments: argparse.Namespace) -> None:
     """Serve the page until an interruption."""
-    from cnpgen.cli.view.page import page_of
-    from cnpgen.cli.view.serve import serve
+    from cnpgen.cli.view.page import page_of, serve
     from cnpgen.store.layout import SPECIFICATION
 
     def page(row: int | None, stamp: str) -> str:
@@ -81,7 +76,6 @@ def _serve(arguments: argparse.Namespace) -> int:
     files = [Path(file) for file in (arguments.what, arguments.problem) if file and Path(file).exists()]
     watched = [path / SPECIFICATION if path.is_dir() else path for path in files]
     serve(page, watched, port=arguments.serve, ready=lambda address: print(address, flush=True))
-    return 0
 
 
 def _scene(arguments: argparse.Namespace) -> "ViewScene":
@@ -130,8 +124,7 @@ def _scene_of_trajectories(arguments: argparse.Namespace, rows: Sequence[int]) -
     from cnpgen.problems.load_robot import load_robot
     from cnpgen.problems.problem_record import as_problem
 
-    if arguments.split:
-        raise UsageError(f"--split is for the folder of a dataset, got {arguments.what}")
+    refuse(arguments, ["split"], f"--split is for the folder of a dataset, got {arguments.what}")
     problem = as_problem(problem_of(arguments))
     loaded = load_file(argparse.Namespace(**vars(arguments) | {"file": Path(arguments.what)}), problem)
     count = len(loaded.trajectories)
@@ -164,11 +157,9 @@ def _samples(arguments: argparse.Namespace, rows: Sequence[int]) -> "tuple[Plans
 
 def _plans(arguments: argparse.Namespace, rows: Sequence[int]) -> "tuple[Plans, int]":
     """Read plans, and count those of the file."""
-    from cnpgen.cli.plan_files import read_plans
-
-    if arguments.split:
-        raise UsageError(f"--split is for the folder of a dataset, got {arguments.what}")
-    plans, option = read_plans(Path(arguments.what), problem=arguments.problem), "--rows" if arguments.rows else "--row"
+    refuse(arguments, ["split"], f"--split is for the folder of a dataset, got {arguments.what}")
+    plans = recipe_names.read_plans(Path(arguments.what), problem=arguments.problem)
+    option = "--rows" if arguments.rows else "--row"
     if (row := max(rows)) >= len(plans):
         raise UsageError(f"{option}: {arguments.what} has no plan {row}: {len(plans)} plans are numbered from 0")
     return plans[list(rows)], len(plans)

@@ -34,8 +34,7 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.arguments import flag, integer, number, numbers
-from cnpgen.schema.memory import check_memory
+from cnpgen.schema.arguments import check_memory, flag, integer, number, numbers
 from cnpgen.store.dataset_spec import StoredProblem
 
 Array = NDArray[Any]

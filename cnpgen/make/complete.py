@@ -29,8 +29,7 @@ from cnpgen.problems.problem_record import record_problem
 from cnpgen.robots.plausible_values import UnitError, check_plausible
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.arguments import numbers
-from cnpgen.schema.memory import check_memory_of_rows
+from cnpgen.schema.arguments import check_memory_of_rows, numbers
 from cnpgen.store.field import Field
 
 Array = NDArray[np.float64]

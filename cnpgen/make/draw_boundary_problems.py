@@ -11,8 +11,7 @@ from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import record_problem
 from cnpgen.robots.scene_arrays import scene_poses
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.arguments import integer
-from cnpgen.schema.memory import check_memory
+from cnpgen.schema.arguments import check_memory, integer
 from cnpgen.store.scene_table import SCENE_ID, concatenate_scenes
 
 SPLIT = "(fresh draws)"  # an invalid name of a split: no dataset contains these rows

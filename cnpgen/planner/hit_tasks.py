@@ -22,8 +22,7 @@ from cnpgen.plans.format import CONDITIONS, UNITS
 from cnpgen.plans.plausible import are_usual
 from cnpgen.robots.plausible_values import MAX_LIMIT_RATIO, check_plausible
 from cnpgen.robots.robot import Robot
-from cnpgen.schema.arguments import concerning, numbers
-from cnpgen.schema.memory import check_memory_of_rows
+from cnpgen.schema.arguments import check_memory_of_rows, concerning, numbers
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]

@@ -22,8 +22,7 @@ from cnpgen.plans.plans import Plans
 from cnpgen.plans.plausible import check_boundary_units
 from cnpgen.problems.problem import Problem
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.arguments import concerning, numbers
-from cnpgen.schema.memory import check_memory
+from cnpgen.schema.arguments import check_memory, concerning, numbers
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.boundary_arguments import boundary_of

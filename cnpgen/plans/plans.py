@@ -21,8 +21,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
 from cnpgen.robots.scene import Scene
 from cnpgen.schema.argument_types import check_fields, checked_arguments
-from cnpgen.schema.arguments import integer, numbers, reject_masked
-from cnpgen.schema.memory import check_memory
+from cnpgen.schema.arguments import check_memory, integer, numbers, reject_masked
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion, states_at_times

@@ -97,11 +97,7 @@ def _evaluated(function: Callable[..., Any], annotation: Any) -> Any:
 
 
 def check_fields(options: Any) -> None:
-    """Check the fields of a frozen dataclass by their annotations; convert NumPy's scalars.
-
-    Raises:
-        UsageError: A field has the wrong type.
-    """
+    """Check the fields of a frozen dataclass by their annotations; convert NumPy's scalars."""
     for name, check in _field_checks(type(options)):  # type: ignore[arg-type]
         object.__setattr__(options, name, check(name, getattr(options, name)))
 
@@ -118,7 +114,7 @@ def _check_of(hint: Any, *, strict: bool = False) -> Check | None:
     options = alternatives(hint)
     arrays = set(options) >= _ARRAYS
     present = [option for option in options if not (arrays and option in _ARRAYS)]
-    checks: list[Check] = [_masked] if arrays else []
+    checks: list[Check] = [reject_masked] if arrays else []
     if set(present) >= {str, Path}:
         checks.append(_path)
         present = [option for option in present if option not in {str, Path}]
@@ -156,7 +152,7 @@ def _check_of_type(hint: Any, *, strict: bool) -> Check | None:
     known |= {
         str: functools.partial(_accepted, lambda value: isinstance(value, str), "a text"),
         collections.abc.Callable: functools.partial(_accepted, callable, "a function"),
-        np.ndarray: _array if strict else _masked,
+        np.ndarray: _array if strict else reject_masked,
     }
     if kind in known:
         return known[kind]
@@ -167,11 +163,6 @@ def _check_of_type(hint: Any, *, strict: bool) -> Check | None:
             _accepted, lambda value: isinstance(value, kind) and not isinstance(value, str | bytes), "a list"
         )
     return functools.partial(_instance, kind)
-
-
-def _masked(name: str, value: Any) -> Any:
-    reject_masked(name, value)
-    return value
 
 
 def _array(name: str, value: Any) -> Any:

@@ -1,8 +1,8 @@
-"""Validation of Python arguments: bounded integers, finite numbers, arrays and flags."""
+"""Validation of Python arguments: bounded integers, finite numbers, arrays that fit into memory, and flags."""
 
 import math
 import operator
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -10,18 +10,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.schema.memory import MIN_CHECKED_SIZE, check_memory
 from cnpgen.schema.units import suggested_unit
 
 Array = NDArray[Any]
 
+BYTES_PER_FLOAT = 8
+MIN_CHECKED_SIZE = 10_000_000  # floats from which on the available memory is measured
+
 
 def integer(name: str, value: Any, *, least: int | None = None, most: int | None = None) -> int:
-    """Return an argument as an integer; accept NumPy integers, reject bool.
-
-    Raises:
-        UsageError: The value is not an integer, or out of range.
-    """
+    """Return an argument as an integer; accept NumPy integers, raise UsageError for bool and values out of range."""
     try:
         found = None if isinstance(value, bool) else operator.index(value)
     except TypeError:
@@ -33,10 +31,10 @@ def integer(name: str, value: Any, *, least: int | None = None, most: int | None
 
 
 def number(name: str, value: Any) -> float:
-    """Return an argument as a float; accept real scalars of all libraries, reject texts, bool, arrays and nan.
+    """Return an argument as a float; accept real scalars of all libraries.
 
     Raises:
-        UsageError: The value is not a finite number.
+        UsageError: The value is a text, a bool, an array, or not finite.
     """
     try:
         real = not isinstance(value, str | bytes | bool | np.bool_ | np.complexfloating) and np.ndim(value) == 0
@@ -49,16 +47,12 @@ def number(name: str, value: Any) -> float:
 
 
 def numbers(name: str, values: ArrayLike, dtype: str = "float64", *, differentiable: bool = False) -> Array:
-    """Return an argument as an array of floats; accept nan and inf, reject texts, dates and complex numbers.
+    """Return an argument as an array of "float64" or "float32"; accept nan and inf, and tensors on the CPU.
 
-    Args:
-        name: Name of the argument.
-        values: Numbers, lists of numbers, arrays, or tensors on the CPU.
-        dtype: "float64" or "float32".
-        differentiable: Whether tensors with gradients raise an error; otherwise they are detached.
+    Tensors with gradients are detached or, with ``differentiable``, raise an error.
 
     Raises:
-        UsageError: The values are not real numbers, have rows of different lengths, or are not in CPU memory.
+        UsageError: The values are texts, dates or complex numbers, have uneven rows, or are not in CPU memory.
     """
     if type(values) is np.ndarray and values.dtype == dtype:  # the usual case
         return _fitting(name, values)
@@ -88,11 +82,7 @@ def _fitting(name: str, array: Array) -> Array:
 
 
 def check_range(name: str, values: ArrayLike, low: float, high: float, unit: str) -> None:
-    """Raise an error for values [unit] outside of their range, with the unit that was probably meant.
-
-    Raises:
-        UsageError: A value is outside of the range, or nan.
-    """
+    """Raise UsageError for values [unit] outside of their range or nan, with the unit that was probably meant."""
     array = np.asarray(values, np.float64)
     outside = ~((low <= array) & (array <= high))
     if outside.any():
@@ -101,15 +91,12 @@ def check_range(name: str, values: ArrayLike, low: float, high: float, unit: str
         raise UsageError(text + suggested_unit(value, unit, low, high), argument=name)
 
 
-def reject_masked(name: str, values: Any) -> None:
-    """Reject masked arrays, whose masks NumPy's functions drop without notice.
-
-    Raises:
-        UsageError: The argument is a masked array, or a list of them.
-    """
+def reject_masked(name: str, values: Any) -> Any:
+    """Return an argument; raise UsageError for masked arrays and lists of them, whose masks NumPy's functions drop."""
     parts = values if isinstance(values, list | tuple) else [values]
     if any(isinstance(part, np.ma.MaskedArray) for part in parts):
         raise UsageError("must not be a masked array: pass filled values, such as values.filled(0.0)", argument=name)
+    return values
 
 
 @contextmanager
@@ -126,11 +113,34 @@ def concerning(argument: str) -> Iterator[None]:
 
 
 def flag(name: str, value: Any) -> bool:
-    """Return an argument as a bool; accept NumPy's bool, reject other types such as 1 and "no".
-
-    Raises:
-        UsageError: The value is not a bool.
-    """
+    """Return an argument as a bool; accept NumPy's bool, raise UsageError for other types such as 1 and "no"."""
     if not isinstance(value, bool | np.bool_):
         raise UsageError(f"must be True or False, got {value!r:.100}", argument=name)
     return bool(value)
+
+
+def check_memory(argument: str, value: int, n_floats: int) -> None:
+    """Refuse a request whose arrays need more than the available memory.
+
+    Args:
+        argument: Name of the argument that determines the size.
+        value: Its value, for the error.
+        n_floats: Lower bound of the number of floats in memory at a time.
+    """
+    needed = n_floats * BYTES_PER_FLOAT
+    if n_floats > MIN_CHECKED_SIZE and needed > (available := available_bytes()):
+        text = f"{needed / 1e9:,.3g} GB of memory, {available / 1e9:,.3g} GB are available"
+        raise UsageError(f"must be smaller: {value:,} needs at least {text}", argument=argument)
+
+
+def check_memory_of_rows(counts: Mapping[str, int], n_floats: int) -> None:
+    """Refuse arguments, name -> number of rows, of at least so many floats; name the one with most rows."""
+    argument = max(counts, key=lambda name: counts[name])
+    check_memory(argument, counts[argument], counts[argument] * n_floats)
+
+
+def available_bytes() -> int:
+    """Return the memory that new arrays can use without swapping."""
+    import psutil
+
+    return int(psutil.virtual_memory().available)

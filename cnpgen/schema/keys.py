@@ -76,17 +76,11 @@ def field(
 
 @dataclass(frozen=True, kw_only=True)
 class Key:
-    """Key of a recipe table, declared by ``field``.
-
-    Attributes:
-        name: Name of the key.
-        hint: Type of the dataclass field, without ``| None``.
-        default: Value of an absent key, ``dataclasses.MISSING`` for required keys.
-    """
+    """Key of a recipe table, declared by ``field``."""
 
     name: str
-    hint: Any
-    default: Any
+    hint: Any  # type of the dataclass field, without ``| None``
+    default: Any  # of an absent key; ``dataclasses.MISSING`` for required keys
     doc: str
     unit: str
     low: float | None
@@ -150,9 +144,7 @@ class RecipeLocation:
 def to_dict(obj: Any, *, label: Callable[[Any], Mapping[str, Any]] = lambda _: {}) -> dict[str, Any]:
     """Turn an object declared with ``field`` into plain dicts, lists, numbers and strings, all in SI.
 
-    Args:
-        obj: Object; fields that are not keys are omitted.
-        label: Function that returns further entries of an object, such as its registered name.
+    Fields that are not keys are omitted; ``label`` returns further entries of an object, such as its registered name.
     """
     values = ((key, getattr(obj, key.name)) for key in keys(type(obj)))
     return {

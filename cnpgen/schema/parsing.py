@@ -42,21 +42,12 @@ def parse(
     mistakes: list[str],
     readers: Mapping[type, Reader] | None = None,
 ) -> T | None:
-    """Build a dataclass declared with ``field`` from a TOML table.
+    """Build a dataclass declared with ``field`` from the table at a location; all values are in SI.
 
-    Further conditions are checked by the dataclass, with a ValueError in ``__post_init__`` or a method
-    ``find_mistakes()`` that yields (key, mistake) pairs. The method also runs if other keys have mistakes, and then
-    stops at the first use of such a key.
-
-    Args:
-        cls: Dataclass to build.
-        table: Result of the TOML parser.
-        where: Location of the table.
-        mistakes: List to which mistakes are appended, one line each.
-        readers: Readers of field types that are not tables of their own keys.
-
-    Returns:
-        The object with all values in SI, or None if there was a mistake.
+    Returns None after a mistake, and appends one line per mistake to ``mistakes``. Field types that are not tables of
+    their own keys have ``readers``. Further conditions are checked by the dataclass: by a ValueError in
+    ``__post_init__``, or by a method ``find_mistakes()`` that yields (key, mistake) pairs. The method also runs if
+    other keys have mistakes, and then stops at the first use of such a key.
     """
     before = len(mistakes)
     parser = _Parser(mistakes, readers or {})
@@ -96,7 +87,7 @@ class _Parser:
         values = {key.name: self.value(key.hint, table[key.name], key, where / key.name) for key in given}
         if len(self.mistakes) == before:
             made = cls(**values)
-            self.check(_mistakes_of(made), where)
+            self.check(getattr(made, "find_mistakes", tuple)(), where)
             return made
         self.check(_first_mistakes_of(_partly(cls, known, values)), where)
         return None
@@ -158,16 +149,11 @@ def _partly(cls: type[T], known: Mapping[str, Key], values: Mapping[str, Any]) -
     return made
 
 
-def _mistakes_of(made: object) -> Iterable[tuple[str, str]]:
-    found: Iterable[tuple[str, str]] = getattr(made, "find_mistakes", tuple)()
-    return found
-
-
 def _first_mistakes_of(made: object) -> list[tuple[str, str]]:
     """List the mistakes of an object up to the first check that uses a value with a mistake."""
     found: list[tuple[str, str]] = []
     with suppress(TypeError, AttributeError):
-        for mistake in _mistakes_of(made):
+        for mistake in getattr(made, "find_mistakes", tuple)():
             found.append(mistake)  # noqa: PERF402 - keeps the mistakes before an error
     return found
 

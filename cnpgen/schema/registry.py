@@ -4,9 +4,9 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
-import importlib
 import importlib.metadata
 import inspect
+import pkgutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -134,14 +134,7 @@ def names(group: str) -> tuple[str, ...]:
 
 
 def load(group: str, name: str) -> type[Any]:
-    """Import the class of a kind.
-
-    Args:
-        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS``, ``EXPORTERS`` or ``FAMILIES``.
-        name: Name of the kind, as ``use`` has it in a recipe.
-
-    Returns:
-        A concrete subclass of the contract of the group.
+    """Import the class of a kind by its name in recipes, a concrete subclass of the contract of the group.
 
     Raises:
         RecipeError: The kind is unknown, defined twice, or cannot be imported.
@@ -174,7 +167,7 @@ def name_hint(group: str, name: str) -> str:
 
 def contract(group: str) -> type[Any]:
     """Import the base class of a group."""
-    kind: type[Any] = _named(CONTRACTS[group])
+    kind: type[Any] = pkgutil.resolve_name(CONTRACTS[group])
     return kind
 
 
@@ -225,8 +218,7 @@ def package_digest(package: str) -> str:
 def package_of(group: str, kind: type) -> str:
     """Return the name of the installed package that registers a class; empty for built-in and unregistered ones."""
     name = name_of(group, kind)
-    found = [entry.dist.name for entry in installed(group) if entry.name == name and entry.dist]
-    return found[0] if found else ""
+    return next((entry.dist.name for entry in installed(group) if entry.name == name and entry.dist), "")
 
 
 def why_missing(group: str, use: str, package: str) -> str:
@@ -252,18 +244,12 @@ def _sources(group: str, name: str) -> dict[str, Callable[[], Any]]:
     """List the packages that define a kind, with import paths."""
     found: dict[str, Callable[[], Any]] = {}
     if name in BUILT_IN[group]:
-        found["cnpgen"] = lambda: _named(BUILT_IN[group][name])
+        found["cnpgen"] = functools.partial(pkgutil.resolve_name, BUILT_IN[group][name])
     for entry in installed(group):
         if entry.name == name:
             package = entry.dist.name if entry.dist else "an installed package"
             found[f"{package} ({entry.value})"] = entry.load
     return found
-
-
-def _named(spec: str) -> Any:
-    """Import the object ``"module:name"``."""
-    module, _, attribute = spec.partition(":")
-    return getattr(importlib.import_module(module), attribute)
 
 
 def _faults(kind: type[Any]) -> Iterator[str]:

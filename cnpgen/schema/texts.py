@@ -21,13 +21,9 @@ def read_at_most(path: Path, most: int, what: str) -> bytes:
 
 
 def read_own(path: Path, owner: Path, what: str) -> bytes:
-    """Read a file of at most ``MAX_NOTES_BYTES`` bytes next to the file to which it belongs.
+    """Read a file of at most ``MAX_NOTES_BYTES`` bytes next to the file to which it belongs, as ``read_at_most``.
 
-    Links to other folders are rejected, since they could leak private files.
-
-    Raises:
-        ValueError: The file is a link out of the owner's folder, missing, not a regular file or too large.
-        OSError: The file cannot be read.
+    Links to other folders raise ValueError, since they could leak private files.
     """
     folders = Path(os.path.realpath(owner)).parent, Path(os.path.realpath(owner.parent))
     if Path(os.path.realpath(path)).parent not in folders:
@@ -36,15 +32,10 @@ def read_own(path: Path, owner: Path, what: str) -> bytes:
 
 
 def utf8_text(content: bytes, encoding: str = "utf-8-sig", *, hint: str = "") -> str:
-    """Decode a text, by default without a byte order mark.
-
-    Args:
-        content: Bytes of the text.
-        encoding: "utf-8-sig", or "utf-8" to keep a byte order mark.
-        hint: Text that is appended to the message.
+    """Decode a text, by default without a byte order mark; "utf-8" keeps it.
 
     Raises:
-        ValueError: The content is not UTF-8; the message names line and byte.
+        ValueError: The content is not UTF-8; the message names line and byte, and ends with the hint.
     """
     try:
         return content.decode(encoding)

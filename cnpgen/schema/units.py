@@ -7,63 +7,36 @@ from typing import Any
 
 from cnpgen.errors import nearest
 
-_SCALES = {
-    "1": {"1": "1", "%": "0.01"},
-    "m": {"m": "1", "km": "1000", "cm": "0.01", "mm": "0.001", "um": "0.000001"},
-    "s": {"s": "1", "ms": "0.001", "us": "0.000001", "min": "60", "h": "3600"},
-    "rad": {"rad": "1", "mrad": "0.001", "deg": "0.0174532925199432957692369"},
-    "rad/s": {"rad/s": "1", "deg/s": "0.0174532925199432957692369", "rpm": "0.1047197551196597746154214"},
-    "rad/s^2": {"rad/s^2": "1", "deg/s^2": "0.0174532925199432957692369"},
-    "rad/s^3": {"rad/s^3": "1", "deg/s^3": "0.0174532925199432957692369"},
-    "m/s": {"m/s": "1", "cm/s": "0.01", "mm/s": "0.001"},
-    "m/s^2": {"m/s^2": "1", "cm/s^2": "0.01", "mm/s^2": "0.001"},
-    "kg": {"kg": "1", "g": "0.001", "t": "1000"},
-    "N": {"N": "1", "kN": "1000"},
-    "N m": {"N m": "1", "Nm": "1", "kN m": "1000"},
-    "1/s": {"1/s": "1", "Hz": "1"},
-    "kg m^2": {"kg m^2": "1"},
+_DEG = "0.0174532925199432957692369"
+
+# SI unit -> dimension, largest plausible absolute value, and units with their conversion factors.
+_QUANTITIES: dict[str, tuple[str, float, dict[str, str]]] = {
+    "1": ("a number", math.inf, {"1": "1", "%": "0.01"}),
+    "m": ("a length", 100.0, {"m": "1", "km": "1000", "cm": "0.01", "mm": "0.001", "um": "0.000001"}),
+    "s": ("a time", 3600.0, {"s": "1", "ms": "0.001", "us": "0.000001", "min": "60", "h": "3600"}),
+    "rad": ("an angle", 8 * math.pi, {"rad": "1", "mrad": "0.001", "deg": _DEG}),
+    "rad/s": ("an angular velocity", 200.0, {"rad/s": "1", "deg/s": _DEG, "rpm": "0.1047197551196597746154214"}),
+    "rad/s^2": ("an angular acceleration", 1e4, {"rad/s^2": "1", "deg/s^2": _DEG}),
+    "rad/s^3": ("an angular jerk", 1e7, {"rad/s^3": "1", "deg/s^3": _DEG}),
+    "m/s": ("a velocity", 100.0, {"m/s": "1", "cm/s": "0.01", "mm/s": "0.001"}),
+    "m/s^2": ("an acceleration", 1e4, {"m/s^2": "1", "cm/s^2": "0.01", "mm/s^2": "0.001"}),
+    "kg": ("a mass", 2500.0, {"kg": "1", "g": "0.001", "t": "1000"}),
+    "N": ("a force", 1e6, {"N": "1", "kN": "1000"}),
+    "N m": ("a torque", 1e5, {"N m": "1", "Nm": "1", "kN m": "1000"}),
+    "1/s": ("a rate", math.inf, {"1/s": "1", "Hz": "1"}),
+    "kg m^2": ("an inertia", 1e4, {"kg m^2": "1"}),
 }
 
 UNITS: dict[str, tuple[str, Decimal]] = {
-    unit: (si, Decimal(factor)) for si, scale in _SCALES.items() for unit, factor in scale.items()
+    unit: (si, Decimal(factor)) for si, (_, _, scale) in _QUANTITIES.items() for unit, factor in scale.items()
 }
 """Unit -> SI unit and conversion factor. Decimal, so that "9 mm" and 0.009 are the same float."""
 
-PLAUSIBLE_MAX = {
-    "m": 100.0,
-    "s": 3600.0,
-    "rad": 8 * math.pi,
-    "rad/s": 200.0,
-    "rad/s^2": 1e4,
-    "rad/s^3": 1e7,
-    "m/s": 100.0,
-    "m/s^2": 1e4,
-    "kg": 2500.0,
-    "N": 1e6,
-    "N m": 1e5,
-    "kg m^2": 1e4,
-}
+PLAUSIBLE_MAX = {si: largest for si, (_, largest, _) in _QUANTITIES.items() if largest < math.inf}
 """SI unit -> largest plausible absolute value of a quantity; larger ones are probably in another unit."""
 
 OTHER_UNITS = {"rad": "deg", "m": "mm", "s": "ms", "kg": "g"}
 """SI unit -> unit in which values are often given by mistake."""
-
-_DIMENSIONS = {
-    "1": "a number",
-    "m": "a length [m]",
-    "s": "a time [s]",
-    "rad": "an angle [rad]",
-    "rad/s": "an angular velocity [rad/s]",
-    "rad/s^2": "an angular acceleration [rad/s^2]",
-    "rad/s^3": "an angular jerk [rad/s^3]",
-    "m/s": "a velocity [m/s]",
-    "m/s^2": "an acceleration [m/s^2]",
-    "kg": "a mass [kg]",
-    "N": "a force [N]",
-    "N m": "a torque [N m]",
-    "1/s": "a rate [1/s]",
-    "kg m^2": "an inertia [kg m^2]",
-}
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _QUANTITY = re.compile(rf"\s*({_NUMBER.pattern})(.*)", re.DOTALL)
@@ -73,17 +46,14 @@ _SPELLINGS = (("**", "^"), ("*", " "), ("·", " "), ("²", "^2"), ("°", "deg"),
 
 def dimension(unit: str) -> str:
     """Return the name of the dimension of an SI unit: ``"a time [s]"``."""
-    return _DIMENSIONS.get(unit, f"a quantity [{unit}]")
+    name = _QUANTITIES[unit][0] if unit in _QUANTITIES else "a quantity"
+    return name if unit == "1" else f"{name} [{unit}]"
 
 
 def suggested_unit(value: float, unit: str, low: float = -math.inf, high: float = math.inf) -> str:
-    """Return a hint for a value outside of its plausible range: ``"; did you mean 15 deg = 0.262 rad?"``.
+    """Return a hint for a value [unit] outside of its plausible range: ``"; did you mean 15 deg = 0.262 rad?"``.
 
-    Args:
-        value: The value, read in ``unit``.
-        unit: SI unit, such as "rad" or "rad/s"; the hint is empty for units without a common mistake.
-        low: Minimum value; the hint is empty if the converted value is below it.
-        high: Maximum value.
+    The hint is empty for units without a common mistake, and if the converted value is outside of ``low`` to ``high``.
     """
     base, slash, per = unit.partition("/")
     factor = float(UNITS[OTHER_UNITS[base]][1]) if base in OTHER_UNITS else 0.0
@@ -101,14 +71,7 @@ def show(value: object) -> str:
 
 
 def parse_number(value: Any, unit: str) -> float:
-    """Read one number or quantity.
-
-    Args:
-        value: An int or a float, in ``unit``; or a text such as ``"50 ms"`` or ``"0.05"``.
-        unit: SI unit of the result.
-
-    Returns:
-        The value [unit].
+    """Read a number in ``unit``, or a text such as ``"50 ms"`` or ``"0.05"``; return the value [unit], an SI unit.
 
     Raises:
         ValueError: The value is not a finite number, or its unit is unknown or of another dimension.
@@ -123,18 +86,10 @@ def parse_number(value: Any, unit: str) -> float:
 
 
 def parse_numbers(value: Any, unit: str, *, count: int | None = None) -> tuple[float, ...]:
-    """Read a list of numbers or quantities.
-
-    Args:
-        value: A list of values for ``parse_number``, or a text such as ``"[0.6, 1.3] m"``.
-        unit: SI unit of the result.
-        count: Required number of values; None for one or more.
-
-    Returns:
-        The values [unit].
+    """Read a list of values for ``parse_number``, or a text such as ``"[0.6, 1.3] m"``; return the values [unit].
 
     Raises:
-        ValueError: The value is not a list, has the wrong length, or an invalid entry.
+        ValueError: The value is not a list, has an invalid entry, or not ``count`` entries (None for one or more).
     """
     match = _LIST.fullmatch(value) if isinstance(value, str) else None
     if match:
@@ -150,14 +105,7 @@ def parse_numbers(value: Any, unit: str, *, count: int | None = None) -> tuple[f
 
 
 def parse_range(value: Any, unit: str) -> tuple[float, float]:
-    """Read a closed interval.
-
-    Args:
-        value: A list of two, ``"[0.6, 1.3] m"``, or a value for ``parse_number``, a single point.
-        unit: SI unit of the result.
-
-    Returns:
-        Low and high end [unit].
+    """Read a list of two, ``"[0.6, 1.3] m"``, or a value for ``parse_number``, a single point; return both ends [unit].
 
     Raises:
         ValueError: An end is invalid, or the low end is above the high end.

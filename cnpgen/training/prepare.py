@@ -21,7 +21,7 @@ from cnpgen.planner.projection import make_projection
 from cnpgen.planner.tasks import Tasks
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.format import OBSTACLE_POSES
-from cnpgen.schema.memory import check_memory
+from cnpgen.schema.arguments import check_memory
 from cnpgen.store.files.documents import plain
 from cnpgen.training.checkpoint import State, start_state
 from cnpgen.training.data import TrainingData

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.schema.arguments import numbers
-from cnpgen.schema.memory import check_memory_of_rows
+from cnpgen.schema.arguments import check_memory_of_rows, numbers
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]

@@ -7,14 +7,13 @@ from pathlib import Path
 import pytest
 
 from cnpgen.cli.describe import (
-    LINE_WIDTH,
     describe,
     describe_pipeline,
     numbers,
     quantity,
     recipe_to_dict,
-    table,
 )
+from cnpgen.cli.terminal import LINE_WIDTH, table
 from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.pipelines.pipeline_file import load_pipeline
 from cnpgen.problems.problem_file import load_problem

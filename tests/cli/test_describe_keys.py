@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from cnpgen.cli.describe import LINE_WIDTH
 from cnpgen.cli.describe_keys import (
     FILES,
     describe_keys,
@@ -17,6 +16,7 @@ from cnpgen.cli.describe_keys import (
     kind_to_dict,
 )
 from cnpgen.cli.main import main
+from cnpgen.cli.terminal import LINE_WIDTH
 from cnpgen.errors import RecipeError
 from cnpgen.schema import registry
 from cnpgen.schema.keys import keys

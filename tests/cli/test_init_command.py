@@ -13,7 +13,7 @@ from cnpgen.cli.describe_keys import part_of
 from cnpgen.cli.init import link_overlaps
 from cnpgen.cli.init.arm import read_arm
 from cnpgen.cli.init.initial_recipes import INITIAL_JERK_RATE, problem_of
-from cnpgen.cli.init.text import toml
+from cnpgen.cli.init.write import toml
 from cnpgen.cli.main import main
 from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.problems.constraints.joint import JointJerk

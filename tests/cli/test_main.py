@@ -20,7 +20,7 @@ from cnpgen.cli import values
 from cnpgen.cli.dry_run import size_text
 from cnpgen.cli.main import main
 from cnpgen.cli.make_command import _yield
-from cnpgen.cli.progress import Meter
+from cnpgen.cli.terminal import Meter
 from cnpgen.errors import DatasetError, RecipeError
 from cnpgen.make.resolve_spec import MAX_ROWS
 from cnpgen.store.check import Finding

@@ -82,7 +82,7 @@ def test_a_run_that_was_killed_before_its_picture_was_drawn_draws_it_when_it_is_
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("often", some([0, 100], 0, "slow"))
 def test_rows_that_are_seen_too_often_are_spoken_of(tiny, tmp_path, capsys, monkeypatch, often):
-    monkeypatch.setattr("cnpgen.cli.train_text.OFTEN", often)
+    monkeypatch.setattr("cnpgen.cli.train_command.OFTEN", often)
     assert main(["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "m.h5"), *SMALL]) == 0
     assert ("a planner from more rows is better" in capsys.readouterr().err) == (often == 0)
 
@@ -268,7 +268,7 @@ def test_refining_goes_on_where_it_was_interrupted(trained, tiny, tmp_path, caps
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("cnpgen.cli.progress.Meter.__call__", interrupted)
+        patch.setattr("cnpgen.cli.terminal.Meter.__call__", interrupted)
         code, text = failing(capsys, [*words, "--refine", "--workers", "1"])
     assert code == 130
     assert "p.h5.part keeps all finished problems; run the same command again to resume" in text

@@ -22,7 +22,7 @@ import pytest
 
 import cnpgen
 from cnpgen.cli.main import main
-from cnpgen.cli.view.serve import stamp
+from cnpgen.cli.view.page import stamp
 from cnpgen.cli.view.view_bodies import robot_bodies, tube, wrapped
 from cnpgen.plans.export import export_plans
 from cnpgen.problems.load_robot import load_robot

@@ -10,7 +10,7 @@ import pytest
 import cnpgen
 from cnpgen import benchmark, losses, recipes, scenes, trajectories
 from cnpgen.errors import MachineError, UsageError
-from cnpgen.schema import memory
+from cnpgen.schema import arguments
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer, numbers
 from tests.faults.call_fuzz import CallOutcome, fuzz_calls
@@ -94,8 +94,8 @@ def test_requests_that_exceed_the_memory_are_refused(monkeypatch: pytest.MonkeyP
         cnpgen.draw_boundary_problems("airhockey-hit", 10**15)
     with pytest.raises(UsageError, match=r"^nodes must be smaller"):
         cnpgen.PlanLoss("airhockey", nodes=10**15)
-    monkeypatch.setattr(memory, "MIN_CHECKED_SIZE", 1000)
-    monkeypatch.setattr(memory, "available_bytes", lambda: 10**6)
+    monkeypatch.setattr(arguments, "MIN_CHECKED_SIZE", 1000)
+    monkeypatch.setattr(arguments, "available_bytes", lambda: 10**6)
     with pytest.raises(UsageError, match=r"n must be smaller: 100,000 needs at least 0\.\d+ GB of memory, 0\.001 GB"):
         cnpgen.draw_boundary_problems("airhockey-hit", 100_000)
 

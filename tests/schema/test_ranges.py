@@ -12,7 +12,7 @@ from cnpgen.problems.problem_record import ProblemRecord, open_problem, record_p
 from cnpgen.refine.options import RefineOptions
 from cnpgen.robots.observation.camera import Camera
 from cnpgen.robots.scene import Scene
-from cnpgen.schema import memory
+from cnpgen.schema import arguments
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import check_range, numbers
 from cnpgen.schema.catalogue import find_recipe
@@ -76,8 +76,8 @@ def test_views_that_repeat_values_are_compared_with_the_memory(planner):
 
 def test_many_plans_are_compared_with_the_memory(planner, monkeypatch):
     q = np.repeat(planner.robot.base[None], 1000, axis=0)
-    monkeypatch.setattr(memory, "MIN_CHECKED_SIZE", 100)
-    monkeypatch.setattr(memory, "available_bytes", lambda: 100_000)
+    monkeypatch.setattr(arguments, "MIN_CHECKED_SIZE", 100)
+    monkeypatch.setattr(arguments, "available_bytes", lambda: 100_000)
     with pytest.raises(UsageError, match=r"start_q must be smaller: 1,000 needs at least"):
         planner.plan(q, q)
     with pytest.raises(UsageError, match=r"boundary must be smaller: 1,000 needs at least"):

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cnpgen.cli.train_text import summary
+from cnpgen.cli.train_command import summary
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.losses.metric_settings import BOUNDED
 from cnpgen.make.make_dataset import make_dataset

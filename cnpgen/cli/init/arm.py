@@ -21,54 +21,31 @@ DEFAULT_SPEED = 1.0  # rad/s or m/s, where the URDF has none
 
 @dataclass(frozen=True)
 class ArmJoint:
-    """A movable joint with the limits of the URDF or placeholders.
-
-    Attributes:
-        name: Its name.
-        kind: Its type in the URDF: "revolute", "continuous", "prismatic" or what cannot be planned.
-        lower: Lower limit of its position [rad or m].
-        upper: Upper limit.
-        velocity: Limit of its velocity [rad/s or m/s].
-        effort: Limit of its torque or force [N m or N]; 0 where the URDF has none.
-        missing: Which limits the URDF does not have: "position", "velocity", "torque".
-    """
+    """A movable joint with the limits of the URDF or placeholders."""
 
     name: str
-    kind: str
-    lower: float
+    kind: str  # type in the URDF: "revolute", "continuous", "prismatic" or one that cannot be planned
+    lower: float  # limit of the position [rad or m]
     upper: float
-    velocity: float
-    effort: float
-    missing: tuple[str, ...]
+    velocity: float  # limit [rad/s or m/s]
+    effort: float  # limit of the torque or force [N m or N]; 0 where the URDF has none
+    missing: tuple[str, ...]  # limits that the URDF does not have: "position", "velocity", "torque"
 
 
 @dataclass(frozen=True)
 class Arm:
-    """An arm in a URDF.
-
-    Attributes:
-        urdf: The URDF file.
-        tip: The tip frame.
-        planned: The joints between the root and the tip, from the root outwards.
-        locked: Names of all other joints that move: they stay at zero.
-        moved: The links that planned joints move.
-        frames: Names of all links and joints.
-        masses: Link -> its mass [kg]; 0 where it has none.
-        impossible: The links that planned joints move with inertias that no body has.
-        shaped: The links that have a ``<collision>`` element.
-        meshes: The mesh files that links name.
-    """
+    """An arm in a URDF."""
 
     urdf: Path
-    tip: str
-    planned: tuple[ArmJoint, ...]
-    locked: tuple[str, ...]
-    moved: tuple[str, ...]
-    frames: tuple[str, ...]
-    masses: Mapping[str, float]
-    impossible: tuple[str, ...]
-    shaped: tuple[str, ...]
-    meshes: tuple[str, ...]
+    tip: str  # frame
+    planned: tuple[ArmJoint, ...]  # joints between the root and the tip, from the root outwards
+    locked: tuple[str, ...]  # names of all other joints that move: they stay at zero
+    moved: tuple[str, ...]  # links that planned joints move
+    frames: tuple[str, ...]  # names of all links and joints
+    masses: Mapping[str, float]  # link -> mass [kg]; 0 where it has none
+    impossible: tuple[str, ...]  # links that planned joints move with inertias that no body has
+    shaped: tuple[str, ...]  # links that have a ``<collision>`` element
+    meshes: tuple[str, ...]  # mesh files that links name
 
     @property
     def has_shape(self) -> bool:

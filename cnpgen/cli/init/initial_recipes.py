@@ -2,8 +2,6 @@
 
 import math
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -42,35 +40,26 @@ TORQUE_STATES = 1000  # random states that determine placeholders of missing tor
 
 @dataclass(frozen=True)
 class InitialProblem:
-    """Problem of an arm, with findings about its input.
-
-    Attributes:
-        problem: The problem.
-        arm: The arm, with placeholders of missing limits.
-        overlaps: Convex parts and ignored pairs of its links; None without link geometry.
-        notes: Sentences about the input.
-    """
+    """Problem of an arm, with findings about its input."""
 
     problem: Problem
-    arm: Arm
-    overlaps: LinkOverlaps | None
+    arm: Arm  # with placeholders of missing limits
+    overlaps: LinkOverlaps | None  # None without link geometry
     notes: tuple[str, ...]
 
 
 def problem_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], srdf: Path | None) -> InitialProblem:
-    """Make the problem of an arm.
+    """Make the problem of an arm, or raise RecipeError if it cannot be planned for.
 
     ``packages`` are folders that are searched for packages of the URDF, the SRDF disables pairs of links.
-
-    Raises:
-        RecipeError: The arm cannot be planned for.
     """
     problem = _problem(with_torques(arm, [1.0] * len(arm.planned)), name, folder, packages, srdf)
-    with _warnings_as_notes() as notes:
+    with warnings.catch_warnings(record=True) as caught:  # such as those about simplified meshes
+        warnings.simplefilter("always")
         overlaps = resolve_overlaps(problem) if arm.has_shape else None
         problem = overlaps.problem if overlaps else problem
         robot = load_robot(problem)
-    notes += overlaps.notes if overlaps else ()
+    notes = [*dict.fromkeys(str(each.message) for each in caught), *(overlaps.notes if overlaps else ())]
     arm, overloaded = _with_torque_limits(arm, robot)
     limits = replace(problem.limits, **_replaced_limits(arm))
     problem = _with_jerk_limits(replace(problem, limits=limits), robot)
@@ -85,11 +74,7 @@ def problem_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], sr
 
 
 def dataset_of(initial: InitialProblem, folder: Path) -> tuple[DatasetRecipe, float]:
-    """Return the dataset of a problem, with its pipeline and the problem, and the share of accepted candidates.
-
-    Raises:
-        RecipeError: No positions were found that the arm reaches.
-    """
+    """Return the dataset of a problem and the share of accepted candidates; raise RecipeError if none are found."""
     problem, name = initial.problem, initial.problem.name
     title, path = f"From rest to rest: {name}", folder / "pipeline.toml"
     stages = _stages(initial.arm, problem)
@@ -122,16 +107,6 @@ def _problem(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], srdf
         constraints = (*constraints, *clearances)  # obstacles may follow
     path, title = folder / "problem.toml", f"Move {arm.urdf.stem} within its limits"
     return Problem(name=name, title=title, robot=robot, limits=limits, constraint=constraints, path=path.absolute())
-
-
-@contextmanager
-def _warnings_as_notes() -> Iterator[list[str]]:
-    """Collect the warnings of the block, such as those about simplified meshes, in a list without repetitions."""
-    notes: list[str] = []
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        yield notes
-    notes += dict.fromkeys(str(each.message) for each in caught)
 
 
 def _replaced_limits(arm: Arm) -> dict[str, Any]:

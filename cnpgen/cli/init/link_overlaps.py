@@ -25,14 +25,7 @@ MAX_LISTED_PAIRS = 6  # of a note
 
 @dataclass(frozen=True)
 class LinkOverlaps:
-    """Choice of convex parts and ignored pairs of a problem.
-
-    Attributes:
-        problem: The problem with decomposed links, ignored pairs and the remaining gap.
-        hulls: Gap of the convex hulls.
-        parts: Gap of the convex parts of the problem.
-        notes: Sentences about the gap and the pairs.
-    """
+    """A problem with decomposed links and ignored pairs, with the gaps of the hulls and the parts, and notes."""
 
     problem: Problem
     hulls: HullGap
@@ -41,11 +34,7 @@ class LinkOverlaps:
 
 
 def resolve_overlaps(problem: Problem) -> LinkOverlaps:
-    """Decompose the links whose hulls reject much free space, and ignore pairs in contact if no state is free.
-
-    Raises:
-        RecipeError: A mesh is missing or cannot be read.
-    """
+    """Decompose the links whose hulls reject much free space, and ignore pairs in contact if no state is free."""
     hulls = _gap(problem)
     problem, parts = _decompose(problem, hulls)
     problem, parts, contacts = _ignore_contacts(problem, parts)

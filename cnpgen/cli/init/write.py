@@ -1,21 +1,28 @@
-"""The three recipe files of an arm, with what was found out about it as comments."""
+"""The three recipe files of an arm, with comments: findings about the arm, and an explanation of every key."""
 
+import json
 import os
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
-from cnpgen.cli.describe import table, with_units
+from cnpgen.cli.describe import link_rows, pair_rows, with_units
+from cnpgen.cli.describe_keys import GROUPS, is_array, kind_summary, part_of
 from cnpgen.cli.init.arm import DEFAULT_RANGE_M, DEFAULT_RANGE_RAD, DEFAULT_SPEED, Arm
 from cnpgen.cli.init.initial_recipes import INITIAL_JERK_RATE, TORQUE_STATES, InitialProblem
 from cnpgen.cli.init.link_overlaps import MAX_PAIR_GAP, LinkOverlaps
-from cnpgen.cli.init.text import RECIPE_LINE_WIDTH, recipe_text
-from cnpgen.cli.shape_rows import link_rows, pair_rows
+from cnpgen.cli.terminal import table
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.robots.robot import Robot
+from cnpgen.schema import registry
+from cnpgen.schema.keys import Key, PerJoint, Range, keys
 from cnpgen.store.joint_units import units_of_joints
+
+RECIPE_LINE_WIDTH = 118
+NOTHING = "..."  # for people to fill in
 
 FILES = ("problem.toml", "pipeline.toml", "dataset.toml")
 
@@ -41,15 +48,11 @@ def sampling_texts(recipe: DatasetRecipe, share: float) -> dict[str, str]:
         "stage.0.start": f"Found by sampling: of the draws {100 * share:.0f} % become samples.",
         "stage.1.guess": "About the base configuration of the problem.",
     }
-    heads = {
-        FILES[1]: _head("How starts and goals are drawn: positions, and joint angles that reach them."),
-        FILES[2]: _head("How many samples there are, from which seed, split how."),
-    }
-    texts = (
-        recipe_text(recipe.pipeline, {"problem": FILES[0]}, comments),
-        recipe_text(recipe, {"pipeline": FILES[1]}, {}),
-    )
-    return {name: "\n".join([*head, "", text]) for (name, head), text in zip(heads.items(), texts, strict=True)}
+    pipeline = _head("How starts and goals are drawn: positions, and joint angles that reach them.")
+    pipeline += ["", recipe_text(recipe.pipeline, {"problem": FILES[0]}, comments)]
+    dataset = _head("How many samples there are, from which seed, split how.")
+    dataset += ["", recipe_text(recipe, {"pipeline": FILES[1]}, {})]
+    return {FILES[1]: "\n".join(pipeline), FILES[2]: "\n".join(dataset)}
 
 
 def _from(folder: Path, path: str) -> str:
@@ -133,3 +136,74 @@ def _joint_rows(arm: Arm) -> Iterator[tuple[str, ...]]:
         ("not in the URDF", "", *(", ".join(joint.missing) for joint in arm.planned)),
         strict=True,
     )
+
+
+def recipe_text(recipe: Any, values: Mapping[str, Any], notes: Mapping[str, str]) -> str:
+    """Write a problem, pipeline or dataset, with other values of keys, such as "robot.urdf", and notes on keys."""
+    return "\n".join(_Writer(values, notes).table(type(recipe), recipe, "")) + "\n"
+
+
+@dataclass(frozen=True)
+class _Writer:
+    """Writes tables, with values and notes as ``recipe_text`` has them; what is left out has ``# `` before it."""
+
+    values: Mapping[str, Any]
+    notes: Mapping[str, str]
+
+    def table(self, cls: type, table: Any, path: str) -> Iterator[str]:
+        """Write the keys of a table, those that hold tables last; without a table, all as left out."""
+        below = list[str]()
+        for key in keys(cls):
+            name = f"{path}.{key.name}" if path else key.name
+            part, value = part_of(key), getattr(table, key.name, None)
+            if part is None:
+                yield from self.key(key, table, name)
+            elif is_array(key):
+                for at, item in enumerate(value or (None,)):
+                    below += ["", *self.entry(part, item, f"{name}.{at}")]
+            else:
+                below += ["", *_comment(kind_summary(part)), _unless(value, f"[{name}]")]
+                below += self.table(part, value, name)
+        yield from below
+
+    def entry(self, cls: type, item: Any, path: str) -> Iterator[str]:
+        """Write one of several tables of the same name; without one, how it would be written."""
+        kind = cls if item is None else type(item)
+        yield from _comment(kind_summary(kind))
+        yield _unless(item, f"[[{path.rpartition('.')[0]}]]")
+        if cls in GROUPS:
+            names = registry.names(GROUPS[cls])
+            yield f'# use = "{names[0]}"' if item is None else f'use = "{registry.name_of(GROUPS[cls], kind)}"'
+        yield from self.table(kind, item, path)
+
+    def key(self, key: Key, table: Any, name: str) -> Iterator[str]:
+        """Write a key below what it means; as left out where it is at its default, or of a table that is left out."""
+        value = self.values.get(name, getattr(table, key.name, None if key.required else key.default))
+        given = table is not None and (key.required or value != key.default)
+        note = f". {self.notes[name]}" if name in self.notes else ""
+        yield from _comment(f"{key.doc}{note}" if given else f"{key.doc} ({key.expected}){note}")
+        yield _unless(given, f"{key.name} = {toml(value) or NOTHING}")
+
+
+def _unless(given: Any, line: str) -> str:
+    """Return a line, as left out unless something is given."""
+    return line if given else f"# {line}"
+
+
+def _comment(text: str) -> list[str]:
+    return wrap(text, RECIPE_LINE_WIDTH, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False)
+
+
+def toml(value: Any) -> str:
+    """Write a value as TOML; nothing where there is none."""
+    if isinstance(value, Range):
+        return toml((value.low, value.high))
+    if isinstance(value, PerJoint):
+        return toml(value.values if len(value.values) > 1 else value.values[0])
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(toml, value))}]" if value else ""
+    if isinstance(value, dict):
+        return f"{{ {', '.join(f'{name} = {entry}' for name, entry in value.items())} }}"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False) if value else ""
+    return repr(value) if isinstance(value, int | float) else ""

@@ -1,27 +1,27 @@
-"""A scene as one page of HTML without external files: MeshCat's viewer, the numbers of the scene, and a script."""
+"""A scene as one page of HTML without external files, in a file or served on the loopback address."""
 
 import base64
 import json
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.cli.view.view_bodies import Body
 from cnpgen.cli.view.view_scene import View, ViewScene
-from cnpgen.errors import requires_extra
-from cnpgen.judges.plans.condition_curves import ConditionCurve
-from cnpgen.robots.robot import Robot
+from cnpgen.errors import CnpgenError, MachineError, UsageError, requires_extra
 
-_NOTES = {
-    "meshes": "",
-    "convex parts": "drawn with the convex parts of its collision geometry",
-    "line": "drawn as the line through its joints' origins",
-}
-SHARE_DIGITS = 4  # of shares of limits
-CURVE_DIGITS = 5  # significant ones of conditions
-_PROBE = 0.5  # joint displacement from which the axis of a joint is computed
+HOST = "127.0.0.1"
+_NAMES = (HOST, "localhost")  # accepted Host headers; requests that another site redirected have other ones
+_RETRY_S = 2  # time after which a browser reloads an error page
+
+Page = Callable[[int | None, str], str]
 
 
 def page_of(scene: ViewScene, *, stamp: str = "") -> str:
@@ -31,7 +31,8 @@ def page_of(scene: ViewScene, *, stamp: str = "") -> str:
         MissingExtraError: MeshCat is not installed.
     """
     template = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
-    data = json.dumps(_content(scene) | {"stamp": stamp}, separators=(",", ":")).replace("<", "\\u003c")
+    content = vars(scene) | {"stamp": stamp}
+    data = json.dumps(content, default=_encoded, separators=(",", ":")).replace("<", "\\u003c")
     before, between = template.split("/*VIEWER*/")
     return before + _viewer() + between.replace("/*DATA*/", data)
 
@@ -45,106 +46,77 @@ def _viewer() -> str:
         return path.read_text(encoding="utf-8")
 
 
-def _content(scene: ViewScene) -> dict[str, Any]:
-    """Return a scene for JSON, arrays as base64 of their bytes."""
-    low, high = _extent(scene)
-    return {
-        "note": _NOTES[scene.kind],
-        "joints": _joints(scene.robot),
-        "tip": _matrix(scene.robot.model.frames[scene.robot.tip_frame].placement.homogeneous),
-        "joints_and_tip": scene.views[0].poses.shape[1],
-        "robot": [_body(body, smooth=scene.kind != "convex parts") for body in scene.bodies],
-        "capsules": [_body(body, smooth=True) for body in scene.capsules],
-        "held": [_body(body) for body in scene.held],
-        "mallet": [_body(body) for body in scene.mallet],
-        "triad": [_body(body, smooth=True) for body in scene.triad],
-        "centre": ((low + high) / 2).tolist(),
-        "size": float(np.linalg.norm(high - low)),
-        "views": [_view(view) for view in scene.views],
-        "first_row": scene.first_row,
-        "n_rows": scene.n_rows,
-    }
+def _encoded(value: View | Body | NDArray[Any]) -> Any:
+    """Return an object for JSON; arrays as base64 of their bytes, with 4 bytes per number."""
+    if isinstance(value, np.ndarray):
+        dtype = "<f4" if value.dtype.kind == "f" else "<u4"
+        return base64.b64encode(np.ascontiguousarray(value, dtype).tobytes()).decode()
+    return vars(value)
 
 
-def _view(view: View) -> dict[str, Any]:
-    return {
-        "title": view.title,
-        "labels": view.labels,
-        "times": view.times.tolist(),
-        "q": _packed(view.q.T, "<f4"),
-        "poses": _packed(view.poses.transpose(0, 1, 3, 2), "<f4"),
-        "world": [_body(body) for body in view.world],
-        "path": [_body(body, smooth=True) for body in view.path],
-        "curves": [{"name": name, "shares": share.round(SHARE_DIGITS).tolist()} for name, share in view.shares.items()],
-        "conditions": [_condition(curve) for curve in view.conditions],
-        "verdict": view.verdict,
-    }
+def serve(page: Page, watched: Sequence[Path], *, port: int, ready: Callable[[str], None]) -> None:
+    """Serve a page until the process is interrupted.
+
+    ``/?row=I`` shows another row. An open page checks every second whether it is out of date, and then reloads.
+
+    Args:
+        page: (row or None, stamp of the files) -> the page as HTML. Its errors are shown in place of the page.
+        watched: The files that the page depends on; for a recipe also the other files in its folder.
+        port: Port on the loopback address; 0 for any free port. MachineError if it is taken.
+        ready: Called with the address once it is served.
+    """
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            address = urlsplit(self.path)
+            if (self.headers.get("Host") or "").rpartition(":")[0] not in _NAMES:
+                self._answer("expected the address of this machine", status=HTTPStatus.FORBIDDEN)
+            elif address.path == "/stamp":
+                self._answer(stamp(watched))
+            elif address.path == "/":
+                self._show(parse_qs(address.query).get("row", [""])[-1])
+            else:
+                self._answer("there is one page, /", status=HTTPStatus.NOT_FOUND)
+
+        def _show(self, row: str) -> None:
+            try:
+                if row and not (row.isascii() and row.isdigit()):
+                    raise UsageError(f"row: expected a number from 0, got {row[:20]!r}")
+                self._answer(page(int(row) if row else None, stamp(watched)), kind="text/html")
+            except CnpgenError as error:
+                self._answer(str(error), status=HTTPStatus.INTERNAL_SERVER_ERROR)
+
+        def _answer(self, text: str, *, kind: str = "text/plain", status: HTTPStatus = HTTPStatus.OK) -> None:
+            body = text.encode()
+            self.send_response(status)
+            self.send_header("Content-Type", f"{kind}; charset=utf-8")
+            self.send_header("Content-Length", str(len(body)))
+            self.send_header("Cache-Control", "no-store")
+            if status is HTTPStatus.INTERNAL_SERVER_ERROR:
+                self.send_header("Refresh", str(_RETRY_S))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *_: object) -> None:
+            """Do not log requests."""
+
+    try:
+        server = HTTPServer((HOST, port), Handler)
+    except OSError as error:
+        raise MachineError(f"--serve: cannot listen on port {port}: {error.strerror}") from error
+    with server:
+        ready(f"http://{HOST}:{server.server_port}/")
+        server.serve_forever()
 
 
-def _condition(curve: ConditionCurve) -> dict[str, Any]:
-    """Return a curve; bounds that do not exist are None."""
-    return {
-        "name": curve.label,
-        "unit": curve.unit,
-        "parts": curve.parts,
-        "values": [_rounded(values) for values in curve.values],
-        "lower": _rounded(curve.lower) if np.isfinite(curve.lower).all() else None,
-        "upper": _rounded(curve.upper) if np.isfinite(curve.upper).all() else None,
-        "tolerance": curve.tolerance,
-        "violated": np.flatnonzero(curve.violated).tolist(),
-        "points": None if curve.points is None else _packed(curve.points, "<f4"),
-        "pairs": curve.pairs,
-    }
+def stamp(watched: Sequence[Path]) -> str:
+    """Return a text that changes when one of the files does."""
+    files = [each for path in watched for each in (path.parent.glob("*") if path.suffix == ".toml" else (path,))]
+    return " ".join(sorted(map(_state, files)))
 
 
-def _rounded(values: NDArray[np.float64]) -> list[float | None]:
-    """Return values with ``CURVE_DIGITS`` significant digits, None for those that are not finite."""
-    return [float(f"{value:.{CURVE_DIGITS}g}") if np.isfinite(value) else None for value in values.tolist()]
-
-
-def _joints(robot: Robot) -> list[dict[str, Any]]:
-    """Return placements, axes and limits of the planned joints, from which the page computes poses."""
-    import pinocchio as pin
-
-    model, data = robot.model, robot.model.createData()
-    pin.forwardKinematics(model, data, np.full(robot.n, _PROBE))
-    joints = []
-    for index, name in enumerate(robot.joint_names):
-        placement = model.jointPlacements[index + 1]
-        twist = pin.log6(placement.actInv(data.liMi[index + 1])).vector / _PROBE  # linear, then angular
-        joints.append(
-            {
-                "name": name,
-                "placement": _matrix(placement.homogeneous),
-                "twist": twist.round(12).tolist(),
-                "low": float(robot.position_lower[index]),
-                "high": float(robot.position_upper[index]),
-            }
-        )
-    return joints
-
-
-def _matrix(matrix: NDArray[np.float64]) -> list[float]:
-    """Return a matrix by columns, as three.js reads it."""
-    return [float(value) for value in matrix.T.ravel()]
-
-
-def _body(body: Body, *, smooth: bool = False) -> dict[str, Any]:
-    arrays = {"corners": _packed(body.corners, "<f4"), "triangles": _packed(body.triangles, "<u4")}
-    return {"name": body.name, "joint": body.joint, "smooth": smooth, **arrays}
-
-
-def _packed(values: NDArray[Any], dtype: str) -> str:
-    return base64.b64encode(np.ascontiguousarray(values, dtype).tobytes()).decode()
-
-
-def _extent(scene: ViewScene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the corners of the box around the robot at the ends of the first view [m], shape (3,) each."""
-    view = scene.views[0]
-    points = [
-        body.corners @ view.poses[k, body.joint, :3, :3].T + view.poses[k, body.joint, :3, 3]
-        for body in (*scene.bodies, *scene.held)
-        for k in (0, len(view.labels) - 1)
-    ]
-    corners = np.concatenate(points)
-    return corners.min(axis=0), corners.max(axis=0)
+def _state(path: Path) -> str:
+    with suppress(OSError):
+        status = path.stat()
+        return f"{path.name}:{status.st_mtime_ns}:{status.st_size}"
+    return f"{path.name}:missing"

@@ -24,24 +24,19 @@ Array = NDArray[np.float64]
 
 LINE_ARM_RADIUS_M = 0.04  # radius of an arm without link geometry, if no constraint gives one
 MAX_TRIANGLES = 400_000  # of all visual meshes; larger pages open slowly
+PROBE = 0.5  # joint displacement from which the axis of a joint is computed
 BALL = 12  # directions per quarter of a circle in which round bodies have corners
 
 
 @dataclass(frozen=True)
 class Body:
-    """Triangles that a joint moves.
-
-    Attributes:
-        name: Name of the body.
-        joint: Index of the joint, from 1; 0 for a fixed body.
-        corners: Corners in the joint's frame [m], shape (V, 3).
-        triangles: Numbers of their corners, shape (F, 3).
-    """
+    """Triangles that a joint moves."""
 
     name: str
-    joint: int
-    corners: Array
-    triangles: NDArray[np.integer[Any]]
+    joint: int  # index from 1; 0 for a fixed body
+    corners: Array  # in the frame of the joint [m], shape (V, 3)
+    triangles: NDArray[np.integer[Any]]  # numbers of their corners, shape (F, 3)
+    smooth: bool = False  # whether the surface is drawn without edges
 
 
 def robot_bodies(problem: Problem, robot: Robot, *, with_meshes: bool = True) -> tuple[list[Body], str]:
@@ -65,14 +60,43 @@ def capsule_bodies(robot: Robot) -> list[Body]:
     """Return the capsules round the links; none of a robot without a shape."""
     found = robot.shape.capsules if robot.shape else ()
     joints = robot.shape.joints if robot.shape else {}
-    return [wrapped(each.link, joints[each.link], np.array([each.first, each.second]), each.radius) for each in found]
+    ends = [np.array([each.first, each.second]) for each in found]
+    pairs = zip(found, ends, strict=True)
+    return [wrapped(each.link, joints[each.link], points, each.radius, smooth=True) for each, points in pairs]
 
 
-def wrapped(name: str, joint: int, corners: Array, radius: float) -> Body:
+def planned_joints(robot: Robot) -> tuple[list[dict[str, Any]], list[float]]:
+    """Return the planned joints and the placement of the tip, by columns, from which the page computes poses."""
+    import pinocchio as pin
+
+    model, data = robot.model, robot.model.createData()
+    pin.forwardKinematics(model, data, np.full(robot.n, PROBE))
+    joints = []
+    for index, name in enumerate(robot.joint_names):
+        placement = model.jointPlacements[index + 1]
+        twist = pin.log6(placement.actInv(data.liMi[index + 1])).vector / PROBE  # linear, then angular
+        joints.append(
+            {
+                "name": name,
+                "placement": _by_columns(placement.homogeneous),
+                "twist": twist.round(12).tolist(),
+                "low": float(robot.position_lower[index]),
+                "high": float(robot.position_upper[index]),
+            }
+        )
+    return joints, _by_columns(model.frames[robot.tip_frame].placement.homogeneous)
+
+
+def _by_columns(matrix: NDArray[np.float64]) -> list[float]:
+    """Return a matrix by columns, as three.js reads it."""
+    return [float(value) for value in matrix.T.ravel()]
+
+
+def wrapped(name: str, joint: int, corners: Array, radius: float, *, smooth: bool = False) -> Body:
     """Return the hull of points [m], shape (V, 3), inflated by a radius [m], as triangles that face outwards."""
     points = (corners[:, None] + radius * _ball()).reshape(-1, 3) if radius else corners
     used, numbers = np.unique(outward_triangles(points), return_inverse=True)
-    return Body(name, joint, points[used], numbers.reshape(-1, 3))
+    return Body(name, joint, points[used], numbers.reshape(-1, 3), smooth)
 
 
 def tube(name: str, points: Array, radius: float) -> Body:
@@ -86,7 +110,15 @@ def tube(name: str, points: Array, radius: float) -> Body:
     ring = np.cos(angles)[:, None] * across[:, None] + np.sin(angles)[:, None] * np.cross(along, across)[:, None]
     first = [(6 * k + i, 6 * k + (i + 1) % 6, 6 * k + 6 + i) for k, i in product(range(len(points) - 1), range(6))]
     second = [(b, b + 6, a + 6) for a, b, _ in first]
-    return Body(name, 0, (points[:, None] + radius * ring).reshape(-1, 3), np.array(first + second).reshape(-1, 3))
+    corners = (points[:, None] + radius * ring).reshape(-1, 3)
+    return Body(name, 0, corners, np.array(first + second).reshape(-1, 3), smooth=True)
+
+
+def extent(bodies: Sequence[Body], poses: Array) -> tuple[Array, Array]:
+    """Return the corners of the box around bodies [m], shape (3,), at transposed poses, shape (K, joints, 4, 4)."""
+    parts = [body.corners @ pose[body.joint, :3, :3] + pose[body.joint, 3, :3] for body in bodies for pose in poses]
+    corners = np.concatenate(parts)
+    return corners.min(axis=0), corners.max(axis=0)
 
 
 def _ball() -> Array:
@@ -106,7 +138,7 @@ def _visual_bodies(problem: Problem, robot: Robot) -> Iterator[Body]:
         for element in link.findall("visual"):
             corners, triangles = _visual(name, element, robot.urdf, packages)
             placed = corners @ frame.placement.rotation.T + frame.placement.translation
-            yield Body(name, int(frame.parentJoint), placed, triangles)
+            yield Body(name, int(frame.parentJoint), placed, triangles, smooth=True)
 
 
 def _visual(
@@ -133,7 +165,7 @@ def _line(robot: Robot, radius: float) -> Iterator[Body]:
     origins.append(data.oMf[robot.tip_frame].translation)
     foot = np.array([np.zeros(3), origins[robot.capsule_axes[0][0]]])
     if np.ptp(foot, axis=0).any():
-        yield wrapped("foot", 0, foot, radius)
+        yield wrapped("foot", 0, foot, radius, smooth=True)
     for a, b in robot.capsule_axes:
         ends = np.array([data.oMi[b].actInv(origins[a]), data.oMi[b].actInv(origins[b])])
-        yield wrapped(f"segment {a}-{b}", b, ends, radius)
+        yield wrapped(f"segment {a}-{b}", b, ends, radius, smooth=True)

@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.cli.view.view_bodies import Body, capsule_bodies, robot_bodies, tube, wrapped
-from cnpgen.cli.view.view_verdict import view_verdict
-from cnpgen.judges.plans.condition_curves import ConditionCurve, condition_curves
+from cnpgen.cli.view.view_bodies import Body, capsule_bodies, extent, planned_joints, robot_bodies, tube, wrapped
+from cnpgen.judges.plans.condition_curves import ConditionCurve, condition_curves, plot_unit
 from cnpgen.judges.plans.plan_plot import along, shares_of_limits
-from cnpgen.judges.plans.verdict import Reason, Verdict
+from cnpgen.judges.plans.verdict import Margin, Reason, Verdict
 from cnpgen.judges.trajectories.trajectory_plot import along_trajectory
 from cnpgen.judges.trajectories.trajectory_verdict import TrajectoryVerdict
 from cnpgen.plans.plans import Plans
@@ -36,64 +35,49 @@ TIP_PATH_RADIUS_M = 4e-3
 TRIAD_LENGTH_M, TRIAD_RADIUS_M = 0.12, 4e-3  # axes of a drawn frame
 PUCK_HEIGHT_M, MALLET_HEIGHT_M = 0.012, 0.05
 DISC_CORNERS = 48
+SHARE_DIGITS = 4  # of shares of limits
+CURVE_DIGITS = 5  # significant ones of conditions
+_NOTES = {  # kind of the robot's bodies -> remark
+    "meshes": "",
+    "convex parts": "drawn with the convex parts of its collision geometry",
+    "line": "drawn as the line through its joints' origins",
+}
 
 
 @dataclass(frozen=True)
 class View:
-    """A plan, a sample or a configuration of the robot.
-
-    Attributes:
-        title: Title.
-        labels: Label of each of the K frames: its time, "start" or "goal".
-        times: Times of the frames [s], shape (K,); 0, 1, ... without a motion.
-        q: Joint positions [rad], shape (n, K).
-        poses: Poses of the joints, the universe first and the tip last, shape (K, joints, 4, 4).
-        world: Obstacles, the table and the puck.
-        path: Path of the tip, of a motion.
-        shares: Quantity -> share of the limits, shape (n, K); empty without a motion.
-        conditions: Curves of the other conditions; empty without a motion.
-        verdict: The verdict for JSON; None without a motion.
-    """
+    """A plan, a sample or a configuration of the robot, with the names that the script of the page has."""
 
     title: str
-    labels: tuple[str, ...]
-    times: Array
-    q: Array
-    poses: Array
-    world: tuple[Body, ...]
-    path: tuple[Body, ...]
-    shares: dict[str, Array]
-    conditions: tuple[ConditionCurve, ...]
-    verdict: dict[str, Any] | None
+    labels: Sequence[str]  # of each of the K frames: its time, "start" or "goal"
+    times: Sequence[float]  # times of the frames [s]; 0, 1, ... without a motion
+    q: Array  # joint positions [rad], shape (K, n)
+    poses: Array  # transposed poses of the joints, the universe first and the tip last, shape (K, joints, 4, 4)
+    world: Sequence[Body]  # obstacles, the table and the puck
+    path: Sequence[Body] = ()  # path of the tip, of a motion
+    curves: Sequence[dict[str, Any]] = ()  # quantities with their shares of the limits; empty without a motion
+    conditions: Sequence[dict[str, Any]] = ()  # curves of the other conditions; empty without a motion
+    verdict: dict[str, Any] | None = None  # None without a motion
 
 
 @dataclass(frozen=True)
 class ViewScene:
-    """The content of a page.
+    """The content of a page, with the names that its script has."""
 
-    Attributes:
-        robot: The robot.
-        bodies: Bodies of the robot.
-        kind: Their kind: "meshes", "convex parts" or "line".
-        capsules: Capsules around its links.
-        held: The held object, in the tip's frame.
-        mallet: The mallet, relative to the position of the tip.
-        triad: Axes of a frame, in the tip's frame.
-        views: The views, one or more.
-        first_row: Row of the first view.
-        n_rows: Number of rows that the source has.
-    """
-
-    robot: Robot
-    bodies: tuple[Body, ...]
-    kind: str
-    capsules: tuple[Body, ...]
-    held: tuple[Body, ...]
-    mallet: tuple[Body, ...]
-    triad: tuple[Body, ...]
-    views: tuple[View, ...]
-    first_row: int = 0
-    n_rows: int = 1
+    note: str  # remark about the bodies of the robot
+    joints: Sequence[dict[str, Any]]  # placements, axes and limits of the planned joints
+    tip: Sequence[float]  # pose of the tip in the frame of the last joint, by columns
+    joints_and_tip: int  # number of poses of a frame
+    robot: Sequence[Body]
+    capsules: Sequence[Body]  # around the links of the robot
+    held: Sequence[Body]  # the held object, in the tip's frame
+    mallet: Sequence[Body]  # the mallet, relative to the position of the tip
+    triad: Sequence[Body]  # axes of a frame, in the tip's frame
+    centre: Sequence[float]  # centre of the box around the robot [m]
+    size: float  # diagonal of the box [m]
+    views: Sequence[View]  # one or more
+    first_row: int = 0  # row of the first view
+    n_rows: int = 1  # number of rows that the source has
 
 
 def scene_of_problem(problem: Problem, robot: Robot) -> ViewScene:
@@ -168,20 +152,76 @@ def _moving(  # noqa: PLR0917 - all of them are shown
     verdict: Verdict,
 ) -> View:
     """Show one motion at phases s and times [s], shape (K,)."""
-    curves = condition_curves(problem, world, s, scene.bodies())
+    curves, shares = condition_curves(problem, world, s, scene.bodies()), shares_of_limits(world)
     poses = _poses(robot, world.q)
     return View(
         title=title,
-        labels=tuple(f"{time:.3f} s" for time in times),
-        times=times,
-        q=world.q,
-        poses=poses,
-        world=tuple(_world(problem, scene)),
-        path=(tube("path of the tip", poses[:, -1, :3, 3], TIP_PATH_RADIUS_M),),
-        shares=shares_of_limits(world),
-        conditions=tuple(curves),
-        verdict=view_verdict(verdict, curves, times, poses, robot.joint_names),
+        labels=[f"{time:.3f} s" for time in times],
+        times=times.tolist(),
+        q=world.q.T,
+        poses=poses.swapaxes(2, 3),
+        world=list(_world(problem, scene)),
+        path=[tube("path of the tip", poses[:, -1, :3, 3], TIP_PATH_RADIUS_M)],
+        curves=[{"name": name, "shares": share.round(SHARE_DIGITS).tolist()} for name, share in shares.items()],
+        conditions=[_condition(curve) for curve in curves],
+        verdict=_verdict(verdict, curves, times, poses, robot.joint_names),
     )
+
+
+def _verdict(
+    verdict: Verdict, curves: Sequence[ConditionCurve], times: Array, poses: Array, joints: Sequence[str]
+) -> dict[str, Any]:
+    """Return a verdict for JSON, its margins located in time and space, the largest violation first.
+
+    The poses of the joints, the universe first and the tip last, have shape (K, joints, 4, 4), the times [s] (K,).
+    """
+    by_name = {curve.name: curve for curve in curves}
+    margins = sorted(verdict.margins.values(), key=lambda margin: -margin.severity)
+    causes = []
+    for margin in margins:
+        frame = int(np.abs(times - margin.time).argmin())
+        point = _point(margin, by_name.get(margin.name), poses[frame], frame, joints).tolist()
+        name, text = f"{margin.name} {margin.part}".strip(), _margin_text(margin)
+        causes.append({"name": name, "text": text, "frame": frame, "ok": margin.ok, "point": point})
+    return {"valid": verdict.valid, "reason": str(verdict.reason), "causes": causes}
+
+
+def _margin_text(margin: Margin) -> str:
+    """Return a margin as text in the units of plots."""
+    factor, unit = plot_unit(margin.unit)
+    side = "outside" if margin.violation > 0 else "inside"
+    amount, tolerance = factor * abs(margin.violation), factor * margin.tolerance
+    return f"{amount:.3g} {unit} {side}, tolerance {tolerance:.3g} {unit}"
+
+
+def _point(margin: Margin, curve: ConditionCurve | None, poses: Array, frame: int, joints: Sequence[str]) -> Array:
+    """Return the place of a margin [m], shape (3,): between the closest points, at the joint, or at the tip."""
+    if curve is not None and curve.points is not None:
+        return np.asarray(curve.points[frame].mean(axis=0))
+    if margin.part in joints:
+        return np.asarray(poses[1 + list(joints).index(margin.part), :3, 3])
+    return np.asarray(poses[-1, :3, 3])
+
+
+def _condition(curve: ConditionCurve) -> dict[str, Any]:
+    """Return a curve; bounds that do not exist are None."""
+    return {
+        "name": curve.label,
+        "unit": curve.unit,
+        "parts": curve.parts,
+        "values": [_rounded(values) for values in curve.values],
+        "lower": _rounded(curve.lower) if np.isfinite(curve.lower).all() else None,
+        "upper": _rounded(curve.upper) if np.isfinite(curve.upper).all() else None,
+        "tolerance": curve.tolerance,
+        "violated": np.flatnonzero(curve.violated).tolist(),
+        "points": curve.points,
+        "pairs": curve.pairs,
+    }
+
+
+def _rounded(values: Array) -> list[float | None]:
+    """Return values with ``CURVE_DIGITS`` significant digits, None for those that are not finite."""
+    return [float(f"{value:.{CURVE_DIGITS}g}") if np.isfinite(value) else None for value in values.tolist()]
 
 
 def _still(  # noqa: PLR0917 - all of them are shown
@@ -194,26 +234,31 @@ def _still(  # noqa: PLR0917 - all of them are shown
     verdict: dict[str, Any] | None = None,
 ) -> View:
     """Show configurations without a motion."""
-    times, world = np.arange(float(len(labels))), tuple(_world(problem, scene))
-    return View(title, labels, times, q, _poses(robot, q), world, (), {}, (), verdict)
+    times, poses = [float(frame) for frame in range(len(labels))], _poses(robot, q).swapaxes(2, 3)
+    return View(title, labels, times, q.T, poses, list(_world(problem, scene)), verdict=verdict)
 
 
 def _scene(problem: Problem, robot: Robot, views: list[View], *, with_meshes: bool) -> ViewScene:
     bodies, kind = robot_bodies(problem, robot, with_meshes=with_meshes)
     size, contact, tip = problem.object_size, problem.first(PuckContact), robot.n + 1
     disc = None if contact is None else _disc_corners(np.zeros(3), contact.mallet_radius, MALLET_HEIGHT_M)
+    held = [] if size is None else [wrapped("object", tip, CUBE * np.array(size), 0.0)]
+    joints, placement = planned_joints(robot)
+    low, high = extent((*bodies, *held), views[0].poses[[0, -1]])
+    axes = {f"axis {'xyz'[k]}": np.array([np.zeros(3), TRIAD_LENGTH_M * np.eye(3)[k]]) for k in range(3)}
     return ViewScene(
-        robot=robot,
-        bodies=tuple(bodies),
-        kind=kind,
-        capsules=tuple(capsule_bodies(robot)),
-        held=() if size is None else (wrapped("object", tip, CUBE * np.array(size), 0.0),),
-        mallet=() if disc is None else (wrapped("mallet", tip, disc, 0.0),),
-        triad=tuple(
-            wrapped(f"axis {name}", tip, np.array([np.zeros(3), TRIAD_LENGTH_M * axis]), TRIAD_RADIUS_M)
-            for name, axis in zip("xyz", np.eye(3), strict=True)
-        ),
-        views=tuple(views),
+        note=_NOTES[kind],
+        joints=joints,
+        tip=placement,
+        joints_and_tip=tip + 1,
+        robot=bodies,
+        capsules=capsule_bodies(robot),
+        held=held,
+        mallet=[] if disc is None else [wrapped("mallet", tip, disc, 0.0)],
+        triad=[wrapped(name, tip, ends, TRIAD_RADIUS_M, smooth=True) for name, ends in axes.items()],
+        centre=((low + high) / 2).tolist(),
+        size=float(np.linalg.norm(high - low)),
+        views=views,
     )
 
 
