@@ -12,6 +12,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.world.certified import PlacedBody
+
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Measure = Callable[[int, int], tuple[float, Array]]  # (pair, state) -> signed distance, separating direction
@@ -94,12 +96,14 @@ class PairDistances:
         bounds: Lower bounds of the distances [m], shape (M, K).
         measure: Measures a pair at a state, as of ``smallest_distances``.
         separation: Bounds the distances of a pair along a direction.
+        bodies: Returns both bodies of a pair at a state with their poses, that of the robot before an obstacle.
         directions: Separating directions of every pair, collected from its measurements.
     """
 
     bounds: Array
     measure: Measure
     separation: SeparationBound
+    bodies: Callable[[int, int], tuple[PlacedBody, PlacedBody]]
     directions: dict[int, list[Array]] = field(default_factory=dict)
 
     def smallest(self) -> list[Array]:

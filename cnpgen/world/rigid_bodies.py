@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cnpgen.robots.shape.hull import ball_round
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.solid import Solid, same_shape
-from cnpgen.world.certified import CertifiedDistance, convex_body
+from cnpgen.world.certified import CertifiedDistance, PlacedBody, convex_body
 from cnpgen.world.pair_distances import PairDistances
 
 Array = NDArray[np.float64]
@@ -107,7 +107,11 @@ class RigidBodies:
         def separation(pair: int, direction: Array, states: "slice | Pairs" = slice(None), /) -> Array:
             return self._separation(*bodies[pair], direction, states)
 
-        return PairDistances(self._bounds(pairs), measure, separation)
+        def bodies_at(pair: int, k: int) -> tuple[PlacedBody, PlacedBody]:
+            a, b = bodies[pair] if bodies[pair][0] < len(self._balls) else bodies[pair][::-1]
+            return self._placed(a, k), self._placed(b, k)
+
+        return PairDistances(self._bounds(pairs), measure, separation, bodies_at)
 
     def contacts(self, pairs: Pairs, within: float) -> Contacts:
         """Measure ``obstacle_pairs`` or ``link_pairs`` at states where their signed distance is below ``within`` [m].
@@ -161,12 +165,13 @@ class RigidBodies:
 
     def _measure(self, a: int, b: int, k: int) -> tuple[float, Array]:
         """Measure a pair at a state; the direction points from a to b, in the frame of a."""
-        pose_a, pose_b = (
-            (self._rotations[frame, ..., k].copy(), self._positions[frame, :, k].copy())
-            for frame in (self._frames[a], self._frames[b])
-        )
-        distance, normal = self._certified.between(self._bodies[a], pose_a, self._bodies[b], pose_b)
-        return distance, normal @ pose_a[0]
+        first, second = self._placed(a, k), self._placed(b, k)
+        distance, normal = self._certified.between(*first, *second)
+        return distance, normal @ first[1][0]
+
+    def _placed(self, body: int, k: int) -> PlacedBody:
+        frame = self._frames[body]
+        return self._bodies[body], (self._rotations[frame, ..., k].copy(), self._positions[frame, :, k].copy())
 
     def _separation(self, a: int, b: int, direction: Array, states: "slice | Pairs" = slice(None)) -> Array:
         """Compute the separation of b from a along a direction in the frame of a, at some states [m], shape (K,)."""

@@ -83,7 +83,7 @@ def test_states_with_different_obstacle_poses_are_checked_one_by_one(context, dr
     other[1, 0] += 1.0
     all_states = np.ones(60, bool)
     together = narrow_phase_of(context, "start")((few, still, still), obstacle_poses, all_states, None)
-    monkeypatch.setattr(PathWorld, "shape_pairs", None)
+    monkeypatch.setattr(PathWorld, "pairs", None)
     alone = narrow_phase_of(context, "start")((few, still, still), other, all_states, None)
     np.testing.assert_array_equal(alone[:, 1:], together[:, 1:])
     assert alone.any()

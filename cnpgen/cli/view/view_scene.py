@@ -168,7 +168,7 @@ def _moving(  # noqa: PLR0917 - all of them are shown
     verdict: Verdict,
 ) -> View:
     """Show one motion at phases s and times [s], shape (K,)."""
-    curves = condition_curves(problem, world, s, scene.bodies())
+    curves = condition_curves(problem, world, s)
     poses = _poses(robot, world.q)
     return View(
         title=title,
