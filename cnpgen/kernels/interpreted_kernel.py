@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from cnpgen.kernels.kernel import Array, GridKernel, Kernel, check_grid, evaluate_lanes
-from cnpgen.kernels.tape import NAMES, OPERATIONS, Tape
+from cnpgen.kernels.tape import NAMES, OPERATIONS, GridSpec, Tape
 
 POINTS_PER_BLOCK = 8192  # lanes or points; smaller blocks cost more interpreter time, larger ones exceed the cache
 
@@ -55,60 +55,38 @@ class _LaneBlock:
 Bind = Callable[[_LaneBlock], Callable[[], Any]]  # binding a step to its rows once halves its interpreter time
 
 
-class InterpretedKernel(Kernel):
-    """A tape evaluated by NumPy."""
+class _BlockProgram:
+    """A tape with a grid, run by NumPy on blocks of points; work rows have shape (nodes, lanes)."""
 
-    def __init__(self, tape: Tape) -> None:
-        super().__init__(tape)
+    def __init__(self, tape: Tape, grid: GridSpec) -> None:
+        self._grid, self._dtype = grid, tape.dtype
         self._slots, self._program = _allocate(tape)
 
-    def __call__(self, *arguments: Array) -> list[Array]:
-        """Evaluate the batch; see ``Kernel``."""
-        with np.errstate(all="ignore"):
-            return evaluate_lanes(self.tape, arguments, self._evaluate)
-
-    def _evaluate(self, arguments: Sequence[Array], n: int) -> list[Array]:
-        results = [np.empty((width, n)) for width in self.tape.outputs]
-        work = np.empty((self._slots, min(n, POINTS_PER_BLOCK)))
-        block = _LaneBlock(self._program, list(work))
-        for start in range(0, n, POINTS_PER_BLOCK):
-            lanes = slice(start, min(start + POINTS_PER_BLOCK, n))
-            if lanes.stop - start < work.shape[1]:
-                block = _LaneBlock(self._program, list(work[:, : lanes.stop - start]))
-            block.run(*_lanes(arguments, results, lanes))
-        return results
-
-
-class InterpretedGridKernel(GridKernel):
-    """A tape with a grid evaluated by NumPy, a few nodes at a time."""
-
-    def __init__(self, tape: Tape) -> None:
-        super().__init__(tape)
-        self._slots, self._program = _allocate(tape)
-
-    def __call__(self, *arguments: Array, out: Sequence[Array]) -> None:
-        """Evaluate the grid; see ``GridKernel``."""
-        k, n = check_grid(self.tape, self.grid, arguments, out)
+    def run(self, arguments: Sequence[Array], out: Sequence[Array], k: int, n: int) -> None:
+        """Evaluate all points of K nodes and N lanes, a few nodes at a time."""
         count = max(POINTS_PER_BLOCK // max(n, 1), 1)
-        work = np.empty((self._slots, min(count, k), min(n, POINTS_PER_BLOCK)), self.tape.dtype)
+        work = np.empty((self._slots, min(count, k), min(n, POINTS_PER_BLOCK)), self._dtype)
+        block = _LaneBlock(self._program, list(work))
         with np.errstate(all="ignore"):
             for node in range(0, k, count):
                 for lane in range(0, n, POINTS_PER_BLOCK):
                     nodes, lanes = slice(node, min(node + count, k)), slice(lane, min(lane + POINTS_PER_BLOCK, n))
-                    rows = [row[: nodes.stop - node, : lanes.stop - lane] for row in work]
-                    _LaneBlock(self._program, rows).run(*self._points(arguments, out, nodes, lanes))
+                    shape = nodes.stop - node, lanes.stop - lane
+                    if shape != block.rows[0].shape:
+                        block = _LaneBlock(self._program, [row[: shape[0], : shape[1]] for row in work])
+                    block.run(*self._points(arguments, out, nodes, lanes))
 
     def _points(
         self, arguments: Sequence[Array], out: Sequence[Array], nodes: slice, lanes: slice
     ) -> tuple[Read, Write]:
-        """Return the functions that read and write a block of points; rows have shape (nodes, lanes)."""
+        """Return the functions that read and write a block of points."""
         part: dict[str, Any] = {"point": (nodes, lanes), "lane": (None, lanes), "node": (nodes, None), "fixed": ()}
 
         def read(argument: int, component: int) -> Any:
-            return arguments[argument][(component, *part[self.grid.arguments[argument]])]
+            return arguments[argument][(component, *part[self._grid.arguments[argument]])]
 
         def write(result: int, component: int, value: Any) -> None:
-            if self.grid.results[result] == "point":
+            if self._grid.results[result] == "point":
                 out[result][component, nodes, lanes] = value
             else:
                 shape = (nodes.stop - nodes.start, lanes.stop - lanes.start)
@@ -117,16 +95,34 @@ class InterpretedGridKernel(GridKernel):
         return read, write
 
 
-def _lanes(arguments: Sequence[Array], results: list[Array], lanes: slice) -> tuple[Read, Write]:
-    """Return the functions that read and write a block of lanes."""
+class InterpretedKernel(Kernel):
+    """A tape evaluated by NumPy, on a grid of one node."""
 
-    def read(argument: int, component: int) -> Any:
-        return arguments[argument][component, lanes]
+    def __init__(self, tape: Tape) -> None:
+        super().__init__(tape)
+        points = GridSpec(("point",) * len(tape.inputs), ("point",) * len(tape.outputs))
+        self._program = _BlockProgram(tape, points)
 
-    def write(result: int, component: int, value: Any) -> None:
-        results[result][component, lanes] = value
+    def __call__(self, *arguments: Array) -> list[Array]:
+        """Evaluate the batch; see ``Kernel``."""
+        return evaluate_lanes(self.tape, arguments, self._evaluate)
 
-    return read, write
+    def _evaluate(self, arguments: Sequence[Array], n: int) -> list[Array]:
+        results = [np.empty((width, 1, n)) for width in self.tape.outputs]
+        self._program.run([argument[:, None] for argument in arguments], results, 1, n)
+        return [result[:, 0] for result in results]
+
+
+class InterpretedGridKernel(GridKernel):
+    """A tape with a grid evaluated by NumPy."""
+
+    def __init__(self, tape: Tape) -> None:
+        super().__init__(tape)
+        self._program = _BlockProgram(tape, self.grid)
+
+    def __call__(self, *arguments: Array, out: Sequence[Array]) -> None:
+        """Evaluate the grid; see ``GridKernel``."""
+        self._program.run(arguments, out, *check_grid(self.tape, self.grid, arguments, out))
 
 
 def _allocate(tape: Tape) -> tuple[int, list[Bind]]:

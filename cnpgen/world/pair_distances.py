@@ -1,7 +1,8 @@
 """Signed distances of pairs of convex bodies along a path: at its states, and over the intervals between them.
 
-The signed distance of two convex bodies is the maximum over unit vectors of their separation along it
-(``cnpgen.world.separation``). Every direction therefore bounds the distances at all states from below.
+The signed distance of two convex bodies (minus the penetration depth if they overlap) is the maximum over unit vectors
+u of their separation ``min over a of u . a - max over b of u . b``. Every direction therefore bounds the distances at
+all states from below.
 """
 
 import math
@@ -12,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.world.certified import PlacedBody
+from cnpgen.world.certified import CertifiedDistance, PlacedBody
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -89,6 +90,21 @@ def clear_states(
 
 
 @dataclass(frozen=True)
+class ClosestPoints:
+    """Smallest signed distance between bodies at K states.
+
+    Attributes:
+        distance: Smallest distance of all pairs [m], minus the penetration depth if they overlap, shape (K,).
+        pair: Index of the pair with this distance, shape (K,).
+        points: Points of the two bodies at this distance, in the world frame [m], shape (K, 2, 3).
+    """
+
+    distance: Array
+    pair: NDArray[np.intp]
+    points: Array
+
+
+@dataclass(frozen=True)
 class PairDistances:
     """Signed distances of M pairs of convex bodies at K states.
 
@@ -132,6 +148,35 @@ class PairDistances:
     def clear_states(self, min_distance: float) -> NDArray[np.bool_]:
         """Return a mask of the states at which all pairs reach a minimum distance [m], shape (K,)."""
         return clear_states(self.bounds, min_distance, self.measure, self.separation)
+
+    def smallest_per_state(self) -> tuple[Array, Indices]:
+        """Find the smallest distance at each state, with pairs in the order of their bounds.
+
+        Returns:
+            Distances [m] and indices of their pairs, shape (K,) each.
+        """
+        count = self.bounds.shape[1]
+        distances, closest = np.full(count, np.inf), np.zeros(count, np.intp)
+        order = np.argsort(self.bounds, axis=0)
+        for k in range(count):
+            for pair in order[:, k].tolist():
+                if self.bounds[pair, k] >= distances[k]:
+                    break
+                distance, _ = self.measure(pair, k)
+                if distance < distances[k]:
+                    distances[k], closest[k] = distance, pair
+        return distances, closest
+
+    def closest_points(self, radius: float = 0.0) -> ClosestPoints:
+        """Measure the smallest distance at every state, unlike ``smallest``; a radius [m] extends the first bodies."""
+        certified, points = CertifiedDistance(), list[tuple[Array, Array]]()
+        distance, closest = self.smallest_per_state()
+        for k, pair in enumerate(closest.tolist()):
+            (a, pose_a), (b, pose_b) = self.bodies(pair, k)
+            _, normal = certified.between(a, pose_a, b, pose_b)  # nan if Coal finds no direction
+            point_a, point_b = certified.witnesses()
+            points.append((point_a + (a.radius + radius) * normal, point_b - b.radius * normal))
+        return ClosestPoints(distance - radius, closest, np.array(points))
 
     def interval_bounds(self, min_distances: Array, displacements: Array, deviations: Array) -> Array:
         """Bound by how much all distances exceed a minimum between neighboring states [m], shape (K - 1,).

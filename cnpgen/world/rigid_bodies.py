@@ -1,12 +1,12 @@
 """Distances of the convex parts of a robot's links from obstacles and from each other."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.robots.shape.convex_part import Contacts
 from cnpgen.robots.shape.hull import ball_round
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.solid import Solid, same_shape
@@ -23,28 +23,6 @@ NO_HELD_SHAPE = (
     "a constraint needs the geometry of the links and a held object: the problem needs [object], and <collision>"
     " elements in its URDF"
 )
-
-
-@dataclass(frozen=True)
-class Contacts:
-    """C pairs of bodies that are close to each other at a state.
-
-    Attributes:
-        pair: Indices of the pairs, shape (C,).
-        k: Indices of the states, shape (C,).
-        distance: Signed distances [m], shape (C,).
-        normal: Unit vectors from the first body to the second in the world frame, shape (C, 3).
-        points: Closest points of the hulls of the first and the second body, without their radii, in the world frame
-            [m], shape (C, 2, 3).
-        joints: Indices of the joints that move the bodies, shape (C, 2); 0 for fixed bodies.
-    """
-
-    pair: NDArray[np.intp]
-    k: NDArray[np.intp]
-    distance: Array
-    normal: Array
-    points: Array
-    joints: NDArray[np.intp]
 
 
 class RigidBodies:
@@ -136,9 +114,8 @@ class RigidBodies:
         pair, k, distance, direction, points = (np.array(column) for column in columns)
         pair, k = pair.astype(np.intp), k.astype(np.intp)
         frames = np.array(self._frames, np.intp)[pairs[pair]]
-        joints = self.joints_of(pairs[pair])
         normal = np.einsum("cij,cj->ci", self._rotations[frames[:, 0], ..., k], direction.reshape(-1, 3))
-        return Contacts(pair, k, distance, normal, points.reshape(-1, 2, 3), joints)
+        return Contacts(pair, k, distance, normal, points.reshape(-1, 2, 3))
 
     def joints_of(self, bodies: Pairs) -> NDArray[np.intp]:
         """Return the indices of the joints that move bodies; 0 for fixed bodies."""

@@ -12,7 +12,6 @@ from cnpgen.judges.plans.measure import MeasuredCondition, measure, name_part
 from cnpgen.problems.constraints.clearance import DistanceConstraint
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.problem import Problem
-from cnpgen.world.closest_points import closest_points
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
 
@@ -123,7 +122,7 @@ def _distance_curves(problem: Problem, constraint: DistanceConstraint, world: Pa
     if not stated.g:
         return
     radius = (problem.arm_radius or 0.0) if constraint.bodies == "robot" and world.robot.shape is None else 0.0
-    closest = closest_points(world, constraint.bodies, radius=radius)
+    closest = world.pairs(constraint.bodies).closest_points(radius)
     count = len(closest.distance)
     least = np.full(count, 1e3 * (float(stated.lower[0]) - radius))
     names = [name_part(problem, constraint, stated, i) for i in range(len(stated.g))]
