@@ -178,13 +178,10 @@ def tape_from_function(
 
 def _check_dense(function: Any) -> None:
     """Raise ValueError for sparse arguments and results, whose components have no fixed position."""
-    for count, nnz, numel, label in (
-        (function.n_in(), function.nnz_in, function.numel_in, "argument"),
-        (function.n_out(), function.nnz_out, function.numel_out, "result"),
-    ):
-        for index in range(count):
-            if nnz(index) != numel(index):
-                raise ValueError(f"{function.name()}: {label} {index} is sparse; densify it")
+    sparse = [f"argument {i}" for i in range(function.n_in()) if not function.sparsity_in(i).is_dense()]
+    sparse += [f"result {i}" for i in range(function.n_out()) if not function.sparsity_out(i).is_dense()]
+    if sparse:
+        raise ValueError(f"{function.name()}: {sparse[0]} is sparse; densify it")
 
 
 def _check_grid(function: Any, grid: GridSpec | None) -> None:

@@ -81,18 +81,17 @@ class ForwardKinematics:
 
     def _check(self, q: Array, frames: Array) -> None:
         """Compare the first, the central and the last state with Pinocchio."""
-        checked = [0, q.shape[1] // 2, -1]
-        states, poses = q[:, checked].T.copy(), frames[-1][..., checked]
-        error = float(np.abs(poses - np.array([self._pinocchio_pose(state) for state in states]).T).max())
-        if error > MAX_POSE_ERROR * (1 + np.abs(states).max()):
-            raise MachineError(f"forward kinematics differ from Pinocchio's by {error:.2g} at one of {states.tolist()}")
-
-    def _pinocchio_pose(self, state: Array) -> Array:
-        """Return the pose of the last joint as Pinocchio computes it, shape (3, 4)."""
         import pinocchio as pin
 
-        pin.forwardKinematics(self._model, self._data, state)
-        return np.asarray(self._data.oMi[len(self._coefficients)].homogeneous[:3])
+        checked = [0, q.shape[1] // 2, -1]
+        states, poses = q[:, checked].T.copy(), frames[-1][..., checked]
+        expected = np.empty((len(states), 3, 4))
+        for pose, state in zip(expected, states, strict=True):
+            pin.forwardKinematics(self._model, self._data, state)
+            pose[:] = self._data.oMi[len(self._coefficients)].homogeneous[:3]
+        error = float(np.abs(poses - expected.T).max())
+        if error > MAX_POSE_ERROR * (1 + np.abs(states).max()):
+            raise MachineError(f"forward kinematics differ from Pinocchio's by {error:.2g} at one of {states.tolist()}")
 
 
 def joint_motion(model: "pin.Model", joint: int) -> Array:

@@ -15,11 +15,10 @@ from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.solid import Solid, place_obstacles
 from cnpgen.world.certified import PlacedBody, convex_body, placed_solid
 from cnpgen.world.forward_kinematics import ForwardKinematics
-from cnpgen.world.pair_distances import PairDistances
+from cnpgen.world.pair_distances import Indices, PairDistances
 from cnpgen.world.world import RobotWorld
 
 Array = NDArray[np.float64]
-States = slice | NDArray[np.intp]
 
 _CACHED = ("tip_rotation", "torque", "_tip_motion")  # of one path
 _AT_ORIGIN = np.eye(3), np.zeros(3)
@@ -168,7 +167,7 @@ class PathWorld(RobotWorld):
             a, b = pairs[pair][0][..., k].tolist()
             return self._collisions.segment_distance(a, b, pair % len(solids))
 
-        def separation_along(pair: int, direction: Array, states: States = slice(None), /) -> Array:
+        def separation_along(pair: int, direction: Array, states: Indices) -> Array:
             return separation(pairs[pair][0][..., states], pairs[pair][1], direction)
 
         def bodies_at(pair: int, k: int) -> tuple[PlacedBody, PlacedBody]:
@@ -184,7 +183,7 @@ class PathWorld(RobotWorld):
         def measure(pair: int, k: int) -> tuple[float, Array]:
             return self._collisions.object_distance(position[:, k].copy(), rotation[..., k].copy(), pair)
 
-        def separation_along(pair: int, direction: Array, states: States = slice(None), /) -> Array:
+        def separation_along(pair: int, direction: Array, states: Indices) -> Array:
             return cuboid_separation(position[:, states], rotation[..., states], size, solids[pair], direction)
 
         def bodies_at(pair: int, k: int) -> tuple[PlacedBody, PlacedBody]:

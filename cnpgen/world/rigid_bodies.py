@@ -82,7 +82,7 @@ class RigidBodies:
         def measure(pair: int, k: int) -> tuple[float, Array]:
             return self._measure(*bodies[pair], k)
 
-        def separation(pair: int, direction: Array, states: "slice | Pairs" = slice(None), /) -> Array:
+        def separation(pair: int, direction: Array, states: Pairs) -> Array:
             return self._separation(*bodies[pair], direction, states)
 
         def bodies_at(pair: int, k: int) -> tuple[PlacedBody, PlacedBody]:
@@ -150,7 +150,7 @@ class RigidBodies:
         frame = self._frames[body]
         return self._bodies[body], (self._rotations[frame, ..., k].copy(), self._positions[frame, :, k].copy())
 
-    def _separation(self, a: int, b: int, direction: Array, states: "slice | Pairs" = slice(None)) -> Array:
+    def _separation(self, a: int, b: int, direction: Array, states: Pairs) -> Array:
         """Compute the separation of b from a along a direction in the frame of a, at some states [m], shape (K,)."""
         (first, second), (frame, other) = (self._bodies[a], self._bodies[b]), (self._frames[a], self._frames[b])
         rotation, between = self._rotations[other], self._positions[other] - self._positions[frame]
