@@ -118,11 +118,8 @@ def statements(
 ) -> str:
     """Return C statements in single-assignment form; sine and cosine of one angle are computed together.
 
-    Args:
-        tape: The tape.
-        read: Returns the expression that reads a component of an argument.
-        write: Returns the statement that stores a component of a result.
-        numbers: Arguments that are never nan.
+    ``read`` and ``write`` return C code for a component of an argument or result; ``numbers`` are arguments that are
+    never nan.
     """
     lines: list[str] = []
     names: dict[int, str] = {}

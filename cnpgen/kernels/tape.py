@@ -134,13 +134,7 @@ class Tape:
 def tape_from_function(
     function: Any, loop: Loop | None = None, *, grid: GridSpec | None = None, dtype: Dtype = "float64"
 ) -> Tape:
-    """Flatten a CasADi SX function.
-
-    Args:
-        function: A ``casadi.Function`` of SX expressions; arguments and results are columns.
-        loop: The iteration, or None.
-        grid: The grid of evaluation points, or None for one point per lane.
-        dtype: Precision of the arithmetic.
+    """Flatten a CasADi SX function, whose arguments and results are columns.
 
     Raises:
         ValueError: The function uses an unsupported operation, or the grid does not match it.

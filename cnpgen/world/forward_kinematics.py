@@ -21,11 +21,7 @@ MAX_POSE_ERROR = 1e-9  # between our poses and Pinocchio's, relative to 1 + the 
 
 
 class ForwardKinematics:
-    """The forward kinematics of a model.
-
-    Args:
-        model: Model with revolute and prismatic joints only.
-    """
+    """The forward kinematics of a model with revolute and prismatic joints only."""
 
     def __init__(self, model: "pin.Model") -> None:
         self._model, self._data = model, model.createData()
@@ -36,10 +32,7 @@ class ForwardKinematics:
         self._slides = self._lengths[:, 1] > 0
 
     def poses(self, q: Array) -> tuple[Array, Array]:
-        """Compute the poses of all joints at K states.
-
-        Args:
-            q: Joint positions [rad], shape (n, K), K > 0.
+        """Compute the poses of all joints at K > 0 states q [rad], shape (n, K).
 
         Returns:
             ``(rotations, positions)``: rotation matrices in the world frame, that of the base first, shape

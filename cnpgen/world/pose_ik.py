@@ -78,10 +78,7 @@ class PoseKinematics:
         self._motions = [joint_motion(model, joint) for joint in range(1, model.njoints)]
 
     def evaluate(self, q: Array) -> tuple[Array, Array, Array]:
-        """Compute poses and Jacobians.
-
-        Args:
-            q: Joint positions [rad], shape (n, K).
+        """Compute poses and Jacobians at joint positions q [rad], shape (n, K).
 
         Returns:
             Positions [m], shape (K, 3); rotation matrices, shape (K, 3, 3); and Jacobians of linear and angular

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.kernels.collision.body_arrays import hull_vertices
+from cnpgen.kernels.collision.body_arrays import primitive_bodies
 from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CollisionChecker, load_collision_library
 from cnpgen.kernels.compiled_kernel import address_of
 from cnpgen.kernels.library import KernelLibrary
@@ -32,15 +32,6 @@ Array = NDArray[np.float64]
 SOURCES = [Path(__file__).with_name(name) for name in ("convex.c", "collision.c", "clearance_loss.c")]
 
 
-class _SampleObstacles(ctypes.Structure):
-    """``sample_obstacles`` of clearance_loss.c."""
-
-    _fields_ = (
-        ("bodies", c_long),
-        *((name, c_void_p) for name in ("kind", "center", "rotation", "size", "first", "count", "vertices")),
-    )
-
-
 def load_clearance_loss(kernels: KernelLibrary, robot: Robot) -> "ClearanceLoss | ClearanceLossReference":
     """Load the losses of a robot, by Pinocchio and Coal where kernels are not compiled.
 
@@ -55,18 +46,11 @@ def load_clearance_loss(kernels: KernelLibrary, robot: Robot) -> "ClearanceLoss 
 
 
 class ClearanceLoss:
-    """Losses of states of one robot among obstacles that differ from sample to sample.
-
-    Args:
-        library: Library of ``SOURCES``.
-        robot: The robot, with link geometry.
-    """
+    """Losses of states of one robot with link geometry among obstacles that differ from sample to sample."""
 
     def __init__(self, library: ctypes.CDLL, robot: Robot) -> None:
         library.clearance_losses.restype = None
-        library.clearance_losses.argtypes = (
-            c_void_p, c_void_p, c_long, c_long, c_void_p, c_double, c_void_p, c_void_p,
-        )  # fmt: skip
+        library.clearance_losses.argtypes = (c_void_p, c_long, c_long, c_void_p, c_double, c_void_p, c_void_p)
         self._library, self._checker = library, CollisionChecker(library, robot)
 
     def __call__(self, q: Array, obstacles: Primitives, required: float) -> tuple[Array, Array]:
@@ -81,19 +65,13 @@ class ClearanceLoss:
             Losses, shape (K, N), and their gradients, shape (K, n, N); nan for states that are not finite.
         """
         nodes, n, samples = q.shape
-        vertices = [self._checker.vertices, *(hull_vertices(mesh.corners) for mesh in obstacles.meshes)]
-        lengths = np.array([len(each) for each in vertices])
-        parts = [
-            *(obstacles.kinds, obstacles.centers, obstacles.rotations, obstacles.sizes),
-            *(np.cumsum(lengths)[:-1], lengths[1:] // 3, np.concatenate(vertices)),
-        ]
-        keep = [np.ascontiguousarray(part) for part in parts]
-        structure = _SampleObstacles(obstacles.kinds.shape[1], *map(address_of, keep))
+        checker, (bodies, vertices, boxes) = self._checker, primitive_bodies(obstacles, len(self._checker.vertices))
+        arrays = bodies, boxes, np.concatenate([checker.vertices, vertices])
+        scene = checker.scene_of(*map(address_of, arrays), bodies.shape[1], boxes.shape[2])
         states = np.ascontiguousarray(q, np.float64)
         losses, gradients = np.empty((nodes, samples)), np.empty((nodes, n, samples))
         self._library.clearance_losses(
-            self._checker.address,
-            ctypes.addressof(structure),
+            ctypes.addressof(scene),
             samples,
             nodes,
             address_of(states),

@@ -129,6 +129,13 @@ class CollisionChecker:
         """Address of the scene for functions in C; valid until the obstacles change."""
         return ctypes.addressof(self._scene)
 
+    def scene_of(self, obstacles: int, boxes: int, vertices: int, count: int, lanes: int) -> _RobotScene:
+        """Return a copy of the scene with the addresses and numbers of other obstacles, for functions in C."""
+        scene = _RobotScene.from_buffer_copy(self._scene)
+        scene.obstacles, scene.boxes, scene.vertices = obstacles, boxes, vertices
+        scene.n_obstacles, scene.lanes = count, lanes
+        return scene
+
     def clear_states(
         self, q: Array, *, obstacle_distance: float | None = 0.0, self_distance: float | None = 0.0
     ) -> NDArray[np.bool_]:

@@ -168,13 +168,8 @@ def upright_box_separation(center: Vec, rotation: list[Vec], size: tuple[float, 
     It is exact for an upright cuboid that overlaps the box: the face normals of both are then all separating axes. If
     they do not overlap it is a lower bound of the distance. For a tilted cuboid it is a lower bound up to terms of the
     order of depth x tilt^2, because tilted axes and cross products of edges are not tested. Contacts then appear deeper
-    by at most tilt [rad] x the length of the largest edge (2.8 mm at 0.01 rad for 0.3 m).
-
-    Args:
-        center: Center of the cuboid [m].
-        rotation: Rows of its rotation matrix.
-        size: Edge lengths of the cuboid [m].
-        box: Bounds of the box along x, y, z [m]; None for an unbounded side.
+    by at most tilt [rad] x the length of the largest edge (2.8 mm at 0.01 rad for 0.3 m). The cuboid has a center [m],
+    rows of a rotation matrix and edge lengths [m].
     """
     import casadi as ca
 
@@ -200,11 +195,7 @@ def upright_box_separation(center: Vec, rotation: list[Vec], size: tuple[float, 
 def cuboid_separation(center: Vec, axes: list[Vec], half: Vec, other: Vec) -> Scalar:
     """Return the largest separation of two cuboids along their 15 separating axes [m].
 
-    Args:
-        center: Center of the first cuboid in the frame of the second [m].
-        axes: Axes of the first cuboid in that frame.
-        half: Half edge lengths of the first cuboid [m].
-        other: Half edge lengths of the second cuboid [m].
+    Center [m] and axes of the first cuboid are in the frame of the second; both have half edge lengths [m].
     """
     import casadi as ca
 
