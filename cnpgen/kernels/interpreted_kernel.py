@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from cnpgen.kernels.kernel import Array, GridKernel, Kernel, axis_names, check_grid, evaluate_lanes
-from cnpgen.kernels.tape import NAMES, OPERATIONS, GridSpec, Tape
+from cnpgen.kernels.tape import NAMES, OPERATIONS, Axes, GridSpec, Tape
 
 POINTS_PER_BLOCK = 8192  # lanes or points; smaller blocks cost more interpreter time, larger ones exceed the cache
 
@@ -33,12 +33,28 @@ Read = Callable[[int, int], Any]  # component of an argument, for the lanes of a
 Write = Callable[[int, int, Any], None]  # stores a component of a result
 
 
-class _LaneBlock:
-    """A program bound to the work rows of a block of lanes, with functions that read and write its present lanes."""
+Step = tuple[str, int, tuple[Any, ...]]  # operation; row of its result; rows of its operands, or numbers
 
-    def __init__(self, program: "list[Bind]", rows: list[Array]) -> None:
+
+class _LaneBlock:
+    """A program bound to the work rows of a block of lanes, which halves its interpreter time.
+
+    Functions read and write the present lanes.
+    """
+
+    def __init__(self, program: list[Step], rows: list[Array]) -> None:
         self.rows = rows
-        self._steps = [bind(self) for bind in program]
+        self._steps = [self._bound(*step) for step in program]
+
+    def _bound(self, name: str, row: int, operands: tuple[Any, ...]) -> Callable[[], Any]:
+        if name == "INPUT":
+            return partial(self._load, row, *operands)
+        if name == "OUTPUT":
+            return partial(self._store, *operands)
+        return partial(_APPLY[name], *map(self._value, operands), self.rows[row])
+
+    def _value(self, operand: int | float) -> Any:
+        return self.rows[operand] if isinstance(operand, int) else operand
 
     def run(self, read: Read, write: Write) -> None:
         """Run the program."""
@@ -46,16 +62,11 @@ class _LaneBlock:
         for step in self._steps:
             step()
 
-    def load(self, row: int, argument: int, component: int) -> None:
-        """Fill a row with a component of an argument."""
+    def _load(self, row: int, argument: int, component: int) -> None:
         np.copyto(self.rows[row], self._read(argument, component))
 
-    def store(self, result: int, component: int, operand: "int | float") -> None:
-        """Store a row or a number as a component of a result."""
-        self._write(result, component, self.rows[operand] if isinstance(operand, int) else operand)
-
-
-Bind = Callable[[_LaneBlock], Callable[[], Any]]  # binding a step to its rows once halves its interpreter time
+    def _store(self, result: int, component: int, operand: int | float) -> None:
+        self._write(result, component, self._value(operand))
 
 
 class _BlockProgram:
@@ -103,8 +114,8 @@ class InterpretedKernel(Kernel):
 
     def __init__(self, tape: Tape) -> None:
         super().__init__(tape)
-        points = GridSpec(("point",) * len(tape.inputs), ("point",) * len(tape.outputs))
-        self._program = _BlockProgram(tape, points)
+        every: Axes = "point"
+        self._program = _BlockProgram(tape, GridSpec((every,) * len(tape.inputs), (every,) * len(tape.outputs)))
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate the batch; see ``Kernel``."""
@@ -128,55 +139,34 @@ class InterpretedGridKernel(GridKernel):
         self._program.run(arguments, out, *check_grid(self.tape, self.grid, arguments, out))
 
 
-def _allocate(tape: Tape) -> tuple[int, list[Bind]]:
-    """Assign a work row to every value, reusing rows of dead values; bind instructions to their operands."""
+def _allocate(tape: Tape) -> tuple[int, list[Step]]:
+    """Assign a work row to every value, reusing rows of dead values; return the number of rows and the program."""
+    columns = tape.operation.tolist(), tape.a.tolist(), tape.b.tolist(), tape.constant.tolist()
     last = np.zeros(len(tape), int)
-    names = [NAMES[code] for code in tape.operation]
-    for k, name in enumerate(names):
-        for operand in _operands(tape, k, name):
-            last[operand] = k
+    for k, (code, a, b, _) in enumerate(zip(*columns, strict=True)):
+        last[[a, b][: OPERATIONS[NAMES[code]]]] = k
     free: list[int] = []
     place: dict[int, Any] = {}  # value -> row, or the constant itself
     count = 0
-    program: list[Bind] = []
-    for k, name in enumerate(names):
+    program: list[Step] = []
+    for k, (code, a, b, constant) in enumerate(zip(*columns, strict=True)):
+        name = NAMES[code]
         if name == "CONST":
-            place[k] = float(tape.constant[k])  # a Python number does not promote float32
+            place[k] = constant  # a Python number does not promote float32
             continue
-        operands = [place[operand] for operand in _operands(tape, k, name)]
-        dying = {operand for operand in _operands(tape, k, name) if last[operand] == k}
+        operands = (a, b)[: OPERATIONS[name]]
+        places = tuple(place[operand] for operand in operands)
+        dying = {operand for operand in operands if last[operand] == k}
         free.extend(place[operand] for operand in dying if isinstance(place[operand], int))
         if name == "OUTPUT":
-            program.append(_bind_method(_LaneBlock.store, int(tape.b[k]), int(tape.constant[k]), operands[0]))
+            program.append((name, -1, (b, int(constant), *places)))
             continue
         place[k] = row = free.pop() if free else count
         count = max(count, row + 1)
-        load = name == "INPUT"
-        program.append(
-            _bind_method(_LaneBlock.load, row, int(tape.a[k]), int(tape.b[k])) if load else _bind(name, operands, row)
-        )
+        program.append((name, row, (a, b) if name == "INPUT" else places))
         if last[k] == 0:
             free.append(row)
     return max(count, 1), program
-
-
-def _operands(tape: Tape, k: int, name: str) -> list[int]:
-    return [int(tape.a[k]), int(tape.b[k])][: OPERATIONS[name]]
-
-
-def _bind_method(method: Callable[..., None], *arguments: float) -> Bind:
-    return lambda block: partial(method, block, *arguments)
-
-
-def _bind(name: str, operands: list[Any], row: int) -> Bind:
-    apply = _APPLY[name]
-
-    def bind(block: _LaneBlock) -> Callable[[], Any]:
-        rows = block.rows
-        values = (rows[operand] if isinstance(operand, int) else operand for operand in operands)
-        return partial(apply, *values, rows[row])
-
-    return bind
 
 
 class MappedKernel(Kernel):
