@@ -65,20 +65,14 @@ class ClearanceLoss:
             Losses, shape (K, N), and their gradients, shape (K, n, N); nan for states that are not finite.
         """
         nodes, n, samples = q.shape
-        checker, (bodies, vertices, boxes) = self._checker, primitive_bodies(obstacles, len(self._checker.vertices))
-        arrays = bodies, boxes, np.concatenate([checker.vertices, vertices])
-        scene = checker.scene_of(*map(address_of, arrays), bodies.shape[1], boxes.shape[2])
+        checker = self._checker
+        bodies, vertices, boxes = primitive_bodies(obstacles, len(checker.vertices))
+        vertices = np.concatenate([checker.vertices, vertices])
+        scene = checker.scene_of(bodies, boxes, vertices)
         states = np.ascontiguousarray(q, np.float64)
         losses, gradients = np.empty((nodes, samples)), np.empty((nodes, n, samples))
-        self._library.clearance_losses(
-            ctypes.addressof(scene),
-            samples,
-            nodes,
-            address_of(states),
-            required,
-            address_of(losses),
-            address_of(gradients),
-        )
+        arrays = address_of(states), required, address_of(losses), address_of(gradients)
+        self._library.clearance_losses(ctypes.addressof(scene), samples, nodes, *arrays)
         return losses, gradients
 
 

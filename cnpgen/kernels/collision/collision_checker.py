@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.collision.body_arrays import BODY, hull_vertices, obstacle_bodies
+from cnpgen.kernels.collision.body_arrays import BODY, Bodies, hull_vertices, obstacle_bodies
 from cnpgen.kernels.compiled_kernel import address_of
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.robots.obstacle import Obstacle
@@ -129,11 +129,11 @@ class CollisionChecker:
         """Address of the scene for functions in C; valid until the obstacles change."""
         return ctypes.addressof(self._scene)
 
-    def scene_of(self, obstacles: int, boxes: int, vertices: int, count: int, lanes: int) -> _RobotScene:
-        """Return a copy of the scene with the addresses and numbers of other obstacles, for functions in C."""
+    def scene_of(self, bodies: Bodies, boxes: Array, vertices: Array) -> _RobotScene:
+        """Return a copy of the scene with other obstacles for functions in C; the caller keeps their arrays."""
         scene = _RobotScene.from_buffer_copy(self._scene)
-        scene.obstacles, scene.boxes, scene.vertices = obstacles, boxes, vertices
-        scene.n_obstacles, scene.lanes = count, lanes
+        scene.obstacles, scene.boxes, scene.vertices = map(address_of, (bodies, boxes, vertices))
+        scene.n_obstacles, scene.lanes = bodies.shape[-1], boxes.shape[-1]
         return scene
 
     def clear_states(
