@@ -55,7 +55,8 @@ class CollisionWorld:
         self._solids = list(solids)
         if not same:
             self._transforms = [coal.Transform3s() for _ in solids]
-            self._boxes = [_coal_box(solid) if isinstance(solid, Box) else None for solid in solids]
+            sizes = [np.ptp(solid.corners, axis=0) if isinstance(solid, Box) else None for solid in solids]
+            self._boxes = [None if size is None else coal.Box(*size) for size in sizes]
             self._bodies = [
                 None if isinstance(solid, Box) else convex_body(solid.corners, solid.radius) for solid in solids
             ]
@@ -131,9 +132,3 @@ class CollisionWorld:
             return distance
         self._result.clear()  # otherwise Coal keeps the smallest distance of earlier calls
         return float(measure(self._transform, self._transforms[obstacle], self._request, self._result))
-
-
-def _coal_box(box: Box) -> Any:
-    import coal
-
-    return coal.Box(*np.ptp(box.corners, axis=0))

@@ -62,12 +62,7 @@ class PoseTolerance:
 
 
 class PoseKinematics:
-    """Poses and Jacobians of a frame of a robot at many states.
-
-    Args:
-        robot: The robot.
-        frame: Index of the frame in Pinocchio's model; the tip by default.
-    """
+    """Poses and Jacobians of a frame of a robot at many states: of a frame of Pinocchio's model, by default the tip."""
 
     def __init__(self, robot: Robot, frame: int | None = None) -> None:
         model = robot.model
@@ -106,12 +101,8 @@ def solve_pose_ik(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Search joint positions with given poses, one for each seed.
 
-    Args:
-        kinematics: Kinematics of the frame.
-        positions: Wanted positions [m], shape (K, 3).
-        rotations: Wanted rotation matrices, shape (K, 3, 3).
-        seeds: Joint positions at which the iteration starts [rad], shape (n, K).
-        tolerance: Accepted differences from the poses; by default none.
+    Positions [m] have shape (K, 3), rotation matrices (K, 3, 3), and the seeds, joint positions at which the iteration
+    starts [rad], (n, K). By default no differences from the poses are accepted.
 
     Returns:
         Joint positions within their limits [rad], shape (n, K), and the mask of those that have their pose, shape (K,).
