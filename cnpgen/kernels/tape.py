@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -91,16 +91,9 @@ class Tape:
 
     def to_bytes(self) -> bytes:
         """Serialize with a checksum; equal tapes have equal bytes."""
-        header = {
-            "name": self.name,
-            "inputs": self.inputs,
-            "outputs": self.outputs,
-            "loop": (self.loop.tolerance, self.loop.limit) if self.loop else None,
-            "grid": (self.grid.arguments, self.grid.results) if self.grid else None,
-            "dtype": self.dtype,
-        }
+        header = {name: getattr(self, name) for name in ("name", "inputs", "outputs", "loop", "grid", "dtype")}
         columns = [getattr(self, name).astype(kind).tobytes() for name, kind in STORED_TYPES.items()]
-        content = b"".join([json.dumps(header).encode(), b"\n", *columns])
+        content = b"".join([json.dumps(header, default=astuple).encode(), b"\n", *columns])
         return hashlib.sha256(content).digest() + content
 
     @classmethod
