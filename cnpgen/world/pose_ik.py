@@ -152,14 +152,7 @@ def rotation_matrices(vectors: Array) -> Array:
 
 def rotation_vectors(rotations: Array) -> Array:
     """Return the rotation vectors of rotation matrices [rad], shape (K, 3)."""
-    skew = np.stack(
-        [
-            rotations[:, 2, 1] - rotations[:, 1, 2],
-            rotations[:, 0, 2] - rotations[:, 2, 0],
-            rotations[:, 1, 0] - rotations[:, 0, 1],
-        ],
-        axis=1,
-    )
+    skew = rotations[:, [2, 0, 1], [1, 2, 0]] - rotations[:, [1, 2, 0], [2, 0, 1]]
     sine = np.linalg.norm(skew, axis=1) / 2
     angle = np.arctan2(sine, (np.trace(rotations, axis1=1, axis2=2) - 1) / 2)
     factor = np.where(sine > 1e-9, angle / np.maximum(2 * sine, 1e-12), 0.5)
