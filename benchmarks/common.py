@@ -8,10 +8,9 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
-from cnpgen.machine.versions import __version__, installed_version
+from cnpgen.machine.versions import __version__, installed_version, processor_entry
 
 LIBRARIES = ("numpy", "scipy", "casadi", "pin", "coal", "h5py", "joblib")
 ROBOT_RECIPES = ("panda-cup", "panda-scenes", "ur5-wipe")  # recipes of robots that come with the extra cnpgen[robots]
@@ -28,23 +27,15 @@ def arguments(text: str | None, add: Callable[[argparse.ArgumentParser], None]) 
 
 def machine() -> dict[str, Any]:
     """Describe the machine and its present load."""
-    lines = _cpuinfo()
-    flags = next((set(line.split()) for line in lines if line.startswith(("flags", "Features"))), set())
+    flags = processor_entry("flags", "features").split()
     return {
         "cores": os.cpu_count(),
-        "cpu": next(
-            (line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine()
-        ),
+        "cpu": processor_entry("model name").strip() or platform.machine(),
         "instructions": next((name for name in INSTRUCTION_SETS if name in flags), platform.machine()),
         "load": round(os.getloadavg()[0], 2),
         "python": platform.python_version(),
         "versions": {"cnpgen": __version__} | {name: installed_version(name) or "not installed" for name in LIBRARIES},
     }
-
-
-def _cpuinfo() -> list[str]:
-    path = Path("/proc/cpuinfo")
-    return path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
 
 
 def machine_line() -> str:

@@ -60,7 +60,9 @@ def bridge_names() -> dict[str, tuple[str, str]]:
         for file in [single] if single.is_file() else sorted((folder / framework).glob("*.py")):
             public = _imported(folder / framework / "__init__.py") if file != single else None
             for node in ast.parse(file.read_text("utf-8")).body:
-                if isinstance(node, ast.ClassDef | ast.FunctionDef) and (public is None or node.name in public):
+                if not isinstance(node, ast.ClassDef | ast.FunctionDef) or node.name.startswith("_"):
+                    continue
+                if public is None or node.name in public:
                     kind = "class" if isinstance(node, ast.ClassDef) else "function"
                     names[f"cnpgen.interop.{framework}.{node.name}"] = kind, ast.get_docstring(node) or ""
     return dict(sorted(names.items()))

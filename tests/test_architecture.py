@@ -35,7 +35,7 @@ SOLVERS = ("kernels", "pipelines", "losses", "refine", "planner")
 INDEPENDENT = {"judges": SOLVERS, "world": SOLVERS, "benchmark.simulator": SOLVERS}
 HEAVY = ("casadi", "pinocchio", "coal", "h5py", "joblib", "scipy", "matplotlib", "daqp", "mujoco", "imageio", "ompl")
 FRAMEWORKS = ("torch", "jax", "tensorflow")
-BRIDGES = ("interop.tensorflow",)  # bridges of one file; users import them
+BRIDGES = ("interop.jax", "interop.tensorflow")  # bridges of one file; users import them
 MODULES = sorted(
     path.relative_to(PACKAGE).with_suffix("") for path in PACKAGE.rglob("*.py") if "_recipes" not in path.parts
 )

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import DatasetError
-from cnpgen.machine.versions import installed_version, versions
+from cnpgen.machine.versions import installed_version, processor_entry, versions
 from cnpgen.store.files.atomic import read_file, write_file
 from cnpgen.store.files.document_structure import ANY_KEY, TEXT, WHOLE, check_structure
 from cnpgen.store.files.documents import parse_json
@@ -82,9 +82,4 @@ def save_runs(folder: Path, runs: Sequence[RunRecord]) -> None:
 
 
 def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        lines = []
-    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(names, platform.machine())
+    return processor_entry("model name").strip() or platform.machine()

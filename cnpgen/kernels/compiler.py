@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import MachineError
+from cnpgen.machine.versions import processor_entry
 from cnpgen.store.files.cache_folder import default_cache_folder, temporary_folder
 
 _LINKER_FLAGS = ("-Wl,-undefined,dynamic_lookup",) if platform.system() == "Darwin" else ()  # for Python's C API
@@ -154,10 +155,7 @@ def kill_compilers() -> None:
 @cache
 def target() -> str:
     """Return a name of the instruction set that kernels are compiled for, so that a cache may be shared by machines."""
-    flags = ""
-    if Path("/proc/cpuinfo").exists():
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
-        flags = next((line.split(":", 1)[1] for line in lines if line.lower().startswith(("flags", "features"))), "")
+    flags = processor_entry("flags", "features")
     return f"{platform.system()}-{platform.machine()}-{hashlib.sha256(flags.encode()).hexdigest()[:8]}"
 
 

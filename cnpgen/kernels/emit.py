@@ -9,16 +9,14 @@ from cnpgen.kernels.tape import NAMES, GridSpec, Tape
 
 VECTORS = Path(__file__).with_name("vectors.h")
 
-_UNARY = {
+_EXPRESSIONS = {  # of one operand or two
     "NEG": "-{}", "SQ": "{0}*{0}", "TWICE": "{0}+{0}", "INV": "one/{}", "SQRT": "vsqrt({})", "FABS": "vabs({})",
     "SIGN": "vsign({})", "NOT": "vnot({})", "EXP": "vexp({})",
-}  # fmt: skip
-_BINARY = {
     "ADD": "{}+{}", "SUB": "{}-{}", "MUL": "{}*{}", "DIV": "{}/{}", "FMIN": "vmin({},{})", "FMAX": "vmax({},{})",
     "LT": "vlt({},{})", "LE": "vle({},{})", "EQ": "veq({},{})", "NE": "vne({},{})", "AND": "vand({},{})",
     "OR": "vor({},{})", "IF_ELSE_ZERO": "vsel({},{})",
 }  # fmt: skip
-_BINARY_WITHOUT_NAN = {"FMIN": "lesser({},{})", "FMAX": "larger({},{})"}  # one instruction if the second is not nan
+_WITHOUT_NAN = {"FMIN": "lesser({},{})", "FMAX": "larger({},{})"}  # one instruction if the second is not nan
 
 
 def prelude(dtype: str) -> str:
@@ -120,11 +118,8 @@ def statements(
 ) -> str:
     """Return C statements in single-assignment form; sine and cosine of one angle are computed together.
 
-    Args:
-        tape: The tape.
-        read: Returns the expression that reads a component of an argument.
-        write: Returns the statement that stores a component of a result.
-        numbers: Arguments that are never nan.
+    ``read`` and ``write`` return C code for a component of an argument or result; ``numbers`` are arguments that are
+    never nan.
     """
     lines: list[str] = []
     names: dict[int, str] = {}
@@ -149,12 +144,10 @@ def statements(
         if name == "INPUT":
             expression = read(a, b)
             never_nan |= {k} if a in numbers else set()
-        elif name in _UNARY:
-            expression = _UNARY[name].format(names[a])
         else:
-            templates = _BINARY_WITHOUT_NAN if name in _BINARY_WITHOUT_NAN and b in never_nan else _BINARY
+            templates = _WITHOUT_NAN if name in _WITHOUT_NAN and b in never_nan else _EXPRESSIONS
             expression = templates[name].format(names[a], names[b])
-            never_nan |= {k} if name in _BINARY_WITHOUT_NAN and never_nan & {a, b} else set()
+            never_nan |= {k} if name in _WITHOUT_NAN and never_nan & {a, b} else set()
         names[k] = f"t{k}"
         lines.append(f"v t{k}={expression};")
     return "\n".join(lines)

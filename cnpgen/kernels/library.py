@@ -17,9 +17,8 @@ import numpy as np
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.kernels.compiled_kernel import CompiledGridKernel, CompiledKernel, compile_source, compile_tape
 from cnpgen.kernels.compiler import require_compiler
-from cnpgen.kernels.interpreted_kernel import InterpretedGridKernel, InterpretedKernel
+from cnpgen.kernels.interpreted_kernel import InterpretedGridKernel, InterpretedKernel, MappedGridKernel, MappedKernel
 from cnpgen.kernels.kernel import GridKernel, Kernel
-from cnpgen.kernels.mapped_kernel import MappedGridKernel, MappedKernel
 from cnpgen.kernels.parallel_compilation import CompilerPool
 from cnpgen.kernels.tape import CODES, Dtype, GridSpec, Loop, Tape, tape_from_function
 from cnpgen.schema.registry import package_digest

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -91,16 +91,9 @@ class Tape:
 
     def to_bytes(self) -> bytes:
         """Serialize with a checksum; equal tapes have equal bytes."""
-        header = {
-            "name": self.name,
-            "inputs": self.inputs,
-            "outputs": self.outputs,
-            "loop": (self.loop.tolerance, self.loop.limit) if self.loop else None,
-            "grid": (self.grid.arguments, self.grid.results) if self.grid else None,
-            "dtype": self.dtype,
-        }
+        header = {name: getattr(self, name) for name in ("name", "inputs", "outputs", "loop", "grid", "dtype")}
         columns = [getattr(self, name).astype(kind).tobytes() for name, kind in STORED_TYPES.items()]
-        content = b"".join([json.dumps(header).encode(), b"\n", *columns])
+        content = b"".join([json.dumps(header, default=astuple).encode(), b"\n", *columns])
         return hashlib.sha256(content).digest() + content
 
     @classmethod
@@ -134,13 +127,7 @@ class Tape:
 def tape_from_function(
     function: Any, loop: Loop | None = None, *, grid: GridSpec | None = None, dtype: Dtype = "float64"
 ) -> Tape:
-    """Flatten a CasADi SX function.
-
-    Args:
-        function: A ``casadi.Function`` of SX expressions; arguments and results are columns.
-        loop: The iteration, or None.
-        grid: The grid of evaluation points, or None for one point per lane.
-        dtype: Precision of the arithmetic.
+    """Flatten a CasADi SX function, whose arguments and results are columns.
 
     Raises:
         ValueError: The function uses an unsupported operation, or the grid does not match it.
@@ -178,13 +165,10 @@ def tape_from_function(
 
 def _check_dense(function: Any) -> None:
     """Raise ValueError for sparse arguments and results, whose components have no fixed position."""
-    for count, nnz, numel, label in (
-        (function.n_in(), function.nnz_in, function.numel_in, "argument"),
-        (function.n_out(), function.nnz_out, function.numel_out, "result"),
-    ):
-        for index in range(count):
-            if nnz(index) != numel(index):
-                raise ValueError(f"{function.name()}: {label} {index} is sparse; densify it")
+    sparse = [f"argument {i}" for i in range(function.n_in()) if not function.sparsity_in(i).is_dense()]
+    sparse += [f"result {i}" for i in range(function.n_out()) if not function.sparsity_out(i).is_dense()]
+    if sparse:
+        raise ValueError(f"{function.name()}: {sparse[0]} is sparse; densify it")
 
 
 def _check_grid(function: Any, grid: GridSpec | None) -> None:

@@ -12,6 +12,7 @@ those of the Cephes library. Errors are at most 2 ulp: of the exponential everyw
 #ifdef SINGLE
 typedef float real;
 typedef int integer;
+#define SUFFIX ps /* of instructions */
 #define ABS_MASK 0x7fffffff
 #define ROUNDING_SHIFT 12582912.0f /* 1.5 * 2^23: x + ROUNDING_SHIFT has the nearest integer in its last bits */
 #define TWO_OVER_PI 0.636619772f
@@ -28,6 +29,7 @@ typedef int integer;
 #else
 typedef double real;
 typedef long long integer;
+#define SUFFIX pd
 #define ABS_MASK 0x7fffffffffffffffLL
 #define ROUNDING_SHIFT 6755399441055744.0
 #define TWO_OVER_PI 0.63661977236758134308
@@ -55,42 +57,24 @@ typedef long long integer;
 #endif
 #endif
 
-#ifdef HAVE_BUILTINS
+#define PASTE(a, b, c, d) a##b##c##d
+#define FUNCTION(a, b, c, d) PASTE(a, b, c, d)
+#if defined(__AVX__) && !defined(HAVE_BUILTINS)
+#include <immintrin.h>
+#endif
 #ifdef __AVX512F__
 #define BYTES 64
-#ifdef SINGLE
-#define WIDE(name, ...) ({ wide none = none; __builtin_ia32_##name##ps512_mask(__VA_ARGS__, none, -1, 4); })
+#ifdef HAVE_BUILTINS
+#define WIDE(name, ...) ({ v none = none; FUNCTION(__builtin_ia32_, name, SUFFIX, 512_mask)(__VA_ARGS__, none, -1, 4); })
 #else
-#define WIDE(name, ...) ({ wide none = none; __builtin_ia32_##name##pd512_mask(__VA_ARGS__, none, -1, 4); })
-#endif
-#else
-#define BYTES 32
-#ifdef SINGLE
-#define WIDE(name, ...) __builtin_ia32_##name##ps256(__VA_ARGS__)
-#else
-#define WIDE(name, ...) __builtin_ia32_##name##pd256(__VA_ARGS__)
-#endif
-#endif
-typedef real wide __attribute__((vector_size(BYTES)));
-#elif defined(__AVX512F__)
-#include <immintrin.h>
-#define BYTES 64
-#ifdef SINGLE
-#define WIDE(name, ...) (v)_mm512_##name##_ps(__VA_ARGS__)
-typedef __m512 wide;
-#else
-#define WIDE(name, ...) (v)_mm512_##name##_pd(__VA_ARGS__)
-typedef __m512d wide;
+#define WIDE(name, ...) (v)FUNCTION(_mm512_, name, _, SUFFIX)(__VA_ARGS__)
 #endif
 #elif defined(__AVX__)
-#include <immintrin.h>
 #define BYTES 32
-#ifdef SINGLE
-#define WIDE(name, ...) (v)_mm256_##name##_ps(__VA_ARGS__)
-typedef __m256 wide;
+#ifdef HAVE_BUILTINS
+#define WIDE(name, ...) FUNCTION(__builtin_ia32_, name, SUFFIX, 256)(__VA_ARGS__)
 #else
-#define WIDE(name, ...) (v)_mm256_##name##_pd(__VA_ARGS__)
-typedef __m256d wide;
+#define WIDE(name, ...) (v)FUNCTION(_mm256_, name, _, SUFFIX)(__VA_ARGS__)
 #endif
 #else
 #define BYTES 16
@@ -110,9 +94,9 @@ I v pick(vi m, v a, v b) { return (v)((m & (vi)a) | (~m & (vi)b)); }
 I v vabs(v x) { return (v)((vi)x & ABS_MASK); }
 
 #ifdef WIDE
-I v vsqrt(v x) { return WIDE(sqrt, (wide)x); }
-I v lesser(v a, v b) { return WIDE(min, (wide)a, (wide)b); }
-I v larger(v a, v b) { return WIDE(max, (wide)a, (wide)b); }
+I v vsqrt(v x) { return WIDE(sqrt, x); }
+I v lesser(v a, v b) { return WIDE(min, a, b); }
+I v larger(v a, v b) { return WIDE(max, a, b); }
 #else
 #if defined(__aarch64__) && defined(SINGLE)
 I v vsqrt(v x) { return (v)vsqrtq_f32((float32x4_t)x); }

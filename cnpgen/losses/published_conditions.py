@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.kernels.symbolic.convex_distances import SMOOTHING_M2
 from cnpgen.kernels.symbolic.kinematics import forward_kinematics
 from cnpgen.kernels.symbolic.linalg import Vec, add, dot, scale, subtract
 from cnpgen.kernels.symbolic.obstacle_distances import SymbolicUprightBox, symbolic_solids
-from cnpgen.kernels.symbolic.segment_distance import SMOOTHING_M2
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.problems.constraints.axis import Vertical
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance

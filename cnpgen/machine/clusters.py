@@ -212,12 +212,9 @@ def _call(function: Callable[[T], R], task: T) -> R:
 
 @contextmanager
 def joined(name: str, address: str | None, workers: int | None) -> Iterator[Cluster]:
-    """Connect to a cluster, or start one on this machine, for the duration of the block.
+    """Connect to a cluster of dask or ray, or start one on this machine, for the duration of the block.
 
-    Args:
-        name: "dask" or "ray".
-        address: Address of the scheduler or head; None for a temporary cluster on this machine.
-        workers: Number of tasks that run at once; None for all workers of the cluster.
+    The number of tasks that run at once is that of the workers of the cluster by default.
 
     Raises:
         MissingExtraError: The package is not installed.

@@ -97,12 +97,10 @@ def assembled(engine: Engine, tasks: int, *, quick: bool = False) -> Iterator[Wo
         with joined(engine.name, engine.address, engine.workers) as cluster:
             yield cluster
         return
-    with _on_loky() if engine.name == "loky" else nullcontext():
+    backend: AbstractContextManager[object] = nullcontext()
+    if engine.name == "loky":
+        from joblib import parallel_config
+
+        backend = parallel_config(backend="loky")
+    with backend:
         yield LocalPool(worker_count(1 if quick and engine.workers is None else engine.workers, tasks))
-
-
-def _on_loky() -> AbstractContextManager[object]:
-    from joblib import parallel_config
-
-    config: AbstractContextManager[object] = parallel_config(backend="loky")
-    return config

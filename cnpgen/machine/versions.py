@@ -1,6 +1,7 @@
-"""Versions of cnpgen and of its numerical libraries."""
+"""Versions of cnpgen and of its numerical libraries, and the processor."""
 
 from functools import cache
+from pathlib import Path
 
 __version__ = "1.0.0"
 
@@ -26,3 +27,12 @@ def installed_version(project: str) -> str:
         return version(project)
     except PackageNotFoundError:
         return ""
+
+
+def processor_entry(*names: str) -> str:
+    """Return the first entry of the processor with one of the lower-case names in Linux, or an empty text."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return ""
+    return next((line.partition(":")[2] for line in lines if line.lower().startswith(names)), "")

@@ -50,14 +50,10 @@ def worker_count(workers: int | None, tasks: int) -> int:
 def distribute(
     function: Callable[[T], R], tasks: Iterable[T], workers: int, *, ordered: bool = False, hint: str = ""
 ) -> Generator[R, None, None]:
-    """Run a function on every task in other processes and yield the results.
+    """Run a function on every task in other processes, or in this one for one worker, and yield the results.
 
-    Args:
-        function: Function to run, picklable.
-        tasks: Arguments of the function, picklable.
-        workers: Number of processes; one for this process.
-        ordered: Whether results keep the order of the tasks; otherwise they are yielded when ready.
-        hint: Text that is appended to the error message.
+    Function and tasks must be picklable. Results are yielded in the order of the tasks, or when they are ready. A hint
+    is appended to the error message.
 
     Raises:
         MachineError: A worker died.

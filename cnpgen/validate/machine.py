@@ -16,7 +16,7 @@ from typing import Any
 
 from cnpgen.errors import PluginError
 from cnpgen.machine.threads import users_environment
-from cnpgen.machine.versions import installed_version
+from cnpgen.machine.versions import installed_version, processor_entry
 
 REQUIRED_MODULES = (
     "numpy", "scipy", "casadi", "pinocchio", "coal", "h5py", "joblib", "psutil", "tqdm", "daqp", "threadpoolctl",
@@ -200,11 +200,7 @@ def vector_instructions() -> str:
     """Return the widest vector instructions of the processor."""
     if platform.machine().lower() in {"arm64", "aarch64"}:
         return "neon"
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").lower().splitlines()
-    except OSError:
-        return "unknown"
-    flags = next((set(line.split()) for line in lines if line.startswith(("flags", "features"))), set[str]())
+    flags = set(processor_entry("flags", "features").lower().split())
     return next((name for flag, name in _VECTOR_FLAGS if flag in flags), "unknown")
 
 

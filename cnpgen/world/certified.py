@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.robots.shape.hull import coal_hull
+from cnpgen.robots.solid import Solid
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]  # rotation matrix of shape (3, 3), and origin [m], shape (3,)
@@ -47,6 +48,9 @@ class ConvexBody:
         return float((self.corners @ (direction @ rotation)).max() + self.radius + direction @ origin)
 
 
+PlacedBody = tuple[ConvexBody, Pose]
+
+
 def convex_body(corners: Array, radius: float = 0.0) -> ConvexBody:
     """Return the body of all points within ``radius`` of the hull of ``corners``; bodies of links are cached."""
     return _cached_body(corners.tobytes(), radius)
@@ -56,6 +60,11 @@ def convex_body(corners: Array, radius: float = 0.0) -> ConvexBody:
 def _cached_body(corners: bytes, radius: float) -> ConvexBody:
     points = np.frombuffer(corners).reshape(-1, 3)
     return ConvexBody(points, radius)
+
+
+def placed_solid(solid: Solid) -> PlacedBody:
+    """Return an obstacle as a body with its pose."""
+    return convex_body(solid.corners, solid.radius), (np.eye(3), solid.position)
 
 
 class CertifiedDistance:

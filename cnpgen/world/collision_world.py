@@ -31,22 +31,21 @@ class CollisionWorld:
 
     Args:
         object_size: Edge lengths of the held object [m], or None.
-        n_segments: Number of the robot's segments.
     """
 
-    def __init__(self, object_size: tuple[float, float, float] | None, n_segments: int) -> None:
+    def __init__(self, object_size: tuple[float, float, float] | None) -> None:
         import coal
 
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
         self._request.gjk_tolerance, self._request.epa_tolerance = GJK_TOLERANCE, EPA_TOLERANCE
         self._certified = CertifiedDistance()
-        self._capsules = [coal.Capsule(0.0, 1.0) for _ in range(n_segments)]
+        self._capsule = coal.Capsule(0.0, 1.0)
         self._object = (
             None if object_size is None else ConvexBody(CUBE * np.array(object_size), 0.0, coal.Box(*object_size))
         )
         self._transform = coal.Transform3s()
         self._solids, self._bodies, self._transforms = list[Solid](), list[ConvexBody | None](), list[Any]()
-        self._from_capsule, self._from_object = [list[Any]() for _ in self._capsules], list[Any]()
+        self._from_capsule, self._from_object = list[Any](), list[Any]()
 
     def place(self, solids: Sequence[Solid]) -> None:
         """Set the obstacles."""
@@ -56,11 +55,12 @@ class CollisionWorld:
         self._solids = list(solids)
         if not same:
             self._transforms = [coal.Transform3s() for _ in solids]
-            self._boxes = [_coal_box(solid) if isinstance(solid, Box) else None for solid in solids]
+            sizes = [np.ptp(solid.corners, axis=0) if isinstance(solid, Box) else None for solid in solids]
+            self._boxes = [None if size is None else coal.Box(*size) for size in sizes]
             self._bodies = [
                 None if isinstance(solid, Box) else convex_body(solid.corners, solid.radius) for solid in solids
             ]
-            self._from_capsule = [self._measures(capsule) for capsule in self._capsules]
+            self._from_capsule = self._measures(self._capsule)
             self._from_object = [] if self._object is None else self._measures(self._object.shape)
         for transform, solid in zip(self._transforms, solids, strict=True):
             transform.setTranslation(solid.position)
@@ -74,9 +74,9 @@ class CollisionWorld:
     def segment_distances(self, segments: Sequence[tuple[Point, Point]]) -> list[float]:
         """Measure the signed distance of every segment, two ends, from every obstacle, segment by segment [m]."""
         distances: list[float] = []
-        for index, (a, b) in enumerate(segments):
-            self._place_segment(index, a, b)
-            distances += self._measure(self._from_capsule[index])
+        for a, b in segments:
+            self._place_segment(a, b)
+            distances += self._measure(self._from_capsule)
         return distances
 
     def segment_distance(self, a: Point, b: Point, obstacle: int) -> tuple[float, Array]:
@@ -86,16 +86,16 @@ class CollisionWorld:
             The distance [m], minus the penetration depth if they overlap, and the separating unit vector from the
             obstacle to the segment, shape (3,).
         """
-        self._place_segment(0, a, b)
-        return self._distance_and_normal(self._from_capsule[0], obstacle)
+        self._place_segment(a, b)
+        return self._distance_and_normal(self._from_capsule, obstacle)
 
-    def _place_segment(self, index: int, a: Point, b: Point) -> None:
+    def _place_segment(self, a: Point, b: Point) -> None:
         (ax, ay, az), (bx, by, bz) = a, b
         along = bx - ax, by - ay, bz - az
         length = math.hypot(*along)
-        self._capsules[index].halfLength = length / 2
+        self._capsule.halfLength = length / 2
         pose = frame_along(along, length), np.array([(ax + bx) / 2, (ay + by) / 2, (az + bz) / 2])
-        self._place(ConvexBody(length * _AXIS, 0.0, self._capsules[index]), pose)
+        self._place(ConvexBody(length * _AXIS, 0.0, self._capsule), pose)
 
     def _place(self, mover: ConvexBody, pose: Pose) -> None:
         self._mover, self._pose = mover, pose
@@ -132,9 +132,3 @@ class CollisionWorld:
             return distance
         self._result.clear()  # otherwise Coal keeps the smallest distance of earlier calls
         return float(measure(self._transform, self._transforms[obstacle], self._request, self._result))
-
-
-def _coal_box(box: Box) -> Any:
-    import coal
-
-    return coal.Box(*np.ptp(box.corners, axis=0))

@@ -21,11 +21,7 @@ MAX_POSE_ERROR = 1e-9  # between our poses and Pinocchio's, relative to 1 + the 
 
 
 class ForwardKinematics:
-    """The forward kinematics of a model.
-
-    Args:
-        model: Model with revolute and prismatic joints only.
-    """
+    """The forward kinematics of a model with revolute and prismatic joints only."""
 
     def __init__(self, model: "pin.Model") -> None:
         self._model, self._data = model, model.createData()
@@ -36,10 +32,7 @@ class ForwardKinematics:
         self._slides = self._lengths[:, 1] > 0
 
     def poses(self, q: Array) -> tuple[Array, Array]:
-        """Compute the poses of all joints at K states.
-
-        Args:
-            q: Joint positions [rad], shape (n, K), K > 0.
+        """Compute the poses of all joints at K > 0 states q [rad], shape (n, K).
 
         Returns:
             ``(rotations, positions)``: rotation matrices in the world frame, that of the base first, shape
@@ -81,18 +74,17 @@ class ForwardKinematics:
 
     def _check(self, q: Array, frames: Array) -> None:
         """Compare the first, the central and the last state with Pinocchio."""
-        checked = [0, q.shape[1] // 2, -1]
-        states, poses = q[:, checked].T.copy(), frames[-1][..., checked]
-        error = float(np.abs(poses - np.array([self._pinocchio_pose(state) for state in states]).T).max())
-        if error > MAX_POSE_ERROR * (1 + np.abs(states).max()):
-            raise MachineError(f"forward kinematics differ from Pinocchio's by {error:.2g} at one of {states.tolist()}")
-
-    def _pinocchio_pose(self, state: Array) -> Array:
-        """Return the pose of the last joint as Pinocchio computes it, shape (3, 4)."""
         import pinocchio as pin
 
-        pin.forwardKinematics(self._model, self._data, state)
-        return np.asarray(self._data.oMi[len(self._coefficients)].homogeneous[:3])
+        checked = [0, q.shape[1] // 2, -1]
+        states, poses = q[:, checked].T.copy(), frames[-1][..., checked]
+        expected = np.empty((len(states), 3, 4))
+        for pose, state in zip(expected, states, strict=True):
+            pin.forwardKinematics(self._model, self._data, state)
+            pose[:] = self._data.oMi[len(self._coefficients)].homogeneous[:3]
+        error = float(np.abs(poses - expected.T).max())
+        if error > MAX_POSE_ERROR * (1 + np.abs(states).max()):
+            raise MachineError(f"forward kinematics differ from Pinocchio's by {error:.2g} at one of {states.tolist()}")
 
 
 def joint_motion(model: "pin.Model", joint: int) -> Array:

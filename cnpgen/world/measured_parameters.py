@@ -46,7 +46,8 @@ class MeasuredParameters:
         if self._load is not None:
             self._set_load()
         if self._robot.parameters.tilts_table:
-            self._set_table()
+            self._turn = self._turned("table_roll", "table_pitch")
+            self._origin = self._robot.table_origin + np.array([0.0, 0.0, self.values.get("table_height", 0.0)])
         if self._robot.parameters.turns_upright:
             self._upright = self._turned(*UPRIGHT_TURN)
 
@@ -97,10 +98,6 @@ class MeasuredParameters:
         shape = payload.inertia * self.values.get("payload_inertia", 1.0)
         body = pin.Inertia(mass, np.array(centre), shape * (mass / payload.mass))
         self.model.inertias[joint] = bare + placement.act(body)
-
-    def _set_table(self) -> None:
-        self._turn = self._turned("table_roll", "table_pitch")
-        self._origin = self._robot.table_origin + np.array([0.0, 0.0, self.values.get("table_height", 0.0)])
 
     def _turned(self, *names: str) -> Array:
         """Return the rotation by two parameters, Ry(pitch) Rx(roll)."""

@@ -1,89 +1,38 @@
 """Signed distances of pairs of convex bodies along a path: at its states, and over the intervals between them.
 
-The signed distance of two convex bodies is the maximum over unit vectors of their separation along it
-(``cnpgen.world.separation``). Every direction therefore bounds the distances at all states from below.
+The signed distance of two convex bodies (minus the penetration depth if they overlap) is the maximum over unit vectors
+u of their separation ``min over a of u . a - max over b of u . b``. Every direction therefore bounds the distances at
+all states from below.
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.world.certified import CertifiedDistance, PlacedBody
+
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
-Measure = Callable[[int, int], tuple[float, Array]]  # (pair, state) -> signed distance, separating direction
 
 RESOLUTION = 1e-9  # m: tolerance of the smallest distance
 
 
-class SeparationBound(Protocol):
-    """Computes the separation of a pair along a direction: lower bounds of its distances [m]."""
+@dataclass(frozen=True)
+class ClosestPoints:
+    """Smallest signed distance between bodies at K states.
 
-    def __call__(self, pair: int, direction: Array, states: slice | Indices = slice(None), /) -> Array:
-        """Return one lower bound per state."""
-
-
-def smallest_distances(bounds: Array, measure: Measure, separation: Callable[[int, Array, Indices], Array]) -> Array:
-    """Find the smallest signed distance of M pairs of convex bodies along K states by best-first search.
-
-    The state with the smallest bound is measured, and its separating direction raises the bounds of the same pair at
-    the states that could be closer. The search ends when no bound is below the smallest measured distance, so no state
-    is missed.
-
-    Args:
-        bounds: Initial lower bounds of the distances [m], shape (M, K).
-        measure: Returns the signed distance of a pair at a state [m] and the unit vector, shape (3,), along which the
-            bodies have this distance, or a vector of nan. Distances are never below their bounds.
-        separation: Returns lower bounds of the distances of a pair [m] along a unit vector at J states, shape (J,).
-
-    Returns:
-        Distances [m], shape (M, K). The smallest one is exact up to ``RESOLUTION`` and stands where it was measured;
-        values that were not measured are lower bounds above it. A state that cannot be measured is nan and ends the
-        search.
+    Attributes:
+        distance: Smallest distance of all pairs [m], minus the penetration depth if they overlap, shape (K,).
+        pair: Index of the pair with this distance, shape (K,).
+        points: Points of the two bodies at this distance, in the world frame [m], shape (K, 2, 3).
     """
-    distances, best = bounds.copy(), np.inf
-    measured: dict[tuple[int, int], float] = {}
-    while distances.size:
-        pair, k = divmod(int(distances.argmin()), distances.shape[1])
-        if distances[pair, k] >= best - RESOLUTION:
-            break
-        distance, direction = measure(pair, k)
-        measured[pair, k] = distance
-        if math.isnan(distance):
-            break
-        distances[pair, k], best = distance, min(best, distance)
-        closer = np.flatnonzero(distances[pair] < best)
-        if len(closer) and np.isfinite(direction).all():
-            distances[pair, closer] = np.maximum(distances[pair, closer], separation(pair, direction, closer))
-    np.maximum(distances, math.nextafter(best, math.inf), out=distances)
-    for index, distance in measured.items():
-        distances[index] = distance
-    return distances
 
-
-def clear_states(
-    bounds: Array, min_distance: float, measure: Measure, separation: Callable[[int, Array, Indices], Array]
-) -> NDArray[np.bool_]:
-    """Return a mask of the states at which the signed distances of all M pairs of convex bodies reach a minimum [m].
-
-    A state whose bound is too small is measured. Its separating direction also bounds the distances at the other
-    unresolved states and usually resolves most of them. States whose distance cannot be measured are not clear. Other
-    arguments are those of ``smallest_distances``.
-    """
-    clear = np.ones(bounds.shape[1], bool)
-    proven = bounds >= min_distance
-    for pair in np.flatnonzero(~proven.all(axis=1)).tolist():
-        unresolved = np.flatnonzero(clear & ~proven[pair])
-        while len(unresolved):
-            k, unresolved = int(unresolved[0]), unresolved[1:]
-            distance, direction = measure(pair, k)
-            clear[k] = distance >= min_distance
-            if len(unresolved) and np.isfinite(direction).all():
-                unresolved = unresolved[~(separation(pair, direction, unresolved) >= min_distance)]
-    return clear
+    distance: Array
+    pair: NDArray[np.intp]
+    points: Array
 
 
 @dataclass(frozen=True)
@@ -92,14 +41,17 @@ class PairDistances:
 
     Attributes:
         bounds: Lower bounds of the distances [m], shape (M, K).
-        measure: Measures a pair at a state, as of ``smallest_distances``.
-        separation: Bounds the distances of a pair along a direction.
+        measure: Returns the signed distance of a pair at a state [m] and the unit vector, shape (3,), along which the
+            bodies have this distance, or a vector of nan. Distances are never below their bounds.
+        separation: Returns lower bounds of the distances of a pair [m] along a unit vector at J states, shape (J,).
+        bodies: Returns both bodies of a pair at a state with their poses, that of the robot before an obstacle.
         directions: Separating directions of every pair, collected from its measurements.
     """
 
     bounds: Array
-    measure: Measure
-    separation: SeparationBound
+    measure: Callable[[int, int], tuple[float, Array]]
+    separation: Callable[[int, Array, Indices], Array]
+    bodies: Callable[[int, int], tuple[PlacedBody, PlacedBody]]
     directions: dict[int, list[Array]] = field(default_factory=dict)
 
     def smallest(self) -> list[Array]:
@@ -111,13 +63,36 @@ class PairDistances:
         return [self._searched([pair])[0] for pair in range(len(self.bounds))]
 
     def _searched(self, pairs: list[int]) -> list[Array]:
-        def measure(index: int, k: int) -> tuple[float, Array]:
-            return self._measured(pairs[index], k)
+        """Find the smallest distance of some pairs by best-first search.
 
-        def separation(index: int, direction: Array, states: Indices) -> Array:
-            return self.separation(pairs[index], direction, states)
+        The state with the smallest bound is measured, and its separating direction raises the bounds of the same pair
+        at the states that could be closer. The search ends when no bound is below the smallest measured distance, so no
+        state is missed.
 
-        return list(smallest_distances(self.bounds[pairs], measure, separation))
+        Returns:
+            Distances [m], one array of shape (K,) per pair. The smallest one is exact up to ``RESOLUTION`` and stands
+            where it was measured; values that were not measured are lower bounds above it. A state that cannot be
+            measured is nan and ends the search.
+        """
+        distances, best = self.bounds[pairs], np.inf
+        measured: dict[tuple[int, int], float] = {}
+        while distances.size:
+            index, k = divmod(int(distances.argmin()), distances.shape[1])
+            if distances[index, k] >= best - RESOLUTION:
+                break
+            distance, direction = self._measured(pairs[index], k)
+            measured[index, k] = distance
+            if math.isnan(distance):
+                break
+            distances[index, k], best = distance, min(best, distance)
+            closer = np.flatnonzero(distances[index] < best)
+            if len(closer) and np.isfinite(direction).all():
+                raised = self.separation(pairs[index], direction, closer)
+                distances[index, closer] = np.maximum(distances[index, closer], raised)
+        np.maximum(distances, math.nextafter(best, math.inf), out=distances)
+        for place, distance in measured.items():
+            distances[place] = distance
+        return list(distances)
 
     def _measured(self, pair: int, k: int) -> tuple[float, Array]:
         """Measure a pair at a state and store the direction."""
@@ -126,8 +101,51 @@ class PairDistances:
         return distance, direction
 
     def clear_states(self, min_distance: float) -> NDArray[np.bool_]:
-        """Return a mask of the states at which all pairs reach a minimum distance [m], shape (K,)."""
-        return clear_states(self.bounds, min_distance, self.measure, self.separation)
+        """Return a mask of the states at which all pairs reach a minimum distance [m], shape (K,).
+
+        A state whose bound is too small is measured. Its separating direction also bounds the distances at the other
+        unresolved states and usually resolves most of them. States whose distance cannot be measured are not clear.
+        """
+        clear = np.ones(self.bounds.shape[1], bool)
+        proven = self.bounds >= min_distance
+        for pair in np.flatnonzero(~proven.all(axis=1)).tolist():
+            unresolved = np.flatnonzero(clear & ~proven[pair])
+            while len(unresolved):
+                k, unresolved = int(unresolved[0]), unresolved[1:]
+                distance, direction = self.measure(pair, k)
+                clear[k] = distance >= min_distance
+                if len(unresolved) and np.isfinite(direction).all():
+                    unresolved = unresolved[~(self.separation(pair, direction, unresolved) >= min_distance)]
+        return clear
+
+    def smallest_per_state(self) -> tuple[Array, Indices]:
+        """Find the smallest distance at each state, with pairs in the order of their bounds.
+
+        Returns:
+            Distances [m] and indices of their pairs, shape (K,) each.
+        """
+        count = self.bounds.shape[1]
+        distances, closest = np.full(count, np.inf), np.zeros(count, np.intp)
+        order = np.argsort(self.bounds, axis=0)
+        for k in range(count):
+            for pair in order[:, k].tolist():
+                if self.bounds[pair, k] >= distances[k]:
+                    break
+                distance, _ = self.measure(pair, k)
+                if distance < distances[k]:
+                    distances[k], closest[k] = distance, pair
+        return distances, closest
+
+    def closest_points(self, radius: float = 0.0) -> ClosestPoints:
+        """Measure the smallest distance at every state, unlike ``smallest``; a radius [m] extends the first bodies."""
+        certified, points = CertifiedDistance(), list[tuple[Array, Array]]()
+        distance, closest = self.smallest_per_state()
+        for k, pair in enumerate(closest.tolist()):
+            (a, pose_a), (b, pose_b) = self.bodies(pair, k)
+            _, normal = certified.between(a, pose_a, b, pose_b)  # nan if Coal finds no direction
+            point_a, point_b = certified.witnesses()
+            points.append((point_a + (a.radius + radius) * normal, point_b - b.radius * normal))
+        return ClosestPoints(distance - radius, closest, np.array(points))
 
     def interval_bounds(self, min_distances: Array, displacements: Array, deviations: Array) -> Array:
         """Bound by how much all distances exceed a minimum between neighboring states [m], shape (K - 1,).

@@ -1,78 +1,55 @@
-"""A robot among its obstacles at K states at once, evaluated with Pinocchio and Coal."""
+"""A robot among its obstacles at K states at once, evaluated with Pinocchio and Coal.
 
-from collections.abc import Callable, Sequence
+Faces of the boxes, and of the held object, bound distances at all states at once. Better directions come from
+measurements (``cnpgen.world.pair_distances``). Cuboids have centers [m], shape (3, K), rotation matrices, shape
+(3, 3, K), and edge lengths [m], shape (3,).
+"""
+
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import RecipeError
-from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.hull import CUBE
-from cnpgen.robots.solid import Solid, place_obstacles, pose_width, solids_of
-from cnpgen.world.collision_world import CollisionWorld
+from cnpgen.robots.solid import Solid, place_obstacles
+from cnpgen.world.certified import PlacedBody, convex_body, placed_solid
 from cnpgen.world.forward_kinematics import ForwardKinematics
-from cnpgen.world.measured_parameters import MeasuredParameters
-from cnpgen.world.pair_distances import PairDistances
-from cnpgen.world.rigid_bodies import NO_HELD_SHAPE, NO_SHAPE, RigidBodies
-from cnpgen.world.separation import cuboid_gaps, cuboid_separation, gaps, separation
+from cnpgen.world.pair_distances import Indices, PairDistances
+from cnpgen.world.world import RobotWorld
 
 Array = NDArray[np.float64]
-States = slice | NDArray[np.intp]
+
+_CACHED = ("tip_rotation", "torque", "_tip_motion")  # of one path
+_AT_ORIGIN = np.eye(3), np.zeros(3)
 
 
-class PathWorld:
+class PathWorld(RobotWorld):
     """A robot along a path, among the obstacles.
 
     It has the interface of ``cnpgen.world.world.World`` with a trailing axis of K states, so that a constraint's
     ``measured`` form, written for one state, returns arrays of shape (K,). ``set_path`` runs the forward kinematics;
-    every other quantity is computed when it is first read. Vectors are in the world frame. The memory of Pinocchio and
-    Coal is reused from path to path: use a world in one process and one thread only.
-
-    Args:
-        robot: The robot.
-        obstacles: The obstacles.
-        object_size: Edge lengths of the held object [m], or None.
+    every other quantity is computed when it is first read. For arguments and further attributes see ``RobotWorld``.
 
     Attributes:
-        robot: The robot.
-        obstacles: The obstacles.
         q: Joint positions [rad], shape (n, K).
         dq: Joint velocities [rad/s], shape (n, K).
         ddq: Joint accelerations [rad/s^2], shape (n, K).
         jerk: Joint jerks [rad/s^3], shape (n, K); None if no constraint needs them.
         tip_position: Positions of the tip [m], shape (3, K).
-        parameters: Parameters of the sample.
     """
 
-    def __init__(
-        self,
-        robot: Robot,
-        obstacles: Sequence[Obstacle] = (),
-        object_size: tuple[float, float, float] | None = None,
-    ) -> None:
+    def _start(self) -> None:
         import pinocchio as pin
 
-        self.robot = robot
-        self.obstacles = tuple(obstacles)
-        self.parameters = MeasuredParameters(robot)
-        self._model = self.parameters.model
-        self._data, self._kinematics = self._model.createData(), ForwardKinematics(self._model)
+        self._kinematics = ForwardKinematics(self._model)
         self._pool = pin.ModelPool(self._model, 1)
-        self._tip = robot.tip_frame
         frame = self._model.frames[self._tip]
         self._carrier, tip = frame.parentJoint, frame.placement.homogeneous
         self._turn, self._offset = tip[:3, :3], tip[:3, 3].copy()
-        self._segment_ends = np.array(robot.capsule_axes, np.int64).reshape(-1, 2)
-        self._object_size = None if object_size is None else np.array(object_size)
-        self._collisions = CollisionWorld(object_size, 1)
-        self._bodies = None if robot.shape is None else RigidBodies(robot.shape, len(obstacles), robot.n)
-        self._held = None if robot.held_shape is None else RigidBodies(robot.held_shape, 0, robot.n)
-        self._pose_width, self._solids = pose_width(self.obstacles), list[Solid]()
-        self._poses: Array | None = None
-        rest = np.zeros((robot.n, 1))
-        self.set_path(robot.base[:, None], rest, rest, place_obstacles(obstacles), rest)
+        self._segment_ends = np.array(self.robot.capsule_axes, np.int64).reshape(-1, 2)
+        rest = np.zeros((self.robot.n, 1))
+        self.set_path(self.robot.base[:, None], rest, rest, place_obstacles(self.obstacles), rest)
 
     def set_path(
         self, q: Array, dq: Array, ddq: Array, obstacle_poses: Array, jerk: Array | None = None, *, exact: bool = True
@@ -91,29 +68,12 @@ class PathWorld:
         import pinocchio as pin
 
         self.q, self.dq, self.ddq, self.jerk, self._exact = q, dq, ddq, jerk, exact
-        self._placed = False
-        self._torque: Array | None = None
-        self._tip_motion: tuple[Array, Array] | None = None
-        self._segments: Array | None = None
-        self._pairs: dict[str, PairDistances] = {}
-        self._place_obstacles(obstacle_poses[: self._pose_width])
-        self.parameters.set(obstacle_poses[self._pose_width :])
+        for name in _CACHED:
+            self.__dict__.pop(name, None)
+        self._place(obstacle_poses)
         if self.parameters.changes_payload:
             self._pool = pin.ModelPool(self._model, 1)  # a pool has its own copy of the model
-        self._move()
-
-    def _place_obstacles(self, poses: Array) -> None:
-        """Move the obstacles, unless they stand there already."""
-        if self._poses is None or not np.array_equal(poses, self._poses):
-            self._poses, copied = None, poses.copy()
-            self._solids = solids_of(self.obstacles, copied)
-            self._collisions.place(self._solids)
-            self._poses = copied  # last: after an error the obstacles are placed again
-
-    def _move(self) -> None:
-        """Run the forward kinematics of every state and store the poses of the joints and the tip."""
         self._rotations, self._origins = self._kinematics.poses(self.q)
-        self._tip_rotation: Array | None = None
         along = self._offset @ self._axes_of_tip()
         self.tip_position = along.reshape(3, -1) + self._origins[self._carrier]
 
@@ -122,50 +82,41 @@ class PathWorld:
         axes: Array = self._rotations[self._carrier].swapaxes(0, 1)
         return axes.reshape(3, -1)
 
-    @property
+    @cached_property
     def tip_rotation(self) -> Array:
         """Rotation matrices of the tip frame, shape (3, 3, K)."""
-        if self._tip_rotation is None:
-            self._tip_rotation = (self._turn.T @ self._axes_of_tip()).reshape(3, 3, -1).swapaxes(0, 1)
-        return self._tip_rotation
+        axes: Array = self._turn.T @ self._axes_of_tip()
+        return axes.reshape(3, 3, -1).swapaxes(0, 1)
 
-    @property
-    def scene_values(self) -> Array:
-        """Values for a constraint (``Constraint.scene_values``); empty if none were given."""
-        return self.parameters.scene_values
-
-    @property
+    @cached_property
     def torque(self) -> Array:
         """Inverse dynamics [N m], shape (n, K)."""
         import pinocchio as pin
 
-        if self._torque is None:
-            q, dq, ddq = (np.asfortranarray(values) for values in (self.q, self.dq, self.ddq))
-            torque = pin.rneaInParallel(1, self._pool, q, dq, ddq)
-            self._torque = np.array(torque).reshape(self.q.shape)  # for one joint Pinocchio returns a list of numbers
-        return self._torque
+        q, dq, ddq = (np.asfortranarray(values) for values in (self.q, self.dq, self.ddq))
+        torque = pin.rneaInParallel(1, self._pool, q, dq, ddq)
+        return np.array(torque).reshape(self.q.shape)  # for one joint Pinocchio returns a list of numbers
 
     @property
     def tip_velocity(self) -> Array:
         """Linear velocities of the tip [m/s], shape (3, K)."""
-        return self._moving_tip()[0]
+        return np.asarray(self._tip_motion[0])
 
     @property
     def tip_acceleration(self) -> Array:
         """Linear accelerations of the tip [m/s^2], shape (3, K)."""
-        return self._moving_tip()[1]
+        return np.asarray(self._tip_motion[1])
+
+    @cached_property
+    def _tip_motion(self) -> Array:
+        """Velocity [m/s] and acceleration [m/s^2] of the tip, shape (2, 3, K)."""
+        states = (np.ascontiguousarray(values.T) for values in (self.q, self.dq, self.ddq))
+        motions = np.array([self._tip_motion_at(*state) for state in zip(*states, strict=True)])
+        return np.ascontiguousarray(motions.transpose(1, 2, 0))
 
     def tip_velocity_at(self, k: int) -> Array:
         """Linear velocity of the tip at one of the states [m/s], shape (3,)."""
         return self._tip_motion_at(*(np.ascontiguousarray(values[:, k]) for values in (self.q, self.dq, self.ddq)))[0]
-
-    def _moving_tip(self) -> tuple[Array, Array]:
-        if self._tip_motion is None:
-            states = (np.ascontiguousarray(values.T) for values in (self.q, self.dq, self.ddq))
-            motions = np.array([self._tip_motion_at(*state) for state in zip(*states, strict=True)])
-            velocity, acceleration = np.ascontiguousarray(motions.transpose(1, 2, 0))
-            self._tip_motion = velocity, acceleration
-        return self._tip_motion
 
     def _tip_motion_at(self, q: Array, dq: Array, ddq: Array) -> tuple[Array, Array]:
         """Compute the velocity [m/s] and acceleration [m/s^2] of the tip at one state, shape (3,) each."""
@@ -176,19 +127,35 @@ class PathWorld:
         velocity = np.array(pin.getFrameVelocity(model, data, tip, frame).linear)
         return velocity, np.array(pin.getFrameClassicalAcceleration(model, data, tip, frame).linear)
 
-    def segment_distances(self, sufficient: float = np.inf) -> list[Array]:
-        """Measure the signed distance of every segment of the robot from every obstacle, segment by segment [m].
+    def pairs(self, bodies: str) -> PairDistances:
+        """Return the signed distances of all pairs of some bodies.
 
-        If the path is not exact, sufficient lower bounds are returned without measuring.
+        Args:
+            bodies: "robot": links, or segments without link geometry, and obstacles, body by body; "self": links of the
+                robot; "object": the held object and obstacles; "held object": the held object and links.
 
-        Returns:
-            Arrays of shape (K,), of which the smallest value is exact (``cnpgen.world.pair_distances``).
+        Raises:
+            RecipeError: The robot has no link geometry, or the problem has no held object, as required.
         """
-        return self._smallest(self.segment_pairs(), sufficient)
+        if bodies == "robot":
+            bodies = "segments" if self.robot.shape is None else "links"
+        return self._pairs_of(bodies)
 
-    def segment_pairs(self) -> PairDistances:
-        """Return the signed distances of every segment of the robot from every obstacle, segment by segment."""
-        return self._once("segments", self._from_segments)
+    def _make_pairs(self, bodies: str) -> PairDistances:
+        if bodies == "segments":
+            return self._from_segments()
+        return self._from_object() if bodies == "object" else super()._make_pairs(bodies)
+
+    def _joint_poses(self) -> tuple[Array, Array]:
+        return self._rotations, self._origins
+
+    def _smallest(self, bodies: str, sufficient: float) -> list[Array]:
+        pairs = self._pairs_of(bodies)
+        if not (np.isfinite(self._origins).all() and np.isfinite(self.tip_position).all()):
+            return [np.full(self.q.shape[1], np.nan) for _ in pairs.bounds]
+        if not self._exact and (pairs.bounds >= sufficient).all():
+            return list(pairs.bounds)
+        return pairs.smallest_of_each() if bodies == "object" else pairs.smallest()
 
     def _from_segments(self) -> PairDistances:
         segments, solids = self.segments(), self._solids
@@ -200,77 +167,30 @@ class PathWorld:
             a, b = pairs[pair][0][..., k].tolist()
             return self._collisions.segment_distance(a, b, pair % len(solids))
 
-        def separation_along(pair: int, direction: Array, states: States = slice(None), /) -> Array:
+        def separation_along(pair: int, direction: Array, states: Indices) -> Array:
             return separation(pairs[pair][0][..., states], pairs[pair][1], direction)
 
-        return PairDistances(bounds, measure, separation_along)
+        def bodies_at(pair: int, k: int) -> tuple[PlacedBody, PlacedBody]:
+            segment, solid = pairs[pair]
+            return (convex_body(segment[..., k].copy()), _AT_ORIGIN), placed_solid(solid)
 
-    def shape_distances(self, sufficient: float = np.inf) -> list[Array]:
-        """Measure the signed distance of every moving part of the robot's links from every obstacle, part by part [m].
+        return PairDistances(bounds, measure, separation_along, bodies_at)
 
-        See ``segment_distances``.
+    def _from_object(self) -> PairDistances:
+        position, rotation = self.tip_position, self.tip_rotation
+        size, solids = self._require_object(), self._solids
 
-        Raises:
-            RecipeError: The robot has no link geometry.
-        """
-        return self._smallest(self.shape_pairs(), sufficient)
+        def measure(pair: int, k: int) -> tuple[float, Array]:
+            return self._collisions.object_distance(position[:, k].copy(), rotation[..., k].copy(), pair)
 
-    def shape_pairs(self) -> PairDistances:
-        """Return the signed distances of every moving part of the robot's links from every obstacle, part by part."""
-        bodies = self._placed_bodies()
-        return self._once("shape", lambda: bodies.pair_distances(bodies.obstacle_pairs))
+        def separation_along(pair: int, direction: Array, states: Indices) -> Array:
+            return cuboid_separation(position[:, states], rotation[..., states], size, solids[pair], direction)
 
-    def self_distances(self, sufficient: float = np.inf) -> list[Array]:
-        """Measure the signed distance of every two parts of links that must not touch [m]; see ``shape_distances``."""
-        return self._smallest(self.self_pairs(), sufficient)
+        def bodies_at(pair: int, k: int) -> tuple[PlacedBody, PlacedBody]:
+            pose = rotation[..., k].copy(), position[:, k].copy()
+            return (convex_body(CUBE * size), pose), placed_solid(solids[pair])
 
-    def self_pairs(self) -> PairDistances:
-        """Return the signed distances of every two parts of links that must not touch."""
-        bodies = self._placed_bodies()
-        return self._once("self", lambda: bodies.pair_distances(bodies.link_pairs))
-
-    def pairs(self, bodies: str) -> PairDistances:
-        """Return the signed distances of all pairs of some bodies.
-
-        Args:
-            bodies: "robot": links, or segments without link geometry, and obstacles; "self": links of the robot;
-                "object": the held object and obstacles; "held object": the held object and links.
-        """
-        if bodies == "robot":
-            return self.segment_pairs() if self.robot.shape is None else self.shape_pairs()
-        pairs = {"self": self.self_pairs, "object": self.object_pairs, "held object": self.held_object_pairs}
-        return pairs[bodies]()
-
-    def _smallest(self, pairs: PairDistances, sufficient: float, *, of_each: bool = False) -> list[Array]:
-        """Measure distances, or return their bounds if the path is not exact and all bounds are sufficient."""
-        if not self._is_finite():
-            return [np.full(self.q.shape[1], np.nan) for _ in pairs.bounds]
-        if not self._exact and (pairs.bounds >= sufficient).all():
-            return list(pairs.bounds)
-        return pairs.smallest_of_each() if of_each else pairs.smallest()
-
-    def _once(self, name: str, make: Callable[[], PairDistances]) -> PairDistances:
-        """Return the distances of a name; make them once per path."""
-        if name not in self._pairs:
-            self._pairs[name] = make()
-        return self._pairs[name]
-
-    def held_object_distances(self, sufficient: float = np.inf) -> list[Array]:
-        """Measure the signed distance of the held object from parts of links [m]; see ``shape_distances``."""
-        return self._smallest(self.held_object_pairs(), sufficient)
-
-    def held_object_pairs(self) -> PairDistances:
-        """Return the signed distances of the held object from every part of the links that may not touch it.
-
-        Raises:
-            RecipeError: The robot has no geometry for it.
-        """
-        bodies = self._held
-        if bodies is None:
-            raise RecipeError([NO_HELD_SHAPE])
-        if "held" not in self._pairs:
-            bodies.place(self._rotations, self._origins, [])
-        return self._once("held", lambda: bodies.pair_distances(bodies.link_pairs))
+        return PairDistances(cuboid_gaps(position, rotation, size, solids), measure, separation_along, bodies_at)
 
     def motion_bounds(self, max_positions: Array) -> Array:
         """Bound the displacement of any point of the robot or the held object per unit of motion of each joint [m].
@@ -289,47 +209,6 @@ class PathWorld:
         extents[self._carrier] = max(extents[self._carrier], np.linalg.norm(self._offset) + held)
         return extents
 
-    def _placed_bodies(self) -> RigidBodies:
-        """Return the parts of the robot's links, placed at the states."""
-        if self._bodies is None:
-            raise RecipeError([NO_SHAPE])
-        if not self._placed:
-            self._bodies.place(self._rotations, self._origins, self._solids)
-            self._placed = True
-        return self._bodies
-
-    def object_distances(self, sufficient: float = np.inf) -> list[Array]:
-        """Measure the signed distance of the held object from every obstacle [m]; see ``segment_distances``.
-
-        The smallest value of each array is exact.
-
-        Raises:
-            RecipeError: The problem has no held object.
-        """
-        return self._smallest(self.object_pairs(), sufficient, of_each=True)
-
-    def object_pairs(self) -> PairDistances:
-        """Return the signed distances of the held object from every obstacle."""
-        return self._once("object", self._from_object)
-
-    def _from_object(self) -> PairDistances:
-        position, rotation = self.tip_position, self.tip_rotation
-        size, solids = self._require_object(), self._solids
-
-        def measure(pair: int, k: int) -> tuple[float, Array]:
-            return self._collisions.object_distance(position[:, k].copy(), rotation[..., k].copy(), pair)
-
-        def separation_along(pair: int, direction: Array, states: States = slice(None), /) -> Array:
-            return cuboid_separation(position[:, states], rotation[..., states], size, solids[pair], direction)
-
-        return PairDistances(cuboid_gaps(position, rotation, size, solids), measure, separation_along)
-
-    def _require_object(self) -> Array:
-        """Return the edge lengths of the held object [m], shape (3,)."""
-        if self._object_size is None:
-            raise RecipeError(["a constraint needs the held object, but the problem has no [object]"])
-        return self._object_size
-
     def object_corners(self, states: "slice | NDArray[np.bool_]" = slice(None)) -> Array:
         """Compute the corners of the held object at a slice or a mask of the states [m], shape (8, 3, K).
 
@@ -342,11 +221,48 @@ class PathWorld:
 
     def segments(self) -> Array:
         """Compute both ends of every segment of the robot [m], shape (segments, 2, 3, K)."""
-        if self._segments is None:
-            points = np.concatenate([self._origins[1:], self.tip_position[None]])
-            self._segments = points[self._segment_ends]
-        return self._segments
+        points = np.concatenate([self._origins[1:], self.tip_position[None]])
+        return np.asarray(points[self._segment_ends])
 
-    def _is_finite(self) -> bool:
-        """Return whether the poses of the joints and the tip are finite."""
-        return bool(np.isfinite(self._origins).all() and np.isfinite(self.tip_position).all())
+
+def separation(vertices: Array, solid: Solid, direction: Array) -> Array:
+    """Compute the separation of a convex body from a solid along a direction, at every state [m], shape (K,).
+
+    Vertices of the body [m] have shape (V, 3, K); the direction is a unit vector from the solid to the body.
+    """
+    return np.asarray((direction @ vertices).min(axis=0) - solid.furthest(direction))
+
+
+def cuboid_separation(position: Array, rotation: Array, size: Array, solid: Solid, direction: Array) -> Array:
+    """Compute the separation of a cuboid from a solid along a unit vector to it, at every state [m], shape (K,)."""
+    reach = (size / 2) @ np.abs(np.einsum("i,ijk->jk", direction, rotation))
+    return np.asarray(direction @ position - reach - solid.furthest(direction))
+
+
+def gaps(low: Array, high: Array, solids: Sequence[Solid]) -> Array:
+    """Bound the distances of axis-aligned boxes from S solids [m], shape (..., S, K).
+
+    If there are gaps along several axes, the distance is at least the length of the vector that they form. Lowest and
+    highest coordinates of the boxes [m] have shape (..., 3, K).
+    """
+    floor, top = _boxes(solids)
+    gap = np.maximum(low[..., None, :, :] - top[..., None], floor[..., None] - high[..., None, :, :])
+    outside = np.maximum(gap, 0.0)
+    distance = np.sqrt((outside * outside).sum(axis=-2))
+    return np.asarray(np.where(distance > 0, distance, gap.max(axis=-2)))
+
+
+def cuboid_gaps(position: Array, rotation: Array, size: Array, solids: Sequence[Solid]) -> Array:
+    """Bound the signed distances of a cuboid from S solids by its faces and their bounding boxes [m], shape (S, K)."""
+    turned, (floor, top) = np.abs(rotation), _boxes(solids)
+    reach = np.einsum("ijk,j->ik", turned, size / 2)  # of the cuboid along the world axes
+    offset = position - (floor + top)[..., None] / 2
+    center = np.einsum("ijk,sik->sjk", rotation, offset)  # in the frame of the cuboid
+    own = np.abs(center) - (size / 2)[:, None] - np.einsum("ijk,si->sjk", turned, (top - floor) / 2)
+    return np.asarray(np.maximum(gaps(position - reach, position + reach, solids), own.max(axis=1)))
+
+
+def _boxes(solids: Sequence[Solid]) -> tuple[Array, Array]:
+    """Return the lowest and the highest coordinates of S solids [m], shape (S, 3) each."""
+    low, high = ([getattr(solid, end) for solid in solids] for end in ("low", "high"))
+    return np.array(low).reshape(-1, 3), np.array(high).reshape(-1, 3)

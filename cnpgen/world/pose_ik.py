@@ -62,12 +62,7 @@ class PoseTolerance:
 
 
 class PoseKinematics:
-    """Poses and Jacobians of a frame of a robot at many states.
-
-    Args:
-        robot: The robot.
-        frame: Index of the frame in Pinocchio's model; the tip by default.
-    """
+    """Poses and Jacobians of a frame of a robot at many states: of a frame of Pinocchio's model, by default the tip."""
 
     def __init__(self, robot: Robot, frame: int | None = None) -> None:
         model = robot.model
@@ -78,10 +73,7 @@ class PoseKinematics:
         self._motions = [joint_motion(model, joint) for joint in range(1, model.njoints)]
 
     def evaluate(self, q: Array) -> tuple[Array, Array, Array]:
-        """Compute poses and Jacobians.
-
-        Args:
-            q: Joint positions [rad], shape (n, K).
+        """Compute poses and Jacobians at joint positions q [rad], shape (n, K).
 
         Returns:
             Positions [m], shape (K, 3); rotation matrices, shape (K, 3, 3); and Jacobians of linear and angular
@@ -109,12 +101,8 @@ def solve_pose_ik(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Search joint positions with given poses, one for each seed.
 
-    Args:
-        kinematics: Kinematics of the frame.
-        positions: Wanted positions [m], shape (K, 3).
-        rotations: Wanted rotation matrices, shape (K, 3, 3).
-        seeds: Joint positions at which the iteration starts [rad], shape (n, K).
-        tolerance: Accepted differences from the poses; by default none.
+    Positions [m] have shape (K, 3), rotation matrices (K, 3, 3), and the seeds, joint positions at which the iteration
+    starts [rad], (n, K). By default no differences from the poses are accepted.
 
     Returns:
         Joint positions within their limits [rad], shape (n, K), and the mask of those that have their pose, shape (K,).
@@ -164,14 +152,7 @@ def rotation_matrices(vectors: Array) -> Array:
 
 def rotation_vectors(rotations: Array) -> Array:
     """Return the rotation vectors of rotation matrices [rad], shape (K, 3)."""
-    skew = np.stack(
-        [
-            rotations[:, 2, 1] - rotations[:, 1, 2],
-            rotations[:, 0, 2] - rotations[:, 2, 0],
-            rotations[:, 1, 0] - rotations[:, 0, 1],
-        ],
-        axis=1,
-    )
+    skew = rotations[:, [2, 0, 1], [1, 2, 0]] - rotations[:, [1, 2, 0], [2, 0, 1]]
     sine = np.linalg.norm(skew, axis=1) / 2
     angle = np.arctan2(sine, (np.trace(rotations, axis1=1, axis2=2) - 1) / 2)
     factor = np.where(sine > 1e-9, angle / np.maximum(2 * sine, 1e-12), 0.5)

@@ -1,16 +1,16 @@
 """Distances of the convex parts of a robot's links from obstacles and from each other."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.robots.shape.convex_part import Contacts
 from cnpgen.robots.shape.hull import ball_round
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.solid import Solid, same_shape
-from cnpgen.world.certified import CertifiedDistance, convex_body
+from cnpgen.world.certified import CertifiedDistance, PlacedBody, convex_body
 from cnpgen.world.pair_distances import PairDistances
 
 Array = NDArray[np.float64]
@@ -23,28 +23,6 @@ NO_HELD_SHAPE = (
     "a constraint needs the geometry of the links and a held object: the problem needs [object], and <collision>"
     " elements in its URDF"
 )
-
-
-@dataclass(frozen=True)
-class Contacts:
-    """C pairs of bodies that are close to each other at a state.
-
-    Attributes:
-        pair: Indices of the pairs, shape (C,).
-        k: Indices of the states, shape (C,).
-        distance: Signed distances [m], shape (C,).
-        normal: Unit vectors from the first body to the second in the world frame, shape (C, 3).
-        points: Closest points of the hulls of the first and the second body, without their radii, in the world frame
-            [m], shape (C, 2, 3).
-        joints: Indices of the joints that move the bodies, shape (C, 2); 0 for fixed bodies.
-    """
-
-    pair: NDArray[np.intp]
-    k: NDArray[np.intp]
-    distance: Array
-    normal: Array
-    points: Array
-    joints: NDArray[np.intp]
 
 
 class RigidBodies:
@@ -104,10 +82,14 @@ class RigidBodies:
         def measure(pair: int, k: int) -> tuple[float, Array]:
             return self._measure(*bodies[pair], k)
 
-        def separation(pair: int, direction: Array, states: "slice | Pairs" = slice(None), /) -> Array:
+        def separation(pair: int, direction: Array, states: Pairs) -> Array:
             return self._separation(*bodies[pair], direction, states)
 
-        return PairDistances(self._bounds(pairs), measure, separation)
+        def bodies_at(pair: int, k: int) -> tuple[PlacedBody, PlacedBody]:
+            a, b = bodies[pair] if bodies[pair][0] < len(self._balls) else bodies[pair][::-1]
+            return self._placed(a, k), self._placed(b, k)
+
+        return PairDistances(self._bounds(pairs), measure, separation, bodies_at)
 
     def contacts(self, pairs: Pairs, within: float) -> Contacts:
         """Measure ``obstacle_pairs`` or ``link_pairs`` at states where their signed distance is below ``within`` [m].
@@ -132,9 +114,8 @@ class RigidBodies:
         pair, k, distance, direction, points = (np.array(column) for column in columns)
         pair, k = pair.astype(np.intp), k.astype(np.intp)
         frames = np.array(self._frames, np.intp)[pairs[pair]]
-        joints = self.joints_of(pairs[pair])
         normal = np.einsum("cij,cj->ci", self._rotations[frames[:, 0], ..., k], direction.reshape(-1, 3))
-        return Contacts(pair, k, distance, normal, points.reshape(-1, 2, 3), joints)
+        return Contacts(pair, k, distance, normal, points.reshape(-1, 2, 3))
 
     def joints_of(self, bodies: Pairs) -> NDArray[np.intp]:
         """Return the indices of the joints that move bodies; 0 for fixed bodies."""
@@ -161,14 +142,15 @@ class RigidBodies:
 
     def _measure(self, a: int, b: int, k: int) -> tuple[float, Array]:
         """Measure a pair at a state; the direction points from a to b, in the frame of a."""
-        pose_a, pose_b = (
-            (self._rotations[frame, ..., k].copy(), self._positions[frame, :, k].copy())
-            for frame in (self._frames[a], self._frames[b])
-        )
-        distance, normal = self._certified.between(self._bodies[a], pose_a, self._bodies[b], pose_b)
-        return distance, normal @ pose_a[0]
+        first, second = self._placed(a, k), self._placed(b, k)
+        distance, normal = self._certified.between(*first, *second)
+        return distance, normal @ first[1][0]
 
-    def _separation(self, a: int, b: int, direction: Array, states: "slice | Pairs" = slice(None)) -> Array:
+    def _placed(self, body: int, k: int) -> PlacedBody:
+        frame = self._frames[body]
+        return self._bodies[body], (self._rotations[frame, ..., k].copy(), self._positions[frame, :, k].copy())
+
+    def _separation(self, a: int, b: int, direction: Array, states: Pairs) -> Array:
         """Compute the separation of b from a along a direction in the frame of a, at some states [m], shape (K,)."""
         (first, second), (frame, other) = (self._bodies[a], self._bodies[b]), (self._frames[a], self._frames[b])
         rotation, between = self._rotations[other], self._positions[other] - self._positions[frame]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,20 +13,20 @@ from numpy.typing import NDArray
 from cnpgen.errors import RecipeError
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
-from cnpgen.robots.solid import place_obstacles, pose_width, solids_of
+from cnpgen.robots.solid import Solid, place_obstacles, pose_width, solids_of
 from cnpgen.world.collision_world import CollisionWorld
 from cnpgen.world.measured_parameters import MeasuredParameters
+from cnpgen.world.pair_distances import PairDistances
 from cnpgen.world.rigid_bodies import NO_HELD_SHAPE, NO_SHAPE, RigidBodies
 
 Array = NDArray[np.float64]
 
 
-class World:
-    """A robot at one state, among the obstacles.
+class RobotWorld(ABC):
+    """A robot among its obstacles, at one or at many states: the parts that ``World`` and ``PathWorld`` share.
 
-    Constraints evaluate their ``measured`` forms on it. ``set_state`` runs the forward kinematics; every other quantity
-    is computed when it is read. Vectors are in the world frame. The memory of Pinocchio and Coal is reused: use a world
-    in one process and one thread only.
+    Vectors are in the world frame. The memory of Pinocchio and Coal is reused: use a world in one process and one
+    thread only.
 
     Args:
         robot: The robot.
@@ -34,10 +36,6 @@ class World:
     Attributes:
         robot: The robot.
         obstacles: The obstacles.
-        q: Joint positions [rad], shape (n,).
-        dq: Joint velocities [rad/s], shape (n,).
-        ddq: Joint accelerations [rad/s^2], shape (n,).
-        jerk: Joint jerks [rad/s^3], shape (n,); None at a boundary state or if no constraint needs them.
         parameters: Parameters of the sample.
     """
 
@@ -47,20 +45,138 @@ class World:
         obstacles: Sequence[Obstacle] = (),
         object_size: tuple[float, float, float] | None = None,
     ) -> None:
-        self.robot, self.obstacles = robot, obstacles
+        self.robot, self.obstacles = robot, tuple(obstacles)
         self.parameters = MeasuredParameters(robot)
         self._model = self.parameters.model
-        self._data = self._model.createData()
-        self._dynamics_data = self._model.createData()  # separate: RNEA's accelerations include gravity
-        self._tip = robot.tip_frame
-        self._object_size = object_size
-        self._collisions = CollisionWorld(object_size, len(robot.capsule_axes))
+        self._data, self._tip = self._model.createData(), robot.tip_frame
+        self._object_size = None if object_size is None else np.array(object_size)
+        self._collisions, self._solids = CollisionWorld(object_size), list[Solid]()
         self._bodies = None if robot.shape is None else RigidBodies(robot.shape, len(obstacles), robot.n)
         self._held = None if robot.held_shape is None else RigidBodies(robot.held_shape, 0, robot.n)
-        self._segments = robot.capsule_axes
-        self._joints = sorted({point for segment in robot.capsule_axes for point in segment} - {robot.n})
-        zero = np.zeros(robot.n)
-        self.set_state(robot.base, zero, zero, place_obstacles(obstacles))
+        self._pose_width = pose_width(self.obstacles)
+        self._poses: Array | None = None  # of the obstacles
+        self._start()
+
+    @abstractmethod
+    def _start(self) -> None:
+        """Allocate further memory, and move to the base configuration."""
+
+    @property
+    def scene_values(self) -> Array:
+        """Values for a constraint (``Constraint.scene_values``); empty if none were given."""
+        return self.parameters.scene_values
+
+    def segment_distances(self, sufficient: float = np.inf) -> list[Any]:
+        """Measure the signed distance of every segment of the robot from every obstacle, segment by segment [m].
+
+        A path that is not exact returns lower bounds without measuring if these are sufficient.
+
+        Returns:
+            Exact distances at one state. At K states, arrays of shape (K,), of which the smallest value is exact.
+        """
+        return self._smallest("segments", sufficient)
+
+    def shape_distances(self, sufficient: float = np.inf) -> list[Any]:
+        """Measure the signed distance of every moving part of the robot's links from every obstacle, part by part [m].
+
+        The smallest is exact, the others are lower bounds above it (``cnpgen.world.pair_distances``).
+
+        Raises:
+            RecipeError: The robot has no link geometry.
+        """
+        return self._smallest("links", sufficient)
+
+    def self_distances(self, sufficient: float = np.inf) -> list[Any]:
+        """Measure the signed distance of every two parts of links that must not touch [m]; see ``shape_distances``."""
+        return self._smallest("self", sufficient)
+
+    def held_object_distances(self, sufficient: float = np.inf) -> list[Any]:
+        """Measure the signed distance of the held object from parts of links [m]; see ``shape_distances``.
+
+        Raises:
+            RecipeError: The robot has no geometry for it.
+        """
+        return self._smallest("held object", sufficient)
+
+    def object_distances(self, sufficient: float = np.inf) -> list[Any]:
+        """Measure the signed distance of the held object from every obstacle [m], negative if they overlap.
+
+        At K states, the smallest value of each array is exact.
+
+        Raises:
+            RecipeError: The problem has no held object.
+        """
+        return self._smallest("object", sufficient)
+
+    @abstractmethod
+    def _smallest(self, bodies: str, sufficient: float) -> list[Any]:
+        """Measure distances, or return their bounds if these are sufficient and need not be exact."""
+
+    def _require_object(self) -> Array:
+        """Return the edge lengths of the held object [m], shape (3,)."""
+        if self._object_size is None:
+            raise RecipeError(["a constraint needs the held object, but the problem has no [object]"])
+        return self._object_size
+
+    @abstractmethod
+    def _joint_poses(self) -> tuple[Array, Array]:
+        """Return the rotations and positions [m] of the base and the joints, as ``RigidBodies.place`` takes them."""
+
+    def _place(self, obstacle_poses: Array) -> None:
+        """Take the poses of the obstacles, unless they stand there already, and discard the distances of the states."""
+        self._pairs, self._placed = dict[str, PairDistances](), False
+        poses, values = obstacle_poses[: self._pose_width], obstacle_poses[self._pose_width :]
+        if self._poses is None or not np.array_equal(poses, self._poses):
+            self._poses, copied = None, poses.copy()
+            self._solids = solids_of(self.obstacles, copied)
+            self._collisions.place(self._solids)
+            self._poses = copied  # last: after an error the obstacles are placed again
+        self.parameters.set(values)
+
+    def _pairs_of(self, bodies: str) -> PairDistances:
+        """Return the signed distances of pairs of bodies, made once per state: "links", "self" or "held object"."""
+        if bodies not in self._pairs:
+            self._pairs[bodies] = self._make_pairs(bodies)
+        return self._pairs[bodies]
+
+    def _make_pairs(self, bodies: str) -> PairDistances:
+        """Return the distances of parts of links from obstacles, from each other, or from the held object."""
+        if bodies != "held object":
+            placed = self._placed_bodies()
+            return placed.pair_distances(placed.link_pairs if bodies == "self" else placed.obstacle_pairs)
+        if self._held is None:
+            raise RecipeError([NO_HELD_SHAPE])
+        self._held.place(*self._joint_poses(), [])
+        return self._held.pair_distances(self._held.link_pairs)
+
+    def _placed_bodies(self) -> RigidBodies:
+        """Return the parts of the robot's links, placed at the states."""
+        if self._bodies is None:
+            raise RecipeError([NO_SHAPE])
+        if not self._placed:
+            self._bodies.place(*self._joint_poses(), self._solids)
+            self._placed = True
+        return self._bodies
+
+
+class World(RobotWorld):
+    """A robot at one state, among the obstacles.
+
+    Constraints evaluate their ``measured`` forms on it. ``set_state`` runs the forward kinematics; every other quantity
+    is computed when it is read. For arguments and further attributes see ``RobotWorld``.
+
+    Attributes:
+        q: Joint positions [rad], shape (n,).
+        dq: Joint velocities [rad/s], shape (n,).
+        ddq: Joint accelerations [rad/s^2], shape (n,).
+        jerk: Joint jerks [rad/s^3], shape (n,); None at a boundary state or if no constraint needs them.
+    """
+
+    def _start(self) -> None:
+        self._dynamics_data = self._model.createData()  # separate: RNEA's accelerations include gravity
+        self._joints = sorted({point for segment in self.robot.capsule_axes for point in segment} - {self.robot.n})
+        zero = np.zeros(self.robot.n)
+        self.set_state(self.robot.base, zero, zero, place_obstacles(self.obstacles))
 
     def set_state(self, q: Array, dq: Array, ddq: Array, obstacle_poses: Array, jerk: Array | None = None) -> None:
         """Move to a state.
@@ -78,15 +194,8 @@ class World:
         self.q, self.dq, self.ddq, self.jerk = q, dq, ddq, jerk
         pin.forwardKinematics(self._model, self._data, q, dq, ddq)
         self._T_world_tip = pin.updateFramePlacement(self._model, self._data, self._tip)
-        self._solids, self._placed = solids_of(self.obstacles, obstacle_poses), False
-        self.parameters.set(obstacle_poses[pose_width(self.obstacles) :])
-        self._collisions.place(self._solids)
-        self._distances: list[float] | None = None
-
-    @property
-    def scene_values(self) -> Array:
-        """Values for a constraint (``Constraint.scene_values``); empty if none were given."""
-        return self.parameters.scene_values
+        self._place(obstacle_poses)
+        self.__dict__.pop("_segment_distances", None)  # of the last state
 
     @property
     def torque(self) -> Array:
@@ -148,63 +257,23 @@ class World:
         frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         return getattr(pin, quantity)(self._model, self._data, self._tip, frame)
 
-    def segment_distances(self, sufficient: float = np.inf) -> list[float]:  # noqa: ARG002 - one state is always exact
-        """Measure the signed distance of every segment of the robot from every obstacle, segment by segment [m]."""
-        if self._distances is None:
-            poses = self._data.oMi  # of the universe and joints 1 to n
-            points = {joint: poses[joint + 1].translation.tolist() for joint in self._joints}
-            points[self.robot.n] = self._T_world_tip.translation.tolist()
-            self._distances = self._collisions.segment_distances([(points[a], points[b]) for a, b in self._segments])
-        return self._distances
+    def _smallest(self, bodies: str, sufficient: float) -> list[float]:  # noqa: ARG002 - one state is always exact
+        if bodies == "segments":
+            return self._segment_distances
+        if bodies == "object":
+            self._require_object()
+            return self._collisions.object_distances(self._T_world_tip.translation, self._T_world_tip.rotation)
+        return [float(distances[0]) for distances in self._pairs_of(bodies).smallest()]
 
-    def shape_distances(self, sufficient: float = np.inf) -> list[float]:  # noqa: ARG002 - one state is always exact
-        """Measure the signed distance of every moving part of the robot's links from every obstacle, part by part [m].
-
-        The smallest is exact, the others are lower bounds above it (``cnpgen.world.pair_distances``).
-
-        Raises:
-            RecipeError: The robot has no link geometry.
-        """
-        bodies = self._placed_bodies()
-        return [float(distances[0]) for distances in bodies.pair_distances(bodies.obstacle_pairs).smallest()]
-
-    def self_distances(self, sufficient: float = np.inf) -> list[float]:  # noqa: ARG002 - one state is always exact
-        """Measure the signed distance of every two parts of links that must not touch [m]; see ``shape_distances``."""
-        bodies = self._placed_bodies()
-        return [float(distances[0]) for distances in bodies.pair_distances(bodies.link_pairs).smallest()]
-
-    def _placed_bodies(self) -> RigidBodies:
-        """Return the parts of the robot's links, placed at the state."""
-        if self._bodies is None:
-            raise RecipeError([NO_SHAPE])
-        if not self._placed:
-            self._bodies.place(*self._joint_poses(), self._solids)
-            self._placed = True
-        return self._bodies
+    @cached_property
+    def _segment_distances(self) -> list[float]:
+        poses = self._data.oMi  # of the universe and joints 1 to n
+        points = {joint: poses[joint + 1].translation.tolist() for joint in self._joints}
+        points[self.robot.n] = self._T_world_tip.translation.tolist()
+        return self._collisions.segment_distances([(points[a], points[b]) for a, b in self.robot.capsule_axes])
 
     def _joint_poses(self) -> tuple[Array, Array]:
         """Return the rotations and positions [m] of the base and the joints, as ``RigidBodies.place`` takes them."""
         poses = list(self._data.oMi)
         rotations = np.array([pose.rotation for pose in poses])[..., None]
         return rotations, np.array([pose.translation for pose in poses])[..., None]
-
-    def held_object_distances(self, sufficient: float = np.inf) -> list[float]:  # noqa: ARG002 - one state is always exact
-        """Measure the signed distance of the held object from parts of links [m]; see ``shape_distances``.
-
-        Raises:
-            RecipeError: The robot has no geometry for it.
-        """
-        if self._held is None:
-            raise RecipeError([NO_HELD_SHAPE])
-        self._held.place(*self._joint_poses(), [])
-        return [float(distances[0]) for distances in self._held.pair_distances(self._held.link_pairs).smallest()]
-
-    def object_distances(self, sufficient: float = np.inf) -> list[float]:  # noqa: ARG002 - one state is always exact
-        """Measure the signed distance of the held object from every obstacle [m], negative if they overlap.
-
-        Raises:
-            RecipeError: The problem has no held object.
-        """
-        if self._object_size is None:
-            raise RecipeError(["a constraint needs the held object, but the problem has no [object]"])
-        return self._collisions.object_distances(self._T_world_tip.translation, self._T_world_tip.rotation)

@@ -14,7 +14,7 @@ from tests.examples.plans import Plan, load, perturbed, reference_trajectory
 def curves_of(plan: Plan, *times: float) -> tuple[dict[str, ConditionCurve], np.ndarray]:
     """Return the curves of a plan by the name of their condition, and their times."""
     world, s, t = along(plan.problem, plan.robot, plan.motion, 0, samples=300, extra_times=times, scene=plan.scene)
-    return {curve.name: curve for curve in condition_curves(plan.problem, world, s, plan.scene.bodies())}, t
+    return {curve.name: curve for curve in condition_curves(plan.problem, world, s)}, t
 
 
 def test_the_tilt_is_the_angle_between_the_tip_s_axis_and_the_vertical() -> None:

@@ -88,14 +88,14 @@ def test_the_intervals_with_the_lowest_bounds_are_chosen_if_there_are_too_many(
     assert np.flatnonzero(found).tolist() == [2, 4]
 
 
-@pytest.mark.parametrize(("label", "kind"), [("transport", "object"), ("dragging", "object"), ("transport", "segment")])
+@pytest.mark.parametrize(("label", "kind"), [("transport", "object"), ("dragging", "object"), ("transport", "robot")])
 def test_interval_bounds_hold_at_finer_samples(label: str, kind: str) -> None:
     plan = perturbed(load(label), 0.01, seed=1)
     (poses,) = plan.scene.poses
     assert_bounds_hold(plan.problem, plan.robot, plan.motion, poses, kind)
 
 
-@pytest.mark.parametrize("kind", ["shape", "self"])
+@pytest.mark.parametrize("kind", ["robot", "self"])
 def test_interval_bounds_hold_for_the_parts_of_a_robot(kind: str, tmp_path: Path) -> None:
     problem = load_problem(write_problem(tmp_path))
     robot = load_robot(problem)
@@ -111,7 +111,7 @@ def assert_bounds_hold(problem: Problem, robot: Robot, motion: Motion, poses: np
     def pairs_at(phases: np.ndarray) -> PairDistances:
         states = evaluate_trajectory(motion, phases)
         world.set_path(states.q, states.dq, states.ddq, poses)
-        return getattr(world, f"{kind}_pairs")()
+        return world.pairs(kind)
 
     fine = pairs_at(finer)
     distances = np.min(

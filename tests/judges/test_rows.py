@@ -594,7 +594,7 @@ def test_obstacle_poses_follow_the_object_or_are_fixed():
 
 
 def test_the_collision_world_measures_segments_in_order_and_exactly():
-    scene = CollisionWorld(None, 3)
+    scene = CollisionWorld(None)
     scene.place(solids_of(HEAVY.obstacle, np.array([0.5, 0.4])))
     up = ((0.4, -0.45, 0.6), (0.4, -0.45, 0.9))  # over the first, 0.75 m from the second
     across = ((0.4, -0.2, 0.2), (0.4, 0.2, 0.2))  # 0.1 m from both
@@ -605,7 +605,7 @@ def test_the_collision_world_measures_segments_in_order_and_exactly():
 
 
 def test_the_collision_world_measures_a_segment_of_length_zero():
-    scene = CollisionWorld(None, 1)
+    scene = CollisionWorld(None)
     scene.place(solids_of(HEAVY.obstacle, np.array([0.5, 0.4])))
     np.testing.assert_allclose(scene.segment_distances([((0.4, 0.0, 0.2),) * 2]), [0.3, 0.3], atol=1e-9)
 
@@ -613,7 +613,7 @@ def test_the_collision_world_measures_a_segment_of_length_zero():
 @pytest.mark.parametrize("turn", [0.0, 0.3, np.pi / 2])
 @pytest.mark.parametrize("depth", [-0.1, -1e-9, 0.0, 1e-9, 1e-3, 0.1])
 def test_the_collision_world_measures_the_penetration_depth_of_an_object(turn, depth):
-    scene = CollisionWorld((0.2, 0.2, 0.3), 0)
+    scene = CollisionWorld((0.2, 0.2, 0.3))
     scene.place(solids_of(HEAVY.obstacle, np.array([0.5, -3.0])))
     position, rotation = np.array([0.41, -0.44, 0.65 - depth]), pin.exp3(np.array([0.0, 0.0, turn]))
     assert scene.object_distances(position, rotation)[0] == pytest.approx(-depth, abs=1e-10)

@@ -6,13 +6,13 @@ from itertools import product
 import numpy as np
 import pytest
 
-from cnpgen.kernels.collision.collision_checker import CloseBodies, CollisionChecker, load_collision_library
+from cnpgen.kernels.collision.collision_checker import CollisionChecker, load_collision_library
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
-from cnpgen.robots.shape.convex_part import turned
+from cnpgen.robots.shape.convex_part import Contacts, turned
 from cnpgen.robots.shape.hull import coal_hull
 from cnpgen.robots.shape.inline import address_of
 from cnpgen.robots.solid import place_obstacles
@@ -97,7 +97,7 @@ def states_of(robot: Robot, count: int = STATES) -> np.ndarray:
     return random.uniform(robot.position_lower, robot.position_upper, (count, robot.n)).T.copy()
 
 
-def by_pair(close: CloseBodies) -> dict[tuple[int, int], float]:
+def by_pair(close: Contacts) -> dict[tuple[int, int], float]:
     return {(int(pair), int(k)): float(d) for pair, k, d in zip(close.pair, close.k, close.distance, strict=True)}
 
 

@@ -13,10 +13,9 @@ from cnpgen.kernels import compiler
 from cnpgen.kernels.compiled_kernel import CompiledGridKernel, compile_tape
 from cnpgen.kernels.compiler import find_compiler
 from cnpgen.kernels.emit import emit
-from cnpgen.kernels.interpreted_kernel import POINTS_PER_BLOCK, InterpretedGridKernel
+from cnpgen.kernels.interpreted_kernel import POINTS_PER_BLOCK, InterpretedGridKernel, MappedGridKernel
 from cnpgen.kernels.kernel import GridKernel
 from cnpgen.kernels.library import KernelLibrary
-from cnpgen.kernels.mapped_kernel import MappedGridKernel
 from cnpgen.kernels.tape import Axes, GridSpec, Loop, Tape, tape_from_function
 from tests.conftest import needs_compiler, some
 from tests.kernels.test_kernels import BINARY, REFERENCE, SPECIAL, UNARY, machine_flags

@@ -24,10 +24,9 @@ from cnpgen.kernels import library as library_module
 from cnpgen.kernels.compiled_kernel import CompiledKernel, compile_tape
 from cnpgen.kernels.compiler import find_compiler, vector_flags
 from cnpgen.kernels.emit import emit
-from cnpgen.kernels.interpreted_kernel import POINTS_PER_BLOCK, InterpretedKernel
+from cnpgen.kernels.interpreted_kernel import POINTS_PER_BLOCK, InterpretedKernel, MappedKernel
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend
-from cnpgen.kernels.mapped_kernel import MappedKernel
 from cnpgen.kernels.parallel_compilation import CompilerPool
 from cnpgen.kernels.tape import CODES, NAMES, Loop, Tape, tape_from_function
 from cnpgen.store.files.cache_folder import exclusive_lock, make_private_folder

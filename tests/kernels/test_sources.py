@@ -18,6 +18,7 @@ from cnpgen.problems.problem_file import load_problem
 WITHOUT_EFFECT = {
     "cnpgen.errors": "the words of exceptions",
     "cnpgen.schema": "how recipes are read: what was read is in the problem's identity",
+    "cnpgen.machine": "the processor, which is in no tape",
     "cnpgen.world": "what Pinocchio and Coal measure, which is in no tape",
     "cnpgen.store": "how columns are described and files are written",
 }

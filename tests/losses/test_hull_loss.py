@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from cnpgen.kernels.collision.clearance_loss import load_clearance_loss
-from cnpgen.kernels.collision.clearance_loss_reference import ClearanceLossReference
+from cnpgen.kernels.collision.clearance_loss import ClearanceLossReference, load_clearance_loss
 from cnpgen.kernels.collision.collision_checker import CollisionChecker, load_collision_library
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.losses.plan_loss import PlanLoss

@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.kernels.interpreted_kernel import InterpretedGridKernel
-from cnpgen.kernels.symbolic.box_distances import signed_segment_box_distance
+from cnpgen.kernels.symbolic.convex_distances import signed_segment_box_distance
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.symbolic_state import FrozenState, SymbolicState
 from cnpgen.kernels.tape import GridSpec, tape_from_function

@@ -43,7 +43,7 @@ def clear_of_object(prepared: PreparedPipeline, q: np.ndarray) -> np.ndarray:
     problem = prepared.context.problem
     world = PathWorld(prepared.context.robot, problem.obstacle, problem.object_size)
     world.set_path(q.copy(), 0 * q, 0 * q, place_obstacles(problem.obstacle))
-    return world.held_object_pairs().clear_states(1e-3)
+    return world.pairs("held object").clear_states(1e-3)
 
 
 def with_margins(prepared: PreparedPipeline, candidates: CandidateBatch) -> CandidateBatch:

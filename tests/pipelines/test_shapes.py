@@ -13,6 +13,7 @@ from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.collision import Collision, capsule_clearance
 from cnpgen.pipelines.stages.narrow_phase import narrow_phase, narrow_phase_of
 from cnpgen.pipelines.stages.stage import CandidateBatch
+from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
@@ -83,7 +84,7 @@ def test_states_with_different_obstacle_poses_are_checked_one_by_one(context, dr
     other[1, 0] += 1.0
     all_states = np.ones(60, bool)
     together = narrow_phase_of(context, "start")((few, still, still), obstacle_poses, all_states, None)
-    monkeypatch.setattr(PathWorld, "shape_pairs", None)
+    monkeypatch.setattr(RobotClearance, "met", None)
     alone = narrow_phase_of(context, "start")((few, still, still), other, all_states, None)
     np.testing.assert_array_equal(alone[:, 1:], together[:, 1:])
     assert alone.any()

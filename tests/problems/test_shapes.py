@@ -8,8 +8,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from cnpgen.kernels.symbolic.convex_distances import segment_distance
 from cnpgen.kernels.symbolic.linalg import symbols
-from cnpgen.kernels.symbolic.segment_distance import segment_distance
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint

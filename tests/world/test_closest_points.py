@@ -8,8 +8,7 @@ import pytest
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
-from cnpgen.robots.solid import place_obstacles, solids_of
-from cnpgen.world.closest_points import closest_points, smallest_per_state
+from cnpgen.robots.solid import place_obstacles
 from cnpgen.world.pair_distances import PairDistances
 from cnpgen.world.path import PathWorld
 from tests.examples.shaped_robot import write_problem
@@ -32,8 +31,7 @@ def world_on_a_path(problem: Problem, q: np.ndarray | None = None) -> PathWorld:
 def test_distances_equal_those_of_single_states_and_of_the_points(kind: str, tmp_path: Path) -> None:
     problem = load_problem("heavy-object") if kind == "object" else load_problem(write_problem(tmp_path))
     world = world_on_a_path(problem)
-    solids = solids_of(problem.obstacle, place_obstacles(problem.obstacle))
-    closest = closest_points(world, kind, solids)
+    closest = world.pairs(kind).closest_points()
     single = world_on_a_path(problem)
     for k in range(0, STATES, 7):
         single.set_path(
@@ -49,8 +47,7 @@ def test_distances_equal_those_of_single_states_and_of_the_points(kind: str, tmp
 def test_the_paper_s_capsules_are_measured_from_their_surface() -> None:
     problem = load_problem("heavy-object")
     world = world_on_a_path(problem)
-    solids = solids_of(problem.obstacle, place_obstacles(problem.obstacle))
-    axes, surface = (closest_points(world, "robot", solids, radius=radius) for radius in (0.0, 0.05))
+    axes, surface = (world.pairs("robot").closest_points(radius) for radius in (0.0, 0.05))
     np.testing.assert_allclose(axes.distance - surface.distance, 0.05, atol=1e-12)
     outside = surface.distance > 0
     assert outside.any()
@@ -69,7 +66,10 @@ def test_the_smallest_pair_of_every_state_is_found(seed: int) -> None:
         calls.append((pair, k))
         return float(truth[pair, k]), np.zeros(3)
 
-    distances, pairs = smallest_per_state(PairDistances(bounds, measure, lambda *_: np.zeros(0)))
+    def unused(*_: object) -> np.ndarray:
+        raise NotImplementedError
+
+    distances, pairs = PairDistances(bounds, measure, unused, unused).smallest_per_state()
     np.testing.assert_array_equal(distances, truth.min(axis=0))
     np.testing.assert_array_equal(pairs, truth.argmin(axis=0))
     assert len(calls) < truth.size

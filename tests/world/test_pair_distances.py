@@ -1,16 +1,19 @@
 """Best-first search of distances, and masks of states at a sufficient distance."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
-from cnpgen.world.pair_distances import RESOLUTION, clear_states, smallest_distances
+from cnpgen.world.pair_distances import RESOLUTION, PairDistances
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
 from tests.examples.shaped_robot import write_problem
 
 NO_DIRECTION = np.full(3, np.nan)
+UNUSED: Any = None
 
 
 def searched(
@@ -26,7 +29,7 @@ def searched(
     def separation(pair: int, direction: np.ndarray, states: np.ndarray) -> np.ndarray:
         return truth[pair, states] - 1e-3 * np.abs(states - direction[2])
 
-    return smallest_distances(bounds, measure, separation), calls
+    return np.array(PairDistances(bounds, measure, separation, UNUSED).smallest()), calls
 
 
 @pytest.mark.parametrize("directions", [True, False])
@@ -62,7 +65,10 @@ def test_directions_are_applied_only_where_the_distance_could_be_smaller() -> No
         applied.append(states)
         return bounds[pair, states]
 
-    smallest_distances(bounds, lambda pair, k: (float(truth[pair, k]), np.array([1.0, 0.0, 0.0])), separation)
+    def measure(pair: int, k: int) -> tuple[float, np.ndarray]:
+        return float(truth[pair, k]), np.array([1.0, 0.0, 0.0])
+
+    PairDistances(bounds, measure, separation, UNUSED).smallest()
     for states in applied:
         assert bounds[0, states].max() < truth[0, bounds[0].argmin()]
     assert 0 < len(applied[0]) < 200
@@ -82,7 +88,7 @@ def test_a_distance_that_cannot_be_measured_ends_the_search() -> None:
 
 
 def test_the_search_without_pairs_returns_no_distances() -> None:
-    assert smallest_distances(np.zeros((0, 7)), lambda *_: (0.0, NO_DIRECTION), lambda *_: NO_DIRECTION).shape == (0, 7)
+    assert PairDistances(np.zeros((0, 7)), UNUSED, UNUSED, UNUSED).smallest() == []
 
 
 OBSTACLE_POSES = np.array([0.3, 0.9])
@@ -125,7 +131,7 @@ def test_one_direction_resolves_all_states_that_it_bounds():
         return distances[k], np.array([1.0, 0.0, 0.0])
 
     bounds = np.full((1, 101), -1.0)
-    found = clear_states(bounds, 0.5, measure, lambda pair, direction, states: distances[states])
+    found = PairDistances(bounds, measure, lambda pair, direction, states: distances[states], UNUSED).clear_states(0.5)
     np.testing.assert_array_equal(found, distances >= 0.5)
     assert calls == list(
         range(50)
@@ -139,7 +145,6 @@ def test_a_state_that_cannot_be_measured_is_not_clear_and_resolves_no_others(dis
     def measure(pair: int, k: int) -> tuple[float, np.ndarray]:
         return (distance, np.array(direction)) if k == 1 else (0.3, np.full(3, np.nan))
 
-    found = clear_states(
-        np.full((1, 3), -1.0), 0.1, measure, lambda pair, direction, states: np.full(len(states), 0.05)
-    )
+    pairs = PairDistances(np.full((1, 3), -1.0), measure, lambda *where: np.full(len(where[2]), 0.05), UNUSED)
+    found = pairs.clear_states(0.1)
     np.testing.assert_array_equal(found, [True, False, True])

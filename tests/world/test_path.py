@@ -152,7 +152,7 @@ def test_a_path_that_is_not_exact_measures_only_if_bounds_are_not_sufficient():
         world.set_path(*states, poses, exact=exact)
         for what in ("segment", "object"):
             distances = getattr(world, f"{what}_distances")
-            least = np.min(getattr(world, f"{what}_pairs")().bounds)
+            least = np.min(world.pairs("robot" if what == "segment" else what).bounds)
             distances_of[what, exact] = [np.array(distances(sufficient)) for sufficient in (least - 1e-3, least + 1e-3)]
     for what in ("segment", "object"):
         (known, _), (bounds, measured) = distances_of[what, True], distances_of[what, False]

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from cnpgen.robots.shape.hull import coal_hull
 from cnpgen.robots.solid import Box
 from cnpgen.world import certified
-from cnpgen.world.separation import cuboid_gaps, cuboid_separation, gaps, separation
+from cnpgen.world.path import cuboid_gaps, cuboid_separation, gaps, separation
 
 SIZE = np.array([0.2, 0.2, 0.3])
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])

@@ -28,7 +28,7 @@ def test_distances_of_segments_and_objects_agree_with_coal_s_own_shapes(kind: st
     random, inside = np.random.default_rng(3), 0
     for _ in range(10):
         obstacle = draw_obstacle(kind, random)
-        world, thinner = CollisionWorld(SIZE, 1), ROUNDER * (obstacle.radius or 0.0) if kind == "cylinder" else 0.0
+        world, thinner = CollisionWorld(SIZE), ROUNDER * (obstacle.radius or 0.0) if kind == "cylinder" else 0.0
         world.place(solids_of([obstacle], place_obstacles([obstacle])))
         for _ in range(20):
             first, second = random.normal(0, 0.2, (2, 3))

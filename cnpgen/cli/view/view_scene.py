@@ -152,7 +152,7 @@ def _moving(  # noqa: PLR0917 - all of them are shown
     verdict: Verdict,
 ) -> View:
     """Show one motion at phases s and times [s], shape (K,)."""
-    curves, shares = condition_curves(problem, world, s, scene.bodies()), shares_of_limits(world)
+    curves, shares = condition_curves(problem, world, s), shares_of_limits(world)
     poses = _poses(robot, world.q)
     return View(
         title=title,

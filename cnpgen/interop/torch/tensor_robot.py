@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -36,23 +35,24 @@ class TensorRobot:
         self.problem = as_problem(problem)
         self.model = RobotModel(self.problem, backend="numpy")
         self._kernels = problem_kernels(self.problem, load_robot(self.problem), *choose_backend("numpy"))
+        self._tapes = dict[Callable[..., Any], TensorTape]()
 
     def __repr__(self) -> str:
         return f"<TensorRobot of {self.problem.name!r}: {len(self.model.joint_names)} joints>"
 
     def forward_kinematics(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Compute positions [m], shape (N, 3), and rotation matrices, shape (N, 3, 3), of the tip."""
-        position, rotation, _ = self._tip(self._rows("q", q))
+        position, rotation, _ = self._run(tip_pose, self._rows("q", q))
         return position.T, rotation.T.reshape(-1, 3, 3)
 
     def jacobian(self, q: torch.Tensor) -> torch.Tensor:
         """Compute the geometric Jacobian of the tip in world axes, linear rows first, shape (N, 6, n)."""
-        columns: torch.Tensor = self._tip(self._rows("q", q))[2].T.reshape(len(q), 6, -1)
+        columns: torch.Tensor = self._run(tip_pose, self._rows("q", q))[2].T.reshape(len(q), 6, -1)
         return columns
 
     def inverse_dynamics(self, q: torch.Tensor, dq: torch.Tensor, ddq: torch.Tensor) -> torch.Tensor:
         """Compute joint torques [N m], payload included, shape (N, n)."""
-        (torque,) = self._dynamics(*self._states(q, dq, ddq))
+        (torque,) = self._run(inverse_dynamics_of, *self._states(q, dq, ddq))
         return torque.T
 
     def constraint_values(
@@ -82,7 +82,7 @@ class TensorRobot:
             raise UsageError(
                 f"must have shape ({len(q)}, {width}), got {tuple(poses.shape)}", argument="obstacle_poses"
             )
-        (values,) = self._constraints(*self._states(q, dq, ddq), poses.to(q).T)
+        (values,) = self._run(constraint_values_of, *self._states(q, dq, ddq), poses.to(q).T)
         return values.T
 
     def _states(self, *states: torch.Tensor) -> list[torch.Tensor]:
@@ -98,17 +98,9 @@ class TensorRobot:
             raise UsageError(f"must have shape (N, {n}), got {tuple(tensor.shape)}", argument=name)
         return tensor.T
 
-    def _load(self, builder: Callable[..., Any], results: tuple[int, ...] | None = None) -> TensorTape:
-        return TensorTape(self._kernels.tape(builder), results)
-
-    @cached_property
-    def _tip(self) -> TensorTape:
-        return self._load(tip_pose)
-
-    @cached_property
-    def _dynamics(self) -> TensorTape:
-        return self._load(inverse_dynamics_of)
-
-    @cached_property
-    def _constraints(self) -> TensorTape:
-        return self._load(constraint_values_of, (0,))
+    def _run(self, builder: Callable[..., Any], *arguments: torch.Tensor) -> list[torch.Tensor]:
+        """Evaluate the SX function of a builder; only the values of constraints, without their derivatives."""
+        if builder not in self._tapes:
+            selected = (0,) if builder is constraint_values_of else None
+            self._tapes[builder] = TensorTape(self._kernels.tape(builder), selected)
+        return self._tapes[builder](*arguments)

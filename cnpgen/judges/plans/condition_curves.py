@@ -1,6 +1,6 @@
 """Values of a problem's conditions over time, for plots and pages: tilt, clearances, distances from the manifold."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import cast
 
@@ -12,8 +12,6 @@ from cnpgen.judges.plans.measure import MeasuredCondition, measure, name_part
 from cnpgen.problems.constraints.clearance import DistanceConstraint
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.solid import Solid
-from cnpgen.world.closest_points import closest_points
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
 
@@ -64,7 +62,7 @@ def plot_unit(unit: str) -> tuple[float, str]:
     return _SCALES.get(unit, (1.0, unit))
 
 
-def condition_curves(problem: Problem, world: PathWorld, s: Array, solids: Sequence[Solid]) -> list[ConditionCurve]:
+def condition_curves(problem: Problem, world: PathWorld, s: Array) -> list[ConditionCurve]:
     """Measure all conditions that are no limits of joints at phases s, shape (K,), where the robot is."""
     start_tip = world.tip_position[:, 0].copy()
     curves: list[ConditionCurve] = []
@@ -72,7 +70,7 @@ def condition_curves(problem: Problem, world: PathWorld, s: Array, solids: Seque
         if is_proven(constraint) or isinstance(constraint, JointTorque):
             continue
         if isinstance(constraint, DistanceConstraint) and constraint.bodies != "held object":
-            curves += _distance_curves(problem, constraint, world, solids)
+            curves += _distance_curves(problem, constraint, world)
         else:
             curves += _value_curves(problem, measure(constraint, world, s, start_tip))
     return curves
@@ -118,15 +116,13 @@ def _tilt_curve(condition: MeasuredCondition) -> ConditionCurve:
     )
 
 
-def _distance_curves(
-    problem: Problem, constraint: DistanceConstraint, world: PathWorld, solids: Sequence[Solid]
-) -> Iterator[ConditionCurve]:
+def _distance_curves(problem: Problem, constraint: DistanceConstraint, world: PathWorld) -> Iterator[ConditionCurve]:
     """Measure the smallest distance of a constraint on distances at every state, with the closest points."""
     (stated,) = constraint.judged(cast(World, world))
     if not stated.g:
         return
     radius = (problem.arm_radius or 0.0) if constraint.bodies == "robot" and world.robot.shape is None else 0.0
-    closest = closest_points(world, constraint.bodies, solids, radius=radius)
+    closest = world.pairs(constraint.bodies).closest_points(radius)
     count = len(closest.distance)
     least = np.full(count, 1e3 * (float(stated.lower[0]) - radius))
     names = [name_part(problem, constraint, stated, i) for i in range(len(stated.g))]

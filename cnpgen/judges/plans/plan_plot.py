@@ -84,7 +84,7 @@ def draw_path(
             ends = world.tip_position[:, :1].T, world.tip_position[:, -1:].T
             scene = scene_of(problem, *ends, world.tip_velocity[:, -1:].T)
         world.set_path(world.q, world.dq, world.ddq, scene.poses[0], world.jerk)
-    curves = [curve for curve in condition_curves(problem, world, s, scene.bodies()) if curve.name != TABLE_HEIGHT]
+    curves = [curve for curve in condition_curves(problem, world, s) if curve.name != TABLE_HEIGHT]
     columns = [1.15, 0.85, 1.0] if curves else [1.15, 1.0]
     figure = new_figure(20 if curves else 15, 9)
     figure.suptitle(title)

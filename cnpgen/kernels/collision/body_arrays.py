@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.robots.observation.primitives import KINDS, MESH, Primitives
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import frame_along
 from cnpgen.robots.shape.inline import corners_of
@@ -24,12 +25,44 @@ BODY = np.dtype(
     ]
 )
 PADDING_DISTANCE_M = 1e6  # of the bounding boxes that pad the obstacles to full vectors
+_BOX, _CYLINDER = KINDS.index("box"), KINDS.index("cylinder")
 
 
 def hull_vertices(corners: Array) -> Array:
     """Return corners, shape (V, 3), by coordinates and padded with the first one, shape (3 * padded count,)."""
     padding = np.repeat(corners[:1], -len(corners) % LANES, axis=0)
     return np.concatenate([corners, padding]).T.ravel()
+
+
+def bounding_boxes(bodies: Bodies, centers: Array, half: Array) -> Array:
+    """Return the bounding boxes of bodies of N samples by rows, shape (N, 16, M padded); see ``obstacle_bodies``.
+
+    Bodies have shape (N, M), centers and half sizes of their boxes without the radius [m] (N, M, 3).
+    """
+    count = bodies.shape[1]
+    boxes = np.zeros((len(bodies), 16, count + -count % LANES))
+    boxes[:, :3] = PADDING_DISTANCE_M
+    rows = np.concatenate([centers, half, bodies["rotation"], bodies["radius"][..., None]], axis=-1)
+    boxes[..., :count] = rows.swapaxes(1, 2)
+    return boxes
+
+
+def primitive_bodies(obstacles: Primitives, first: int) -> tuple[Bodies, Array, Array]:
+    """Return the obstacles of N samples as bodies, vertices of meshes and boxes, as ``obstacle_bodies`` of one."""
+    kinds, sizes = obstacles.kinds, obstacles.sizes
+    blocks = [hull_vertices(mesh.corners) for mesh in obstacles.meshes]
+    ends = np.cumsum([first, *map(len, blocks)])
+    box, cylinder, mesh = kinds == _BOX, kinds == _CYLINDER, kinds >= MESH
+    rounded = (kinds >= 0) & ~(box | cylinder | mesh)
+    bodies = np.zeros(kinds.shape, BODY)
+    bodies["kind"] = np.where(mesh, HULL, np.where(cylinder, CYLINDER, BOX))
+    centers = np.where((kinds >= 0)[..., None], obstacles.centers, PADDING_DISTANCE_M)
+    bodies["position"], bodies["rotation"] = centers, obstacles.rotations.reshape(*kinds.shape, 9)
+    bodies["first"][mesh], bodies["count"][mesh] = ends[kinds[mesh] - MESH], np.diff(ends)[kinds[mesh] - MESH] // 3
+    bodies["size"][box], bodies["size"][cylinder] = sizes[box], sizes[cylinder][:, [0, 0, 1]]
+    bodies["size"][rounded, 2], bodies["radius"][rounded] = sizes[rounded, 1], sizes[rounded, 0]
+    half = np.where(mesh[..., None], sizes, bodies["size"])
+    return bodies, np.concatenate([*blocks, np.empty(0)]), bounding_boxes(bodies, centers, half)
 
 
 def obstacle_bodies(obstacles: Sequence[Obstacle], numbers: Array, first: int) -> tuple[Bodies, Array, Array]:
@@ -47,17 +80,15 @@ def obstacle_bodies(obstacles: Sequence[Obstacle], numbers: Array, first: int) -
         half sizes, rotation, radius), shape (16, O padded).
     """
     bodies, vertices = np.zeros(len(obstacles), BODY), list[Array]()
-    boxes = np.zeros((16, len(obstacles) + -len(obstacles) % LANES))
-    boxes[:3] = PADDING_DISTANCE_M
+    centers, halves = np.empty((2, len(obstacles), 3))
     for index, (obstacle, part) in enumerate(zip(obstacles, number_slices(obstacles), strict=True)):
         body = bodies[index]
-        center, half = _fill(body, obstacle, numbers[part])
+        centers[index], halves[index] = _fill(body, obstacle, numbers[part])
         if body["kind"] == HULL:
             corners = corners_of(obstacle.mesh)
             vertices.append(hull_vertices(corners))
             body["count"], body["first"], first = len(vertices[-1]) // 3, first, first + len(vertices[-1])
-        boxes[:3, index], boxes[3:6, index] = center, half
-        boxes[6:15, index], boxes[15, index] = body["rotation"], body["radius"]
+    (boxes,) = bounding_boxes(bodies[None], centers[None], halves[None])
     return bodies, np.concatenate([*vertices, np.empty(0)]), boxes
 
 

@@ -8,20 +8,20 @@ from collections.abc import Mapping, Sequence
 from ctypes import c_double, c_int, c_long, c_void_p
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.collision.body_arrays import BODY, hull_vertices, obstacle_bodies
+from cnpgen.kernels.collision.body_arrays import BODY, Bodies, hull_vertices, obstacle_bodies
 from cnpgen.kernels.compiled_kernel import address_of
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.shape.convex_part import Contacts
 from cnpgen.robots.shape.shape import Shape
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 _NAMES = ("convex.c", "collision.c", "tree_search.c", "manifold_search.c", "hull_rows.c")
 SOURCES = [Path(__file__).with_name(name) for name in _NAMES]
@@ -39,24 +39,6 @@ class _RobotScene(ctypes.Structure):
         *((name, c_void_p) for name in ("link_pairs", "first_pair", "pairs", "moving", "moving_frames")),
         *((name, c_void_p) for name in ("added", "pair_added", "obstacles", "boxes", "vertices")),
     )
-
-
-class CloseBodies(NamedTuple):
-    """C pairs of bodies that are close to each other at a state.
-
-    Attributes:
-        pair: Indices of the pairs, shape (C,).
-        k: Indices of the states, shape (C,).
-        distance: Signed distances [m], shape (C,).
-        normal: Unit vectors from the first body to the second in the world frame, shape (C, 3).
-        points: Closest points of both bodies without their radii, in the world frame [m], shape (C, 2, 3).
-    """
-
-    pair: Indices
-    k: Indices
-    distance: Array
-    normal: Array
-    points: Array
 
 
 def load_collision_library(kernels: KernelLibrary, sources: Sequence[Path] = SOURCES) -> ctypes.CDLL | None:
@@ -147,6 +129,13 @@ class CollisionChecker:
         """Address of the scene for functions in C; valid until the obstacles change."""
         return ctypes.addressof(self._scene)
 
+    def scene_of(self, bodies: Bodies, boxes: Array, vertices: Array) -> _RobotScene:
+        """Return a copy of the scene with other obstacles for functions in C; the caller keeps their arrays."""
+        scene = _RobotScene.from_buffer_copy(self._scene)
+        scene.obstacles, scene.boxes, scene.vertices = map(address_of, (bodies, boxes, vertices))
+        scene.n_obstacles, scene.lanes = bodies.shape[-1], boxes.shape[-1]
+        return scene
+
     def clear_states(
         self, q: Array, *, obstacle_distance: float | None = 0.0, self_distance: float | None = 0.0
     ) -> NDArray[np.bool_]:
@@ -163,7 +152,7 @@ class CollisionChecker:
         self.library.clear_states(self.address, address_of(states), len(states), *limits, address_of(clear))
         return clear.astype(bool)
 
-    def close_bodies(self, q: Array, within: float, *, of_obstacles: bool) -> CloseBodies:
+    def close_bodies(self, q: Array, within: float, *, of_obstacles: bool) -> Contacts:
         """Measure all pairs of bodies at states where their signed distance is below ``within``.
 
         Args:
@@ -180,7 +169,7 @@ class CollisionChecker:
                 self.address, address_of(states), len(states), within, of_obstacles, capacity, *addresses
             )
             if count <= capacity:
-                return CloseBodies(pair[:count], k[:count], distance[:count], normal[:count], points[:count])
+                return Contacts(pair[:count], k[:count], distance[:count], normal[:count], points[:count])
             capacity = count
 
     def joint_poses(self, q: Array) -> Array:

@@ -58,11 +58,7 @@ class DistanceColumns:
 class RowKernels:
     """The kernels ``(w, poses) -> g`` and ``-> (g, dg/dw)`` of a problem, with rows of distances.
 
-    Args:
-        values: Compiled kernel of the other rows; w begins with the joint positions.
-        jacobian: Compiled kernel of the other rows and their derivatives, column by column.
-        checker: Collision checks with the obstacles in place.
-        columns: The rows of distances.
+    They call compiled kernels of the other rows, with derivatives column by column; w begins with the joint positions.
 
     Attributes:
         values: Kernel of all rows.

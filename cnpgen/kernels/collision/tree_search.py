@@ -83,16 +83,9 @@ def find_tree_path(
 ) -> Array | None:
     """Search for a path whose straight lines are clear; it is shortened by its estimated duration.
 
-    On a manifold the path consists of projected states at small distances, and fewer of them make it shorter.
-
-    Args:
-        checker: The robot among its obstacles.
-        ends: First and last configuration [rad], shape (n,) each; they are not checked themselves.
-        box: Lowest and highest random configurations [rad], shape (n,) each.
-        velocity_limit: Velocity limits of the joints [rad/s], shape (n,).
-        settings: Settings of the search.
-        seed: Seed of the random numbers.
-        manifold: Equalities; they must hold at both ends.
+    On a manifold the path consists of projected states at small distances, and fewer of them make it shorter. The
+    equalities must hold at both ends, which are not checked themselves. Ends and the corners of the box of random
+    configurations [rad] have shape (n,), as velocity limits [rad/s] have.
 
     Returns:
         Corners of the path [rad], shape (K, n), or None if the trees do not connect.

@@ -88,15 +88,9 @@ def inverse_dynamics(
     payload: PayloadBody | None = None,
     loads: Sequence[Load] = (),
 ) -> Vec:
-    """Return joint torques [N m] by recursive Newton-Euler in joint frames.
+    """Return joint torques [N m] by recursive Newton-Euler in joint frames, at q [rad], dq and ddq of n scalars.
 
-    Args:
-        chain: The chain.
-        q: Joint positions [rad], n scalars.
-        dq: Joint velocities [rad/s].
-        ddq: Joint accelerations [rad/s^2].
-        payload: The payload of which ``loads`` are multiples.
-        loads: Loads at the tip beside those of the chain.
+    Loads are multiples of the payload, at the tip beside those of the chain.
     """
     motions = body_motions(chain, q, dq, ddq)
     wrenches = [

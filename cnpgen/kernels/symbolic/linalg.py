@@ -54,14 +54,9 @@ def gram(rows: Matrix, damping: float = 0.0) -> list[list[Scalar]]:
 def factorize(
     lower: Matrix, safeguard: Callable[[Scalar], Scalar] | None = None
 ) -> tuple[list[list[Scalar]], list[Scalar]]:
-    """Factorize a symmetric matrix as ``L D L^T``.
+    """Factorize a symmetric matrix, given by its lower triangle, as ``L D L^T``: return strictly lower L, and 1 / D.
 
-    Args:
-        lower: Lower triangle, row i of length i + 1.
-        safeguard: Function applied to every pivot, e.g. to keep it positive; None for no change.
-
-    Returns:
-        ``(L, inverse of D)``: the strictly lower triangle of L, row i of length i, and 1 / D.
+    The safeguard is applied to every pivot, for example to keep it positive.
     """
     factor: list[list[Scalar]] = []
     inverse: list[Scalar] = []

@@ -9,17 +9,18 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from cnpgen.kernels.symbolic.box_distances import (
+from cnpgen.kernels.symbolic.convex_distances import (
+    SMOOTHING_M2,
     UNBOUNDED_EXTENT_M,
     Bounds,
     cuboid_separation,
     segment_box_distance,
     segment_box_separation,
+    segment_distance,
     signed_segment_box_distance,
     upright_box_separation,
 )
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, scale, subtract, transposed_times
-from cnpgen.kernels.symbolic.segment_distance import SMOOTHING_M2, segment_distance
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import supporting_planes

@@ -230,11 +230,7 @@ class FrozenState(SymbolicState):
 def time_derivatives(path: Sequence[Vec], rate: Sequence[Scalar]) -> tuple[Vec, Vec, Vec | None]:
     """Return ``dq = p' r``, ``ddq = p'' r^2 + p' r r'`` and the jerk ``p''' r^3 + 3 p'' r' r^2 + p' (r'' r + r'^2) r``.
 
-    It is ``cnpgen.trajectory.spline_motion.time_derivatives`` in SX.
-
-    Args:
-        path: p', p'' and p''' of every joint; the jerk is None without p'''.
-        rate: r, r' and r''; r'' only with p'''.
+    It is ``cnpgen.trajectory.spline_motion.time_derivatives`` in SX. Without p''' the jerk is None, and r'' not needed.
     """
     (p1, p2), (r, r1) = path[:2], rate[:2]
     dq = [a * r for a in p1]

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.collision.body_arrays import BODY, BOX, CYLINDER, LANES, PADDING_DISTANCE_M, Bodies
+from cnpgen.kernels.collision.body_arrays import BODY, BOX, CYLINDER, Bodies, bounding_boxes
 from cnpgen.pipelines.families.family import Layout
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene_arrays import make_scene_table, rotations_of, scene_poses
@@ -58,13 +58,7 @@ class BatchScenes:
         bodies["kind"], bodies["size"] = np.where(cylinder, CYLINDER, BOX), half
         bodies["radius"] = np.where(box | cylinder, 0.0, size[..., 0])
         bodies["rotation"], bodies["position"] = rotation, table.obstacle_position
-        padded = kind.shape[1] + -kind.shape[1] % LANES
-        boxes = np.zeros((len(self), 16, padded))
-        boxes[:, :3] = PADDING_DISTANCE_M
-        scenes, entries = np.nonzero(kind >= 0)
-        numbers = [bodies["position"], half, rotation, bodies["radius"][..., None]]
-        boxes[scenes, :, entries] = np.concatenate(numbers, axis=-1)[scenes, entries]
-        return bodies, boxes
+        return bodies, bounding_boxes(bodies, bodies["position"], half)
 
 
 def batch_scenes(

@@ -129,7 +129,7 @@ class RobotClearance(DistanceConstraint):
 
     def met(self, path: "PathWorld", tolerance: float) -> NDArray[np.bool_] | None:
         """Return a mask of the states with sufficient distance of the convex parts from the obstacles."""
-        return path.shape_pairs().clear_states(self.distance - tolerance) if path.robot.shape else None
+        return path.pairs(self.bodies).clear_states(self.distance - tolerance) if path.robot.shape else None
 
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions of the capsules."""

@@ -49,7 +49,7 @@ class SelfClearance(LinkClearance):
         return self._capsule_distances(state, _looked_at(state.robot))
 
     def _capsule_distances(self, state: "SymbolicState", pairs: "Sequence[LinkPair]") -> tuple[Condition, ...]:
-        from cnpgen.kernels.symbolic.segment_distance import segment_distance
+        from cnpgen.kernels.symbolic.convex_distances import segment_distance
 
         ends = [(state.capsules[pair.first], state.capsules[pair.second]) for pair in pairs]
         distances = [segment_distance((a, b), (c, d), freeze=state.freeze) for (a, b, _), (c, d, _) in ends]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CloseBodies, CollisionChecker
+from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CollisionChecker
 from cnpgen.kernels.collision.row_kernels import DistanceColumns, RowKernels
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
@@ -26,11 +26,12 @@ from cnpgen.refine.solver.grid import Grid
 from cnpgen.refine.solver.residuals import DISTANCE_SCALE_M
 from cnpgen.refine.solver.transcription import Linearization, ResidualKernels, Transcription, cache_last
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.shape.convex_part import Contacts
 from cnpgen.robots.shape.held_object import HELD_OBJECT, with_held_object
 from cnpgen.robots.solid import solids_of
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.forward_kinematics import ForwardKinematics
-from cnpgen.world.rigid_bodies import Contacts, RigidBodies
+from cnpgen.world.rigid_bodies import RigidBodies
 
 Array = NDArray[np.float64]
 Pairs = NDArray[np.intp]
@@ -211,7 +212,7 @@ class Hulls:
             turning = np.einsum("cjx,cbx->cbj", axes[k], levers)
             turning += np.einsum("cjx,cbx->cbj", np.cross(origins, axes)[k], normals)
             speeds = np.where(self._sliding, np.einsum("cjx,cbx->cbj", axes[k], normals), turning)
-            speeds *= self._moves[contacts.joints]
+            speeds *= self._moves[self._bodies.joints_of(group.pairs[contacts.pair])]
             nearest = contacts.distance <= distances[k, column]
             gradients[k[nearest], column[nearest]] = (speeds[:, 1] - speeds[:, 0])[nearest]
         return gradients.transpose(2, 1, 0)
@@ -247,21 +248,20 @@ class Hulls:
         if self.checker is None:
             self._place(q, obstacle_poses)
             return [self._bodies.contacts(group.pairs, group.required + within) for group in self._groups]
-        checker, found = self.placed_checker(obstacle_poses), dict[bool, CloseBodies]()
+        checker, found = self.placed_checker(obstacle_poses), dict[bool, Contacts]()
         for kind, required in ((True, self.obstacle_distance), (False, self.self_distance)):
             if required is not None:
                 found[kind] = checker.close_bodies(q, required + within, of_obstacles=kind)
         return [self._contacts_of(group, found[group.of_obstacles], group.required + within) for group in self._groups]
 
-    def _contacts_of(self, group: _Group, close: CloseBodies, within: float) -> Contacts:
+    def _contacts_of(self, group: _Group, close: Contacts, within: float) -> Contacts:
         """Return the pairs of a group that are closer than ``within`` [m]."""
         pair = np.searchsorted(group.numbers, close.pair)
         pair[pair == len(group.numbers)] = 0
         kept = np.flatnonzero((close.distance < within) & (group.numbers[pair] == close.pair))
         pair = pair[kept].astype(np.intp)
-        joints = self._bodies.joints_of(group.pairs[pair])
         k, distance, normal, points = close.k[kept], close.distance[kept], close.normal[kept], close.points[kept]
-        return Contacts(pair, k, distance, normal, points, joints)
+        return Contacts(pair, k, distance, normal, points)
 
     def _joint_axes(self, q: Array) -> tuple[Array, Array]:
         """Return axes and origins [m] of the joints in the world frame, shape (K, n, 3) each."""

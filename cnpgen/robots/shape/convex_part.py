@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -36,6 +37,24 @@ class ConvexPart:
     def moved(self, rotation: Array, translation: Array) -> "ConvexPart":
         """Return the part in another frame, given rotation and translation [m] of the present frame in it."""
         return ConvexPart(self.link, self.vertices @ rotation.T + translation, self.radius)
+
+
+class Contacts(NamedTuple):
+    """C pairs of bodies that are close to each other at a state.
+
+    Attributes:
+        pair: Indices of the pairs, shape (C,).
+        k: Indices of the states, shape (C,).
+        distance: Signed distances [m], shape (C,).
+        normal: Unit vectors from the first body to the second in the world frame, shape (C, 3).
+        points: Closest points of both bodies without their radii, in the world frame [m], shape (C, 2, 3).
+    """
+
+    pair: NDArray[np.int64]
+    k: NDArray[np.int64]
+    distance: Array
+    normal: Array
+    points: Array
 
 
 def link_convex_parts(urdf: str) -> list[ConvexPart]:

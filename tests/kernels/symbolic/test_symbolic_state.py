@@ -10,7 +10,11 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.kernels.interpreted_kernel import InterpretedKernel
-from cnpgen.kernels.symbolic.box_distances import segment_box_distance, segment_box_separation, upright_box_separation
+from cnpgen.kernels.symbolic.convex_distances import (
+    segment_box_distance,
+    segment_box_separation,
+    upright_box_separation,
+)
 from cnpgen.kernels.symbolic.dynamics import inverse_dynamics
 from cnpgen.kernels.symbolic.kinematics import bias_acceleration, forward_kinematics, tip_velocity
 from cnpgen.kernels.symbolic.linalg import symbols

@@ -1,4 +1,4 @@
-"""Exact distances of segments and cuboids from axis-aligned boxes, as SX.
+"""Exact distances of segments from each other, and of segments and cuboids from axis-aligned boxes, as SX.
 
 Segments are given by their ends [m], boxes by their bounds along x, y, z [m]. ``freeze`` is a function that makes a
 value constant for differentiation.
@@ -9,16 +9,42 @@ from collections.abc import Callable
 from functools import reduce
 from typing import Any
 
-from cnpgen.kernels.symbolic.linalg import Scalar, Vec, cross, dot
-from cnpgen.kernels.symbolic.segment_distance import SMOOTHING_M2
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, cross, dot, scale, subtract
 
 Bounds = list[tuple[Any, Any]]  # (low, high) per axis; None for an unbounded side
+SMOOTHING_M2 = 1e-12  # keeps square roots of squared distances differentiable; squared length of a degenerate segment
 UNBOUNDED_EXTENT_M = 100.0  # extent of a box along an axis without a bound
 MIN_SQUARED_DISTANCE_M2 = 1e-30  # the square root of smaller values has no finite gradient
 MIN_EXTENT_M = 1e-12  # replaces an extent of 0 of a segment along an axis, so that 1 / extent is finite
 MIN_SQUARED_NORMAL_M2 = 1e-16  # squared length of a cross product at which a segment is parallel to an edge
 MIN_SQUARED_SINE = 1e-12  # squared sine of the angle at which two edges are parallel
 MIN_DENOMINATOR = 1e-30  # m^2; a normal number of float32, too
+
+
+def segment_distance(first: tuple[Vec, Vec], second: tuple[Vec, Vec], *, freeze: Callable[[Any], Any]) -> Scalar:
+    """Return the distance of two segments [m]; it has a gradient everywhere and is 1e-6 m for crossing segments.
+
+    The closest points of the two lines are clamped to their segments (Ericson 2005, section 5.1.9). They are constant
+    for differentiation (envelope theorem), which ``freeze`` makes them. Segments are given by their ends [m].
+    """
+    import casadi as ca
+
+    a, b = subtract(first[1], first[0]), subtract(second[1], second[0])
+    r = subtract(first[0], second[0])
+    aa, bb, ab = dot(a, a), dot(b, b), dot(a, b)
+    ar, br = dot(a, r), dot(b, r)
+    s = _clamped((ab * br - ar * bb) / ca.fmax(aa * bb - ab * ab, SMOOTHING_M2 * SMOOTHING_M2))
+    t = _clamped((ab * s + br) / ca.fmax(bb, SMOOTHING_M2))
+    s, t = freeze(_clamped((ab * t - ar) / ca.fmax(aa, SMOOTHING_M2))), freeze(t)
+    difference = subtract(add(r, scale(a, s)), scale(b, t))
+    return ca.sqrt(dot(difference, difference) + SMOOTHING_M2)
+
+
+def _clamped(value: Any) -> Any:
+    """Return a value limited to [0, 1]."""
+    import casadi as ca
+
+    return ca.fmax(ca.fmin(value, 1), 0)
 
 
 def segment_box_distance(first: Vec, second: Vec, box: Bounds) -> Scalar:
@@ -142,13 +168,8 @@ def upright_box_separation(center: Vec, rotation: list[Vec], size: tuple[float, 
     It is exact for an upright cuboid that overlaps the box: the face normals of both are then all separating axes. If
     they do not overlap it is a lower bound of the distance. For a tilted cuboid it is a lower bound up to terms of the
     order of depth x tilt^2, because tilted axes and cross products of edges are not tested. Contacts then appear deeper
-    by at most tilt [rad] x the length of the largest edge (2.8 mm at 0.01 rad for 0.3 m).
-
-    Args:
-        center: Center of the cuboid [m].
-        rotation: Rows of its rotation matrix.
-        size: Edge lengths of the cuboid [m].
-        box: Bounds of the box along x, y, z [m]; None for an unbounded side.
+    by at most tilt [rad] x the length of the largest edge (2.8 mm at 0.01 rad for 0.3 m). The cuboid has a center [m],
+    rows of a rotation matrix and edge lengths [m].
     """
     import casadi as ca
 
@@ -174,11 +195,7 @@ def upright_box_separation(center: Vec, rotation: list[Vec], size: tuple[float, 
 def cuboid_separation(center: Vec, axes: list[Vec], half: Vec, other: Vec) -> Scalar:
     """Return the largest separation of two cuboids along their 15 separating axes [m].
 
-    Args:
-        center: Center of the first cuboid in the frame of the second [m].
-        axes: Axes of the first cuboid in that frame.
-        half: Half edge lengths of the first cuboid [m].
-        other: Half edge lengths of the second cuboid [m].
+    Center [m] and axes of the first cuboid are in the frame of the second; both have half edge lengths [m].
     """
     import casadi as ca
 

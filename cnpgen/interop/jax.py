@@ -1,4 +1,4 @@
-"""Differentiable plans in JAX: control points from network outputs, and their loss; both may be jitted."""
+"""The bridge to JAX: batches as JAX arrays; control points from network outputs and their loss, which may be jitted."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from dataclasses import fields
 from functools import partial
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.errors import UsageError
+from cnpgen.errors import UsageError, requires_extra
 from cnpgen.interop.host_evaluation import evaluate
+from cnpgen.loader.batch import Batch
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.losses.quadrature import check_quadrature
 from cnpgen.planner.boundary_layer import BoundaryLayer
@@ -22,9 +21,35 @@ from cnpgen.robots.scene import Scene
 from cnpgen.schema.arguments import number, numbers
 from cnpgen.trajectory.boundary import Boundary
 
-for _kind in (Tasks, Boundary):
-    jax.tree_util.register_dataclass(_kind, [field.name for field in fields(_kind)], [])  # for arguments of jit
-jax.tree_util.register_dataclass(Scene, ["poses"], ["obstacles"])
+with requires_extra("jax", "jax"):
+    import jax
+    import jax.numpy as jnp
+
+    for _kind in (Tasks, Boundary):
+        jax.tree_util.register_dataclass(_kind, [field.name for field in fields(_kind)], [])  # for arguments of jit
+    jax.tree_util.register_dataclass(Scene, ["poses"], ["obstacles"])
+
+__all__ = ["control_points", "plan_loss", "to_jax"]
+_MAX_INT32 = np.iinfo(np.int32).max
+
+
+def to_jax(batch: Batch, *, device: Any = None) -> dict[str, jax.Array]:
+    """Return a batch as JAX arrays; ``jax.device_put(batch.table)`` transfers its packed table at once.
+
+    Args:
+        batch: The batch, which must not be written to afterwards, because JAX may use its memory.
+        device: Device or sharding of the arrays; JAX's default if None.
+
+    Returns:
+        Field name -> values, shape (B, width) or (B,).
+
+    Raises:
+        UsageError: Without x64, JAX would truncate float64 or integers outside int32.
+    """
+    if not jax.config.jax_enable_x64:
+        _check_precision(batch)
+    arrays = jax.device_put(dict(batch), device)
+    return {name: arrays[name] for name in batch}  # JAX sorts names
 
 
 def control_points(
@@ -98,6 +123,13 @@ def plan_loss(
     variables = [arrays.pop(name) for name in ("path", "rate", "weights")]
     total, terms = _plan_loss(loss, *variables, arrays | {"shift": jnp.asarray(shift, loss.dtype)})
     return total, jax.lax.stop_gradient(terms)
+
+
+def _check_precision(batch: Batch) -> None:
+    large = [name for name, values in batch.integers.items() if values.size and np.abs(values).max() > _MAX_INT32]
+    if batch.table.dtype == np.float64 or large:
+        values = f"the integers of {', '.join(large)}" if large else "float64"
+        raise UsageError(f'JAX would truncate {values}: jax.config.update("jax_enable_x64", True) keeps all digits')
 
 
 def _evaluate(loss: PlanLoss, *, gradient: bool, arguments: tuple[Any, ...]) -> tuple[jax.Array, ...]:
