@@ -43,9 +43,7 @@ def run(arguments: argparse.Namespace) -> None:
     if not re.match(NAME, name):
         raise UsageError(f"DIR must be lower-case letters, digits and hyphens, such as my-hits; got {name!r}")
     texts = copied_texts(recipe, name)
-    existing = [str(folder / file) for file in texts if (folder / file).exists()]
-    if existing and not arguments.force:
-        raise UsageError(f"{', '.join(existing)} exists already: --force writes over it")
+    recipe_names.check_absent(folder, texts, force=arguments.force)
     check_writable(folder)
     for file, text in texts.items():
         folder.mkdir(parents=True, exist_ok=True)

@@ -11,10 +11,11 @@ module with a planner for 'cnpgen benchmark', which uses limits, kinematics and 
 import argparse
 import sys
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 from cnpgen.cli.parser import Parser
+from cnpgen.cli.recipe_names import check_absent
 from cnpgen.errors import UsageError
 
 
@@ -43,7 +44,7 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.planner:
         _write_planner(folder, force=arguments.force)
         return
-    _check_place(folder, FILES, force=arguments.force)
+    check_absent(folder, FILES, force=arguments.force)
     arm = read_arm(arguments.urdf, arguments.tip)
     packages = (*arguments.packages, *packages_of_environment(arm.meshes, arm.urdf, arguments.packages))
     with warnings.catch_warnings():
@@ -68,7 +69,7 @@ def _write_planner(folder: Path, *, force: bool) -> None:
     from cnpgen.cli.init.planner_package import planner_texts
 
     texts = planner_texts(folder.name)
-    _check_place(folder, texts, force=force)
+    check_absent(folder, texts, force=force)
     _write(folder, texts)
     test = f"cnpgen benchmark hits-81 --planners {folder.name} cnpgen --n 2"
     print("next:", f"pip install -e {folder}", test, "cnpgen docs benchmark", sep="\n  ", file=sys.stderr)
@@ -95,9 +96,3 @@ def _folder(name: str) -> Path:
         raise UsageError(f"NAME must be lower-case letters, digits and hyphens, such as my-arm; got {name!r}")
     check_writable(folder)
     return folder
-
-
-def _check_place(folder: Path, names: Iterable[str], *, force: bool) -> None:
-    there = [str(folder / name) for name in names if (folder / name).exists()]
-    if there and not force:
-        raise UsageError(f"{', '.join(there)} exist{'s' if len(there) == 1 else ''} already: --force writes over it")

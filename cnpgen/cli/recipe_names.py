@@ -1,6 +1,7 @@
 """Arguments that name a recipe or a path; one that does not exist or is of another kind is refused."""
 
 import os
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -51,11 +52,12 @@ def is_recipe(what: str) -> bool:
     return path.suffix == ".toml" or (not path.exists() and what in _shipped("dataset", "pipeline"))
 
 
-def _shipped(*kinds: str) -> set[str]:
+def _shipped(*kinds: str) -> list[str]:
+    """Return the names of shipped recipes in order, so that suggestions do not depend on the process."""
     from cnpgen.schema.catalogue import list_recipes
     from cnpgen.schema.toml import MARKS
 
-    return {name for kind in MARKS if not kinds or kind in kinds for name in list_recipes(kind)}
+    return sorted({name for kind in MARKS if not kinds or kind in kinds for name in list_recipes(kind)})
 
 
 # Types of arguments, which argparse reads before it reports missing options.
@@ -155,6 +157,13 @@ def read_plans(path: Path, *, problem: str | None = None) -> "Plans":
     if not len(plans):
         raise DatasetError(f"no plans in {path}")
     return plans
+
+
+def check_absent(folder: Path, names: Iterable[str], *, force: bool) -> None:
+    """Refuse files that exist in a folder, unless they may be replaced."""
+    there = [str(folder / name) for name in names if (folder / name).exists()]
+    if there and not force:
+        raise UsageError(f"{', '.join(there)} exist{'s' if len(there) == 1 else ''} already: --force writes over it")
 
 
 def _refuse_shipped(text: str) -> None:

@@ -66,7 +66,7 @@ def test_existing_files_are_replaced_only_with_force(tmp_path: Path, capsys):
     assert main(words) == 0
     (tmp_path / "mine" / "problem.toml").write_text("mine")
     assert main(words) == 2
-    assert "exists already: --force" in capsys.readouterr().err
+    assert "iiwa14_striker.urdf exist already: --force" in capsys.readouterr().err  # two files
     assert (tmp_path / "mine" / "problem.toml").read_text() == "mine"
     assert main([*words, "--force"]) == 0
     assert load_problem(tmp_path / "mine" / "problem.toml").name == "mine"

@@ -718,3 +718,15 @@ def test_a_full_disk_behind_stdout_is_a_line():
 def test_closed_streams_are_no_error():
     command = f"'{sys.executable}' -m cnpgen list >&- 2>&-"
     assert subprocess.run(command, shell=True, env=ENVIRONMENT, check=False).returncode == 0
+
+
+def test_suggestions_do_not_depend_on_the_process():
+    """Names that are equally similar are in the same order, whatever the seed of Python's hashes is."""
+    script = "from cnpgen.cli.recipe_names import _shipped; print(*_shipped())"
+    orders = {
+        subprocess.run(
+            [sys.executable, "-c", script], env=os.environ | {"PYTHONHASHSEED": seed}, capture_output=True, check=True
+        ).stdout
+        for seed in "123"
+    }
+    assert len(orders) == 1
