@@ -332,11 +332,7 @@ def to_json(spec: DatasetSpec) -> dict[str, Any]:
 
 
 def from_json(content: Mapping[str, Any]) -> DatasetSpec:
-    """Rebuild a specification from the result of :func:`to_json`.
-
-    Raises:
-        DatasetError: A key is missing or has the wrong type.
-    """
+    """Rebuild a specification from the result of ``to_json``; a missing key or a wrong type raises DatasetError."""
     try:
         required = [name for name in DatasetSpec.__dataclass_fields__ if name not in _SCENE_KEYS]
         arguments = {name: content[name] for name in required}
@@ -372,11 +368,7 @@ def write_dataset_spec(folder: Path, spec: DatasetSpec) -> None:
 
 
 def load_dataset_spec(folder: Path) -> DatasetSpec:
-    """Read ``specification.json``.
-
-    Raises:
-        DatasetError: It is missing, damaged, or has another format version.
-    """
+    """Read ``specification.json``; raise DatasetError if it is missing, damaged, or of another format version."""
     path = folder / SPECIFICATION
     _refuse_old_format(folder)
     document = load_document(

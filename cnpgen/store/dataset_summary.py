@@ -134,9 +134,5 @@ def stats_document(summary: DatasetSummary) -> dict[str, Any]:
 
 
 def load_stats_document(folder: Path) -> dict[str, Any]:
-    """Read ``stats.json``.
-
-    Raises:
-        DatasetError: It is missing, damaged or of another format version.
-    """
+    """Read ``stats.json``; raise DatasetError if it is missing, damaged or of another format version."""
     return load_document(folder / STATS, STATS_FORMAT, version=STATS_VERSION, structure=STATS_STRUCTURE)

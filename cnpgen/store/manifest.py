@@ -67,11 +67,7 @@ def _name(folder: Path) -> str:
 
 
 def load_manifest(folder: Path) -> dict[str, Any]:
-    """Read ``manifest.json``.
-
-    Raises:
-        DatasetError: It is missing (the dataset is unfinished), damaged or of another format version.
-    """
+    """Read ``manifest.json``; raise DatasetError if it is missing, damaged or of another format version."""
     return load_document(folder / MANIFEST, MANIFEST_FORMAT, version=MANIFEST_VERSION, structure=MANIFEST_STRUCTURE)
 
 
@@ -93,11 +89,7 @@ def _location(entry: dict[str, Any]) -> tuple[str, str, int, int]:
 
 
 def source_date() -> datetime | None:
-    """Return the time in the environment variable SOURCE_DATE_EPOCH, or None if it is not set.
-
-    Raises:
-        UsageError: It is not a time.
-    """
+    """Return the time in the variable SOURCE_DATE_EPOCH, or None if it is not set; another value raises UsageError."""
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
     try:
         return datetime.fromtimestamp(int(epoch), UTC) if epoch else None

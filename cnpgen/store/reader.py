@@ -34,11 +34,7 @@ class StoredDataset:
     manifest: dict[str, Any] | None
 
     def tasks(self, split: str) -> list[ShardTask]:
-        """List the existing shards of a split, in order.
-
-        Raises:
-            DatasetError: There is no such split.
-        """
+        """List the existing shards of a split, in order; an unknown split raises DatasetError."""
         if split not in self.spec.splits:
             raise DatasetError(f"{self.folder} {lacks('split', split, self.spec.splits)}", concerns="split")
         tasks = [task for task in shards(self.spec) if task.split == split]

@@ -74,11 +74,7 @@ def record_to_json(record: ShardRecord) -> dict[str, Any]:
 
 
 def record_from_json(content: Mapping[str, Any]) -> ShardRecord:
-    """Rebuild a record from the result of :func:`record_to_json`.
-
-    Raises:
-        DatasetError: A key is missing or has the wrong type.
-    """
+    """Rebuild a record from the result of ``record_to_json``; a missing key or a wrong type raises DatasetError."""
     try:
         check_structure(content, _RECORD_STRUCTURE)
         statistics = {name: statistics_from_json(item) for name, item in content["statistics"].items()}
@@ -95,11 +91,7 @@ def save_record(folder: Path, task: ShardTask, record: ShardRecord) -> None:
 
 
 def load_record(folder: Path, task: ShardTask) -> ShardRecord:
-    """Read the sidecar of a shard.
-
-    Raises:
-        DatasetError: It is missing, damaged, of another format version or of another shard.
-    """
+    """Read the sidecar of a shard; a missing or damaged one, and that of another shard, raise DatasetError."""
     path = folder / task.sidecar
     record = record_from_json(load_document(path, SHARD_RECORD_FORMAT, version=SHARD_RECORD_VERSION, structure={}))
     if (record.file, record.rows, record.first_sample_id) != (task.file, task.rows, task.first_row):
@@ -122,11 +114,8 @@ def commit_shard(
 ) -> ShardRecord:
     """Write a shard and then its sidecar; a committed shard is not written again. Return the record of the shard.
 
-    The columns are in their stored type, of shape (rows, width) or (rows,), the scenes, too. Other arguments become
-    attributes of the record.
-
-    Raises:
-        DatasetError: The columns do not fit the specification, or are not finite.
+    The columns are finite, in their stored type, of shape (rows, width) or (rows,), the scenes, too; others raise
+    DatasetError. Other arguments become attributes of the record.
     """
     if is_committed(folder, spec, task):  # another process made the same shard
         return load_record(folder, task)
@@ -179,11 +168,9 @@ def _write(
 
 
 def load_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> ShardRecord:
-    """Read the sidecar of a shard and check that it belongs to this specification; the shard itself is not read.
+    """Read the sidecar of a shard, without the shard itself.
 
-    Raises:
-        DatasetError: The sidecar is missing, damaged or of another specification, or the shard is missing or has
-            another size.
+    Raise DatasetError if it is damaged or of another specification, or if the shard is missing or has another size.
     """
     record = load_record(folder, task)
     if record.specification_fingerprint != spec.version_with(task).fingerprint:
@@ -198,11 +185,7 @@ def load_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> ShardRec
 
 
 def check_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> None:
-    """Check that a shard is the recorded one, by its sha256.
-
-    Raises:
-        DatasetError: As for :func:`load_committed`, or the shard was changed.
-    """
+    """Check a shard as ``load_committed``, and its sha256: a changed shard raises DatasetError."""
     record = load_committed(folder, spec, task)
     if file_sha256(folder / task.file) != record.sha256:
         raise DatasetError(f"{folder / task.file} was changed: its sha256 is not the recorded one")

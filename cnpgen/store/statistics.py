@@ -103,11 +103,7 @@ _HISTOGRAM_STRUCTURE = {"low": [NUMBER], "high": [NUMBER], "counts": [[WHOLE]]}
 
 
 def statistics_from_json(content: Mapping[str, Any]) -> FieldStatistics:
-    """Rebuild statistics from a dict with the structure ``STATISTICS_STRUCTURE``.
-
-    Raises:
-        ValueError: Shapes or counts are inconsistent.
-    """
+    """Rebuild statistics from ``STATISTICS_STRUCTURE``; inconsistent shapes or counts raise ValueError."""
     keys = {"mean": "mean", "m2": "m2", "minimum": "min", "maximum": "max"}
     arrays = {name: np.array(content[key], np.float64) for name, key in keys.items()}
     counts = None
@@ -175,11 +171,7 @@ def column_statistics(columns: Mapping[str, NDArray[Any]], fields: Sequence[Fiel
 
 
 def merge_statistics(parts: Sequence[Mapping[str, FieldStatistics]]) -> dict[str, FieldStatistics]:
-    """Merge the statistics of shards, in order.
-
-    Raises:
-        DatasetError: There are no parts, or they are of different fields.
-    """
+    """Merge the statistics of shards, in order; none, and those of different fields, raise DatasetError."""
     if not parts:
         raise DatasetError("there are no statistics to merge")
     merged = dict(parts[0])

@@ -61,12 +61,9 @@ def find_workspace(folder: Path) -> Workspace:
 
 
 def check_place(workspace: Workspace) -> None:
-    """Raise an error if no dataset can be made in a folder, before any computation.
+    """Raise UsageError if no dataset can be made in a folder, before any computation.
 
     The folder of a finished dataset need not be writable.
-
-    Raises:
-        UsageError: It is a file, contains files that are not a dataset of cnpgen, or a link out of it.
     """
     if workspace.content == "a file":
         raise _other_folder(f"{workspace.existing} is a file, not a folder")
@@ -125,12 +122,7 @@ def open_workspace(folder: Path, spec: DatasetSpec, *, force: bool = False) -> D
 
 
 def require_dataset_spec(folder: Path, spec: DatasetSpec) -> None:
-    """Check that the folder still has a specification, since another process may have replaced the dataset.
-
-    Raises:
-        UsageError: It now has another specification.
-        MachineError: The specification or the folder is missing.
-    """
+    """Raise an error if another process has replaced or deleted the dataset in a folder."""
     try:
         is_unchanged = spec.fingerprint.encode() in read_file(folder / SPECIFICATION)
     except DatasetError as error:
@@ -202,11 +194,7 @@ def _sizes(spec: DatasetSpec) -> str:
 
 
 def _cleared(workspace: Workspace) -> Workspace:
-    """Delete the dataset in a folder, and no other files.
-
-    Raises:
-        UsageError: The folder contains files that are not part of the dataset.
-    """
+    """Delete the dataset in a folder, and no other files: see ``check_clearable``."""
     if workspace.content != "a dataset":
         return workspace
     folder, splits = workspace.folder, check_clearable(workspace)
@@ -224,12 +212,9 @@ def _cleared(workspace: Workspace) -> Workspace:
 
 
 def check_clearable(workspace: Workspace) -> list[Path]:
-    """Raise an error if a folder contains other files than a dataset; return the folders of its splits.
+    """Return the folders of the splits of a dataset; other files in its folder raise UsageError.
 
     These are the splits of the specification, or all folders with shards if the specification cannot be read.
-
-    Raises:
-        UsageError: The folder contains files that are not part of the dataset.
     """
     folder, spec = workspace.folder, workspace.spec
     named = sorted({path.parent for path in _shard_files(folder)})

@@ -72,9 +72,6 @@ def find_maximum(
         known: A value that is attained, in the form of the result.
         threshold: Value, at most 1, below which spans are not searched.
         parts: Number of parts of a span per subdivision, a power of 2.
-
-    Returns:
-        ``(value, row, s)``: the largest value that is attained, the index of its function, and its phase.
     """
     best, *at = known
     starts = np.arange(parts)[:, None] / parts

@@ -128,15 +128,10 @@ def pairs_of(world: PathWorld, constraint: Constraint) -> PairDistances:
 
 
 def chord_deviation_bounds(curve: Curve, s: Array, motion_bounds: Array) -> Array:
-    """Bound the deviation of points of the robot from the chords between neighboring phases.
+    """Bound the deviation of the robot's points from the chords between neighboring phases [m], shape (K - 1,).
 
-    Args:
-        curve: One motion.
-        s: Phases, ascending, at distances of at most a part of a span, shape (K,).
-        motion_bounds: Motion bounds of the joints (``PathWorld.motion_bounds``) [m], shape (n,).
-
-    Returns:
-        Bounds [m], shape (K - 1,); 0 where a phase is below its predecessor.
+    Phases ascend at distances of at most a part of a span; the bound is 0 where a phase is below its predecessor.
+    Motion bounds of the joints [m] have shape (n,).
     """
     bounds = curve.derivative_bounds()
     edges, first, second = bounds.edges, bounds.first, bounds.second

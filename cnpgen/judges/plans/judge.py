@@ -93,14 +93,7 @@ def judge(  # noqa: PLR0917 - all of them are needed to interpret a plan
 class Judge:
     """Judges plans of one problem as ``judge`` does, and reuses the memory of Pinocchio and Coal between calls.
 
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        step: Time step of verdicts without early exit [s].
-        tracking_error: Largest tracking error of the joints, see ``judge``.
-
-    Raises:
-        UsageError: The step is not positive, or above ``MAX_STEP_S``; or a tracking error is negative.
+    The arguments are those of ``judge``; the step is that of verdicts without early exit.
     """
 
     def __init__(
@@ -172,11 +165,7 @@ class Judge:
 
 
 def check_step(step: float) -> None:
-    """Check that a time step [s] is above 0 and at most ``MAX_STEP_S``.
-
-    Raises:
-        UsageError: The step is outside this range.
-    """
+    """Raise UsageError if a time step [s] is not above 0 and at most ``MAX_STEP_S``."""
     if not 0 < step <= MAX_STEP_S:
         raise UsageError(f"the time step must be above 0 and at most {MAX_STEP_S:g} s, got {step:g} s", concerns="step")
 

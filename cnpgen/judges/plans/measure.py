@@ -116,13 +116,9 @@ class MeasuredCondition:
 
 
 def measure(constraint: Constraint, world: PathWorld, s: Array, start_tip: Array) -> list[MeasuredCondition]:
-    """Measure the conditions of a constraint along a motion.
+    """Measure the conditions of a constraint where the robot is, at phases of shape (K,).
 
-    Args:
-        constraint: The constraint.
-        world: The robot at phases s.
-        s: Phases, shape (K,).
-        start_tip: Tip position at the start of the motion [m], shape (3,).
+    ``start_tip`` is the position of the tip at the start of the motion [m], shape (3,).
     """
     measured = []
     for condition in constraint.judged(cast(World, world)):  # PathWorld has the interface of World for K states

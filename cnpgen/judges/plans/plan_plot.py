@@ -114,13 +114,8 @@ def along(
 ) -> tuple[PathWorld, Array, Array]:
     """Place the robot at K times of one motion, uniformly spaced but for extra ones [s].
 
-    The index is that of error messages. Obstacles, by default those of the problem, matter for distances only.
-
-    Returns:
-        The world, phases, and times [s], shape (K,) each.
-
-    Raises:
-        UsageError: The rate is not positive, or values are not finite.
+    The index is that of error messages. Obstacles, by default those of the problem, matter for distances only. Return
+    the world, phases, and times [s], shape (K,) each. A motion that cannot be evaluated raises UsageError.
     """
     if not motion.runs_forward()[0]:
         raise UsageError(f"plan {index} cannot be drawn: its rate ds/dt is not positive everywhere")

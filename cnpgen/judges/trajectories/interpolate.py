@@ -32,10 +32,8 @@ CONSISTENCY_TOLERANCE = 1e-6  # relative, of samples with a bound of the jerk: r
 def interpolated(trajectory: Trajectory, interpolation: Interpolation | None, noise: Array) -> CurveFamily:
     """Return the curves of an interpolation, by default the one that the derivatives determine, through samples.
 
-    Positions, velocities and accelerations have errors of at most the noise, shape (3,).
-
-    Raises:
-        UsageError: The samples lack the derivatives of the interpolation.
+    Positions, velocities and accelerations have errors of at most the noise, shape (3,). If the samples lack the
+    derivatives of the interpolation, UsageError is raised.
     """
     data = data_of(trajectory)
     kind = interpolation or INTERPOLATIONS[len(data)]
@@ -75,13 +73,8 @@ def _known(t: Array, coefficients: Array) -> CurveFamily:
 def bounded_jerk(trajectory: Trajectory, max_jerk: Array, noise: Array) -> CurveFamily | None:
     """Return all curves through samples with noise whose jerks are bounded; None if the samples contradict the bound.
 
-    Args:
-        trajectory: The samples.
-        max_jerk: Bounds of the jerks [rad/s^3], shape (n,).
-        noise: Largest errors of positions, velocities and accelerations [rad, rad/s, rad/s^2], shape (3,).
-
-    Raises:
-        UsageError: There are fewer than three samples with positions alone.
+    Bounds of the jerks [rad/s^3] have shape (n,), the largest errors of positions, velocities and accelerations (3,).
+    Fewer than three samples with positions alone raise UsageError.
     """
     data = data_of(trajectory)
     if len(data) == 1:
@@ -133,16 +126,10 @@ def span_data(data: list[Array], h: Array) -> Array:
 
 
 def polynomials_of_positions(t: Array, q: Array, neighbors: int) -> tuple[Array, Array, Array]:
-    """Return polynomials through positions around every span.
+    """Return polynomials through K positions [rad], shape (K, n), around every span between times [s], shape (K,).
 
-    Args:
-        t: Times of the samples [s], shape (K,).
-        q: Positions [rad], shape (K, n).
-        neighbors: Number W of samples that determine a polynomial; at most K are used.
-
-    Returns:
-        Nodes, where the span is [0, 1], shape (S, W), weights of the positions for the Bernstein coefficients, shape
-        (S, W, W), and the positions, shape (S, W, n).
+    At most W neighbors determine each. The results are nodes, where the span is [0, 1], shape (S, W), weights of the
+    positions for the Bernstein coefficients, shape (S, W, W), and the positions, shape (S, W, n).
     """
     size, count = min(neighbors, len(t)), len(t) - 1
     first = np.clip(np.arange(count) - (size // 2 - 1), 0, len(t) - size)

@@ -40,13 +40,7 @@ DECIDING_ERROR = 1e3  # an error this large, in SI units, is that of a missing d
 class FamilyJudge:
     """Judges families of curves of one problem, and reuses the memory of Pinocchio and Coal between calls.
 
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        step: Maximum time between checked times [s].
-
-    Raises:
-        UsageError: The step is not positive, or too long.
+    The step is the maximum time between checked times [s]; see ``check_step``.
     """
 
     def __init__(self, problem: Problem, robot: Robot, *, step: float = 1e-3) -> None:

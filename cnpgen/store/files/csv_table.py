@@ -25,11 +25,7 @@ class CsvTable:
         return [row[index].strip() for _, row in self.lines]
 
     def numbers(self, name: str) -> NDArray[np.float64]:
-        """Return the numbers of a column, shape (rows,).
-
-        Raises:
-            DatasetError: A cell is not a number.
-        """
+        """Return the numbers of a column, shape (rows,); other cells raise DatasetError."""
         values = []
         for (line, _), cell in zip(self.lines, self.texts(name), strict=True):
             try:

@@ -28,11 +28,7 @@ _CHECKSUM = re.compile(r'"self_sha256": "([0-9a-f]{64})"\n}\n\Z')
 
 
 def plain(value: Any) -> Any:
-    """Convert a value to JSON types: tuples and arrays to lists, infinities to strings that ``float()`` reads.
-
-    Raises:
-        TypeError: A value cannot be converted.
-    """
+    """Convert a value to JSON types: tuples and arrays to lists, infinities to strings that ``float()`` reads."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
@@ -129,11 +125,7 @@ def load_document(path: Path, kind: str, *, version: int, structure: Structure) 
 
 
 def parse_json(text: str) -> Any:
-    """Parse untrusted JSON.
-
-    Raises:
-        ValueError: The text is not JSON, is nested too deeply, or contains invalid Unicode.
-    """
+    """Parse untrusted JSON; raise ValueError if it is not JSON, nested too deeply, or not valid Unicode."""
     try:
         value = json.loads(text)
     except RecursionError as error:

@@ -74,11 +74,7 @@ class Attributes:
         return bool(h5a.exists(self._item, name.encode()))
 
     def __getitem__(self, name: str) -> Any:
-        """Return a text, a number or an array of numbers.
-
-        Raises:
-            DatasetError: The attribute has another type or is too large.
-        """
+        """Return a text, a number or an array of numbers; other types and large values raise DatasetError."""
         from h5py import AttributeManager, h5a, h5s, h5t
 
         attribute = h5a.open(self._item, name.encode())
@@ -102,11 +98,7 @@ class Attributes:
 
 
 def _decoded(path: Path, name: bytes) -> str:
-    """Decode a name in a file.
-
-    Raises:
-        DatasetError: The name is not UTF-8.
-    """
+    """Decode a name in a file; one that is not UTF-8 raises DatasetError."""
     try:
         return name.decode()
     except UnicodeDecodeError as error:
@@ -263,11 +255,7 @@ def opened_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
 
 
 def require_possible_size(path: Path) -> int:
-    """Return the size of a file [bytes], and refuse huge sparse files.
-
-    Raises:
-        DatasetError: The file is larger than ``MAX_HDF5_BYTES``.
-    """
+    """Return the size of a file [bytes]; a huge sparse file, above ``MAX_HDF5_BYTES``, raises DatasetError."""
     if (size := path.stat().st_size) > MAX_HDF5_BYTES:
         raise DatasetError(f"{path} has {size:,} bytes, expected at most {MAX_HDF5_BYTES:,}")
     return size
