@@ -15,7 +15,7 @@ from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.intact import COPY_HINT, OUTSIDE, RERUN_HINT, leads_outside, outside_links
 from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, SPECIFICATION, STATS, WORK
-from cnpgen.store.manifest import data_fingerprint, lists_shards_of, load_manifest
+from cnpgen.store.manifest import data_fingerprint, lists_shards_of, load_manifest, shard_entries
 from cnpgen.store.scene_table import SCENE_ARRAYS, scene_attributes
 from cnpgen.store.shard import (
     SHARD_FORMAT,
@@ -72,7 +72,7 @@ def check_dataset(folder: Path) -> list[Finding]:
         return [*links, Finding(SPECIFICATION, _reason(error, folder / SPECIFICATION), hint=REPLACE_HINT)]
     findings, manifest = _check_manifest(folder, spec)
     findings = links + findings
-    entries, finished = _shard_entries(manifest), (folder / MANIFEST).exists()
+    entries, finished = shard_entries(manifest), (folder / MANIFEST).exists()
     for task in shards(spec):
         entry = entries.get(task.file)
         if finished or (folder / task.sidecar).exists():
@@ -83,7 +83,7 @@ def check_dataset(folder: Path) -> list[Finding]:
 def check_documents(folder: Path, spec: DatasetSpec) -> list[Finding]:
     """Check the documents of a finished dataset: the manifest, the files it lists and the sidecars, but no shard."""
     findings, manifest = _check_manifest(folder, spec)
-    for entry in _shard_entries(manifest).values():
+    for entry in shard_entries(manifest).values():
         findings += _check_digest(folder, entry["sidecar"]["file"], entry["sidecar"]["sha256"])
     return findings
 
@@ -106,7 +106,7 @@ def _check_manifest(folder: Path, spec: DatasetSpec) -> tuple[list[Finding], dic
         return [Finding(MANIFEST, f"is of another specification than {SPECIFICATION}", hint=REMAKE_HINT)], {}
     if not lists_shards_of(manifest, spec):
         return [Finding(MANIFEST, f"lists other shards than {SPECIFICATION}", hint=REMAKE_HINT)], {}
-    entries, findings = _shard_entries(manifest), []
+    entries, findings = shard_entries(manifest), []
     if data_fingerprint((file, entry["sha256"]) for file, entry in entries.items()) != manifest["fingerprint"]:
         findings.append(Finding(MANIFEST, "its fingerprint is not that of the shards it lists", hint=REMAKE_HINT))
     for name in _LISTED:
@@ -116,10 +116,6 @@ def _check_manifest(folder: Path, spec: DatasetSpec) -> tuple[list[Finding], dic
         else:
             findings += _check_file(folder, name, entry["bytes"], entry["sha256"])
     return findings, manifest
-
-
-def _shard_entries(manifest: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    return {entry["file"]: entry for split in manifest.get("splits", {}).values() for entry in split["shards"]}
 
 
 def _check_digest(folder: Path, name: str, sha256: str) -> list[Finding]:

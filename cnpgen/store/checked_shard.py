@@ -122,16 +122,12 @@ def read_columns(shard: Shard, placements: Mapping[str, StoredField], names: Ite
         for name, place in selected.items():
             columns[name] = np.empty(place.shape, place.dtype)
             file.seek(place.offset or 0)
-            _fill(shard, file.readinto, columns[name].data.cast("B"))
+            buffer = columns[name].data.cast("B")
+            while buffer:  # the system reads at most 2 GiB at once
+                if not (count := file.readinto(buffer)):
+                    raise DatasetError(f"{shard.path} was cut off while it was read; {RERUN_HINT}")
+                buffer = buffer[count:]
     return columns
-
-
-def _fill(shard: Shard, readinto: Any, buffer: memoryview) -> None:
-    """Fill a buffer; the system reads at most 2 GiB at once."""
-    while buffer:
-        if not (count := readinto(buffer)):
-            raise DatasetError(f"{shard.path} was cut off while it was read; {RERUN_HINT}")
-        buffer = buffer[count:]
 
 
 def check_values(shard: Shard, columns: Mapping[str, NDArray[Any]]) -> None:

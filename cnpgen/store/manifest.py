@@ -71,21 +71,24 @@ def load_manifest(folder: Path) -> dict[str, Any]:
     return load_document(folder / MANIFEST, MANIFEST_FORMAT, version=MANIFEST_VERSION, structure=MANIFEST_STRUCTURE)
 
 
+def shard_entries(manifest: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the entries of the shards of all splits, by file."""
+    return {entry["file"]: entry for split in manifest.get("splits", {}).values() for entry in split["shards"]}
+
+
 def lists_shards_of(manifest: dict[str, Any], spec: DatasetSpec) -> bool:
     """Return whether a manifest lists exactly the shards of a specification, in order.
 
     Only these file names are opened: no path in a manifest can lead outside the folder of the dataset.
     """
-    listed = {split: [_location(item) for item in part["shards"]] for split, part in manifest["splits"].items()}
-    expected: dict[str, list[tuple[str, str, int, int]]] = {split: [] for split in spec.splits}
-    for task in shards(spec):
-        expected[task.split].append((task.file, task.sidecar, task.first_row, task.rows))
-    return listed == expected
-
-
-def _location(entry: dict[str, Any]) -> tuple[str, str, int, int]:
-    """Return file, sidecar, first row and number of rows of a shard."""
-    return entry["file"], entry["sidecar"]["file"], entry["first_sample_id"], entry["rows"]
+    if manifest["splits"].keys() != spec.splits.keys():
+        return False
+    listed = [
+        (split, entry["file"], entry["sidecar"]["file"], entry["first_sample_id"], entry["rows"])
+        for split in spec.splits
+        for entry in manifest["splits"][split]["shards"]
+    ]
+    return listed == [(task.split, task.file, task.sidecar, task.first_row, task.rows) for task in shards(spec)]
 
 
 def source_date() -> datetime | None:

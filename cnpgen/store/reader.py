@@ -15,7 +15,7 @@ from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, load_dataset_spec,
 from cnpgen.store.dataset_summary import summarize_dataset, unfinished
 from cnpgen.store.intact import require_intact
 from cnpgen.store.layout import MANIFEST, SPECIFICATION
-from cnpgen.store.manifest import lists_shards_of, load_manifest
+from cnpgen.store.manifest import lists_shards_of, load_manifest, shard_entries
 from cnpgen.store.paths import require_dataset
 from cnpgen.store.scene_table import SceneTable, distinct_scenes
 from cnpgen.store.shard import storage_dtype
@@ -92,10 +92,9 @@ class StoredDataset:
 
     def shard(self, task: ShardTask) -> Shard:
         """Return a shard with its record in the manifest or, without a manifest, in its sidecar."""
-        if (recorded := self._recorded.get(task.file)) is None:
-            record = load_record(self.folder, task)
-            recorded = record.bytes, record.sha256
-        return Shard(self.folder, self.spec, task, *recorded)
+        if (entry := self._entries.get(task.file)) is None:
+            entry = vars(load_record(self.folder, task))
+        return Shard(self.folder, self.spec, task, entry["bytes"], entry["sha256"])
 
     def _checked(self, task: ShardTask) -> Shard:
         """Verify a shard and return it."""
@@ -104,12 +103,9 @@ class StoredDataset:
         return shard
 
     @cached_property
-    def _recorded(self) -> dict[str, tuple[int, str]]:
-        """Shard -> size [bytes] and sha256 in the manifest; empty without a manifest."""
-        splits = {} if self.manifest is None else self.manifest["splits"]
-        return {
-            entry["file"]: (entry["bytes"], entry["sha256"]) for split in splits.values() for entry in split["shards"]
-        }
+    def _entries(self) -> dict[str, dict[str, Any]]:
+        """Shard -> its entry in the manifest; empty without a manifest."""
+        return shard_entries(self.manifest or {})
 
     def _names(self, fields: Sequence[str] | None) -> list[str]:
         return [self.spec.field_named(name).name for name in fields] if fields else [f.name for f in self.spec.fields]

@@ -139,10 +139,7 @@ def _density(content: Mapping[str, Any]) -> DensityMap:
 def sampling_from_json(content: Mapping[str, Any]) -> SamplingStatistics:
     """Rebuild sampling statistics from a dict with the structure ``SAMPLING_STRUCTURE``."""
     return SamplingStatistics(
-        tried=int(content["tried"]),
-        accepted=int(content["accepted"]),
-        rejections={name: int(count) for name, count in content["rejections"].items()},
-        stages={name: str(stage) for name, stage in content["stages"].items()},
+        **{name: content[name] for name in ("tried", "accepted", "rejections", "stages")},
         densities={name: _density(item) for name, item in content["densities"].items()},
         verification={name: float(value) for name, value in content["verification"].items()},
     )

@@ -60,13 +60,11 @@ class FieldStatistics:
         Raises:
             DatasetError: The columns or the ranges of the histograms differ.
         """
-        if not _have_equal_columns(self, other):
+        ranges = (np.array_equal(getattr(self, name), getattr(other, name)) for name in ("low", "high"))
+        if self.mean.shape != other.mean.shape or not all(ranges):
             raise DatasetError("statistics of different fields cannot be merged")
         count = self.count + other.count
         delta = other.mean - self.mean
-        histogram = None
-        if self.histogram is not None and other.histogram is not None:
-            histogram = self.histogram + other.histogram
         return FieldStatistics(
             count=count,
             mean=self.mean + delta * (other.count / count),
@@ -75,7 +73,7 @@ class FieldStatistics:
             maximum=np.maximum(self.maximum, other.maximum),
             low=self.low,
             high=self.high,
-            histogram=histogram,
+            histogram=None if self.histogram is None or other.histogram is None else self.histogram + other.histogram,
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -87,15 +85,6 @@ class FieldStatistics:
             counts = self.histogram.tolist()
             content["histogram"] = {"low": self.low.tolist(), "high": self.high.tolist(), "counts": counts}
         return content
-
-
-def _have_equal_columns(a: FieldStatistics, b: FieldStatistics) -> bool:
-    """Return whether two statistics are of the same columns."""
-    if a.mean.shape != b.mean.shape or (a.histogram is None) != (b.histogram is None):
-        return False
-    if a.low is None or b.low is None or a.high is None or b.high is None:
-        return True
-    return np.array_equal(a.low, b.low) and np.array_equal(a.high, b.high)
 
 
 STATISTICS_STRUCTURE = {"count": WHOLE, "mean": [NUMBER], "m2": [NUMBER], "min": [NUMBER], "max": [NUMBER]}

@@ -22,24 +22,14 @@ _FORMAT_KEY = re.compile(rb'\{\s*"format": "cnpgen-')
 
 @dataclass(frozen=True)
 class Workspace:
-    """The content of a folder for a dataset; other processes may change it later.
+    """The content of a folder for a dataset, possibly unfinished or damaged; other processes may change it later."""
 
-    Attributes:
-        folder: The folder.
-        existing: The folder, or its nearest existing parent.
-        content: "nothing"; "a dataset", possibly unfinished or damaged; "a file" in place of the folder; or
-            "something else".
-        has_shards: Whether there are shards or sidecars.
-        spec: The specification in it; None where there is none that can be read.
-        damage: Reason why the specification cannot be read; empty if it can.
-    """
-
-    folder: Path
-    existing: Path
-    content: Literal["nothing", "a dataset", "a file", "something else"]
-    has_shards: bool = False
-    spec: DatasetSpec | None = None
-    damage: str = ""
+    folder: Path  # the folder
+    existing: Path  # the folder, or its nearest existing parent
+    content: Literal["nothing", "a dataset", "a file", "something else"]  # a file is in place of the folder
+    has_shards: bool = False  # whether there are shards or sidecars
+    spec: DatasetSpec | None = None  # the specification in it; None where there is none that can be read
+    damage: str = ""  # reason why the specification cannot be read; empty if it can
 
 
 def find_workspace(folder: Path) -> Workspace:

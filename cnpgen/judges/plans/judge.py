@@ -17,12 +17,12 @@ from cnpgen.judges.plans.continuous_collision import check_continuous_collision
 from cnpgen.judges.plans.evaluated_trajectory import (
     EvaluatedTrajectory,
     Phases,
+    SplineCurve,
     evaluate_at_phases,
     evaluate_trajectory,
     jerks,
 )
 from cnpgen.judges.plans.joint_limits import ProvenJointLimits, joint_limits
-from cnpgen.judges.plans.judged_curve import SplineCurve
 from cnpgen.judges.plans.local_maxima import check_local_maxima
 from cnpgen.judges.plans.measure import EvaluationContext, boundary_margins, by_name, evaluation_context, measure
 from cnpgen.judges.plans.paper import metrics_of, paper_rule
@@ -199,7 +199,8 @@ class _Plan:
 @lru_cache(maxsize=8)
 def _corners(path_points: int, rate_points: int, degree: int, kinks: tuple[float, ...]) -> frozenset[float]:
     """Return knots and two phases on either side of kinks, across which second differences estimate no derivative."""
-    return knots(path_points, rate_points, degree).union(s + k * KINK_OFFSET for s in kinks for k in range(-2, 3))
+    around_kinks = (s + k * KINK_OFFSET for s in kinks for k in range(-2, 3))
+    return frozenset(knots(path_points, rate_points, degree).tolist()).union(around_kinks)
 
 
 def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, scene: Scene, goal_xyz: Array) -> None:
@@ -246,11 +247,7 @@ def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
         return True
     world.set_path(states.q, states.dq, states.ddq, plan.obstacle_poses, states.jerk, exact=False)
     start_tip = world.tip_position[:, 0]
-    measured = [
-        condition
-        for constraint in plan.problem.constraint
-        for condition in measure(constraint, world, samples.s, start_tip)
-    ]
+    measured = chain.from_iterable(measure(each, world, samples.s, start_tip) for each in plan.problem.constraint)
     if not all((condition.relative_violation <= 1).all() for condition in measured):
         return True
     return not all(margin.ok for margin in boundary_margins(states, plan.boundary, samples, world.robot))
