@@ -55,11 +55,8 @@ def read_checked(shard: Shard) -> dict[str, NDArray[Any]]:
 def read_rows(shard: Shard, names: Iterable[str] | None = None) -> dict[str, NDArray[Any]]:
     """Read and check fields of a shard, by default all, after its sha256 was compared.
 
-    Returns:
-        Field name -> values as stored, shape (rows, width) or (rows,).
-
-    Raises:
-        DatasetError: The shard is missing or damaged, or differs from its record or the specification.
+    The result is field name -> values as stored, shape (rows, width) or (rows,). A missing or damaged shard, and one
+    that differs from the specification, raises DatasetError.
     """
     placements = check_header(shard)
     columns = read_columns(shard, placements, [item.name for item in shard.spec.fields] if names is None else names)

@@ -23,6 +23,7 @@ from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, SPECIFICATION, STATS,
 
 MANIFEST_FORMAT = "cnpgen-dataset"
 MANIFEST_VERSION = 2
+LISTED = (SPECIFICATION, STATS, CARD, CROISSANT)  # files with their size and sha256 beside the shards
 _SHARD_STRUCTURE = {
     **dict.fromkeys(("file", "sha256"), TEXT),
     **dict.fromkeys(("rows", "first_sample_id", "bytes"), WHOLE),
@@ -32,7 +33,7 @@ MANIFEST_STRUCTURE = {
     "fingerprint": TEXT,
     "specification_fingerprint": TEXT,
     "splits": {ANY_KEY: {"rows": WHOLE, "shards": [_SHARD_STRUCTURE]}},
-    "files": {name: {"bytes": WHOLE, "sha256": TEXT} for name in (SPECIFICATION, STATS, CARD, CROISSANT)},
+    "files": {name: {"bytes": WHOLE, "sha256": TEXT} for name in LISTED},
 }
 
 
@@ -40,11 +41,7 @@ def finalize(folder: Path, spec: DatasetSpec, *, notes: str = "") -> dict[str, A
     """Summarize the shards of a dataset: write statistics, card, Croissant description and, last, the manifest.
 
     The same shards give the same files, so several processes may do it at the same time. ``notes`` is Markdown for the
-    card.
-
-    Raises:
-        DatasetError: Shards are missing, damaged or of another specification; the message names them.
-        UsageError: SOURCE_DATE_EPOCH is not a time.
+    card. Errors are those of ``summarize_dataset`` and ``source_date``.
     """
     summary = summarize_dataset(folder, spec)
     created = _created(summary)
@@ -133,7 +130,9 @@ def _manifest(folder: Path, summary: DatasetSummary, *, created: str) -> dict[st
         "verification": dict(summary.sampling.verification),
         "splits": {split: _split(folder, summary, split) for split in spec.splits},
         "stats": STATS,
-        "files": {name: _listed(folder / name) for name in (SPECIFICATION, STATS, CARD, CROISSANT)},
+        "files": {
+            name: {"bytes": (folder / name).stat().st_size, "sha256": file_sha256(folder / name)} for name in LISTED
+        },
     }
 
 
@@ -183,7 +182,3 @@ def _split(folder: Path, summary: DatasetSummary, split: str) -> dict[str, Any]:
     ]
     sampling = summary.sampling_by_split[split]
     return {"rows": summary.spec.splits[split], "yield": sampling.yield_json(), "shards": entries}
-
-
-def _listed(path: Path) -> dict[str, Any]:
-    return {"bytes": path.stat().st_size, "sha256": file_sha256(path)}

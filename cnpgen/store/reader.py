@@ -47,13 +47,9 @@ class StoredDataset:
     ) -> dict[str, NDArray[Any]]:
         """Read rows ``start`` to ``stop`` of a split; of an unfinished dataset, only the existing ones of them.
 
-        By default, all fields are read, in the order of the specification, and all rows.
-
-        Returns:
-            Field name -> values, shape (rows, width) or (rows,).
-
-        Raises:
-            DatasetError: There is no such split or field, the rows are out of range, or a shard is damaged.
+        By default, all fields are read, in the order of the specification, and all rows. The result is field name ->
+        values, shape (rows, width) or (rows,). An unknown split or field, rows out of range, and a damaged shard raise
+        DatasetError.
         """
         names = self._names(fields)
         tasks = self.tasks(split)
@@ -73,10 +69,8 @@ class StoredDataset:
     def read_scenes(self, split: str, *, start: int = 0, stop: int | None = None) -> SceneTable:
         """Read the scenes of rows ``start`` to ``stop`` of a split, and those of other rows in the same shards.
 
-        ``table.rows_of(scene_id)`` returns the index of the scene of each row.
-
-        Raises:
-            DatasetError: The dataset has no scenes, or a shard is missing or damaged.
+        ``table.rows_of(scene_id)`` returns the index of the scene of each row. A dataset without scenes or rows, and a
+        damaged shard, raise DatasetError.
         """
         if not self.spec.scene_obstacles:
             raise DatasetError(f"{self.folder} has no scenes")

@@ -119,52 +119,35 @@ def commit_shard(
     """
     if is_committed(folder, spec, task):  # another process made the same shard
         return load_record(folder, task)
-    about = {"sampling": sampling, "started": started, "seconds": seconds, "versions": versions or {}}
     if scenes is not None:
         check_scenes(scenes, spec.scene_obstacles, columns[SCENE_ID], len(spec.scene_families))
+    path, attributes = folder / task.file, shard_attributes(spec, task)
+    families, work = spec.scene_families, folder / WORK
     try:
-        return _write(folder, spec, task, (columns, scenes), about)
+        size = write_shard(
+            path, columns, spec.fields, attributes, dtype=spec.dtype, scenes=scenes, families=families, work=work
+        )
+        record = ShardRecord(
+            file=task.file,
+            bytes=size,
+            sha256=file_sha256(path),
+            rows=task.rows,
+            first_sample_id=task.first_row,
+            specification_fingerprint=spec.version_with(task).fingerprint,
+            statistics=column_statistics(columns, spec.fields),
+            sampling=sampling,
+            started=started,
+            seconds=seconds,
+            versions=versions or {},
+        )
+        if not is_committed(folder, spec, task):  # otherwise another process may already have summarized its record
+            save_record(folder, task, record)
+            return record
     except CnpgenError:
         # Another process may have committed the shard, finished the dataset and removed all temporary files.
-        if is_committed(folder, spec, task):
-            return load_record(folder, task)
-        raise
-
-
-def _write(
-    folder: Path,
-    spec: DatasetSpec,
-    task: ShardTask,
-    content: tuple[Mapping[str, NDArray[Any]], SceneTable | None],
-    about: Mapping[str, Any],
-) -> ShardRecord:
-    """Write a shard and then its sidecar, unless another process has committed the shard in the meantime."""
-    path = folder / task.file
-    columns, scenes = content
-    size = write_shard(
-        path,
-        columns,
-        spec.fields,
-        shard_attributes(spec, task),
-        dtype=spec.dtype,
-        scenes=scenes,
-        families=spec.scene_families,
-        work=folder / WORK,
-    )
-    record = ShardRecord(
-        file=task.file,
-        bytes=size,
-        sha256=file_sha256(path),
-        rows=task.rows,
-        first_sample_id=task.first_row,
-        specification_fingerprint=spec.version_with(task).fingerprint,
-        statistics=column_statistics(columns, spec.fields),
-        **about,
-    )
-    if is_committed(folder, spec, task):  # another process may already have summarized its own record
-        return load_record(folder, task)
-    save_record(folder, task, record)
-    return record
+        if not is_committed(folder, spec, task):
+            raise
+    return load_record(folder, task)
 
 
 def load_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> ShardRecord:

@@ -70,11 +70,8 @@ def check_place(workspace: Workspace) -> None:
 def started_spec(workspace: Workspace, wanted: DatasetSpec) -> DatasetSpec | None:
     """Return the specification in a folder if it equals the wanted one, or None if the folder has no shards.
 
-    The returned specification may have been written by another version of cnpgen.
-
-    Raises:
-        UsageError: The folder has shards of another specification.
-        DatasetError: The folder has shards and a damaged specification.
+    The returned specification may have been written by another version of cnpgen. Shards of another specification raise
+    UsageError, those of a damaged one DatasetError.
     """
     existing = workspace.spec
     if existing is not None and existing.fingerprint == wanted.fingerprint:
@@ -91,11 +88,8 @@ def open_workspace(folder: Path, spec: DatasetSpec, *, force: bool = False) -> D
     """Create the folder with its specification, or check that it already contains the same specification.
 
     The folder is inspected again, because another process may have started the dataset while kernels were compiled. A
-    specification without shards is replaced; ``force`` deletes an existing dataset.
-
-    Raises:
-        UsageError: The folder contains another dataset or other files.
-        DatasetError: The specification in the folder is damaged.
+    specification without shards is replaced; ``force`` deletes an existing dataset. Errors are those of ``check_place``
+    and ``started_spec``.
     """
     workspace = find_workspace(folder)
     check_place(workspace)

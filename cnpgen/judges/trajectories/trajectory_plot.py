@@ -31,9 +31,6 @@ def plot_trajectory(
     """Draw a sampled trajectory as ``plot_plan`` draws plans, by the interpolation that its derivatives determine.
 
     Violations to mark are given as margins.
-
-    Raises:
-        MachineError: matplotlib is missing, or the file cannot be written.
     """
     with np.errstate(all="ignore"):
         world, s, t, scene = along_trajectory(

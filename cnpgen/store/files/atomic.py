@@ -115,6 +115,17 @@ def write_file(path: Path, content: bytes | str, *, work: Path | None = None) ->
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Raise an error that names the file if it is missing or cannot be read."""
+    try:
+        yield
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise DatasetError(f"{path} is missing") from error
+    except OSError as error:
+        raise machine_error("read", path, error) from error
+
+
 def read_file(path: Path, *, max_bytes: int | None = None) -> bytes:
     """Read a whole file of at most ``max_bytes``, by default of any size.
 
@@ -122,25 +133,16 @@ def read_file(path: Path, *, max_bytes: int | None = None) -> bytes:
         DatasetError: The file is missing, too large, or a device or a pipe, whose size is unknown.
         MachineError: The file cannot be read.
     """
-    try:
+    with _reading(path):
         status = path.stat()
         if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
             raise DatasetError(f"{path} is not a file")
         if max_bytes is not None and status.st_size > max_bytes:
             raise DatasetError(f"{path} has {status.st_size:,} bytes, expected at most {max_bytes:,}")
         return path.read_bytes()
-    except (FileNotFoundError, NotADirectoryError) as error:
-        raise DatasetError(f"{path} is missing") from error
-    except OSError as error:
-        raise machine_error("read", path, error) from error
 
 
 def file_sha256(path: Path) -> str:
     """Compute the sha256 of a file in constant memory, as 64 hexadecimal digits; errors are those of ``read_file``."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except (FileNotFoundError, NotADirectoryError) as error:
-        raise DatasetError(f"{path} is missing") from error
-    except OSError as error:
-        raise machine_error("read", path, error) from error
+    with _reading(path), path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

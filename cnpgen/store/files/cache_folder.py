@@ -26,11 +26,7 @@ MAX_LOCK_WAIT_S = 600  # a process that holds a lock longer may have been stoppe
 
 
 def default_cache_folder() -> Path:
-    """Return ``$CNPGEN_CACHE``, else ``cnpgen`` in ``$XDG_CACHE_HOME`` or ``~/.cache``.
-
-    Raises:
-        MachineError: Neither variable is set, and the user has no home folder.
-    """
+    """Return ``$CNPGEN_CACHE``, else ``cnpgen`` in ``$XDG_CACHE_HOME`` or ``~/.cache``."""
     if os.environ.get("CNPGEN_CACHE"):
         return Path(os.environ["CNPGEN_CACHE"])
     try:

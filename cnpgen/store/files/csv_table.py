@@ -38,9 +38,7 @@ class CsvTable:
 def read_csv_table(path: Path, *, example: str) -> CsvTable:
     """Read a CSV table; messages name the columns of ``example``.
 
-    Raises:
-        DatasetError: It is too large, not UTF-8, has no columns or equal ones, or rows of another length.
-        OSError: The file cannot be read.
+    A table that is too large, not UTF-8, or has no columns, equal ones, or rows of another length raises DatasetError.
     """
     if (size := path.stat().st_size) > MAX_TABLE_BYTES:
         raise DatasetError(f"{path} has {size:,} bytes, expected a table of at most {MAX_TABLE_BYTES:,}")

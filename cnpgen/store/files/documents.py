@@ -102,8 +102,7 @@ def save_document(path: Path, document: Mapping[str, Any], *, work: Path | None 
 def load_document(path: Path, kind: str, *, version: int, structure: Structure) -> dict[str, Any]:
     """Read a document with the "format" ``kind``, a "format_version" and a structure, and verify its checksum.
 
-    Raises:
-        DatasetError: The file is missing, too large, cut off or changed, or has another format, version or structure.
+    A missing, too large or damaged file, and another format, version or structure, raise DatasetError.
     """
     text, document = _parse(path)
     if document.get("format") != kind:

@@ -153,8 +153,7 @@ class Hdf5:
     def __getitem__(self, name: str) -> Column:
         """Return a dataset without reading its numbers.
 
-        Raises:
-            DatasetError: It is not a plain dataset of numbers in this file, or declares more numbers than possible.
+        All but plain numbers in this file, and more of them than possible, raise DatasetError.
         """
         if name not in self._columns:
             self._columns[name] = self._checked(name, self._open(name))
@@ -239,7 +238,10 @@ def opened_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
     if content is None and not path.is_file():
         raise DatasetError(f"{path} is missing" if not path.exists() else f"{path} is not a file")
     try:
-        size = _check_bytes(path, content)
+        if content is None:
+            require_possible_size(path)
+        with path.open("rb") if content is None else io.BytesIO(content) as stream:
+            size = check_heaps(path, stream)  # before HDF5 reads the file
         source: Any = path if content is None else io.BytesIO(content)
         with h5py.File(source, "r", locking="best-effort" if content is None else None) as file:
             yield Hdf5(path, Attributes(path, file.id), file.id, size)
@@ -259,12 +261,3 @@ def require_possible_size(path: Path) -> int:
     if (size := path.stat().st_size) > MAX_HDF5_BYTES:
         raise DatasetError(f"{path} has {size:,} bytes, expected at most {MAX_HDF5_BYTES:,}")
     return size
-
-
-def _check_bytes(path: Path, content: bytes | None) -> int:
-    """Raise an error for damage that makes HDF5 hang; return the size of the file [bytes]."""
-    if content is not None:
-        return check_heaps(path, io.BytesIO(content))
-    require_possible_size(path)
-    with path.open("rb") as file:
-        return check_heaps(path, file)
