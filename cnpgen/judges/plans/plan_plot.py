@@ -1,4 +1,4 @@
-"""Plots of one plan: joints relative to their limits over time, the tip over the table or among the obstacles."""
+"""Plots of plans and sampled trajectories: joints relative to their limits, and the tip over the table or in views."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,6 +17,7 @@ from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import Solid, place_obstacles
 from cnpgen.store.files.figure_file import new_figure, save_figure
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.path import PathWorld
@@ -64,10 +65,29 @@ def plot_plan(
     with np.errstate(all="ignore"):
         world, s, t = along(problem, robot, one, index, extra_times=[margin.time for margin in margins])
     title = f"{problem.name}, plan {index}: {t[-1]:.3f} s" + (f"\n{note}" if note else "")
-    draw_path(problem, world, s, t, Path(path), scene=scene, title=title, margins=margins)
+    _draw_path(problem, world, s, t, Path(path), scene=scene, title=title, margins=margins)
 
 
-def draw_path(
+def plot_trajectory(
+    problem: Problem,
+    robot: Robot,
+    trajectory: Trajectory,
+    path: str | Path,
+    *,
+    title: str,
+    margins: Sequence[Margin] = (),
+) -> None:
+    """Draw a sampled trajectory as ``plot_plan`` draws plans, by the interpolation that its derivatives determine.
+
+    Violations to mark are given as margins.
+    """
+    times = [margin.time for margin in margins]
+    with np.errstate(all="ignore"):
+        world, s, t, scene = along_trajectory(problem, robot, trajectory, extra_times=times)
+    _draw_path(problem, world, s, t, Path(path), scene=scene, title=title, margins=margins)
+
+
+def _draw_path(
     problem: Problem,
     world: PathWorld,
     s: Array,
@@ -119,8 +139,7 @@ def along(
     """
     if not motion.runs_forward()[0]:
         raise UsageError(f"plan {index} cannot be drawn: its rate ds/dt is not positive everywhere")
-    duration = float(motion.duration()[0])
-    t = np.union1d(np.linspace(0, duration, samples), np.clip(np.array(extra_times, float), 0, duration))
+    t = _times(float(motion.duration()[0]), samples, extra_times)
     s = motion.phase_at(t[None])[0]
     states = motion.at(s)
     q, dq, ddq = (values[0].T for values in (states.q, states.dq, states.ddq))
@@ -131,6 +150,33 @@ def along(
     poses = place_obstacles(problem.obstacle) if scene is None else scene.poses[0]
     world.set_path(q, dq, ddq, poses, jerk)
     return world, s, t
+
+
+def along_trajectory(
+    problem: Problem,
+    robot: Robot,
+    trajectory: Trajectory,
+    *,
+    samples: int = PLOT_SAMPLES,
+    extra_times: Sequence[float] = (),
+) -> tuple[PathWorld, Array, Array, Scene]:
+    """Place the robot along a trajectory as ``along``, among obstacles by its ends, which are returned, too."""
+    t = _times(trajectory.duration, samples, extra_times)
+    share, phase_of = t / trajectory.duration, trajectory.phase_of()
+    q, dq, ddq = (np.ascontiguousarray(values.T) for values in trajectory.states(t))
+    jerk = np.ascontiguousarray(trajectory.jerks(t).T) if problem.uses_jerk else None
+    world = PathWorld(robot, problem.obstacle, problem.object_size)
+    world.set_path(q, dq, ddq, place_obstacles(problem.obstacle), jerk)
+    tip, velocity = world.tip_position.T, world.tip_velocity.T
+    parameters = None if trajectory.parameters is None else trajectory.parameters[None]
+    scene = scene_of(problem, tip[:1], tip[-1:], velocity[-1:], parameters)
+    world.set_path(q, dq, ddq, scene.poses[0], jerk)
+    return world, share if phase_of is None else phase_of(share), t, scene
+
+
+def _times(duration: float, samples: int, extra: Sequence[float]) -> Array:
+    """Return uniformly spaced times and extra ones within the duration [s], ascending."""
+    return np.union1d(np.linspace(0, duration, samples), np.clip(np.array(extra, float), 0, duration))
 
 
 def shares_of_limits(world: PathWorld) -> dict[str, Array]:
@@ -235,6 +281,8 @@ def _draw_over_table(figure: "SubFigure", table: Table, world: PathWorld, s: Arr
 
 def _draw_views(figure: "SubFigure", problem: Problem, world: PathWorld, solids: list[Solid]) -> None:
     """Draw arm, object and obstacles in two views: from the side with the largest tip motion, and from above."""
+    from matplotlib.patches import Polygon
+
     corners = world.object_corners() if problem.object else None
     side = int(np.ptp(world.tip_position[1]) >= np.ptp(world.tip_position[0]))
     colors = [_BETWEEN] * (DRAWN_STATES - 2) + [_START, _GOAL]
@@ -243,7 +291,9 @@ def _draw_views(figure: "SubFigure", problem: Problem, world: PathWorld, solids:
     links = [_links(problem, world, k) for k in indices]
     for axis, (across, up), title in zip(figure.subplots(2, 1), ((side, 2), (1, 0)), ("side", "top"), strict=True):
         for solid in solids:
-            _draw_solid(axis, solid, (across, up))
+            outline = _outline((solid.position + solid.corners)[:, [across, up]], solid.radius)
+            axis.add_patch(Polygon(outline, facecolor=_BOX, edgecolor=_LIMIT, zorder=0))
+            axis.update_datalim(outline)
         for k, points, color in zip(indices, links, colors, strict=True):
             _draw_body(axis, points, None if corners is None else corners[..., k], (across, up), color)
         _draw_tip_path(axis, world.tip_position[across], world.tip_position[up])
@@ -302,12 +352,3 @@ def _draw_tip_path(axis: "Axes", a: Array, b: Array) -> None:
     axis.plot(a, b, color="black", linewidth=1.4)
     axis.plot(a[0], b[0], "o", color=_START, label="start")
     axis.plot(a[-1], b[-1], "s", color=_GOAL, label="goal")
-
-
-def _draw_solid(axis: "Axes", solid: Solid, plane: tuple[int, int]) -> None:
-    """Draw the projection of an obstacle."""
-    from matplotlib.patches import Polygon
-
-    outline = _outline((solid.position + solid.corners)[:, list(plane)], solid.radius)
-    axis.add_patch(Polygon(outline, facecolor=_BOX, edgecolor=_LIMIT, zorder=0))
-    axis.update_datalim(outline)

@@ -1,4 +1,4 @@
-"""Verification of rows from their stored numbers: every constraint at both ends, positions, hits and diagnostics."""
+"""Verification of rows from their stored numbers: constraints at both ends, positions, hits, diagnostics and plans."""
 
 import math
 from collections import defaultdict
@@ -6,11 +6,13 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import DatasetError
+from cnpgen.judges.plans.judge import judge
 from cnpgen.judges.rows.hits import HitRule, highest_speed, judge_goals, velocity_factors
 from cnpgen.judges.rows.row_report import ENDS, Array, Check, Index, RowReport, compare, merge
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, Condition
@@ -18,6 +20,8 @@ from cnpgen.problems.constraints.needs import measured_needs
 from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
+from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.world import World
 
 NO_RULE = HitRule()
@@ -255,3 +259,36 @@ def _judge_hit(
         highest *= velocity_factors(robot, columns)[finite]
         error = np.abs(columns["hit_speed_max"][finite, 0] - highest)
         yield compare("highest hit speed", "m/s", violation=error, tolerance=DIAGNOSTIC_TOLERANCES[dtype], row=finite)
+
+
+@dataclass(frozen=True)
+class PlanCheck:
+    """Number of plans in rows of a certified dataset, number of valid ones, and error messages of one line."""
+
+    judged: int = 0
+    valid: int = 0
+    problems: tuple[str, ...] = ()
+
+
+def check_plans(problem: Problem, robot: Robot, columns: Mapping[str, NDArray[Any]]) -> PlanCheck:
+    """Judge the plans in columns of a certified dataset, field -> values; rows of other datasets have none."""
+    if "path_control_points" not in columns:
+        return PlanCheck()
+    rows, spec = len(columns["start_q"]), problem.trajectory
+    path = columns["path_control_points"].reshape(rows, spec.path_control_points, robot.n)
+    motion = Motion(path, columns["rate_control_points"], spec.degree)
+    boundary = Boundary.from_batch(columns, None)
+    velocity = goal_velocities(problem, robot, boundary.goal_q, boundary.goal_dq)
+    poses = columns.get(OBSTACLE_POSES)
+    scene = scene_of(
+        problem, columns["start_xyz"], columns["goal_xyz"], velocity, boundary.parameters, obstacle_poses=poses
+    )
+    verdicts = judge(problem, robot, motion, boundary, scene, columns["goal_xyz"])
+    invalid = [(row, verdict.reason) for row, verdict in enumerate(verdicts) if not verdict.valid]
+    problems = []
+    if invalid:
+        row, reason = invalid[0]
+        problems.append(f"{len(invalid)} of {rows} plans are not valid, the first one is that of row {row}: {reason}")
+    if not np.allclose(columns["duration"], motion.duration(), rtol=1e-9, atol=0):
+        problems.append("stored durations differ from those of the plans")
+    return PlanCheck(rows, rows - len(invalid), tuple(problems))
