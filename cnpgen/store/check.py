@@ -196,18 +196,12 @@ def check_content(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[Find
             problems += _check_field(field, schema[field.name], spec, task)
     if spec.scene_obstacles:
         problems += _check_scene_attributes(spec, schema)
-    if not problems:
-        problems = _check_rows(folder, spec, task)
+    if not problems:  # the description is that of the specification
+        try:
+            read_rows(Shard(folder, spec, task))
+        except DatasetError as error:
+            problems = [_reason(error, path)]
     return [Finding(task.file, problem, hint=DELETE_HINT) for problem in problems]
-
-
-def _check_rows(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[str]:
-    """Check the values of a shard whose description is that of the specification."""
-    try:
-        read_rows(Shard(folder, spec, task))
-    except DatasetError as error:
-        return [_reason(error, folder / task.file)]
-    return []
 
 
 def _check_field(field: Field, stored: StoredField, spec: DatasetSpec, task: ShardTask) -> list[str]:

@@ -54,16 +54,10 @@ def evaluate_trajectory(motion: Motion, s: Array, *, jerk: bool = False) -> Eval
 def evaluate_at_phases(motion: Motion, phases: Phases, *, jerk: bool = False) -> EvaluatedTrajectory:
     """Evaluate one motion as ``evaluate_trajectory``, up to rounding, with cached bases of the splines."""
     orders = PATH_ORDERS + jerk
-    points, rates = motion.path.shape[1], motion.rate.shape[1]
-    p = motion.path[0].T @ _bases(points, motion.degree, orders, phases)
-    r = motion.rate[0] @ _bases(rates, motion.degree, orders - 1, phases)
-    count = len(phases.s)
-    return EvaluatedTrajectory(
-        *states_by_chain_rule(
-            [p[:, k * count : (k + 1) * count] for k in range(orders)],
-            [r[k * count : (k + 1) * count] for k in range(orders - 1)],
-        )
-    )
+    path, rate = motion.path[0].T, motion.rate[0]
+    p = (path @ _bases(path.shape[1], motion.degree, orders, phases)).reshape(len(path), orders, -1)
+    r = (rate @ _bases(len(rate), motion.degree, orders - 1, phases)).reshape(orders - 1, -1)
+    return EvaluatedTrajectory(*states_by_chain_rule(list(p.swapaxes(0, 1)), list(r)))
 
 
 @lru_cache(maxsize=8)

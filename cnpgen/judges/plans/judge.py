@@ -131,7 +131,7 @@ class Judge:
             return Verdict(reason)
         cells = EARLY_EXIT_CELLS if early_exit else TABLE_CELLS
         table = time_table(plan.motion.rate[0], plan.motion.degree, cells=cells)
-        sampled = _sampled_for_early_exit(plan, table) if early_exit else _sampled(plan, table, self._step)
+        sampled = _sampled(plan, table, None if early_exit else self._step)
         if sampled is None:
             return Verdict(Reason.TOO_LONG, metrics=Metrics(duration=float(table[1, -1])))
         (states, samples), world = sampled, self._world
@@ -253,23 +253,22 @@ def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
     return not all(margin.ok for margin in boundary_margins(states, plan.boundary, samples, world.robot))
 
 
-def _sampled(plan: _Plan, table: Array, step: float) -> tuple[EvaluatedTrajectory, Samples] | None:
-    """Choose samples and evaluate the motion there; None if its duration is too long."""
-    samples = sample(table, step, plan.spans, plan.corners)
-    return (evaluate_trajectory(plan.motion, samples.s, jerk=plan.problem.uses_jerk), samples) if samples else None
+def _sampled(plan: _Plan, table: Array, step: float | None) -> tuple[EvaluatedTrajectory, Samples] | None:
+    """Choose samples with a maximum step and evaluate the motion there; None if its duration is too long.
 
-
-def _sampled_for_early_exit(plan: _Plan, table: Array) -> tuple[EvaluatedTrajectory, Samples] | None:
-    """Evaluate the motion at few phases, the same ones for every plan of a problem; see ``_sampled``."""
+    Without a step, for early exit, they are few phases, the same ones for every plan of a problem.
+    """
+    jerk = plan.problem.uses_jerk
+    if step is not None:
+        samples = sample(table, step, plan.spans, plan.corners)
+        return (evaluate_trajectory(plan.motion, samples.s, jerk=jerk), samples) if samples else None
     if not table[1, -1] < MAX_DURATION_S:
         return None
-    phases, jerk = early_exit_phases(plan.spans, plan.corners), plan.problem.uses_jerk
-    exact = any(constraint.tolerance == 0 for constraint in plan.problem.constraint)  # use the rounding of ``_sampled``
-    states = (
-        evaluate_trajectory(plan.motion, phases.s, jerk=jerk)
-        if exact
-        else evaluate_at_phases(plan.motion, phases, jerk=jerk)
-    )
+    phases = early_exit_phases(plan.spans, plan.corners)
+    if any(constraint.tolerance == 0 for constraint in plan.problem.constraint):  # needs the rounding of other verdicts
+        states = evaluate_trajectory(plan.motion, phases.s, jerk=jerk)
+    else:
+        states = evaluate_at_phases(plan.motion, phases, jerk=jerk)
     return states, Samples(phases.s, times(phases.s, table))
 
 

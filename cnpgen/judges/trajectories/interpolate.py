@@ -44,7 +44,10 @@ def interpolated(trajectory: Trajectory, interpolation: Interpolation | None, no
     h = np.diff(trajectory.t)
     weights = hermite_weights(len(data))
     coefficients = np.einsum("cw,swn->csn", weights, span_data(data, h))
-    errors = [_noise_errors(weights, order, h, noise, len(data)) for order in range(4)]
+    orders = np.tile(np.arange(len(data)), 2)
+    scaled_noise = noise[orders] * h[:, None] ** orders
+    effects = [scaled_noise @ np.abs(differentiated(weights, order)).T for order in range(4)]
+    errors = [effect.max(axis=1) / h**order for order, effect in enumerate(effects)]
     bounds = [np.repeat(error[:, None], trajectory.q.shape[1], axis=1) for error in errors]
     for order in range(len(data) + 1, 4):  # derivatives that jump at the knots
         bounds[order] = np.full_like(bounds[order], UNDEFINED)
@@ -173,13 +176,6 @@ def differentiated(weights: Array, order: int) -> Array:
         degree = weights.shape[-2] - 1
         weights = degree * np.diff(weights, axis=-2) if degree else np.zeros_like(weights)
     return weights
-
-
-def _noise_errors(weights: Array, order: int, h: Array, noise: Array, m: int) -> Array:
-    """Bound the effect of noise on a derivative in every span, shape (S,)."""
-    orders = np.tile(np.arange(m), 2)
-    scaled = noise[orders] * h[:, None] ** orders
-    return np.asarray((scaled @ np.abs(differentiated(weights, order)).T).max(axis=1) / h**order)
 
 
 def _kernel_norms(nodes: Array, orders: NDArray[np.intp], weights: Array, order: int) -> Array:
