@@ -81,7 +81,7 @@ class ProvenJointLimits:
         low = np.array([coefficients.min(axis=0).min(axis=0) for coefficients in functions])
         high = np.array([coefficients.max(axis=0).max(axis=0) for coefficients in functions])
         upper_bounds = self._relative_violations(low, high)
-        skippable = (self.tolerance > 0).all(axis=1) & early_exit  # without a tolerance, limits depend on rounding
+        skippable = np.asarray((self.tolerance > 0).all(axis=1) & early_exit)  # without a tolerance, rounding decides
         for limit in np.flatnonzero(~skippable | ~(upper_bounds.max(axis=1) <= 1)).tolist():
             threshold = 1.0 if skippable[limit] else -np.inf
             (rows,) = (~(upper_bounds[limit] <= threshold)).nonzero()
