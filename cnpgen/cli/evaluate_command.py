@@ -164,7 +164,7 @@ def _draw(found: "Evaluation", picture: str, index: int | None) -> None:
 
 def _draw_trajectory(found: "TrajectoryEvaluation", picture: str, index: int | None, labels: tuple[str, ...]) -> None:
     """Draw a trajectory, by default the first that is not valid, and mark what is not valid."""
-    from cnpgen.judges.plans.plan_plot import plot_trajectory
+    from cnpgen.judges.trajectories.trajectory_plot import plot_trajectory
     from cnpgen.plans import open_problem
 
     first = next((at for at, verdict in enumerate(found.verdicts) if not verdict.valid), 0)

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from cnpgen.cli.view.view_bodies import Body, capsule_bodies, robot_bodies, tube, wrapped
 from cnpgen.cli.view.view_verdict import view_verdict
 from cnpgen.judges.plans.condition_curves import ConditionCurve, condition_curves
-from cnpgen.judges.plans.plan_plot import along, along_trajectory, shares_of_limits
+from cnpgen.judges.plans.plan_plot import along, shares_of_limits
 from cnpgen.judges.plans.verdict import Reason, Verdict
+from cnpgen.judges.trajectories.trajectory_plot import along_trajectory
 from cnpgen.judges.trajectories.trajectory_verdict import TrajectoryVerdict
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.puck_contact import PUCK_OUT_OF_REACH_M, PuckContact

@@ -1,4 +1,4 @@
-"""Plots of plans and sampled trajectories: joints relative to their limits, and the tip over the table or in views."""
+"""Plots of one plan: joints relative to their limits over time, the tip over the table or among the obstacles."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +17,6 @@ from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import Solid, place_obstacles
 from cnpgen.store.files.figure_file import new_figure, save_figure
-from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.path import PathWorld
@@ -65,29 +64,10 @@ def plot_plan(
     with np.errstate(all="ignore"):
         world, s, t = along(problem, robot, one, index, extra_times=[margin.time for margin in margins])
     title = f"{problem.name}, plan {index}: {t[-1]:.3f} s" + (f"\n{note}" if note else "")
-    _draw_path(problem, world, s, t, Path(path), scene=scene, title=title, margins=margins)
+    draw_path(problem, world, s, t, Path(path), scene=scene, title=title, margins=margins)
 
 
-def plot_trajectory(
-    problem: Problem,
-    robot: Robot,
-    trajectory: Trajectory,
-    path: str | Path,
-    *,
-    title: str,
-    margins: Sequence[Margin] = (),
-) -> None:
-    """Draw a sampled trajectory as ``plot_plan`` draws plans, by the interpolation that its derivatives determine.
-
-    Violations to mark are given as margins.
-    """
-    times = [margin.time for margin in margins]
-    with np.errstate(all="ignore"):
-        world, s, t, scene = along_trajectory(problem, robot, trajectory, extra_times=times)
-    _draw_path(problem, world, s, t, Path(path), scene=scene, title=title, margins=margins)
-
-
-def _draw_path(
+def draw_path(
     problem: Problem,
     world: PathWorld,
     s: Array,
@@ -139,7 +119,7 @@ def along(
     """
     if not motion.runs_forward()[0]:
         raise UsageError(f"plan {index} cannot be drawn: its rate ds/dt is not positive everywhere")
-    t = _times(float(motion.duration()[0]), samples, extra_times)
+    t = plot_times(float(motion.duration()[0]), samples, extra_times)
     s = motion.phase_at(t[None])[0]
     states = motion.at(s)
     q, dq, ddq = (values[0].T for values in (states.q, states.dq, states.ddq))
@@ -152,29 +132,7 @@ def along(
     return world, s, t
 
 
-def along_trajectory(
-    problem: Problem,
-    robot: Robot,
-    trajectory: Trajectory,
-    *,
-    samples: int = PLOT_SAMPLES,
-    extra_times: Sequence[float] = (),
-) -> tuple[PathWorld, Array, Array, Scene]:
-    """Place the robot along a trajectory as ``along``, among obstacles by its ends, which are returned, too."""
-    t = _times(trajectory.duration, samples, extra_times)
-    share, phase_of = t / trajectory.duration, trajectory.phase_of()
-    q, dq, ddq = (np.ascontiguousarray(values.T) for values in trajectory.states(t))
-    jerk = np.ascontiguousarray(trajectory.jerks(t).T) if problem.uses_jerk else None
-    world = PathWorld(robot, problem.obstacle, problem.object_size)
-    world.set_path(q, dq, ddq, place_obstacles(problem.obstacle), jerk)
-    tip, velocity = world.tip_position.T, world.tip_velocity.T
-    parameters = None if trajectory.parameters is None else trajectory.parameters[None]
-    scene = scene_of(problem, tip[:1], tip[-1:], velocity[-1:], parameters)
-    world.set_path(q, dq, ddq, scene.poses[0], jerk)
-    return world, share if phase_of is None else phase_of(share), t, scene
-
-
-def _times(duration: float, samples: int, extra: Sequence[float]) -> Array:
+def plot_times(duration: float, samples: int, extra: Sequence[float]) -> Array:
     """Return uniformly spaced times and extra ones within the duration [s], ascending."""
     return np.union1d(np.linspace(0, duration, samples), np.clip(np.array(extra, float), 0, duration))
 
