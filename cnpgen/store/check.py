@@ -1,6 +1,6 @@
 """Shallow check of a dataset: every file exists, is undamaged and fits the specification. No sample is recomputed."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -194,8 +194,12 @@ def check_content(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[Find
     for field in spec.fields:
         if field.name in schema:
             problems += _check_field(field, schema[field.name], spec, task)
-    if spec.scene_obstacles:
-        problems += _check_scene_attributes(spec, schema)
+    expected_scenes = scene_attributes(spec.scene_families) if spec.scene_obstacles else {}
+    problems += [
+        f"{name} has the attributes {schema[name].attributes}, expected {expected}"
+        for name, expected in expected_scenes.items()
+        if name in schema and schema[name].attributes != expected
+    ]
     if not problems:  # the description is that of the specification
         try:
             read_rows(Shard(folder, spec, task))
@@ -219,15 +223,6 @@ def _check_field(field: Field, stored: StoredField, spec: DatasetSpec, task: Sha
         f"field {field.name!r} has {name} {actual!r}, expected {wanted!r} by {SPECIFICATION}"
         for name, (actual, wanted) in pairs.items()
         if not np.array_equal(actual, wanted)
-    ]
-
-
-def _check_scene_attributes(spec: DatasetSpec, schema: Mapping[str, StoredField]) -> list[str]:
-    """Compare the attributes of the scenes of a shard with the specification."""
-    return [
-        f"{name} has the attributes {schema[name].attributes}, expected {expected}"
-        for name, expected in scene_attributes(spec.scene_families).items()
-        if name in schema and schema[name].attributes != expected
     ]
 
 

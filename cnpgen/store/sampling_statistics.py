@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -147,7 +148,4 @@ def sampling_from_json(content: Mapping[str, Any]) -> SamplingStatistics:
 
 def merge_sampling(parts: Sequence[SamplingStatistics]) -> SamplingStatistics:
     """Merge sampling statistics, in order; without any, all counts are 0."""
-    merged = SamplingStatistics(tried=0, accepted=0)
-    for part in parts:
-        merged = merged.merge(part)
-    return merged
+    return reduce(SamplingStatistics.merge, parts, SamplingStatistics(tried=0, accepted=0))
