@@ -256,8 +256,7 @@ def opened_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
         raise DatasetError(f"{path} is damaged or cut off: {error}") from error
 
 
-def require_possible_size(path: Path) -> int:
-    """Return the size of a file [bytes]; a huge sparse file, above ``MAX_HDF5_BYTES``, raises DatasetError."""
+def require_possible_size(path: Path) -> None:
+    """Raise DatasetError if a file is larger than ``MAX_HDF5_BYTES``, as huge sparse files are."""
     if (size := path.stat().st_size) > MAX_HDF5_BYTES:
         raise DatasetError(f"{path} has {size:,} bytes, expected at most {MAX_HDF5_BYTES:,}")
-    return size
