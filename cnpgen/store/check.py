@@ -1,6 +1,6 @@
 """Shallow check of a dataset: every file exists, is undamaged and fits the specification. No sample is recomputed."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,8 @@ from cnpgen.store.dataset_summary import summarize_dataset, unfinished
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.intact import COPY_HINT, OUTSIDE, RERUN_HINT, leads_outside, outside_links
-from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, SPECIFICATION, STATS, WORK
-from cnpgen.store.manifest import data_fingerprint, lists_shards_of, load_manifest
+from cnpgen.store.layout import CROISSANT, MANIFEST, SPECIFICATION, WORK
+from cnpgen.store.manifest import LISTED, data_fingerprint, lists_shards_of, load_manifest, shard_entries
 from cnpgen.store.scene_table import SCENE_ARRAYS, scene_attributes
 from cnpgen.store.shard import (
     SHARD_FORMAT,
@@ -28,7 +28,6 @@ from cnpgen.store.shard import (
 )
 from cnpgen.store.shard_record import load_record
 
-_LISTED = (SPECIFICATION, STATS, CARD, CROISSANT)
 _MISSING = "(missing)"
 
 REMAKE_HINT = f"{RERUN_HINT}: it replaces damaged or missing files and keeps the others"
@@ -72,7 +71,7 @@ def check_dataset(folder: Path) -> list[Finding]:
         return [*links, Finding(SPECIFICATION, _reason(error, folder / SPECIFICATION), hint=REPLACE_HINT)]
     findings, manifest = _check_manifest(folder, spec)
     findings = links + findings
-    entries, finished = _shard_entries(manifest), (folder / MANIFEST).exists()
+    entries, finished = shard_entries(manifest), (folder / MANIFEST).exists()
     for task in shards(spec):
         entry = entries.get(task.file)
         if finished or (folder / task.sidecar).exists():
@@ -83,8 +82,8 @@ def check_dataset(folder: Path) -> list[Finding]:
 def check_documents(folder: Path, spec: DatasetSpec) -> list[Finding]:
     """Check the documents of a finished dataset: the manifest, the files it lists and the sidecars, but no shard."""
     findings, manifest = _check_manifest(folder, spec)
-    for entry in _shard_entries(manifest).values():
-        findings += _check_digest(folder, entry["sidecar"]["file"], entry["sidecar"]["sha256"])
+    for entry in shard_entries(manifest).values():
+        findings += _check_file(folder, entry["sidecar"]["file"], entry["sidecar"]["sha256"])
     return findings
 
 
@@ -106,27 +105,26 @@ def _check_manifest(folder: Path, spec: DatasetSpec) -> tuple[list[Finding], dic
         return [Finding(MANIFEST, f"is of another specification than {SPECIFICATION}", hint=REMAKE_HINT)], {}
     if not lists_shards_of(manifest, spec):
         return [Finding(MANIFEST, f"lists other shards than {SPECIFICATION}", hint=REMAKE_HINT)], {}
-    entries, findings = _shard_entries(manifest), []
+    entries, findings = shard_entries(manifest), []
     if data_fingerprint((file, entry["sha256"]) for file, entry in entries.items()) != manifest["fingerprint"]:
         findings.append(Finding(MANIFEST, "its fingerprint is not that of the shards it lists", hint=REMAKE_HINT))
-    for name in _LISTED:
+    for name in LISTED:
         entry = manifest["files"][name]
         if name == CROISSANT and not (folder / name).exists():
             findings.append(Finding(name, "is missing, as in published datasets", note=True, hint=REMAKE_HINT))
         else:
-            findings += _check_file(folder, name, entry["bytes"], entry["sha256"])
+            findings += _check_file(folder, name, entry["sha256"], entry["bytes"])
     return findings, manifest
 
 
-def _shard_entries(manifest: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    return {entry["file"]: entry for split in manifest.get("splits", {}).values() for entry in split["shards"]}
-
-
-def _check_digest(folder: Path, name: str, sha256: str) -> list[Finding]:
-    """Compare a file with its recorded sha256."""
-    if not (folder / name).is_file():
+def _check_file(folder: Path, name: str, sha256: str, size: int | None = None) -> list[Finding]:
+    """Compare a file with its recorded sha256 and its size, if that is recorded."""
+    path = folder / name
+    if not path.is_file():
         return [Finding(name, "is missing", hint=REMAKE_HINT)]
-    if file_sha256(folder / name) != sha256:
+    if size is not None and (actual := path.stat().st_size) != size:
+        return [Finding(name, f"has {actual} bytes instead of {size}", hint=REMAKE_HINT)]
+    if file_sha256(path) != sha256:
         return [Finding(name, "was changed: its sha256 is not the recorded one", hint=REMAKE_HINT)]
     return []
 
@@ -150,14 +148,6 @@ def check_shard(folder: Path, spec: DatasetSpec, task: ShardTask, entry: dict[st
     return findings + damage + content
 
 
-def _check_file(folder: Path, name: str, size: int, sha256: str) -> list[Finding]:
-    """Compare a file with its recorded size and sha256."""
-    path = folder / name
-    if path.is_file() and (actual := path.stat().st_size) != size:
-        return [Finding(name, f"has {actual} bytes instead of {size}", hint=REMAKE_HINT)]
-    return _check_digest(folder, name, sha256)
-
-
 def _is_of_another_spec(path: Path, spec: DatasetSpec) -> bool:
     """Return whether a shard that is not the recorded one is an intact shard of another specification."""
     try:
@@ -168,18 +158,18 @@ def _is_of_another_spec(path: Path, spec: DatasetSpec) -> bool:
 
 def _check_sidecar(
     folder: Path, spec: DatasetSpec, task: ShardTask, entry: dict[str, Any] | None
-) -> tuple[list[Finding], tuple[int, str] | None]:
-    """Check a sidecar; return also the recorded size and sha256 of the shard, or None if neither record is valid."""
-    expected = None if entry is None else (entry["bytes"], entry["sha256"])
+) -> tuple[list[Finding], tuple[str, int] | None]:
+    """Check a sidecar; return also the recorded sha256 and size of the shard, or None if neither record is valid."""
+    expected = None if entry is None else (entry["sha256"], entry["bytes"])
     try:
         record = load_record(folder, task)
     except DatasetError as error:
         return [Finding(task.sidecar, _reason(error, folder / task.sidecar), hint=REMAKE_HINT)], expected
-    findings = [] if entry is None else _check_digest(folder, task.sidecar, entry["sidecar"]["sha256"])
+    findings = [] if entry is None else _check_file(folder, task.sidecar, entry["sidecar"]["sha256"])
     if record.specification_fingerprint != spec.version_with(task).fingerprint:
         text = f"belongs to another specification ({record.specification_fingerprint[:12]}...)"
         findings.append(Finding(task.sidecar, text, hint=REMAKE_HINT))
-    return findings, expected or (record.bytes, record.sha256)
+    return findings, expected or (record.sha256, record.bytes)
 
 
 def check_content(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[Finding]:
@@ -204,20 +194,18 @@ def check_content(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[Find
     for field in spec.fields:
         if field.name in schema:
             problems += _check_field(field, schema[field.name], spec, task)
-    if spec.scene_obstacles:
-        problems += _check_scene_attributes(spec, schema)
-    if not problems:
-        problems = _check_rows(folder, spec, task)
+    expected_scenes = scene_attributes(spec.scene_families) if spec.scene_obstacles else {}
+    problems += [
+        f"{name} has the attributes {schema[name].attributes}, expected {expected}"
+        for name, expected in expected_scenes.items()
+        if name in schema and schema[name].attributes != expected
+    ]
+    if not problems:  # the description is that of the specification
+        try:
+            read_rows(Shard(folder, spec, task))
+        except DatasetError as error:
+            problems = [_reason(error, path)]
     return [Finding(task.file, problem, hint=DELETE_HINT) for problem in problems]
-
-
-def _check_rows(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[str]:
-    """Check the values of a shard whose description is that of the specification."""
-    try:
-        read_rows(Shard(folder, spec, task))
-    except DatasetError as error:
-        return [_reason(error, folder / task.file)]
-    return []
 
 
 def _check_field(field: Field, stored: StoredField, spec: DatasetSpec, task: ShardTask) -> list[str]:
@@ -238,18 +226,9 @@ def _check_field(field: Field, stored: StoredField, spec: DatasetSpec, task: Sha
     ]
 
 
-def _check_scene_attributes(spec: DatasetSpec, schema: Mapping[str, StoredField]) -> list[str]:
-    """Compare the attributes of the scenes of a shard with the specification."""
-    return [
-        f"{name} has the attributes {schema[name].attributes}, expected {expected}"
-        for name, expected in scene_attributes(spec.scene_families).items()
-        if name in schema and schema[name].attributes != expected
-    ]
-
-
 def _extras(folder: Path, spec: DatasetSpec) -> Iterator[Finding]:
     """Yield a finding for every file or folder that does not belong to the dataset."""
-    known = {SPECIFICATION, MANIFEST, *_LISTED, WORK, *spec.splits}
+    known = {SPECIFICATION, MANIFEST, *LISTED, WORK, *spec.splits}
     for task in shards(spec):
         known |= {task.file, task.sidecar}
     for parent in [folder, *(folder / split for split in spec.splits)]:

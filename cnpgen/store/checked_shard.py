@@ -55,11 +55,8 @@ def read_checked(shard: Shard) -> dict[str, NDArray[Any]]:
 def read_rows(shard: Shard, names: Iterable[str] | None = None) -> dict[str, NDArray[Any]]:
     """Read and check fields of a shard, by default all, after its sha256 was compared.
 
-    Returns:
-        Field name -> values as stored, shape (rows, width) or (rows,).
-
-    Raises:
-        DatasetError: The shard is missing or damaged, or differs from its record or the specification.
+    The result is field name -> values as stored, shape (rows, width) or (rows,). A missing or damaged shard, and one
+    that differs from the specification, raises DatasetError.
     """
     placements = check_header(shard)
     columns = read_columns(shard, placements, [item.name for item in shard.spec.fields] if names is None else names)
@@ -70,11 +67,7 @@ def read_rows(shard: Shard, names: Iterable[str] | None = None) -> dict[str, NDA
 
 
 def read_scenes(shard: Shard, placements: Mapping[str, StoredField] | None = None) -> SceneTable:
-    """Read and check the scenes of a shard after its sha256 was compared; ``check_header`` returns the placements.
-
-    Raises:
-        DatasetError: The scenes are missing or invalid.
-    """
+    """Read and check the scenes of a shard after its sha256 was compared; ``check_header`` returns the placements."""
     placements = check_header(shard) if placements is None else placements
     names, spec = [item.name for item in SCENE_ARRAYS], shard.spec
     try:
@@ -88,10 +81,9 @@ def read_scenes(shard: Shard, placements: Mapping[str, StoredField] | None = Non
 
 
 def check_header(shard: Shard) -> dict[str, StoredField]:
-    """Compare position, fields, shapes, types and sample IDs with the specification; return the stored fields.
+    """Return the stored fields of a shard.
 
-    Raises:
-        DatasetError: They differ, or the file is damaged.
+    Raise DatasetError if position, fields, shapes, types or sample IDs are not those of the specification.
     """
     placements, identity = read_placements(shard.path)
     spec, task = shard.spec, shard.task
@@ -117,10 +109,7 @@ def check_field(shard: Shard, item: Field, placement: StoredField | None) -> Non
 def read_columns(shard: Shard, placements: Mapping[str, StoredField], names: Iterable[str]) -> dict[str, NDArray[Any]]:
     """Read fields of a shard after ``check_header``; values that are contiguous in the file are read directly.
 
-    Reading a file that is truncated meanwhile ends in an error; reading its memory map would end the process.
-
-    Raises:
-        DatasetError: The file is cut off.
+    Reading a file that is truncated meanwhile raises DatasetError; reading its memory map would end the process.
     """
     selected = {name: placements[name] for name in names}
     if any(place.offset is None for place in selected.values()):
@@ -130,24 +119,16 @@ def read_columns(shard: Shard, placements: Mapping[str, StoredField], names: Ite
         for name, place in selected.items():
             columns[name] = np.empty(place.shape, place.dtype)
             file.seek(place.offset or 0)
-            _fill(shard, file.readinto, columns[name].data.cast("B"))
+            buffer = columns[name].data.cast("B")
+            while buffer:  # the system reads at most 2 GiB at once
+                if not (count := file.readinto(buffer)):
+                    raise DatasetError(f"{shard.path} was cut off while it was read; {RERUN_HINT}")
+                buffer = buffer[count:]
     return columns
 
 
-def _fill(shard: Shard, readinto: Any, buffer: memoryview) -> None:
-    """Fill a buffer; the system reads at most 2 GiB at once."""
-    while buffer:
-        if not (count := readinto(buffer)):
-            raise DatasetError(f"{shard.path} was cut off while it was read; {RERUN_HINT}")
-        buffer = buffer[count:]
-
-
 def check_values(shard: Shard, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Check that all values are finite and that sample IDs are the indices of the rows.
-
-    Raises:
-        DatasetError: They are not.
-    """
+    """Raise DatasetError if a value is not finite, or if sample IDs are not the indices of the rows."""
     if problem := finite_problem(columns):
         raise DatasetError(f"{shard.path}: {problem}")
     ids = columns.get(SAMPLE_ID)

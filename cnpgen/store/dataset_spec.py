@@ -285,17 +285,13 @@ def shards(spec: DatasetSpec) -> list[ShardTask]:
 
     Shards begin at multiples of the shard size and at the first row of every extension.
     """
-    return [
-        ShardTask(split, index, first, end - first)
-        for split, rows in spec.splits.items()
-        for index, (first, end) in enumerate(pairwise([*_first_rows(spec, split, rows), rows]))
-    ]
-
-
-def _first_rows(spec: DatasetSpec, split: str, rows: int) -> list[int]:
-    """Return the first row of every shard of a split."""
-    previous = {splits.get(split, 0) for splits in spec.previous_splits}
-    return sorted({*range(0, rows, spec.shard_size), *(end for end in previous if 0 < end < rows)})
+    tasks = []
+    for split, rows in spec.splits.items():
+        previous = {splits.get(split, 0) for splits in spec.previous_splits}
+        first_rows = sorted({*range(0, rows, spec.shard_size), *(end for end in previous if 0 < end < rows)})
+        ranges = enumerate(pairwise([*first_rows, rows]))
+        tasks += [ShardTask(split, index, first, end - first) for index, (first, end) in ranges]
+    return tasks
 
 
 def shard_attributes(spec: DatasetSpec, task: ShardTask) -> dict[str, str | int]:
@@ -319,8 +315,6 @@ def shard_attributes(spec: DatasetSpec, task: ShardTask) -> dict[str, str | int]
 
 def to_json(spec: DatasetSpec) -> dict[str, Any]:
     """Return a specification as a JSON-able dict."""
-    converted_names = {"seed", "fields", "previous_splits", *_SCENE_KEYS}
-    content = {name: getattr(spec, name) for name in DatasetSpec.__dataclass_fields__ if name not in converted_names}
     converted = {
         "seed": str(spec.seed),  # JSON numbers of other readers have 53 bits
         "fields": plain([asdict(item) for item in spec.fields]),
@@ -328,15 +322,12 @@ def to_json(spec: DatasetSpec) -> dict[str, Any]:
     }
     if spec.scene_obstacles:  # absent in specifications without scenes, whose fingerprints stay the same
         converted |= {name: plain(getattr(spec, name)) for name in _SCENE_KEYS}
-    return content | converted
+    names = [name for name in DatasetSpec.__dataclass_fields__ if name not in {*converted, *_SCENE_KEYS}]
+    return {name: getattr(spec, name) for name in names} | converted
 
 
 def from_json(content: Mapping[str, Any]) -> DatasetSpec:
-    """Rebuild a specification from the result of :func:`to_json`.
-
-    Raises:
-        DatasetError: A key is missing or has the wrong type.
-    """
+    """Rebuild a specification from the result of ``to_json``; a missing key or a wrong type raises DatasetError."""
     try:
         required = [name for name in DatasetSpec.__dataclass_fields__ if name not in _SCENE_KEYS]
         arguments = {name: content[name] for name in required}
@@ -345,20 +336,12 @@ def from_json(content: Mapping[str, Any]) -> DatasetSpec:
             arguments["scene_families"] = tuple(map(str, content["scene_families"]))
         arguments["previous_splits"] = tuple(content["previous_splits"])
         arguments["seed"] = int(content["seed"])
-        arguments["fields"] = tuple(_field(item) for item in content["fields"])
+        arguments["fields"] = tuple(Field(**item | {"names": tuple(item["names"])}) for item in content["fields"])
         return DatasetSpec(**arguments)
     except UsageError as error:
         raise DatasetError(f"{SPECIFICATION} is damaged: {error}") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise DatasetError(f"{SPECIFICATION} is damaged: {type(error).__name__} {error}") from error
-
-
-def _field(content: Mapping[str, Any]) -> Field:
-    limits = {
-        name: None if content[name] is None else tuple(float(value) for value in content[name])
-        for name in ("valid_min", "valid_max")
-    }
-    return Field(**{**content, "names": tuple(content["names"]), **limits})
 
 
 def write_dataset_spec(folder: Path, spec: DatasetSpec) -> None:
@@ -372,11 +355,7 @@ def write_dataset_spec(folder: Path, spec: DatasetSpec) -> None:
 
 
 def load_dataset_spec(folder: Path) -> DatasetSpec:
-    """Read ``specification.json``.
-
-    Raises:
-        DatasetError: It is missing, damaged, or has another format version.
-    """
+    """Read ``specification.json``; raise DatasetError if it is missing, damaged, or of another format version."""
     path = folder / SPECIFICATION
     _refuse_old_format(folder)
     document = load_document(

@@ -86,8 +86,7 @@ class DatasetSummary:
 def summarize_dataset(folder: Path, spec: DatasetSpec, *, allow_incomplete: bool = False) -> DatasetSummary:
     """Read the sidecars of a dataset; of an incomplete one only with ``allow_incomplete``.
 
-    Raises:
-        DatasetError: A shard is missing, damaged or of another specification; the message names it.
+    Otherwise a shard that is missing, damaged or of another specification raises DatasetError, which names it.
     """
     records, problems = [], []
     for task in shards(spec):
@@ -134,9 +133,5 @@ def stats_document(summary: DatasetSummary) -> dict[str, Any]:
 
 
 def load_stats_document(folder: Path) -> dict[str, Any]:
-    """Read ``stats.json``.
-
-    Raises:
-        DatasetError: It is missing, damaged or of another format version.
-    """
+    """Read ``stats.json``; raise DatasetError if it is missing, damaged or of another format version."""
     return load_document(folder / STATS, STATS_FORMAT, version=STATS_VERSION, structure=STATS_STRUCTURE)

@@ -49,11 +49,7 @@ def digest_problem(path: Path) -> str:
 
 
 def require_intact(path: Path, *, size: int, sha256: str) -> None:
-    """Raise an error if a shard has not its recorded size [bytes] and sha256; verify it once per process.
-
-    Raises:
-        DatasetError: The shard is missing, cut off or changed.
-    """
+    """Raise DatasetError if a shard has not its recorded size [bytes] and sha256; verify it once per process."""
     if problem := size_problem(path, size):
         raise DatasetError(f"{problem}; {RERUN_HINT}")
     identity = (path.absolute(), path.stat().st_mtime_ns, size, sha256)

@@ -10,9 +10,7 @@ _SEPARATOR = ", "
 def units_of_joints(revolute_unit: str, is_prismatic: tuple[bool, ...]) -> str:
     """Return the unit of a joint quantity: one for all joints, or one per joint, separated by commas, if they differ.
 
-    Args:
-        revolute_unit: Unit of revolute joints: "rad", "rad/s", "rad/s^2", "rad/s^3" or "N m".
-        is_prismatic: For every joint, whether it is prismatic.
+    The unit of revolute joints is "rad", "rad/s", "rad/s^2", "rad/s^3" or "N m".
     """
     units = [_PRISMATIC[revolute_unit] if prismatic else revolute_unit for prismatic in is_prismatic]
     return units[0] if len(set(units)) == 1 else _SEPARATOR.join(units)

@@ -23,6 +23,7 @@ from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, SPECIFICATION, STATS,
 
 MANIFEST_FORMAT = "cnpgen-dataset"
 MANIFEST_VERSION = 2
+LISTED = (SPECIFICATION, STATS, CARD, CROISSANT)  # files with their size and sha256 beside the shards
 _SHARD_STRUCTURE = {
     **dict.fromkeys(("file", "sha256"), TEXT),
     **dict.fromkeys(("rows", "first_sample_id", "bytes"), WHOLE),
@@ -32,7 +33,7 @@ MANIFEST_STRUCTURE = {
     "fingerprint": TEXT,
     "specification_fingerprint": TEXT,
     "splits": {ANY_KEY: {"rows": WHOLE, "shards": [_SHARD_STRUCTURE]}},
-    "files": {name: {"bytes": WHOLE, "sha256": TEXT} for name in (SPECIFICATION, STATS, CARD, CROISSANT)},
+    "files": {name: {"bytes": WHOLE, "sha256": TEXT} for name in LISTED},
 }
 
 
@@ -40,11 +41,7 @@ def finalize(folder: Path, spec: DatasetSpec, *, notes: str = "") -> dict[str, A
     """Summarize the shards of a dataset: write statistics, card, Croissant description and, last, the manifest.
 
     The same shards give the same files, so several processes may do it at the same time. ``notes`` is Markdown for the
-    card.
-
-    Raises:
-        DatasetError: Shards are missing, damaged or of another specification; the message names them.
-        UsageError: SOURCE_DATE_EPOCH is not a time.
+    card. Errors are those of ``summarize_dataset`` and ``source_date``.
     """
     summary = summarize_dataset(folder, spec)
     created = _created(summary)
@@ -67,12 +64,13 @@ def _name(folder: Path) -> str:
 
 
 def load_manifest(folder: Path) -> dict[str, Any]:
-    """Read ``manifest.json``.
-
-    Raises:
-        DatasetError: It is missing (the dataset is unfinished), damaged or of another format version.
-    """
+    """Read ``manifest.json``; raise DatasetError if it is missing, damaged or of another format version."""
     return load_document(folder / MANIFEST, MANIFEST_FORMAT, version=MANIFEST_VERSION, structure=MANIFEST_STRUCTURE)
+
+
+def shard_entries(manifest: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the entries of the shards of all splits, by file."""
+    return {entry["file"]: entry for split in manifest.get("splits", {}).values() for entry in split["shards"]}
 
 
 def lists_shards_of(manifest: dict[str, Any], spec: DatasetSpec) -> bool:
@@ -80,24 +78,18 @@ def lists_shards_of(manifest: dict[str, Any], spec: DatasetSpec) -> bool:
 
     Only these file names are opened: no path in a manifest can lead outside the folder of the dataset.
     """
-    listed = {split: [_location(item) for item in part["shards"]] for split, part in manifest["splits"].items()}
-    expected: dict[str, list[tuple[str, str, int, int]]] = {split: [] for split in spec.splits}
-    for task in shards(spec):
-        expected[task.split].append((task.file, task.sidecar, task.first_row, task.rows))
-    return listed == expected
-
-
-def _location(entry: dict[str, Any]) -> tuple[str, str, int, int]:
-    """Return file, sidecar, first row and number of rows of a shard."""
-    return entry["file"], entry["sidecar"]["file"], entry["first_sample_id"], entry["rows"]
+    if manifest["splits"].keys() != spec.splits.keys():
+        return False
+    listed = [
+        (split, entry["file"], entry["sidecar"]["file"], entry["first_sample_id"], entry["rows"])
+        for split in spec.splits
+        for entry in manifest["splits"][split]["shards"]
+    ]
+    return listed == [(task.split, task.file, task.sidecar, task.first_row, task.rows) for task in shards(spec)]
 
 
 def source_date() -> datetime | None:
-    """Return the time in the environment variable SOURCE_DATE_EPOCH, or None if it is not set.
-
-    Raises:
-        UsageError: It is not a time.
-    """
+    """Return the time in the variable SOURCE_DATE_EPOCH, or None if it is not set; another value raises UsageError."""
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
     try:
         return datetime.fromtimestamp(int(epoch), UTC) if epoch else None
@@ -138,7 +130,9 @@ def _manifest(folder: Path, summary: DatasetSummary, *, created: str) -> dict[st
         "verification": dict(summary.sampling.verification),
         "splits": {split: _split(folder, summary, split) for split in spec.splits},
         "stats": STATS,
-        "files": {name: _listed(folder / name) for name in (SPECIFICATION, STATS, CARD, CROISSANT)},
+        "files": {
+            name: {"bytes": (folder / name).stat().st_size, "sha256": file_sha256(folder / name)} for name in LISTED
+        },
     }
 
 
@@ -188,7 +182,3 @@ def _split(folder: Path, summary: DatasetSummary, split: str) -> dict[str, Any]:
     ]
     sampling = summary.sampling_by_split[split]
     return {"rows": summary.spec.splits[split], "yield": sampling.yield_json(), "shards": entries}
-
-
-def _listed(path: Path) -> dict[str, Any]:
-    return {"bytes": path.stat().st_size, "sha256": file_sha256(path)}

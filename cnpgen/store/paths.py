@@ -20,9 +20,7 @@ HDF5_KINDS = (ANY_HDF5, *_KIND_OF_FORMAT.values())
 def require_folder(folder: str | Path, *, argument: str = "folder") -> Path:
     """Return the path of a folder that exists; errors name the argument.
 
-    Raises:
-        UsageError: It is no text or path, or the folder is missing or is a file.
-        MachineError: It cannot be read.
+    No text or path, a missing folder and a file raise UsageError, and a folder that cannot be read MachineError.
     """
     if not isinstance(folder, str | Path) or not str(folder) or "\0" in str(folder):
         raise UsageError(f"must name a folder, got {folder!r:.100}", argument=argument)
@@ -34,12 +32,7 @@ def require_folder(folder: str | Path, *, argument: str = "folder") -> Path:
 
 
 def require_dataset(folder: str | Path, *, argument: str = "folder") -> Path:
-    """Return the path of a folder that contains a dataset, possibly unfinished or damaged.
-
-    Raises:
-        UsageError: As ``require_folder``, or the folder contains no dataset.
-        MachineError: It cannot be read.
-    """
+    """Return the path of a folder that contains a dataset, possibly unfinished or damaged; see ``require_folder``."""
     folder = require_folder(folder, argument=argument)
     if is_dataset(folder):
         return folder
@@ -54,11 +47,7 @@ def require_file(
     """Raise an error that names the argument if a path is not a file with some expected content: "a file of plans".
 
     Files of other ``kinds``, as of ``file_kind``, are refused, if any are listed. ``of_dataset`` is a hint for the
-    folder of a dataset.
-
-    Raises:
-        UsageError: The path does not exist, is a folder, a device or a pipe, or a file of another kind.
-        MachineError: It cannot be read.
+    folder of a dataset. Files that cannot be read raise MachineError, other paths UsageError.
     """
     require_path(path, expected, argument=argument)
     if path.is_dir():
@@ -72,12 +61,7 @@ def require_file(
 
 
 def require_path(path: Path, expected: str, *, argument: str = "path") -> None:
-    """Raise an error if a path, with some expected content, does not exist; it names the argument.
-
-    Raises:
-        UsageError: It does not exist.
-        MachineError: It cannot be read.
-    """
+    """Raise UsageError, naming the argument, if a path is missing, and MachineError if it cannot be read."""
     check_readable(path)
     if not path.exists():
         raise UsageError(f"{path} is not there, expected {expected}{similar_path(path)}", concerns=argument)

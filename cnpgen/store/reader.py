@@ -15,7 +15,7 @@ from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, load_dataset_spec,
 from cnpgen.store.dataset_summary import summarize_dataset, unfinished
 from cnpgen.store.intact import require_intact
 from cnpgen.store.layout import MANIFEST, SPECIFICATION
-from cnpgen.store.manifest import lists_shards_of, load_manifest
+from cnpgen.store.manifest import lists_shards_of, load_manifest, shard_entries
 from cnpgen.store.paths import require_dataset
 from cnpgen.store.scene_table import SceneTable, distinct_scenes
 from cnpgen.store.shard import storage_dtype
@@ -34,11 +34,7 @@ class StoredDataset:
     manifest: dict[str, Any] | None
 
     def tasks(self, split: str) -> list[ShardTask]:
-        """List the existing shards of a split, in order.
-
-        Raises:
-            DatasetError: There is no such split.
-        """
+        """List the existing shards of a split, in order; an unknown split raises DatasetError."""
         if split not in self.spec.splits:
             raise DatasetError(f"{self.folder} {lacks('split', split, self.spec.splits)}", concerns="split")
         tasks = [task for task in shards(self.spec) if task.split == split]
@@ -51,13 +47,9 @@ class StoredDataset:
     ) -> dict[str, NDArray[Any]]:
         """Read rows ``start`` to ``stop`` of a split; of an unfinished dataset, only the existing ones of them.
 
-        By default, all fields are read, in the order of the specification, and all rows.
-
-        Returns:
-            Field name -> values, shape (rows, width) or (rows,).
-
-        Raises:
-            DatasetError: There is no such split or field, the rows are out of range, or a shard is damaged.
+        By default, all fields are read, in the order of the specification, and all rows. The result is field name ->
+        values, shape (rows, width) or (rows,). An unknown split or field, rows out of range, and a damaged shard raise
+        DatasetError.
         """
         names = self._names(fields)
         tasks = self.tasks(split)
@@ -77,10 +69,8 @@ class StoredDataset:
     def read_scenes(self, split: str, *, start: int = 0, stop: int | None = None) -> SceneTable:
         """Read the scenes of rows ``start`` to ``stop`` of a split, and those of other rows in the same shards.
 
-        ``table.rows_of(scene_id)`` returns the index of the scene of each row.
-
-        Raises:
-            DatasetError: The dataset has no scenes, or a shard is missing or damaged.
+        ``table.rows_of(scene_id)`` returns the index of the scene of each row. A dataset without scenes or rows, and a
+        damaged shard, raise DatasetError.
         """
         if not self.spec.scene_obstacles:
             raise DatasetError(f"{self.folder} has no scenes")
@@ -96,10 +86,9 @@ class StoredDataset:
 
     def shard(self, task: ShardTask) -> Shard:
         """Return a shard with its record in the manifest or, without a manifest, in its sidecar."""
-        if (recorded := self._recorded.get(task.file)) is None:
-            record = load_record(self.folder, task)
-            recorded = record.bytes, record.sha256
-        return Shard(self.folder, self.spec, task, *recorded)
+        if (entry := self._entries.get(task.file)) is None:
+            entry = vars(load_record(self.folder, task))
+        return Shard(self.folder, self.spec, task, entry["bytes"], entry["sha256"])
 
     def _checked(self, task: ShardTask) -> Shard:
         """Verify a shard and return it."""
@@ -108,12 +97,9 @@ class StoredDataset:
         return shard
 
     @cached_property
-    def _recorded(self) -> dict[str, tuple[int, str]]:
-        """Shard -> size [bytes] and sha256 in the manifest; empty without a manifest."""
-        splits = {} if self.manifest is None else self.manifest["splits"]
-        return {
-            entry["file"]: (entry["bytes"], entry["sha256"]) for split in splits.values() for entry in split["shards"]
-        }
+    def _entries(self) -> dict[str, dict[str, Any]]:
+        """Shard -> its entry in the manifest; empty without a manifest."""
+        return shard_entries(self.manifest or {})
 
     def _names(self, fields: Sequence[str] | None) -> list[str]:
         return [self.spec.field_named(name).name for name in fields] if fields else [f.name for f in self.spec.fields]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -139,10 +140,7 @@ def _density(content: Mapping[str, Any]) -> DensityMap:
 def sampling_from_json(content: Mapping[str, Any]) -> SamplingStatistics:
     """Rebuild sampling statistics from a dict with the structure ``SAMPLING_STRUCTURE``."""
     return SamplingStatistics(
-        tried=int(content["tried"]),
-        accepted=int(content["accepted"]),
-        rejections={name: int(count) for name, count in content["rejections"].items()},
-        stages={name: str(stage) for name, stage in content["stages"].items()},
+        **{name: content[name] for name in ("tried", "accepted", "rejections", "stages")},
         densities={name: _density(item) for name, item in content["densities"].items()},
         verification={name: float(value) for name, value in content["verification"].items()},
     )
@@ -150,7 +148,4 @@ def sampling_from_json(content: Mapping[str, Any]) -> SamplingStatistics:
 
 def merge_sampling(parts: Sequence[SamplingStatistics]) -> SamplingStatistics:
     """Merge sampling statistics, in order; without any, all counts are 0."""
-    merged = SamplingStatistics(tried=0, accepted=0)
-    for part in parts:
-        merged = merged.merge(part)
-    return merged
+    return reduce(SamplingStatistics.merge, parts, SamplingStatistics(tried=0, accepted=0))

@@ -96,11 +96,7 @@ class SceneTable:
         return ((item.name, getattr(self, item.name)) for item in fields(self))
 
     def rows_of(self, scene_id: NDArray[np.int64]) -> NDArray[np.intp]:
-        """Return the index of the scene of each of N samples with scene IDs, shape (N,).
-
-        Raises:
-            DatasetError: There is no such scene.
-        """
+        """Return the index of the scene of each of N samples, shape (N,); an unknown scene ID raises DatasetError."""
         rows = np.minimum(np.searchsorted(self.scene_ids, scene_id), max(len(self) - 1, 0))
         if len(scene_id) and (not len(self) or (self.scene_ids[rows] != scene_id).any()):
             raise DatasetError("the scene_id of a sample is not among the scene_ids")
@@ -141,12 +137,9 @@ def scene_attributes(families: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 
 def check_scenes(table: SceneTable, obstacles: int, scene_id: NDArray[np.int64], families: int) -> None:
-    """Check the scenes of a shard with a capacity of obstacles and a number of families.
+    """Check the scenes of a shard with a capacity of obstacles and a number of families; raise DatasetError.
 
-    The samples have scene IDs of shape (rows,).
-
-    Raises:
-        DatasetError: IDs are not those of the samples, or numbers, kinds, sizes or quaternions are invalid.
+    IDs must be those of the samples, shape (rows,); numbers, kinds, sizes and quaternions must be valid.
     """
     check_shapes({name: values.shape for name, values in table.arrays()}, obstacles)
     if not np.array_equal(table.scene_ids, np.unique(scene_id)):

@@ -26,11 +26,7 @@ _STORAGE = {"float64": "<f8", "float32": "<f4", "int64": "<i8"}
 
 
 def storage_dtype(field: Field, dtype: str) -> np.dtype[Any]:
-    """Return the little-endian type of a field in a dataset of the float type "float64" or "float32".
-
-    Raises:
-        DatasetError: The type is not supported.
-    """
+    """Return the little-endian type of a field in a dataset of the float type "float64" or "float32"."""
     name = dtype if field.dtype == "float" else field.dtype
     if name not in _STORAGE:
         raise DatasetError(f"field {field.name!r} cannot be stored as {name!r}, only as one of {', '.join(_STORAGE)}")
@@ -63,11 +59,8 @@ def write_shard(
 ) -> int:
     """Write a shard atomically, and read it back before it is renamed; return the size of the file [bytes].
 
-    Columns are finite, in their stored type, of shape (rows, width) or (rows,). Every field must have one. The
-    attribute "rows" must be their number. Scenes are in their stored types, too. The temporary file is in ``work``.
-
-    Raises:
-        DatasetError: The columns do not fit the fields, or are not finite.
+    Columns are finite, in their stored type, of shape (rows, width) or (rows,), one for every field; others raise
+    DatasetError. The attribute "rows" must be their number. The scenes are in their stored types, too.
     """
     rows = int(attributes["rows"])
     _check_columns(columns, fields, rows, dtype)
@@ -132,13 +125,9 @@ def _encode(
 
 
 def read_shard(path: Path, fields: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
-    """Read whole fields of a shard, by default all.
+    """Read whole fields of a shard, by default all: field name -> values, shape (rows, width) or (rows,).
 
-    Returns:
-        Field name -> values, shape (rows, width) or (rows,).
-
-    Raises:
-        DatasetError: The file is missing, damaged or cut off, or has no such field.
+    A damaged file and an unknown field raise DatasetError.
     """
     with opened_hdf5(path) as file:
         known = list(file)
@@ -149,11 +138,7 @@ def read_shard(path: Path, fields: Sequence[str] | None = None) -> dict[str, NDA
 
 
 def read_attributes(path: Path, names: Sequence[str] | None = None) -> dict[str, str | int]:
-    """Read attributes of a shard, by default all.
-
-    Raises:
-        DatasetError: The file is missing, damaged or cut off, or has no such attribute.
-    """
+    """Read attributes of a shard, by default all; a missing one raises DatasetError."""
     with opened_hdf5(path) as file:
         values = {name: file.attributes[name] for name in (file.attributes if names is None else names)}
         return {name: value if isinstance(value, str) else int(value) for name, value in values.items()}
@@ -173,24 +158,16 @@ class StoredField:
 
 
 def read_schema(path: Path) -> dict[str, StoredField]:
-    """Read the descriptions of the datasets of a shard, without their values.
-
-    Raises:
-        DatasetError: The file is missing, damaged or cut off.
-    """
+    """Read the descriptions of the datasets of a shard, without their values."""
     with opened_hdf5(path) as file:
         columns = file.columns().items()
         return {name: StoredField(item.shape, item.dtype, item.offset, item.attributes.all()) for name, item in columns}
 
 
 def read_placements(path: Path) -> tuple[dict[str, StoredField], dict[str, int]]:
-    """Read the locations of the fields of a shard, without attributes, and the identity of the shard.
+    """Read the locations of the fields of a shard, without their attributes, and the identity of the shard.
 
-    Returns:
-        Field name -> location; and the attributes ``specification_key``, ``first_sample_id`` and ``rows`` of the file.
-
-    Raises:
-        DatasetError: The file is missing, damaged or cut off.
+    The identity consists of the attributes ``specification_key``, ``first_sample_id`` and ``rows`` of the file.
     """
     with opened_hdf5(path) as file:
         columns = file.columns().items()

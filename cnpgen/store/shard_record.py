@@ -74,11 +74,7 @@ def record_to_json(record: ShardRecord) -> dict[str, Any]:
 
 
 def record_from_json(content: Mapping[str, Any]) -> ShardRecord:
-    """Rebuild a record from the result of :func:`record_to_json`.
-
-    Raises:
-        DatasetError: A key is missing or has the wrong type.
-    """
+    """Rebuild a record from the result of ``record_to_json``; a missing key or a wrong type raises DatasetError."""
     try:
         check_structure(content, _RECORD_STRUCTURE)
         statistics = {name: statistics_from_json(item) for name, item in content["statistics"].items()}
@@ -95,11 +91,7 @@ def save_record(folder: Path, task: ShardTask, record: ShardRecord) -> None:
 
 
 def load_record(folder: Path, task: ShardTask) -> ShardRecord:
-    """Read the sidecar of a shard.
-
-    Raises:
-        DatasetError: It is missing, damaged, of another format version or of another shard.
-    """
+    """Read the sidecar of a shard; a missing or damaged one, and that of another shard, raise DatasetError."""
     path = folder / task.sidecar
     record = record_from_json(load_document(path, SHARD_RECORD_FORMAT, version=SHARD_RECORD_VERSION, structure={}))
     if (record.file, record.rows, record.first_sample_id) != (task.file, task.rows, task.first_row):
@@ -122,68 +114,46 @@ def commit_shard(
 ) -> ShardRecord:
     """Write a shard and then its sidecar; a committed shard is not written again. Return the record of the shard.
 
-    The columns are in their stored type, of shape (rows, width) or (rows,), the scenes, too. Other arguments become
-    attributes of the record.
-
-    Raises:
-        DatasetError: The columns do not fit the specification, or are not finite.
+    The columns are finite, in their stored type, of shape (rows, width) or (rows,), the scenes, too; others raise
+    DatasetError. Other arguments become attributes of the record.
     """
     if is_committed(folder, spec, task):  # another process made the same shard
         return load_record(folder, task)
-    about = {"sampling": sampling, "started": started, "seconds": seconds, "versions": versions or {}}
     if scenes is not None:
         check_scenes(scenes, spec.scene_obstacles, columns[SCENE_ID], len(spec.scene_families))
+    path, attributes = folder / task.file, shard_attributes(spec, task)
+    families, work = spec.scene_families, folder / WORK
     try:
-        return _write(folder, spec, task, (columns, scenes), about)
+        size = write_shard(
+            path, columns, spec.fields, attributes, dtype=spec.dtype, scenes=scenes, families=families, work=work
+        )
+        record = ShardRecord(
+            file=task.file,
+            bytes=size,
+            sha256=file_sha256(path),
+            rows=task.rows,
+            first_sample_id=task.first_row,
+            specification_fingerprint=spec.version_with(task).fingerprint,
+            statistics=column_statistics(columns, spec.fields),
+            sampling=sampling,
+            started=started,
+            seconds=seconds,
+            versions=versions or {},
+        )
+        if not is_committed(folder, spec, task):  # otherwise another process may already have summarized its record
+            save_record(folder, task, record)
+            return record
     except CnpgenError:
         # Another process may have committed the shard, finished the dataset and removed all temporary files.
-        if is_committed(folder, spec, task):
-            return load_record(folder, task)
-        raise
-
-
-def _write(
-    folder: Path,
-    spec: DatasetSpec,
-    task: ShardTask,
-    content: tuple[Mapping[str, NDArray[Any]], SceneTable | None],
-    about: Mapping[str, Any],
-) -> ShardRecord:
-    """Write a shard and then its sidecar, unless another process has committed the shard in the meantime."""
-    path = folder / task.file
-    columns, scenes = content
-    size = write_shard(
-        path,
-        columns,
-        spec.fields,
-        shard_attributes(spec, task),
-        dtype=spec.dtype,
-        scenes=scenes,
-        families=spec.scene_families,
-        work=folder / WORK,
-    )
-    record = ShardRecord(
-        file=task.file,
-        bytes=size,
-        sha256=file_sha256(path),
-        rows=task.rows,
-        first_sample_id=task.first_row,
-        specification_fingerprint=spec.version_with(task).fingerprint,
-        statistics=column_statistics(columns, spec.fields),
-        **about,
-    )
-    if is_committed(folder, spec, task):  # another process may already have summarized its own record
-        return load_record(folder, task)
-    save_record(folder, task, record)
-    return record
+        if not is_committed(folder, spec, task):
+            raise
+    return load_record(folder, task)
 
 
 def load_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> ShardRecord:
-    """Read the sidecar of a shard and check that it belongs to this specification; the shard itself is not read.
+    """Read the sidecar of a shard, without the shard itself.
 
-    Raises:
-        DatasetError: The sidecar is missing, damaged or of another specification, or the shard is missing or has
-            another size.
+    Raise DatasetError if it is damaged or of another specification, or if the shard is missing or has another size.
     """
     record = load_record(folder, task)
     if record.specification_fingerprint != spec.version_with(task).fingerprint:
@@ -198,11 +168,7 @@ def load_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> ShardRec
 
 
 def check_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> None:
-    """Check that a shard is the recorded one, by its sha256.
-
-    Raises:
-        DatasetError: As for :func:`load_committed`, or the shard was changed.
-    """
+    """Check a shard as ``load_committed``, and its sha256: a changed shard raises DatasetError."""
     record = load_committed(folder, spec, task)
     if file_sha256(folder / task.file) != record.sha256:
         raise DatasetError(f"{folder / task.file} was changed: its sha256 is not the recorded one")

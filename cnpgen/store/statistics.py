@@ -60,13 +60,11 @@ class FieldStatistics:
         Raises:
             DatasetError: The columns or the ranges of the histograms differ.
         """
-        if not _have_equal_columns(self, other):
+        ranges = (np.array_equal(getattr(self, name), getattr(other, name)) for name in ("low", "high"))
+        if self.mean.shape != other.mean.shape or not all(ranges):
             raise DatasetError("statistics of different fields cannot be merged")
         count = self.count + other.count
         delta = other.mean - self.mean
-        histogram = None
-        if self.histogram is not None and other.histogram is not None:
-            histogram = self.histogram + other.histogram
         return FieldStatistics(
             count=count,
             mean=self.mean + delta * (other.count / count),
@@ -75,7 +73,7 @@ class FieldStatistics:
             maximum=np.maximum(self.maximum, other.maximum),
             low=self.low,
             high=self.high,
-            histogram=histogram,
+            histogram=None if self.histogram is None or other.histogram is None else self.histogram + other.histogram,
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -89,25 +87,12 @@ class FieldStatistics:
         return content
 
 
-def _have_equal_columns(a: FieldStatistics, b: FieldStatistics) -> bool:
-    """Return whether two statistics are of the same columns."""
-    if a.mean.shape != b.mean.shape or (a.histogram is None) != (b.histogram is None):
-        return False
-    if a.low is None or b.low is None or a.high is None or b.high is None:
-        return True
-    return np.array_equal(a.low, b.low) and np.array_equal(a.high, b.high)
-
-
 STATISTICS_STRUCTURE = {"count": WHOLE, "mean": [NUMBER], "m2": [NUMBER], "min": [NUMBER], "max": [NUMBER]}
 _HISTOGRAM_STRUCTURE = {"low": [NUMBER], "high": [NUMBER], "counts": [[WHOLE]]}
 
 
 def statistics_from_json(content: Mapping[str, Any]) -> FieldStatistics:
-    """Rebuild statistics from a dict with the structure ``STATISTICS_STRUCTURE``.
-
-    Raises:
-        ValueError: Shapes or counts are inconsistent.
-    """
+    """Rebuild statistics from ``STATISTICS_STRUCTURE``; inconsistent shapes or counts raise ValueError."""
     keys = {"mean": "mean", "m2": "m2", "minimum": "min", "maximum": "max"}
     arrays = {name: np.array(content[key], np.float64) for name, key in keys.items()}
     counts = None
@@ -175,11 +160,7 @@ def column_statistics(columns: Mapping[str, NDArray[Any]], fields: Sequence[Fiel
 
 
 def merge_statistics(parts: Sequence[Mapping[str, FieldStatistics]]) -> dict[str, FieldStatistics]:
-    """Merge the statistics of shards, in order.
-
-    Raises:
-        DatasetError: There are no parts, or they are of different fields.
-    """
+    """Merge the statistics of shards, in order; none, and those of different fields, raise DatasetError."""
     if not parts:
         raise DatasetError("there are no statistics to merge")
     merged = dict(parts[0])

@@ -22,24 +22,14 @@ _FORMAT_KEY = re.compile(rb'\{\s*"format": "cnpgen-')
 
 @dataclass(frozen=True)
 class Workspace:
-    """The content of a folder for a dataset; other processes may change it later.
+    """The content of a folder for a dataset, possibly unfinished or damaged; other processes may change it later."""
 
-    Attributes:
-        folder: The folder.
-        existing: The folder, or its nearest existing parent.
-        content: "nothing"; "a dataset", possibly unfinished or damaged; "a file" in place of the folder; or
-            "something else".
-        has_shards: Whether there are shards or sidecars.
-        spec: The specification in it; None where there is none that can be read.
-        damage: Reason why the specification cannot be read; empty if it can.
-    """
-
-    folder: Path
-    existing: Path
-    content: Literal["nothing", "a dataset", "a file", "something else"]
-    has_shards: bool = False
-    spec: DatasetSpec | None = None
-    damage: str = ""
+    folder: Path  # the folder
+    existing: Path  # the folder, or its nearest existing parent
+    content: Literal["nothing", "a dataset", "a file", "something else"]  # a file is in place of the folder
+    has_shards: bool = False  # whether there are shards or sidecars
+    spec: DatasetSpec | None = None  # the specification in it; None where there is none that can be read
+    damage: str = ""  # reason why the specification cannot be read; empty if it can
 
 
 def find_workspace(folder: Path) -> Workspace:
@@ -61,12 +51,9 @@ def find_workspace(folder: Path) -> Workspace:
 
 
 def check_place(workspace: Workspace) -> None:
-    """Raise an error if no dataset can be made in a folder, before any computation.
+    """Raise UsageError if no dataset can be made in a folder, before any computation.
 
     The folder of a finished dataset need not be writable.
-
-    Raises:
-        UsageError: It is a file, contains files that are not a dataset of cnpgen, or a link out of it.
     """
     if workspace.content == "a file":
         raise _other_folder(f"{workspace.existing} is a file, not a folder")
@@ -83,11 +70,8 @@ def check_place(workspace: Workspace) -> None:
 def started_spec(workspace: Workspace, wanted: DatasetSpec) -> DatasetSpec | None:
     """Return the specification in a folder if it equals the wanted one, or None if the folder has no shards.
 
-    The returned specification may have been written by another version of cnpgen.
-
-    Raises:
-        UsageError: The folder has shards of another specification.
-        DatasetError: The folder has shards and a damaged specification.
+    The returned specification may have been written by another version of cnpgen. Shards of another specification raise
+    UsageError, those of a damaged one DatasetError.
     """
     existing = workspace.spec
     if existing is not None and existing.fingerprint == wanted.fingerprint:
@@ -104,11 +88,8 @@ def open_workspace(folder: Path, spec: DatasetSpec, *, force: bool = False) -> D
     """Create the folder with its specification, or check that it already contains the same specification.
 
     The folder is inspected again, because another process may have started the dataset while kernels were compiled. A
-    specification without shards is replaced; ``force`` deletes an existing dataset.
-
-    Raises:
-        UsageError: The folder contains another dataset or other files.
-        DatasetError: The specification in the folder is damaged.
+    specification without shards is replaced; ``force`` deletes an existing dataset. Errors are those of ``check_place``
+    and ``started_spec``.
     """
     workspace = find_workspace(folder)
     check_place(workspace)
@@ -125,12 +106,7 @@ def open_workspace(folder: Path, spec: DatasetSpec, *, force: bool = False) -> D
 
 
 def require_dataset_spec(folder: Path, spec: DatasetSpec) -> None:
-    """Check that the folder still has a specification, since another process may have replaced the dataset.
-
-    Raises:
-        UsageError: It now has another specification.
-        MachineError: The specification or the folder is missing.
-    """
+    """Raise an error if another process has replaced or deleted the dataset in a folder."""
     try:
         is_unchanged = spec.fingerprint.encode() in read_file(folder / SPECIFICATION)
     except DatasetError as error:
@@ -202,11 +178,7 @@ def _sizes(spec: DatasetSpec) -> str:
 
 
 def _cleared(workspace: Workspace) -> Workspace:
-    """Delete the dataset in a folder, and no other files.
-
-    Raises:
-        UsageError: The folder contains files that are not part of the dataset.
-    """
+    """Delete the dataset in a folder, and no other files: see ``check_clearable``."""
     if workspace.content != "a dataset":
         return workspace
     folder, splits = workspace.folder, check_clearable(workspace)
@@ -224,12 +196,9 @@ def _cleared(workspace: Workspace) -> Workspace:
 
 
 def check_clearable(workspace: Workspace) -> list[Path]:
-    """Raise an error if a folder contains other files than a dataset; return the folders of its splits.
+    """Return the folders of the splits of a dataset; other files in its folder raise UsageError.
 
     These are the splits of the specification, or all folders with shards if the specification cannot be read.
-
-    Raises:
-        UsageError: The folder contains files that are not part of the dataset.
     """
     folder, spec = workspace.folder, workspace.spec
     named = sorted({path.parent for path in _shard_files(folder)})

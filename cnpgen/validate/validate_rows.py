@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import CnpgenError, counted
-from cnpgen.judges.rows.certified_plans import PlanCheck, check_plans
 from cnpgen.judges.rows.hits import hit_rule, repeated_fraction, speed_fractions
 from cnpgen.judges.rows.row_report import RowReport, merge
-from cnpgen.judges.rows.verify import OBSTACLE_POSES, verify_rows
+from cnpgen.judges.rows.verify import OBSTACLE_POSES, PlanCheck, check_plans, verify_rows
 from cnpgen.machine.engine import Engine, assembled
 from cnpgen.make.recipe_file import restored
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES

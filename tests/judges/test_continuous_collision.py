@@ -9,8 +9,7 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.judges.plans.continuous_collision import Intervals, chord_deviation_bounds
-from cnpgen.judges.plans.evaluated_trajectory import evaluate_trajectory
-from cnpgen.judges.plans.judged_curve import SplineCurve
+from cnpgen.judges.plans.evaluated_trajectory import SplineCurve, evaluate_trajectory
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem

@@ -12,7 +12,7 @@ import pytest
 
 from cnpgen.cli.main import main
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.judges.rows.certified_plans import PlanCheck, check_plans
+from cnpgen.judges.rows.verify import PlanCheck, check_plans
 from cnpgen.make.certify import NO_PLAN, CertifiedPlan, certified
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.merge import _shipped_notes

@@ -28,27 +28,19 @@ MAX_SUBDIVISIONS = 40  # intervals are then shorter than a picosecond
 
 @dataclass(frozen=True)
 class PiecewisePolynomials:
-    """Joint positions and their time derivatives as polynomials between knots, in Bernstein form.
+    """Joint positions and their time derivatives as polynomials between knots, in Bernstein form."""
 
-    Attributes:
-        edges: Phases between which they are polynomials, ascending from 0 to 1, shape (S + 1,).
-        q: Coefficients [rad], shape (D + 1, S, n).
-        dq: Coefficients [rad/s], shape (2 D, S, n).
-        ddq: Coefficients [rad/s^2], shape (3 D - 1, S, n).
-        jerk: Coefficients [rad/s^3], shape (4 D - 2, S, n), or None if no constraint needs them.
-    """
-
-    edges: Array
-    q: Array
-    dq: Array
-    ddq: Array
-    jerk: Array | None = None
+    edges: Array  # phases between which they are polynomials, ascending from 0 to 1, shape (S + 1,)
+    q: Array  # coefficients [rad], shape (D + 1, S, n)
+    dq: Array  # coefficients [rad/s], shape (2 D, S, n)
+    ddq: Array  # coefficients [rad/s^2], shape (3 D - 1, S, n)
+    jerk: Array | None = None  # coefficients [rad/s^3], shape (4 D - 2, S, n), or None if no constraint needs them
 
 
 def polynomials(motion: Motion, *, jerk: bool = False) -> PiecewisePolynomials:
     """Return the polynomials of one motion, optionally with those of its jerks."""
     degree, path, rate = motion.degree, motion.path[0], motion.rate[0, :, None]
-    edges = _edges(len(path), len(rate), degree)
+    edges = knots(len(path), len(rate), degree)
     p, p1, p2, *p3 = bernstein_coefficients(path, degree, range(3 + jerk), edges)
     r, r1, *r2 = bernstein_coefficients(rate, degree, range(2 + jerk), edges)
     first, r_r = _product(np.concatenate([p1, r1], axis=2), r), _product(r, r)
@@ -72,9 +64,6 @@ def find_maximum(
         known: A value that is attained, in the form of the result.
         threshold: Value, at most 1, below which spans are not searched.
         parts: Number of parts of a span per subdivision, a power of 2.
-
-    Returns:
-        ``(value, row, s)``: the largest value that is attained, the index of its function, and its phase.
     """
     best, *at = known
     starts = np.arange(parts)[:, None] / parts
@@ -102,16 +91,10 @@ def _search_threshold(best: float, threshold: float) -> float:
 
 
 @cache
-def knots(path_points: int, rate_points: int, degree: int) -> frozenset[float]:
-    """Return the knots of both splines of a motion."""
+def knots(path_points: int, rate_points: int, degree: int) -> Array:
+    """Return the knots of both splines of a motion in ascending order."""
     spans = (path_points - degree, rate_points - degree)
-    return frozenset({round(k / count, 12): k / count for count in spans for k in range(count + 1)}.values())
-
-
-@cache
-def _edges(path_points: int, rate_points: int, degree: int) -> Array:
-    """Return the knots of both splines in ascending order."""
-    return np.array(sorted(knots(path_points, rate_points, degree)))
+    return np.array(sorted({round(k / count, 12): k / count for count in spans for k in range(count + 1)}.values()))
 
 
 def bernstein_coefficients(control: Array, degree: int, orders: Sequence[int], edges: Array) -> list[Array]:

@@ -24,31 +24,18 @@ _SCALES = {"m": (1e3, "mm"), "rad": (180 / np.pi, "deg")}  # SI unit -> factor a
 
 @dataclass(frozen=True)
 class ConditionCurve:
-    """Values of one condition along a motion, with bounds.
+    """Values of one condition along a motion, with bounds."""
 
-    Attributes:
-        name: Name of the condition, as in the verdict.
-        label: Name of the values: of an equality they are deviations, of several values distances from their bounds.
-        unit: Unit of values and bounds, "mm" and "deg" instead of "m" and "rad".
-        parts: Names of the m values; one empty name for a single value.
-        values: Values, shape (m, K).
-        lower: Lower bounds, shape (K,); -inf for none.
-        upper: Upper bounds, shape (K,); inf for none.
-        tolerance: Violation of a bound that is accepted.
-        points: Closest points of two bodies in the world frame [m], shape (K, 2, 3); None if it is no distance.
-        pairs: Names of the closest bodies at every state, empty if it is no distance.
-    """
-
-    name: str
-    label: str
-    unit: str
-    parts: tuple[str, ...]
-    values: Array
-    lower: Array
-    upper: Array
-    tolerance: float
-    points: Array | None = None
-    pairs: tuple[str, ...] = ()
+    name: str  # name of the condition, as in the verdict
+    label: str  # name of the values: of an equality they are deviations, of several values distances from their bounds
+    unit: str  # unit of values and bounds, "mm" and "deg" instead of "m" and "rad"
+    parts: tuple[str, ...]  # names of the m values; one empty name for a single value
+    values: Array  # values, shape (m, K)
+    lower: Array  # lower bounds, shape (K,); -inf for none
+    upper: Array  # upper bounds, shape (K,); inf for none
+    tolerance: float  # violation of a bound that is accepted
+    points: Array | None = None  # closest points of two bodies in the world [m], shape (K, 2, 3); None if no distance
+    pairs: tuple[str, ...] = ()  # names of the closest bodies at every state, empty if it is no distance
 
     @property
     def violated(self) -> NDArray[np.bool_]:

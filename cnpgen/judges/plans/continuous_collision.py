@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.judges.plans.judged_curve import Curve
+from cnpgen.judges.plans.evaluated_trajectory import Curve
 from cnpgen.judges.plans.measure import EvaluationContext, MeasuredCondition
 from cnpgen.judges.plans.verdict import Margin
 from cnpgen.problems.constraints.clearance import DistanceConstraint
@@ -40,17 +40,11 @@ def is_contact(constraint: Constraint) -> bool:
 
 @dataclass(frozen=True)
 class Intervals:
-    """I intervals between samples.
+    """I intervals between samples."""
 
-    Attributes:
-        s: Phases of both ends, shape (I, 2).
-        margin: Smallest distance minus the smallest valid one, at both ends [m], shape (I, 2).
-        lower_bound: Proven lower bound of the margin over the interval [m], shape (I,).
-    """
-
-    s: Array
-    margin: Array
-    lower_bound: Array
+    s: Array  # phases of both ends, shape (I, 2)
+    margin: Array  # smallest distance minus the smallest valid one, at both ends [m], shape (I, 2)
+    lower_bound: Array  # proven lower bound of the margin over the interval [m], shape (I,)
 
     def around_minimum(self) -> NDArray[np.bool_]:
         """Return a mask of the intervals on both sides of the smallest margin, shape (I,)."""
@@ -128,18 +122,12 @@ def pairs_of(world: PathWorld, constraint: Constraint) -> PairDistances:
 
 
 def chord_deviation_bounds(curve: Curve, s: Array, motion_bounds: Array) -> Array:
-    """Bound the deviation of points of the robot from the chords between neighboring phases.
+    """Bound the deviation of the robot's points from the chords between neighboring phases [m], shape (K - 1,).
 
-    Args:
-        curve: One motion.
-        s: Phases, ascending, at distances of at most a part of a span, shape (K,).
-        motion_bounds: Motion bounds of the joints (``PathWorld.motion_bounds``) [m], shape (n,).
-
-    Returns:
-        Bounds [m], shape (K - 1,); 0 where a phase is below its predecessor.
+    Phases ascend at distances of at most a part of a span; the bound is 0 where a phase is below its predecessor.
+    Motion bounds of the joints [m] have shape (n,).
     """
-    bounds = curve.derivative_bounds()
-    edges, first, second = bounds.edges, bounds.first, bounds.second
+    edges, first, second = curve.derivative_bounds()
     proximal = np.cumsum(first, axis=1) - first
     curvature = (second + first * (first + 2 * proximal)) @ motion_bounds
     low, high = np.searchsorted(edges[1:-1], s[:-1], "right"), np.searchsorted(edges[1:-1], s[1:], "left")

@@ -1,19 +1,22 @@
-"""One motion evaluated at many phases: joint positions and their time derivatives, joint by joint.
+"""Curves that the judge evaluates at many phases: joint positions and their time derivatives, joint by joint.
 
 The splines are those of ``scipy_splines``, not those of the planners and solvers that are checked.
 """
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.judges.plans.bernstein import bernstein_coefficients
 from cnpgen.judges.plans.scipy_splines import basis_matrix, spline_derivatives, states_by_chain_rule
 from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
 PATH_ORDERS = 3  # derivatives of the path for accelerations, including order 0; jerks need one more
+BOUND_PARTS = 4  # of every span, over which derivatives are bounded
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,19 +28,12 @@ class Phases:
 
 @dataclass(frozen=True)
 class EvaluatedTrajectory:
-    """K states of one motion; every array has shape (n, K).
+    """K states of one motion; every array has shape (n, K)."""
 
-    Attributes:
-        q: Joint positions [rad].
-        dq: Joint velocities [rad/s].
-        ddq: Joint accelerations [rad/s^2].
-        jerk: Joint jerks [rad/s^3], or None if no constraint needs them.
-    """
-
-    q: Array
-    dq: Array
-    ddq: Array
-    jerk: Array | None = None
+    q: Array  # joint positions [rad]
+    dq: Array  # joint velocities [rad/s]
+    ddq: Array  # joint accelerations [rad/s^2]
+    jerk: Array | None = None  # joint jerks [rad/s^3], or None if no constraint needs them
 
     def is_finite(self) -> bool:
         """Return whether all values are finite."""
@@ -58,16 +54,10 @@ def evaluate_trajectory(motion: Motion, s: Array, *, jerk: bool = False) -> Eval
 def evaluate_at_phases(motion: Motion, phases: Phases, *, jerk: bool = False) -> EvaluatedTrajectory:
     """Evaluate one motion as ``evaluate_trajectory``, up to rounding, with cached bases of the splines."""
     orders = PATH_ORDERS + jerk
-    points, rates = motion.path.shape[1], motion.rate.shape[1]
-    p = motion.path[0].T @ _bases(points, motion.degree, orders, phases)
-    r = motion.rate[0] @ _bases(rates, motion.degree, orders - 1, phases)
-    count = len(phases.s)
-    return EvaluatedTrajectory(
-        *states_by_chain_rule(
-            [p[:, k * count : (k + 1) * count] for k in range(orders)],
-            [r[k * count : (k + 1) * count] for k in range(orders - 1)],
-        )
-    )
+    path, rate = motion.path[0].T, motion.rate[0]
+    p = (path @ _bases(path.shape[1], motion.degree, orders, phases)).reshape(len(path), orders, -1)
+    r = (rate @ _bases(len(rate), motion.degree, orders - 1, phases)).reshape(orders - 1, -1)
+    return EvaluatedTrajectory(*states_by_chain_rule(list(p.swapaxes(0, 1)), list(r)))
 
 
 @lru_cache(maxsize=8)
@@ -82,3 +72,38 @@ def jerks(motion: Motion, s: Array) -> Array:
     jerk = evaluate_trajectory(motion, s, jerk=True).jerk
     assert jerk is not None
     return jerk
+
+
+class Curve(Protocol):
+    """One motion of n joints as a function of the phase: splines, or the polynomials of a sampled trajectory."""
+
+    def evaluate(self, s: Array, *, jerk: bool) -> EvaluatedTrajectory:
+        """Evaluate the states at phases s in [0, 1], shape (K,), optionally with jerks."""
+
+    def derivative_bounds(self) -> tuple[Array, Array, Array]:
+        """Return S + 1 phases from 0 to 1, and bounds of p' and p'' between them [rad], shape (S, n) each."""
+
+    def max_positions(self) -> Array:
+        """Bound the absolute joint positions [rad], shape (n,)."""
+
+
+@dataclass(frozen=True)
+class SplineCurve:
+    """One motion as two B-splines; for its methods see ``Curve``."""
+
+    motion: Motion
+
+    def evaluate(self, s: Array, *, jerk: bool) -> EvaluatedTrajectory:
+        """Evaluate the states."""
+        return evaluate_trajectory(self.motion, s, jerk=jerk)
+
+    def derivative_bounds(self) -> tuple[Array, Array, Array]:
+        """Bound derivatives by Bernstein coefficients of the path."""
+        path, degree = self.motion.path[0], self.motion.degree
+        edges = np.linspace(0, 1, BOUND_PARTS * (len(path) - degree) + 1)
+        first, second = (np.abs(values).max(axis=0) for values in bernstein_coefficients(path, degree, (1, 2), edges))
+        return edges, first, second
+
+    def max_positions(self) -> Array:
+        """Bound positions by the control points."""
+        return np.asarray(np.abs(self.motion.path[0]).max(axis=0))

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import cast
 
 import numpy as np
@@ -47,24 +46,14 @@ def _per_factor(values: Array, factor: float) -> Array:
 
 @dataclass(frozen=True)
 class ProvenJointLimits:
-    """L limits of n joints that are proven to hold or to be violated.
+    """L limits of n joints that are proven to hold or to be violated."""
 
-    Attributes:
-        constraints: Constraints of a problem that are proven.
-        conditions: Condition of each constraint, the same at all states.
-        joints: Names of the joints.
-        tolerance: Accepted violations, shape (L, n).
-        bounds: Lower bounds of all joints, then upper ones, shape (L, 2 n).
-        scale: Unit of relative violations: the tolerance, or a small value if it is 0; negative for lower bounds, shape
-            (L, 2 n).
-    """
-
-    constraints: tuple[Constraint, ...]
-    conditions: tuple[Condition, ...]
-    joints: tuple[str, ...]
-    tolerance: Array
-    bounds: Array
-    scale: Array
+    constraints: tuple[Constraint, ...]  # constraints of a problem that are proven
+    conditions: tuple[Condition, ...]  # condition of each constraint, the same at all states
+    joints: tuple[str, ...]  # names of the joints
+    tolerance: Array  # accepted violations, shape (L, n)
+    bounds: Array  # lower bounds of all joints, then upper ones, shape (L, 2 n)
+    scale: Array  # units of relative violations: tolerances, or small values, negative for lower bounds, shape (L, 2 n)
 
     def scaled(self, parameters: Mapping[str, float]) -> "ProvenJointLimits":
         """Return the limits of a sample with these parameters, by name."""
@@ -73,11 +62,6 @@ class ProvenJointLimits:
             return self
         tolerance, bounds, scale = (factors * values for values in (self.tolerance, self.bounds, self.scale))
         return replace(self, tolerance=tolerance, bounds=bounds, scale=scale)
-
-    @cached_property
-    def tolerant(self) -> NDArray[np.bool_]:
-        """Mask of the limits with a tolerance at every joint, shape (L,); others depend on rounding."""
-        return np.asarray((self.tolerance > 0).all(axis=1))
 
     def margins(
         self, world: PathWorld, polynomials: PiecewisePolynomials, s: Array, table: Array, *, early_exit: bool
@@ -94,8 +78,10 @@ class ProvenJointLimits:
         pairs = list(zip(names, factors, strict=True))
         functions = [_per_factor(getattr(polynomials, name), factor) for name, factor in pairs]
         maxima = self._at_samples(np.array([_per_factor(getattr(world, name), factor) for name, factor in pairs]), s)
-        upper_bounds = self._upper_bounds(functions)
-        skippable = self.tolerant & early_exit
+        low = np.array([coefficients.min(axis=0).min(axis=0) for coefficients in functions])
+        high = np.array([coefficients.max(axis=0).max(axis=0) for coefficients in functions])
+        upper_bounds = self._relative_violations(low, high)
+        skippable = np.asarray((self.tolerance > 0).all(axis=1) & early_exit)  # without a tolerance, rounding decides
         for limit in np.flatnonzero(~skippable | ~(upper_bounds.max(axis=1) <= 1)).tolist():
             threshold = 1.0 if skippable[limit] else -np.inf
             (rows,) = (~(upper_bounds[limit] <= threshold)).nonzero()
@@ -111,12 +97,6 @@ class ProvenJointLimits:
             series = values[limit, joint]
             maxima.append((float(violations[limit, row]), row, float(s[series.argmin() if below else series.argmax()])))
         return maxima
-
-    def _upper_bounds(self, functions: list[Array]) -> Array:
-        """Bound the relative violations by functions with Bernstein coefficients of shape (d + 1, S, n)."""
-        low = np.array([coefficients.min(axis=0).min(axis=0) for coefficients in functions])
-        high = np.array([coefficients.max(axis=0).max(axis=0) for coefficients in functions])
-        return self._relative_violations(low, high)
 
     def _relative_violations(self, low: Array, high: Array) -> Array:
         """Return the violations by minima and maxima, shape (L, n), in multiples of ``scale``, shape (L, 2 n)."""

@@ -17,12 +17,12 @@ from cnpgen.judges.plans.continuous_collision import check_continuous_collision
 from cnpgen.judges.plans.evaluated_trajectory import (
     EvaluatedTrajectory,
     Phases,
+    SplineCurve,
     evaluate_at_phases,
     evaluate_trajectory,
     jerks,
 )
 from cnpgen.judges.plans.joint_limits import ProvenJointLimits, joint_limits
-from cnpgen.judges.plans.judged_curve import SplineCurve
 from cnpgen.judges.plans.local_maxima import check_local_maxima
 from cnpgen.judges.plans.measure import EvaluationContext, boundary_margins, by_name, evaluation_context, measure
 from cnpgen.judges.plans.paper import metrics_of, paper_rule
@@ -93,14 +93,7 @@ def judge(  # noqa: PLR0917 - all of them are needed to interpret a plan
 class Judge:
     """Judges plans of one problem as ``judge`` does, and reuses the memory of Pinocchio and Coal between calls.
 
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        step: Time step of verdicts without early exit [s].
-        tracking_error: Largest tracking error of the joints, see ``judge``.
-
-    Raises:
-        UsageError: The step is not positive, or above ``MAX_STEP_S``; or a tracking error is negative.
+    The arguments are those of ``judge``; the step is that of verdicts without early exit.
     """
 
     def __init__(
@@ -138,7 +131,7 @@ class Judge:
             return Verdict(reason)
         cells = EARLY_EXIT_CELLS if early_exit else TABLE_CELLS
         table = time_table(plan.motion.rate[0], plan.motion.degree, cells=cells)
-        sampled = _sampled_for_early_exit(plan, table) if early_exit else _sampled(plan, table, self._step)
+        sampled = _sampled(plan, table, None if early_exit else self._step)
         if sampled is None:
             return Verdict(Reason.TOO_LONG, metrics=Metrics(duration=float(table[1, -1])))
         (states, samples), world = sampled, self._world
@@ -172,11 +165,7 @@ class Judge:
 
 
 def check_step(step: float) -> None:
-    """Check that a time step [s] is above 0 and at most ``MAX_STEP_S``.
-
-    Raises:
-        UsageError: The step is outside this range.
-    """
+    """Raise UsageError if a time step [s] is not above 0 and at most ``MAX_STEP_S``."""
     if not 0 < step <= MAX_STEP_S:
         raise UsageError(f"the time step must be above 0 and at most {MAX_STEP_S:g} s, got {step:g} s", concerns="step")
 
@@ -210,7 +199,8 @@ class _Plan:
 @lru_cache(maxsize=8)
 def _corners(path_points: int, rate_points: int, degree: int, kinks: tuple[float, ...]) -> frozenset[float]:
     """Return knots and two phases on either side of kinks, across which second differences estimate no derivative."""
-    return knots(path_points, rate_points, degree).union(s + k * KINK_OFFSET for s in kinks for k in range(-2, 3))
+    around_kinks = (s + k * KINK_OFFSET for s in kinks for k in range(-2, 3))
+    return frozenset(knots(path_points, rate_points, degree).tolist()).union(around_kinks)
 
 
 def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, scene: Scene, goal_xyz: Array) -> None:
@@ -257,33 +247,28 @@ def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
         return True
     world.set_path(states.q, states.dq, states.ddq, plan.obstacle_poses, states.jerk, exact=False)
     start_tip = world.tip_position[:, 0]
-    measured = [
-        condition
-        for constraint in plan.problem.constraint
-        for condition in measure(constraint, world, samples.s, start_tip)
-    ]
+    measured = chain.from_iterable(measure(each, world, samples.s, start_tip) for each in plan.problem.constraint)
     if not all((condition.relative_violation <= 1).all() for condition in measured):
         return True
     return not all(margin.ok for margin in boundary_margins(states, plan.boundary, samples, world.robot))
 
 
-def _sampled(plan: _Plan, table: Array, step: float) -> tuple[EvaluatedTrajectory, Samples] | None:
-    """Choose samples and evaluate the motion there; None if its duration is too long."""
-    samples = sample(table, step, plan.spans, plan.corners)
-    return (evaluate_trajectory(plan.motion, samples.s, jerk=plan.problem.uses_jerk), samples) if samples else None
+def _sampled(plan: _Plan, table: Array, step: float | None) -> tuple[EvaluatedTrajectory, Samples] | None:
+    """Choose samples with a maximum step and evaluate the motion there; None if its duration is too long.
 
-
-def _sampled_for_early_exit(plan: _Plan, table: Array) -> tuple[EvaluatedTrajectory, Samples] | None:
-    """Evaluate the motion at few phases, the same ones for every plan of a problem; see ``_sampled``."""
+    Without a step, for early exit, they are few phases, the same ones for every plan of a problem.
+    """
+    jerk = plan.problem.uses_jerk
+    if step is not None:
+        samples = sample(table, step, plan.spans, plan.corners)
+        return (evaluate_trajectory(plan.motion, samples.s, jerk=jerk), samples) if samples else None
     if not table[1, -1] < MAX_DURATION_S:
         return None
-    phases, jerk = early_exit_phases(plan.spans, plan.corners), plan.problem.uses_jerk
-    exact = any(constraint.tolerance == 0 for constraint in plan.problem.constraint)  # use the rounding of ``_sampled``
-    states = (
-        evaluate_trajectory(plan.motion, phases.s, jerk=jerk)
-        if exact
-        else evaluate_at_phases(plan.motion, phases, jerk=jerk)
-    )
+    phases = early_exit_phases(plan.spans, plan.corners)
+    if any(constraint.tolerance == 0 for constraint in plan.problem.constraint):  # needs the rounding of other verdicts
+        states = evaluate_trajectory(plan.motion, phases.s, jerk=jerk)
+    else:
+        states = evaluate_at_phases(plan.motion, phases, jerk=jerk)
     return states, Samples(phases.s, times(phases.s, table))
 
 

@@ -31,19 +31,12 @@ MIN_CURVATURE = 1e-30  # relative to the tolerance
 
 @dataclass(frozen=True)
 class _SampledValues:
-    """R rows of K samples of values of conditions.
+    """R rows of K samples of values of conditions."""
 
-    Attributes:
-        of: Index of the row's condition among the measured ones, shape (R,).
-        part: Index of the row's value in the condition, shape (R,).
-        s: Phases, ascending, shape (R, K); (1, K) if they are the same in every row.
-        violation: Violations in multiples of the tolerance, shape (R, K).
-    """
-
-    of: Indices
-    part: Indices
-    s: Array
-    violation: Array
+    of: Indices  # index of the row's condition among the measured ones, shape (R,)
+    part: Indices  # index of the row's value in the condition, shape (R,)
+    s: Array  # phases, ascending, shape (R, K); (1, K) if they are the same in every row
+    violation: Array  # violations in multiples of the tolerance, shape (R, K)
 
     def promising(self, largest: Array) -> tuple[Indices, Indices, Array]:
         """Find intervals that may contain a larger maximum than the known ones, the highest estimate first.

@@ -12,9 +12,8 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
+from cnpgen.judges.plans.evaluated_trajectory import Curve, EvaluatedTrajectory
 from cnpgen.judges.plans.joint_limits import is_proven
-from cnpgen.judges.plans.judged_curve import Curve
 from cnpgen.judges.plans.sampling import Samples, times
 from cnpgen.judges.plans.verdict import ZERO_TOLERANCE, Margin, Reason
 from cnpgen.problems.constraints.clearance import ObjectContact
@@ -67,23 +66,14 @@ def boundary_margins(states: EvaluatedTrajectory, boundary: Boundary, samples: S
 
 @dataclass(frozen=True)
 class MeasuredCondition:
-    """A condition along a motion.
+    """A condition along a motion."""
 
-    Attributes:
-        constraint: Constraint that states the condition.
-        condition: Judged values of the constraint at K samples.
-        g: Values [unit of the condition], shape (m, K).
-        relaxation: Distance by which the bounds are relaxed [unit of the condition], shape (K,).
-        tolerance: Accepted violation, shape (m,).
-        uncertainty: Largest error of the values, shape (m, K), (m, 1) or one for all; 0 for a known motion.
-    """
-
-    constraint: Constraint
-    condition: Condition
-    g: Array
-    relaxation: Array
-    tolerance: Array
-    uncertainty: Array | float = 0.0
+    constraint: Constraint  # constraint that states the condition
+    condition: Condition  # judged values of the constraint at K samples
+    g: Array  # values [unit of the condition], shape (m, K)
+    relaxation: Array  # distance by which the bounds are relaxed [unit of the condition], shape (K,)
+    tolerance: Array  # accepted violation, shape (m,)
+    uncertainty: Array | float = 0.0  # largest errors of the values, shape (m, K), (m, 1), or one of all; 0 if known
 
     @cached_property
     def violation(self) -> Array:
@@ -116,13 +106,9 @@ class MeasuredCondition:
 
 
 def measure(constraint: Constraint, world: PathWorld, s: Array, start_tip: Array) -> list[MeasuredCondition]:
-    """Measure the conditions of a constraint along a motion.
+    """Measure the conditions of a constraint where the robot is, at phases of shape (K,).
 
-    Args:
-        constraint: The constraint.
-        world: The robot at phases s.
-        s: Phases, shape (K,).
-        start_tip: Tip position at the start of the motion [m], shape (3,).
+    ``start_tip`` is the position of the tip at the start of the motion [m], shape (3,).
     """
     measured = []
     for condition in constraint.judged(cast(World, world)):  # PathWorld has the interface of World for K states
@@ -157,33 +143,23 @@ def name_part(problem: Problem, constraint: Constraint, condition: Condition, pa
     return f"[{part}]"
 
 
+AddUncertainty = Callable[[MeasuredCondition, Array], MeasuredCondition]
+
+
 @dataclass(frozen=True)
 class EvaluationContext:
-    """One motion with its measured conditions, and the means to measure them at other phases.
+    """One motion with its measured conditions, and the means to measure them at other phases."""
 
-    Attributes:
-        problem: The problem.
-        curve: One motion.
-        obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-        samples: Times and phases of the initial samples.
-        table: Times of the motion (``time_table``).
-        start_tip: Tip position at the start [m], shape (3,).
-        world: The robot; ``move`` moves it.
-        measured: Conditions at the samples.
-        with_uncertainty: Adds the errors of the values to conditions at phases, if the motion is not known exactly.
-        phase_of: Returns the phases of bounds for phases of the curve, if they differ.
-    """
-
-    problem: Problem
-    curve: Curve
-    obstacle_poses: Array
-    samples: Samples
-    table: Array
-    start_tip: Array
-    world: PathWorld
-    measured: Sequence[MeasuredCondition]
-    with_uncertainty: Callable[[MeasuredCondition, Array], MeasuredCondition] | None = None
-    phase_of: Callable[[Array], Array] | None = None
+    problem: Problem  # the problem
+    curve: Curve  # one motion
+    obstacle_poses: Array  # poses and sizes of the obstacles, shape (width,)
+    samples: Samples  # times and phases of the initial samples
+    table: Array  # times of the motion (``time_table``)
+    start_tip: Array  # tip position at the start [m], shape (3,)
+    world: PathWorld  # the robot; ``move`` moves it
+    measured: Sequence[MeasuredCondition]  # conditions at the samples
+    with_uncertainty: AddUncertainty | None = None  # adds errors to conditions at phases, if the motion is not known
+    phase_of: Callable[[Array], Array] | None = None  # phases of the curve -> phases of bounds, if they differ
 
     def move(self, s: Array) -> None:
         """Move the robot to phases s, shape (K,)."""

@@ -114,18 +114,12 @@ def along(
 ) -> tuple[PathWorld, Array, Array]:
     """Place the robot at K times of one motion, uniformly spaced but for extra ones [s].
 
-    The index is that of error messages. Obstacles, by default those of the problem, matter for distances only.
-
-    Returns:
-        The world, phases, and times [s], shape (K,) each.
-
-    Raises:
-        UsageError: The rate is not positive, or values are not finite.
+    The index is that of error messages. Obstacles, by default those of the problem, matter for distances only. Return
+    the world, phases, and times [s], shape (K,) each. A motion that cannot be evaluated raises UsageError.
     """
     if not motion.runs_forward()[0]:
         raise UsageError(f"plan {index} cannot be drawn: its rate ds/dt is not positive everywhere")
-    duration = float(motion.duration()[0])
-    t = np.union1d(np.linspace(0, duration, samples), np.clip(np.array(extra_times, float), 0, duration))
+    t = plot_times(float(motion.duration()[0]), samples, extra_times)
     s = motion.phase_at(t[None])[0]
     states = motion.at(s)
     q, dq, ddq = (values[0].T for values in (states.q, states.dq, states.ddq))
@@ -136,6 +130,11 @@ def along(
     poses = place_obstacles(problem.obstacle) if scene is None else scene.poses[0]
     world.set_path(q, dq, ddq, poses, jerk)
     return world, s, t
+
+
+def plot_times(duration: float, samples: int, extra: Sequence[float]) -> Array:
+    """Return uniformly spaced times and extra ones within the duration [s], ascending."""
+    return np.union1d(np.linspace(0, duration, samples), np.clip(np.array(extra, float), 0, duration))
 
 
 def shares_of_limits(world: PathWorld) -> dict[str, Array]:
@@ -240,6 +239,8 @@ def _draw_over_table(figure: "SubFigure", table: Table, world: PathWorld, s: Arr
 
 def _draw_views(figure: "SubFigure", problem: Problem, world: PathWorld, solids: list[Solid]) -> None:
     """Draw arm, object and obstacles in two views: from the side with the largest tip motion, and from above."""
+    from matplotlib.patches import Polygon
+
     corners = world.object_corners() if problem.object else None
     side = int(np.ptp(world.tip_position[1]) >= np.ptp(world.tip_position[0]))
     colors = [_BETWEEN] * (DRAWN_STATES - 2) + [_START, _GOAL]
@@ -248,7 +249,9 @@ def _draw_views(figure: "SubFigure", problem: Problem, world: PathWorld, solids:
     links = [_links(problem, world, k) for k in indices]
     for axis, (across, up), title in zip(figure.subplots(2, 1), ((side, 2), (1, 0)), ("side", "top"), strict=True):
         for solid in solids:
-            _draw_solid(axis, solid, (across, up))
+            outline = _outline((solid.position + solid.corners)[:, [across, up]], solid.radius)
+            axis.add_patch(Polygon(outline, facecolor=_BOX, edgecolor=_LIMIT, zorder=0))
+            axis.update_datalim(outline)
         for k, points, color in zip(indices, links, colors, strict=True):
             _draw_body(axis, points, None if corners is None else corners[..., k], (across, up), color)
         _draw_tip_path(axis, world.tip_position[across], world.tip_position[up])
@@ -307,12 +310,3 @@ def _draw_tip_path(axis: "Axes", a: Array, b: Array) -> None:
     axis.plot(a, b, color="black", linewidth=1.4)
     axis.plot(a[0], b[0], "o", color=_START, label="start")
     axis.plot(a[-1], b[-1], "s", color=_GOAL, label="goal")
-
-
-def _draw_solid(axis: "Axes", solid: Solid, plane: tuple[int, int]) -> None:
-    """Draw the projection of an obstacle."""
-    from matplotlib.patches import Polygon
-
-    outline = _outline((solid.position + solid.corners)[:, list(plane)], solid.radius)
-    axis.add_patch(Polygon(outline, facecolor=_BOX, edgecolor=_LIMIT, zorder=0))
-    axis.update_datalim(outline)

@@ -39,13 +39,8 @@ class Samples:
 def time_table(rate: Array, degree: int, *, cells: int = TABLE_CELLS) -> Array:
     """Tabulate phases and their times [s], by a two-point Gauss rule in every cell.
 
-    Args:
-        rate: Control points of r [1/s], shape (R,), of a positive r.
-        degree: Degree of r.
-        cells: Number of cells of equal size.
-
-    Returns:
-        Table of shape (2, C), both rows ascending: phases from 0 to 1, times from 0 to the duration.
+    The rate, of positive r, has control points [1/s] of shape (R,). The table has shape (2, C), both rows ascending:
+    phases from 0 to 1, times from 0 to the duration.
     """
     phases, halves = _table_phases(cells)
     inverse = 1.0 / (_nodes(len(rate), degree, cells) @ rate)
@@ -67,21 +62,15 @@ def _table_phases(cells: int) -> tuple[Array, Array]:
 
 
 def sample(table: Array, step: float, spans: int, additional: Collection[float] = ()) -> Samples | None:
-    """Choose samples with a maximum time step that resolve every feature of a B-spline.
+    """Choose samples with a maximum time step [s] that resolve every feature of a B-spline.
 
     * Samples in time, at least ``MIN_SAMPLES`` and at most ``MAX_TIME_SAMPLES``, with steps of at most ``step``.
     * Samples in phase, ``SAMPLES_PER_SPAN`` in every span: if r is large, a time step may skip a part of the path.
     * ``SAMPLES_PER_END`` phases near each end, spaced quadratically from 1e-5 on: the clamped basis functions there are
       about 0.01 wide, less than a time step of a fast motion.
 
-    Args:
-        table: Result of ``time_table``.
-        step: Time step [s].
-        spans: Number of intervals between the knots of the finer spline.
-        additional: Additional phases.
-
-    Returns:
-        The samples, or None if the duration is ``MAX_DURATION_S`` or more.
+    Spans are those between the knots of the finer spline. The result is None for a duration of ``MAX_DURATION_S`` or
+    more.
     """
     duration = table[1, -1]
     if not duration < MAX_DURATION_S:

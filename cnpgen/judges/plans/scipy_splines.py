@@ -53,16 +53,9 @@ def _span_polynomials(points: int, degree: int) -> Array:
 
 
 def spline_derivatives(control: Array, degree: int, s: Array, *, orders: int) -> list[Array]:
-    """Evaluate one spline and its first derivatives at many phases by Horner's rule.
+    """Evaluate one spline and its first derivatives, ``orders`` results in all, at K phases by Horner's rule.
 
-    Args:
-        control: Control points, shape (C, n).
-        degree: Degree D, at least 3.
-        s: Phases in [0, 1], shape (K,).
-        orders: Number of results: 1 is the spline alone.
-
-    Returns:
-        Arrays of shape (n, K).
+    Control points have shape (C, n), phases (K,), the results (n, K). The degree is at least 3.
     """
     spans = len(control) - degree
     span = np.clip(s * spans, 0, spans - 1).astype(np.intp)

@@ -37,13 +37,7 @@ TUBE_COMBINATIONS = 8  # random ones of all changes
 class TrackingTube:
     """States within a tracking error of a plan.
 
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        error: Largest tracking error of every joint [rad], shape (n,), or one for all.
-
-    Raises:
-        UsageError: The error is negative, not finite, or has a wrong shape.
+    The error is the largest one of every joint [rad], shape (n,), or one for all; a negative one raises UsageError.
     """
 
     def __init__(self, problem: Problem, robot: Robot, error: TrackingError) -> None:

@@ -72,7 +72,11 @@ class Margin:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the margin for JSON; values that are not finite are None."""
-        return {**_for_json({entry.name: getattr(self, entry.name) for entry in fields(self)}), "ok": self.ok}
+        values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        infinite = {
+            name: None for name, value in values.items() if isinstance(value, float) and not math.isfinite(value)
+        }
+        return {**values, **infinite, "ok": self.ok}
 
 
 @dataclass(frozen=True)
@@ -172,12 +176,6 @@ class Verdict:
             "paper": {"finished": self.paper.finished, "valid": self.paper.valid, "broken": list(self.paper.broken)},
             "samples": self.samples,
         }
-
-
-def _for_json(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in values.items()
-    }
 
 
 def summarize_verdicts(verdicts: Sequence[Verdict]) -> dict[str, Any]:

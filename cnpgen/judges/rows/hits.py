@@ -89,10 +89,8 @@ def speed_fractions(columns: Mapping[str, Array]) -> Array:
 def repeated_fraction(fractions: Array, dtype: str) -> tuple[int, float]:
     """Find a fraction below 1 that more hits have than chance explains: such hits were scaled in time afterwards.
 
-    The fractions are those of all rows of a dataset.
-
-    Returns:
-        Number of hits with the fraction, and the fraction; 0 if there is none.
+    The fractions are those of all rows of a dataset. Return the number of hits with the fraction, and the fraction; 0
+    if there is none.
     """
     drawn = np.sort(fractions[(fractions > 0) & (fractions < 1)])
     expected, count = len(drawn) * FRACTION_TOLERANCES[dtype], 2

@@ -92,18 +92,10 @@ def compare(
     row: Index,
     end: Index | int = 1,
 ) -> tuple[Check, Index]:
-    """Compare violations with their tolerances.
+    """Compare k violations of rows, shape (k,), with their tolerances; return also the rows that fail, ascending.
 
-    Args:
-        name: Name of the check.
-        unit: SI unit of the violations.
-        violation: Distance of each value outside its bounds, shape (k,); nan counts as infinite.
-        tolerance: Tolerance of each value, shape (k,), or of all.
-        row: Row of each value, shape (k,).
-        end: End of each value as an index of ``ENDS``, shape (k,), or of all; the goal by default.
-
-    Returns:
-        The result, and the rows that fail the check, ascending.
+    A violation of nan counts as infinite. Tolerances, and ends as indices of ``ENDS``, have shape (k,) or are those of
+    all; the end is the goal by default.
     """
     if violation.size == 0:
         return Check(name, unit, 0.0, 0.0, 0, -1, "start"), np.empty(0, np.int64)

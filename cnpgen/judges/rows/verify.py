@@ -1,17 +1,18 @@
-"""Verification of rows from their stored numbers: every constraint at both ends, positions and hits."""
+"""Verification of rows from their stored numbers: constraints at both ends, positions, hits, diagnostics and plans."""
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import DatasetError
-from cnpgen.judges.rows.diagnostics import DIAGNOSTIC_TOLERANCES, Diagnostic, stored_diagnostics
+from cnpgen.judges.plans.judge import judge
 from cnpgen.judges.rows.hits import HitRule, highest_speed, judge_goals, velocity_factors
 from cnpgen.judges.rows.row_report import ENDS, Array, Check, Index, RowReport, compare, merge
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, Condition
@@ -19,11 +20,16 @@ from cnpgen.problems.constraints.needs import measured_needs
 from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
+from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.world import World
 
 NO_RULE = HitRule()
 OBSTACLE_POSES = "obstacle_poses"
 VERIFICATION_BLOCK_ROWS = 1024  # measurements of a block need less than 10 MB
+# Tolerances of stored diagnostics, in their units. Coal's distances have errors of 4e-11 m. In float32 the rounding of
+# joint positions moves the arm by 1e-7 m and changes its highest speed by 2e-6 m/s in 40,000 rows.
+DIAGNOSTIC_TOLERANCES = {"float64": 1e-8, "float32": 1e-4}
 
 _REQUIRED = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "start_xyz", "goal_xyz")
 _DERIVATIVES = ("q", "dq", "ddq")
@@ -114,6 +120,25 @@ class _ConditionValues:
         return compare(name, unit, violation=violation, tolerance=tolerance, row=row, end=end)
 
 
+@dataclass(frozen=True)
+class Diagnostic:
+    """One diagnostic of both ends."""
+
+    name: str  # name of the diagnostic
+    unit: str  # SI unit
+    compute: Callable[[World], float]  # function that computes it from a world's state
+    stored: Array  # stored values, shape (rows, 2); nan at an end without one
+    recomputed: Array  # recomputed values, shape (rows, 2)
+
+    def judged(self, finite: Index, dtype: str) -> tuple[Check, Index]:
+        """Compare stored and recomputed values in finite rows."""
+        index, end = np.nonzero(~np.isnan(self.stored[finite]))
+        row = finite[index]
+        error = np.abs(self.stored[row, end] - self.recomputed[row, end])
+        tolerance = DIAGNOSTIC_TOLERANCES[dtype]
+        return compare(self.name, self.unit, violation=error, tolerance=tolerance, row=row, end=end)
+
+
 @dataclass
 class _Measurements:
     """Measurements in a block of rows; nan in rows that were not measured.
@@ -138,13 +163,32 @@ def _verify_block(problem: Problem, world: World, columns: dict[str, Array], dty
         compare("finite", "1", violation=n_invalid.astype(float), tolerance=0.0, row=np.arange(rows), end=0),
         _judge_position(measurements, columns, finite, dtype),
         *(values.judged(key, dtype) for key, values in measurements.conditions.items()),
-        *_judge_hit(measurements, columns, finite, dtype),
-        *_judge_highest(world.robot, measurements, columns, finite, dtype),
+        *_judge_hit(world.robot, measurements, columns, finite, dtype),
         *judge_goals(world.robot, rule, columns, finite, dtype),
         *(diagnostic.judged(finite, dtype) for diagnostic in measurements.diagnostics),
     ]
     failed = np.unique(np.concatenate([failed_rows for _, failed_rows in judged]))
     return RowReport(rows, tuple(check for check, _ in judged), failed)
+
+
+def _stored_diagnostics(problem: Problem, columns: Mapping[str, Array]) -> list[Diagnostic]:
+    """List the diagnostics in columns that can be recomputed: torque ratio, and clearance of an arm with a radius."""
+    radius, missing = problem.arm_radius, np.full((len(columns["start_q"]), 1), np.nan)
+    kinds: dict[str, tuple[str, str, Callable[[World], float]]] = {
+        "torque_ratio": ("holding torque ratio", "1", _holding_torque_ratio)
+    }
+    if radius is not None and problem.obstacle:
+        kinds["clearance"] = "clearance", "m", lambda world: min(world.segment_distances()) - radius
+    diagnostics = []
+    for field_name, kind in kinds.items():
+        stored = np.concatenate([columns.get(f"{end}_{field_name}", missing) for end in ENDS], axis=1)
+        if not np.isnan(stored).all():
+            diagnostics.append(Diagnostic(*kind, stored, np.full_like(stored, np.nan)))
+    return diagnostics
+
+
+def _holding_torque_ratio(world: World) -> float:
+    return float(np.max(np.abs(world.holding_torque) / world.robot.torque_limit))
 
 
 def _measure(problem: Problem, world: World, columns: dict[str, Array], finite: Index) -> _Measurements:
@@ -154,7 +198,7 @@ def _measure(problem: Problem, world: World, columns: dict[str, Array], finite: 
     given = {"parameters": columns.get("parameters"), "obstacle_poses": columns.get(OBSTACLE_POSES)}
     poses = scene_of(problem, columns["start_xyz"], columns["goal_xyz"], velocity, **given).poses
     position, velocity, jacobian = (np.full((rows, *shape), np.nan) for shape in ((2, 3), (3,), (3, world.robot.n)))
-    measurements = _Measurements(position, velocity, jacobian, stored_diagnostics(problem, columns))
+    measurements = _Measurements(position, velocity, jacobian, _stored_diagnostics(problem, columns))
     for index, end in enumerate(ENDS):
         (q, dq, ddq), orders = _states(columns, end)
         forms = [partial(constraint.measured_at, end=end) for constraint in problem.constraint]
@@ -164,21 +208,18 @@ def _measure(problem: Problem, world: World, columns: dict[str, Array], finite: 
             measurements.position[row, index] = world.tip_position
             measured = chain.from_iterable(form(world) for form in forms)
             known = (condition for condition, need in zip(measured, needs, strict=True) if need <= orders[row])
-            _record(measurements, known, (row, index))
+            for condition in known:
+                values = measurements.conditions[condition.name, condition.unit, condition.tolerance_kind]
+                values.conditions.append(condition)
+                values.places.append((row, index))
             for diagnostic in measurements.diagnostics:
-                diagnostic.note(world, row, index)
+                if np.isfinite(diagnostic.stored[row, index]):
+                    diagnostic.recomputed[row, index] = diagnostic.compute(world)
             if end == "goal" and "hit_speed" in columns:
                 measurements.hit_velocity[row] = world.parameters.along_table(world.tip_velocity)
             if end == "goal" and "hit_speed_max" in columns:
                 measurements.hit_jacobian[row] = world.parameters.along_table(world.tip_jacobian)
     return measurements
-
-
-def _record(measurements: _Measurements, conditions: Iterator[Condition], place: tuple[int, int]) -> None:
-    for condition in conditions:
-        key = condition.name, condition.unit, condition.tolerance_kind
-        measurements.conditions[key].conditions.append(condition)
-        measurements.conditions[key].places.append(place)
 
 
 def _states(columns: dict[str, Array], end: str) -> tuple[list[Array], list[int]]:
@@ -198,27 +239,56 @@ def _judge_position(block: _Measurements, columns: dict[str, Array], finite: Ind
 
 
 def _judge_hit(
-    block: _Measurements, columns: dict[str, Array], finite: Index, dtype: str
-) -> Iterator[tuple[Check, Index]]:
-    """Check direction and speed of the tip at the goal in the plane of the table."""
-    if "hit_angle" not in columns or "hit_speed" not in columns:
-        return
-    angle, speed = columns["hit_angle"][finite, 0], columns["hit_speed"][finite, 0]
-    x, y, _ = block.hit_velocity[finite].T
-    along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
-    moving, tolerances = speed > 0, BOUNDARY_TOLERANCES[dtype]
-    direction, error = np.abs(np.arctan2(across, along)[moving]), np.abs(along - speed)
-    tolerance = tolerances["direction"]
-    yield compare("hit direction", "rad", violation=direction, tolerance=tolerance, row=finite[moving])
-    yield compare("hit speed", "m/s", violation=error, tolerance=tolerances["velocity"], row=finite)
-
-
-def _judge_highest(
     robot: Robot, block: _Measurements, columns: dict[str, Array], finite: Index, dtype: str
 ) -> Iterator[tuple[Check, Index]]:
-    """Check the stored highest possible speed of a hit."""
-    if "hit_angle" in columns and "hit_speed_max" in columns:
-        highest = highest_speed(block.hit_jacobian[finite], columns["hit_angle"][finite, 0], robot.velocity_limit)
+    """Check direction, speed and highest possible speed of the tip at the goal in the plane of the table."""
+    if "hit_angle" not in columns:
+        return
+    angle = columns["hit_angle"][finite, 0]
+    if "hit_speed" in columns:
+        speed, tolerances = columns["hit_speed"][finite, 0], BOUNDARY_TOLERANCES[dtype]
+        x, y, _ = block.hit_velocity[finite].T
+        along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+        moving = speed > 0
+        direction, error = np.abs(np.arctan2(across, along)[moving]), np.abs(along - speed)
+        tolerance = tolerances["direction"]
+        yield compare("hit direction", "rad", violation=direction, tolerance=tolerance, row=finite[moving])
+        yield compare("hit speed", "m/s", violation=error, tolerance=tolerances["velocity"], row=finite)
+    if "hit_speed_max" in columns:
+        highest = highest_speed(block.hit_jacobian[finite], angle, robot.velocity_limit)
         highest *= velocity_factors(robot, columns)[finite]
         error = np.abs(columns["hit_speed_max"][finite, 0] - highest)
         yield compare("highest hit speed", "m/s", violation=error, tolerance=DIAGNOSTIC_TOLERANCES[dtype], row=finite)
+
+
+@dataclass(frozen=True)
+class PlanCheck:
+    """Number of plans in rows of a certified dataset, number of valid ones, and error messages of one line."""
+
+    judged: int = 0
+    valid: int = 0
+    problems: tuple[str, ...] = ()
+
+
+def check_plans(problem: Problem, robot: Robot, columns: Mapping[str, NDArray[Any]]) -> PlanCheck:
+    """Judge the plans in columns of a certified dataset, field -> values; rows of other datasets have none."""
+    if "path_control_points" not in columns:
+        return PlanCheck()
+    rows, spec = len(columns["start_q"]), problem.trajectory
+    path = columns["path_control_points"].reshape(rows, spec.path_control_points, robot.n)
+    motion = Motion(path, columns["rate_control_points"], spec.degree)
+    boundary = Boundary.from_batch(columns, None)
+    velocity = goal_velocities(problem, robot, boundary.goal_q, boundary.goal_dq)
+    poses = columns.get(OBSTACLE_POSES)
+    scene = scene_of(
+        problem, columns["start_xyz"], columns["goal_xyz"], velocity, boundary.parameters, obstacle_poses=poses
+    )
+    verdicts = judge(problem, robot, motion, boundary, scene, columns["goal_xyz"])
+    invalid = [(row, verdict.reason) for row, verdict in enumerate(verdicts) if not verdict.valid]
+    problems = []
+    if invalid:
+        row, reason = invalid[0]
+        problems.append(f"{len(invalid)} of {rows} plans are not valid, the first one is that of row {row}: {reason}")
+    if not np.allclose(columns["duration"], motion.duration(), rtol=1e-9, atol=0):
+        problems.append("stored durations differ from those of the plans")
+    return PlanCheck(rows, rows - len(invalid), tuple(problems))

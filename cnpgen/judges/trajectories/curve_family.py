@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from cnpgen.judges.plans.bernstein import PiecewisePolynomials
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
-from cnpgen.judges.plans.judged_curve import DerivativeBounds
 
 Array = NDArray[np.float64]
 
@@ -23,20 +22,12 @@ UNDEFINED = 1e6  # bound of a derivative that the curve does not have, in SI uni
 
 @dataclass(frozen=True, eq=False)
 class CurveFamily:
-    """Curves of n joints on S spans.
+    """Curves of n joints on S spans; the bound of a derivative that does not exist at the knots is ``UNDEFINED``."""
 
-    Attributes:
-        t: Times of the knots [s], from 0 to the duration, shape (S + 1,).
-        coefficients: Bernstein coefficients of the nominal positions [rad], shape (d + 1, S, n).
-        bounds: Largest differences from the nominal positions, velocities, accelerations and jerks, one array of shape
-            (S, n) each; ``UNDEFINED`` for derivatives that do not exist at the knots.
-        has_jerk: Whether the nominal jerks are those of the polynomials; otherwise they are 0.
-    """
-
-    t: Array
-    coefficients: Array
-    bounds: tuple[Array, Array, Array, Array]
-    has_jerk: bool = True
+    t: Array  # times of the knots [s], from 0 to the duration, shape (S + 1,)
+    coefficients: Array  # Bernstein coefficients of the nominal positions [rad], shape (d + 1, S, n)
+    bounds: tuple[Array, Array, Array, Array]  # largest differences of q, dq, ddq and jerk, shape (S, n) each
+    has_jerk: bool = True  # whether the nominal jerks are those of the polynomials; otherwise they are 0
 
     @property
     def duration(self) -> float:
@@ -58,11 +49,6 @@ class CurveFamily:
             found[3] = np.zeros_like(found[3])
         return PiecewisePolynomials(self.edges, *found)
 
-    @cached_property
-    def is_known(self) -> bool:
-        """Whether the family is one curve with all derivatives."""
-        return not any(bound.any() for bound in self.bounds)
-
     def evaluate(self, s: Array, *, jerk: bool) -> EvaluatedTrajectory:
         """Evaluate the nominal curve at phases s in [0, 1], shape (K,); at a knot, the span after it."""
         span, u = self._spans(s)
@@ -74,10 +60,10 @@ class CurveFamily:
         span, _ = self._spans(s)
         return [np.ascontiguousarray(bound[span].T) for bound in self.bounds]
 
-    def derivative_bounds(self) -> DerivativeBounds:
-        """Bound the derivatives of the nominal positions by the phase."""
+    def derivative_bounds(self) -> tuple[Array, Array, Array]:
+        """Bound the derivatives of the nominal positions by the phase; see ``Curve``."""
         first, second = (np.abs(values).max(axis=0) for values in (self.polynomials.dq, self.polynomials.ddq))
-        return DerivativeBounds(self.edges, first * self.duration, second * self.duration**2)
+        return self.edges, first * self.duration, second * self.duration**2
 
     def max_positions(self) -> Array:
         """Bound the absolute positions of all curves [rad], shape (n,)."""

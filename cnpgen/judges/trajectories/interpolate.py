@@ -32,10 +32,8 @@ CONSISTENCY_TOLERANCE = 1e-6  # relative, of samples with a bound of the jerk: r
 def interpolated(trajectory: Trajectory, interpolation: Interpolation | None, noise: Array) -> CurveFamily:
     """Return the curves of an interpolation, by default the one that the derivatives determine, through samples.
 
-    Positions, velocities and accelerations have errors of at most the noise, shape (3,).
-
-    Raises:
-        UsageError: The samples lack the derivatives of the interpolation.
+    Positions, velocities and accelerations have errors of at most the noise, shape (3,). If the samples lack the
+    derivatives of the interpolation, UsageError is raised.
     """
     data = data_of(trajectory)
     kind = interpolation or INTERPOLATIONS[len(data)]
@@ -46,7 +44,10 @@ def interpolated(trajectory: Trajectory, interpolation: Interpolation | None, no
     h = np.diff(trajectory.t)
     weights = hermite_weights(len(data))
     coefficients = np.einsum("cw,swn->csn", weights, span_data(data, h))
-    errors = [_noise_errors(weights, order, h, noise, len(data)) for order in range(4)]
+    orders = np.tile(np.arange(len(data)), 2)
+    scaled_noise = noise[orders] * h[:, None] ** orders
+    effects = [scaled_noise @ np.abs(differentiated(weights, order)).T for order in range(4)]
+    errors = [effect.max(axis=1) / h**order for order, effect in enumerate(effects)]
     bounds = [np.repeat(error[:, None], trajectory.q.shape[1], axis=1) for error in errors]
     for order in range(len(data) + 1, 4):  # derivatives that jump at the knots
         bounds[order] = np.full_like(bounds[order], UNDEFINED)
@@ -75,13 +76,8 @@ def _known(t: Array, coefficients: Array) -> CurveFamily:
 def bounded_jerk(trajectory: Trajectory, max_jerk: Array, noise: Array) -> CurveFamily | None:
     """Return all curves through samples with noise whose jerks are bounded; None if the samples contradict the bound.
 
-    Args:
-        trajectory: The samples.
-        max_jerk: Bounds of the jerks [rad/s^3], shape (n,).
-        noise: Largest errors of positions, velocities and accelerations [rad, rad/s, rad/s^2], shape (3,).
-
-    Raises:
-        UsageError: There are fewer than three samples with positions alone.
+    Bounds of the jerks [rad/s^3] have shape (n,), the largest errors of positions, velocities and accelerations (3,).
+    Fewer than three samples with positions alone raise UsageError.
     """
     data = data_of(trajectory)
     if len(data) == 1:
@@ -133,16 +129,10 @@ def span_data(data: list[Array], h: Array) -> Array:
 
 
 def polynomials_of_positions(t: Array, q: Array, neighbors: int) -> tuple[Array, Array, Array]:
-    """Return polynomials through positions around every span.
+    """Return polynomials through K positions [rad], shape (K, n), around every span between times [s], shape (K,).
 
-    Args:
-        t: Times of the samples [s], shape (K,).
-        q: Positions [rad], shape (K, n).
-        neighbors: Number W of samples that determine a polynomial; at most K are used.
-
-    Returns:
-        Nodes, where the span is [0, 1], shape (S, W), weights of the positions for the Bernstein coefficients, shape
-        (S, W, W), and the positions, shape (S, W, n).
+    At most W neighbors determine each. The results are nodes, where the span is [0, 1], shape (S, W), weights of the
+    positions for the Bernstein coefficients, shape (S, W, W), and the positions, shape (S, W, n).
     """
     size, count = min(neighbors, len(t)), len(t) - 1
     first = np.clip(np.arange(count) - (size // 2 - 1), 0, len(t) - size)
@@ -186,13 +176,6 @@ def differentiated(weights: Array, order: int) -> Array:
         degree = weights.shape[-2] - 1
         weights = degree * np.diff(weights, axis=-2) if degree else np.zeros_like(weights)
     return weights
-
-
-def _noise_errors(weights: Array, order: int, h: Array, noise: Array, m: int) -> Array:
-    """Bound the effect of noise on a derivative in every span, shape (S,)."""
-    orders = np.tile(np.arange(m), 2)
-    scaled = noise[orders] * h[:, None] ** orders
-    return np.asarray((scaled @ np.abs(differentiated(weights, order)).T).max(axis=1) / h**order)
 
 
 def _kernel_norms(nodes: Array, orders: NDArray[np.intp], weights: Array, order: int) -> Array:

@@ -40,13 +40,7 @@ DECIDING_ERROR = 1e3  # an error this large, in SI units, is that of a missing d
 class FamilyJudge:
     """Judges families of curves of one problem, and reuses the memory of Pinocchio and Coal between calls.
 
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        step: Maximum time between checked times [s].
-
-    Raises:
-        UsageError: The step is not positive, or too long.
+    The step is the maximum time between checked times [s]; see ``check_step``.
     """
 
     def __init__(self, problem: Problem, robot: Robot, *, step: float = 1e-3) -> None:
@@ -70,13 +64,10 @@ class FamilyJudge:
     ) -> TrajectoryVerdict:
         """Judge one family; values that cannot be evaluated give an undecided verdict.
 
-        Args:
-            family: The curves.
-            trajectory: The samples, with phases and parameters; without them, phases are shares of the duration, and
-                parameters nominal.
-            scene: Poses and sizes of the obstacles, then values for a constraint and parameters, shape (width,). By
-                default, they follow from the ends of the curves and the parameters.
-            smooth: Another curve at the same times; joint limits that it violates are not valid.
+        The trajectory has the samples, with phases and parameters; without them, phases are shares of the duration, and
+        parameters nominal. The scene has poses and sizes of the obstacles, then values for a constraint and parameters,
+        shape (width,); by default, they follow from the ends of the curves and the parameters. Joint limits that
+        ``smooth``, another curve at the same times, violates are not valid.
         """
         if not family.duration < MAX_DURATION_S or len(family.t) > MAX_TIME_SAMPLES:
             reason = f"{Reason.TOO_LONG}: at most {MAX_DURATION_S:g} s and {MAX_TIME_SAMPLES:,} samples are judged"

@@ -35,19 +35,12 @@ LIMIT_FACTOR = 1.05  # on the acceleration limits
 
 @dataclass(frozen=True, eq=False)
 class _Polynomials:
-    """Polynomials of positions in S spans.
+    """Polynomials of positions in S spans."""
 
-    Attributes:
-        weights: Weights of the data for the Bernstein coefficients, shape (S, d + 1, W).
-        data: Data of the spans, scaled by powers of their lengths, shape (S, W, n).
-        noise: Largest errors of the data, shape (S, W).
-        h: Lengths of the spans [s], shape (S,).
-    """
-
-    weights: Array
-    data: Array
-    noise: Array
-    h: Array
+    weights: Array  # weights of the data for the Bernstein coefficients, shape (S, d + 1, W)
+    data: Array  # data of the spans, scaled by powers of their lengths, shape (S, W, n)
+    noise: Array  # largest errors of the data, shape (S, W)
+    h: Array  # lengths of the spans [s], shape (S,)
 
     def values(self, order: int) -> Array:
         """Return a derivative by time at the compared phases of all spans, shape (phases, S, n)."""

@@ -132,23 +132,14 @@ def _sums(steps: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _EndProgram:
-    """Quadratic program of the accelerations at N knots of one joint.
+    """Quadratic program of the accelerations at N knots of one joint."""
 
-    Attributes:
-        curvature: Hessian of the cost, shape (N, N).
-        gradient: Gradient of the cost per unit of the jerk at the last knot, shape (N,).
-        equalities: Rows for the changes of velocity and position in every span, and for known accelerations.
-        jerks: Rows for the jerks between knots, shape (N - 1, N).
-        h: Lengths of the spans [s].
-        given: Whether the accelerations at all samples are known, not only the last one.
-    """
-
-    curvature: Array
-    gradient: Array
-    equalities: Array
-    jerks: Array
-    h: Array
-    given: bool
+    curvature: Array  # Hessian of the cost, shape (N, N)
+    gradient: Array  # gradient of the cost per unit of the jerk at the last knot, shape (N,)
+    equalities: Array  # rows for the changes of velocity and position in every span, and for known accelerations
+    jerks: Array  # rows for the jerks between knots, shape (N - 1, N)
+    h: Array  # lengths of the spans [s]
+    given: bool  # whether the accelerations at all samples are known, not only the last one
 
     @classmethod
     def at(cls, t: Array, knots: Array, *, given: bool) -> "_EndProgram":

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.judges.plans.plan_plot import PLOT_SAMPLES, draw_path
+from cnpgen.judges.plans.plan_plot import PLOT_SAMPLES, draw_path, plot_times
 from cnpgen.judges.plans.verdict import Margin
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
@@ -31,27 +31,23 @@ def plot_trajectory(
     """Draw a sampled trajectory as ``plot_plan`` draws plans, by the interpolation that its derivatives determine.
 
     Violations to mark are given as margins.
-
-    Raises:
-        MachineError: matplotlib is missing, or the file cannot be written.
     """
+    times = [margin.time for margin in margins]
     with np.errstate(all="ignore"):
-        world, s, t, scene = along_trajectory(
-            problem, robot, trajectory, samples=PLOT_SAMPLES, extra_times=[margin.time for margin in margins]
-        )
+        world, s, t, scene = along_trajectory(problem, robot, trajectory, extra_times=times)
     draw_path(problem, world, s, t, Path(path), scene=scene, title=title, margins=margins)
 
 
 def along_trajectory(
-    problem: Problem, robot: Robot, trajectory: Trajectory, *, samples: int, extra_times: Sequence[float] = ()
+    problem: Problem,
+    robot: Robot,
+    trajectory: Trajectory,
+    *,
+    samples: int = PLOT_SAMPLES,
+    extra_times: Sequence[float] = (),
 ) -> tuple[PathWorld, Array, Array, Scene]:
-    """Place the robot at K times of a trajectory, uniformly spaced but for extra ones [s], among obstacles by its ends.
-
-    Returns:
-        The world, phases, times [s], shape (K,) each, and the obstacles.
-    """
-    times = np.clip(np.array(extra_times, float), 0, trajectory.duration)
-    t = np.union1d(np.linspace(0, trajectory.duration, samples), times)
+    """Place the robot along a trajectory as ``along``, among obstacles by its ends, which are returned, too."""
+    t = plot_times(trajectory.duration, samples, extra_times)
     share, phase_of = t / trajectory.duration, trajectory.phase_of()
     q, dq, ddq = (np.ascontiguousarray(values.T) for values in trajectory.states(t))
     jerk = np.ascontiguousarray(trajectory.jerks(t).T) if problem.uses_jerk else None

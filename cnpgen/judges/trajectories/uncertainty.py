@@ -28,15 +28,10 @@ SCENE_FACTOR = 2.0  # on the largest change by one of the possible scenes
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Errors of conditions along a family of curves.
+    """Errors of conditions along a family of curves."""
 
-    Attributes:
-        s: Phases at which the blocks begin, shape (B,).
-        errors: Condition (``_key``) -> errors in every block, shape (m, B), or one for all.
-    """
-
-    s: Array
-    errors: dict[tuple[int, str], Array | float]
+    s: Array  # phases at which the blocks begin, shape (B,)
+    errors: dict[tuple[int, str], Array | float]  # by ``_key``: in every block, shape (m, B), or one of all
 
     def add(self, condition: MeasuredCondition, s: Array) -> MeasuredCondition:
         """Return a condition at phases s, shape (K,), with the error of its values."""
@@ -77,7 +72,8 @@ def uncertainty_of(  # noqa: PLR0917 - the family, and everything that measures 
         else:
             smooth.append(condition)
     starts = np.unique(np.linspace(0, len(s), min(MAX_BLOCKS, len(s)) + 1).astype(np.intp))[:-1]
-    if smooth and (len(scenes) > 1 or not family.is_known):
+    is_known = not any(bound.any() for bound in family.bounds)
+    if smooth and (len(scenes) > 1 or not is_known):
         found = _changes(problem, family, world, scenes, smooth, s, starts)
         for condition, change in zip(smooth, found, strict=True):
             relaxed = float(ends[0]) if condition.relaxation.any() else 0.0

@@ -47,11 +47,7 @@ def machine_errors(verb: str, path: Path) -> Iterator[None]:
 
 
 def check_readable(path: Path) -> None:
-    """Check that an existing file or folder can be read.
-
-    Raises:
-        MachineError: The operating system denies it.
-    """
+    """Raise MachineError if the operating system denies reading an existing file or folder."""
     try:
         mode = path.stat().st_mode
         if stat.S_ISDIR(mode):
@@ -65,11 +61,7 @@ def check_readable(path: Path) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Check that a file, or files in a folder, can be written before they are computed; the path may be missing.
-
-    Raises:
-        MachineError: An existing file is read-only, or no file can be created in its folder or in the next one above.
-    """
+    """Raise MachineError if a file, or files in a folder, cannot be written; the path may be missing."""
     with machine_errors("write", path):
         places = [path.absolute(), *path.absolute().parents]
         if path.is_file():
@@ -81,13 +73,10 @@ def check_writable(path: Path) -> None:
 
 @contextmanager
 def committing(path: Path, work: Path | None = None) -> Iterator[Path]:
-    """Yield a temporary path to write to, and rename it to ``path`` if the block ends without an error.
+    """Yield a temporary path for the block to write to, and rename it to ``path`` if the block ends without an error.
 
     Several processes may write the same ``path`` at once: each has its own temporary file and the last rename wins. The
     temporary file is in ``work``, on the same file system, or in the folder of ``path``. Both folders are created.
-
-    Yields:
-        The temporary path; the block must create this file.
 
     Raises:
         MachineError: The file cannot be written. ``path`` is unchanged and the temporary file is removed.
@@ -121,13 +110,20 @@ def _synchronize(path: Path) -> None:
 
 
 def write_file(path: Path, content: bytes | str, *, work: Path | None = None) -> None:
-    """Write a whole file atomically; text is encoded as UTF-8.
-
-    Raises:
-        MachineError: The file cannot be written.
-    """
+    """Write a whole file atomically, or raise MachineError; text is encoded as UTF-8."""
     with committing(path, work) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Raise an error that names the file if it is missing or cannot be read."""
+    try:
+        yield
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise DatasetError(f"{path} is missing") from error
+    except OSError as error:
+        raise machine_error("read", path, error) from error
 
 
 def read_file(path: Path, *, max_bytes: int | None = None) -> bytes:
@@ -137,30 +133,16 @@ def read_file(path: Path, *, max_bytes: int | None = None) -> bytes:
         DatasetError: The file is missing, too large, or a device or a pipe, whose size is unknown.
         MachineError: The file cannot be read.
     """
-    try:
+    with _reading(path):
         status = path.stat()
         if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
             raise DatasetError(f"{path} is not a file")
         if max_bytes is not None and status.st_size > max_bytes:
             raise DatasetError(f"{path} has {status.st_size:,} bytes, expected at most {max_bytes:,}")
         return path.read_bytes()
-    except (FileNotFoundError, NotADirectoryError) as error:
-        raise DatasetError(f"{path} is missing") from error
-    except OSError as error:
-        raise machine_error("read", path, error) from error
 
 
 def file_sha256(path: Path) -> str:
-    """Compute the sha256 of a file in constant memory, as 64 hexadecimal digits.
-
-    Raises:
-        DatasetError: The file is missing.
-        MachineError: The file cannot be read.
-    """
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except (FileNotFoundError, NotADirectoryError) as error:
-        raise DatasetError(f"{path} is missing") from error
-    except OSError as error:
-        raise machine_error("read", path, error) from error
+    """Compute the sha256 of a file in constant memory, as 64 hexadecimal digits; errors are those of ``read_file``."""
+    with _reading(path), path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

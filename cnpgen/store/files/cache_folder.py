@@ -26,11 +26,7 @@ MAX_LOCK_WAIT_S = 600  # a process that holds a lock longer may have been stoppe
 
 
 def default_cache_folder() -> Path:
-    """Return ``$CNPGEN_CACHE``, else ``cnpgen`` in ``$XDG_CACHE_HOME`` or ``~/.cache``.
-
-    Raises:
-        MachineError: Neither variable is set, and the user has no home folder.
-    """
+    """Return ``$CNPGEN_CACHE``, else ``cnpgen`` in ``$XDG_CACHE_HOME`` or ``~/.cache``."""
     if os.environ.get("CNPGEN_CACHE"):
         return Path(os.environ["CNPGEN_CACHE"])
     try:
@@ -75,11 +71,7 @@ def _temporary_cache(problem: str, expected: str) -> Path:
 
 
 def make_private_folder(folder: Path) -> None:
-    """Create a folder and its missing parents with permissions for this user only, independent of the umask.
-
-    Raises:
-        OSError: It cannot be created.
-    """
+    """Create a folder and its missing parents with permissions for this user only, independent of the umask."""
     for path in (*reversed(folder.absolute().parents), folder.absolute()):
         if not path.is_dir():
             try:
@@ -98,11 +90,7 @@ def make_read_only_for_others(path: Path) -> None:
 
 @contextmanager
 def exclusive_lock(lock: Path) -> Iterator[None]:
-    """Run the context in one process at a time, if the system has file locks; a lock ends with its process.
-
-    Raises:
-        OSError: The lock file cannot be created.
-    """
+    """Run the context in one process at a time, if the system has file locks; a lock ends with its process."""
     with os.fdopen(os.open(lock, os.O_CREAT | os.O_RDWR, stat.S_IRUSR | stat.S_IWUSR), "r+b") as file:
         with suppress(FileNotFoundError):  # another process has finished and removed it
             lock.chmod(stat.S_IRUSR | stat.S_IWUSR)  # independent of the umask
@@ -124,8 +112,7 @@ def read_only_cache(folder: Path) -> Path | None:
 def require_trusted(folder: Path) -> list[Path]:
     """Return the folders with cached kernels: this one and the read-only cache that it links to, if any.
 
-    Raises:
-        MachineError: Other users may change files in one of them.
+    A folder in which other users may change files raises MachineError.
     """
     linked = read_only_cache(folder)
     folders = [folder] if linked is None else [folder, linked]

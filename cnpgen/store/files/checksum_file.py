@@ -66,10 +66,8 @@ def with_checksum(content: bytes, *, kind: str, version: int) -> bytes:
 def verify_checksum(path: Path, *, kind: str, version: int) -> bool:
     """Verify the checksum of a file, if it has one; return whether it has one.
 
-    A damaged checksum is an error, and not taken for a missing one.
-
-    Raises:
-        DatasetError: The file is cut off, damaged or too large, or has another format version.
+    A damaged checksum is an error, and not taken for a missing one. A damaged or too large file, and another format
+    version, raise DatasetError.
     """
     with machine_errors("read", path), path.open("rb") as file:
         block = file.read(HEADER_BYTES)
@@ -102,8 +100,7 @@ def _check_checksum(path: Path, block: bytes, digest: str, *, kind: str, version
 def read_with_checksum(path: Path, *, kind: str, version: int) -> Content:
     """Read a file with a checksum and verify it.
 
-    Raises:
-        DatasetError: The file is missing, too large, cut off or damaged, or of another kind or format version.
+    A missing, too large or damaged file, and another kind or format version, raise DatasetError.
     """
     data = read_file(path, max_bytes=MAX_CHECKSUM_FILE_BYTES)
     _check_checksum(

@@ -25,11 +25,7 @@ class CsvTable:
         return [row[index].strip() for _, row in self.lines]
 
     def numbers(self, name: str) -> NDArray[np.float64]:
-        """Return the numbers of a column, shape (rows,).
-
-        Raises:
-            DatasetError: A cell is not a number.
-        """
+        """Return the numbers of a column, shape (rows,); other cells raise DatasetError."""
         values = []
         for (line, _), cell in zip(self.lines, self.texts(name), strict=True):
             try:
@@ -42,9 +38,7 @@ class CsvTable:
 def read_csv_table(path: Path, *, example: str) -> CsvTable:
     """Read a CSV table; messages name the columns of ``example``.
 
-    Raises:
-        DatasetError: It is too large, not UTF-8, has no columns or equal ones, or rows of another length.
-        OSError: The file cannot be read.
+    A table that is too large, not UTF-8, or has no columns, equal ones, or rows of another length raises DatasetError.
     """
     if (size := path.stat().st_size) > MAX_TABLE_BYTES:
         raise DatasetError(f"{path} has {size:,} bytes, expected a table of at most {MAX_TABLE_BYTES:,}")

@@ -58,11 +58,7 @@ class StructureError(ValueError):
 
 
 def check_structure(value: Any, structure: Structure) -> None:
-    """Raise an error if a result of ``json.loads`` does not have a structure.
-
-    Raises:
-        StructureError: The value has another structure; the message contains key, expected structure and value.
-    """
+    """Raise StructureError, which names the key, if a result of ``json.loads`` has another structure."""
     if isinstance(structure, Leaf):
         if not _is(value, structure):
             raise _structure_error(structure.value, value)

@@ -28,11 +28,7 @@ _CHECKSUM = re.compile(r'"self_sha256": "([0-9a-f]{64})"\n}\n\Z')
 
 
 def plain(value: Any) -> Any:
-    """Convert a value to JSON types: tuples and arrays to lists, infinities to strings that ``float()`` reads.
-
-    Raises:
-        TypeError: A value cannot be converted.
-    """
+    """Convert a value to JSON types: tuples and arrays to lists, infinities to strings that ``float()`` reads."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
@@ -106,8 +102,7 @@ def save_document(path: Path, document: Mapping[str, Any], *, work: Path | None 
 def load_document(path: Path, kind: str, *, version: int, structure: Structure) -> dict[str, Any]:
     """Read a document with the "format" ``kind``, a "format_version" and a structure, and verify its checksum.
 
-    Raises:
-        DatasetError: The file is missing, too large, cut off or changed, or has another format, version or structure.
+    A missing, too large or damaged file, and another format, version or structure, raise DatasetError.
     """
     text, document = _parse(path)
     if document.get("format") != kind:
@@ -129,11 +124,7 @@ def load_document(path: Path, kind: str, *, version: int, structure: Structure) 
 
 
 def parse_json(text: str) -> Any:
-    """Parse untrusted JSON.
-
-    Raises:
-        ValueError: The text is not JSON, is nested too deeply, or contains invalid Unicode.
-    """
+    """Parse untrusted JSON; raise ValueError if it is not JSON, nested too deeply, or not valid Unicode."""
     try:
         value = json.loads(text)
     except RecursionError as error:

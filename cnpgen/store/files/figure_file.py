@@ -11,11 +11,7 @@ if TYPE_CHECKING:
 
 
 def new_figure(width: float, height: float, dpi: int = 110) -> "Figure":
-    """Return an empty figure with a size [inch] and automatic layout.
-
-    Raises:
-        MissingExtraError: matplotlib is missing.
-    """
+    """Return an empty figure with a size [inch] and automatic layout; raise MissingExtraError without matplotlib."""
     with requires_extra("plot", "matplotlib"):
         from matplotlib.figure import Figure
     return Figure(figsize=(width, height), layout="constrained", dpi=dpi)

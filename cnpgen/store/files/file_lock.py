@@ -33,11 +33,9 @@ def unlock(file: IO[bytes]) -> None:
 
 @contextmanager
 def output_lock(out: Path, lock: Path) -> Iterator[None]:
-    """Refuse a second process that writes the same output, while the block runs and the lock file exists.
+    """Raise UsageError if another process writes the same output; else hold the lock file while the block runs.
 
-    Raises:
-        UsageError: Another process writes the output.
-        MachineError: The lock file cannot be created.
+    A lock file that cannot be created raises MachineError.
     """
     with machine_errors("write", lock):
         file = lock.open("ab")

@@ -74,11 +74,7 @@ class Attributes:
         return bool(h5a.exists(self._item, name.encode()))
 
     def __getitem__(self, name: str) -> Any:
-        """Return a text, a number or an array of numbers.
-
-        Raises:
-            DatasetError: The attribute has another type or is too large.
-        """
+        """Return a text, a number or an array of numbers; other types and large values raise DatasetError."""
         from h5py import AttributeManager, h5a, h5s, h5t
 
         attribute = h5a.open(self._item, name.encode())
@@ -102,11 +98,7 @@ class Attributes:
 
 
 def _decoded(path: Path, name: bytes) -> str:
-    """Decode a name in a file.
-
-    Raises:
-        DatasetError: The name is not UTF-8.
-    """
+    """Decode a name in a file; one that is not UTF-8 raises DatasetError."""
     try:
         return name.decode()
     except UnicodeDecodeError as error:
@@ -161,8 +153,7 @@ class Hdf5:
     def __getitem__(self, name: str) -> Column:
         """Return a dataset without reading its numbers.
 
-        Raises:
-            DatasetError: It is not a plain dataset of numbers in this file, or declares more numbers than possible.
+        All but plain numbers in this file, and more of them than possible, raise DatasetError.
         """
         if name not in self._columns:
             self._columns[name] = self._checked(name, self._open(name))
@@ -247,7 +238,10 @@ def opened_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
     if content is None and not path.is_file():
         raise DatasetError(f"{path} is missing" if not path.exists() else f"{path} is not a file")
     try:
-        size = _check_bytes(path, content)
+        if content is None:
+            require_possible_size(path)
+        with path.open("rb") if content is None else io.BytesIO(content) as stream:
+            size = check_heaps(path, stream)  # before HDF5 reads the file
         source: Any = path if content is None else io.BytesIO(content)
         with h5py.File(source, "r", locking="best-effort" if content is None else None) as file:
             yield Hdf5(path, Attributes(path, file.id), file.id, size)
@@ -262,21 +256,7 @@ def opened_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
         raise DatasetError(f"{path} is damaged or cut off: {error}") from error
 
 
-def require_possible_size(path: Path) -> int:
-    """Return the size of a file [bytes], and refuse huge sparse files.
-
-    Raises:
-        DatasetError: The file is larger than ``MAX_HDF5_BYTES``.
-    """
+def require_possible_size(path: Path) -> None:
+    """Raise DatasetError if a file is larger than ``MAX_HDF5_BYTES``, as huge sparse files are."""
     if (size := path.stat().st_size) > MAX_HDF5_BYTES:
         raise DatasetError(f"{path} has {size:,} bytes, expected at most {MAX_HDF5_BYTES:,}")
-    return size
-
-
-def _check_bytes(path: Path, content: bytes | None) -> int:
-    """Raise an error for damage that makes HDF5 hang; return the size of the file [bytes]."""
-    if content is not None:
-        return check_heaps(path, io.BytesIO(content))
-    require_possible_size(path)
-    with path.open("rb") as file:
-        return check_heaps(path, file)

@@ -15,14 +15,11 @@ _CHUNK_BYTES = 1 << 23  # compared at once, which limits the memory of the compa
 
 
 def check_heaps(path: Path, file: BinaryIO) -> int:
-    """Raise an error if the objects of a global heap collection do not fill it; return the size of the file [bytes].
+    """Raise DatasetError if the objects of a global heap do not fill it; return the size of the file [bytes].
 
     HDF5 walks from object to object by their sizes. After a damaged size it can reach zeros, an object of size 0, and
     never ends (HDF5 2.0, function H5HG__cache_heap_deserialize). The content is read and not mapped into memory: using
     a map of a file that is cut off meanwhile would end the process.
-
-    Raises:
-        DatasetError: A collection is damaged.
     """
     begins, size = _collections(file)
     for begin in begins:

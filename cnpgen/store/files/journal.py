@@ -66,11 +66,8 @@ class JournalFile:
 def open_journal_file(path: Path, magic: bytes) -> JournalFile:
     """Open a journal for reading and appending, or create it, and remove an incomplete last record.
 
-    ``magic`` is the first line of the file, with format name and version, in ASCII with its newline.
-
-    Raises:
-        DatasetError: The file does not start with ``magic``.
-        UsageError: Another process has locked the file.
+    ``magic`` is the first line of the file, with format name and version, in ASCII with its newline. A file that does
+    not start with it raises DatasetError, one that another process has locked UsageError.
     """
     with machine_errors("write", path):
         file = os.fdopen(os.open(path, _MODE, 0o666), "r+b")

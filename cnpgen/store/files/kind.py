@@ -31,11 +31,7 @@ def kind_name(word: str) -> str:
 
 
 def is_hdf5(path: Path) -> bool:
-    """Return whether a file has the signature of HDF5, possibly after a user block.
-
-    Raises:
-        OSError: The file cannot be read.
-    """
+    """Return whether a file has the signature of HDF5, possibly after a user block."""
     with path.open("rb") as file:
         return any(file.seek(offset) == offset and file.read(len(HDF5)) == HDF5 for offset in _SIGNATURE_OFFSETS)
 
@@ -50,11 +46,7 @@ def apparent_kind(path: Path) -> str:
 
 
 def kind_of_content(path: Path) -> str:
-    """Return the kind of a file from its first bytes, "a zip archive" or "a model of cnpgen"; empty if unknown.
-
-    Raises:
-        OSError: The file cannot be read.
-    """
+    """Return the kind of a file from its first bytes, "a zip archive" or "a model of cnpgen"; empty if unknown."""
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
     known = (kind for signature, kind in _SIGNATURES.items() if head.startswith(signature))
