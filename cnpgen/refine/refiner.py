@@ -23,7 +23,7 @@ from cnpgen.refine.solver.cost_term import CostTerm, cost_term_residuals, residu
 from cnpgen.refine.solver.grid import make_grid
 from cnpgen.refine.solver.hull_feedback import HullFeedback
 from cnpgen.refine.solver.hull_problem import can_measure_hulls, without_distances
-from cnpgen.refine.solver.hulls import CompiledHullTranscription, Hulls, HullTranscription
+from cnpgen.refine.solver.hulls import CompiledHullTranscription, Hulls, HullTranscription, has_clearance_constraints
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS, Result, Settings, minimize
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription, cache_last
@@ -248,8 +248,7 @@ class Refiner:
 
     def _measure_ends(self, task: RefinementTask) -> Array:
         """Return by how much the hulls at both ends violate their distances within the tolerance [m], shape (2, m)."""
-        ends = np.stack([task.boundary.start_q[0], task.boundary.goal_q[0]], axis=1)
-        return self.hulls.accepted_at(ends, task.scene.poses[0])
+        return self.hulls.accepted_at(task.ends, task.scene.poses[0])
 
     def _feedback(self, level: GridLevel) -> HullFeedback:
         if level.points not in self._feedbacks:
@@ -330,9 +329,10 @@ class Refiner:
         factor = self.check.speed_ratio(task, x)
         return x if factor == 1 else np.concatenate([interior.ravel(), np.log(rate / (SLOWNESS * factor))])
 
-    def rest_space(self, task: RefinementTask, hulls: Hulls | None = None) -> RestSpace:
+    def rest_space(self, task: RefinementTask) -> RestSpace:
         """Return the valid states at rest, for the search of joint-space paths."""
         bounds, poses = self.check.rest_bounds(task), self.kernel_poses(task)
+        hulls = self.hulls if has_clearance_constraints(self.problem, self.robot) else None
         return RestSpace(self.residual_kernels, self.robot, bounds, poses, task.scene.poses[0], hulls)
 
     def manifold(self, task: RefinementTask) -> EqualityKernel | None:

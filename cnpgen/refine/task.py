@@ -92,6 +92,11 @@ class RefinementTask:
         return bool(np.abs(basis(s, len(path), degree) @ path - reference).max() <= self.stay_within)
 
     @property
+    def ends(self) -> Array:
+        """Joint positions at the start and at the goal [rad], shape (n, 2)."""
+        return np.stack([self.boundary.start_q[0], self.boundary.goal_q[0]], axis=1)
+
+    @property
     def at_rest(self) -> bool:
         """Whether the motion starts and ends at rest; time scaling then preserves its boundary conditions."""
         ends = (self.boundary.start_dq, self.boundary.start_ddq, self.boundary.goal_dq, self.boundary.goal_ddq)

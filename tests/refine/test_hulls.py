@@ -13,7 +13,7 @@ from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
-from cnpgen.refine import obstacle_attempts, strategy, tree_paths
+from cnpgen.refine import attempts, rrt_connect
 from cnpgen.refine import refiner as refiner_module
 from cnpgen.refine.refine_engine import load_refiner
 from cnpgen.refine.solver.hull_feedback import HullFeedback
@@ -258,13 +258,13 @@ def test_large_trees_follow_the_first_ones(monkeypatch):
         grown.append(settings)
         return np.zeros((3, 2)) if len(grown) - 1 in hits else None
 
-    monkeypatch.setattr(tree_paths, "find_tree_path", find)
+    monkeypatch.setattr(rrt_connect, "find_tree_path", find)
     robot = SimpleNamespace(position_lower=-np.ones(2), position_upper=np.ones(2), velocity_limit=np.ones(2))
     space = SimpleNamespace(robot=robot, meets_other_conditions=lambda _: True)
     hulls = SimpleNamespace(obstacle_distance=0.0, self_distance=0.0, placed_checker=lambda _: None)
     boundary = SimpleNamespace(start_q=np.zeros((1, 2)), goal_q=np.ones((1, 2)))
     task = SimpleNamespace(boundary=boundary, scene=SimpleNamespace(poses=np.zeros((1, 0))))
-    search = tree_paths.TreeSearch(task, space, hulls, None)
+    search = rrt_connect.TreeSearch(task, space, hulls, None)
     cases = (
         ({0, 1, 3}, (12, 0, 12)),  # small trees with every margin find enough paths
         (set(), (4, 3, 3)),  # nothing connects
@@ -294,8 +294,8 @@ def test_large_trees_follow_the_first_ones(monkeypatch):
 def test_a_problem_without_a_path_reports_it(tmp_path, monkeypatch):
     problem = narrow(tmp_path, WALL)
     tool, task = refiner(problem), between(problem, BESIDE_WALL)
-    monkeypatch.setattr(obstacle_attempts, "path_guesses", lambda *_: iter(()))
-    monkeypatch.setattr(strategy, "_from_other_guesses", lambda *_: iter(()))
+    monkeypatch.setattr(attempts, "path_guesses", lambda *_: iter(()))
+    monkeypatch.setattr(attempts, "_from_other_guesses", lambda *_: iter(()))
     found = refine_task(tool, PlanChecker(problem, load_robot(problem), degree=tool.spec.degree), task)
     assert not found.valid
     assert found.outcome is Outcome.NO_PATH
@@ -306,8 +306,7 @@ def test_a_problem_without_a_path_reports_it(tmp_path, monkeypatch):
 def test_no_attempt_is_made_if_an_end_is_inside_an_obstacle(tmp_path):
     problem = narrow(tmp_path, SLOT)
     tool, inside = refiner(problem), between(problem, np.add(IN_SLOT, [0.0, 0.0, 0.1, 0.0]))
-    best = tool.attempt(inside, tool.line_guess(inside), 1.0, Outcome.SOLVED, iterations=0, violation=0.0)
-    assert list(obstacle_attempts.around_obstacles(tool, inside, best, tool.hulls)) == []
+    assert attempts.ends_penetrate(tool, inside)
     found = refine_task(tool, PlanChecker(problem, load_robot(problem), degree=tool.spec.degree), inside)
     assert found.reason == "robot in collision"  # not that of the attempt, which also exceeds other limits
 

@@ -13,7 +13,8 @@ from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem
-from cnpgen.refine import initial_guesses, strategy
+from cnpgen.refine import initial_guesses
+from cnpgen.refine.attempts import make_attempts
 from cnpgen.refine.grid_levels import GridLevel
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.refine_engine import load_refiner, prepare, tasks_of
@@ -399,7 +400,7 @@ def test_cached_values_of_a_transcription_belong_to_its_variables() -> None:
 def test_a_feasible_coarse_level_is_yielded_at_once_and_measured_only_if_rejected() -> None:
     plan = load("hit")
     tool = refiner("airhockey")
-    attempts = strategy.make_attempts(tool, task(plan), None)
+    attempts = make_attempts(tool, task(plan), None)
     first, second = next(attempts), next(attempts)
     assert (first.outcome, first.violation) == (Outcome.SOLVED, 0.0)
     _, violation = tool.check.measure(task(plan), first.x)
