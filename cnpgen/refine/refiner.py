@@ -21,9 +21,14 @@ from cnpgen.refine.solver.bounds import Bounds, accepted_along, bounds_template,
 from cnpgen.refine.solver.compiled_backend import load_step_library
 from cnpgen.refine.solver.cost_term import CostTerm, cost_term_residuals, residual_counts
 from cnpgen.refine.solver.grid import make_grid
-from cnpgen.refine.solver.hull_feedback import HullFeedback
-from cnpgen.refine.solver.hull_problem import can_measure_hulls, without_distances
-from cnpgen.refine.solver.hulls import CompiledHullTranscription, Hulls, HullTranscription, has_clearance_constraints
+from cnpgen.refine.solver.hull_levels import (
+    CompiledHullTranscription,
+    HullFeedback,
+    HullTranscription,
+    can_measure_hulls,
+    without_distances,
+)
+from cnpgen.refine.solver.hulls import Hulls, has_clearance_constraints
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS, Result, Settings, minimize
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription, cache_last
@@ -48,7 +53,7 @@ class Refiner:
 
     Attributes:
         measures_hulls: Whether distances of the links' hulls replace those of capsules in all levels, see
-            ``cnpgen.refine.solver.hull_problem``.
+            ``cnpgen.refine.solver.hull_levels``.
 
     Args:
         problem: The problem.
@@ -144,27 +149,21 @@ class Refiner:
         bounds = self.bounds(task, level, ends)
         if not np.nanmax(bounds.end_violations(ends)) < MAX_END_VIOLATION:
             settings = replace(settings, max_iterations=0)
-        if self.measures_hulls:
-            motion = CompiledHullTranscription(
-                self.residual_kernels,
-                motion.grid,
-                self.hulls,
-                boundary=task.boundary,
-                kernel_poses=self.kernel_poses(task),
-                obstacle_poses=task.scene.poses[0],
-            )
-            accepted = accepted_along(near_ends(self._grids[level.points].s), self.accepted_at_ends(task))
-            more = -accepted if extra is None else extra - accepted
-            bounds = self._bounds[level].with_hull_distances(bounds, self.hulls.min_distances, more)
-        elif hulls is not None:
-            motion = HullTranscription(
+        hulls = self.hulls if self.measures_hulls else hulls
+        if hulls is not None:
+            kind = CompiledHullTranscription if self.measures_hulls else HullTranscription
+            motion = kind(
                 self.residual_kernels,
                 motion.grid,
                 hulls,
                 boundary=task.boundary,
+                kernel_poses=self.kernel_poses(task),
                 obstacle_poses=task.scene.poses[0],
             )
-            bounds = self._bounds[level].with_hull_distances(bounds, hulls.min_distances)
+            more: Array | float = 0.0 if extra is None else extra
+            if self.measures_hulls:
+                more = more - accepted_along(near_ends(motion.grid.s), self.accepted_at_ends(task))
+            bounds = self._bounds[level].with_hull_distances(bounds, hulls.min_distances, more)
         return minimize(motion, bounds, x, settings, deadline=task.deadline)
 
     def transcription(self, task: RefinementTask, level: GridLevel) -> Transcription:

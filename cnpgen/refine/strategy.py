@@ -27,8 +27,7 @@ from cnpgen.refine.attempts import make_attempts
 from cnpgen.refine.proof.end_violations import end_violations
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.bounds import PRECISE_FRACTION
-from cnpgen.refine.solver.hull_feedback import MAX_FED_BACK_M, MIN_FED_BACK_M
-from cnpgen.refine.solver.hull_problem import without_contacts
+from cnpgen.refine.solver.hull_levels import MAX_FED_BACK_M, MIN_FED_BACK_M, without_contacts
 from cnpgen.refine.solver.sqp import Deadline
 from cnpgen.refine.task import MAX_JUDGED_VIOLATION, Attempt, Outcome, RefinementTask
 from cnpgen.robots.robot import Robot

@@ -16,7 +16,7 @@ from cnpgen.problems.problem_file import load_problem
 from cnpgen.refine import attempts, rrt_connect
 from cnpgen.refine import refiner as refiner_module
 from cnpgen.refine.refine_engine import load_refiner
-from cnpgen.refine.solver.hull_feedback import HullFeedback
+from cnpgen.refine.solver.hull_levels import HullFeedback
 from cnpgen.refine.solver.hulls import MEASURED_RANGE_M, Hulls, has_clearance_constraints
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS
 from cnpgen.refine.strategy import PlanChecker, RefinementSearch, refine_task

@@ -26,7 +26,7 @@ from cnpgen.refine.solver.bounds import INTERVAL_FRACTION, NO_TIGHTENING, Bounds
 from cnpgen.refine.solver.compiled_backend import CompiledBackend
 from cnpgen.refine.solver.cost_term import CostTerm, choose_cost_term, cost_term_residuals, residual_counts
 from cnpgen.refine.solver.grid import make_grid
-from cnpgen.refine.solver.qp_subproblem import Backend, NumpyBackend, ResidualSelection
+from cnpgen.refine.solver.qp_subproblem import NumpyBackend, ResidualSelection
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
 from cnpgen.refine.solver.sqp import Deadline, Settings, minimize
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription
@@ -456,7 +456,7 @@ class CountingChecker(PlanChecker):
 @pytest.mark.parametrize("radius", [0.02, 0.3])
 @pytest.mark.parametrize("kind", [NumpyBackend, pytest.param(CompiledBackend, marks=needs_compiler)])
 def test_the_solution_of_a_subproblem_meets_the_optimality_conditions(
-    kind: type[Backend], radius: float, monkeypatch: pytest.MonkeyPatch
+    kind: type[NumpyBackend | CompiledBackend], radius: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for module in (qp_subproblem, compiled_backend):  # a violation by 1e-6 of a row's length is too large here
         monkeypatch.setattr(module, "QP_TOLERANCE", 1e-9)

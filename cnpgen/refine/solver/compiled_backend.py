@@ -25,9 +25,9 @@ from cnpgen.refine.solver.qp_subproblem import (
     QP_TOLERANCE,
     Mask,
     NumpyBackend,
+    NumpySubproblem,
     ResidualSelection,
     Step,
-    Subproblem,
 )
 from cnpgen.refine.solver.transcription import Transcription
 from cnpgen.trajectory.spline import end_derivatives
@@ -89,7 +89,7 @@ def load_step_library(kernels: KernelLibrary) -> ctypes.CDLL | None:
 
 
 class CompiledBackend:
-    """Backend of step.c; see ``Backend``."""
+    """Backend of step.c; see ``NumpyBackend``."""
 
     def __init__(self, motion: Transcription, bounds: Bounds, thinning: int) -> None:
         library = motion.kernels.step_library
@@ -102,7 +102,7 @@ class CompiledBackend:
         self._fallback, self._activate = NumpyBackend(motion, bounds, thinning), motion.activate
 
     def value(self, x: Array) -> tuple[float, Array, float]:
-        """Evaluate a motion; see ``Backend``."""
+        """Evaluate a motion; see ``NumpyBackend``."""
         g = np.empty((self._m, self._points))
         self._activate()
         cost = self._evaluate(self._address, address_of(x), address_of(g))
@@ -111,7 +111,7 @@ class CompiledBackend:
     def subproblem(
         self, x: Array, g: Array, selection: ResidualSelection, *, proximal: float, penalty: float
     ) -> "CompiledSubproblem":
-        """Build the subproblem; see ``Backend``."""
+        """Build the subproblem; see ``NumpyBackend``."""
         selected = np.zeros((self._m, self._points), bool)
         missed = np.ascontiguousarray(selection.missed.T)
         before = None if selection.multipliers is None else np.ascontiguousarray(selection.multipliers.T)
@@ -241,15 +241,15 @@ class CompiledBackend:
 
 @dataclass(frozen=True)
 class CompiledSubproblem:
-    """Subproblem of step.c at an iterate with residuals g; see ``Subproblem``."""
+    """Subproblem of step.c at an iterate with residuals g; see ``NumpySubproblem``."""
 
     backend: CompiledBackend
-    fallback: Callable[[], Subproblem]  # builds the same subproblem in NumPy
+    fallback: Callable[[], NumpySubproblem]  # builds the same subproblem in NumPy
     g: Array
     selected: Mask
     elastic_gradient: float  # of the elastic variable's cost
 
     def solve(self, box: Array, *, warm: Array | None = None, relax: bool = False) -> Step | None:
-        """Return the best step within the box; see ``Subproblem``. DAQP solves it if active_set.c does not."""
+        """Return the best step within the box; see ``NumpySubproblem``. DAQP solves it if active_set.c does not."""
         step = self.backend.solve(self, box, warm, relax=relax)
         return self.fallback().solve(box, warm=warm, relax=relax) if step is None else step

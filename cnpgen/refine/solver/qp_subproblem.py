@@ -6,7 +6,6 @@ as BLAS.
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,51 +64,25 @@ class ResidualSelection:
     multipliers: Array | None
 
 
-class Subproblem(Protocol):
-    """Quadratic programs at one iterate."""
-
-    @property
-    def selected(self) -> Mask:
-        """Mask of the residuals in the programs, shape (K, m)."""
-
-    def solve(self, box: Array, *, warm: Array | None = None, relax: bool = False) -> "Step | None":
-        """Return the best step within the box, or None without a solution.
-
-        Args:
-            box: Largest change of every variable, shape (nx,).
-            warm: Multipliers, shape (K, m), of the residuals in the initial working set, or None.
-            relax: Whether satisfied residuals may be violated, too, up to the remaining largest violation.
-        """
-
-
-class Backend(Protocol):
-    """Evaluations and subproblems of a motion within its bounds."""
-
-    def value(self, x: Array) -> tuple[float, Array, float]:
-        """Evaluate the regularized objective, residuals (K, m) and their largest violation."""
-
-    def subproblem(
-        self, x: Array, g: Array, selection: ResidualSelection, *, proximal: float, penalty: float
-    ) -> Subproblem:
-        """Build the subproblem at x with residuals g; it is valid until the next one is built."""
-
-
 class NumpyBackend:
-    """Backend in NumPy and DAQP; see ``select_residuals`` for ``thinning``."""
+    """Evaluations and subproblems of a motion within its bounds, in NumPy and DAQP.
+
+    See ``select_residuals`` for ``thinning``.
+    """
 
     def __init__(self, motion: Transcription, bounds: Bounds, thinning: int) -> None:
         self._motion, self._bounds, self._thinning = motion, bounds, thinning
         self._evaluate = cache_last(motion.evaluate)  # after a rejected step the iterate is the same
 
     def value(self, x: Array) -> tuple[float, Array, float]:
-        """Evaluate a motion; see ``Backend``."""
+        """Evaluate the regularized objective, residuals (K, m) and their largest violation."""
         cost, g = self._motion.value(x)
         return cost, g, self._bounds.max_violation(g)
 
     def subproblem(
         self, x: Array, g: Array, selection: ResidualSelection, *, proximal: float, penalty: float
     ) -> "NumpySubproblem":
-        """Build the subproblem; see ``Backend``."""
+        """Build the subproblem at x with residuals g; it is valid until the next one is built."""
         at = self._evaluate(x)
         errors = self._motion.linearization_errors(at, selection.max_log_rate_change)
         selected = select_residuals(
@@ -123,21 +96,24 @@ class NumpyBackend:
 
 @dataclass(frozen=True)
 class NumpySubproblem:
-    """Quadratic model of the objective and linear model of the selected residuals, solved by DAQP.
-
-    ``proximal`` is the weight of the proximal term, ``penalty`` that of the largest violation at the iterate.
-    """
+    """Quadratic model of the objective and linear model of the selected residuals, solved by DAQP."""
 
     motion: Transcription
     at: Linearization
     bounds: Bounds
-    selected: Mask
-    violation: float
-    proximal: float
-    penalty: float
+    selected: Mask  # residuals in the programs, shape (K, m)
+    violation: float  # the largest one at the iterate
+    proximal: float  # weight of the proximal term
+    penalty: float  # weight of the violation
 
     def solve(self, box: Array, *, warm: Array | None = None, relax: bool = False) -> Step | None:
-        """Return the best step within the box; see ``Subproblem``."""
+        """Return the best step within the box, or None without a solution.
+
+        Args:
+            box: Largest change of every variable, shape (nx,).
+            warm: Multipliers, shape (K, m), of the residuals in the initial working set, or None.
+            relax: Whether satisfied residuals may be violated, too, up to the remaining largest violation.
+        """
         import daqp
 
         nx, unwhiten = self.motion.nx, self._unwhiten

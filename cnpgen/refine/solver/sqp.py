@@ -20,14 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.refine.solver.bounds import Bounds
-from cnpgen.refine.solver.compiled_backend import CompiledBackend
+from cnpgen.refine.solver.compiled_backend import CompiledBackend, CompiledSubproblem
 from cnpgen.refine.solver.qp_subproblem import (
-    Backend,
     Mask,
     NumpyBackend,
+    NumpySubproblem,
     ResidualSelection,
     Step,
-    Subproblem,
     local_maxima,
 )
 from cnpgen.refine.solver.transcription import Transcription
@@ -149,7 +148,7 @@ def minimize(
     return last if iterate.converged or feasible is None else replace(feasible, iterations=iteration)
 
 
-def make_backend(motion: Transcription, bounds: Bounds, thinning: int) -> Backend:
+def make_backend(motion: Transcription, bounds: Bounds, thinning: int) -> NumpyBackend | CompiledBackend:
     """Return the backend of a motion: compiled if its kernels are, else NumPy."""
     compiled = motion.kernels.step_library is not None
     return CompiledBackend(motion, bounds, thinning) if compiled else NumpyBackend(motion, bounds, thinning)
@@ -214,7 +213,7 @@ class _Iterate:
         smallest, tolerance = min(before, default=0.0), self._settings.violation_tolerance
         return smallest > tolerance and min(recent) > max(STALL_FRACTION * smallest, tolerance)
 
-    def _propose(self, subproblem: Subproblem) -> Step | None:
+    def _propose(self, subproblem: NumpySubproblem | CompiledSubproblem) -> Step | None:
         """Solve the subproblem; solve it again, relaxed or without warm start, if the step is of little use."""
         box = self._radius * self._scale
         step = subproblem.solve(box, warm=self._multipliers)
