@@ -24,7 +24,7 @@ from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.attempts import make_attempts
-from cnpgen.refine.proof.end_violations import end_violations
+from cnpgen.refine.proof.explain import end_violations
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.bounds import PRECISE_FRACTION
 from cnpgen.refine.solver.hull_levels import MAX_FED_BACK_M, MIN_FED_BACK_M, without_contacts
@@ -130,7 +130,9 @@ def _input_plans(refiner: Refiner, task: RefinementTask, x: Array | None) -> Ite
 def _is_input(task: RefinementTask, path: Array, rate: Array) -> bool:
     """Return whether a plan is the input plan up to rounding."""
     pairs = (path, task.path), (rate, task.rate)
-    return all(np.allclose(now, before, rtol=0.0, atol=MAX_ROUNDING_ERROR) for now, before in pairs)
+    return all(
+        before is not None and np.allclose(now, before, rtol=0.0, atol=MAX_ROUNDING_ERROR) for now, before in pairs
+    )
 
 
 def _invalid_input(refiner: Refiner, task: RefinementTask) -> Attempt:
