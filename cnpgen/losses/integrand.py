@@ -112,25 +112,15 @@ def relaxation_argument(problem: Problem) -> int:
 
 @dataclass(frozen=True)
 class Inputs:
-    """The arguments of the kernels as SX columns, in order, with the axes of ``grid_specs``.
+    """The arguments of the kernels as SX columns, in order, with the axes of ``grid_specs``."""
 
-    Attributes:
-        path: p, p' and p'' [rad], n each, and p''' if the jerk is constrained.
-        rate: r and r' [1/s], and r'' if the jerk is constrained.
-        obstacle_poses: Poses and sizes of the obstacles.
-        relaxation: Relaxation of the conditions with time-varying bounds, in their units.
-        node: Quadrature weight.
-        tightening: Factors of the limits of all constraints, then insets of the other bounds of all constraints.
-        weights: Weight of every constraint (the paper's e^alpha).
-    """
-
-    path: tuple[Any, ...]
-    rate: Any
-    obstacle_poses: Any
-    relaxation: Any
-    node: Any
-    tightening: Any
-    weights: Any
+    path: tuple[Any, ...]  # p, p' and p'' [rad], n each, and p''' if the jerk is constrained
+    rate: Any  # r and r' [1/s], and r'' if the jerk is constrained
+    obstacle_poses: Any  # poses and sizes of the obstacles
+    relaxation: Any  # relaxation of the conditions with time-varying bounds, in their units
+    node: Any  # quadrature weight
+    tightening: Any  # factors of the limits of all constraints, then insets of the other bounds of all constraints
+    weights: Any  # weight of every constraint (the paper's e^alpha)
 
     @property
     def columns(self) -> list[Any]:

@@ -74,19 +74,12 @@ def rotating_shift(step: int, count: int = 8) -> float:
 
 @dataclass(frozen=True)
 class BasisTable:
-    """The basis functions at the nodes.
+    """The basis functions at the nodes."""
 
-    Attributes:
-        s: Phases, shape (K,), float64.
-        weights: Quadrature weights, shape (1, K).
-        path: Basis functions of p and its derivatives, shape (orders K, C).
-        rate: Basis functions of r and its derivatives, shape ((orders - 1) K, R).
-    """
-
-    s: Array
-    weights: NDArray[Any]
-    path: NDArray[Any]
-    rate: NDArray[Any]
+    s: Array  # phases, shape (K,), float64
+    weights: NDArray[Any]  # quadrature weights, shape (1, K)
+    path: NDArray[Any]  # basis functions of p and its derivatives, shape (orders K, C)
+    rate: NDArray[Any]  # basis functions of r and its derivatives, shape ((orders - 1) K, R)
 
 
 @lru_cache(maxsize=64)

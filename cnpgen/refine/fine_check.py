@@ -24,35 +24,23 @@ MAX_SCALING = 1.25  # a motion that must be slower by more is left to the solver
 
 @dataclass(frozen=True)
 class GridViolation:
-    """Largest violation of the bounds on the fine grid.
+    """Largest violation of the bounds on the fine grid."""
 
-    Attributes:
-        worst: Largest violation as a multiple of its tolerance; inf where a residual is not finite.
-        position: Whether a condition on q alone violates its tolerance.
-        time_scale: Factor of the duration, at least 1, that removes the worst violations of velocity, acceleration,
-            torque and jerk. These scale with the rate, its square and its cube.
-    """
-
-    worst: float
-    position: bool
+    worst: float  # largest violation as a multiple of its tolerance; inf where a residual is not finite
+    position: bool  # whether a condition on q alone violates its tolerance
+    # Factor of the duration, at least 1, that removes the worst violations of velocity, acceleration, torque and jerk.
+    # These scale with the rate, its square and its cube.
     time_scale: float
 
 
 @dataclass(frozen=True)
 class RestBounds:
-    """Bounds of the residuals of a robot at rest halfway along the motion, shape (m,) each.
+    """Bounds of the residuals of a robot at rest halfway along the motion, shape (m,) each."""
 
-    Attributes:
-        lower: Lower bounds.
-        upper: Upper bounds.
-        capsules: Mask of the clearances of capsules.
-        equal: Mask of the equalities of positions.
-    """
-
-    lower: Array
-    upper: Array
-    capsules: NDArray[np.bool_]
-    equal: NDArray[np.bool_]
+    lower: Array  # lower bounds
+    upper: Array  # upper bounds
+    capsules: NDArray[np.bool_]  # mask of the clearances of capsules
+    equal: NDArray[np.bool_]  # mask of the equalities of positions
 
 
 class FineCheck:

@@ -26,15 +26,10 @@ _RECORD_ERRORS = (
 
 @dataclass
 class Journal:
-    """Finished plans of a run in an append-only file; the first record identifies the run.
+    """Finished plans of a run in an append-only file; the first record identifies the run."""
 
-    Attributes:
-        path: Path of the file.
-        finished: Results of earlier runs, index of the plan -> judged attempt.
-    """
-
-    path: Path
-    finished: dict[int, Attempt]
+    path: Path  # path of the file
+    finished: dict[int, Attempt]  # results of earlier runs, index of the plan -> judged attempt
     _file: JournalFile
 
     def append(self, indices: Sequence[int], results: Sequence[Attempt]) -> None:

@@ -50,22 +50,14 @@ MANIFOLD_NODES, MANIFOLD_LARGE_TREE_NODES = 6_000, 24_000
 
 @dataclass(frozen=True)
 class RestSpace:
-    """Valid states of a robot at rest for one task.
+    """Valid states of a robot at rest for one task."""
 
-    Attributes:
-        kernels: Residual kernels.
-        robot: The robot.
-        bounds: Bounds of the residuals of a state.
-        kernel_poses: Scene values that the kernels take, shape (width,).
-        scene_poses: Poses and sizes of the obstacles of the hulls, shape (width,).
-        hulls: Hulls that decide where capsules collide, or without capsules everywhere; None where links are capsules.
-    """
-
-    kernels: ResidualKernels
-    robot: Robot
-    bounds: RestBounds
-    kernel_poses: Array
-    scene_poses: Array
+    kernels: ResidualKernels  # residual kernels
+    robot: Robot  # the robot
+    bounds: RestBounds  # bounds of the residuals of a state
+    kernel_poses: Array  # scene values that the kernels take, shape (width,)
+    scene_poses: Array  # poses and sizes of the obstacles of the hulls, shape (width,)
+    # Hulls that decide where capsules collide, or without capsules everywhere; None where links are capsules.
     hulls: Hulls | None
 
     def follow(self, q: Array) -> Array:

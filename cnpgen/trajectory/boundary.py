@@ -277,17 +277,11 @@ def anchor_line(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
 
 @dataclass(frozen=True)
 class BoundaryDerivative:
-    """Derivative of one path control point with respect to one rate control point.
+    """Derivative of one path control point with respect to one rate control point."""
 
-    Attributes:
-        point: Index of the path control point, 0 to C - 1.
-        variable: Index of the rate control point, 0 to R - 1.
-        derivative: d(path control point) / d(rate control point) [rad s], shape (N, n).
-    """
-
-    point: int
-    variable: int
-    derivative: Array
+    point: int  # index of the path control point, 0 to C - 1
+    variable: int  # index of the rate control point, 0 to R - 1
+    derivative: Array  # d(path control point) / d(rate control point) [rad s], shape (N, n)
 
 
 def boundary_derivatives(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> list[BoundaryDerivative]:

@@ -167,14 +167,10 @@ class EndDerivatives:
 
     ``x'(0) = eta (c1 - c0)`` with ``eta = D (C - D)`` (the paper's Appendix A prints the square of C - D) and
     ``x''(0) = beta (c2 - 3 c1 + 2 c0)`` with ``beta = D (D - 1) / 2 (C - D)^2``; both need C >= D + 2.
-
-    Attributes:
-        eta: Factor of the first derivative.
-        beta: Factor of the second derivative.
     """
 
-    eta: float
-    beta: float
+    eta: float  # factor of the first derivative
+    beta: float  # factor of the second derivative
 
 
 @cache

@@ -48,15 +48,10 @@ def joint_limits(problem: Problem, robot: Robot, *, tolerances: float) -> JointL
 
 @dataclass(frozen=True)
 class EndState:
-    """State at the start of a motion, or at its goal with reversed time.
+    """State at the start of a motion, or at its goal with reversed time."""
 
-    Attributes:
-        q: Joint positions [rad], shape (n,).
-        dq: Joint velocities [rad/s], shape (n,); at the goal the opposite of the motion's.
-    """
-
-    q: Array
-    dq: Array
+    q: Array  # joint positions [rad], shape (n,)
+    dq: Array  # joint velocities [rad/s], shape (n,); at the goal the opposite of the motion's
 
     def box(self, time: float, limits: JointLimits) -> tuple[Array, Array]:
         """Bound each joint's position ``time`` [s] later: (lower, upper), shape (n,); empty where lower > upper."""

@@ -32,17 +32,11 @@ MIN_GAIN_M = 1e-7  # at which a local search ends
 
 @dataclass(frozen=True)
 class TableBounds:
-    """Bounds of all tables of a problem: ``normals @ tip <= limits``.
+    """Bounds of all tables of a problem: ``normals @ tip <= limits``."""
 
-    Attributes:
-        normals: Unit vectors, shape (m, 3).
-        limits: Limits [m], shape (m,).
-        height: Mask of the rows of the height, shape (m,).
-    """
-
-    normals: Array
-    limits: Array
-    height: NDArray[np.bool_]
+    normals: Array  # unit vectors, shape (m, 3)
+    limits: Array  # limits [m], shape (m,)
+    height: NDArray[np.bool_]  # mask of the rows of the height, shape (m,)
 
     def violation(self, tip: Array) -> tuple[float, float]:
         """Return the violation of the rectangle, at least ``MIN_VIOLATION_M``, and of the height by a tip [m]."""
@@ -78,20 +72,13 @@ def table_bounds(problem: Problem, start_tip: Array, *, tolerances: float) -> Ta
 
 @dataclass(frozen=True)
 class TableViolation:
-    """Smallest violation found at one time.
+    """Smallest violation found at one time."""
 
-    Attributes:
-        time: Time from the end [s].
-        value: Violation of the rectangle, at least ``MIN_VIOLATION_M``, plus ``HEIGHT_WEIGHT`` times that of the height
-            [m].
-        multipliers: Multipliers of the table's bounds, shape (m,).
-        box: Reachable joint positions: (lower, upper), shape (n,) each.
-    """
-
-    time: float
+    time: float  # time from the end [s]
+    # Violation of the rectangle, at least ``MIN_VIOLATION_M``, plus ``HEIGHT_WEIGHT`` times that of the height [m].
     value: float
-    multipliers: Array
-    box: tuple[Array, Array]
+    multipliers: Array  # multipliers of the table's bounds, shape (m,)
+    box: tuple[Array, Array]  # reachable joint positions: (lower, upper), shape (n,) each
 
     def weight(self, bounds: TableBounds) -> float:
         """Return the weight of one metre off the table: 1, or ``HEIGHT_WEIGHT`` if only the height is violated."""
@@ -101,19 +88,12 @@ class TableViolation:
 
 @dataclass(frozen=True)
 class TableExit:
-    """Instant at which the tip leaves the table, or nearly so, in every motion.
+    """Instant at which the tip leaves the table, or nearly so, in every motion."""
 
-    Attributes:
-        end: "start" or "goal".
-        time: Time from that end [s].
-        distance: Smallest distance off the table, or, negative, largest distance from its edge [m].
-        proven: Whether it is proven with all tolerances; otherwise a local search without tolerances found it.
-    """
-
-    end: str
-    time: float
-    distance: float
-    proven: bool
+    end: str  # "start" or "goal"
+    time: float  # time from that end [s]
+    distance: float  # smallest distance off the table, or, negative, largest distance from its edge [m]
+    proven: bool  # whether it is proven with all tolerances; otherwise a local search without tolerances found it
 
 
 def find_table_exit(problem: Problem, robot: Robot, boundary: Boundary) -> TableExit | None:

@@ -19,17 +19,11 @@ MAX_BOXES = 4000
 
 @dataclass(frozen=True)
 class TipKinematics:
-    """The tip at one configuration.
+    """The tip at one configuration."""
 
-    Attributes:
-        position: Position [m], shape (3,).
-        jacobian: Derivative of the position [m/rad], shape (3, n).
-        axes: Axes of revolute joints in the world, zero for prismatic ones, shape (3, n).
-    """
-
-    position: Array
-    jacobian: Array
-    axes: Array
+    position: Array  # position [m], shape (3,)
+    jacobian: Array  # derivative of the position [m/rad], shape (3, n)
+    axes: Array  # axes of revolute joints in the world, zero for prismatic ones, shape (3, n)
 
     def curvature(self, direction: Array) -> Array:
         """Return second derivatives along a direction, shape (n, n): ``c . (axis_i x J_j)`` for i <= j."""

@@ -35,21 +35,13 @@ MAX_TEMPLATES = 64
 
 @dataclass(frozen=True)
 class Tightening:
-    """Tightening of the problem's bounds against overshoot between grid points.
+    """Tightening of the problem's bounds against overshoot between grid points."""
 
-    Attributes:
-        limit: Fraction of acceleration, torque and jerk limits.
-        gentle: Fraction of position and velocity limits, on which boundary states lie.
-        clearance: Distance added to clearances [m].
-        band: Half width of equalities, as a fraction of their tolerance.
-        edge: Phase over which the tightening fades in from either end, since boundary states may lie on a limit.
-    """
-
-    limit: float
-    gentle: float
-    clearance: float
-    band: float
-    edge: float
+    limit: float  # fraction of acceleration, torque and jerk limits
+    gentle: float  # fraction of position and velocity limits, on which boundary states lie
+    clearance: float  # distance added to clearances [m]
+    band: float  # half width of equalities, as a fraction of their tolerance
+    edge: float  # phase over which the tightening fades in from either end, since boundary states may lie on a limit
 
 
 NO_TIGHTENING = Tightening(limit=0.0, gentle=0.0, clearance=0.0, band=0.0, edge=1.0)
@@ -57,20 +49,15 @@ NO_TIGHTENING = Tightening(limit=0.0, gentle=0.0, clearance=0.0, band=0.0, edge=
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of the residuals on the grid, in scaled units.
+    """Bounds of the residuals on the grid, in scaled units."""
 
-    Attributes:
-        lower: Lower bounds, shape (K, m), -inf where there are none.
-        upper: Upper bounds, shape (K, m).
-        nonsmooth: Mask of residuals that change abruptly with the last rate control points, shape (K, m): those of
-            accelerations and jerks at the ends.
-        interval_tolerance: Accepted violation between grid points, shape (K, m): that of the verdict, or of a precise
-            plan for equalities; inf where it is unknown.
-    """
-
-    lower: Array
-    upper: Array
+    lower: Array  # lower bounds, shape (K, m), -inf where there are none
+    upper: Array  # upper bounds, shape (K, m)
+    # Mask of residuals that change abruptly with the last rate control points, shape (K, m): those of accelerations and
+    # jerks at the ends.
     nonsmooth: NDArray[np.bool_]
+    # Accepted violation between grid points, shape (K, m): that of the verdict, or of a precise plan for equalities;
+    # inf where it is unknown.
     interval_tolerance: Array
 
     @property

@@ -22,13 +22,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class CostTerm:
-    """Sum of the terms of an objective in addition to the duration.
+    """Sum of the terms of an objective in addition to the duration."""
 
-    Attributes:
-        terms: The terms, of positive weight.
-    """
-
-    terms: tuple[ObjectiveTerm, ...]
+    terms: tuple[ObjectiveTerm, ...]  # the terms, of positive weight
 
     @property
     def tables(self) -> list[dict[str, Any]]:

@@ -29,39 +29,24 @@ DAQP_LOWER, DAQP_UPPER = 3, 1  # DAQP's codes of initially active bounds
 
 @dataclass(frozen=True)
 class Step:
-    """Solution of a subproblem.
+    """Solution of a subproblem."""
 
-    Attributes:
-        dx: Step of the variables, shape (nx,).
-        remaining: Fraction of the violations that remains after the step.
-        multipliers: Multipliers of all residuals, shape (K, m); 0 for those that are not selected.
-        gain: Predicted reduction of the objective.
-    """
-
-    dx: Array
-    remaining: float
-    multipliers: Array
-    gain: float
+    dx: Array  # step of the variables, shape (nx,)
+    remaining: float  # fraction of the violations that remains after the step
+    multipliers: Array  # multipliers of all residuals, shape (K, m); 0 for those that are not selected
+    gain: float  # predicted reduction of the objective
 
 
 @dataclass(frozen=True)
 class ResidualSelection:
-    """Rule that selects the residuals of a subproblem.
+    """Rule that selects the residuals of a subproblem."""
 
-    Attributes:
-        violation: Largest violation at the current iterate.
-        max_distance: Residuals are selected at local maxima within this distance of a bound.
-        max_log_rate_change: Bound of the change of log r; nonsmooth residuals that it could move over a bound are
-            selected.
-        missed: Mask of residuals that are selected in any case, shape (K, m).
-        multipliers: Multipliers of the last step, shape (K, m), or None; residuals with one are selected.
-    """
-
-    violation: float
-    max_distance: float
+    violation: float  # largest violation at the current iterate
+    max_distance: float  # residuals are selected at local maxima within this distance of a bound
+    # Bound of the change of log r; nonsmooth residuals that it could move over a bound are selected.
     max_log_rate_change: float
-    missed: Mask
-    multipliers: Array | None
+    missed: Mask  # mask of residuals that are selected in any case, shape (K, m)
+    multipliers: Array | None  # multipliers of the last step, shape (K, m), or None; residuals with one are selected
 
 
 class NumpyBackend:

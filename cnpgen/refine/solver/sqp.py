@@ -52,34 +52,23 @@ ACCEPTED_RATIO, GOOD_RATIO, POOR_RATIO = 0.05, 0.7, 0.3  # of reduction to predi
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of the iteration.
+    """Settings of the iteration."""
 
-    Attributes:
-        max_iterations: Largest number of steps tried.
-        radius: Initial trust radius, infinity norm [rad and log].
-        proximal: Weight of the proximal term.
-        penalty: Initial weight of the largest violation in the merit function. A motion that is 1 % slower costs 1 % of
-            its duration. Violations are therefore profitable in motions of more seconds than this; there the weight
-            grows.
-        violation_bound: Initial violation up to which steps are accepted for their reduction of the objective.
-        max_initial_violation: Largest violation of a usable initial guess.
-        cost_tolerance: Relative change of the objective, predicted and actual, at which it has converged.
-        selection_distances: Pairs (step length, distance): after a step longer than the first, residuals within the
-            second of a bound are selected.
-        violation_tolerance: Largest scaled violation of a feasible iterate.
-        thinning: Interval of grid points at which inactive residuals are selected.
-    """
-
-    max_iterations: int = 40
-    radius: float = 0.3
-    proximal: float = 0.02
+    max_iterations: int = 40  # largest number of steps tried
+    radius: float = 0.3  # initial trust radius, infinity norm [rad and log]
+    proximal: float = 0.02  # weight of the proximal term
+    # Initial weight of the largest violation in the merit function. A motion that is 1 % slower costs 1 % of its
+    # duration. Violations are therefore profitable in motions of more seconds than this; there the weight grows.
     penalty: float = 2.0
+    # Initial violation up to which steps are accepted for their reduction of the objective.
     violation_bound: float = 0.3
-    max_initial_violation: float = np.inf
-    cost_tolerance: float = 1e-3
+    max_initial_violation: float = np.inf  # largest violation of a usable initial guess
+    cost_tolerance: float = 1e-3  # relative change of the objective, predicted and actual, at which it has converged
+    # Pairs (step length, distance): after a step longer than the first, residuals within the second of a bound are
+    # selected.
     selection_distances: tuple[tuple[float, float], ...] = SELECTION_DISTANCES
-    violation_tolerance: float = 6e-4
-    thinning: int = 6
+    violation_tolerance: float = 6e-4  # largest scaled violation of a feasible iterate
+    thinning: int = 6  # interval of grid points at which inactive residuals are selected
 
 
 DEFAULT_SETTINGS = Settings()
@@ -108,21 +97,13 @@ class Deadline:
 
 @dataclass(frozen=True)
 class Result:
-    """Result of an iteration.
+    """Result of an iteration."""
 
-    Attributes:
-        x: Last accepted iterate.
-        cost: Regularized objective there.
-        violation: Largest scaled violation there.
-        iterations: Number of steps tried.
-        converged: Whether the iteration ended before its limit of steps.
-    """
-
-    x: Array
-    cost: float
-    violation: float
-    iterations: int
-    converged: bool
+    x: Array  # last accepted iterate
+    cost: float  # regularized objective there
+    violation: float  # largest scaled violation there
+    iterations: int  # number of steps tried
+    converged: bool  # whether the iteration ended before its limit of steps
 
 
 def minimize(

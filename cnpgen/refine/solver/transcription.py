@@ -28,47 +28,28 @@ RATE_SMOOTHING = 1e-4  # weight of the squared second differences of log r, whic
 
 @dataclass(frozen=True)
 class Linearization:
-    """Objective and residuals at one x, with their derivatives.
+    """Objective and residuals at one x, with their derivatives."""
 
-    Attributes:
-        x: Variables, shape (nx,).
-        cost: Objective [s].
-        gradient: Gradient of the objective, shape (nx,).
-        curvature: Positive semidefinite model of its Hessian, shape (nx, nx).
-        g: Residuals, shape (K, m).
-        jacobian: d(residuals)/d(w), shape (width of w, m, K).
-        rate: Rate control points, shape (R,).
-    """
-
-    x: Array
-    cost: float
-    gradient: Array
-    curvature: Array
-    g: Array
-    jacobian: Array
-    rate: Array
+    x: Array  # variables, shape (nx,)
+    cost: float  # objective [s]
+    gradient: Array  # gradient of the objective, shape (nx,)
+    curvature: Array  # positive semidefinite model of its Hessian, shape (nx, nx)
+    g: Array  # residuals, shape (K, m)
+    jacobian: Array  # d(residuals)/d(w), shape (width of w, m, K)
+    rate: Array  # rate control points, shape (R,)
 
 
 @dataclass(frozen=True)
 class ResidualKernels:
-    """Kernels of a problem.
+    """Kernels of a problem."""
 
-    Attributes:
-        spec: Degree and numbers of control points.
-        values: Kernel of ``cnpgen.refine.solver.residuals.stage_values``.
-        jacobian: Kernel of ``cnpgen.refine.solver.residuals.stage_jacobian``.
-        cost_term: Cost term in addition to the duration, or None.
-        cost_residuals: Kernel of ``cnpgen.refine.solver.cost_term.cost_term_residuals``, or None.
-        cost_counts: Number of residuals of every term of the cost term.
-        step_library: Library of ``cnpgen.refine.solver.compiled_backend``, or None for the NumPy backend.
-    """
-
-    spec: TrajectorySpec
-    values: Kernel
-    jacobian: Kernel
-    cost_term: CostTerm | None = None
-    cost_residuals: Kernel | None = None
-    cost_counts: tuple[int, ...] = ()
+    spec: TrajectorySpec  # degree and numbers of control points
+    values: Kernel  # kernel of ``cnpgen.refine.solver.residuals.stage_values``
+    jacobian: Kernel  # kernel of ``cnpgen.refine.solver.residuals.stage_jacobian``
+    cost_term: CostTerm | None = None  # cost term in addition to the duration, or None
+    cost_residuals: Kernel | None = None  # kernel of ``cnpgen.refine.solver.cost_term.cost_term_residuals``, or None
+    cost_counts: tuple[int, ...] = ()  # number of residuals of every term of the cost term
+    # Library of ``cnpgen.refine.solver.compiled_backend``, or None for the NumPy backend.
     step_library: CDLL | None = None
 
 
