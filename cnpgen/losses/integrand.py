@@ -177,15 +177,10 @@ def time_varying_conditions(problem: Problem, robot: Robot, form: str) -> list[t
 def relaxation_of(
     time_varying: Sequence[tuple[Constraint, Condition]], s: NDArray[np.float64], start_tip: Array
 ) -> Array:
-    """Return the relaxation of time-varying bounds, of motions that may start outside a constraint.
+    """Return the relaxation of the conditions of ``time_varying_conditions``, each in its unit, shape (values, K, N).
 
-    Args:
-        time_varying: The conditions of ``time_varying_conditions``.
-        s: Phases, shape (K,).
-        start_tip: Positions of the tip at the start [m], shape (N, 3).
-
-    Returns:
-        Relaxation of every value in its unit, shape (values, K, N).
+    It is that of motions that may start outside a constraint: at phases s, shape (K,), with positions of the tip at the
+    start [m], shape (N, 3).
 
     Raises:
         UsageError: ``bound_relaxation`` of a constraint returns another shape than its contract states.

@@ -98,14 +98,10 @@ BOUNDED = MetricSettings(
 def alpha_step(
     alpha: ArrayLike, losses: ArrayLike, budgets: ArrayLike, *, gamma: float, largest_log: float = 10.0
 ) -> Array:
-    """Take one step of the metric, ``alpha_i + gamma log(L_i / C_i)`` (paper, update rule of alpha).
+    """Take one step of the metric, ``alpha_i + gamma log(L_i / C_i)`` (paper, update rule of alpha), shape (m,).
 
-    Args:
-        alpha: Logarithms of the weights, shape (m,).
-        losses: Mean of every term, shape (m,). A value that is not finite leaves its weight unchanged.
-        budgets: Acceptable value of every term (the paper's C-bar^2), shape (m,). 0 leaves its weight unchanged.
-        gamma: Step size.
-        largest_log: Bound on the absolute value of the logarithm.
+    The logarithm is at most ``largest_log`` in absolute value. A mean that is not finite, or a budget (the paper's
+    C-bar^2) of 0, leaves its weight unchanged.
     """
     before, mean, budget = (np.asarray(x, float) for x in (alpha, losses, budgets))
     learned = (budget > 0) & np.isfinite(mean)
@@ -117,15 +113,7 @@ def alpha_step(
 
 
 def average_loss(terms: ArrayLike, average: Average) -> Array:
-    """Average every term over valid plans; nan if there are none.
-
-    Args:
-        terms: Losses of N plans, shape (N, m).
-        average: Kind of average.
-
-    Returns:
-        Shape (m,).
-    """
+    """Average every term of the losses of N plans, shape (N, m), over valid plans, shape (m,); nan without any."""
     values = np.asarray(terms, float)
     values = values[np.isfinite(values).all(axis=1)]
     if len(values) == 0:

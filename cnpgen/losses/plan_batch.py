@@ -85,11 +85,7 @@ def check_batch(
 
 
 def check_shapes(problem: Problem, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Check the shapes of the arrays of plans.
-
-    Args:
-        problem: The problem.
-        shapes: Shapes of ``path``, ``rate`` and, if present, ``obstacle_poses`` and ``start_tip``.
+    """Check the shapes of ``path``, ``rate`` and, if present, ``obstacle_poses`` and ``start_tip``.
 
     Raises:
         UsageError: A shape is wrong, or the obstacle poses are missing.

@@ -46,17 +46,8 @@ class RestBounds:
 class FineCheck:
     """Evaluation of motions of one problem on the fine grid.
 
-    Args:
-        problem: The problem.
-        world: Its world.
-        kernels: Its residual kernels.
-        poses: Function that returns the scene values of a task that the kernels take.
-        penetration: Function of a task and states (n, K) that returns by how much distances that the kernels do not
-            compute are violated above their tolerance [m]; None if there are none.
-
-    Attributes:
-        equalities: Names of the equality conditions.
-        transcription: Function that returns the transcription of a task on the fine grid; the last one is cached.
+    ``poses`` returns the scene values of a task that the kernels take. ``penetration`` returns by how much distances
+    that the kernels do not compute are violated above their tolerance at states (n, K) [m].
     """
 
     def __init__(

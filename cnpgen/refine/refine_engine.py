@@ -113,17 +113,7 @@ def load_refiner(
     levels: GridLevels | None = None,
     coarser: Refiner | None = None,
 ) -> Refiner:
-    """Build the refiner of a problem.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        spec: Degree and numbers of control points; the problem's by default.
-        options: Options of the refiner.
-        kernels: Library of kernels; by default the fastest backend of this machine.
-        levels: Grid levels, see ``Refiner``.
-        coarser: Refiner with the problem's own control points, see ``Refiner``.
-    """
+    """Build the refiner of a problem; see ``Refiner``. The default is the fastest backend of this machine."""
     if kernels is None:
         kernels = problem_kernels(problem, robot, *choose_backend(None))
     settings = Settings(cost_tolerance=options.tolerance, max_iterations=options.max_iterations)

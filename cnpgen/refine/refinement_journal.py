@@ -46,12 +46,9 @@ class Journal:
 
 
 def open_journal(path: Path, identity: str, *, discard: bool = False) -> Journal:
-    """Open the journal of a run with the results of earlier runs of the same identity.
+    """Open the journal of a run with the results of earlier runs of the same identity; create it if it is missing.
 
-    Args:
-        path: Path of the file; it is created if it is missing.
-        identity: JSON text that identifies the run: plans, options, version.
-        discard: Whether to discard finished plans of another run.
+    The identity is a JSON text: plans, options, version. Finished plans of another run are lost only if ``discard``.
 
     Raises:
         UsageError: The file is no journal, holds another run's plans, or is in use.

@@ -51,19 +51,9 @@ SLOWNESS = 1.6  # times slower than the bounds of speeds require: the solver cha
 class Refiner:
     """Solver of one problem, and the checks and initial guesses for it.
 
-    Attributes:
-        measures_hulls: Whether distances of the links' hulls replace those of capsules in all levels, see
-            ``cnpgen.refine.solver.hull_levels``.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        kernels: Library of kernels.
-        spec: Degree and numbers of control points; the problem's by default.
-        cost_term: Cost term in addition to the duration, or None.
-        settings: Settings of the iteration.
-        levels: Grid levels; ``default_grid_levels`` by default.
-        coarser: Refiner with the problem's own control points, for plans with several spans for each of its spans.
+    If it ``measures_hulls``, distances of the links' hulls replace those of capsules in all levels, see
+    ``cnpgen.refine.solver.hull_levels``. Control points are those of the problem by default; ``coarser`` is a refiner
+    with these, for plans with several spans for each of its spans.
     """
 
     def __init__(

@@ -152,15 +152,9 @@ class _Tree:
 
 
 def follow_line(begin: Array, end: Array, follow: Follow) -> tuple[Array, bool]:
-    """Return the states of a straight line up to the first invalid one.
+    """Return the valid states of a straight line, shape (k, n), and whether they reach its end.
 
-    Args:
-        begin: Start of the line, shape (n,); not among the states.
-        end: End of the line, shape (n,).
-        follow: Function that returns the leading valid states, see ``RestSpace.follow``.
-
-    Returns:
-        ``(states, reached)``: states, shape (k, n), and whether the last one is the end.
+    Both ends have shape (n,); ``begin`` is not among the states. See ``RestSpace.follow`` for the leading valid states.
     """
     count = max(int(np.ceil(np.abs(end - begin).max() / STATE_SPACING)), 1)
     fractions, states = np.arange(1, count + 1) / count, begin[:, None]
@@ -175,16 +169,10 @@ def follow_line(begin: Array, end: Array, follow: Follow) -> tuple[Array, bool]:
 
 
 def find_paths(start: Array, goal: Array, robot: Robot, follow: Follow) -> Iterator[Array]:
-    """Yield valid paths between two configurations: the line, if it is valid, or several paths of the trees.
+    """Yield valid paths between two configurations, shape (K, n): the line, if it is valid, or several of the trees.
 
-    Args:
-        start: First configuration, shape (n,).
-        goal: Last configuration, shape (n,).
-        robot: The robot; random configurations are within its limits and at most a turn away from both ends.
-        follow: Function that returns the leading valid states, see ``RestSpace.follow``.
-
-    Yields:
-        States of a path, shape (K, n). The search ends with the first trees that do not connect.
+    Random configurations are within the robot's limits and at most a turn away from both ends. The search ends with the
+    first trees that do not connect.
     """
     states, reached = follow_line(start, goal, follow)
     if reached:

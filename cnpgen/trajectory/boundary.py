@@ -285,13 +285,7 @@ class BoundaryDerivative:
 
 
 def boundary_derivatives(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> list[BoundaryDerivative]:
-    """Differentiate ``start_points`` and ``goal_points``; other derivatives are zero.
-
-    Args:
-        boundary: Boundary conditions of N motions.
-        rate: Rate control points [1/s], shape (N, R), positive.
-        spec: Degree and numbers of control points.
-    """
+    """Differentiate ``start_points`` and ``goal_points`` in rate control points, (N, R); other derivatives are zero."""
     b, last, points = boundary, spec.rate_control_points - 1, spec.path_control_points
     c1, c2, c2_inner = _three_derivatives(b.start_dq, b.start_ddq, rate[:, :1], rate[:, 1:2], spec)
     derivatives = [BoundaryDerivative(1, 0, c1), BoundaryDerivative(2, 0, c2), BoundaryDerivative(2, 1, c2_inner)]

@@ -25,16 +25,10 @@ def clamped_knots(points: int, degree: int) -> Array:
 
 
 def basis(s: Array, points: int, degree: int, order: int = 0) -> Array:
-    """Evaluate every basis function, or a derivative of it, by the Cox-de Boor recursion.
+    """Evaluate every basis function at phases s, or a derivative of some order, by the Cox-de Boor recursion.
 
-    Args:
-        s: Phases in [0, 1], shape (K,).
-        points: Number of control points C.
-        degree: Degree D.
-        order: Order of the derivative with respect to s.
-
-    Returns:
-        Shape (K, C): ``basis(s, C, D, order) @ control_points`` is the derivative of the spline.
+    Phases in [0, 1] have shape (K,), the result (K, C): ``basis(s, C, D, order) @ control_points`` is the derivative of
+    the spline.
     """
     knots, matrix = derivative(points, degree, order)
     degree -= order
@@ -110,15 +104,9 @@ def select_spans(coefficients: Array, s: Array) -> tuple[Array, Array]:
 
 
 def horner(selected: Array, offset: Array, order: int = 0) -> Array:
-    """Evaluate the polynomials of ``select_spans``, or a derivative of them, by Horner's rule.
+    """Evaluate the polynomials of ``select_spans``, or a derivative of some order, by Horner's rule.
 
-    Args:
-        selected: Coefficients, shape (D + 1, N, K, ...).
-        offset: Phases minus left knots, shape (N, K), or (M, N, K) for M phases of each polynomial.
-        order: Order of the derivative.
-
-    Returns:
-        Values, shape (N, K, ...) or (M, N, K, ...).
+    Phases minus left knots have shape (N, K), or (M, N, K) for M phases of each polynomial; values the same with (...).
     """
     degree = len(selected) - 1
     offset = offset.reshape(*offset.shape, *(1,) * (selected.ndim - 3))

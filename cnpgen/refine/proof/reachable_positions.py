@@ -27,13 +27,7 @@ class JointLimits:
 
 
 def joint_limits(problem: Problem, robot: Robot, *, tolerances: float) -> JointLimits:
-    """Return the limits of a problem's constraints.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        tolerances: Fraction of the constraints' tolerances by which the limits are relaxed, from 0 to 1.
-    """
+    """Return the limits of a problem's constraints, relaxed by a fraction of their tolerances, from 0 to 1."""
     lower, upper, velocity, acceleration = (sign * np.full(robot.n, NO_LIMIT) for sign in (-1, 1, 1, 1))
     for constraint in problem.constraint:
         tolerance = tolerances * constraint.tolerance

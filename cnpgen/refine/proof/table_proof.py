@@ -48,13 +48,9 @@ class TableBounds:
 def table_bounds(problem: Problem, start_tip: Array, *, tolerances: float) -> TableBounds | None:
     """Return the bounds of the problem's tables, or None if it has none or they differ from sample to sample.
 
-    The height is bounded by its tolerance. A motion that starts off the table may be off by the table's ``start_off``
-    at any time, since the time-varying bound depends on its phase.
-
-    Args:
-        problem: The problem.
-        start_tip: Tip at the start [m], shape (3,).
-        tolerances: Fraction of the tolerance by which the rectangles are enlarged.
+    The rectangles are enlarged by a fraction of the tolerance; the height is bounded by its tolerance. A motion with a
+    tip [m], shape (3,), that starts off the table may be off by the table's ``start_off`` at any time, since the
+    time-varying bound depends on its phase.
     """
     tables = [constraint for constraint in problem.constraint if isinstance(constraint, Table)]
     if not tables or problem.parameters.tilts_table or problem.parameters.changes_rectangle:

@@ -63,17 +63,9 @@ class ArmKinematics:
 
 
 def bound_projection(arm: ArmKinematics, direction: Array, lower: Array, upper: Array, *, above: float) -> float | None:
-    """Return a lower bound of ``direction . tip`` over a box of joint positions.
+    """Return a lower bound of ``direction . tip`` over a box of joint positions, or None below a threshold.
 
-    Args:
-        arm: The arm.
-        direction: Direction, shape (3,).
-        lower: Lower ends of the box [rad], shape (n,).
-        upper: Upper ends of the box [rad], shape (n,).
-        above: Threshold that the bound must exceed [m].
-
-    Returns:
-        A lower bound above ``above``, or None if none was found.
+    The direction has shape (3,), the lower and upper ends of the box [rad] shape (n,), the threshold is ``above`` [m].
     """
     boxes, bound = [(lower, upper)], np.inf
     for _ in range(MAX_BOXES):

@@ -79,11 +79,9 @@ class Bounds:
         return max(worst, 0.0) if np.isfinite(worst) else np.inf
 
     def tightened(self, g: Array, midpoint_weights: Array) -> "Bounds | None":
-        """Return bounds tightened where residuals g violate them between grid points, or None if none do.
+        """Return bounds tightened where residuals g (K, m) violate them between grid points, or None if none do.
 
-        Args:
-            g: Residuals, shape (K, m).
-            midpoint_weights: Weights of the cubic interpolation, see ``Grid.midpoint_weights``.
+        Midpoints are interpolated with ``Grid.midpoint_weights``.
         """
         centers = sum(
             weights[:, None] * g[k : k + len(midpoint_weights)] for k, weights in enumerate(midpoint_weights.T)
@@ -178,12 +176,10 @@ class BoundsTemplate:
         self._nonsmooth[[*END_POINTS, *(-1 - point for point in END_POINTS)]] = self.orders >= 2
 
     def bounds_for(self, start_tip: Array, *, ends: Array | None = None) -> Bounds:
-        """Return the bounds of one motion.
+        """Return the bounds of one motion with the tip at ``start_tip`` [m], shape (3,), at the start.
 
-        Args:
-            start_tip: Position of the tip at the start [m], shape (3,).
-            ends: Residuals of the boundary states, shape (2, m), nan where they are free. Bounds near an end that
-                violates them within the tolerance are relaxed by the violation: no motion meets narrower ones.
+        Residuals of the boundary states ``ends`` have shape (2, m), nan where they are free. Bounds near an end that
+        violates them within the tolerance are relaxed by the violation: no motion meets narrower ones.
         """
         lower, upper = self._lower, self._upper
         for constraint, condition, columns in self._time_varying:
@@ -197,13 +193,7 @@ class BoundsTemplate:
         return bounds if ends is None else self._relaxed_at_ends(bounds, ends)
 
     def near(self, bounds: Bounds, positions: Array, distance: float) -> Bounds:
-        """Return bounds that also keep the joints near a path.
-
-        Args:
-            bounds: Bounds of one motion.
-            positions: Joint positions of the path on the grid [rad], shape (K, n).
-            distance: Largest difference of every joint from the path [rad].
-        """
+        """Return bounds that also keep every joint within a distance [rad] of a path on the grid, shape (K, n)."""
         columns = np.isfinite(self._position_scale)
         if columns.sum() != positions.shape[1]:
             return bounds
@@ -217,10 +207,7 @@ class BoundsTemplate:
     def with_hull_distances(self, bounds: Bounds, min_distances: Array, extra: Array | float = 0.0) -> Bounds:
         """Return bounds without those of capsules and with further columns for the distances of hulls.
 
-        Args:
-            bounds: Bounds of one motion.
-            min_distances: Required distances [m], shape (columns,).
-            extra: Additional distances [m], shape (K, columns).
+        Required distances [m] have shape (columns,), additional ones shape (K, columns).
         """
         added = _added_clearance(self._s, self._tightening)[:, None]
         lower = (min_distances + added + extra) / DISTANCE_SCALE_M

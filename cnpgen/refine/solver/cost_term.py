@@ -37,15 +37,10 @@ class CostTerm:
         return np.array(rows, float)
 
     def rate(self, e: Array, counts: Iterable[int]) -> tuple[Array, Array]:
-        """Evaluate the weighted size of the residuals and its curvature.
+        """Evaluate the weighted size rho of the residuals e, shape (m, K), and its curvature.
 
-        Args:
-            e: Residuals, shape (m, K).
-            counts: Number of residuals of every term.
-
-        Returns:
-            ``(rho, weight)``, shapes (K,) and (m, K): ``weight * e`` is the gradient of rho in e, and the diagonal
-            matrix of ``weight`` bounds its Hessian from above.
+        ``counts`` are the numbers of residuals of every term. The result is ``(rho, weight)``, shapes (K,) and (m, K):
+        ``weight * e`` is the gradient of rho in e, and the diagonal matrix of ``weight`` bounds its Hessian from above.
         """
         rho, weights, first = np.zeros(e.shape[1]), np.empty(e.shape), 0
         for count, smoothing, weight in self.groups(counts).tolist():
@@ -58,13 +53,10 @@ class CostTerm:
 
 
 def choose_cost_term(problem: Problem, objective: str = "time", weight: float | None = None) -> CostTerm | None:
-    """Return the cost term of an objective, or None if its weight is 0.
+    """Return the cost term of an objective (``read_objective``), or None if its weight is 0.
 
-    Args:
-        problem: The problem.
-        objective: See ``read_objective``; "time" is the problem's own objective.
-        weight: Weight of each term; by default that in ``objective`` or of the problem. Of the problem's own objective,
-            weight of the centrifugal acceleration.
+    "time" is the problem's own objective. A weight replaces that of each term in ``objective``; of the problem's own
+    objective, that of the centrifugal acceleration.
     """
     terms = read_objective(objective)
     if terms is None:

@@ -38,12 +38,7 @@ class Bases:
         return _first(self.path, self.support), _first(self.rate, self.support)
 
     def states(self, path: Array, rate: Array) -> Array:
-        """Evaluate a motion: w = (p, p', ..., r, r', ...), shape (orders n + orders - 1, K).
-
-        Args:
-            path: Path control points, shape (C, n).
-            rate: Rate control points, shape (R,).
-        """
+        """Evaluate a motion: w = (p, p', ..., r, r', ...), shape (orders n + orders - 1, K), from (C, n) and (R,)."""
         orders, points, _ = self.path.shape
         first = orders * path.shape[1]
         w = np.empty((first + orders - 1, points))

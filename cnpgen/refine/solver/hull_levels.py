@@ -141,16 +141,10 @@ class HullFeedback:
     def missing_clearance(
         self, path: Array, hulls: Hulls, obstacle_poses: Array, *, accepted: Array | None = None
     ) -> Array | None:
-        """Return by how much the required distances must grow at the grid points [m].
+        """Return by how much the required distances must grow at the grid points [m], shape (K, columns).
 
-        Args:
-            path: Path control points, shape (C, n).
-            hulls: Clearances of the hulls.
-            obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-            accepted: Accepted violations of both ends [m], shape (2, columns), or None.
-
-        Returns:
-            Shape (K, columns), or None if no motion between grid points collides, or more than ``MAX_FED_BACK_M``.
+        The result is None if no motion of the path control points, (C, n), collides between grid points, or more than
+        ``MAX_FED_BACK_M``. Accepted violations of both ends [m] have shape (2, columns).
         """
         missing = hulls.missing((self._basis @ path).T, self._margins, obstacle_poses)
         if accepted is not None:

@@ -118,15 +118,10 @@ class Hulls:
         return pairs[numbers], numbers
 
     def measure(self, q: Array, obstacle_poses: Array) -> tuple[Array, list[Contacts]]:
-        """Measure the distances of close parts.
+        """Measure the distances of close parts at joint positions q [rad], shape (n, K).
 
-        Args:
-            q: Joint positions [rad], shape (n, K).
-            obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-
-        Returns:
-            Distances [m], shape (K, m), at most ``MEASURED_RANGE_M`` above the required ones, nan if q is not finite;
-            and the contacts of every constraint.
+        The result are distances [m], shape (K, m), at most ``MEASURED_RANGE_M`` above the required ones, nan if q is
+        not finite; and the contacts of every constraint.
         """
         if not np.isfinite(q).all():
             return np.full((q.shape[1], len(self.min_distances)), np.nan), []

@@ -163,12 +163,9 @@ def select_residuals(
 ) -> Mask:
     """Select the residuals close to a bound at a local maximum, and nonsmooth ones that may cross it: (K, m).
 
-    Args:
-        g: Residuals, shape (K, m).
-        bounds: Bounds of the residuals.
-        thinning: Interval of grid points at which residuals are selected without being a local maximum.
-        max_distance: Largest distance from a bound; at most ``MAX_SPEED_DISTANCE`` without accelerations.
-        linearization_errors: Possible change of nonsmooth residuals, shape (K, m).
+    Without accelerations ``max_distance`` is at most ``MAX_SPEED_DISTANCE``. At every ``thinning``-th grid point
+    residuals are selected without being a local maximum. ``linearization_errors`` are possible changes of nonsmooth
+    residuals.
     """
     violations = bounds.violations(g)
     distances = np.where(bounds.accelerated, max_distance, min(max_distance, MAX_SPEED_DISTANCE))

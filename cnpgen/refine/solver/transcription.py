@@ -54,14 +54,7 @@ class ResidualKernels:
 
 
 class Transcription:
-    """One motion on one grid.
-
-    Args:
-        kernels: Residual kernels.
-        grid: The grid.
-        boundary: Boundary conditions of one motion.
-        obstacle_poses: Poses and sizes of its obstacles, shape (width,).
-    """
+    """One motion on one grid, with poses and sizes of its obstacles, shape (width,)."""
 
     def __init__(self, kernels: ResidualKernels, grid: Grid, *, boundary: Boundary, obstacle_poses: Array) -> None:
         spec = kernels.spec
@@ -123,12 +116,7 @@ class Transcription:
         return np.asarray(g.T)
 
     def objective(self, path: Array, rate: Array) -> float:
-        """Return the objective of a motion [s]: its duration and the cost term, without the regularization.
-
-        Args:
-            path: Path control points [rad], shape (C, n).
-            rate: Rate control points [1/s], shape (R,).
-        """
+        """Return the objective of a motion [s], from control points (C, n) and (R,): duration and cost term."""
         if self.kernels.cost_term is None:
             return self.duration(rate)
         e, _, weights = self._cost_residuals(path, rate)
@@ -156,13 +144,7 @@ class Transcription:
         return Linearization(x, cost, gradient, curvature, g.T, jacobian.reshape(len(w), *g.shape), rate)
 
     def rows(self, at: Linearization, k: Indices, residual: Indices) -> Array:
-        """Return the gradients of chosen residuals with respect to the variables, shape (m, nx).
-
-        Args:
-            at: Linearization of the motion.
-            k: Grid point of every row, shape (m,).
-            residual: Index of the residual of every row, shape (m,).
-        """
+        """Return the gradients of residuals with indices (m,) at grid points k, (m,), in the variables: (m, nx)."""
         return self._chain(at.jacobian[:, residual, k].T, k, at.rate, self.grid.bases)
 
     def linearization_errors(self, at: Linearization, step: float) -> Array:
