@@ -14,6 +14,7 @@ from cnpgen.refine.task import RefinementTask
 from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 FINE_POINTS = 600
 PENETRATION_SCALE_M = 1e-4  # of violated distances without a tolerance of their own
 MAX_SCALINGS = 6  # of one motion, each by the factor that its largest violation requires
@@ -31,16 +32,6 @@ class GridViolation:
     # Factor of the duration, at least 1, that removes the worst violations of velocity, acceleration, torque and jerk.
     # These scale with the rate, its square and its cube.
     time_scale: float
-
-
-@dataclass(frozen=True)
-class RestBounds:
-    """Bounds of the residuals of a robot at rest halfway along the motion, shape (m,) each."""
-
-    lower: Array  # lower bounds
-    upper: Array  # upper bounds
-    capsules: NDArray[np.bool_]  # mask of the clearances of capsules
-    equal: NDArray[np.bool_]  # mask of the equalities of positions
 
 
 class FineCheck:
@@ -97,12 +88,15 @@ class FineCheck:
         position = collision > 1 or bool(violated[:, self._bounds.orders == 0].any())
         return cost, GridViolation(max(worst, collision), position, time_scale)
 
-    def rest_bounds(self, task: RefinementTask) -> RestBounds:
-        """Return the bounds halfway along the motion, relaxed by their tolerances except for clearances."""
+    def rest_bounds(self, task: RefinementTask) -> tuple[Array, Array, Mask, Mask]:
+        """Return bounds of a robot at rest halfway along the motion, relaxed by tolerances except for clearances.
+
+        The result is ``(lower, upper, capsules, equal)``, see ``cnpgen.refine.rrt_connect.RestSpace``.
+        """
         bounds, half, capsules = self._bounds.bounds_for(task.start_xyz), FINE_POINTS // 2, self._bounds.capsules
         tolerances = np.where(capsules | self._bounds.held_clearances, 0.0, self._bounds.tolerances)
         equal = self._bounds.equal & (self._bounds.orders == 0)
-        return RestBounds(bounds.lower[half] - tolerances, bounds.upper[half] + tolerances, capsules, equal)
+        return bounds.lower[half] - tolerances, bounds.upper[half] + tolerances, capsules, equal
 
     def speed_ratio(self, task: RefinementTask, x: Array) -> float:
         """Return the factor by which a motion exceeds bounds of speeds other than those of joints, at least 1.

@@ -142,14 +142,7 @@ class Refiner:
         hulls = self.hulls if self.measures_hulls else hulls
         if hulls is not None:
             kind = CompiledHullTranscription if self.measures_hulls else HullTranscription
-            motion = kind(
-                self.residual_kernels,
-                motion.grid,
-                hulls,
-                boundary=task.boundary,
-                kernel_poses=self.kernel_poses(task),
-                obstacle_poses=task.scene.poses[0],
-            )
+            motion = kind(motion, hulls, task.scene.poses[0])
             more: Array | float = 0.0 if extra is None else extra
             if self.measures_hulls:
                 more = more - accepted_along(near_ends(motion.grid.s), self.accepted_at_ends(task))
@@ -320,9 +313,10 @@ class Refiner:
 
     def rest_space(self, task: RefinementTask) -> RestSpace:
         """Return the valid states at rest, for the search of joint-space paths."""
-        bounds, poses = self.check.rest_bounds(task), self.kernel_poses(task)
+        poses = self.kernel_poses(task)
         hulls = self.hulls if has_clearance_constraints(self.problem, self.robot) else None
-        return RestSpace(self.residual_kernels, self.robot, bounds, poses, task.scene.poses[0], hulls)
+        bounds = self.check.rest_bounds(task)
+        return RestSpace(self.residual_kernels, self.robot, *bounds, poses, task.scene.poses[0], hulls)
 
     def manifold(self, task: RefinementTask) -> EqualityKernel | None:
         """Return the equalities that compiled trees keep, or None if there are none."""

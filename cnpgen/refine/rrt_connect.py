@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.collision.tree_search import EqualityKernel, TreeSettings, estimated_duration, find_tree_path
-from cnpgen.refine.fine_check import RestBounds
 from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.refine.solver.transcription import ResidualKernels
 from cnpgen.refine.task import RefinementTask
@@ -54,7 +53,10 @@ class RestSpace:
 
     kernels: ResidualKernels  # residual kernels
     robot: Robot  # the robot
-    bounds: RestBounds  # bounds of the residuals of a state
+    lower: Array  # bounds of the residuals of a state, shape (m,)
+    upper: Array
+    capsules: NDArray[np.bool_]  # mask of the clearances of capsules, shape (m,)
+    equal: NDArray[np.bool_]  # mask of the equalities of positions, shape (m,)
     kernel_poses: Array  # scene values that the kernels take, shape (width,)
     scene_poses: Array  # poses and sizes of the obstacles of the hulls, shape (width,)
     # Hulls that decide where capsules collide, or without capsules everywhere; None where links are capsules.
@@ -62,7 +64,7 @@ class RestSpace:
 
     def follow(self, q: Array) -> Array:
         """Project K states, shape (n, K), onto the equalities; return the leading valid ones."""
-        q = self.projected(q) if self.bounds.equal.any() else q
+        q = self.projected(q) if self.equal.any() else q
         return q[:, : self._count_valid(q)]
 
     def meets_other_conditions(self, path: Array) -> bool:
@@ -70,22 +72,22 @@ class RestSpace:
         counts = [max(int(np.ceil(np.abs(b - a).max() / STATE_SPACING)), 1) for a, b in pairwise(path)]
         where = np.concatenate([k + np.arange(count) / count for k, count in enumerate(counts)])
         q = np.stack([np.interp(where, np.arange(len(path)), joint) for joint in path.T])
-        return bool(self._met(q)[~self.bounds.capsules].all())
+        return bool(self._met(q)[~self.capsules].all())
 
     def _met(self, q: Array) -> NDArray[np.bool_]:
         """Return a mask of the bounds that the states meet, shape (m, K)."""
         (g,) = self.kernels.values(*self._arguments(q))
-        return np.asarray((g >= self.bounds.lower[:, None]) & (g <= self.bounds.upper[:, None]))
+        return np.asarray((g >= self.lower[:, None]) & (g <= self.upper[:, None]))
 
     def _count_valid(self, q: Array) -> int:
         """Return the number of leading valid states."""
         met, poses = self._met(q), self.scene_poses
         if self.hulls is None:
             return _first(~np.logical_and.reduce(met))
-        first = _first(~np.logical_and.reduce(met[~self.bounds.capsules]))
+        first = _first(~np.logical_and.reduce(met[~self.capsules]))
         if first:
             first = _first(~self.hulls.clear_states(q[:, :first], poses, uncovered_only=True))
-        resolved = np.logical_and.reduce(met[self.bounds.capsules]) & self.bounds.capsules.any()
+        resolved = np.logical_and.reduce(met[self.capsules]) & self.capsules.any()
         unresolved = np.flatnonzero(~resolved[:first])
         if not len(unresolved):
             return first
@@ -95,8 +97,8 @@ class RestSpace:
     def projected(self, q: Array) -> Array:
         """Project K states onto the equalities; joints that reach a limit stay there."""
         low, high = self.robot.position_lower[:, None], self.robot.position_upper[:, None]
-        q, rows = np.clip(q, low, high), self.bounds.equal
-        lower, upper = self.bounds.lower[rows, None], self.bounds.upper[rows, None]
+        q, rows = np.clip(q, low, high), self.equal
+        lower, upper = self.lower[rows, None], self.upper[rows, None]
         for _ in range(MAX_PROJECTIONS):
             g, columns = self.kernels.jacobian(*self._arguments(q))
             error = g[rows] - (lower + upper) / 2

@@ -50,7 +50,7 @@ def compare(tool: Refiner, problem: RefinementTask, *, within: float = 1e-6) -> 
     """Compare values, selected residuals, steps up to a fraction of the box, and multipliers at five points."""
     motion = tool.transcription(problem, tool.levels.coarse)
     bounds = tool.bounds(problem, tool.levels.coarse, motion.end_residuals())
-    plain, fast = NumpyBackend(motion, bounds, 6), CompiledBackend(motion, bounds, 6)
+    plain, fast = NumpyBackend(motion, bounds), CompiledBackend(motion, bounds)
     x, multipliers, radius, compared = tool.line_guess(problem), None, 0.3, 0
     for turn in range(5):
         (cost, g, violation), value = plain.value(x), fast.value(x)
@@ -129,7 +129,7 @@ def test_no_memory_is_overwritten_with_narrower_vectors_and_all_residuals(
     problem, level = task(plan), tool.levels.coarse
     motion = tool.transcription(problem, level)
     bounds, x = tool.bounds(problem, level, motion.end_residuals()), tool.line_guess(problem)
-    plain, fast = NumpyBackend(motion, bounds, 6), CompiledBackend(motion, bounds, 6)
+    plain, fast = NumpyBackend(motion, bounds), CompiledBackend(motion, bounds)
     for guard in guards:
         guard.value = np.pi
     _, g, violation = fast.value(x)
@@ -161,7 +161,7 @@ def test_daqp_solves_programs_with_too_many_working_set_changes(monkeypatch: pyt
     plan = load("replan")
     tool, problem = refiner_of(plan), task(plan)
     motion = tool.transcription(problem, tool.levels.coarse)
-    backend = CompiledBackend(motion, tool.bounds(problem, tool.levels.coarse, motion.end_residuals()), 6)
+    backend = CompiledBackend(motion, tool.bounds(problem, tool.levels.coarse, motion.end_residuals()))
     x = tool.line_guess(problem)
     _, g, violation = backend.value(x)
     selection = ResidualSelection(violation, 0.3, 0.3, np.zeros(g.shape, bool), None)

@@ -463,7 +463,7 @@ def test_the_solution_of_a_subproblem_meets_the_optimality_conditions(
     plan, tool = load("hit"), refiner("airhockey")
     motion = tool.transcription(task(plan), tool.levels.coarse)
     bounds = tool.bounds(task(plan), tool.levels.coarse, motion.end_residuals())
-    at, backend = motion.evaluate(tool.line_guess(task(plan))), kind(motion, bounds, 6)
+    at, backend = motion.evaluate(tool.line_guess(task(plan))), kind(motion, bounds)
     selection = ResidualSelection(
         bounds.max_violation(at.g),
         max_distance=0.4,

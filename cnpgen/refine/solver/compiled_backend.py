@@ -23,6 +23,7 @@ from cnpgen.refine.solver.qp_subproblem import (
     MAX_WORKING_SET_CHANGES,
     MIN_MULTIPLIER,
     QP_TOLERANCE,
+    THINNING,
     Mask,
     NumpyBackend,
     NumpySubproblem,
@@ -91,15 +92,15 @@ def load_step_library(kernels: KernelLibrary) -> ctypes.CDLL | None:
 class CompiledBackend:
     """Backend of step.c; see ``NumpyBackend``."""
 
-    def __init__(self, motion: Transcription, bounds: Bounds, thinning: int) -> None:
+    def __init__(self, motion: Transcription, bounds: Bounds) -> None:
         library = motion.kernels.step_library
         assert library is not None
         self._evaluate, self._build, self._solve = library.evaluate, library.build_subproblem, library.solve_subproblem
         self._arrays: list[Any] = []  # keeps the memory of step.c alive
         self._points, self._m, self._nx = len(motion.grid.s), motion.kernels.values.tape.outputs[0], motion.nx
-        self._motion = self._describe(motion, bounds, thinning)
+        self._motion = self._describe(motion, bounds)
         self._address = ctypes.addressof(self._motion)
-        self._fallback, self._activate = NumpyBackend(motion, bounds, thinning), motion.activate
+        self._fallback, self._activate = NumpyBackend(motion, bounds), motion.activate
 
     def value(self, x: Array) -> tuple[float, Array, float]:
         """Evaluate a motion; see ``NumpyBackend``."""
@@ -144,7 +145,7 @@ class CompiledBackend:
         state = self._motion
         return Step(dx, state.remaining, multipliers.T, state.gain) if np.isfinite(dx).all() else None
 
-    def _describe(self, motion: Transcription, bounds: Bounds, thinning: int) -> _Motion:
+    def _describe(self, motion: Transcription, bounds: Bounds) -> _Motion:
         spec, stride = motion.spec, motion.nx + 2 + -(motion.nx + 2) % MAX_LANES
         path = end_derivatives(spec.path_control_points, spec.degree)
         rate = end_derivatives(spec.rate_control_points, spec.degree)
@@ -157,7 +158,7 @@ class CompiledBackend:
             nx=motion.nx,
             stride=stride,
             m=self._m,
-            thinning=thinning,
+            thinning=THINNING,
             eta=path.eta,
             beta=path.beta,
             rate_eta=rate.eta,

@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 from cnpgen.kernels.collision.collision_checker import MAX_JOINTS
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.bounds import NO_TIGHTENING, accepted_along, bounds_template, near_ends
-from cnpgen.refine.solver.grid import Grid
 from cnpgen.refine.solver.hulls import LINK_CONSTRAINTS, OBJECT_CONSTRAINTS, Hulls
 from cnpgen.refine.solver.residuals import DISTANCE_SCALE_M
-from cnpgen.refine.solver.transcription import Linearization, ResidualKernels, Transcription, cache_last
+from cnpgen.refine.solver.transcription import Linearization, Transcription, cache_last
 from cnpgen.robots.robot import Robot
-from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline import basis
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 from cnpgen.world.world import World
@@ -70,22 +68,14 @@ def _changed(problem: Problem, **changes: Any) -> Problem:
 
 
 class HullTranscription(Transcription):
-    """One motion on one grid with the clearances of the links' hulls as further residuals, evaluated in NumPy.
+    """A motion with the clearances of the links' hulls as further residuals, evaluated in NumPy.
 
-    The kernels take the scene values ``kernel_poses``, the hulls ``obstacle_poses``, shape (width,) each.
+    The hulls are among obstacles with ``obstacle_poses``, shape (width,), all of those of the scene.
     """
 
-    def __init__(
-        self,
-        kernels: ResidualKernels,
-        grid: Grid,
-        hulls: Hulls,
-        *,
-        boundary: Boundary,
-        kernel_poses: Array,
-        obstacle_poses: Array,
-    ) -> None:
-        super().__init__(replace(kernels, step_library=None), grid, boundary=boundary, obstacle_poses=kernel_poses)
+    def __init__(self, motion: Transcription, hulls: Hulls, obstacle_poses: Array) -> None:
+        kernels = replace(motion.kernels, step_library=None)
+        super().__init__(kernels, motion.grid, boundary=motion.boundary, obstacle_poses=motion.obstacle_poses)
         self._hulls = hulls
         self._measure = cache_last(lambda w: hulls.measure(w[: self.n], obstacle_poses))
 
@@ -107,19 +97,10 @@ class HullTranscription(Transcription):
 class CompiledHullTranscription(Transcription):
     """Such a motion with compiled kernels and hulls, see ``HullTranscription``."""
 
-    def __init__(
-        self,
-        kernels: ResidualKernels,
-        grid: Grid,
-        hulls: Hulls,
-        *,
-        boundary: Boundary,
-        kernel_poses: Array,
-        obstacle_poses: Array,
-    ) -> None:
-        self._rows = hulls.row_kernels(kernels, obstacle_poses)
-        with_rows = replace(kernels, values=self._rows.values, jacobian=self._rows.jacobian)
-        super().__init__(with_rows, grid, boundary=boundary, obstacle_poses=kernel_poses)
+    def __init__(self, motion: Transcription, hulls: Hulls, obstacle_poses: Array) -> None:
+        self._rows = hulls.row_kernels(motion.kernels, obstacle_poses)
+        kernels = replace(motion.kernels, values=self._rows.values, jacobian=self._rows.jacobian)
+        super().__init__(kernels, motion.grid, boundary=motion.boundary, obstacle_poses=motion.obstacle_poses)
 
     def activate(self) -> None:
         """Make the kernels those of this thread, see ``RowKernels``."""

@@ -23,6 +23,7 @@ ELASTIC_GRADIENT = 1e-3  # of the elastic variable's cost where nothing is viola
 MIN_MULTIPLIER = 1e-9  # smaller multipliers belong to inactive residuals
 QP_TOLERANCE = 1e-6  # primal tolerance of DAQP and of active_set.c
 MAX_WORKING_SET_CHANGES = 3000
+THINNING = 6  # interval of grid points at which residuals are selected without being a local maximum
 MAX_SPEED_DISTANCE = 0.4  # selection distance without accelerations, which grow with the square of the rate
 DAQP_LOWER, DAQP_UPPER = 3, 1  # DAQP's codes of initially active bounds
 
@@ -50,13 +51,10 @@ class ResidualSelection:
 
 
 class NumpyBackend:
-    """Evaluations and subproblems of a motion within its bounds, in NumPy and DAQP.
+    """Evaluations and subproblems of a motion within its bounds, in NumPy and DAQP."""
 
-    See ``select_residuals`` for ``thinning``.
-    """
-
-    def __init__(self, motion: Transcription, bounds: Bounds, thinning: int) -> None:
-        self._motion, self._bounds, self._thinning = motion, bounds, thinning
+    def __init__(self, motion: Transcription, bounds: Bounds) -> None:
+        self._motion, self._bounds = motion, bounds
         self._evaluate = cache_last(motion.evaluate)  # after a rejected step the iterate is the same
 
     def value(self, x: Array) -> tuple[float, Array, float]:
@@ -68,11 +66,11 @@ class NumpyBackend:
         self, x: Array, g: Array, selection: ResidualSelection, *, proximal: float, penalty: float
     ) -> "NumpySubproblem":
         """Build the subproblem at x with residuals g; it is valid until the next one is built."""
-        at = self._evaluate(x)
-        errors = self._motion.linearization_errors(at, selection.max_log_rate_change)
-        selected = select_residuals(
-            g, self._bounds, thinning=self._thinning, max_distance=selection.max_distance, linearization_errors=errors
-        )
+        at, bounds, distance = self._evaluate(x), self._bounds, selection.max_distance
+        violations, errors = bounds.violations(g), self._motion.linearization_errors(at, selection.max_log_rate_change)
+        distances = np.where(bounds.accelerated, distance, min(distance, MAX_SPEED_DISTANCE))
+        selected: Mask = local_maxima(violations) & (violations > -distances)
+        selected |= bounds.nonsmooth & (violations > -errors)
         selected |= selection.missed
         if selection.multipliers is not None:
             selected |= selection.multipliers != 0
@@ -158,24 +156,7 @@ class NumpySubproblem:
         return rows, np.where(above > 0, -DAQP_INFINITY, lower - g), np.where(below > 0, DAQP_INFINITY, upper - g)
 
 
-def select_residuals(
-    g: Array, bounds: Bounds, *, thinning: int, max_distance: float, linearization_errors: Array
-) -> Mask:
-    """Select the residuals close to a bound at a local maximum, and nonsmooth ones that may cross it: (K, m).
-
-    Without accelerations ``max_distance`` is at most ``MAX_SPEED_DISTANCE``. At every ``thinning``-th grid point
-    residuals are selected without being a local maximum. ``linearization_errors`` are possible changes of nonsmooth
-    residuals.
-    """
-    violations = bounds.violations(g)
-    distances = np.where(bounds.accelerated, max_distance, min(max_distance, MAX_SPEED_DISTANCE))
-    selected: Mask = (local_maxima(violations, thinning=thinning) & (violations > -distances)) | (
-        bounds.nonsmooth & (violations > -linearization_errors)
-    )
-    return selected
-
-
-def local_maxima(violations: Array, *, thinning: int) -> Mask:
+def local_maxima(violations: Array) -> Mask:
     """Return a mask of local maxima along the motion, their neighbors and the thinned grid, shape (K, m)."""
     peak = np.zeros(violations.shape, bool, order="F")
     peak[1:-1] = (violations[1:-1] >= violations[:-2]) & (violations[1:-1] >= violations[2:])
@@ -183,5 +164,5 @@ def local_maxima(violations: Array, *, thinning: int) -> Mask:
     mask = peak.copy("F")
     mask[1:] |= peak[:-1]
     mask[:-1] |= peak[1:]
-    mask[::thinning] = True
+    mask[::THINNING] = True
     return mask

@@ -68,7 +68,6 @@ class Settings:
     # selected.
     selection_distances: tuple[tuple[float, float], ...] = SELECTION_DISTANCES
     violation_tolerance: float = 6e-4  # largest scaled violation of a feasible iterate
-    thinning: int = 6  # interval of grid points at which inactive residuals are selected
 
 
 DEFAULT_SETTINGS = Settings()
@@ -129,10 +128,10 @@ def minimize(
     return last if iterate.converged or feasible is None else replace(feasible, iterations=iteration)
 
 
-def make_backend(motion: Transcription, bounds: Bounds, thinning: int) -> NumpyBackend | CompiledBackend:
+def make_backend(motion: Transcription, bounds: Bounds) -> NumpyBackend | CompiledBackend:
     """Return the backend of a motion: compiled if its kernels are, else NumPy."""
     compiled = motion.kernels.step_library is not None
-    return CompiledBackend(motion, bounds, thinning) if compiled else NumpyBackend(motion, bounds, thinning)
+    return CompiledBackend(motion, bounds) if compiled else NumpyBackend(motion, bounds)
 
 
 class _Iterate:
@@ -142,7 +141,7 @@ class _Iterate:
     tightened = False  # whether the last step tightened the bounds for violations between grid points
 
     def __init__(self, motion: Transcription, bounds: Bounds, settings: Settings, x: Array) -> None:
-        self._backend, self._motion = make_backend(motion, bounds, settings.thinning), motion
+        self._backend, self._motion = make_backend(motion, bounds), motion
         self._corrections = MAX_MIDPOINT_CORRECTIONS
         self.x = self._start = x
         self.cost, self._g, self.violation = self._backend.value(x)
@@ -241,13 +240,13 @@ class _Iterate:
         if tighter is None:
             return
         self.converged, self.tightened, self._corrections, self._bounds = False, True, self._corrections - 1, tighter
-        self._backend = make_backend(self._motion, tighter, self._settings.thinning)
+        self._backend = make_backend(self._motion, tighter)
         self.violation = tighter.max_violation(self._g)
 
     def _reject(self, violations: Array, selected: Mask, size: float) -> None:
         """Select the residuals that a rejected step violated; shrink the radius unless they explain the rejection."""
         violated = violations > self._settings.violation_tolerance
-        missed = local_maxima(violations, thinning=self._settings.thinning) & violated & ~selected
+        missed = local_maxima(violations) & violated & ~selected
         self._missed |= missed
         if not (missed.any() and violations[missed].max() >= violations.max()):
             self._radius = 0.35 * min(self._radius, size)
