@@ -9,17 +9,18 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.collision.collision_checker import load_collision_library
 from cnpgen.kernels.collision.tree_search import EqualityKernel
-from cnpgen.kernels.library import KernelLibrary, problem_kernels
+from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
 from cnpgen.problems.equalities import equality_residuals
 from cnpgen.problems.obstacles import table_frame_of
 from cnpgen.problems.problem import Problem
 from cnpgen.refine import initial_guesses
 from cnpgen.refine.fine_check import FineCheck
 from cnpgen.refine.grid_levels import GridLevel, GridLevels, default_grid_levels
+from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
 from cnpgen.refine.rrt_connect import RestSpace
 from cnpgen.refine.solver.bounds import Bounds, accepted_along, bounds_template, near_ends
 from cnpgen.refine.solver.compiled_backend import load_step_library
-from cnpgen.refine.solver.cost_term import CostTerm, cost_term_residuals, residual_counts
+from cnpgen.refine.solver.cost_term import choose_cost_term, cost_term_residuals, residual_counts
 from cnpgen.refine.solver.grid import make_grid
 from cnpgen.refine.solver.hull_levels import (
     CompiledHullTranscription,
@@ -30,7 +31,7 @@ from cnpgen.refine.solver.hull_levels import (
 )
 from cnpgen.refine.solver.hulls import Hulls, has_clearance_constraints
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
-from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS, Result, Settings, minimize
+from cnpgen.refine.solver.sqp import Result, Settings, minimize
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription, cache_last
 from cnpgen.refine.task import Attempt, Outcome, RefinementTask
 from cnpgen.robots.robot import Robot
@@ -52,8 +53,9 @@ class Refiner:
     """Solver of one problem, and the checks and initial guesses for it.
 
     If it ``measures_hulls``, distances of the links' hulls replace those of capsules in all levels, see
-    ``cnpgen.refine.solver.hull_levels``. Control points are those of the problem by default; ``coarser`` is a refiner
-    with these, for plans with several spans for each of its spans.
+    ``cnpgen.refine.solver.hull_levels``. By default kernels have the fastest backend of this machine, and control
+    points are those of the problem. ``coarser`` is a refiner with these, for plans with several spans for each of its
+    spans.
     """
 
     def __init__(
@@ -61,15 +63,18 @@ class Refiner:
         problem: Problem,
         robot: Robot,
         *,
-        kernels: KernelLibrary,
+        kernels: KernelLibrary | None = None,
         spec: TrajectorySpec | None = None,
-        cost_term: CostTerm | None = None,
-        settings: Settings = DEFAULT_SETTINGS,
+        options: RefineOptions = DEFAULT_OPTIONS,
         levels: GridLevels | None = None,
         coarser: "Refiner | None" = None,
     ) -> None:
-        self.problem, self.robot, self.settings, self.coarser = problem, robot, settings, coarser
+        self.problem, self.robot, self.coarser = problem, robot, coarser
         self.spec = problem.trajectory if spec is None else spec
+        self.settings = Settings(cost_tolerance=options.tolerance, max_iterations=options.max_iterations)
+        cost_term = choose_cost_term(problem, options.objective, options.weight)
+        if kernels is None:
+            kernels = problem_kernels(problem, robot, *choose_backend(None))
         library, world = load_collision_library(kernels), World(robot, problem.obstacle, problem.object_size)
         self.measures_hulls = library is not None and can_measure_hulls(problem, robot, world)
         self._library, self._hulls, solved = library, dict[int, Hulls](), problem
@@ -86,7 +91,7 @@ class Refiner:
             () if cost_term is None else residual_counts(robot, cost_term),
             load_step_library(kernels),
         )
-        self.levels = default_grid_levels(problem, settings) if levels is None else levels
+        self.levels = default_grid_levels(problem, self.settings) if levels is None else levels
         if self.measures_hulls and levels is None:  # trees avoid the hulls, so that their paths are nearly valid
             self.levels = replace(self.levels, path=self.levels.warm)
         self._world = world

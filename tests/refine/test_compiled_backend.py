@@ -12,7 +12,6 @@ import pytest
 from cnpgen.kernels import compiler
 from cnpgen.kernels.library import KernelLibrary, problem_kernels
 from cnpgen.problems.load_robot import load_robot
-from cnpgen.refine.refine_engine import load_refiner
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver import compiled_backend, qp_subproblem
 from cnpgen.refine.solver.compiled_backend import CompiledBackend
@@ -33,7 +32,7 @@ LABELS = ("hit", "replan", "transport")
 
 def refiner_of(plan: Plan) -> Refiner:
     """Return the refiner with the problem's own objective, including its cost term."""
-    return load_refiner(plan.problem, plan.robot, kernels=library(plan.problem.name))
+    return Refiner(plan.problem, plan.robot, kernels=library(plan.problem.name))
 
 
 def with_goal_acceleration(plan: Plan, constrained: bool) -> Boundary:
@@ -96,7 +95,7 @@ def test_steps_of_arms_of_any_number_of_joints_are_those_of_numpy_and_daqp(
     use_tight_tolerance(monkeypatch)
     problem = chain(tmp_path, joints, jerk=jerk)
     spec = TrajectorySpec(degree=points[0], path_control_points=points[1], rate_control_points=points[2])
-    tool = load_refiner(problem, load_robot(problem), spec=spec)
+    tool = Refiner(problem, load_robot(problem), spec=spec)
     random = np.random.default_rng(joints)
     q, dq = 0.5 * random.normal(size=(2, 1, joints)), 0.2 * random.normal(size=(2, 1, joints))
     for goal_ddq in (None, random.normal(size=(1, joints))):

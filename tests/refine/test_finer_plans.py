@@ -10,7 +10,7 @@ import pytest
 from cnpgen.plans.plans import make_plans
 from cnpgen.refine import attempts
 from cnpgen.refine.options import RefineOptions
-from cnpgen.refine.refine_engine import load_refiner, prepare
+from cnpgen.refine.refine_engine import prepare
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.sqp import Deadline
 from cnpgen.refine.strategy import PlanChecker, refine_task
@@ -88,7 +88,7 @@ def test_if_the_problem_has_too_few_control_points_the_plan_is_refined_with_its_
     shipped = load("hit")
     own = TrajectorySpec(degree=7, path_control_points=8, rate_control_points=8)
     plan = replace(shipped, problem=replace(shipped.problem, trajectory=own))
-    tool = load_refiner(plan.problem, plan.robot, spec=finer(own, 2), coarser=load_refiner(plan.problem, plan.robot))
+    tool = Refiner(plan.problem, plan.robot, spec=finer(own, 2), coarser=Refiner(plan.problem, plan.robot))
     motion = tool.check.transcription(task(plan))
     path, rate = motion.unpack(tool.line_guess(task(plan)))
     assert refined(plan, tool, task(plan, path=path, rate=rate)).valid

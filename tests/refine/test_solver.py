@@ -17,7 +17,7 @@ from cnpgen.refine import initial_guesses
 from cnpgen.refine.attempts import make_attempts
 from cnpgen.refine.grid_levels import GridLevel
 from cnpgen.refine.options import RefineOptions
-from cnpgen.refine.refine_engine import load_refiner, prepare, tasks_of
+from cnpgen.refine.refine_engine import prepare, tasks_of
 from cnpgen.refine.refine_plans import refine_plans, solve_plans
 from cnpgen.refine.refinement import Refinement
 from cnpgen.refine.refiner import Refiner
@@ -319,7 +319,7 @@ def test_an_input_plan_is_returned_with_exact_ends_and_reported_as_adjusted_if_t
     plan = load("hit")
     best = refine(plan)
     path = best.path + off * np.eye(len(best.path))[-1][:, None]  # its last control point
-    without_iterations = refiner_of(plan.problem, settings=Settings(max_iterations=0))
+    without_iterations = refiner_of(plan.problem, max_iterations=0)
     checker = PlanChecker(plan.problem, plan.robot, degree=7)
     found = refine_task(without_iterations, checker, task(plan, path=path, rate=best.rate))
     assert found.valid
@@ -369,7 +369,7 @@ def test_an_iterate_becomes_feasible_once_its_objective_has_converged(monkeypatc
 @pytest.mark.parametrize("label", LABELS)
 def test_a_rejected_step_is_never_tried_again_unchanged(label: str, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = load(label)
-    problem, tool = task(plan), refiner(plan.problem.name, cost_term_of("jerk", 1.0))
+    problem, tool = task(plan), refiner(plan.problem.name, objective="jerk", weight=1.0)
     reject, rejections = sqp._Iterate._reject, []
 
     def record(iterate: sqp._Iterate, violations: np.ndarray, selected: np.ndarray, size: float) -> None:
@@ -509,7 +509,7 @@ def test_time_scaling_is_as_large_as_the_bound_of_the_tip_speed_requires(tmp_pat
     limit = TipSpeed(highest=fastest / 1.05)
     problem = replace(plan.problem, constraint=(*plan.problem.constraint, limit))
     kernels = problem_kernels(problem, plan.robot, "numpy", tmp_path)
-    tool = Refiner(problem, plan.robot, kernels=kernels, settings=Settings(max_iterations=0))
+    tool = Refiner(problem, plan.robot, kernels=kernels, options=RefineOptions(max_iterations=0, weight=0.0))
     checker = PlanChecker(problem, plan.robot, degree=7)
     found = refine_task(tool, checker, task(plan, path=plan.motion.path[0], rate=plan.motion.rate[0]))
     assert (found.outcome, found.reason) == (Outcome.TIME_SCALED, "ok")
@@ -598,11 +598,11 @@ def test_stalled_iterations_become_feasible_on_the_same_level(monkeypatch: pytes
 @needs_compiler
 def test_first_steps_from_a_plan_select_accelerations_far_from_their_limits() -> None:
     plans = Planner("airhockey-replan").plan_batch(draw_boundary_problems("airhockey-replan", 40, seed=8).boundary)
-    tool = load_refiner(*open_problem(plans.problem))
+    tool = Refiner(*open_problem(plans.problem))
     steps = []
     for distances in (sqp.SELECTION_DISTANCES, tool.levels.warm.settings.selection_distances):
         warm = replace(tool.levels.warm, settings=replace(tool.levels.warm.settings, selection_distances=distances))
-        solver = load_refiner(tool.problem, tool.robot, levels=replace(tool.levels, warm=warm))
+        solver = Refiner(tool.problem, tool.robot, levels=replace(tool.levels, warm=warm))
         results = [solver.run_level(problem, warm, solver.input_variables(problem)) for problem in tasks_of(plans)]
         steps.append(sum(result.iterations for result in results))
     assert steps[1] < 0.95 * steps[0]
