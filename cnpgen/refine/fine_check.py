@@ -124,7 +124,7 @@ class FineCheck:
         return np.asarray(violations / np.maximum(self._bounds.tolerances, MIN_RESIDUAL_TOLERANCE))
 
     def scale_time(
-        self, task: RefinementTask, motion: Transcription, x: Array, *, unlimited: bool = False
+        self, task: RefinementTask, x: Array, *, unlimited: bool = False
     ) -> tuple[Array, float, GridViolation]:
         """Scale a motion from rest to rest uniformly in time until it meets its limits.
 
@@ -134,7 +134,7 @@ class FineCheck:
         Returns:
             ``(variables, objective, violation)`` of the scaled motion, or of the last one tried.
         """
-        total = 1.0
+        total, split = 1.0, self.transcription(task).split
         cost, violation = self.measure(task, x)
         for _ in range(MAX_SCALINGS):
             if violation.worst <= 1 or violation.time_scale <= 1 or not np.isfinite(violation.time_scale):
@@ -143,7 +143,7 @@ class FineCheck:
                 break
             total *= violation.time_scale * (1 + 1e-9)
             x = x.copy()
-            x[motion.split :] -= np.log(violation.time_scale * (1 + 1e-9))
+            x[split:] -= np.log(violation.time_scale * (1 + 1e-9))
             cost, violation = self.measure(task, x)
         return x, cost, violation
 

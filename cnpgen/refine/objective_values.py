@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem
-from cnpgen.refine.solver.cost_term import choose_cost_term, cost_term_residuals, residual_counts
 from cnpgen.refine.solver.grid import make_grid
+from cnpgen.refine.solver.residuals import choose_cost_term, cost_term_residuals, residual_counts
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 

@@ -20,7 +20,6 @@ from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
 from cnpgen.refine.rrt_connect import RestSpace
 from cnpgen.refine.solver.bounds import Bounds, accepted_along, bounds_template, near_ends
 from cnpgen.refine.solver.compiled_backend import load_step_library
-from cnpgen.refine.solver.cost_term import choose_cost_term, cost_term_residuals, residual_counts
 from cnpgen.refine.solver.grid import make_grid
 from cnpgen.refine.solver.hull_levels import (
     CompiledHullTranscription,
@@ -30,7 +29,13 @@ from cnpgen.refine.solver.hull_levels import (
     without_distances,
 )
 from cnpgen.refine.solver.hulls import Hulls, has_clearance_constraints
-from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
+from cnpgen.refine.solver.residuals import (
+    choose_cost_term,
+    cost_term_residuals,
+    residual_counts,
+    stage_jacobian,
+    stage_values,
+)
 from cnpgen.refine.solver.sqp import Result, Settings, minimize
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription, cache_last
 from cnpgen.refine.task import Attempt, Outcome, RefinementTask
@@ -253,8 +258,7 @@ class Refiner:
 
     def time_scaled(self, task: RefinementTask, attempt: Attempt, *, unlimited: bool = False) -> Attempt:
         """Scale an attempt uniformly in time; return the better of both."""
-        motion = self.check.transcription(task)
-        x, cost, violation = self.check.scale_time(task, motion, attempt.variables, unlimited=unlimited)
+        x, cost, violation = self.check.scale_time(task, attempt.variables, unlimited=unlimited)
         scaled = self.attempt(
             task, x, cost, Outcome.TIME_SCALED, iterations=attempt.iterations, violation=violation.worst
         )

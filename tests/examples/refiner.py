@@ -15,9 +15,8 @@ from cnpgen.problems.problem import Problem
 from cnpgen.refine.grid_levels import GridLevels
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.refiner import Refiner
-from cnpgen.refine.solver.cost_term import CostTerm, cost_term_residuals, residual_counts
 from cnpgen.refine.solver.grid import make_grid
-from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
+from cnpgen.refine.solver.residuals import CostTerm, cost_term_residuals, residual_counts, stage_jacobian, stage_values
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription
 from cnpgen.refine.strategy import PlanChecker, refine_task
 from cnpgen.refine.task import Attempt, RefinementTask

@@ -24,10 +24,16 @@ from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver import compiled_backend, qp_subproblem, sqp
 from cnpgen.refine.solver.bounds import INTERVAL_FRACTION, NO_TIGHTENING, Bounds, bounds_template
 from cnpgen.refine.solver.compiled_backend import CompiledBackend
-from cnpgen.refine.solver.cost_term import CostTerm, choose_cost_term, cost_term_residuals, residual_counts
 from cnpgen.refine.solver.grid import make_grid
 from cnpgen.refine.solver.qp_subproblem import NumpyBackend, ResidualSelection
-from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
+from cnpgen.refine.solver.residuals import (
+    CostTerm,
+    choose_cost_term,
+    cost_term_residuals,
+    residual_counts,
+    stage_jacobian,
+    stage_values,
+)
 from cnpgen.refine.solver.sqp import Deadline, Settings, minimize
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription
 from cnpgen.refine.strategy import PlanChecker, refine_task

@@ -129,14 +129,8 @@ def bounds_template(problem: Problem, world: World, s: Array, tightening: Tighte
 class BoundsTemplate:
     """Bounds of the motions of a problem on one grid with phases s, shape (K,); the state of its world is changed.
 
-    Attributes:
-        conditions: Conditions of the residuals.
-        tolerances: Tolerances of the verdict in scaled units, shape (m,); ``UNKNOWN_TOLERANCE`` for conservative
-            conditions.
-        orders: Highest derivative of q on which each residual depends, shape (m,).
-        equal: Mask of equalities, shape (m,).
-        capsules: Mask of clearances of capsules, those of the links or the paper's, shape (m,).
-        held_clearances: Mask of clearances of the held object from the links, shape (m,).
+    Per residual, shape (m,), it has tolerances of the verdict in scaled units (``UNKNOWN_TOLERANCE`` for conservative
+    conditions), the highest derivative of q, and masks of equalities, capsules and clearances of the held object.
     """
 
     def __init__(self, problem: Problem, world: World, s: Array, tightening: Tightening) -> None:

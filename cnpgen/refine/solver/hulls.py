@@ -57,13 +57,6 @@ class Hulls:
 
     ``has_clearance_constraints`` must hold. Without a library of compiled collision checks Coal measures. The held
     object is a part of the robot only ``with_object``.
-
-    Attributes:
-        checker: Compiled collision checks, or None.
-        obstacle_distance: Largest required distance from obstacles [m], None without such a constraint.
-        self_distance: Largest required distance of links from each other [m], None without such a constraint.
-        min_distances: Required distances [m], shape (m,), of pairs of links or of a link and an obstacle.
-        tolerances: Accepted violations of them in a valid motion [m], shape (m,).
     """
 
     def __init__(
@@ -92,11 +85,13 @@ class Hulls:
             if of_links:
                 uncovered = [frozenset((names[a], names[b])) not in covered for a, b in pairs.tolist()]
                 self._uncovered.append((pairs[np.array(uncovered, bool)], required))
+        # of pairs of links or of a link and an obstacle [m], shape (m,): required distances, and accepted violations
         self.min_distances, accepted = np.full((2, len(columns)), -np.inf)
         for constraint, group in zip(constraints, self._groups, strict=True):
             np.maximum.at(self.min_distances, group.columns, group.required)
             np.maximum.at(accepted, group.columns, group.required - _tolerance(constraint))
         self.tolerances = self.min_distances - accepted
+        # largest required distances from obstacles and of links from each other [m]; None without such a constraint
         self.obstacle_distance, (added_to_links, added_to_object) = _largest(constraints, RobotClearance, ObjectContact)
         self.self_distance, added = _largest(constraints, SelfClearance, ObjectClearance)
         self.checker = None

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
-from cnpgen.refine.solver.cost_term import CostTerm
 from cnpgen.refine.solver.grid import Bases, Grid
+from cnpgen.refine.solver.residuals import CostTerm
 from cnpgen.trajectory.boundary import Boundary, assemble, boundary_derivatives
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
@@ -47,7 +47,7 @@ class ResidualKernels:
     values: Kernel  # kernel of ``cnpgen.refine.solver.residuals.stage_values``
     jacobian: Kernel  # kernel of ``cnpgen.refine.solver.residuals.stage_jacobian``
     cost_term: CostTerm | None = None  # cost term in addition to the duration, or None
-    cost_residuals: Kernel | None = None  # kernel of ``cnpgen.refine.solver.cost_term.cost_term_residuals``, or None
+    cost_residuals: Kernel | None = None  # kernel of ``cnpgen.refine.solver.residuals.cost_term_residuals``, or None
     cost_counts: tuple[int, ...] = ()  # number of residuals of every term of the cost term
     # Library of ``cnpgen.refine.solver.compiled_backend``, or None for the NumPy backend.
     step_library: CDLL | None = None
