@@ -51,8 +51,8 @@ MANIFOLD_NODES, MANIFOLD_LARGE_TREE_NODES = 6_000, 24_000
 class RestSpace:
     """Valid states of a robot at rest for one task."""
 
-    kernels: ResidualKernels  # residual kernels
-    robot: Robot  # the robot
+    kernels: ResidualKernels
+    robot: Robot
     lower: Array  # bounds of the residuals of a state, shape (m,)
     upper: Array
     capsules: NDArray[np.bool_]  # mask of the clearances of capsules, shape (m,)

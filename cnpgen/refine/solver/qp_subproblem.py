@@ -46,7 +46,7 @@ class ResidualSelection:
     max_distance: float  # residuals are selected at local maxima within this distance of a bound
     # Bound of the change of log r; nonsmooth residuals that it could move over a bound are selected.
     max_log_rate_change: float
-    missed: Mask  # mask of residuals that are selected in any case, shape (K, m)
+    missed: Mask  # residuals that are selected in any case, shape (K, m)
     multipliers: Array | None  # multipliers of the last step, shape (K, m), or None; residuals with one are selected
 
 

@@ -78,7 +78,7 @@ def _motion(n: int, orders: int) -> tuple[Any, tuple[Any, ...]]:
 class CostTerm:
     """Sum of the terms of an objective in addition to the duration."""
 
-    terms: tuple[ObjectiveTerm, ...]  # the terms, of positive weight
+    terms: tuple[ObjectiveTerm, ...]  # of positive weight
 
     @property
     def tables(self) -> list[dict[str, Any]]:
