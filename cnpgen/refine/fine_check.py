@@ -129,10 +129,8 @@ class FineCheck:
         """Scale a motion from rest to rest uniformly in time until it meets its limits.
 
         The path is unchanged; the rate is divided by one factor. This does not reduce violations of positions or of
-        torques that gravity causes. Motions with such violations are scaled only if ``unlimited``.
-
-        Returns:
-            ``(variables, objective, violation)`` of the scaled motion, or of the last one tried.
+        torques that gravity causes. Motions with such violations are scaled only if ``unlimited``. The result is
+        ``(variables, objective, violation)`` of the scaled motion, or of the last one tried.
         """
         total, split = 1.0, self.transcription(task).split
         cost, violation = self.measure(task, x)

@@ -166,14 +166,8 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
     Raises:
         UsageError: A shape is wrong, or a value is not finite.
     """
-    arguments = {
-        "start_q": start_q,
-        "start_dq": start_dq,
-        "start_ddq": start_ddq,
-        "goal_q": goal_q,
-        "goal_dq": goal_dq,
-        "goal_ddq": goal_ddq,
-    }
+    conditions = start_q, start_dq, start_ddq, goal_q, goal_dq, goal_ddq
+    arguments = {entry.name: values for entry, values in zip(fields(Boundary), conditions, strict=False)}
     arrays = {name: _rows(name, values, n) for name, values in arguments.items() if values is not None}
     if parameters is not None:
         values = numbers("parameters", parameters)

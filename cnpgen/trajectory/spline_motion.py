@@ -329,8 +329,7 @@ def time_derivatives(p: Sequence[Array], r: Sequence[Array]) -> list[Array]:
 def states_at_times(motion: Motion, t: Array) -> tuple[Array, Array, Array]:
     """Evaluate each of N motions at one time [s], shape (N,), faster than ``Motion.at_times``, for online replanning.
 
-    Returns:
-        Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (N, n) each.
+    The result are positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (N, n) each.
     """
     s = motion.phase_at(t[:, None])[:, 0]
     p = derivatives_of_each(motion.path, motion.degree, s)

@@ -8,6 +8,7 @@ proof may have a valid plan.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -68,9 +69,8 @@ def explain_failure(problem: Problem, robot: Robot, boundary: Boundary, scene: S
     conditions = (scene.poses, *vars(boundary).values())
     if not all(values is None or np.isfinite(values).all() for values in conditions):
         return Explanation(Feasibility.INFEASIBLE, "the boundary conditions are not finite")
-    for _, text in end_violations(problem, robot, boundary, scene):
-        return Explanation(Feasibility.INFEASIBLE, text)
-    for text in _cannot_brake(problem, robot, boundary):
+    violations = (text for _, text in end_violations(problem, robot, boundary, scene))
+    for text in chain(violations, _cannot_brake(problem, robot, boundary)):
         return Explanation(Feasibility.INFEASIBLE, text)
     unknown = Explanation(Feasibility.UNKNOWN, "there is no proof of infeasibility")
     return _off_table(problem, robot, boundary) or unknown
@@ -94,12 +94,12 @@ def explain_plans(plans: "Plans", indices: Sequence[int] | None = None) -> dict[
     from cnpgen.plans.tips import correct_tips
     from cnpgen.problems.problem_record import open_problem
 
-    indices = None if indices is None else [integer("indices", index) for index in indices]
     if indices is None:
         indices = np.flatnonzero(plans.status != PlanStatus.VALID).tolist()
+    indices = [integer("indices", index) for index in indices]
     if wrong := [index for index in indices if not 0 <= index < len(plans)]:
         raise UsageError(f"there are plans 0 to {len(plans) - 1}, got {wrong[0]}", concerns="indices")
-    if not len(indices):
+    if not indices:
         return {}
     plans = correct_tips(plans)
     problem, robot = open_problem(plans.problem)

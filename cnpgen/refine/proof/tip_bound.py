@@ -32,11 +32,7 @@ class TipKinematics:
 
 
 class ArmKinematics:
-    """Positions of the tip by Pinocchio.
-
-    Attributes:
-        reach: Upper bounds of the derivatives of the tip's position by each joint, of any order, shape (n,).
-    """
+    """Positions of the tip by Pinocchio."""
 
     def __init__(self, robot: Robot) -> None:
         self._model, self._data = robot.model, robot.model.createData()
@@ -49,6 +45,7 @@ class ArmKinematics:
         ]
         lengths.append(float(np.linalg.norm(robot.chain.tip_translation)))
         outer = np.cumsum(lengths[::-1])[::-1]
+        # upper bounds of the derivatives of the tip's position by each joint, of any order, shape (n,)
         self.reach = np.array([1.0 if joint.prismatic else outer[i] for i, joint in enumerate(joints)])
 
     def at(self, q: Array) -> TipKinematics:

@@ -90,12 +90,10 @@ class NumpySubproblem:
     penalty: float  # weight of the violation
 
     def solve(self, box: Array, *, warm: Array | None = None, relax: bool = False) -> Step | None:
-        """Return the best step within the box, or None without a solution.
+        """Return the best step within the box of largest changes, shape (nx,), or None without a solution.
 
-        Args:
-            box: Largest change of every variable, shape (nx,).
-            warm: Multipliers, shape (K, m), of the residuals in the initial working set, or None.
-            relax: Whether satisfied residuals may be violated, too, up to the remaining largest violation.
+        ``warm`` are the multipliers of the residuals in the initial working set, shape (K, m). With ``relax`` satisfied
+        residuals may be violated, too, up to the remaining largest violation.
         """
         import daqp
 

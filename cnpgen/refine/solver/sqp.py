@@ -75,15 +75,10 @@ DEFAULT_SETTINGS = Settings()
 
 @dataclass
 class Deadline:
-    """Time at which a sequence of steps must have ended: iterations of a solver, or verdicts.
+    """Time at which a sequence of steps must have ended: iterations of a solver, or verdicts."""
 
-    Attributes:
-        until: Time in the clock of ``time.perf_counter`` [s].
-        max_duration: Time reserved for one step: the largest so far, times ``STEP_TIME_FACTOR`` [s].
-    """
-
-    until: float
-    max_duration: float = 0.0
+    until: float  # in the clock of ``time.perf_counter`` [s]
+    max_duration: float = 0.0  # time reserved for one step: the largest so far, times ``STEP_TIME_FACTOR`` [s]
 
     def allows(self, steps: int) -> bool:
         """Return whether there is time for so many steps."""
