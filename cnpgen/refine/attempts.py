@@ -190,7 +190,7 @@ def _is_deep(refiner: Refiner, task: RefinementTask) -> bool:
 
 def ends_penetrate(refiner: Refiner, task: RefinementTask) -> bool:
     """Return whether an end is inside an obstacle or another link, so that no motion is valid."""
-    return refiner.hulls.violation(task.ends, task.scene.poses[0], above_tolerance=True) > MIN_END_PENETRATION_M
+    return refiner.penetration(task, task.ends) > MIN_END_PENETRATION_M
 
 
 def along_tree_paths(refiner: Refiner, task: RefinementTask, best: Attempt) -> Iterator[Attempt]:

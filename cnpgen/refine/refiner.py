@@ -105,11 +105,12 @@ class Refiner:
             world,
             self.residual_kernels,
             poses=self.kernel_poses,
-            penetration=self._penetration if self.measures_hulls else None,
+            penetration=self.penetration if self.measures_hulls else None,
         )
         has_manifold = self.measures_hulls and bool(self.check.equalities)
         self._equalities = kernels.load_by_structure(equality_residuals) if has_manifold else None
-        self.accepted_at_ends = cache_last(self._measure_ends)  # several levels of a task need it
+        # by how much the hulls at both ends violate their distances within the tolerance [m], shape (2, m)
+        self.accepted_at_ends = cache_last(lambda task: self.hulls.accepted_at(task.ends, task.scene.poses[0]))
         every, orders = tuple(vars(self.levels).values()), problem.path_orders
         self._grids = {points: make_grid(self.spec, points, orders) for points in {level.points for level in every}}
         self._feedbacks = dict[int, HullFeedback]()
@@ -172,7 +173,7 @@ class Refiner:
         """Return the scene values that the residual kernels take, shape (width,)."""
         return task.scene.poses[0, self._kernel_poses]
 
-    def _penetration(self, task: RefinementTask, q: Array) -> float:
+    def penetration(self, task: RefinementTask, q: Array) -> float:
         """Return by how much the hulls at states q (n, K) violate their required distances above the tolerance [m]."""
         return self.hulls.violation(q, task.scene.poses[0], above_tolerance=True)
 
@@ -237,10 +238,6 @@ class Refiner:
             earlier, result = result.iterations, self.run_level(task, level, result.x, extra=extra)
             result = replace(result, iterations=earlier + result.iterations)
         return result
-
-    def _measure_ends(self, task: RefinementTask) -> Array:
-        """Return by how much the hulls at both ends violate their distances within the tolerance [m], shape (2, m)."""
-        return self.hulls.accepted_at(task.ends, task.scene.poses[0])
 
     def _feedback(self, level: GridLevel) -> HullFeedback:
         if level.points not in self._feedbacks:

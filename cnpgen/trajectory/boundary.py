@@ -201,9 +201,7 @@ def _repeated(rows: Array, count: int) -> Array:
 def start_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
     """Compute the first three path control points [rad], shape (N, 3, n)."""
     _check_joints(boundary)
-    path, speed = _end_derivatives(spec)
-    dr = speed.eta * (rate[:, 1:2] - rate[:, :1])
-    return _three(boundary.start_q, boundary.start_dq, boundary.start_ddq, rate[:, :1], dr=dr, path=path)
+    return _three(boundary.start_q, boundary.start_dq, boundary.start_ddq, rate[:, :1], rate[:, 1:2], spec=spec)
 
 
 def goal_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
@@ -212,13 +210,12 @@ def goal_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
     They are three if the goal's acceleration is prescribed.
     """
     _check_joints(boundary)
-    path, speed = _end_derivatives(spec)
     # With reversed phase, r' and p' change sign: the goal is a start with -dq.
     if boundary.goal_ddq is None:
+        path, _ = _end_derivatives(spec)
         before = boundary.goal_q - boundary.goal_dq / rate[:, -1:] / path.eta
         return np.concatenate([before[:, None], boundary.goal_q[:, None]], axis=1)
-    dr = speed.eta * (rate[:, -2:-1] - rate[:, -1:])
-    points = _three(boundary.goal_q, -boundary.goal_dq, boundary.goal_ddq, rate[:, -1:], dr=dr, path=path)
+    points = _three(boundary.goal_q, -boundary.goal_dq, boundary.goal_ddq, rate[:, -1:], rate[:, -2:-1], spec=spec)
     return points[:, ::-1]
 
 
@@ -241,13 +238,13 @@ def _end_derivatives(spec: TrajectorySpec) -> tuple[EndDerivatives, EndDerivativ
     return path, end_derivatives(spec.rate_control_points, spec.degree)
 
 
-def _three(q: Array, dq: Array, ddq: Array, rate: Array, *, dr: Array, path: EndDerivatives) -> Array:
-    """Compute the control points at s = 0 from q, dq, ddq, r(0) and r'(0)."""
-    eta, beta = path.eta, path.beta
-    first = dq / rate  # p'(0)
-    second = (ddq - first * dr * rate) / rate**2  # p''(0), from ddq = p'' r^2 + p' r' r
-    c1 = q + first / eta
-    c2 = second / beta - 2 * q + 3 * c1
+def _three(q: Array, dq: Array, ddq: Array, outer: Array, inner: Array, *, spec: TrajectorySpec) -> Array:
+    """Compute the control points at s = 0 from q, dq, ddq and the first two rate control points, shape (N, 1) each."""
+    path, speed = _end_derivatives(spec)
+    first, dr = dq / outer, speed.eta * (inner - outer)  # p'(0), r'(0)
+    second = (ddq - first * dr * outer) / outer**2  # p''(0), from ddq = p'' r^2 + p' r' r
+    c1 = q + first / path.eta
+    c2 = second / path.beta - 2 * q + 3 * c1
     points = np.empty((len(q), 3, q.shape[1]), c2.dtype)  # np.stack takes as long as the computation
     points[:, 0], points[:, 1], points[:, 2] = q, c1, c2
     return points

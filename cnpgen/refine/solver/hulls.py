@@ -178,7 +178,8 @@ class Hulls:
     def gradients(self, q: Array, distances: Array, groups: list[Contacts]) -> Array:
         """Differentiate the result of ``measure`` in q: shape (n, m, K), 0 for parts out of range."""
         gradients = np.zeros((q.shape[1], len(self.min_distances), self._n))
-        axes, origins = self._joint_axes(q)
+        rotations, positions = self._kinematics.poses(q)  # of the joints in the world frame
+        axes, origins = np.einsum("jxyk,jy->kjx", rotations[1:], self._axes), positions[1:].transpose(2, 0, 1)
         for contacts, group in zip(groups, self._groups, strict=True):
             k, column = contacts.k, group.columns[contacts.pair]
             normals = np.repeat(contacts.normal[:, None], 2, axis=1)
@@ -237,12 +238,6 @@ class Hulls:
         joints = self._bodies.joints_of(group.pairs[pair])
         k, distance, normal, points = close.k[kept], close.distance[kept], close.normal[kept], close.points[kept]
         return Contacts(pair, k, distance, normal, points, joints)
-
-    def _joint_axes(self, q: Array) -> tuple[Array, Array]:
-        """Return axes and origins [m] of the joints in the world frame, shape (K, n, 3) each."""
-        rotations, positions = self._kinematics.poses(q)
-        axes = np.einsum("jxyk,jy->kjx", rotations[1:], self._axes)
-        return axes, positions[1:].transpose(2, 0, 1)
 
     def _place(self, q: Array, obstacle_poses: Array) -> None:
         self._bodies.place(*self._kinematics.poses(q), solids_of(self._obstacles, obstacle_poses))
