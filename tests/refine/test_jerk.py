@@ -90,7 +90,7 @@ def test_the_fine_check_scales_time_by_the_cube_root_of_the_jerk_ratio() -> None
     s = check.transcription(task(plan)).grid.s
     worst = np.abs(plan.motion.at(s).jerk[0] / plan.robot.jerk_limit).max()
     assert violation.time_scale == pytest.approx(np.cbrt(worst), rel=1e-6)
-    time_scaled, _, after = check.scale_time(task(plan), check.transcription(task(plan)), x, unlimited=True)
+    time_scaled, _, after = check.scale_time(task(plan), x, unlimited=True)
     assert after.worst <= 1
     path, rate = check.transcription(task(plan)).unpack(time_scaled)
     jerk = Motion(path[None], rate[None]).at(s).jerk[0]

@@ -286,7 +286,7 @@ def test_a_motion_from_rest_to_rest_that_is_too_fast_is_scaled_by_the_exact_fact
     motion = tool.check.transcription(problem)
     x = motion.pack(good.path, good.rate * 1.1)
     _, before = tool.check.measure(problem, x)
-    time_scaled, _, after = tool.check.scale_time(problem, motion, x)
+    time_scaled, _, after = tool.check.scale_time(problem, x)
     assert before.worst > 1 >= after.worst
     path, rate = motion.unpack(time_scaled)
     np.testing.assert_allclose(path, motion.unpack(x)[0], atol=1e-14)
