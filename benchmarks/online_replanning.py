@@ -38,7 +38,6 @@ from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
 from cnpgen.refine.options import DEFAULT_OPTIONS
-from cnpgen.refine.refine_engine import load_refiner
 from cnpgen.refine.refine_plans import refine_plans
 from cnpgen.refine.refiner import Refiner
 from cnpgen.trajectory.boundary import Boundary
@@ -215,7 +214,7 @@ def refine_finer_knots(plans: list[Plans], refined: list[Made], spec: Trajectory
 def load_refiner_of(plans: Plans) -> Refiner:
     """Load a refiner that uses all control points of plans."""
     problem, robot = open_problem(plans.problem)
-    return load_refiner(problem, robot, spec=plans.motion.spec)
+    return Refiner(problem, robot, spec=plans.motion.spec)
 
 
 def refine_each(plans: Plans, refiner: Refiner | None = None) -> list[Made]:

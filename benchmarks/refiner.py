@@ -35,7 +35,7 @@ from cnpgen.problems.problem_record import open_problem
 from cnpgen.refine.grid_levels import GridLevels, default_grid_levels
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.proof.explain import explain_plans
-from cnpgen.refine.refine_engine import load_refiner, prepare, tasks_of
+from cnpgen.refine.refine_engine import prepare, tasks_of
 from cnpgen.refine.refine_plans import refine_plans
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.sqp import Settings
@@ -159,7 +159,7 @@ def planned(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
 
 def with_numpy(plans: Plans) -> Refiner:
     """Return a refiner with compiled kernels and the NumPy backend."""
-    refiner = load_refiner(*open_problem(plans.problem))
+    refiner = Refiner(*open_problem(plans.problem))
     refiner.residual_kernels = replace(refiner.residual_kernels, step_library=None)
     return refiner
 
@@ -285,7 +285,7 @@ def wide_band(problems: Plans) -> Refiner:
     problem, robot = open_problem(problems.problem)
     usual = vars(default_grid_levels(problem, Settings()))
     wider = {name: replace(level, tightening=replace(level.tightening, band=0.9)) for name, level in usual.items()}
-    refiner = load_refiner(problem, robot, levels=GridLevels(**wider))
+    refiner = Refiner(problem, robot, levels=GridLevels(**wider))
     refiner.check.equalities = set()  # plans that use the tolerance need no finer level
     return refiner
 

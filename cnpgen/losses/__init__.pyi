@@ -1,10 +1,10 @@
 from cnpgen.losses.margins import Margins as Margins
 from cnpgen.losses.margins import suggested_margins as suggested_margins
+from cnpgen.losses.metric import BOUNDED as BOUNDED
+from cnpgen.losses.metric import PUBLISHED as PUBLISHED
 from cnpgen.losses.metric import Metric as Metric
-from cnpgen.losses.metric_settings import BOUNDED as BOUNDED
-from cnpgen.losses.metric_settings import PUBLISHED as PUBLISHED
-from cnpgen.losses.metric_settings import MetricSettings as MetricSettings
-from cnpgen.losses.metric_settings import suggested_weights as suggested_weights
+from cnpgen.losses.metric import MetricSettings as MetricSettings
+from cnpgen.losses.metric import suggested_weights as suggested_weights
 from cnpgen.losses.plan_loss import LossValue as LossValue
 from cnpgen.losses.plan_loss import PlanLoss as PlanLoss
 from cnpgen.losses.quadrature import rotating_shift as rotating_shift

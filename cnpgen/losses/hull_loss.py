@@ -25,13 +25,9 @@ TRAINING_DISTANCE_M = 0.02  # in addition to the required one, so that plans kee
 
 
 class HullLoss:
-    """Loss of the first constraint ``robot-clearance``, which the kernels of the loss omit.
+    """Loss of the first constraint ``robot-clearance``, which the kernels of a problem with placed obstacles omit.
 
-    Args:
-        problem: A problem whose samples place obstacles.
-        robot: Its robot.
-        kernels: Library of its kernels.
-        tightening: Factors, then insets of all constraints, shape (2 m,).
+    ``tightening`` has the factors, then the insets of all constraints, shape (2 m,).
 
     Raises:
         UsageError: The problem has no constraint ``robot-clearance``, or its robot no link geometry.
@@ -52,12 +48,8 @@ class HullLoss:
     ) -> None:
         """Add the loss to the results of a block, and its weighted gradients if there are any.
 
-        Args:
-            results: Terms, shape (1 + m, lanes), and gradients, samples last; changed in place.
-            batch: The N plans of the block.
-            weights: Weights of the constraints, shape (m,).
-            table: Basis functions at the nodes.
-            shift: Shift of the nodes.
+        The results are changed in place: terms, shape (1 + m, lanes), and gradients, samples last. The batch has the N
+        plans of the block, and constraints have weights of shape (m,).
         """
         terms, by_path, by_rate = results
         nodes, count, stride = len(table.s), len(batch), min(NODE_STRIDE, len(table.s))

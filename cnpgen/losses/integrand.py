@@ -1,10 +1,12 @@
 """The integrand: the step losses of one phase of one plan and their gradient, as SX.
 
 Terms are the task loss and one per constraint of the problem, all times ``dt/ds = 1 / r`` (paper, section on loss
-functions) and the quadrature weight of the node.
+functions) and the quadrature weight of the node. A condition ``lower <= g <= upper`` has the violation
+``e = g - min(max(g, lower), upper)``. ``Huber(e)`` is the paper's ``Huber(ReLU(.))`` of an inequality and its
+``Huber(d)`` of an equality. Its derivative is e clipped to [-1, 1].
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,15 +14,87 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.kernels.symbolic.linalg import dot
 from cnpgen.kernels.symbolic.symbolic_state import FrozenState, SymbolicState, time_derivatives
 from cnpgen.kernels.tape import Axes, GridSpec
 from cnpgen.losses.published_conditions import published_conditions
-from cnpgen.losses.terms import Term, constraint_term, task_term
 from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.objectives import ObjectiveTerm
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 
 Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Term:
+    """A step loss."""
+
+    value: Any  # an SX scalar
+    parts: list[tuple[Any, Any]]  # SX scalars with the derivatives of the loss with respect to them
+
+
+def task_term(state: SymbolicState, objective: Sequence[ObjectiveTerm]) -> Term:
+    """Return the step loss of the objective: ``1 + sum of weight_i size_i``; ``1 + eta kappa v^2`` in the paper."""
+    import casadi as ca
+
+    value, parts = ca.SX(1), []
+    for term in objective:
+        residuals = term.training_residuals(state)
+        squares = dot(residuals, residuals)
+        smoothing = term.smoothing if term.training_smoothing is None else term.training_smoothing
+        if smoothing > 0:
+            size = ca.sqrt(squares + smoothing**2) - smoothing
+            parts.append((size, term.weight))
+        else:
+            size = squares
+            parts += [(e, 2 * term.weight * e) for e in residuals]
+        value += term.weight * size
+    return Term(value, parts)
+
+
+def constraint_term(conditions: Sequence[Condition], factor: Any, inset: Any, relaxation: Sequence[Any]) -> Term:
+    """Return the sum of Huber's losses of all conditions of a constraint.
+
+    Limits shrink by a factor, toward their center if they are not symmetric to zero. Other bounds are moved inwards by
+    an inset; equalities are unchanged. The bounds of every value are moved outwards by its relaxation, or None.
+    """
+    import casadi as ca
+
+    value, parts = ca.SX(0), []
+    for (g, lower, upper), width in zip(_bounded(conditions, factor, inset), relaxation, strict=True):
+        nearest = g
+        if lower is not None:
+            nearest = ca.fmax(nearest, lower if width is None else lower - width)
+        if upper is not None:
+            nearest = ca.fmin(nearest, upper if width is None else upper + width)
+        derivative = ca.fmin(ca.fmax(g - nearest, -1), 1)
+        value += derivative * (g - nearest - 0.5 * derivative)
+        parts.append((g, derivative))
+    return Term(value, parts)
+
+
+def _bounded(conditions: Sequence[Condition], factor: Any, inset: Any) -> Iterator[tuple[Any, Any, Any]]:
+    """Yield values with their tightened bounds, None for a missing bound."""
+    for condition in conditions:
+        for g, low, high in zip(condition.g, condition.lower.tolist(), condition.upper.tolist(), strict=True):
+            if low == high:
+                yield g, low, high
+            elif condition.tolerance_kind != "limit":
+                yield g, low + inset if np.isfinite(low) else None, high - inset if np.isfinite(high) else None
+            elif np.isfinite(low) and np.isfinite(high):
+                center, half = (low + high) / 2, (high - low) / 2
+                yield g, center - half * factor, center + half * factor
+            else:
+                reduction = 1 - factor
+                yield (
+                    g,
+                    low + abs(low) * reduction if np.isfinite(low) else None,
+                    high - abs(high) * reduction if np.isfinite(high) else None,
+                )
+
+
+# Kernels
 
 
 def grid_specs(problem: Problem) -> tuple[GridSpec, GridSpec]:
@@ -38,25 +112,15 @@ def relaxation_argument(problem: Problem) -> int:
 
 @dataclass(frozen=True)
 class Inputs:
-    """The arguments of the kernels as SX columns, in order, with the axes of ``grid_specs``.
+    """The arguments of the kernels as SX columns, in order, with the axes of ``grid_specs``."""
 
-    Attributes:
-        path: p, p' and p'' [rad], n each, and p''' if the jerk is constrained.
-        rate: r and r' [1/s], and r'' if the jerk is constrained.
-        obstacle_poses: Poses and sizes of the obstacles.
-        relaxation: Relaxation of the conditions with time-varying bounds, in their units.
-        node: Quadrature weight.
-        tightening: Factors of the limits of all constraints, then insets of the other bounds of all constraints.
-        weights: Weight of every constraint (the paper's e^alpha).
-    """
-
-    path: tuple[Any, ...]
-    rate: Any
-    obstacle_poses: Any
-    relaxation: Any
-    node: Any
-    tightening: Any
-    weights: Any
+    path: tuple[Any, ...]  # p, p' and p'' [rad], n each, and p''' if the jerk is constrained
+    rate: Any  # r and r' [1/s], and r'' if the jerk is constrained
+    obstacle_poses: Any  # poses and sizes of the obstacles
+    relaxation: Any  # relaxation of the conditions with time-varying bounds, in their units
+    node: Any  # quadrature weight
+    tightening: Any  # factors of the limits of all constraints, then insets of the other bounds of all constraints
+    weights: Any  # weight of every constraint (the paper's e^alpha)
 
     @property
     def columns(self) -> list[Any]:
@@ -113,15 +177,10 @@ def time_varying_conditions(problem: Problem, robot: Robot, form: str) -> list[t
 def relaxation_of(
     time_varying: Sequence[tuple[Constraint, Condition]], s: NDArray[np.float64], start_tip: Array
 ) -> Array:
-    """Return the relaxation of time-varying bounds, of motions that may start outside a constraint.
+    """Return the relaxation of the conditions of ``time_varying_conditions``, each in its unit, shape (values, K, N).
 
-    Args:
-        time_varying: The conditions of ``time_varying_conditions``.
-        s: Phases, shape (K,).
-        start_tip: Positions of the tip at the start [m], shape (N, 3).
-
-    Returns:
-        Relaxation of every value in its unit, shape (values, K, N).
+    It is that of motions that may start outside a constraint: at phases s, shape (K,), with positions of the tip at the
+    start [m], shape (N, 3).
 
     Raises:
         UsageError: ``bound_relaxation`` of a constraint returns another shape than its contract states.

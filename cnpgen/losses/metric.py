@@ -7,32 +7,101 @@ The default is therefore a metric whose weights grow with the progress of a run.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.losses.metric_settings import Average, MetricSettings
-from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.problems.problem import Problem
+from cnpgen.schema.argument_types import check_fields, checked_arguments
 from cnpgen.schema.arguments import numbers
 
 Array = NDArray[np.float64]
+Kind = Literal["fixed", "ramped", "learned"]
+Average = Literal["mean", "median", "trimmed"]
+
+WEIGHT_FACTOR = 100.0  # of the weight in the problem file, for constraint classes without ``training_weight``
 TRIMMED_FRACTION = 0.1  # of the plans, those with the largest losses, excluded from a trimmed mean
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricSettings:
+    """The dependence of weights on the progress of a run (0 at its start, 1 at its end) and on the losses of plans.
+
+    Attributes:
+        kind: "fixed": the first weights; "ramped": growing weights; "learned": the published rule.
+        growth: Factor by which ramped weights grow, and budgets of the learned metric shrink, during the ramp.
+        ramp: Progress at the start and the end of the ramp, which is geometric.
+        gamma: Step size of the learned metric.
+        every: Interval of its steps: "epoch", as published, or "batch".
+        largest_log: Bound on ``|log(mean L_i / C_i)|`` in a step, from the authors' implementation.
+        lowest: Lower bound of a learned weight; without it the weight of a term without violations decreases forever.
+        highest: Upper bound of a learned weight.
+        budget_factor: Factor of all budgets of the learned metric.
+        average: Average over the plans of a batch: "mean" as published, "median" or "trimmed".
+        frozen: Progress after which a learned metric is constant.
+    """
+
+    kind: Kind = "ramped"
+    growth: float = 30.0
+    ramp: tuple[float, float] = (0.1, 0.95)
+    gamma: float = 1e-2
+    every: Literal["epoch", "batch"] = "epoch"
+    largest_log: float = 10.0
+    lowest: float = 0.0
+    highest: float = math.inf
+    budget_factor: float = 1.0
+    average: Average = "mean"
+    frozen: float = math.inf
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        for name in ("growth", "gamma", "largest_log", "highest", "budget_factor"):
+            if not getattr(self, name) > 0:
+                raise UsageError(f"{name} of a metric must be above 0, got {getattr(self, name)}", concerns=name)
+        if not self.lowest <= self.highest:
+            raise UsageError(f"must be at most highest = {self.highest}, got {self.lowest}", argument="lowest")
+        ramp = numbers("ramp", self.ramp)
+        if ramp.shape != (2,) or not 0 <= ramp[0] < ramp[1]:
+            raise UsageError(
+                f"the ramp of a metric must begin at 0 or later and before it ends, got {self.ramp!r:.99}",
+                concerns="ramp",
+            )
+
+    @checked_arguments
+    def grown(self, progress: float) -> float:
+        """Return the factor of the ramp."""
+        begin, end = self.ramp
+        return float(self.growth ** min(max((progress - begin) / (end - begin), 0.0), 1.0))
+
+
+# The paper's rule with the authors' bound of the logarithm; the paper's budgets belong to PlanLoss(..., form="paper").
+PUBLISHED = MetricSettings(kind="learned", growth=1.0)
+# The same rule for short runs: steps per batch, decreasing budgets, bounds, and a mean that is robust to outliers.
+BOUNDED = MetricSettings(
+    kind="learned",
+    growth=400.0,
+    ramp=(0.1, 0.6),
+    gamma=1e-3,
+    every="batch",
+    lowest=1e-4,
+    highest=1e6,
+    average="trimmed",
+    frozen=0.67,
+)
 
 
 def alpha_step(
     alpha: ArrayLike, losses: ArrayLike, budgets: ArrayLike, *, gamma: float, largest_log: float = 10.0
 ) -> Array:
-    """Take one step of the metric, ``alpha_i + gamma log(L_i / C_i)`` (paper, update rule of alpha).
+    """Take one step of the metric, ``alpha_i + gamma log(L_i / C_i)`` (paper, update rule of alpha), shape (m,).
 
-    Args:
-        alpha: Logarithms of the weights, shape (m,).
-        losses: Mean of every term, shape (m,). A value that is not finite leaves its weight unchanged.
-        budgets: Acceptable value of every term (the paper's C-bar^2), shape (m,). 0 leaves its weight unchanged.
-        gamma: Step size.
-        largest_log: Bound on the absolute value of the logarithm.
+    The logarithm is at most ``largest_log`` in absolute value. A mean that is not finite, or a budget (the paper's
+    C-bar^2) of 0, leaves its weight unchanged.
     """
     before, mean, budget = (np.asarray(x, float) for x in (alpha, losses, budgets))
     learned = (budget > 0) & np.isfinite(mean)
@@ -44,15 +113,7 @@ def alpha_step(
 
 
 def average_loss(terms: ArrayLike, average: Average) -> Array:
-    """Average every term over valid plans; nan if there are none.
-
-    Args:
-        terms: Losses of N plans, shape (N, m).
-        average: Kind of average.
-
-    Returns:
-        Shape (m,).
-    """
+    """Average every term of the losses of N plans, shape (N, m), over valid plans, shape (m,); nan without any."""
     values = np.asarray(terms, float)
     values = values[np.isfinite(values).all(axis=1)]
     if len(values) == 0:
@@ -167,3 +228,26 @@ class Metric:
                 f"the state is that of a metric of {alpha.size} terms, expected {self.alpha.size}", concerns="state"
             )
         self.alpha, self._sum, self._count = alpha, total, count
+
+
+@checked_arguments
+def suggested_weights(problem: Problem, weights0: ArrayLike) -> Array:
+    """Return first weights: ``training_weight`` of the constraint classes, else 100 times those of the problem file.
+
+    With the weights of the shipped classes, planners of the shipped problems became valid within minutes. They are the
+    base of the fixed and ramped metrics.
+
+    Args:
+        problem: The problem.
+        weights0: Weights from the problem file, ``PlanLoss.weights0``, shape (m,).
+    """
+    weights = numbers("weights0", weights0)
+    if weights.shape != (len(problem.constraint),):
+        expected = f"({len(problem.constraint)},), one weight per constraint"
+        raise UsageError(f"must have shape {expected}, got {weights.shape}", argument="weights0")
+    pairs = zip(problem.constraint, weights.tolist(), strict=True)
+    suggested = [
+        WEIGHT_FACTOR * weight if constraint.training_weight is None else constraint.training_weight
+        for constraint, weight in pairs
+    ]
+    return np.array(suggested)

@@ -18,21 +18,13 @@ MAX_VECTOR_LANES = 16
 
 @dataclass(frozen=True)
 class PlanBatch:
-    """N plans with their obstacle poses and start positions.
+    """N plans with their obstacle poses and start positions."""
 
-    Attributes:
-        path: Path control points [rad], shape (N, C, n).
-        rate: Rate control points [1/s], shape (N, R).
-        obstacle_poses: Poses and sizes of the obstacles, shape (N, width).
-        start_tip: Positions of the tip at the start [m], shape (N, 3), float64, or None.
-        valid: Mask of the plans that are finite with positive rate control points, shape (N,).
-    """
-
-    path: Array
-    rate: Array
-    obstacle_poses: Array
-    start_tip: Array | None
-    valid: NDArray[np.bool_]
+    path: Array  # path control points [rad], shape (N, C, n)
+    rate: Array  # rate control points [1/s], shape (N, R)
+    obstacle_poses: Array  # poses and sizes of the obstacles, shape (N, width)
+    start_tip: Array | None  # positions of the tip at the start [m], shape (N, 3), float64, or None
+    valid: NDArray[np.bool_]  # mask of the plans that are finite with positive rate control points, shape (N,)
 
     def __len__(self) -> int:
         return len(self.rate)
@@ -93,11 +85,7 @@ def check_batch(
 
 
 def check_shapes(problem: Problem, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Check the shapes of the arrays of plans.
-
-    Args:
-        problem: The problem.
-        shapes: Shapes of ``path``, ``rate`` and, if present, ``obstacle_poses`` and ``start_tip``.
+    """Check the shapes of ``path``, ``rate`` and, if present, ``obstacle_poses`` and ``start_tip``.
 
     Raises:
         UsageError: A shape is wrong, or the obstacle poses are missing.

@@ -23,16 +23,11 @@ RULES = ("cosine", "gauss")
 
 
 def quadrature(rule: str, nodes: int, shift: float = 0.0) -> tuple[Array, Array]:
-    """Return nodes and weights on [0, 1].
+    """Return K nodes and weights on [0, 1], shape (K,) each; the weights sum to 1.
 
-    Args:
-        rule: "cosine": the midpoint rule in theta; "gauss": Gauss-Legendre.
-        nodes: Number of nodes K.
-        shift: Offset of the nodes of the cosine rule, as a fraction of their spacing in theta, in [0, 1). The average
-            over shifts covers the intervals between nodes.
-
-    Returns:
-        ``(s, weights)``, shape (K,) each; the weights sum to 1.
+    The rule is "cosine", the midpoint rule in theta, or "gauss", Gauss-Legendre. The nodes of the cosine rule are
+    offset by a fraction of their spacing in theta, in [0, 1). The average over shifts covers the intervals between
+    nodes.
 
     Raises:
         UsageError: The rule does not exist, the number of nodes is no positive integer, or the shift is not in [0, 1).
@@ -74,19 +69,12 @@ def rotating_shift(step: int, count: int = 8) -> float:
 
 @dataclass(frozen=True)
 class BasisTable:
-    """The basis functions at the nodes.
+    """The basis functions at the nodes."""
 
-    Attributes:
-        s: Phases, shape (K,), float64.
-        weights: Quadrature weights, shape (1, K).
-        path: Basis functions of p and its derivatives, shape (orders K, C).
-        rate: Basis functions of r and its derivatives, shape ((orders - 1) K, R).
-    """
-
-    s: Array
-    weights: NDArray[Any]
-    path: NDArray[Any]
-    rate: NDArray[Any]
+    s: Array  # phases, shape (K,), float64
+    weights: NDArray[Any]  # quadrature weights, shape (1, K)
+    path: NDArray[Any]  # basis functions of p and its derivatives, shape (orders K, C)
+    rate: NDArray[Any]  # basis functions of r and its derivatives, shape ((orders - 1) K, R)
 
 
 @lru_cache(maxsize=64)

@@ -24,8 +24,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import check_memory, concerning, numbers
 from cnpgen.store.dataset_spec import StoredProblem
-from cnpgen.trajectory.boundary import Boundary
-from cnpgen.trajectory.boundary_arguments import boundary_of
+from cnpgen.trajectory.boundary import Boundary, boundary_of
 from cnpgen.trajectory.remaining_trajectory import remaining_trajectory, with_finer_knots
 
 Array = NDArray[np.float64]

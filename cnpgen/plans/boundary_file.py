@@ -22,8 +22,7 @@ from cnpgen.store.files.checksum_file import verify_checksum
 from cnpgen.store.files.hdf5 import opened_hdf5
 from cnpgen.store.paths import HDF5_KINDS, require_file
 from cnpgen.store.shard import SHARD_FORMAT
-from cnpgen.trajectory.boundary import Boundary
-from cnpgen.trajectory.boundary_arguments import boundary_of
+from cnpgen.trajectory.boundary import Boundary, boundary_of
 
 CONTEXT = ("hit_angle", "hit_speed")  # dataset columns that plans keep
 ASKED = (*CONDITIONS, "sample_id", OBSTACLE_POSES, GOAL_OPTION, *CONTEXT)

@@ -14,6 +14,7 @@ from cnpgen.refine.task import RefinementTask
 from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 FINE_POINTS = 600
 PENETRATION_SCALE_M = 1e-4  # of violated distances without a tolerance of their own
 MAX_SCALINGS = 6  # of one motion, each by the factor that its largest violation requires
@@ -24,51 +25,20 @@ MAX_SCALING = 1.25  # a motion that must be slower by more is left to the solver
 
 @dataclass(frozen=True)
 class GridViolation:
-    """Largest violation of the bounds on the fine grid.
+    """Largest violation of the bounds on the fine grid."""
 
-    Attributes:
-        worst: Largest violation as a multiple of its tolerance; inf where a residual is not finite.
-        position: Whether a condition on q alone violates its tolerance.
-        time_scale: Factor of the duration, at least 1, that removes the worst violations of velocity, acceleration,
-            torque and jerk. These scale with the rate, its square and its cube.
-    """
-
-    worst: float
-    position: bool
+    worst: float  # largest violation as a multiple of its tolerance; inf where a residual is not finite
+    position: bool  # whether a condition on q alone violates its tolerance
+    # Factor of the duration, at least 1, that removes the worst violations of velocity, acceleration, torque and jerk.
+    # These scale with the rate, its square and its cube.
     time_scale: float
-
-
-@dataclass(frozen=True)
-class RestBounds:
-    """Bounds of the residuals of a robot at rest halfway along the motion, shape (m,) each.
-
-    Attributes:
-        lower: Lower bounds.
-        upper: Upper bounds.
-        capsules: Mask of the clearances of capsules.
-        equal: Mask of the equalities of positions.
-    """
-
-    lower: Array
-    upper: Array
-    capsules: NDArray[np.bool_]
-    equal: NDArray[np.bool_]
 
 
 class FineCheck:
     """Evaluation of motions of one problem on the fine grid.
 
-    Args:
-        problem: The problem.
-        world: Its world.
-        kernels: Its residual kernels.
-        poses: Function that returns the scene values of a task that the kernels take.
-        penetration: Function of a task and states (n, K) that returns by how much distances that the kernels do not
-            compute are violated above their tolerance [m]; None if there are none.
-
-    Attributes:
-        equalities: Names of the equality conditions.
-        transcription: Function that returns the transcription of a task on the fine grid; the last one is cached.
+    ``poses`` returns the scene values of a task that the kernels take. ``penetration`` returns by how much distances
+    that the kernels do not compute are violated above their tolerance at states (n, K) [m].
     """
 
     def __init__(
@@ -118,12 +88,15 @@ class FineCheck:
         position = collision > 1 or bool(violated[:, self._bounds.orders == 0].any())
         return cost, GridViolation(max(worst, collision), position, time_scale)
 
-    def rest_bounds(self, task: RefinementTask) -> RestBounds:
-        """Return the bounds halfway along the motion, relaxed by their tolerances except for clearances."""
+    def rest_bounds(self, task: RefinementTask) -> tuple[Array, Array, Mask, Mask]:
+        """Return bounds of a robot at rest halfway along the motion, relaxed by tolerances except for clearances.
+
+        The result is ``(lower, upper, capsules, equal)``, see ``cnpgen.refine.rrt_connect.RestSpace``.
+        """
         bounds, half, capsules = self._bounds.bounds_for(task.start_xyz), FINE_POINTS // 2, self._bounds.capsules
         tolerances = np.where(capsules | self._bounds.held_clearances, 0.0, self._bounds.tolerances)
         equal = self._bounds.equal & (self._bounds.orders == 0)
-        return RestBounds(bounds.lower[half] - tolerances, bounds.upper[half] + tolerances, capsules, equal)
+        return bounds.lower[half] - tolerances, bounds.upper[half] + tolerances, capsules, equal
 
     def speed_ratio(self, task: RefinementTask, x: Array) -> float:
         """Return the factor by which a motion exceeds bounds of speeds other than those of joints, at least 1.
@@ -151,17 +124,15 @@ class FineCheck:
         return np.asarray(violations / np.maximum(self._bounds.tolerances, MIN_RESIDUAL_TOLERANCE))
 
     def scale_time(
-        self, task: RefinementTask, motion: Transcription, x: Array, *, unlimited: bool = False
+        self, task: RefinementTask, x: Array, *, unlimited: bool = False
     ) -> tuple[Array, float, GridViolation]:
         """Scale a motion from rest to rest uniformly in time until it meets its limits.
 
         The path is unchanged; the rate is divided by one factor. This does not reduce violations of positions or of
-        torques that gravity causes. Motions with such violations are scaled only if ``unlimited``.
-
-        Returns:
-            ``(variables, objective, violation)`` of the scaled motion, or of the last one tried.
+        torques that gravity causes. Motions with such violations are scaled only if ``unlimited``. The result is
+        ``(variables, objective, violation)`` of the scaled motion, or of the last one tried.
         """
-        total = 1.0
+        total, split = 1.0, self.transcription(task).split
         cost, violation = self.measure(task, x)
         for _ in range(MAX_SCALINGS):
             if violation.worst <= 1 or violation.time_scale <= 1 or not np.isfinite(violation.time_scale):
@@ -170,7 +141,7 @@ class FineCheck:
                 break
             total *= violation.time_scale * (1 + 1e-9)
             x = x.copy()
-            x[motion.split :] -= np.log(violation.time_scale * (1 + 1e-9))
+            x[split:] -= np.log(violation.time_scale * (1 + 1e-9))
             cost, violation = self.measure(task, x)
         return x, cost, violation
 

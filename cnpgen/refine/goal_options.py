@@ -22,6 +22,7 @@ from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.joint import JointVelocity
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.refine.refinement import Refinement
+from cnpgen.refine.task import Attempt
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]  # called with plans finished and valid since the last call
@@ -42,26 +43,34 @@ def refine_goal_options(
     """
     _check_tasks(plans)
     tasks = list(dict.fromkeys(plans.sample_id.tolist()))
-    chosen: dict[int, tuple[Refinement, int]] = {}
-    lowest, files = dict[int, float](), list[Path]()
+    rounds, results = list[Refinement](), list[Attempt]()  # of all rounds
+    chosen, lowest, files = dict[int, int](), dict[int, float](), list[Path]()  # by task: index of a result, its cost
     if begin is not None:
         begin(len(tasks), 0)
     for round_number, rows in enumerate(_rounds(plans, min_durations(plans), lowest)):
         file = Path(f"{journal}.{round_number}" if round_number else f"{journal}") if journal is not None else None
         files += [] if file is None or not round_number else [file]
         refinement = refine(plans[rows], journal=file)
-        for row, result in enumerate(refinement.results):
-            task = int(refinement.plans.sample_id[row])
+        rounds.append(refinement)
+        for task, result in zip(refinement.plans.sample_id.tolist(), refinement.results, strict=True):
             first, improves = task not in chosen, result.valid and result.cost < lowest.get(task, np.inf)
             if progress is not None and (first or improves):
                 progress(int(first), int(improves and task not in lowest))
             if first or improves:
-                chosen[task] = refinement, row
+                chosen[task] = len(results)
             if improves:
                 lowest[task] = result.cost
+            results.append(result)
     for file in files:
         file.unlink(missing_ok=True)
-    return _of_rows([chosen[task] for task in tasks])
+    rows = np.array([chosen[task] for task in tasks])
+    return replace(
+        rounds[0],
+        input_plans=concatenate([refinement.input_plans for refinement in rounds])[rows],
+        plans=concatenate([refinement.plans for refinement in rounds])[rows],
+        results=tuple(results[row] for row in rows),
+        times=sum((refinement.times for refinement in rounds), NO_TIME),
+    )
 
 
 def _check_tasks(plans: Plans) -> None:
@@ -98,18 +107,3 @@ def _rounds(plans: Plans, min_duration: Array, lowest: dict[int, float]) -> Iter
         waiting = rows[(min_duration[rows] < bound) | np.isinf(bound)]  # also goals that are not finite
         if len(waiting):
             yield waiting
-
-
-def _of_rows(chosen: list[tuple[Refinement, int]]) -> Refinement:
-    """Return one refinement of single results of several."""
-    parts = list({id(refinement): refinement for refinement, _ in chosen}.values())
-    starts = np.cumsum([0, *(len(part.results) for part in parts)])
-    position = {id(part): int(start) for part, start in zip(parts, starts, strict=False)}
-    rows = np.array([position[id(refinement)] + row for refinement, row in chosen])
-    return replace(
-        parts[0],
-        input_plans=concatenate([part.input_plans for part in parts])[rows],
-        plans=concatenate([part.plans for part in parts])[rows],
-        results=tuple(refinement.results[row] for refinement, row in chosen),
-        times=sum((part.times for part in parts), NO_TIME),
-    )

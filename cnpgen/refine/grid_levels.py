@@ -26,23 +26,14 @@ class GridLevel:
 
 @dataclass(frozen=True)
 class GridLevels:
-    """Grid levels of a problem.
+    """Grid levels of a problem."""
 
-    Attributes:
-        warm: Coarse level from an input plan.
-        coarse: Coarse level from a straight line.
-        fine: Finer grid, from the result of a coarse level.
-        strict: Finer grid with tighter bounds, for plans that the verdict rejects.
-        restart: Level for other initial guesses.
-        path: Level for motions along a valid joint-space path: violations weigh more than any duration.
-    """
-
-    warm: GridLevel
-    coarse: GridLevel
-    fine: GridLevel
-    strict: GridLevel
-    restart: GridLevel
-    path: GridLevel
+    warm: GridLevel  # coarse level from an input plan
+    coarse: GridLevel  # coarse level from a straight line
+    fine: GridLevel  # finer grid, from the result of a coarse level
+    strict: GridLevel  # finer grid with tighter bounds, for plans that the verdict rejects
+    restart: GridLevel  # level for other initial guesses
+    path: GridLevel  # level for motions along a valid joint-space path: violations weigh more than any duration
 
 
 def default_grid_levels(problem: Problem, settings: Settings) -> GridLevels:

@@ -21,13 +21,8 @@ SAMPLES_PER_CONTROL_POINT = 20  # of the fit to a joint-space path
 def straight_line(boundary: Boundary, velocity_limit: Array, spec: TrajectorySpec) -> tuple[Array, Array]:
     """Return the line between the boundary control points at a constant rate.
 
-    Args:
-        boundary: Boundary conditions of one motion.
-        velocity_limit: Velocity limits of the joints [rad/s], shape (n,).
-        spec: Degree and numbers of control points.
-
-    Returns:
-        ``(path, rate)``: interior path control points [rad], shape (m, n), and rate control points [1/s], shape (R,).
+    The result is ``(path, rate)``: interior path control points [rad], shape (m, n), and rate control points [1/s],
+    shape (R,). Velocity limits [rad/s] have shape (n,).
     """
     rate = _constant_rate(boundary, velocity_limit, spec)
     return anchor_line(boundary, rate[None], spec)[0], rate
@@ -92,15 +87,9 @@ def fit_to_path(states: Array, boundary: Boundary, velocity_limit: Array, spec: 
 
 
 def along_tip_path(world: World, start_q: Array, goal_q: Array, tip_path: Array) -> Array:
-    """Return joint positions along a tip path [rad], shape (TIP_PATH_STATES, n).
+    """Return joint positions along a tip path [m], a polyline of shape (K, 3): [rad], shape (TIP_PATH_STATES, n).
 
-    They result from Gauss-Newton steps of minimum norm from the joint-space line.
-
-    Args:
-        world: World of the robot; it is moved.
-        start_q: Joint positions at the start [rad], shape (n,).
-        goal_q: Joint positions at the goal [rad], shape (n,).
-        tip_path: Polyline from the tip at the start to the tip at the goal [m], shape (K, 3).
+    They result from Gauss-Newton steps of minimum norm from the joint-space line; the world is moved.
     """
     lengths, rest = _arc_lengths(tip_path), np.zeros(len(start_q))
     along = np.linspace(0, 1, TIP_PATH_STATES)

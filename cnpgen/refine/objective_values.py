@@ -1,13 +1,15 @@
 """Values of objectives of plans: the duration and the integrals of the terms, without their weights."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem
-from cnpgen.refine.solver.cost_term import choose_cost_term, cost_term_residuals, residual_counts
 from cnpgen.refine.solver.grid import make_grid
+from cnpgen.refine.solver.residuals import CostTerm, choose_cost_term, cost_term_residuals, residual_counts
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 
@@ -46,10 +48,9 @@ def objective_values(plans: Plans, objective: str = "time") -> dict[str, Array]:
     rates = np.array([w[4 * robot.n] for w in states])
     first = 0
     for count, term in zip(counts, cost_term.terms, strict=True):
-        squares = np.sum(e[first : first + count] ** 2, axis=0).reshape(rates.shape)
-        size = np.sqrt(squares + term.smoothing**2) - term.smoothing if term.smoothing else squares
+        size, _ = CostTerm((replace(term, weight=1.0),)).rate(e[first : first + count], [count])
         name = registry.name_of(registry.OBJECTIVES, type(term))
         number = sum(key.partition(" ")[0] == name for key in values)
-        values[f"{name} {number + 1}" if number else name] = (size / rates) @ grid.cost_weights
+        values[f"{name} {number + 1}" if number else name] = (size.reshape(rates.shape) / rates) @ grid.cost_weights
         first += count
     return values

@@ -8,17 +8,14 @@ from threading import get_ident
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
+from cnpgen.kernels.library import KernelLibrary
 from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
-from cnpgen.refine.grid_levels import GridLevels
-from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
+from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.refiner import Refiner
-from cnpgen.refine.solver.cost_term import choose_cost_term
-from cnpgen.refine.solver.sqp import Settings
 from cnpgen.refine.strategy import PlanChecker, refine_task, refine_task_until
 from cnpgen.refine.task import Attempt, RefinementTask
 from cnpgen.robots.robot import Robot
@@ -63,7 +60,7 @@ def load_solver(problem: Problem, robot: Robot, kernels: KernelLibrary) -> Solve
         A function of the columns of N rows, shape (N, width) each, among them ``obstacle_poses`` of scenes, and of N
         motions as initial guesses, or None. It returns N motions and the mask of those that the verdict accepts, (N,).
     """
-    refiner = load_refiner(problem, robot, kernels=kernels)
+    refiner = Refiner(problem, robot, kernels=kernels)
     checker, spec = PlanChecker(problem, robot, degree=refiner.spec.degree), refiner.spec
 
     def solve(columns: Mapping[str, Array], initial_guess: Motion | None = None) -> tuple[Motion, NDArray[np.bool_]]:
@@ -100,40 +97,4 @@ def _checker(record: ProblemRecord, degree: int, _thread: int) -> PlanChecker:
 def _refiner(record: ProblemRecord, spec: TrajectorySpec, options: RefineOptions) -> Refiner:
     problem, robot = open_problem(record)
     coarser = _refiner(record, problem.trajectory, options) if is_finer(spec, problem.trajectory) else None
-    return load_refiner(problem, robot, spec=spec, options=options, coarser=coarser)
-
-
-def load_refiner(
-    problem: Problem,
-    robot: Robot,
-    *,
-    spec: TrajectorySpec | None = None,
-    options: RefineOptions = DEFAULT_OPTIONS,
-    kernels: KernelLibrary | None = None,
-    levels: GridLevels | None = None,
-    coarser: Refiner | None = None,
-) -> Refiner:
-    """Build the refiner of a problem.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        spec: Degree and numbers of control points; the problem's by default.
-        options: Options of the refiner.
-        kernels: Library of kernels; by default the fastest backend of this machine.
-        levels: Grid levels, see ``Refiner``.
-        coarser: Refiner with the problem's own control points, see ``Refiner``.
-    """
-    if kernels is None:
-        kernels = problem_kernels(problem, robot, *choose_backend(None))
-    settings = Settings(cost_tolerance=options.tolerance, max_iterations=options.max_iterations)
-    return Refiner(
-        problem,
-        robot,
-        kernels=kernels,
-        spec=spec,
-        cost_term=choose_cost_term(problem, options.objective, options.weight),
-        settings=settings,
-        levels=levels,
-        coarser=coarser,
-    )
+    return Refiner(problem, robot, spec=spec, options=options, coarser=coarser)

@@ -26,15 +26,10 @@ _RECORD_ERRORS = (
 
 @dataclass
 class Journal:
-    """Finished plans of a run in an append-only file; the first record identifies the run.
+    """Finished plans of a run in an append-only file; the first record identifies the run."""
 
-    Attributes:
-        path: Path of the file.
-        finished: Results of earlier runs, index of the plan -> judged attempt.
-    """
-
-    path: Path
-    finished: dict[int, Attempt]
+    path: Path  # path of the file
+    finished: dict[int, Attempt]  # results of earlier runs, index of the plan -> judged attempt
     _file: JournalFile
 
     def append(self, indices: Sequence[int], results: Sequence[Attempt]) -> None:
@@ -51,12 +46,9 @@ class Journal:
 
 
 def open_journal(path: Path, identity: str, *, discard: bool = False) -> Journal:
-    """Open the journal of a run with the results of earlier runs of the same identity.
+    """Open the journal of a run with the results of earlier runs of the same identity; create it if it is missing.
 
-    Args:
-        path: Path of the file; it is created if it is missing.
-        identity: JSON text that identifies the run: plans, options, version.
-        discard: Whether to discard finished plans of another run.
+    The identity is a JSON text: plans, options, version. Finished plans of another run are lost only if ``discard``.
 
     Raises:
         UsageError: The file is no journal, holds another run's plans, or is in use.

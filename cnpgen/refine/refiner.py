@@ -9,23 +9,34 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.collision.collision_checker import load_collision_library
 from cnpgen.kernels.collision.tree_search import EqualityKernel
-from cnpgen.kernels.library import KernelLibrary, problem_kernels
+from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
 from cnpgen.problems.equalities import equality_residuals
 from cnpgen.problems.obstacles import table_frame_of
 from cnpgen.problems.problem import Problem
 from cnpgen.refine import initial_guesses
 from cnpgen.refine.fine_check import FineCheck
 from cnpgen.refine.grid_levels import GridLevel, GridLevels, default_grid_levels
+from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
 from cnpgen.refine.rrt_connect import RestSpace
 from cnpgen.refine.solver.bounds import Bounds, accepted_along, bounds_template, near_ends
 from cnpgen.refine.solver.compiled_backend import load_step_library
-from cnpgen.refine.solver.cost_term import CostTerm, cost_term_residuals, residual_counts
 from cnpgen.refine.solver.grid import make_grid
-from cnpgen.refine.solver.hull_feedback import HullFeedback
-from cnpgen.refine.solver.hull_problem import can_measure_hulls, without_distances
-from cnpgen.refine.solver.hulls import CompiledHullTranscription, Hulls, HullTranscription
-from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
-from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS, Result, Settings, minimize
+from cnpgen.refine.solver.hull_levels import (
+    CompiledHullTranscription,
+    HullFeedback,
+    HullTranscription,
+    can_measure_hulls,
+    without_distances,
+)
+from cnpgen.refine.solver.hulls import Hulls, has_clearance_constraints
+from cnpgen.refine.solver.residuals import (
+    choose_cost_term,
+    cost_term_residuals,
+    residual_counts,
+    stage_jacobian,
+    stage_values,
+)
+from cnpgen.refine.solver.sqp import Result, Settings, minimize
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription, cache_last
 from cnpgen.refine.task import Attempt, Outcome, RefinementTask
 from cnpgen.robots.robot import Robot
@@ -46,19 +57,10 @@ SLOWNESS = 1.6  # times slower than the bounds of speeds require: the solver cha
 class Refiner:
     """Solver of one problem, and the checks and initial guesses for it.
 
-    Attributes:
-        measures_hulls: Whether distances of the links' hulls replace those of capsules in all levels, see
-            ``cnpgen.refine.solver.hull_problem``.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        kernels: Library of kernels.
-        spec: Degree and numbers of control points; the problem's by default.
-        cost_term: Cost term in addition to the duration, or None.
-        settings: Settings of the iteration.
-        levels: Grid levels; ``default_grid_levels`` by default.
-        coarser: Refiner with the problem's own control points, for plans with several spans for each of its spans.
+    If it ``measures_hulls``, distances of the links' hulls replace those of capsules in all levels, see
+    ``cnpgen.refine.solver.hull_levels``. By default kernels have the fastest backend of this machine, and control
+    points are those of the problem. ``coarser`` is a refiner with these, for plans with several spans for each of its
+    spans.
     """
 
     def __init__(
@@ -66,15 +68,18 @@ class Refiner:
         problem: Problem,
         robot: Robot,
         *,
-        kernels: KernelLibrary,
+        kernels: KernelLibrary | None = None,
         spec: TrajectorySpec | None = None,
-        cost_term: CostTerm | None = None,
-        settings: Settings = DEFAULT_SETTINGS,
+        options: RefineOptions = DEFAULT_OPTIONS,
         levels: GridLevels | None = None,
         coarser: "Refiner | None" = None,
     ) -> None:
-        self.problem, self.robot, self.settings, self.coarser = problem, robot, settings, coarser
+        self.problem, self.robot, self.coarser = problem, robot, coarser
         self.spec = problem.trajectory if spec is None else spec
+        self.settings = Settings(cost_tolerance=options.tolerance, max_iterations=options.max_iterations)
+        cost_term = choose_cost_term(problem, options.objective, options.weight)
+        if kernels is None:
+            kernels = problem_kernels(problem, robot, *choose_backend(None))
         library, world = load_collision_library(kernels), World(robot, problem.obstacle, problem.object_size)
         self.measures_hulls = library is not None and can_measure_hulls(problem, robot, world)
         self._library, self._hulls, solved = library, dict[int, Hulls](), problem
@@ -91,7 +96,7 @@ class Refiner:
             () if cost_term is None else residual_counts(robot, cost_term),
             load_step_library(kernels),
         )
-        self.levels = default_grid_levels(problem, settings) if levels is None else levels
+        self.levels = default_grid_levels(problem, self.settings) if levels is None else levels
         if self.measures_hulls and levels is None:  # trees avoid the hulls, so that their paths are nearly valid
             self.levels = replace(self.levels, path=self.levels.warm)
         self._world = world
@@ -100,11 +105,12 @@ class Refiner:
             world,
             self.residual_kernels,
             poses=self.kernel_poses,
-            penetration=self._penetration if self.measures_hulls else None,
+            penetration=self.penetration if self.measures_hulls else None,
         )
         has_manifold = self.measures_hulls and bool(self.check.equalities)
         self._equalities = kernels.load_by_structure(equality_residuals) if has_manifold else None
-        self.accepted_at_ends = cache_last(self._measure_ends)  # several levels of a task need it
+        # by how much the hulls at both ends violate their distances within the tolerance [m], shape (2, m)
+        self.accepted_at_ends = cache_last(lambda task: self.hulls.accepted_at(task.ends, task.scene.poses[0]))
         every, orders = tuple(vars(self.levels).values()), problem.path_orders
         self._grids = {points: make_grid(self.spec, points, orders) for points in {level.points for level in every}}
         self._feedbacks = dict[int, HullFeedback]()
@@ -144,27 +150,14 @@ class Refiner:
         bounds = self.bounds(task, level, ends)
         if not np.nanmax(bounds.end_violations(ends)) < MAX_END_VIOLATION:
             settings = replace(settings, max_iterations=0)
-        if self.measures_hulls:
-            motion = CompiledHullTranscription(
-                self.residual_kernels,
-                motion.grid,
-                self.hulls,
-                boundary=task.boundary,
-                kernel_poses=self.kernel_poses(task),
-                obstacle_poses=task.scene.poses[0],
-            )
-            accepted = accepted_along(near_ends(self._grids[level.points].s), self.accepted_at_ends(task))
-            more = -accepted if extra is None else extra - accepted
-            bounds = self._bounds[level].with_hull_distances(bounds, self.hulls.min_distances, more)
-        elif hulls is not None:
-            motion = HullTranscription(
-                self.residual_kernels,
-                motion.grid,
-                hulls,
-                boundary=task.boundary,
-                obstacle_poses=task.scene.poses[0],
-            )
-            bounds = self._bounds[level].with_hull_distances(bounds, hulls.min_distances)
+        hulls = self.hulls if self.measures_hulls else hulls
+        if hulls is not None:
+            kind = CompiledHullTranscription if self.measures_hulls else HullTranscription
+            motion = kind(motion, hulls, task.scene.poses[0])
+            more: Array | float = 0.0 if extra is None else extra
+            if self.measures_hulls:
+                more = more - accepted_along(near_ends(motion.grid.s), self.accepted_at_ends(task))
+            bounds = self._bounds[level].with_hull_distances(bounds, hulls.min_distances, more)
         return minimize(motion, bounds, x, settings, deadline=task.deadline)
 
     def transcription(self, task: RefinementTask, level: GridLevel) -> Transcription:
@@ -180,7 +173,7 @@ class Refiner:
         """Return the scene values that the residual kernels take, shape (width,)."""
         return task.scene.poses[0, self._kernel_poses]
 
-    def _penetration(self, task: RefinementTask, q: Array) -> float:
+    def penetration(self, task: RefinementTask, q: Array) -> float:
         """Return by how much the hulls at states q (n, K) violate their required distances above the tolerance [m]."""
         return self.hulls.violation(q, task.scene.poses[0], above_tolerance=True)
 
@@ -246,11 +239,6 @@ class Refiner:
             result = replace(result, iterations=earlier + result.iterations)
         return result
 
-    def _measure_ends(self, task: RefinementTask) -> Array:
-        """Return by how much the hulls at both ends violate their distances within the tolerance [m], shape (2, m)."""
-        ends = np.stack([task.boundary.start_q[0], task.boundary.goal_q[0]], axis=1)
-        return self.hulls.accepted_at(ends, task.scene.poses[0])
-
     def _feedback(self, level: GridLevel) -> HullFeedback:
         if level.points not in self._feedbacks:
             self._feedbacks[level.points] = HullFeedback(self.spec, self._grids[level.points].s)
@@ -267,8 +255,7 @@ class Refiner:
 
     def time_scaled(self, task: RefinementTask, attempt: Attempt, *, unlimited: bool = False) -> Attempt:
         """Scale an attempt uniformly in time; return the better of both."""
-        motion = self.check.transcription(task)
-        x, cost, violation = self.check.scale_time(task, motion, attempt.variables, unlimited=unlimited)
+        x, cost, violation = self.check.scale_time(task, attempt.variables, unlimited=unlimited)
         scaled = self.attempt(
             task, x, cost, Outcome.TIME_SCALED, iterations=attempt.iterations, violation=violation.worst
         )
@@ -330,10 +317,12 @@ class Refiner:
         factor = self.check.speed_ratio(task, x)
         return x if factor == 1 else np.concatenate([interior.ravel(), np.log(rate / (SLOWNESS * factor))])
 
-    def rest_space(self, task: RefinementTask, hulls: Hulls | None = None) -> RestSpace:
+    def rest_space(self, task: RefinementTask) -> RestSpace:
         """Return the valid states at rest, for the search of joint-space paths."""
-        bounds, poses = self.check.rest_bounds(task), self.kernel_poses(task)
-        return RestSpace(self.residual_kernels, self.robot, bounds, poses, task.scene.poses[0], hulls)
+        poses = self.kernel_poses(task)
+        hulls = self.hulls if has_clearance_constraints(self.problem, self.robot) else None
+        bounds = self.check.rest_bounds(task)
+        return RestSpace(self.residual_kernels, self.robot, *bounds, poses, task.scene.poses[0], hulls)
 
     def manifold(self, task: RefinementTask) -> EqualityKernel | None:
         """Return the equalities that compiled trees keep, or None if there are none."""

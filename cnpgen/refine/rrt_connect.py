@@ -2,21 +2,22 @@
 
 Kernels check many states of an edge at once against capsules; Coal's hulls decide where only a capsule collides. Where
 there are equalities, the states of an edge are first projected onto the manifold by Gauss-Newton steps within the joint
-limits (CBiRRT, Berenson et al. 2009). Where compiled code measures hulls, ``tree_paths`` searches instead. Random
-numbers are the same for every task. The refiner adds velocities and accelerations. The tree of
+limits (CBiRRT, Berenson et al. 2009). Where compiled code measures hulls, its trees search instead (``TreeSearch``).
+Random numbers are the same for every task. The refiner adds velocities and accelerations. The tree of
 ``benchmark/planners/sst.py`` has states, costs and pruning (SST) and is separate.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
+from itertools import count, islice, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.refine.fine_check import RestBounds
+from cnpgen.kernels.collision.tree_search import EqualityKernel, TreeSettings, estimated_duration, find_tree_path
 from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.refine.solver.transcription import ResidualKernels
+from cnpgen.refine.task import RefinementTask
 from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -35,30 +36,35 @@ MAX_PROJECTION_STEP = 0.5  # rad or m, of any joint
 RELATIVE_DAMPING = 1e-6  # of these steps, in scaled units
 PROJECTED_FRACTION = 0.05  # of its tolerance, at which an equality is met
 
+TREE_MARGINS_M = (6e-3, 3e-3, 1e-3, 0.0)  # of small trees in turn, added to the required distances
+SMALL_TREES, SMALL_TREE_EXTENSIONS = 12, 4_000  # four, if these find too few paths
+MIN_TREE_PATHS, MAX_TREE_PATHS = 3, 8
+LARGE_TREE_EXTENSIONS = 128_000  # without margin, in narrow passages
+LARGE_TREES, MAX_UNCONNECTED_TREES = 12, 3  # with edges of either length; three if no tree connects
+TREE_EXTENSION_RAD, SHORT_TREE_EXTENSION_RAD = 1.0, 0.5  # length of an edge [rad or m]; shorter ones after the others
+TREE_SHORTCUTS = 400  # attempted on a path
+MANIFOLD_SPACING_RAD = 0.04  # of projected states, which are all nodes, so that trees have more of them
+MANIFOLD_NODES, MANIFOLD_LARGE_TREE_NODES = 6_000, 24_000
+
 
 @dataclass(frozen=True)
 class RestSpace:
-    """Valid states of a robot at rest for one task.
-
-    Attributes:
-        kernels: Residual kernels.
-        robot: The robot.
-        bounds: Bounds of the residuals of a state.
-        kernel_poses: Scene values that the kernels take, shape (width,).
-        scene_poses: Poses and sizes of the obstacles of the hulls, shape (width,).
-        hulls: Hulls that decide where capsules collide, or without capsules everywhere; None where links are capsules.
-    """
+    """Valid states of a robot at rest for one task."""
 
     kernels: ResidualKernels
     robot: Robot
-    bounds: RestBounds
-    kernel_poses: Array
-    scene_poses: Array
+    lower: Array  # bounds of the residuals of a state, shape (m,)
+    upper: Array
+    capsules: NDArray[np.bool_]  # mask of the clearances of capsules, shape (m,)
+    equal: NDArray[np.bool_]  # mask of the equalities of positions, shape (m,)
+    kernel_poses: Array  # scene values that the kernels take, shape (width,)
+    scene_poses: Array  # poses and sizes of the obstacles of the hulls, shape (width,)
+    # Hulls that decide where capsules collide, or without capsules everywhere; None where links are capsules.
     hulls: Hulls | None
 
     def follow(self, q: Array) -> Array:
         """Project K states, shape (n, K), onto the equalities; return the leading valid ones."""
-        q = self.projected(q) if self.bounds.equal.any() else q
+        q = self.projected(q) if self.equal.any() else q
         return q[:, : self._count_valid(q)]
 
     def meets_other_conditions(self, path: Array) -> bool:
@@ -66,22 +72,22 @@ class RestSpace:
         counts = [max(int(np.ceil(np.abs(b - a).max() / STATE_SPACING)), 1) for a, b in pairwise(path)]
         where = np.concatenate([k + np.arange(count) / count for k, count in enumerate(counts)])
         q = np.stack([np.interp(where, np.arange(len(path)), joint) for joint in path.T])
-        return bool(self._met(q)[~self.bounds.capsules].all())
+        return bool(self._met(q)[~self.capsules].all())
 
     def _met(self, q: Array) -> NDArray[np.bool_]:
         """Return a mask of the bounds that the states meet, shape (m, K)."""
         (g,) = self.kernels.values(*self._arguments(q))
-        return np.asarray((g >= self.bounds.lower[:, None]) & (g <= self.bounds.upper[:, None]))
+        return np.asarray((g >= self.lower[:, None]) & (g <= self.upper[:, None]))
 
     def _count_valid(self, q: Array) -> int:
         """Return the number of leading valid states."""
         met, poses = self._met(q), self.scene_poses
         if self.hulls is None:
             return _first(~np.logical_and.reduce(met))
-        first = _first(~np.logical_and.reduce(met[~self.bounds.capsules]))
+        first = _first(~np.logical_and.reduce(met[~self.capsules]))
         if first:
             first = _first(~self.hulls.clear_states(q[:, :first], poses, uncovered_only=True))
-        resolved = np.logical_and.reduce(met[self.bounds.capsules]) & self.bounds.capsules.any()
+        resolved = np.logical_and.reduce(met[self.capsules]) & self.capsules.any()
         unresolved = np.flatnonzero(~resolved[:first])
         if not len(unresolved):
             return first
@@ -91,8 +97,8 @@ class RestSpace:
     def projected(self, q: Array) -> Array:
         """Project K states onto the equalities; joints that reach a limit stay there."""
         low, high = self.robot.position_lower[:, None], self.robot.position_upper[:, None]
-        q, rows = np.clip(q, low, high), self.bounds.equal
-        lower, upper = self.bounds.lower[rows, None], self.bounds.upper[rows, None]
+        q, rows = np.clip(q, low, high), self.equal
+        lower, upper = self.lower[rows, None], self.upper[rows, None]
         for _ in range(MAX_PROJECTIONS):
             g, columns = self.kernels.jacobian(*self._arguments(q))
             error = g[rows] - (lower + upper) / 2
@@ -148,15 +154,9 @@ class _Tree:
 
 
 def follow_line(begin: Array, end: Array, follow: Follow) -> tuple[Array, bool]:
-    """Return the states of a straight line up to the first invalid one.
+    """Return the valid states of a straight line, shape (k, n), and whether they reach its end.
 
-    Args:
-        begin: Start of the line, shape (n,); not among the states.
-        end: End of the line, shape (n,).
-        follow: Function that returns the leading valid states, see ``RestSpace.follow``.
-
-    Returns:
-        ``(states, reached)``: states, shape (k, n), and whether the last one is the end.
+    Both ends have shape (n,); ``begin`` is not among the states. See ``RestSpace.follow`` for the leading valid states.
     """
     count = max(int(np.ceil(np.abs(end - begin).max() / STATE_SPACING)), 1)
     fractions, states = np.arange(1, count + 1) / count, begin[:, None]
@@ -171,16 +171,10 @@ def follow_line(begin: Array, end: Array, follow: Follow) -> tuple[Array, bool]:
 
 
 def find_paths(start: Array, goal: Array, robot: Robot, follow: Follow) -> Iterator[Array]:
-    """Yield valid paths between two configurations: the line, if it is valid, or several paths of the trees.
+    """Yield valid paths between two configurations, shape (K, n): the line, if it is valid, or several of the trees.
 
-    Args:
-        start: First configuration, shape (n,).
-        goal: Last configuration, shape (n,).
-        robot: The robot; random configurations are within its limits and at most a turn away from both ends.
-        follow: Function that returns the leading valid states, see ``RestSpace.follow``.
-
-    Yields:
-        States of a path, shape (K, n). The search ends with the first trees that do not connect.
+    Random configurations are within the robot's limits and at most a turn away from both ends. The search ends with the
+    first trees that do not connect.
     """
     states, reached = follow_line(start, goal, follow)
     if reached:
@@ -218,3 +212,82 @@ def _shortened(path: Array, follow: Follow, random: np.random.Generator) -> Arra
         if reached and len(states) < last - first:
             path = np.vstack([path[: first + 1], states, path[last + 1 :]])
     return path
+
+
+@dataclass(frozen=True)
+class TreeSearch:
+    """Search for paths between the ends of a task by compiled trees, on a manifold if there are equalities.
+
+    Several small trees with different margins grow in milliseconds, and large ones if these find few paths. The paths
+    are sorted by an estimated duration. Large trees with shorter edges follow one by one, until a motion along one of
+    their paths is valid. Conditions other than distances are checked on the paths, not in the trees.
+    """
+
+    task: RefinementTask
+    space: RestSpace
+    hulls: Hulls
+    manifold: EqualityKernel | None
+
+    def paths(self) -> Iterator[Array]:
+        """Yield paths, corners of shape (K, n) each.
+
+        At most ``MAX_TREE_PATHS`` paths of the first trees are sorted: those that meet all conditions at rest come
+        first, and then those of shorter estimated duration. Paths of large trees with shorter edges follow.
+        """
+        found, seeds = list[Array](), count()
+        line = self._grow(0, 0, TREE_EXTENSION_RAD)
+        if line is not None:
+            yield line
+            return
+        found += self._small_trees(seeds)
+        missing = max(MIN_TREE_PATHS - len(found), 0)
+        found += islice(self._large_trees(seeds, TREE_EXTENSION_RAD, bool(found)), missing)
+        space, limit = self.space, self.space.robot.velocity_limit
+        durations = [(not space.meets_other_conditions(path), estimated_duration(path, limit)) for path in found]
+        for index in sorted(range(len(found)), key=durations.__getitem__)[:MAX_TREE_PATHS]:
+            yield found[index]
+        yield from self._large_trees(seeds, SHORT_TREE_EXTENSION_RAD, bool(found))
+
+    def _small_trees(self, seeds: Iterator[int]) -> Iterator[Array]:
+        """Yield the paths of small trees with every margin, and of further ones if these find enough."""
+        number = 0
+        for seed in islice(seeds, SMALL_TREES):
+            if seed == len(TREE_MARGINS_M) and number < MIN_TREE_PATHS:
+                return
+            margin = TREE_MARGINS_M[seed % len(TREE_MARGINS_M)]
+            path = self._grow(seed, SMALL_TREE_EXTENSIONS, TREE_EXTENSION_RAD, margin)
+            if path is not None:
+                number += 1
+                yield path
+
+    def _large_trees(self, seeds: Iterator[int], extension: float, connected: bool) -> Iterator[Array]:
+        """Yield the paths of large trees; of fewer ones if there is no path yet."""
+        for number, seed in enumerate(islice(seeds, LARGE_TREES)):
+            if number == MAX_UNCONNECTED_TREES and not connected:
+                return  # there is probably no path
+            path = self._grow(seed, LARGE_TREE_EXTENSIONS, extension)
+            if path is not None:
+                connected = True
+                yield path
+
+    def _grow(self, seed: int, extensions: int, length: float, margin: float = 0.0) -> Array | None:
+        """Return the path of one pair of trees, or None."""
+        settings = TreeSettings(
+            self.hulls.obstacle_distance,
+            self.hulls.self_distance,
+            margin=margin,
+            extension=length,
+            max_extensions=extensions,
+            shortcuts=TREE_SHORTCUTS,
+        )
+        if self.manifold is not None:
+            nodes = MANIFOLD_LARGE_TREE_NODES if extensions == LARGE_TREE_EXTENSIONS else MANIFOLD_NODES
+            settings = replace(settings, spacing=MANIFOLD_SPACING_RAD, max_nodes=nodes)
+        task, robot = self.task, self.space.robot
+        start, goal = task.boundary.start_q[0], task.boundary.goal_q[0]
+        lower, upper = np.minimum(start, goal) - MAX_TURN, np.maximum(start, goal) + MAX_TURN
+        box = np.maximum(robot.position_lower, lower), np.minimum(robot.position_upper, upper)
+        checker = self.hulls.placed_checker(task.scene.poses[0])
+        return find_tree_path(
+            checker, (start, goal), box, robot.velocity_limit, settings, seed=seed, manifold=self.manifold
+        )

@@ -1,27 +1,16 @@
-"""Strategy of the refiner: the order of the attempts at a task, and the rule that accepts one of them.
+"""Strategy of the refiner: attempts at a task in their order (``attempts``), and the rule that accepts one of them.
 
-The next attempt is made only if no earlier one was accepted. Attempts in their order (``make_attempts``):
-
-1. Plans with finer knots than their problem: the levels of step 2 with the problem's own control points.
-2. Coarse level from the input plan or a straight line, uniform time scaling, fine level, strict level.
-3. Other initial guesses, and the best attempt so far after uniform time scaling.
-4. Step 2 again, from a straight line at constant rate, then from the best attempt so far.
-5. Without a deadline: levels on hulls in place of capsules, and joint-space paths of RRT-Connect. If compiled trees can
-   search these paths, they come right after step 2, whose finer levels run only for nearly valid attempts. Without a
-   path there are no further attempts.
-
-Acceptance (``RefinementSearch``): the independent verdict decides, never the solver's own residuals. The first valid
-plan is returned if it is precise; otherwise one more attempt is judged. A plan whose links touch something within the
-tolerance is not precise, and up to ``MAX_CONTACTS`` attempts are judged. If the verdict rejects an attempt for a
-shallow collision of hulls, or finds such a contact, the solver continues it with a constraint at the phase that the
-verdict names. The result is never worse than the input plan: it replaces it only if the verdict finds a smaller
-violation, or none and a lower cost.
+The independent verdict decides, never the solver's own residuals. The first valid plan is returned if it is precise;
+otherwise one more attempt is judged. A plan whose links touch something within the tolerance is not precise, and up to
+``MAX_CONTACTS`` attempts are judged. If the verdict rejects an attempt for a shallow collision of hulls, or finds such
+a contact, the solver continues it with a constraint at the phase that the verdict names. The result is never worse than
+the input plan: it replaces it only if the verdict finds a smaller violation, or none and a lower cost.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -34,25 +23,20 @@ from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
-from cnpgen.refine.grid_levels import MAX_INITIAL_VIOLATION
-from cnpgen.refine.obstacle_attempts import along_path, around_obstacles, ends_penetrate, is_deep, path_guesses
-from cnpgen.refine.proof.end_violations import end_violations
+from cnpgen.refine.attempts import make_attempts
+from cnpgen.refine.proof.explain import end_violations
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.bounds import PRECISE_FRACTION
-from cnpgen.refine.solver.hull_feedback import MAX_FED_BACK_M, MIN_FED_BACK_M
-from cnpgen.refine.solver.hull_problem import without_contacts
-from cnpgen.refine.solver.hulls import Hulls, has_clearance_constraints
-from cnpgen.refine.solver.sqp import Deadline, Result
+from cnpgen.refine.solver.hull_levels import MAX_FED_BACK_M, MIN_FED_BACK_M, without_contacts
+from cnpgen.refine.solver.sqp import Deadline
 from cnpgen.refine.task import MAX_JUDGED_VIOLATION, Attempt, Outcome, RefinementTask
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
-from cnpgen.trajectory.remaining_trajectory import with_fewer_knots, with_finer_knots
 from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
 
-NEARLY_VALID = 30.0  # tolerances; attempts with larger violations are left for joint-space paths
 MAX_VERDICT_FEEDBACKS = 3  # of collisions of one attempt from the verdict to the solver
 MAX_CONTACTS = 6  # valid attempts whose links touch something within the tolerance, before the search ends with one
 FEEDBACK_GROWTH = 3.0  # of the added distance, from one of them to the next: an edge may pass between grid points
@@ -76,12 +60,10 @@ def refine_task(refiner: Refiner, checker: PlanChecker, task: RefinementTask) ->
         if search.add(attempt) or search.found_no_path or search.continue_rejected(attempt):
             break
     if not (search.judged or search.skipped):  # no attempt stays near the input path
-        path, rate, outcome = next(_input_plans(refiner, task, x))
-        search.judged.append(search.judge(search.input_attempt(path, rate, outcome)))
+        search.judged.append(search.judge(next(_input_plans(refiner, task, x))))
     best = search.best()
-    for path, rate, outcome in () if search.costs_less_than_input(best, x) else _input_plans(refiner, task, x):
-        plan = search.input_attempt(path, rate, outcome)
-        if search.may_replace(plan, best):
+    for plan in () if search.costs_less_than_input(best, x) else _input_plans(refiner, task, x):
+        if not best.valid or (plan.cost <= best.cost and not checker.refutes(task, plan.path, plan.rate)):
             judged = search.judge(plan)
             best = min(best, judged, key=lambda attempt: attempt.rank)
             if judged.valid:
@@ -105,9 +87,9 @@ def refine_task_until(refiner: Refiner, checker: PlanChecker, task: RefinementTa
     search, x = RefinementSearch(refiner, checker, task), refiner.input_variables(task)
     verdicts = Deadline(until, max_duration=VERDICT_TIME_S)
     best: Attempt | None = None
-    for path, rate, outcome in _input_plans(refiner, task, x):
+    for plan in _input_plans(refiner, task, x):
         begun = time.perf_counter()
-        best = _better(best, search.judge(search.input_attempt(path, rate, outcome)))
+        best = _better(best, search.judge(plan))
         verdicts = Deadline(until)
         verdicts.note(begun)
         if best.valid:
@@ -131,24 +113,26 @@ def _better(best: Attempt | None, other: Attempt) -> Attempt:
     return other if best is None or other.rank < best.rank else best
 
 
-def _input_plans(refiner: Refiner, task: RefinementTask, x: Array | None) -> Iterator[tuple[Array, Array, Outcome]]:
+def _input_plans(refiner: Refiner, task: RefinementTask, x: Array | None) -> Iterator[Attempt]:
     """Yield the input plan if it can be evaluated: with exact ends if that changes it, then unmodified."""
+    motion = refiner.check.transcription(task)
     if x is not None:
-        path, rate = refiner.check.transcription(task).unpack(x)
+        path, rate = motion.unpack(x)
         if not _is_input(task, path, rate):
-            yield path, rate, Outcome.ADJUSTED
+            yield Attempt(path=path, rate=rate, cost=motion.objective(path, rate), outcome=Outcome.ADJUSTED)
     if task.path is None or task.rate is None or not np.isfinite(task.path).all():
         return
     if Motion(task.path[None], task.rate[None], refiner.spec.degree).runs_forward()[0]:
-        yield task.path, task.rate, Outcome.UNCHANGED
+        cost = motion.objective(task.path, task.rate)
+        yield Attempt(path=task.path, rate=task.rate, cost=cost, outcome=Outcome.UNCHANGED)
 
 
 def _is_input(task: RefinementTask, path: Array, rate: Array) -> bool:
     """Return whether a plan is the input plan up to rounding."""
-    assert task.path is not None
-    assert task.rate is not None
-    differences = np.abs(path - task.path).max(), np.abs(rate - task.rate).max()
-    return all(bool(difference <= MAX_ROUNDING_ERROR) for difference in differences)
+    pairs = (path, task.path), (rate, task.rate)
+    return all(
+        before is not None and np.allclose(now, before, rtol=0.0, atol=MAX_ROUNDING_ERROR) for now, before in pairs
+    )
 
 
 def _invalid_input(refiner: Refiner, task: RefinementTask) -> Attempt:
@@ -201,29 +185,17 @@ class PlanChecker:
 
 @dataclass
 class RefinementSearch:
-    """Attempts at one task with their verdicts.
-
-    Attributes:
-        refiner: Refiner of the problem.
-        checker: Independent check.
-        task: The task.
-        iterations: Iterations of all attempts so far.
-        judged: Judged attempts.
-        skipped: Attempts with violations above ``MAX_JUDGED_VIOLATION``.
-        verdict: Last verdict.
-        found_no_path: Whether trees searched paths among the obstacles in vain.
-        contacts: Number of valid plans whose links touch something within the tolerance.
-    """
+    """Attempts at one task with their verdicts."""
 
     refiner: Refiner
     checker: PlanChecker
     task: RefinementTask
-    iterations: int = 0
+    iterations: int = 0  # of all attempts so far
     judged: list[Attempt] = field(default_factory=list)
-    skipped: list[Attempt] = field(default_factory=list)
-    verdict: Verdict | None = None
-    found_no_path: bool = False
-    contacts: int = 0
+    skipped: list[Attempt] = field(default_factory=list)  # with violations above ``MAX_JUDGED_VIOLATION``
+    verdict: Verdict | None = None  # the last one
+    found_no_path: bool = False  # whether trees searched paths among the obstacles in vain
+    contacts: int = 0  # valid plans whose links touch something within the tolerance
 
     def add(self, attempt: Attempt) -> bool:
         """Judge an attempt; return whether the search ends: it is valid and precise, or enough others are valid."""
@@ -271,17 +243,6 @@ class RefinementSearch:
         motion = self.refiner.check.transcription(self.task)
         return best.valid and x is not None and best.cost < motion.duration(np.exp(x[motion.split :]))
 
-    def may_replace(self, plan: Attempt, best: Attempt) -> bool:
-        """Return whether a plan may be better than the best one: not more expensive than a valid one, not refuted."""
-        if not best.valid:
-            return True
-        return plan.cost <= best.cost and not self.checker.refutes(self.task, plan.path, plan.rate)
-
-    def input_attempt(self, path: Array, rate: Array, outcome: Outcome) -> Attempt:
-        """Return a form of the input plan as an attempt."""
-        cost = self.refiner.check.transcription(self.task).objective(path, rate)
-        return Attempt(path=path, rate=rate, cost=cost, outcome=outcome)
-
     def judge(self, plan: Attempt) -> Attempt:
         """Return a plan with its verdict."""
         removable = self.refiner.measures_hulls and not self._ends_touch  # contacts, by the solver
@@ -317,161 +278,3 @@ class RefinementSearch:
         equalities = (margin.severity for margin in verdict.margins.values() if margin.name in check.equalities)
         worst = max(equalities, default=0.0)
         return worst <= PRECISE_FRACTION or worst <= PRECISE_FRACTION + check.end_equality_error(self.task)
-
-
-# Order of the attempts
-
-
-def make_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> Iterator[Attempt]:
-    """Yield attempts at a task that stay near its input path, of variables x, if they must; see ``_all_attempts``."""
-    task = replace(task, stay_within=None) if x is None else task
-    for attempt in _all_attempts(refiner, task, x):
-        if task.is_near(attempt.path, refiner.spec.degree):
-            yield attempt
-
-
-def _all_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> Iterator[Attempt]:
-    """Yield attempts at a task; later ones are more expensive and requested only if the earlier ones were rejected."""
-    if refiner.settings.max_iterations == 0:
-        guess, outcome = (refiner.line_guess(task), Outcome.SOLVED) if x is None else (x, Outcome.ADJUSTED)
-        yield refiner.measured(task, guess, outcome, unlimited=True)
-        return
-    if x is not None and refiner.coarser is not None:
-        yield from _with_fewer_control_points(refiner, refiner.coarser, task, x)
-    adjusted = refiner.measured(task, x, Outcome.ADJUSTED) if x is not None and task.at_rest else None
-    searches_trees = refiner.measures_hulls and task.deadline is None
-    hulls = refiner.hulls if searches_trees else None
-    if hulls is None:
-        best = yield from run_levels(refiner, task, x, adjusted)
-    else:
-        best = yield from _before_paths(refiner, task, x, adjusted, hulls)
-    if task.stay_within is not None or refiner.check.ends_are_invalid(task):  # the other guesses are other paths
-        return
-    if hulls is not None:
-        best = yield from _best_of(around_obstacles(refiner, task, best, hulls), best)
-        if ends_penetrate(task, hulls):
-            return
-    others = _from_other_guesses(refiner, task, x if adjusted is None else adjusted.variables, best)
-    best = yield from _best_of(others, best)
-    even_line = refiner.even_line_guess(task)
-    # all attempts so far may depend on the input plan or on the rising rate
-    if x is not None or not np.array_equal(even_line, refiner.line_guess(task)):
-        best = yield from _restart(refiner, task, None, even_line, best)
-    best = yield from _restart(refiner, task, best.variables, even_line, best)
-    if hulls is not None or task.deadline is not None:
-        return
-    if has_clearance_constraints(refiner.problem, refiner.robot):
-        yield from around_obstacles(refiner, task, best, refiner.hulls)
-    elif task.at_rest:
-        yield from (along_path(refiner, task, guess) for guess in path_guesses(refiner, task))
-
-
-def _best_of(attempts: Iterator[Attempt], best: Attempt) -> Generator[Attempt, None, Attempt]:
-    """Yield attempts; return the best of them and ``best``."""
-    for attempt in attempts:
-        yield attempt
-        best = attempt if attempt.is_better(best) else best
-    return best
-
-
-def _with_fewer_control_points(refiner: Refiner, coarser: Refiner, task: RefinementTask, x: Array) -> Iterator[Attempt]:
-    """Yield the attempts of the levels with the problem's own control points, written with all of the plan's.
-
-    With three times as many control points a step takes ten times as long, for objectives that are 0.3 % lower.
-    """
-    if coarser.spec.path_control_points < task.boundary.min_control_points(coarser.spec.degree):
-        return
-    own, fewer, degree = refiner.check.transcription(task), coarser.check.transcription(task), refiner.spec.degree
-    path, rate = own.unpack(x)
-    fitted = with_fewer_knots(Motion(path[None], rate[None], degree), task.boundary, coarser.spec)
-    guess = coarser.input_variables(replace(task, path=fitted.path[0], rate=fitted.rate[0]))
-    for attempt in () if guess is None else run_levels(coarser, task, guess, None):
-        motion = Motion(attempt.path[None], attempt.rate[None], degree)
-        finer = with_finer_knots(motion, refiner.spec)
-        variables = own.pack(finer.path[0], finer.rate[0])
-        path, rate = own.unpack(variables)
-        yield replace(attempt, x=variables, path=path, rate=rate)
-    if task.deadline is not None:
-        task.deadline.max_duration *= (own.nx / fewer.nx) ** 2  # estimate for steps with all control points
-
-
-def _before_paths(
-    refiner: Refiner, task: RefinementTask, x: Array | None, adjusted: Attempt | None, hulls: Hulls
-) -> Generator[Attempt, None, Attempt]:
-    """Yield the attempts before joint-space paths; return the best one."""
-    if x is None and is_deep(refiner, task, hulls):
-        line = refiner.measured(task, refiner.line_guess(task), Outcome.NOT_CONVERGED)
-        yield line
-        return line
-    return (yield from run_levels(refiner, task, x, adjusted, max_violation=NEARLY_VALID))
-
-
-def run_levels(
-    refiner: Refiner,
-    task: RefinementTask,
-    x: Array | None,
-    adjusted: Attempt | None,
-    line: Array | None = None,
-    *,
-    max_violation: float = np.inf,
-) -> Generator[Attempt, None, Attempt]:
-    """Yield the attempts of the coarse, fine and strict levels; return the best one.
-
-    Args:
-        refiner: Refiner of the problem.
-        task: The task.
-        x: Variables of the initial guess, or None.
-        adjusted: Input plan with exact ends, scaled in time, for motions from rest to rest; replaces ``x``.
-        line: Initial guess without a plan, or with a plan of large violation; the straight line by default.
-        max_violation: Violation of the coarse level, in tolerances, above which the finer levels are left out.
-    """
-    coarse = run_coarse_level(refiner, task, x if adjusted is None else adjusted.variables, line)
-    outcome = Outcome.SOLVED if coarse.converged else Outcome.NOT_CONVERGED
-    feasible = coarse.violation <= refiner.settings.violation_tolerance
-    if feasible:
-        cost = coarse.cost - refiner.check.transcription(task).regularization(coarse.x)
-        # most of these are valid, so that their violation is not needed
-        yield refiner.attempt(task, coarse.x, cost, outcome, iterations=coarse.iterations, violation=0.0)
-    best = refiner.measured(task, coarse.x, outcome, 0 if feasible else coarse.iterations)
-    best = refiner.continue_scaled(task, best)
-    if not feasible or best.x is not coarse.x:
-        yield best
-    if best.violation > max_violation:
-        return best
-    fine = refiner.solve(task, refiner.levels.fine, best.variables, Outcome.SOLVED_FINE)
-    yield fine
-    if adjusted is not None and adjusted.outcome is Outcome.TIME_SCALED and adjusted.violation <= 1:
-        yield adjusted
-    best = fine if fine.is_better(best) else best
-    strict = refiner.solve(task, refiner.levels.strict, best.variables, Outcome.SOLVED_FINE)
-    yield strict
-    return strict if strict.is_better(best) else best
-
-
-def run_coarse_level(refiner: Refiner, task: RefinementTask, x: Array | None, line: Array | None) -> Result:
-    """Run the coarse level from variables x, or from a line if there are none or their violation is too large."""
-    if x is not None:
-        result = refiner.run_level(task, refiner.levels.warm, x)
-        if result.violation < MAX_INITIAL_VIOLATION:
-            return result
-    return refiner.run_level(task, refiner.levels.coarse, refiner.line_guess(task) if line is None else line)
-
-
-def _from_other_guesses(refiner: Refiner, task: RefinementTask, x: Array | None, best: Attempt) -> Iterator[Attempt]:
-    """Yield attempts from the input plan with more iterations, from other guesses, and from the best attempt."""
-    for guess in [*([] if x is None else [x]), *refiner.other_guesses(task)]:
-        other = refiner.solve(task, refiner.levels.restart, guess, Outcome.RESTARTED)
-        yield other
-        best = other if other.is_better(best) else best
-    last = refiner.time_scaled(task, best, unlimited=True) if task.at_rest else best
-    yield refiner.solve(task, refiner.levels.warm, last.variables, Outcome.RESTARTED)
-    if task.at_rest:  # its verdict names the limit that no time scaling meets
-        yield last
-
-
-def _restart(
-    refiner: Refiner, task: RefinementTask, x: Array | None, line: Array, best: Attempt
-) -> Generator[Attempt, None, Attempt]:
-    """Yield the attempts of all levels from another initial guess; return the best of these and ``best``."""
-    attempts = run_levels(refiner, task, x, None, line)
-    return (yield from _best_of((replace(attempt, outcome=Outcome.RESTARTED) for attempt in attempts), best))

@@ -54,26 +54,16 @@ class Outcome(IntEnum):
 
 @dataclass(frozen=True)
 class RefinementTask:
-    """Boundary problem with an optional input plan.
+    """Boundary problem with an optional input plan."""
 
-    Attributes:
-        boundary: Boundary conditions of one motion, shape (1, n) each.
-        scene: Its obstacles, one sample.
-        start_xyz: Position of the tip at the start [m], shape (3,).
-        goal_xyz: Position of the tip at the goal [m], shape (3,).
-        path: Path control points of the input plan [rad], shape (C, n), or None.
-        rate: Rate control points of the input plan [1/s], shape (R,), or None.
-        deadline: Deadline of the solver's iterations, or None.
-        stay_within: Largest difference of every joint from the path of the input plan [rad or m], or None.
-    """
-
-    boundary: Boundary
-    scene: Scene
-    start_xyz: Array
-    goal_xyz: Array
-    path: Array | None = None
-    rate: Array | None = None
-    deadline: Deadline | None = None
+    boundary: Boundary  # boundary conditions of one motion, shape (1, n) each
+    scene: Scene  # its obstacles, one sample
+    start_xyz: Array  # position of the tip at the start [m], shape (3,)
+    goal_xyz: Array  # position of the tip at the goal [m], shape (3,)
+    path: Array | None = None  # path control points of the input plan [rad], shape (C, n), or None
+    rate: Array | None = None  # rate control points of the input plan [1/s], shape (R,), or None
+    deadline: Deadline | None = None  # deadline of the solver's iterations, or None
+    # Largest difference of every joint from the path of the input plan [rad or m], or None.
     stay_within: float | None = None
 
     def reference(self, s: Array, degree: int) -> Array | None:
@@ -90,6 +80,11 @@ class RefinementTask:
         if reference is None or self.stay_within is None:
             return True
         return bool(np.abs(basis(s, len(path), degree) @ path - reference).max() <= self.stay_within)
+
+    @property
+    def ends(self) -> Array:
+        """Joint positions at the start and at the goal [rad], shape (n, 2)."""
+        return np.stack([self.boundary.start_q[0], self.boundary.goal_q[0]], axis=1)
 
     @property
     def at_rest(self) -> bool:

@@ -9,8 +9,7 @@ import numpy as np
 
 from cnpgen.errors import UsageError
 from cnpgen.losses.margins import Margins, suggested_margins
-from cnpgen.losses.metric import Metric
-from cnpgen.losses.metric_settings import suggested_weights
+from cnpgen.losses.metric import Metric, suggested_weights
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.machine.versions import __version__
 from cnpgen.planner.inference_pipeline import InferencePipeline, LoadedProblem, make_inference_pipeline

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from cnpgen.losses.metric_settings import PUBLISHED
+from cnpgen.losses.metric import PUBLISHED
 from cnpgen.training.settings import Length, TrainingSettings
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from cnpgen.errors import UsageError
-from cnpgen.losses.metric_settings import BOUNDED, PUBLISHED, MetricSettings
+from cnpgen.losses.metric import BOUNDED, PUBLISHED, MetricSettings
 from cnpgen.losses.plan_loss import FORMS
 from cnpgen.planner.model import MAX_NETWORK_ITERATIONS, ModelConfig
 from cnpgen.planner.network.features import FEATURE_SETS

@@ -6,16 +6,17 @@ different numbers of joints, or the spline has less than degree + 2 control poin
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from enum import Enum
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.schema.arguments import integer
+from cnpgen.schema.arguments import check_memory_of_rows, integer, numbers
 from cnpgen.trajectory.spline import EndDerivatives, end_derivatives
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
@@ -146,12 +147,60 @@ def join_boundaries(parts: Sequence[Boundary]) -> Boundary:
     return Boundary(**{name: np.concatenate([part[name] for part in arrays]) for name in arrays[0]})
 
 
+def boundary_of(  # noqa: PLR0917 - in the order of the paper
+    n: int,
+    start_q: ArrayLike,
+    start_dq: ArrayLike | None,
+    start_ddq: ArrayLike | None,
+    goal_q: ArrayLike,
+    goal_dq: ArrayLike | None,
+    goal_ddq: ArrayLike | None = None,
+    parameters: ArrayLike | None = None,
+) -> Boundary:
+    """Check boundary conditions and bring them to shape (N, n).
+
+    Positions [rad], velocities [rad/s] and accelerations [rad/s^2] of n joints have shape (n,) or (N, n), parameters
+    (width,) or (N, width). Derivatives that are None are zero, at the goal's acceleration free.
+
+    Raises:
+        UsageError: A shape is wrong, or a value is not finite.
+    """
+    conditions = start_q, start_dq, start_ddq, goal_q, goal_dq, goal_ddq
+    arguments = {entry.name: values for entry, values in zip(fields(Boundary), conditions, strict=False)}
+    arrays = {name: _rows(name, values, n) for name, values in arguments.items() if values is not None}
+    if parameters is not None:
+        values = numbers("parameters", parameters)
+        arrays["parameters"] = _rows("parameters", values, values.shape[-1] if values.ndim else 0)
+    rows = max(len(values) for values in arrays.values())
+    for name, values in arrays.items():
+        if len(values) not in {1, rows}:
+            raise UsageError(f"has {len(values)} rows, another boundary condition has {rows}", argument=name)
+    check_memory_of_rows({name: len(values) for name, values in arrays.items()}, 6 * n)
+    if goal_ddq is None:
+        del arguments["goal_ddq"]
+    zero = np.zeros((1, n))
+    return Boundary(**{name: _repeated(arrays.get(name, zero), rows) for name in {**arguments, **arrays}})
+
+
+def _rows(name: str, values: ArrayLike, n: int) -> Array:
+    array = numbers(name, values)
+    if array.ndim not in {1, 2} or array.shape[-1] != n or n == 0:
+        raise UsageError(f"must have shape ({n},) or (N, {n}), got {array.shape}", argument=name)
+    rows = array.reshape(-1, n)
+    if not math.isfinite(rows.sum()) and not np.isfinite(rows).all():
+        row = int(np.argmin(np.isfinite(rows).all(axis=1)))
+        raise UsageError(f"must be finite, got {rows[row]} in row {row}", argument=name)
+    return rows
+
+
+def _repeated(rows: Array, count: int) -> Array:
+    return rows if len(rows) == count else np.repeat(rows, count, axis=0)
+
+
 def start_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
     """Compute the first three path control points [rad], shape (N, 3, n)."""
     _check_joints(boundary)
-    path, speed = _end_derivatives(spec)
-    dr = speed.eta * (rate[:, 1:2] - rate[:, :1])
-    return _three(boundary.start_q, boundary.start_dq, boundary.start_ddq, rate[:, :1], dr=dr, path=path)
+    return _three(boundary.start_q, boundary.start_dq, boundary.start_ddq, rate[:, :1], rate[:, 1:2], spec=spec)
 
 
 def goal_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
@@ -160,13 +209,12 @@ def goal_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
     They are three if the goal's acceleration is prescribed.
     """
     _check_joints(boundary)
-    path, speed = _end_derivatives(spec)
     # With reversed phase, r' and p' change sign: the goal is a start with -dq.
     if boundary.goal_ddq is None:
+        path, _ = _end_derivatives(spec)
         before = boundary.goal_q - boundary.goal_dq / rate[:, -1:] / path.eta
         return np.concatenate([before[:, None], boundary.goal_q[:, None]], axis=1)
-    dr = speed.eta * (rate[:, -2:-1] - rate[:, -1:])
-    points = _three(boundary.goal_q, -boundary.goal_dq, boundary.goal_ddq, rate[:, -1:], dr=dr, path=path)
+    points = _three(boundary.goal_q, -boundary.goal_dq, boundary.goal_ddq, rate[:, -1:], rate[:, -2:-1], spec=spec)
     return points[:, ::-1]
 
 
@@ -189,13 +237,13 @@ def _end_derivatives(spec: TrajectorySpec) -> tuple[EndDerivatives, EndDerivativ
     return path, end_derivatives(spec.rate_control_points, spec.degree)
 
 
-def _three(q: Array, dq: Array, ddq: Array, rate: Array, *, dr: Array, path: EndDerivatives) -> Array:
-    """Compute the control points at s = 0 from q, dq, ddq, r(0) and r'(0)."""
-    eta, beta = path.eta, path.beta
-    first = dq / rate  # p'(0)
-    second = (ddq - first * dr * rate) / rate**2  # p''(0), from ddq = p'' r^2 + p' r' r
-    c1 = q + first / eta
-    c2 = second / beta - 2 * q + 3 * c1
+def _three(q: Array, dq: Array, ddq: Array, outer: Array, inner: Array, *, spec: TrajectorySpec) -> Array:
+    """Compute the control points at s = 0 from q, dq, ddq and the first two rate control points, shape (N, 1) each."""
+    path, speed = _end_derivatives(spec)
+    first, dr = dq / outer, speed.eta * (inner - outer)  # p'(0), r'(0)
+    second = (ddq - first * dr * outer) / outer**2  # p''(0), from ddq = p'' r^2 + p' r' r
+    c1 = q + first / path.eta
+    c2 = second / path.beta - 2 * q + 3 * c1
     points = np.empty((len(q), 3, q.shape[1]), c2.dtype)  # np.stack takes as long as the computation
     points[:, 0], points[:, 1], points[:, 2] = q, c1, c2
     return points
@@ -219,27 +267,15 @@ def anchor_line(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
 
 @dataclass(frozen=True)
 class BoundaryDerivative:
-    """Derivative of one path control point with respect to one rate control point.
+    """Derivative of one path control point with respect to one rate control point."""
 
-    Attributes:
-        point: Index of the path control point, 0 to C - 1.
-        variable: Index of the rate control point, 0 to R - 1.
-        derivative: d(path control point) / d(rate control point) [rad s], shape (N, n).
-    """
-
-    point: int
-    variable: int
-    derivative: Array
+    point: int  # index of the path control point, 0 to C - 1
+    variable: int  # index of the rate control point, 0 to R - 1
+    derivative: Array  # d(path control point) / d(rate control point) [rad s], shape (N, n)
 
 
 def boundary_derivatives(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> list[BoundaryDerivative]:
-    """Differentiate ``start_points`` and ``goal_points``; other derivatives are zero.
-
-    Args:
-        boundary: Boundary conditions of N motions.
-        rate: Rate control points [1/s], shape (N, R), positive.
-        spec: Degree and numbers of control points.
-    """
+    """Differentiate ``start_points`` and ``goal_points`` in rate control points, (N, R); other derivatives are zero."""
     b, last, points = boundary, spec.rate_control_points - 1, spec.path_control_points
     c1, c2, c2_inner = _three_derivatives(b.start_dq, b.start_ddq, rate[:, :1], rate[:, 1:2], spec)
     derivatives = [BoundaryDerivative(1, 0, c1), BoundaryDerivative(2, 0, c2), BoundaryDerivative(2, 1, c2_inner)]

@@ -27,11 +27,9 @@ def remaining_trajectory(
 ) -> Motion:
     """Fit a motion to the remaining trajectory of each of N motions after a time [s], shape (N,), before their end.
 
-    Boundary conditions are the states at these times and the goals. Acceleration limits [rad/s^2] have shape (n,).
-
-    Returns:
-        N motions with exact ends and durations, and with the control points of ``spec``. Each span is divided into two
-        or three if accelerations would otherwise differ by more than 0.1 % of the limits.
+    Boundary conditions are the states at these times and the goals. Acceleration limits [rad/s^2] have shape (n,). Ends
+    and durations are exact. Each span of ``spec`` is divided into two or three if accelerations would otherwise differ
+    by more than 0.1 % of the limits.
     """
     duration = motion.duration() - t
     times = duration[:, None] * np.linspace(0, 1, COMPARISON_SAMPLES)

@@ -16,12 +16,7 @@ MAX_REST_SPEED_RATIO = 2e-3  # of the mean speed: smaller velocities are 0; acce
 
 
 def checked_samples(t: ArrayLike, q: ArrayLike, dq: ArrayLike | None) -> tuple[Array, Array, Array | None]:
-    """Return the samples of one trajectory as arrays of float64.
-
-    Args:
-        t: Times [s], shape (K,), K >= 2, increasing.
-        q: Joint positions [rad], shape (K, n).
-        dq: Joint velocities [rad/s], shape (K, n), or None.
+    """Return times (K,) [s], positions and velocities (K, n) of one trajectory as arrays of float64.
 
     Raises:
         UsageError: A shape is wrong, the times do not increase, or a value is not finite.

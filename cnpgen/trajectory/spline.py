@@ -25,16 +25,10 @@ def clamped_knots(points: int, degree: int) -> Array:
 
 
 def basis(s: Array, points: int, degree: int, order: int = 0) -> Array:
-    """Evaluate every basis function, or a derivative of it, by the Cox-de Boor recursion.
+    """Evaluate every basis function at phases s, or a derivative of some order, by the Cox-de Boor recursion.
 
-    Args:
-        s: Phases in [0, 1], shape (K,).
-        points: Number of control points C.
-        degree: Degree D.
-        order: Order of the derivative with respect to s.
-
-    Returns:
-        Shape (K, C): ``basis(s, C, D, order) @ control_points`` is the derivative of the spline.
+    Phases in [0, 1] have shape (K,), the result (K, C): ``basis(s, C, D, order) @ control_points`` is the derivative of
+    the spline.
     """
     knots, matrix = derivative(points, degree, order)
     degree -= order
@@ -76,10 +70,8 @@ def _cox_de_boor(s: Array, knots: Array, degree: int, first: NDArray[np.intp]) -
 def power_coefficients(control: Array, degree: int) -> Array:
     """Convert N splines to the power basis of each span, for ``select_spans`` and ``horner``.
 
-    Control points have shape (N, C) or (N, C, n).
-
-    Returns:
-        Coefficients of the powers of (s - left knot), highest first, shape (D + 1, spans, N, ...).
+    Control points have shape (N, C) or (N, C, n), the coefficients of the powers of (s - left knot), highest first,
+    shape (D + 1, spans, N, ...).
     """
     matrices = taylor_coefficients(control.shape[1], degree)[::-1]
     columns = control.reshape(*control.shape[:2], prod(control.shape[2:]))
@@ -89,10 +81,9 @@ def power_coefficients(control: Array, degree: int) -> Array:
 
 @cache
 def taylor_coefficients(points: int, degree: int) -> Array:
-    """Return the Taylor coefficients of every basis function at every left knot, lowest power first.
+    """Return the Taylor coefficients of every basis function at every left knot, shape (D + 1, spans, C).
 
-    Returns:
-        Shape (D + 1, spans, C): entry k times the control points gives the coefficients of (s - left knot)^k.
+    Entry k times the control points gives the coefficients of (s - left knot)^k.
     """
     left = np.arange(points - degree) / (points - degree)
     return np.stack([basis(left, points, degree, order) / factorial(order) for order in range(degree + 1)])
@@ -101,8 +92,7 @@ def taylor_coefficients(points: int, degree: int) -> Array:
 def select_spans(coefficients: Array, s: Array) -> tuple[Array, Array]:
     """Select, for every spline, the coefficients of the spans that contain its phases in [0, 1], shape (N, K).
 
-    Returns:
-        ``(selected, offset)``: coefficients, shape (D + 1, N, K, ...), and s - left knot, shape (N, K).
+    The result are the coefficients, shape (D + 1, N, K, ...), and s - left knot, shape (N, K).
     """
     spans = coefficients.shape[1]
     span = np.clip(np.nan_to_num(s) * spans, 0, spans - 1).astype(np.intp)
@@ -110,15 +100,9 @@ def select_spans(coefficients: Array, s: Array) -> tuple[Array, Array]:
 
 
 def horner(selected: Array, offset: Array, order: int = 0) -> Array:
-    """Evaluate the polynomials of ``select_spans``, or a derivative of them, by Horner's rule.
+    """Evaluate the polynomials of ``select_spans``, or a derivative of some order, by Horner's rule.
 
-    Args:
-        selected: Coefficients, shape (D + 1, N, K, ...).
-        offset: Phases minus left knots, shape (N, K), or (M, N, K) for M phases of each polynomial.
-        order: Order of the derivative.
-
-    Returns:
-        Values, shape (N, K, ...) or (M, N, K, ...).
+    Phases minus left knots have shape (N, K), or (M, N, K) for M phases of each polynomial; values the same with (...).
     """
     degree = len(selected) - 1
     offset = offset.reshape(*offset.shape, *(1,) * (selected.ndim - 3))
@@ -167,14 +151,10 @@ class EndDerivatives:
 
     ``x'(0) = eta (c1 - c0)`` with ``eta = D (C - D)`` (the paper's Appendix A prints the square of C - D) and
     ``x''(0) = beta (c2 - 3 c1 + 2 c0)`` with ``beta = D (D - 1) / 2 (C - D)^2``; both need C >= D + 2.
-
-    Attributes:
-        eta: Factor of the first derivative.
-        beta: Factor of the second derivative.
     """
 
-    eta: float
-    beta: float
+    eta: float  # factor of the first derivative
+    beta: float  # factor of the second derivative
 
 
 @cache
@@ -195,10 +175,7 @@ def graded_edges(points: int, degree: int) -> Array:
 
     There are four cells per span, and cells that halve towards s = 0 and s = 1. There the first basis function is 0.01
     wide, and 1 / r is nearly singular if the first control point is much smaller than the second. With cells of equal
-    size the duration of such motions is wrong in the third digit.
-
-    Returns:
-        Edges, ascending from 0 to 1, including the knots.
+    size the duration of such motions is wrong in the third digit. The edges ascend from 0 to 1 and include the knots.
     """
     spans = points - degree
     end = 0.5 ** np.arange(24, 2, -1)

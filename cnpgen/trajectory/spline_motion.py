@@ -315,16 +315,10 @@ def _nodes(edges: Array, points: int, degree: int) -> Array:
 
 
 def time_derivatives(p: Sequence[Array], r: Sequence[Array]) -> list[Array]:
-    """Convert derivatives of the path and the rate by phase to derivatives of the positions by time.
+    """Convert derivatives of the path and the rate by phase to positions and their derivatives by time.
 
-    ``dq = p' r``, ``ddq = (p'' r + p' r') r`` and ``jerk = ((p''' r + 3 p'' r') r + p' (r'' r + r'^2)) r``.
-
-    Args:
-        p: Path and its first two or three derivatives by phase.
-        r: Rate and its derivatives by phase, one less than of the path; their shapes broadcast to those of the path.
-
-    Returns:
-        Positions, velocities, accelerations and, if the path has three derivatives, jerks.
+    ``dq = p' r``, ``ddq = (p'' r + p' r') r`` and ``jerk = ((p''' r + 3 p'' r') r + p' (r'' r + r'^2)) r``. The jerk is
+    returned if the path has three derivatives; the rate has one less. Their shapes broadcast to those of the path.
     """
     states = [p[0], p[1] * r[0], (p[2] * r[0] + p[1] * r[1]) * r[0]]
     if len(p) > 3:
@@ -335,8 +329,7 @@ def time_derivatives(p: Sequence[Array], r: Sequence[Array]) -> list[Array]:
 def states_at_times(motion: Motion, t: Array) -> tuple[Array, Array, Array]:
     """Evaluate each of N motions at one time [s], shape (N,), faster than ``Motion.at_times``, for online replanning.
 
-    Returns:
-        Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (N, n) each.
+    The result are positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (N, n) each.
     """
     s = motion.phase_at(t[:, None])[:, 0]
     p = derivatives_of_each(motion.path, motion.degree, s)

@@ -9,7 +9,6 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
-from cnpgen.refine.refine_engine import load_refiner
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.task import RefinementTask
 from cnpgen.trajectory.boundary import Boundary
@@ -48,7 +47,7 @@ def narrow(folder: Path, obstacles: str) -> Problem:
 @cache
 def refiner(problem: Problem) -> Refiner:
     """Return the refiner of a problem."""
-    return load_refiner(problem, load_robot(problem))
+    return Refiner(problem, load_robot(problem))
 
 
 def between(problem: Problem, ends: np.ndarray) -> RefinementTask:

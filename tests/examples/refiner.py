@@ -12,15 +12,17 @@ from cnpgen.kernels.compiler import find_compiler
 from cnpgen.kernels.library import KernelLibrary, default_cache_folder, problem_kernels
 from cnpgen.problems.objectives import ObjectiveTerm, read_objective
 from cnpgen.problems.problem import Problem
+from cnpgen.refine.grid_levels import GridLevels
+from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.refiner import Refiner
-from cnpgen.refine.solver.cost_term import CostTerm, cost_term_residuals, residual_counts
 from cnpgen.refine.solver.grid import make_grid
-from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
+from cnpgen.refine.solver.residuals import CostTerm, cost_term_residuals, residual_counts, stage_jacobian, stage_values
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription
 from cnpgen.refine.strategy import PlanChecker, refine_task
 from cnpgen.refine.task import Attempt, RefinementTask
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion
+from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 from tests.examples.plans import PROBLEMS, ROBOTS, Plan
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
@@ -56,14 +58,18 @@ def library(name: str) -> KernelLibrary:
 
 
 @cache
-def refiner(name: str, cost_term: CostTerm | None = None) -> Refiner:
-    return refiner_of(PROBLEMS[name], cost_term)
+def refiner(name: str, **options: Any) -> Refiner:
+    return refiner_of(PROBLEMS[name], **options)
 
 
-def refiner_of(problem: Problem, cost_term: CostTerm | None = None, **options: object) -> Refiner:
-    """Return the refiner of a problem with the residuals of the shipped one."""
+def refiner_of(
+    problem: Problem, *, spec: TrajectorySpec | None = None, levels: GridLevels | None = None, **options: Any
+) -> Refiner:
+    """Return the refiner of a problem with the residuals of the shipped one, by default without a cost term."""
     robot, kernels = ROBOTS[problem.name], library(problem.name)
-    return Refiner(problem, robot, kernels=kernels, cost_term=cost_term, **options)
+    return Refiner(
+        problem, robot, kernels=kernels, spec=spec, levels=levels, options=RefineOptions(**{"weight": 0.0, **options})
+    )
 
 
 def obstacle_poses(plan: Plan) -> np.ndarray:

@@ -7,7 +7,7 @@ from scipy.optimize import least_squares
 from cnpgen.kernels.collision.tree_search import TreeSettings, find_tree_path
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
-from cnpgen.refine.refine_engine import load_refiner
+from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.refine.strategy import PlanChecker, refine_task
 from cnpgen.robots.solid import place_obstacles
@@ -38,7 +38,7 @@ class Setting:
     def __init__(self, folder, obstacles):
         self.problem = load_problem(write_problem(folder, obstacles=obstacles, more=LEVEL))
         self.robot = load_robot(self.problem)
-        self.tool, self.poses = load_refiner(self.problem, self.robot), place_obstacles(self.problem.obstacle)
+        self.tool, self.poses = Refiner(self.problem, self.robot), place_obstacles(self.problem.obstacle)
         self.ends = [self.level(q) for q in BESIDE_WALL]
         self.manifold = self.tool.manifold(between(self.problem, np.array(self.ends)))
 

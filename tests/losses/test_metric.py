@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import UsageError
-from cnpgen.losses.metric import Metric, alpha_step, average_loss
-from cnpgen.losses.metric_settings import BOUNDED, PUBLISHED, MetricSettings, suggested_weights
+from cnpgen.losses.metric import BOUNDED, PUBLISHED, Metric, MetricSettings, alpha_step, average_loss, suggested_weights
 from cnpgen.problems.constraints.axis import Axis, Vertical
 from cnpgen.problems.constraints.line import Line
 from cnpgen.problems.constraints.plane import Plane

@@ -14,8 +14,8 @@ from cnpgen.kernels.symbolic.convex_distances import signed_segment_box_distance
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.symbolic_state import FrozenState, SymbolicState
 from cnpgen.kernels.tape import GridSpec, tape_from_function
+from cnpgen.losses.integrand import constraint_term
 from cnpgen.losses.published_conditions import published_conditions
-from cnpgen.losses.terms import constraint_term
 from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.solid import place_obstacles

@@ -12,7 +12,6 @@ import pytest
 from cnpgen.kernels import compiler
 from cnpgen.kernels.library import KernelLibrary, problem_kernels
 from cnpgen.problems.load_robot import load_robot
-from cnpgen.refine.refine_engine import load_refiner
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver import compiled_backend, qp_subproblem
 from cnpgen.refine.solver.compiled_backend import CompiledBackend
@@ -33,7 +32,7 @@ LABELS = ("hit", "replan", "transport")
 
 def refiner_of(plan: Plan) -> Refiner:
     """Return the refiner with the problem's own objective, including its cost term."""
-    return load_refiner(plan.problem, plan.robot, kernels=library(plan.problem.name))
+    return Refiner(plan.problem, plan.robot, kernels=library(plan.problem.name))
 
 
 def with_goal_acceleration(plan: Plan, constrained: bool) -> Boundary:
@@ -50,7 +49,7 @@ def compare(tool: Refiner, problem: RefinementTask, *, within: float = 1e-6) -> 
     """Compare values, selected residuals, steps up to a fraction of the box, and multipliers at five points."""
     motion = tool.transcription(problem, tool.levels.coarse)
     bounds = tool.bounds(problem, tool.levels.coarse, motion.end_residuals())
-    plain, fast = NumpyBackend(motion, bounds, 6), CompiledBackend(motion, bounds, 6)
+    plain, fast = NumpyBackend(motion, bounds), CompiledBackend(motion, bounds)
     x, multipliers, radius, compared = tool.line_guess(problem), None, 0.3, 0
     for turn in range(5):
         (cost, g, violation), value = plain.value(x), fast.value(x)
@@ -96,7 +95,7 @@ def test_steps_of_arms_of_any_number_of_joints_are_those_of_numpy_and_daqp(
     use_tight_tolerance(monkeypatch)
     problem = chain(tmp_path, joints, jerk=jerk)
     spec = TrajectorySpec(degree=points[0], path_control_points=points[1], rate_control_points=points[2])
-    tool = load_refiner(problem, load_robot(problem), spec=spec)
+    tool = Refiner(problem, load_robot(problem), spec=spec)
     random = np.random.default_rng(joints)
     q, dq = 0.5 * random.normal(size=(2, 1, joints)), 0.2 * random.normal(size=(2, 1, joints))
     for goal_ddq in (None, random.normal(size=(1, joints))):
@@ -129,7 +128,7 @@ def test_no_memory_is_overwritten_with_narrower_vectors_and_all_residuals(
     problem, level = task(plan), tool.levels.coarse
     motion = tool.transcription(problem, level)
     bounds, x = tool.bounds(problem, level, motion.end_residuals()), tool.line_guess(problem)
-    plain, fast = NumpyBackend(motion, bounds, 6), CompiledBackend(motion, bounds, 6)
+    plain, fast = NumpyBackend(motion, bounds), CompiledBackend(motion, bounds)
     for guard in guards:
         guard.value = np.pi
     _, g, violation = fast.value(x)
@@ -161,7 +160,7 @@ def test_daqp_solves_programs_with_too_many_working_set_changes(monkeypatch: pyt
     plan = load("replan")
     tool, problem = refiner_of(plan), task(plan)
     motion = tool.transcription(problem, tool.levels.coarse)
-    backend = CompiledBackend(motion, tool.bounds(problem, tool.levels.coarse, motion.end_residuals()), 6)
+    backend = CompiledBackend(motion, tool.bounds(problem, tool.levels.coarse, motion.end_residuals()))
     x = tool.line_guess(problem)
     _, g, violation = backend.value(x)
     selection = ResidualSelection(violation, 0.3, 0.3, np.zeros(g.shape, bool), None)

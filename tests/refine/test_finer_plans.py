@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from cnpgen.plans.plans import make_plans
-from cnpgen.refine import strategy
+from cnpgen.refine import attempts
 from cnpgen.refine.options import RefineOptions
-from cnpgen.refine.refine_engine import load_refiner, prepare
+from cnpgen.refine.refine_engine import prepare
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.sqp import Deadline
 from cnpgen.refine.strategy import PlanChecker, refine_task
@@ -61,7 +61,7 @@ def test_a_plan_with_more_spans_is_refined_with_the_control_points_of_its_proble
 def test_if_that_gives_no_valid_plan_all_control_points_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = load("hit")
     spec = finer(plan.problem.trajectory, 2)
-    tool, problem, run_levels = tool_of(plan, spec), slower_task(plan, spec), strategy.run_levels
+    tool, problem, run_levels = tool_of(plan, spec), slower_task(plan, spec), attempts.run_levels
 
     def violating(refiner: Refiner, *arguments: Any, **options: Any) -> Iterator[Attempt]:
         for attempt in run_levels(refiner, *arguments, **options):
@@ -69,7 +69,7 @@ def test_if_that_gives_no_valid_plan_all_control_points_are_used(monkeypatch: py
             factor[3:-3] = np.exp(0.3) if refiner is tool.coarser else 1.0
             yield replace(attempt, rate=attempt.rate * factor)
 
-    monkeypatch.setattr(strategy, "run_levels", violating)
+    monkeypatch.setattr(attempts, "run_levels", violating)
     found = refined(plan, tool, problem)
     assert found.valid
     motion = Motion(found.path[None], found.rate[None])
@@ -88,7 +88,7 @@ def test_if_the_problem_has_too_few_control_points_the_plan_is_refined_with_its_
     shipped = load("hit")
     own = TrajectorySpec(degree=7, path_control_points=8, rate_control_points=8)
     plan = replace(shipped, problem=replace(shipped.problem, trajectory=own))
-    tool = load_refiner(plan.problem, plan.robot, spec=finer(own, 2), coarser=load_refiner(plan.problem, plan.robot))
+    tool = Refiner(plan.problem, plan.robot, spec=finer(own, 2), coarser=Refiner(plan.problem, plan.robot))
     motion = tool.check.transcription(task(plan))
     path, rate = motion.unpack(tool.line_guess(task(plan)))
     assert refined(plan, tool, task(plan, path=path, rate=rate)).valid
@@ -105,9 +105,9 @@ def test_before_a_deadline_steps_with_all_control_points_are_expected_to_take_lo
     problem = replace(slower_task(plan, spec), deadline=deadline)
     x = tool.input_variables(problem)
     assert x is not None
-    attempts = strategy.make_attempts(tool, problem, x)
-    coarse = [next(attempts) for _ in range(3)]
+    made = attempts.make_attempts(tool, problem, x)
+    coarse = [next(made) for _ in range(3)]
     before = deadline.max_duration
-    monkeypatch.setattr(strategy, "run_levels", lambda *_, **__: iter([coarse[-1]]))
-    next(attempts)
+    monkeypatch.setattr(attempts, "run_levels", lambda *_, **__: iter([coarse[-1]]))
+    next(made)
     assert deadline.max_duration > 5 * before > 0

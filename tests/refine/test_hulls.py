@@ -13,10 +13,10 @@ from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
-from cnpgen.refine import obstacle_attempts, strategy, tree_paths
+from cnpgen.refine import attempts, rrt_connect
 from cnpgen.refine import refiner as refiner_module
-from cnpgen.refine.refine_engine import load_refiner
-from cnpgen.refine.solver.hull_feedback import HullFeedback
+from cnpgen.refine.refiner import Refiner
+from cnpgen.refine.solver.hull_levels import HullFeedback
 from cnpgen.refine.solver.hulls import MEASURED_RANGE_M, Hulls, has_clearance_constraints
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS
 from cnpgen.refine.strategy import PlanChecker, RefinementSearch, refine_task
@@ -86,7 +86,7 @@ def test_distances_of_positions_that_are_not_finite_are_nan(tmp_path, library):
 @needs_compiler
 def test_compiled_rows_are_the_distances_of_hulls_and_their_gradients(tmp_path):
     problem = load_problem(write_problem(tmp_path, obstacles=KINDS))
-    robot, tool = load_robot(problem), load_refiner(problem, load_robot(problem))
+    robot, tool = load_robot(problem), Refiner(problem, load_robot(problem))
     kernels, poses = tool.residual_kernels, place_obstacles(problem.obstacle)
     hulls, width, rows = tool.hulls, kernels.values.tape.inputs[0], kernels.values.tape.outputs[0]
     w = np.random.default_rng(0).uniform(0.1, 1.0, (width, 40))
@@ -175,7 +175,7 @@ def test_an_end_within_the_tolerance_of_a_contact_is_accepted(tmp_path):
     more = more.replace("[0.08, 0.06, 0.12]", "[0.25, 0.25, 0.25]")
     problem = load_problem(write_problem(tmp_path, obstacles=table, more=more))
     robot, poses = load_robot(problem), place_obstacles(problem.obstacle)
-    tool, world, zero = load_refiner(problem, robot), World(robot, problem.obstacle, problem.object_size), np.zeros(4)
+    tool, world, zero = Refiner(problem, robot), World(robot, problem.obstacle, problem.object_size), np.zeros(4)
 
     def depth(lift: float) -> float:
         world.set_state(np.array([0.0, lift, 0.9, 0.0]), zero, zero, poses)
@@ -194,7 +194,7 @@ def test_an_end_within_the_tolerance_of_a_contact_is_accepted(tmp_path):
 def test_compiled_rows_of_the_held_object_have_its_depth(tmp_path):
     problem = load_problem(write_problem(tmp_path, more=HELD))
     robot = load_robot(problem)
-    tool, poses = load_refiner(problem, robot), place_obstacles(problem.obstacle)
+    tool, poses = Refiner(problem, robot), place_obstacles(problem.obstacle)
     kernels, hulls = tool.residual_kernels, tool.hulls
     q = np.random.default_rng(3).uniform(robot.position_lower, robot.position_upper, (60, robot.n)).T.copy()
     w = np.ones((kernels.values.tape.inputs[0], 60))
@@ -215,7 +215,7 @@ def test_compiled_rows_of_the_held_object_have_its_depth(tmp_path):
 def test_scenes_of_a_robot_share_kernels(tmp_path, more):
     problem = load_problem(write_problem(tmp_path, obstacles=KINDS, more=more))
     other = problem.with_obstacles(problem.obstacle[:2])
-    tapes = [load_refiner(item, load_robot(item)).residual_kernels.values.tape for item in (problem, other)]
+    tapes = [Refiner(item, load_robot(item)).residual_kernels.values.tape for item in (problem, other)]
     assert tapes[0].inputs == tapes[1].inputs
     assert tapes[0].to_bytes() == tapes[1].to_bytes()
 
@@ -223,7 +223,7 @@ def test_scenes_of_a_robot_share_kernels(tmp_path, more):
 @needs_compiler
 def test_collisions_between_grid_points_require_more_clearance(tmp_path):
     problem = narrow(tmp_path, WALL)
-    tool, task = load_refiner(problem, load_robot(problem)), between(problem, BESIDE_WALL)
+    tool, task = Refiner(problem, load_robot(problem)), between(problem, BESIDE_WALL)
     path, _ = tool.check.transcription(task).unpack(tool.line_guess(task))
     poses, s = task.scene.poses[0], np.linspace(0, 1, 9)
     assert HullFeedback(tool.spec, s).missing_clearance(path, tool.hulls, poses) is None  # deeper than fed back
@@ -237,7 +237,7 @@ def test_collisions_between_grid_points_require_more_clearance(tmp_path):
 @needs_compiler
 def test_a_collision_of_the_verdict_becomes_larger_distances_around_its_phase(tmp_path):
     problem = narrow(tmp_path, WALL)
-    tool, task = load_refiner(problem, load_robot(problem)), between(problem, BESIDE_WALL)
+    tool, task = Refiner(problem, load_robot(problem)), between(problem, BESIDE_WALL)
     path, _ = tool.check.transcription(task).unpack(tool.line_guess(task))
     feedback, poses = HullFeedback(tool.spec, np.linspace(0, 1, 9)), task.scene.poses[0]
     extra = feedback.clearance_at(path, tool.hulls, poses, phase=0.45, depth=0.003)
@@ -258,13 +258,13 @@ def test_large_trees_follow_the_first_ones(monkeypatch):
         grown.append(settings)
         return np.zeros((3, 2)) if len(grown) - 1 in hits else None
 
-    monkeypatch.setattr(tree_paths, "find_tree_path", find)
+    monkeypatch.setattr(rrt_connect, "find_tree_path", find)
     robot = SimpleNamespace(position_lower=-np.ones(2), position_upper=np.ones(2), velocity_limit=np.ones(2))
     space = SimpleNamespace(robot=robot, meets_other_conditions=lambda _: True)
     hulls = SimpleNamespace(obstacle_distance=0.0, self_distance=0.0, placed_checker=lambda _: None)
     boundary = SimpleNamespace(start_q=np.zeros((1, 2)), goal_q=np.ones((1, 2)))
     task = SimpleNamespace(boundary=boundary, scene=SimpleNamespace(poses=np.zeros((1, 0))))
-    search = tree_paths.TreeSearch(task, space, hulls, None)
+    search = rrt_connect.TreeSearch(task, space, hulls, None)
     cases = (
         ({0, 1, 3}, (12, 0, 12)),  # small trees with every margin find enough paths
         (set(), (4, 3, 3)),  # nothing connects
@@ -294,8 +294,8 @@ def test_large_trees_follow_the_first_ones(monkeypatch):
 def test_a_problem_without_a_path_reports_it(tmp_path, monkeypatch):
     problem = narrow(tmp_path, WALL)
     tool, task = refiner(problem), between(problem, BESIDE_WALL)
-    monkeypatch.setattr(obstacle_attempts, "path_guesses", lambda *_: iter(()))
-    monkeypatch.setattr(strategy, "_from_other_guesses", lambda *_: iter(()))
+    monkeypatch.setattr(attempts, "path_guesses", lambda *_: iter(()))
+    monkeypatch.setattr(attempts, "_from_other_guesses", lambda *_: iter(()))
     found = refine_task(tool, PlanChecker(problem, load_robot(problem), degree=tool.spec.degree), task)
     assert not found.valid
     assert found.outcome is Outcome.NO_PATH
@@ -306,8 +306,7 @@ def test_a_problem_without_a_path_reports_it(tmp_path, monkeypatch):
 def test_no_attempt_is_made_if_an_end_is_inside_an_obstacle(tmp_path):
     problem = narrow(tmp_path, SLOT)
     tool, inside = refiner(problem), between(problem, np.add(IN_SLOT, [0.0, 0.0, 0.1, 0.0]))
-    best = tool.attempt(inside, tool.line_guess(inside), 1.0, Outcome.SOLVED, iterations=0, violation=0.0)
-    assert list(obstacle_attempts.around_obstacles(tool, inside, best, tool.hulls)) == []
+    assert attempts.ends_penetrate(tool, inside)
     found = refine_task(tool, PlanChecker(problem, load_robot(problem), degree=tool.spec.degree), inside)
     assert found.reason == "robot in collision"  # not that of the attempt, which also exceeds other limits
 
@@ -328,7 +327,7 @@ def test_a_slot_that_is_too_narrow_for_capsules_is_wide_enough_for_hulls(tmp_pat
     if not compiled:
         monkeypatch.setattr(refiner_module, "can_measure_hulls", lambda *_: False)
     robot, task = load_robot(problem), between(problem, IN_SLOT)
-    tool = load_refiner(problem, robot)
+    tool = Refiner(problem, robot)
     assert tool.measures_hulls == compiled
     hulls, checker, start = (
         Hulls(problem, robot),
@@ -354,7 +353,7 @@ def test_a_contact_of_an_end_does_not_prolong_the_search(tmp_path, monkeypatch):
     robot = load_robot(problem)
     farther = np.array([[0.0, 0.0, 0.0, 0.0], [0.0, -0.0005, 0.0, 0.0]])
     task = between(problem, np.add(IN_SLOT, farther))
-    tool = load_refiner(problem, robot)
+    tool = Refiner(problem, robot)
     ends = np.stack([task.boundary.start_q[0], task.boundary.goal_q[0]], axis=1)
     start, goal = tool.hulls.measure(ends, task.scene.poses[0])[0].min(axis=1)
     assert goal - start > 1e-4
@@ -364,7 +363,7 @@ def test_a_contact_of_an_end_does_not_prolong_the_search(tmp_path, monkeypatch):
     )
     closer = replace(problem, constraint=tuple(constraints))
     vars(closer)["urdf_text"] = problem.urdf_text
-    tool, checker = load_refiner(closer, robot), PlanChecker(closer, robot, degree=problem.trajectory.degree)
+    tool, checker = Refiner(closer, robot), PlanChecker(closer, robot, degree=problem.trajectory.degree)
     assert tool.accepted_at_ends(task)[0].max() == pytest.approx(CONTACT_M, abs=1e-9)
     assert tool.accepted_at_ends(task)[1].max() == 0
     monkeypatch.setattr(checker, "strict_verdict", None)  # it would find the contact of the start
@@ -377,7 +376,7 @@ def test_a_contact_within_the_tolerance_is_removed(tmp_path):
     """A plan approaches an obstacle half way; the required distance is larger by half the tolerance."""
     problem = narrow(tmp_path, SLOT)
     robot, task, degree = load_robot(problem), between(problem, IN_SLOT), problem.trajectory.degree
-    tool = load_refiner(problem, robot)
+    tool = Refiner(problem, robot)
     found = refine_task(tool, PlanChecker(problem, robot, degree=degree), task)
     path = found.path.copy()
     path[5:-5, 1] += CONTACT_TURN_RAD
@@ -388,7 +387,7 @@ def test_a_contact_within_the_tolerance_is_removed(tmp_path):
         replace(each, distance=distance) if isinstance(each, RobotClearance) else each for each in problem.constraint
     )
     larger = replace(problem, constraint=tuple(constraints))
-    tool, checker = load_refiner(larger, robot), PlanChecker(larger, robot, degree=degree)
+    tool, checker = Refiner(larger, robot), PlanChecker(larger, robot, degree=degree)
     x = tool.check.transcription(task).pack(path, found.rate)
     touching = replace(found, path=path, x=x, violation=1.0)
     assert checker.verdict(task, touching.path, touching.rate).valid

@@ -10,7 +10,7 @@ import cnpgen
 from cnpgen.cli.main import main
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.planner import Planner
-from cnpgen.refine import initial_guesses, strategy
+from cnpgen.refine import attempts, initial_guesses
 from cnpgen.refine.grid_levels import GridLevel
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.refine_engine import prepare, tasks_of
@@ -114,7 +114,7 @@ def test_if_all_attempts_from_an_input_plan_fail_the_straight_line_is_tried(monk
         yield from ()
 
     monkeypatch.setattr(Refiner, "run_level", misleading)
-    monkeypatch.setattr(strategy, "_from_other_guesses", none)
+    monkeypatch.setattr(attempts, "_from_other_guesses", none)
     problem = task(plan, path=wrong, rate=plan.motion.rate[0])
     found = refine_task(tool, PlanChecker(PROBLEMS["heavy-object"], ROBOTS["heavy-object"], degree=7), problem)
     assert tool.levels.warm is not tool.levels.coarse

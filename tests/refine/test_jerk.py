@@ -9,6 +9,7 @@ import pytest
 from cnpgen.kernels.compiler import find_compiler
 from cnpgen.kernels.library import default_cache_folder, problem_kernels
 from cnpgen.refine.fine_check import FineCheck
+from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.grid import FIRST_JERK_PHASE, make_grid
 from cnpgen.refine.solver.transcription import Transcription
@@ -27,7 +28,7 @@ def jerk_limited_refiner(name: str) -> Refiner:
         "compiled" if find_compiler() and name == "airhockey" else "numpy"
     )  # the other problem needs few evaluations
     kernels = problem_kernels(problem, robot, backend, default_cache_folder())
-    return Refiner(problem, robot, kernels=kernels)
+    return Refiner(problem, robot, kernels=kernels, options=RefineOptions(weight=0.0))
 
 
 @pytest.mark.slow
@@ -89,7 +90,7 @@ def test_the_fine_check_scales_time_by_the_cube_root_of_the_jerk_ratio() -> None
     s = check.transcription(task(plan)).grid.s
     worst = np.abs(plan.motion.at(s).jerk[0] / plan.robot.jerk_limit).max()
     assert violation.time_scale == pytest.approx(np.cbrt(worst), rel=1e-6)
-    time_scaled, _, after = check.scale_time(task(plan), check.transcription(task(plan)), x, unlimited=True)
+    time_scaled, _, after = check.scale_time(task(plan), x, unlimited=True)
     assert after.worst <= 1
     path, rate = check.transcription(task(plan)).unpack(time_scaled)
     jerk = Motion(path[None], rate[None]).at(s).jerk[0]

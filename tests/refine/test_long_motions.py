@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from cnpgen.refine import attempts
 from cnpgen.refine import refiner as refiner_module
-from cnpgen.refine import strategy
 from cnpgen.refine.solver.sqp import Result
 from cnpgen.refine.strategy import PlanChecker, refine_task
 from cnpgen.refine.task import Outcome, RefinementTask
@@ -48,9 +48,9 @@ def attempt_after(monkeypatch: pytest.MonkeyPatch, continuations: int):
     problem = task(plan)
     rate = 0.4 * plan.motion.rate[0] + 0.6 / plan.motion.duration()[0]
     x = tool.check.transcription(problem).pack(plan.motion.path[0], rate)
-    monkeypatch.setattr(strategy, "run_coarse_level", lambda *_: Result(x, 0.0, 1.0, 1, True))
+    monkeypatch.setattr(attempts, "run_coarse_level", lambda *_: Result(x, 0.0, 1.0, 1, True))
     monkeypatch.setattr(refiner_module, "MAX_CONTINUATIONS", continuations)
-    found = next(strategy.make_attempts(tool, problem, None))
+    found = next(attempts.make_attempts(tool, problem, None))
     path, rate = tool.check.transcription(problem).unpack(found.x)
     return found, verdict(plan, problem.boundary, path, rate).valid, Motion(path[None], rate[None]).duration()[0]
 

@@ -1,13 +1,14 @@
 """Joint-space paths around obstacles: free of collisions by meshes, reproducible, and needed by some tasks."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.refine import rrt_connect, strategy
+from cnpgen.refine import attempts, rrt_connect
 from cnpgen.refine.initial_guesses import fit_to_path
 from cnpgen.refine.rrt_connect import Follow, RestSpace, find_path, find_paths, follow_line
 from cnpgen.refine.solver.hulls import Hulls
@@ -28,8 +29,9 @@ def wall(tmp_path_factory: pytest.TempPathFactory) -> Problem:
 
 
 def space_of(problem: Problem) -> RestSpace:
-    task, hulls = between(problem, BESIDE_WALL), Hulls(problem, load_robot(problem))
-    return refiner(problem).rest_space(task, hulls)
+    return replace(
+        refiner(problem).rest_space(between(problem, BESIDE_WALL)), hulls=Hulls(problem, load_robot(problem))
+    )
 
 
 def until(collides: Callable[[np.ndarray], np.ndarray]) -> Follow:
@@ -116,5 +118,5 @@ def test_an_arm_moves_over_a_wall_that_no_other_guess_avoids(wall, monkeypatch):
     meshes = Meshes(wall, robot, wall.path.parent)
     states = Motion(found.path[None], found.rate[None], tool.spec.degree).at(np.linspace(0, 1, 300)).q[0]
     assert min(min(meshes.distances(q)) for q in states) > -1e-4  # what the problem allows
-    monkeypatch.setattr(strategy, "around_obstacles", lambda refiner, task, best, hulls: iter(()))
+    monkeypatch.setattr(attempts, "along_tree_paths", lambda refiner, task, best: iter(()))
     assert not refine_task(tool, checker, task).valid

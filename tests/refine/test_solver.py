@@ -13,20 +13,27 @@ from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem
-from cnpgen.refine import initial_guesses, strategy
+from cnpgen.refine import initial_guesses
+from cnpgen.refine.attempts import make_attempts
 from cnpgen.refine.grid_levels import GridLevel
 from cnpgen.refine.options import RefineOptions
-from cnpgen.refine.refine_engine import load_refiner, prepare, tasks_of
+from cnpgen.refine.refine_engine import prepare, tasks_of
 from cnpgen.refine.refine_plans import refine_plans, solve_plans
 from cnpgen.refine.refinement import Refinement
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver import compiled_backend, qp_subproblem, sqp
 from cnpgen.refine.solver.bounds import INTERVAL_FRACTION, NO_TIGHTENING, Bounds, bounds_template
 from cnpgen.refine.solver.compiled_backend import CompiledBackend
-from cnpgen.refine.solver.cost_term import CostTerm, choose_cost_term, cost_term_residuals, residual_counts
 from cnpgen.refine.solver.grid import make_grid
-from cnpgen.refine.solver.qp_subproblem import Backend, NumpyBackend, ResidualSelection
-from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
+from cnpgen.refine.solver.qp_subproblem import NumpyBackend, ResidualSelection
+from cnpgen.refine.solver.residuals import (
+    CostTerm,
+    choose_cost_term,
+    cost_term_residuals,
+    residual_counts,
+    stage_jacobian,
+    stage_values,
+)
 from cnpgen.refine.solver.sqp import Deadline, Settings, minimize
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription
 from cnpgen.refine.strategy import PlanChecker, refine_task
@@ -279,7 +286,7 @@ def test_a_motion_from_rest_to_rest_that_is_too_fast_is_scaled_by_the_exact_fact
     motion = tool.check.transcription(problem)
     x = motion.pack(good.path, good.rate * 1.1)
     _, before = tool.check.measure(problem, x)
-    time_scaled, _, after = tool.check.scale_time(problem, motion, x)
+    time_scaled, _, after = tool.check.scale_time(problem, x)
     assert before.worst > 1 >= after.worst
     path, rate = motion.unpack(time_scaled)
     np.testing.assert_allclose(path, motion.unpack(x)[0], atol=1e-14)
@@ -318,7 +325,7 @@ def test_an_input_plan_is_returned_with_exact_ends_and_reported_as_adjusted_if_t
     plan = load("hit")
     best = refine(plan)
     path = best.path + off * np.eye(len(best.path))[-1][:, None]  # its last control point
-    without_iterations = refiner_of(plan.problem, settings=Settings(max_iterations=0))
+    without_iterations = refiner_of(plan.problem, max_iterations=0)
     checker = PlanChecker(plan.problem, plan.robot, degree=7)
     found = refine_task(without_iterations, checker, task(plan, path=path, rate=best.rate))
     assert found.valid
@@ -368,7 +375,7 @@ def test_an_iterate_becomes_feasible_once_its_objective_has_converged(monkeypatc
 @pytest.mark.parametrize("label", LABELS)
 def test_a_rejected_step_is_never_tried_again_unchanged(label: str, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = load(label)
-    problem, tool = task(plan), refiner(plan.problem.name, cost_term_of("jerk", 1.0))
+    problem, tool = task(plan), refiner(plan.problem.name, objective="jerk", weight=1.0)
     reject, rejections = sqp._Iterate._reject, []
 
     def record(iterate: sqp._Iterate, violations: np.ndarray, selected: np.ndarray, size: float) -> None:
@@ -399,7 +406,7 @@ def test_cached_values_of_a_transcription_belong_to_its_variables() -> None:
 def test_a_feasible_coarse_level_is_yielded_at_once_and_measured_only_if_rejected() -> None:
     plan = load("hit")
     tool = refiner("airhockey")
-    attempts = strategy.make_attempts(tool, task(plan), None)
+    attempts = make_attempts(tool, task(plan), None)
     first, second = next(attempts), next(attempts)
     assert (first.outcome, first.violation) == (Outcome.SOLVED, 0.0)
     _, violation = tool.check.measure(task(plan), first.x)
@@ -455,14 +462,14 @@ class CountingChecker(PlanChecker):
 @pytest.mark.parametrize("radius", [0.02, 0.3])
 @pytest.mark.parametrize("kind", [NumpyBackend, pytest.param(CompiledBackend, marks=needs_compiler)])
 def test_the_solution_of_a_subproblem_meets_the_optimality_conditions(
-    kind: type[Backend], radius: float, monkeypatch: pytest.MonkeyPatch
+    kind: type[NumpyBackend | CompiledBackend], radius: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for module in (qp_subproblem, compiled_backend):  # a violation by 1e-6 of a row's length is too large here
         monkeypatch.setattr(module, "QP_TOLERANCE", 1e-9)
     plan, tool = load("hit"), refiner("airhockey")
     motion = tool.transcription(task(plan), tool.levels.coarse)
     bounds = tool.bounds(task(plan), tool.levels.coarse, motion.end_residuals())
-    at, backend = motion.evaluate(tool.line_guess(task(plan))), kind(motion, bounds, 6)
+    at, backend = motion.evaluate(tool.line_guess(task(plan))), kind(motion, bounds)
     selection = ResidualSelection(
         bounds.max_violation(at.g),
         max_distance=0.4,
@@ -508,7 +515,7 @@ def test_time_scaling_is_as_large_as_the_bound_of_the_tip_speed_requires(tmp_pat
     limit = TipSpeed(highest=fastest / 1.05)
     problem = replace(plan.problem, constraint=(*plan.problem.constraint, limit))
     kernels = problem_kernels(problem, plan.robot, "numpy", tmp_path)
-    tool = Refiner(problem, plan.robot, kernels=kernels, settings=Settings(max_iterations=0))
+    tool = Refiner(problem, plan.robot, kernels=kernels, options=RefineOptions(max_iterations=0, weight=0.0))
     checker = PlanChecker(problem, plan.robot, degree=7)
     found = refine_task(tool, checker, task(plan, path=plan.motion.path[0], rate=plan.motion.rate[0]))
     assert (found.outcome, found.reason) == (Outcome.TIME_SCALED, "ok")
@@ -597,11 +604,11 @@ def test_stalled_iterations_become_feasible_on_the_same_level(monkeypatch: pytes
 @needs_compiler
 def test_first_steps_from_a_plan_select_accelerations_far_from_their_limits() -> None:
     plans = Planner("airhockey-replan").plan_batch(draw_boundary_problems("airhockey-replan", 40, seed=8).boundary)
-    tool = load_refiner(*open_problem(plans.problem))
+    tool = Refiner(*open_problem(plans.problem))
     steps = []
     for distances in (sqp.SELECTION_DISTANCES, tool.levels.warm.settings.selection_distances):
         warm = replace(tool.levels.warm, settings=replace(tool.levels.warm.settings, selection_distances=distances))
-        solver = load_refiner(tool.problem, tool.robot, levels=replace(tool.levels, warm=warm))
+        solver = Refiner(tool.problem, tool.robot, levels=replace(tool.levels, warm=warm))
         results = [solver.run_level(problem, warm, solver.input_variables(problem)) for problem in tasks_of(plans)]
         steps.append(sum(result.iterations for result in results))
     assert steps[1] < 0.95 * steps[0]

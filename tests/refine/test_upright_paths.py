@@ -10,7 +10,7 @@ import pytest
 import cnpgen
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem
-from cnpgen.refine import strategy
+from cnpgen.refine import attempts
 from cnpgen.refine.options import DEFAULT_OPTIONS
 from cnpgen.refine.refine_engine import prepare, tasks_of
 from cnpgen.refine.rrt_connect import MAX_STATE_SPACING, STATE_SPACING, RestSpace, find_paths, follow_line
@@ -81,6 +81,6 @@ def test_a_transport_that_no_other_guess_solves_is_solved_along_a_path(
     (found,) = cnpgen.solve_plans(transport(label), workers=1).results
     assert found.valid
     assert found.outcome is Outcome.RESTARTED
-    monkeypatch.setattr(strategy, "path_guesses", lambda refiner, task, hulls=None: iter(()))
+    monkeypatch.setattr(attempts, "path_guesses", lambda refiner, task: iter(()))
     (before,) = cnpgen.solve_plans(transport(label), workers=1).results
     assert not before.valid

@@ -9,8 +9,7 @@ import pytest
 
 from cnpgen.errors import UsageError
 from cnpgen.losses.margins import suggested_margins
-from cnpgen.losses.metric import Metric
-from cnpgen.losses.metric_settings import MetricSettings
+from cnpgen.losses.metric import Metric, MetricSettings
 from cnpgen.planner.network.architecture import Architecture
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.constraints.table import Table

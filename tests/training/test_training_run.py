@@ -16,7 +16,7 @@ import pytest
 
 from cnpgen.cli.train_command import summary
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.losses.metric_settings import BOUNDED
+from cnpgen.losses.metric import BOUNDED
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model

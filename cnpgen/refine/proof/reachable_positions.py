@@ -27,13 +27,7 @@ class JointLimits:
 
 
 def joint_limits(problem: Problem, robot: Robot, *, tolerances: float) -> JointLimits:
-    """Return the limits of a problem's constraints.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        tolerances: Fraction of the constraints' tolerances by which the limits are relaxed, from 0 to 1.
-    """
+    """Return the limits of a problem's constraints, relaxed by a fraction of their tolerances, from 0 to 1."""
     lower, upper, velocity, acceleration = (sign * np.full(robot.n, NO_LIMIT) for sign in (-1, 1, 1, 1))
     for constraint in problem.constraint:
         tolerance = tolerances * constraint.tolerance
@@ -48,15 +42,10 @@ def joint_limits(problem: Problem, robot: Robot, *, tolerances: float) -> JointL
 
 @dataclass(frozen=True)
 class EndState:
-    """State at the start of a motion, or at its goal with reversed time.
+    """State at the start of a motion, or at its goal with reversed time."""
 
-    Attributes:
-        q: Joint positions [rad], shape (n,).
-        dq: Joint velocities [rad/s], shape (n,); at the goal the opposite of the motion's.
-    """
-
-    q: Array
-    dq: Array
+    q: Array  # joint positions [rad], shape (n,)
+    dq: Array  # joint velocities [rad/s], shape (n,); at the goal the opposite of the motion's
 
     def box(self, time: float, limits: JointLimits) -> tuple[Array, Array]:
         """Bound each joint's position ``time`` [s] later: (lower, upper), shape (n,); empty where lower > upper."""

@@ -32,35 +32,28 @@ MIN_GAIN_M = 1e-7  # at which a local search ends
 
 @dataclass(frozen=True)
 class TableBounds:
-    """Bounds of all tables of a problem: ``normals @ tip <= limits``.
+    """Bounds of all tables of a problem: ``normals @ tip <= limits``."""
 
-    Attributes:
-        normals: Unit vectors, shape (m, 3).
-        limits: Limits [m], shape (m,).
-        height: Mask of the rows of the height, shape (m,).
-    """
+    normals: Array  # unit vectors, shape (m, 3)
+    limits: Array  # limits [m], shape (m,)
+    height: NDArray[np.bool_]  # mask of the rows of the height, shape (m,)
 
-    normals: Array
-    limits: Array
-    height: NDArray[np.bool_]
+    def violation(self, tip: Array) -> float:
+        """Return the violation by a tip [m].
 
-    def violation(self, tip: Array) -> tuple[float, float]:
-        """Return the violation of the rectangle, at least ``MIN_VIOLATION_M``, and of the height by a tip [m]."""
+        It is that of the rectangle, at least ``MIN_VIOLATION_M``, plus ``HEIGHT_WEIGHT`` times that of the height.
+        """
         violation = self.normals @ tip - self.limits
         rectangle, height = violation[~self.height].max(), violation[self.height].max()
-        return max(float(rectangle), MIN_VIOLATION_M), max(float(height), 0.0)
+        return max(float(rectangle), MIN_VIOLATION_M) + HEIGHT_WEIGHT * max(float(height), 0.0)
 
 
 def table_bounds(problem: Problem, start_tip: Array, *, tolerances: float) -> TableBounds | None:
     """Return the bounds of the problem's tables, or None if it has none or they differ from sample to sample.
 
-    The height is bounded by its tolerance. A motion that starts off the table may be off by the table's ``start_off``
-    at any time, since the time-varying bound depends on its phase.
-
-    Args:
-        problem: The problem.
-        start_tip: Tip at the start [m], shape (3,).
-        tolerances: Fraction of the tolerance by which the rectangles are enlarged.
+    The rectangles are enlarged by a fraction of the tolerance; the height is bounded by its tolerance. A motion with a
+    tip [m], shape (3,), that starts off the table may be off by the table's ``start_off`` at any time, since the
+    time-varying bound depends on its phase.
     """
     tables = [constraint for constraint in problem.constraint if isinstance(constraint, Table)]
     if not tables or problem.parameters.tilts_table or problem.parameters.changes_rectangle:
@@ -78,20 +71,12 @@ def table_bounds(problem: Problem, start_tip: Array, *, tolerances: float) -> Ta
 
 @dataclass(frozen=True)
 class TableViolation:
-    """Smallest violation found at one time.
+    """Smallest violation found at one time."""
 
-    Attributes:
-        time: Time from the end [s].
-        value: Violation of the rectangle, at least ``MIN_VIOLATION_M``, plus ``HEIGHT_WEIGHT`` times that of the height
-            [m].
-        multipliers: Multipliers of the table's bounds, shape (m,).
-        box: Reachable joint positions: (lower, upper), shape (n,) each.
-    """
-
-    time: float
-    value: float
-    multipliers: Array
-    box: tuple[Array, Array]
+    time: float  # time from the end [s]
+    value: float  # see ``TableBounds.violation``
+    multipliers: Array  # multipliers of the table's bounds, shape (m,)
+    box: tuple[Array, Array]  # reachable joint positions: (lower, upper), shape (n,) each
 
     def weight(self, bounds: TableBounds) -> float:
         """Return the weight of one metre off the table: 1, or ``HEIGHT_WEIGHT`` if only the height is violated."""
@@ -101,19 +86,12 @@ class TableViolation:
 
 @dataclass(frozen=True)
 class TableExit:
-    """Instant at which the tip leaves the table, or nearly so, in every motion.
+    """Instant at which the tip leaves the table, or nearly so, in every motion."""
 
-    Attributes:
-        end: "start" or "goal".
-        time: Time from that end [s].
-        distance: Smallest distance off the table, or, negative, largest distance from its edge [m].
-        proven: Whether it is proven with all tolerances; otherwise a local search without tolerances found it.
-    """
-
-    end: str
-    time: float
-    distance: float
-    proven: bool
+    end: str  # "start" or "goal"
+    time: float  # time from that end [s]
+    distance: float  # smallest distance off the table, or, negative, largest distance from its edge [m]
+    proven: bool  # whether it is proven with all tolerances; otherwise a local search without tolerances found it
 
 
 def find_table_exit(problem: Problem, robot: Robot, boundary: Boundary) -> TableExit | None:
@@ -127,8 +105,8 @@ def find_table_exit(problem: Problem, robot: Robot, boundary: Boundary) -> Table
     times = sample_times(boundary, relaxed)
     for end, state in end_states(boundary).items():
         worst = max(_violations(arm, exact, state, limits, times), key=lambda item: item.value, default=None)
-        end_merit = _merit(exact, arm.at(state.q).position)
-        if worst is None or worst.value < max(-VERGE_DISTANCE_M, end_merit + MIN_DRIFT_M):
+        at_end = exact.violation(arm.at(state.q).position)
+        if worst is None or worst.value < max(-VERGE_DISTANCE_M, at_end + MIN_DRIFT_M):
             continue
         proof = _prove(arm, wide, _violations(arm, wide, state, relaxed, times))
         if proof is not None:
@@ -160,23 +138,19 @@ def _prove(arm: ArmKinematics, bounds: TableBounds, violations: list[TableViolat
 
 def _smallest(arm: ArmKinematics, bounds: TableBounds, time: float, box: tuple[Array, Array]) -> TableViolation:
     """Search from several configurations; stop at one without violation."""
-    best: TableViolation | None = None
-    random = np.random.default_rng(0)
+    random, violations = np.random.default_rng(0), list[TableViolation]()
     center = (box[0] + box[1]) / 2
     for q in (center, *(random.uniform(*box) for _ in range(LOCAL_SEARCHES - 1))):
-        value, multipliers = _search(arm, bounds, q, box)
-        if best is None or value < best.value:
-            best = TableViolation(time, value, multipliers, box)
-        if value <= MIN_VIOLATION_M:
+        violations.append(TableViolation(time, *_search(arm, bounds, q, box), box))
+        if violations[-1].value <= MIN_VIOLATION_M:
             break
-    assert best is not None
-    return best
+    return min(violations, key=lambda item: item.value)
 
 
 def _search(arm: ArmKinematics, bounds: TableBounds, q: Array, box: tuple[Array, Array]) -> tuple[float, Array]:
     """Minimize from q by linear programs on a shrinking box; return the violation and the multipliers."""
     radius = float((box[1] - box[0]).max())
-    value = _merit(bounds, arm.at(q).position)
+    value = bounds.violation(arm.at(q).position)
     multipliers: Array = np.zeros(len(bounds.limits))
     for _ in range(MAX_LP_STEPS):
         region = np.maximum(box[0], q - radius), np.minimum(box[1], q + radius)
@@ -184,7 +158,7 @@ def _search(arm: ArmKinematics, bounds: TableBounds, q: Array, box: tuple[Array,
         if solution is None:
             break
         step, predicted, multipliers = solution
-        new = _merit(bounds, arm.at(q + step).position)
+        new = bounds.violation(arm.at(q + step).position)
         if new < value:
             gain, q, value = value - new, q + step, new
             if gain < MIN_GAIN_M:
@@ -194,11 +168,6 @@ def _search(arm: ArmKinematics, bounds: TableBounds, q: Array, box: tuple[Array,
         else:
             radius *= 0.3
     return value, multipliers
-
-
-def _merit(bounds: TableBounds, tip: Array) -> float:
-    rectangle, height = bounds.violation(tip)
-    return rectangle + HEIGHT_WEIGHT * height
 
 
 def _linear_step(

@@ -19,17 +19,11 @@ MAX_BOXES = 4000
 
 @dataclass(frozen=True)
 class TipKinematics:
-    """The tip at one configuration.
+    """The tip at one configuration."""
 
-    Attributes:
-        position: Position [m], shape (3,).
-        jacobian: Derivative of the position [m/rad], shape (3, n).
-        axes: Axes of revolute joints in the world, zero for prismatic ones, shape (3, n).
-    """
-
-    position: Array
-    jacobian: Array
-    axes: Array
+    position: Array  # position [m], shape (3,)
+    jacobian: Array  # derivative of the position [m/rad], shape (3, n)
+    axes: Array  # axes of revolute joints in the world, zero for prismatic ones, shape (3, n)
 
     def curvature(self, direction: Array) -> Array:
         """Return second derivatives along a direction, shape (n, n): ``c . (axis_i x J_j)`` for i <= j."""
@@ -38,11 +32,7 @@ class TipKinematics:
 
 
 class ArmKinematics:
-    """Positions of the tip by Pinocchio.
-
-    Attributes:
-        reach: Upper bounds of the derivatives of the tip's position by each joint, of any order, shape (n,).
-    """
+    """Positions of the tip by Pinocchio."""
 
     def __init__(self, robot: Robot) -> None:
         self._model, self._data = robot.model, robot.model.createData()
@@ -55,6 +45,7 @@ class ArmKinematics:
         ]
         lengths.append(float(np.linalg.norm(robot.chain.tip_translation)))
         outer = np.cumsum(lengths[::-1])[::-1]
+        # upper bounds of the derivatives of the tip's position by each joint, of any order, shape (n,)
         self.reach = np.array([1.0 if joint.prismatic else outer[i] for i, joint in enumerate(joints)])
 
     def at(self, q: Array) -> TipKinematics:
@@ -69,17 +60,9 @@ class ArmKinematics:
 
 
 def bound_projection(arm: ArmKinematics, direction: Array, lower: Array, upper: Array, *, above: float) -> float | None:
-    """Return a lower bound of ``direction . tip`` over a box of joint positions.
+    """Return a lower bound of ``direction . tip`` over a box of joint positions, or None below a threshold.
 
-    Args:
-        arm: The arm.
-        direction: Direction, shape (3,).
-        lower: Lower ends of the box [rad], shape (n,).
-        upper: Upper ends of the box [rad], shape (n,).
-        above: Threshold that the bound must exceed [m].
-
-    Returns:
-        A lower bound above ``above``, or None if none was found.
+    The direction has shape (3,), the lower and upper ends of the box [rad] shape (n,), the threshold is ``above`` [m].
     """
     boxes, bound = [(lower, upper)], np.inf
     for _ in range(MAX_BOXES):

@@ -35,21 +35,13 @@ MAX_TEMPLATES = 64
 
 @dataclass(frozen=True)
 class Tightening:
-    """Tightening of the problem's bounds against overshoot between grid points.
+    """Tightening of the problem's bounds against overshoot between grid points."""
 
-    Attributes:
-        limit: Fraction of acceleration, torque and jerk limits.
-        gentle: Fraction of position and velocity limits, on which boundary states lie.
-        clearance: Distance added to clearances [m].
-        band: Half width of equalities, as a fraction of their tolerance.
-        edge: Phase over which the tightening fades in from either end, since boundary states may lie on a limit.
-    """
-
-    limit: float
-    gentle: float
-    clearance: float
-    band: float
-    edge: float
+    limit: float  # fraction of acceleration, torque and jerk limits
+    gentle: float  # fraction of position and velocity limits, on which boundary states lie
+    clearance: float  # distance added to clearances [m]
+    band: float  # half width of equalities, as a fraction of their tolerance
+    edge: float  # phase over which the tightening fades in from either end, since boundary states may lie on a limit
 
 
 NO_TIGHTENING = Tightening(limit=0.0, gentle=0.0, clearance=0.0, band=0.0, edge=1.0)
@@ -57,20 +49,15 @@ NO_TIGHTENING = Tightening(limit=0.0, gentle=0.0, clearance=0.0, band=0.0, edge=
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of the residuals on the grid, in scaled units.
+    """Bounds of the residuals on the grid, in scaled units."""
 
-    Attributes:
-        lower: Lower bounds, shape (K, m), -inf where there are none.
-        upper: Upper bounds, shape (K, m).
-        nonsmooth: Mask of residuals that change abruptly with the last rate control points, shape (K, m): those of
-            accelerations and jerks at the ends.
-        interval_tolerance: Accepted violation between grid points, shape (K, m): that of the verdict, or of a precise
-            plan for equalities; inf where it is unknown.
-    """
-
-    lower: Array
-    upper: Array
+    lower: Array  # lower bounds, shape (K, m), -inf where there are none
+    upper: Array  # upper bounds, shape (K, m)
+    # Mask of residuals that change abruptly with the last rate control points, shape (K, m): those of accelerations and
+    # jerks at the ends.
     nonsmooth: NDArray[np.bool_]
+    # Accepted violation between grid points, shape (K, m): that of the verdict, or of a precise plan for equalities;
+    # inf where it is unknown.
     interval_tolerance: Array
 
     @property
@@ -92,11 +79,9 @@ class Bounds:
         return max(worst, 0.0) if np.isfinite(worst) else np.inf
 
     def tightened(self, g: Array, midpoint_weights: Array) -> "Bounds | None":
-        """Return bounds tightened where residuals g violate them between grid points, or None if none do.
+        """Return bounds tightened where residuals g (K, m) violate them between grid points, or None if none do.
 
-        Args:
-            g: Residuals, shape (K, m).
-            midpoint_weights: Weights of the cubic interpolation, see ``Grid.midpoint_weights``.
+        Midpoints are interpolated with ``Grid.midpoint_weights``.
         """
         centers = sum(
             weights[:, None] * g[k : k + len(midpoint_weights)] for k, weights in enumerate(midpoint_weights.T)
@@ -144,14 +129,8 @@ def bounds_template(problem: Problem, world: World, s: Array, tightening: Tighte
 class BoundsTemplate:
     """Bounds of the motions of a problem on one grid with phases s, shape (K,); the state of its world is changed.
 
-    Attributes:
-        conditions: Conditions of the residuals.
-        tolerances: Tolerances of the verdict in scaled units, shape (m,); ``UNKNOWN_TOLERANCE`` for conservative
-            conditions.
-        orders: Highest derivative of q on which each residual depends, shape (m,).
-        equal: Mask of equalities, shape (m,).
-        capsules: Mask of clearances of capsules, those of the links or the paper's, shape (m,).
-        held_clearances: Mask of clearances of the held object from the links, shape (m,).
+    Per residual, shape (m,), it has tolerances of the verdict in scaled units (``UNKNOWN_TOLERANCE`` for conservative
+    conditions), the highest derivative of q, and masks of equalities, capsules and clearances of the held object.
     """
 
     def __init__(self, problem: Problem, world: World, s: Array, tightening: Tightening) -> None:
@@ -191,12 +170,10 @@ class BoundsTemplate:
         self._nonsmooth[[*END_POINTS, *(-1 - point for point in END_POINTS)]] = self.orders >= 2
 
     def bounds_for(self, start_tip: Array, *, ends: Array | None = None) -> Bounds:
-        """Return the bounds of one motion.
+        """Return the bounds of one motion with the tip at ``start_tip`` [m], shape (3,), at the start.
 
-        Args:
-            start_tip: Position of the tip at the start [m], shape (3,).
-            ends: Residuals of the boundary states, shape (2, m), nan where they are free. Bounds near an end that
-                violates them within the tolerance are relaxed by the violation: no motion meets narrower ones.
+        Residuals of the boundary states ``ends`` have shape (2, m), nan where they are free. Bounds near an end that
+        violates them within the tolerance are relaxed by the violation: no motion meets narrower ones.
         """
         lower, upper = self._lower, self._upper
         for constraint, condition, columns in self._time_varying:
@@ -210,13 +187,7 @@ class BoundsTemplate:
         return bounds if ends is None else self._relaxed_at_ends(bounds, ends)
 
     def near(self, bounds: Bounds, positions: Array, distance: float) -> Bounds:
-        """Return bounds that also keep the joints near a path.
-
-        Args:
-            bounds: Bounds of one motion.
-            positions: Joint positions of the path on the grid [rad], shape (K, n).
-            distance: Largest difference of every joint from the path [rad].
-        """
+        """Return bounds that also keep every joint within a distance [rad] of a path on the grid, shape (K, n)."""
         columns = np.isfinite(self._position_scale)
         if columns.sum() != positions.shape[1]:
             return bounds
@@ -230,10 +201,7 @@ class BoundsTemplate:
     def with_hull_distances(self, bounds: Bounds, min_distances: Array, extra: Array | float = 0.0) -> Bounds:
         """Return bounds without those of capsules and with further columns for the distances of hulls.
 
-        Args:
-            bounds: Bounds of one motion.
-            min_distances: Required distances [m], shape (columns,).
-            extra: Additional distances [m], shape (K, columns).
+        Required distances [m] have shape (columns,), additional ones shape (K, columns).
         """
         added = _added_clearance(self._s, self._tightening)[:, None]
         lower = (min_distances + added + extra) / DISTANCE_SCALE_M

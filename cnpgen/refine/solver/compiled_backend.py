@@ -23,11 +23,12 @@ from cnpgen.refine.solver.qp_subproblem import (
     MAX_WORKING_SET_CHANGES,
     MIN_MULTIPLIER,
     QP_TOLERANCE,
+    THINNING,
     Mask,
     NumpyBackend,
+    NumpySubproblem,
     ResidualSelection,
     Step,
-    Subproblem,
 )
 from cnpgen.refine.solver.transcription import Transcription
 from cnpgen.trajectory.spline import end_derivatives
@@ -89,20 +90,20 @@ def load_step_library(kernels: KernelLibrary) -> ctypes.CDLL | None:
 
 
 class CompiledBackend:
-    """Backend of step.c; see ``Backend``."""
+    """Backend of step.c; see ``NumpyBackend``."""
 
-    def __init__(self, motion: Transcription, bounds: Bounds, thinning: int) -> None:
+    def __init__(self, motion: Transcription, bounds: Bounds) -> None:
         library = motion.kernels.step_library
         assert library is not None
         self._evaluate, self._build, self._solve = library.evaluate, library.build_subproblem, library.solve_subproblem
         self._arrays: list[Any] = []  # keeps the memory of step.c alive
         self._points, self._m, self._nx = len(motion.grid.s), motion.kernels.values.tape.outputs[0], motion.nx
-        self._motion = self._describe(motion, bounds, thinning)
+        self._motion = self._describe(motion, bounds)
         self._address = ctypes.addressof(self._motion)
-        self._fallback, self._activate = NumpyBackend(motion, bounds, thinning), motion.activate
+        self._fallback, self._activate = NumpyBackend(motion, bounds), motion.activate
 
     def value(self, x: Array) -> tuple[float, Array, float]:
-        """Evaluate a motion; see ``Backend``."""
+        """Evaluate a motion; see ``NumpyBackend``."""
         g = np.empty((self._m, self._points))
         self._activate()
         cost = self._evaluate(self._address, address_of(x), address_of(g))
@@ -111,7 +112,7 @@ class CompiledBackend:
     def subproblem(
         self, x: Array, g: Array, selection: ResidualSelection, *, proximal: float, penalty: float
     ) -> "CompiledSubproblem":
-        """Build the subproblem; see ``Backend``."""
+        """Build the subproblem; see ``NumpyBackend``."""
         selected = np.zeros((self._m, self._points), bool)
         missed = np.ascontiguousarray(selection.missed.T)
         before = None if selection.multipliers is None else np.ascontiguousarray(selection.multipliers.T)
@@ -144,7 +145,7 @@ class CompiledBackend:
         state = self._motion
         return Step(dx, state.remaining, multipliers.T, state.gain) if np.isfinite(dx).all() else None
 
-    def _describe(self, motion: Transcription, bounds: Bounds, thinning: int) -> _Motion:
+    def _describe(self, motion: Transcription, bounds: Bounds) -> _Motion:
         spec, stride = motion.spec, motion.nx + 2 + -(motion.nx + 2) % MAX_LANES
         path = end_derivatives(spec.path_control_points, spec.degree)
         rate = end_derivatives(spec.rate_control_points, spec.degree)
@@ -157,7 +158,7 @@ class CompiledBackend:
             nx=motion.nx,
             stride=stride,
             m=self._m,
-            thinning=thinning,
+            thinning=THINNING,
             eta=path.eta,
             beta=path.beta,
             rate_eta=rate.eta,
@@ -241,15 +242,15 @@ class CompiledBackend:
 
 @dataclass(frozen=True)
 class CompiledSubproblem:
-    """Subproblem of step.c at an iterate with residuals g; see ``Subproblem``."""
+    """Subproblem of step.c at an iterate with residuals g; see ``NumpySubproblem``."""
 
     backend: CompiledBackend
-    fallback: Callable[[], Subproblem]  # builds the same subproblem in NumPy
+    fallback: Callable[[], NumpySubproblem]  # builds the same subproblem in NumPy
     g: Array
     selected: Mask
     elastic_gradient: float  # of the elastic variable's cost
 
     def solve(self, box: Array, *, warm: Array | None = None, relax: bool = False) -> Step | None:
-        """Return the best step within the box; see ``Subproblem``. DAQP solves it if active_set.c does not."""
+        """Return the best step within the box; see ``NumpySubproblem``. DAQP solves it if active_set.c does not."""
         step = self.backend.solve(self, box, warm, relax=relax)
         return self.fallback().solve(box, warm=warm, relax=relax) if step is None else step

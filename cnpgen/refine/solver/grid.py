@@ -19,21 +19,13 @@ FIRST_JERK_PHASE = 1e-6  # close enough to 0; jerks there differ by some percent
 
 @dataclass(frozen=True)
 class Bases:
-    """Spline bases at some phases.
+    """Spline bases at some phases."""
 
-    Attributes:
-        path: Basis of p and its derivatives, shape (orders, K, C).
-        rate: Basis of r and its derivatives, shape (orders - 1, K, R).
-        path_at: ``path`` phase by phase, shape (K, C, orders).
-        rate_at: ``rate`` phase by phase, shape (K, orders - 1, R).
-        support: Number of control points with nonzero basis functions at a phase.
-    """
-
-    path: Array
-    rate: Array
-    path_at: Array
-    rate_at: Array
-    support: int
+    path: Array  # basis of p and its derivatives, shape (orders, K, C)
+    rate: Array  # basis of r and its derivatives, shape (orders - 1, K, R)
+    path_at: Array  # ``path`` phase by phase, shape (K, C, orders)
+    rate_at: Array  # ``rate`` phase by phase, shape (K, orders - 1, R)
+    support: int  # number of control points with nonzero basis functions at a phase
 
     @cached_property
     def phases_last(self) -> tuple[Array, Array]:
@@ -46,12 +38,7 @@ class Bases:
         return _first(self.path, self.support), _first(self.rate, self.support)
 
     def states(self, path: Array, rate: Array) -> Array:
-        """Evaluate a motion: w = (p, p', ..., r, r', ...), shape (orders n + orders - 1, K).
-
-        Args:
-            path: Path control points, shape (C, n).
-            rate: Rate control points, shape (R,).
-        """
+        """Evaluate a motion: w = (p, p', ..., r, r', ...), shape (orders n + orders - 1, K), from (C, n) and (R,)."""
         orders, points, _ = self.path.shape
         first = orders * path.shape[1]
         w = np.empty((first + orders - 1, points))
@@ -62,25 +49,17 @@ class Bases:
 
 @dataclass(frozen=True)
 class Grid:
-    """Grid on (0, 1].
+    """Grid on (0, 1]."""
 
-    Attributes:
-        s: Phases, shape (K,); at s = 0 everything but the jerk is fixed by the boundary conditions.
-        bases: Bases on the grid, three orders of p and two of r, or four and three where the jerk is constrained.
-        time_basis: Basis of r at the nodes of the time integral, shape (Q, R).
-        time_weights: Quadrature weights of the time integral, shape (Q,).
-        cost_bases: Bases at the Gauss nodes of the cost term's integral, four orders of p and three of r. The nodes are
-            few, since their residuals are expensive. The error of the integral is up to a few tenths of a percent, that
-            of the objective up to 0.1 %.
-        cost_weights: Quadrature weights of the cost term's integral.
-    """
-
-    s: Array
-    bases: Bases
-    time_basis: Array
-    time_weights: Array
+    s: Array  # phases, shape (K,); at s = 0 everything but the jerk is fixed by the boundary conditions
+    bases: Bases  # bases on the grid, three orders of p and two of r, or four and three where the jerk is constrained
+    time_basis: Array  # basis of r at the nodes of the time integral, shape (Q, R)
+    time_weights: Array  # quadrature weights of the time integral, shape (Q,)
+    # Bases at the Gauss nodes of the cost term's integral, four orders of p and three of r. The nodes are few, since
+    # their residuals are expensive. The error of the integral is up to a few tenths of a percent, that of the objective
+    # up to 0.1 %.
     cost_bases: Bases
-    cost_weights: Array
+    cost_weights: Array  # quadrature weights of the cost term's integral
 
     @cached_property
     def midpoint_weights(self) -> Array:

@@ -6,9 +6,8 @@ The derivative of the distance treats the closest points and the direction as co
 velocity of the points along the direction.
 """
 
-from collections import defaultdict
 from ctypes import CDLL
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -22,14 +21,12 @@ from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
-from cnpgen.refine.solver.grid import Grid
 from cnpgen.refine.solver.residuals import DISTANCE_SCALE_M
-from cnpgen.refine.solver.transcription import Linearization, ResidualKernels, Transcription, cache_last
+from cnpgen.refine.solver.transcription import ResidualKernels
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.convex_part import Contacts
 from cnpgen.robots.shape.held_object import HELD_OBJECT, with_held_object
 from cnpgen.robots.solid import solids_of
-from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.rigid_bodies import RigidBodies
 
@@ -47,38 +44,20 @@ def has_clearance_constraints(problem: Problem, robot: Robot) -> bool:
 
 @dataclass(frozen=True)
 class _Group:
-    """Pairs of bodies of one constraint.
+    """Pairs of bodies of one constraint."""
 
-    Attributes:
-        pairs: Pairs of bodies, shape (P, 2).
-        columns: Columns of their distances, shape (P,).
-        required: Required distance [m].
-        of_obstacles: Whether they are obstacles and moving parts, else two links.
-        numbers: Their numbers among all pairs of obstacles and moving parts, or of links, shape (P,).
-    """
-
-    pairs: Pairs
-    columns: Pairs
-    required: float
-    of_obstacles: bool
-    numbers: Pairs
+    pairs: Pairs  # shape (P, 2)
+    columns: Pairs  # of their distances, shape (P,)
+    required: float  # distance [m]
+    of_obstacles: bool  # whether they are obstacles and moving parts, else two links
+    numbers: Pairs  # among all pairs of obstacles and moving parts, or of links, shape (P,)
 
 
 class Hulls:
     """Clearances of a robot's convex parts at many states. Not thread-safe: memory is reused.
 
-    Args:
-        problem: The problem.
-        robot: Its robot; ``has_clearance_constraints`` must hold.
-        library: Library of compiled collision checks, or None to measure with Coal.
-        with_object: Whether the held object is a part of the robot, for its constraints.
-
-    Attributes:
-        checker: Compiled collision checks, or None.
-        obstacle_distance: Largest required distance from obstacles [m], None without such a constraint.
-        self_distance: Largest required distance of links from each other [m], None without such a constraint.
-        min_distances: Required distances [m], shape (m,), of pairs of links or of a link and an obstacle.
-        tolerances: Accepted violations of them in a valid motion [m], shape (m,).
+    ``has_clearance_constraints`` must hold. Without a library of compiled collision checks Coal measures. The held
+    object is a part of the robot only ``with_object``.
     """
 
     def __init__(
@@ -98,21 +77,22 @@ class Hulls:
         names = [*links, *range(len(problem.obstacle))]
         columns: dict[Any, int] = {}
         self._groups, self._uncovered = list[_Group](), list[tuple[Pairs, float]]()
-        min_distances, accepted = (defaultdict[int, float](lambda: -np.inf) for _ in range(2))  # by column
         covered = {frozenset((pair.first, pair.second)) for pair in shape.pairs if pair.for_solvers}
         for constraint in constraints:
             of_links, required = isinstance(constraint, SelfClearance | ObjectClearance), _required(constraint)
             pairs, numbers = self._pairs_of(constraint, names, of_links=of_links)
             indices = [columns.setdefault((names[a], names[b]), len(columns)) for a, b in pairs.tolist()]
-            for column in indices:
-                min_distances[column] = max(min_distances[column], required)
-                accepted[column] = max(accepted[column], required - _tolerance(constraint))
             self._groups.append(_Group(pairs, np.array(indices, np.intp), required, not of_links, numbers))
             if of_links:
                 uncovered = [frozenset((names[a], names[b])) not in covered for a, b in pairs.tolist()]
                 self._uncovered.append((pairs[np.array(uncovered, bool)], required))
-        self.min_distances = np.array([min_distances[column] for column in range(len(columns))])
-        self.tolerances = self.min_distances - np.array([accepted[column] for column in range(len(columns))])
+        # of pairs of links or of a link and an obstacle [m], shape (m,): required distances, and accepted violations
+        self.min_distances, accepted = np.full((2, len(columns)), -np.inf)
+        for constraint, group in zip(constraints, self._groups, strict=True):
+            np.maximum.at(self.min_distances, group.columns, group.required)
+            np.maximum.at(accepted, group.columns, group.required - _tolerance(constraint))
+        self.tolerances = self.min_distances - accepted
+        # largest required distances from obstacles and of links from each other [m]; None without such a constraint
         self.obstacle_distance, (added_to_links, added_to_object) = _largest(constraints, RobotClearance, ObjectContact)
         self.self_distance, added = _largest(constraints, SelfClearance, ObjectClearance)
         self.checker = None
@@ -134,15 +114,10 @@ class Hulls:
         return pairs[numbers], numbers
 
     def measure(self, q: Array, obstacle_poses: Array) -> tuple[Array, list[Contacts]]:
-        """Measure the distances of close parts.
+        """Measure the distances of close parts at joint positions q [rad], shape (n, K).
 
-        Args:
-            q: Joint positions [rad], shape (n, K).
-            obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-
-        Returns:
-            Distances [m], shape (K, m), at most ``MEASURED_RANGE_M`` above the required ones, nan if q is not finite;
-            and the contacts of every constraint.
+        The result are distances [m], shape (K, m), at most ``MEASURED_RANGE_M`` above the required ones, nan if q is
+        not finite; and the contacts of every constraint.
         """
         if not np.isfinite(q).all():
             return np.full((q.shape[1], len(self.min_distances)), np.nan), []
@@ -204,7 +179,8 @@ class Hulls:
     def gradients(self, q: Array, distances: Array, groups: list[Contacts]) -> Array:
         """Differentiate the result of ``measure`` in q: shape (n, m, K), 0 for parts out of range."""
         gradients = np.zeros((q.shape[1], len(self.min_distances), self._n))
-        axes, origins = self._joint_axes(q)
+        rotations, positions = self._kinematics.poses(q)  # of the joints in the world frame
+        axes, origins = np.einsum("jxyk,jy->kjx", rotations[1:], self._axes), positions[1:].transpose(2, 0, 1)
         for contacts, group in zip(groups, self._groups, strict=True):
             k, column = contacts.k, group.columns[contacts.pair]
             normals = np.repeat(contacts.normal[:, None], 2, axis=1)
@@ -263,12 +239,6 @@ class Hulls:
         k, distance, normal, points = close.k[kept], close.distance[kept], close.normal[kept], close.points[kept]
         return Contacts(pair, k, distance, normal, points)
 
-    def _joint_axes(self, q: Array) -> tuple[Array, Array]:
-        """Return axes and origins [m] of the joints in the world frame, shape (K, n, 3) each."""
-        rotations, positions = self._kinematics.poses(q)
-        axes = np.einsum("jxyk,jy->kjx", rotations[1:], self._axes)
-        return axes, positions[1:].transpose(2, 0, 1)
-
     def _place(self, q: Array, obstacle_poses: Array) -> None:
         self._bodies.place(*self._kinematics.poses(q), solids_of(self._obstacles, obstacle_poses))
 
@@ -290,53 +260,3 @@ def _largest(constraints: list[Any], *kinds: type) -> tuple[float | None, list[f
     ]
     required = max(largest)
     return (None, largest) if required == -np.inf else (required, [distance - required for distance in largest])
-
-
-class CompiledHullTranscription(Transcription):
-    """One motion on one grid with the clearances of the links' hulls as further residuals, evaluated in compiled code.
-
-    Kernels and hulls must be compiled; ``kernel_poses`` are the scene values that the kernels take, shape (width,).
-    """
-
-    def __init__(
-        self,
-        kernels: ResidualKernels,
-        grid: Grid,
-        hulls: Hulls,
-        *,
-        boundary: Boundary,
-        kernel_poses: Array,
-        obstacle_poses: Array,
-    ) -> None:
-        self._rows = hulls.row_kernels(kernels, obstacle_poses)
-        with_rows = replace(kernels, values=self._rows.values, jacobian=self._rows.jacobian)
-        super().__init__(with_rows, grid, boundary=boundary, obstacle_poses=kernel_poses)
-
-    def activate(self) -> None:
-        """Make the kernels those of this thread, see ``RowKernels``."""
-        self._rows.activate()
-
-
-class HullTranscription(Transcription):
-    """One motion on one grid with the clearances of the links' hulls as further residuals, evaluated in NumPy."""
-
-    def __init__(
-        self, kernels: ResidualKernels, grid: Grid, hulls: Hulls, *, boundary: Boundary, obstacle_poses: Array
-    ) -> None:
-        super().__init__(replace(kernels, step_library=None), grid, boundary=boundary, obstacle_poses=obstacle_poses)
-        self._hulls = hulls
-        self._measure = cache_last(lambda w: hulls.measure(w[: self.n], obstacle_poses))
-
-    def measured(self, x: Array) -> tuple[float, Array]:
-        """Evaluate the objective and residuals (K, m + columns)."""
-        cost, g = super().measured(x)
-        return cost, np.hstack([g, self._measure(self._at(x)[0])[0] / DISTANCE_SCALE_M])
-
-    def evaluate(self, x: Array) -> Linearization:
-        """Evaluate objective and residuals with their derivatives."""
-        at, (w, _, _) = super().evaluate(x), self._at(x)
-        distances, groups = self._measure(w)
-        gradients = np.zeros((len(w), len(self._hulls.min_distances), w.shape[1]))
-        gradients[: self.n] = self._hulls.gradients(w[: self.n], distances, groups) / DISTANCE_SCALE_M
-        jacobian = np.concatenate([at.jacobian, gradients], axis=1)
-        return replace(at, g=np.hstack([at.g, distances / DISTANCE_SCALE_M]), jacobian=jacobian)

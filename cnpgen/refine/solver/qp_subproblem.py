@@ -6,7 +6,6 @@ as BLAS.
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,97 +23,54 @@ ELASTIC_GRADIENT = 1e-3  # of the elastic variable's cost where nothing is viola
 MIN_MULTIPLIER = 1e-9  # smaller multipliers belong to inactive residuals
 QP_TOLERANCE = 1e-6  # primal tolerance of DAQP and of active_set.c
 MAX_WORKING_SET_CHANGES = 3000
+THINNING = 6  # interval of grid points at which residuals are selected without being a local maximum
 MAX_SPEED_DISTANCE = 0.4  # selection distance without accelerations, which grow with the square of the rate
 DAQP_LOWER, DAQP_UPPER = 3, 1  # DAQP's codes of initially active bounds
 
 
 @dataclass(frozen=True)
 class Step:
-    """Solution of a subproblem.
+    """Solution of a subproblem."""
 
-    Attributes:
-        dx: Step of the variables, shape (nx,).
-        remaining: Fraction of the violations that remains after the step.
-        multipliers: Multipliers of all residuals, shape (K, m); 0 for those that are not selected.
-        gain: Predicted reduction of the objective.
-    """
-
-    dx: Array
-    remaining: float
-    multipliers: Array
-    gain: float
+    dx: Array  # step of the variables, shape (nx,)
+    remaining: float  # fraction of the violations that remains after the step
+    multipliers: Array  # multipliers of all residuals, shape (K, m); 0 for those that are not selected
+    gain: float  # predicted reduction of the objective
 
 
 @dataclass(frozen=True)
 class ResidualSelection:
-    """Rule that selects the residuals of a subproblem.
+    """Rule that selects the residuals of a subproblem."""
 
-    Attributes:
-        violation: Largest violation at the current iterate.
-        max_distance: Residuals are selected at local maxima within this distance of a bound.
-        max_log_rate_change: Bound of the change of log r; nonsmooth residuals that it could move over a bound are
-            selected.
-        missed: Mask of residuals that are selected in any case, shape (K, m).
-        multipliers: Multipliers of the last step, shape (K, m), or None; residuals with one are selected.
-    """
-
-    violation: float
-    max_distance: float
+    violation: float  # largest violation at the current iterate
+    max_distance: float  # residuals are selected at local maxima within this distance of a bound
+    # Bound of the change of log r; nonsmooth residuals that it could move over a bound are selected.
     max_log_rate_change: float
-    missed: Mask
-    multipliers: Array | None
-
-
-class Subproblem(Protocol):
-    """Quadratic programs at one iterate."""
-
-    @property
-    def selected(self) -> Mask:
-        """Mask of the residuals in the programs, shape (K, m)."""
-
-    def solve(self, box: Array, *, warm: Array | None = None, relax: bool = False) -> "Step | None":
-        """Return the best step within the box, or None without a solution.
-
-        Args:
-            box: Largest change of every variable, shape (nx,).
-            warm: Multipliers, shape (K, m), of the residuals in the initial working set, or None.
-            relax: Whether satisfied residuals may be violated, too, up to the remaining largest violation.
-        """
-
-
-class Backend(Protocol):
-    """Evaluations and subproblems of a motion within its bounds."""
-
-    def value(self, x: Array) -> tuple[float, Array, float]:
-        """Evaluate the regularized objective, residuals (K, m) and their largest violation."""
-
-    def subproblem(
-        self, x: Array, g: Array, selection: ResidualSelection, *, proximal: float, penalty: float
-    ) -> Subproblem:
-        """Build the subproblem at x with residuals g; it is valid until the next one is built."""
+    missed: Mask  # residuals that are selected in any case, shape (K, m)
+    multipliers: Array | None  # multipliers of the last step, shape (K, m), or None; residuals with one are selected
 
 
 class NumpyBackend:
-    """Backend in NumPy and DAQP; see ``select_residuals`` for ``thinning``."""
+    """Evaluations and subproblems of a motion within its bounds, in NumPy and DAQP."""
 
-    def __init__(self, motion: Transcription, bounds: Bounds, thinning: int) -> None:
-        self._motion, self._bounds, self._thinning = motion, bounds, thinning
+    def __init__(self, motion: Transcription, bounds: Bounds) -> None:
+        self._motion, self._bounds = motion, bounds
         self._evaluate = cache_last(motion.evaluate)  # after a rejected step the iterate is the same
 
     def value(self, x: Array) -> tuple[float, Array, float]:
-        """Evaluate a motion; see ``Backend``."""
+        """Evaluate the regularized objective, residuals (K, m) and their largest violation."""
         cost, g = self._motion.value(x)
         return cost, g, self._bounds.max_violation(g)
 
     def subproblem(
         self, x: Array, g: Array, selection: ResidualSelection, *, proximal: float, penalty: float
     ) -> "NumpySubproblem":
-        """Build the subproblem; see ``Backend``."""
-        at = self._evaluate(x)
-        errors = self._motion.linearization_errors(at, selection.max_log_rate_change)
-        selected = select_residuals(
-            g, self._bounds, thinning=self._thinning, max_distance=selection.max_distance, linearization_errors=errors
-        )
+        """Build the subproblem at x with residuals g; it is valid until the next one is built."""
+        at, bounds, distance = self._evaluate(x), self._bounds, selection.max_distance
+        violations, errors = bounds.violations(g), self._motion.linearization_errors(at, selection.max_log_rate_change)
+        distances = np.where(bounds.accelerated, distance, min(distance, MAX_SPEED_DISTANCE))
+        selected: Mask = local_maxima(violations) & (violations > -distances)
+        selected |= bounds.nonsmooth & (violations > -errors)
         selected |= selection.missed
         if selection.multipliers is not None:
             selected |= selection.multipliers != 0
@@ -123,21 +79,22 @@ class NumpyBackend:
 
 @dataclass(frozen=True)
 class NumpySubproblem:
-    """Quadratic model of the objective and linear model of the selected residuals, solved by DAQP.
-
-    ``proximal`` is the weight of the proximal term, ``penalty`` that of the largest violation at the iterate.
-    """
+    """Quadratic model of the objective and linear model of the selected residuals, solved by DAQP."""
 
     motion: Transcription
     at: Linearization
     bounds: Bounds
-    selected: Mask
-    violation: float
-    proximal: float
-    penalty: float
+    selected: Mask  # residuals in the programs, shape (K, m)
+    violation: float  # the largest one at the iterate
+    proximal: float  # weight of the proximal term
+    penalty: float  # weight of the violation
 
     def solve(self, box: Array, *, warm: Array | None = None, relax: bool = False) -> Step | None:
-        """Return the best step within the box; see ``Subproblem``."""
+        """Return the best step within the box of largest changes, shape (nx,), or None without a solution.
+
+        ``warm`` are the multipliers of the residuals in the initial working set, shape (K, m). With ``relax`` satisfied
+        residuals may be violated, too, up to the remaining largest violation.
+        """
         import daqp
 
         nx, unwhiten = self.motion.nx, self._unwhiten
@@ -197,27 +154,7 @@ class NumpySubproblem:
         return rows, np.where(above > 0, -DAQP_INFINITY, lower - g), np.where(below > 0, DAQP_INFINITY, upper - g)
 
 
-def select_residuals(
-    g: Array, bounds: Bounds, *, thinning: int, max_distance: float, linearization_errors: Array
-) -> Mask:
-    """Select the residuals close to a bound at a local maximum, and nonsmooth ones that may cross it: (K, m).
-
-    Args:
-        g: Residuals, shape (K, m).
-        bounds: Bounds of the residuals.
-        thinning: Interval of grid points at which residuals are selected without being a local maximum.
-        max_distance: Largest distance from a bound; at most ``MAX_SPEED_DISTANCE`` without accelerations.
-        linearization_errors: Possible change of nonsmooth residuals, shape (K, m).
-    """
-    violations = bounds.violations(g)
-    distances = np.where(bounds.accelerated, max_distance, min(max_distance, MAX_SPEED_DISTANCE))
-    selected: Mask = (local_maxima(violations, thinning=thinning) & (violations > -distances)) | (
-        bounds.nonsmooth & (violations > -linearization_errors)
-    )
-    return selected
-
-
-def local_maxima(violations: Array, *, thinning: int) -> Mask:
+def local_maxima(violations: Array) -> Mask:
     """Return a mask of local maxima along the motion, their neighbors and the thinned grid, shape (K, m)."""
     peak = np.zeros(violations.shape, bool, order="F")
     peak[1:-1] = (violations[1:-1] >= violations[:-2]) & (violations[1:-1] >= violations[2:])
@@ -225,5 +162,5 @@ def local_maxima(violations: Array, *, thinning: int) -> Mask:
     mask = peak.copy("F")
     mask[1:] |= peak[:-1]
     mask[:-1] |= peak[1:]
-    mask[::thinning] = True
+    mask[::THINNING] = True
     return mask

@@ -20,14 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.refine.solver.bounds import Bounds
-from cnpgen.refine.solver.compiled_backend import CompiledBackend
+from cnpgen.refine.solver.compiled_backend import CompiledBackend, CompiledSubproblem
 from cnpgen.refine.solver.qp_subproblem import (
-    Backend,
     Mask,
     NumpyBackend,
+    NumpySubproblem,
     ResidualSelection,
     Step,
-    Subproblem,
     local_maxima,
 )
 from cnpgen.refine.solver.transcription import Transcription
@@ -53,34 +52,22 @@ ACCEPTED_RATIO, GOOD_RATIO, POOR_RATIO = 0.05, 0.7, 0.3  # of reduction to predi
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of the iteration.
+    """Settings of the iteration."""
 
-    Attributes:
-        max_iterations: Largest number of steps tried.
-        radius: Initial trust radius, infinity norm [rad and log].
-        proximal: Weight of the proximal term.
-        penalty: Initial weight of the largest violation in the merit function. A motion that is 1 % slower costs 1 % of
-            its duration. Violations are therefore profitable in motions of more seconds than this; there the weight
-            grows.
-        violation_bound: Initial violation up to which steps are accepted for their reduction of the objective.
-        max_initial_violation: Largest violation of a usable initial guess.
-        cost_tolerance: Relative change of the objective, predicted and actual, at which it has converged.
-        selection_distances: Pairs (step length, distance): after a step longer than the first, residuals within the
-            second of a bound are selected.
-        violation_tolerance: Largest scaled violation of a feasible iterate.
-        thinning: Interval of grid points at which inactive residuals are selected.
-    """
-
-    max_iterations: int = 40
-    radius: float = 0.3
-    proximal: float = 0.02
+    max_iterations: int = 40  # largest number of steps tried
+    radius: float = 0.3  # initial trust radius, infinity norm [rad and log]
+    proximal: float = 0.02  # weight of the proximal term
+    # Initial weight of the largest violation in the merit function. A motion that is 1 % slower costs 1 % of its
+    # duration. Violations are therefore profitable in motions of more seconds than this; there the weight grows.
     penalty: float = 2.0
+    # Initial violation up to which steps are accepted for their reduction of the objective.
     violation_bound: float = 0.3
-    max_initial_violation: float = np.inf
-    cost_tolerance: float = 1e-3
+    max_initial_violation: float = np.inf  # largest violation of a usable initial guess
+    cost_tolerance: float = 1e-3  # relative change of the objective, predicted and actual, at which it has converged
+    # Pairs (step length, distance): after a step longer than the first, residuals within the second of a bound are
+    # selected.
     selection_distances: tuple[tuple[float, float], ...] = SELECTION_DISTANCES
-    violation_tolerance: float = 6e-4
-    thinning: int = 6
+    violation_tolerance: float = 6e-4  # largest scaled violation of a feasible iterate
 
 
 DEFAULT_SETTINGS = Settings()
@@ -88,15 +75,10 @@ DEFAULT_SETTINGS = Settings()
 
 @dataclass
 class Deadline:
-    """Time at which a sequence of steps must have ended: iterations of a solver, or verdicts.
+    """Time at which a sequence of steps must have ended: iterations of a solver, or verdicts."""
 
-    Attributes:
-        until: Time in the clock of ``time.perf_counter`` [s].
-        max_duration: Time reserved for one step: the largest so far, times ``STEP_TIME_FACTOR`` [s].
-    """
-
-    until: float
-    max_duration: float = 0.0
+    until: float  # in the clock of ``time.perf_counter`` [s]
+    max_duration: float = 0.0  # time reserved for one step: the largest so far, times ``STEP_TIME_FACTOR`` [s]
 
     def allows(self, steps: int) -> bool:
         """Return whether there is time for so many steps."""
@@ -109,21 +91,13 @@ class Deadline:
 
 @dataclass(frozen=True)
 class Result:
-    """Result of an iteration.
+    """Result of an iteration."""
 
-    Attributes:
-        x: Last accepted iterate.
-        cost: Regularized objective there.
-        violation: Largest scaled violation there.
-        iterations: Number of steps tried.
-        converged: Whether the iteration ended before its limit of steps.
-    """
-
-    x: Array
-    cost: float
-    violation: float
-    iterations: int
-    converged: bool
+    x: Array  # last accepted iterate
+    cost: float  # regularized objective there
+    violation: float  # largest scaled violation there
+    iterations: int  # number of steps tried
+    converged: bool  # whether the iteration ended before its limit of steps
 
 
 def minimize(
@@ -149,10 +123,10 @@ def minimize(
     return last if iterate.converged or feasible is None else replace(feasible, iterations=iteration)
 
 
-def make_backend(motion: Transcription, bounds: Bounds, thinning: int) -> Backend:
+def make_backend(motion: Transcription, bounds: Bounds) -> NumpyBackend | CompiledBackend:
     """Return the backend of a motion: compiled if its kernels are, else NumPy."""
     compiled = motion.kernels.step_library is not None
-    return CompiledBackend(motion, bounds, thinning) if compiled else NumpyBackend(motion, bounds, thinning)
+    return CompiledBackend(motion, bounds) if compiled else NumpyBackend(motion, bounds)
 
 
 class _Iterate:
@@ -162,7 +136,7 @@ class _Iterate:
     tightened = False  # whether the last step tightened the bounds for violations between grid points
 
     def __init__(self, motion: Transcription, bounds: Bounds, settings: Settings, x: Array) -> None:
-        self._backend, self._motion = make_backend(motion, bounds, settings.thinning), motion
+        self._backend, self._motion = make_backend(motion, bounds), motion
         self._corrections = MAX_MIDPOINT_CORRECTIONS
         self.x = self._start = x
         self.cost, self._g, self.violation = self._backend.value(x)
@@ -214,7 +188,7 @@ class _Iterate:
         smallest, tolerance = min(before, default=0.0), self._settings.violation_tolerance
         return smallest > tolerance and min(recent) > max(STALL_FRACTION * smallest, tolerance)
 
-    def _propose(self, subproblem: Subproblem) -> Step | None:
+    def _propose(self, subproblem: NumpySubproblem | CompiledSubproblem) -> Step | None:
         """Solve the subproblem; solve it again, relaxed or without warm start, if the step is of little use."""
         box = self._radius * self._scale
         step = subproblem.solve(box, warm=self._multipliers)
@@ -261,13 +235,13 @@ class _Iterate:
         if tighter is None:
             return
         self.converged, self.tightened, self._corrections, self._bounds = False, True, self._corrections - 1, tighter
-        self._backend = make_backend(self._motion, tighter, self._settings.thinning)
+        self._backend = make_backend(self._motion, tighter)
         self.violation = tighter.max_violation(self._g)
 
     def _reject(self, violations: Array, selected: Mask, size: float) -> None:
         """Select the residuals that a rejected step violated; shrink the radius unless they explain the rejection."""
         violated = violations > self._settings.violation_tolerance
-        missed = local_maxima(violations, thinning=self._settings.thinning) & violated & ~selected
+        missed = local_maxima(violations) & violated & ~selected
         self._missed |= missed
         if not (missed.any() and violations[missed].max() >= violations.max()):
             self._radius = 0.35 * min(self._radius, size)

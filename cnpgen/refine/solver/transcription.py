@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
-from cnpgen.refine.solver.cost_term import CostTerm
 from cnpgen.refine.solver.grid import Bases, Grid
+from cnpgen.refine.solver.residuals import CostTerm
 from cnpgen.trajectory.boundary import Boundary, assemble, boundary_derivatives
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
@@ -28,59 +28,33 @@ RATE_SMOOTHING = 1e-4  # weight of the squared second differences of log r, whic
 
 @dataclass(frozen=True)
 class Linearization:
-    """Objective and residuals at one x, with their derivatives.
+    """Objective and residuals at one x, with their derivatives."""
 
-    Attributes:
-        x: Variables, shape (nx,).
-        cost: Objective [s].
-        gradient: Gradient of the objective, shape (nx,).
-        curvature: Positive semidefinite model of its Hessian, shape (nx, nx).
-        g: Residuals, shape (K, m).
-        jacobian: d(residuals)/d(w), shape (width of w, m, K).
-        rate: Rate control points, shape (R,).
-    """
-
-    x: Array
-    cost: float
-    gradient: Array
-    curvature: Array
-    g: Array
-    jacobian: Array
-    rate: Array
+    x: Array  # variables, shape (nx,)
+    cost: float  # objective [s]
+    gradient: Array  # gradient of the objective, shape (nx,)
+    curvature: Array  # positive semidefinite model of its Hessian, shape (nx, nx)
+    g: Array  # residuals, shape (K, m)
+    jacobian: Array  # d(residuals)/d(w), shape (width of w, m, K)
+    rate: Array  # rate control points, shape (R,)
 
 
 @dataclass(frozen=True)
 class ResidualKernels:
-    """Kernels of a problem.
+    """Kernels of a problem."""
 
-    Attributes:
-        spec: Degree and numbers of control points.
-        values: Kernel of ``cnpgen.refine.solver.residuals.stage_values``.
-        jacobian: Kernel of ``cnpgen.refine.solver.residuals.stage_jacobian``.
-        cost_term: Cost term in addition to the duration, or None.
-        cost_residuals: Kernel of ``cnpgen.refine.solver.cost_term.cost_term_residuals``, or None.
-        cost_counts: Number of residuals of every term of the cost term.
-        step_library: Library of ``cnpgen.refine.solver.compiled_backend``, or None for the NumPy backend.
-    """
-
-    spec: TrajectorySpec
-    values: Kernel
-    jacobian: Kernel
-    cost_term: CostTerm | None = None
-    cost_residuals: Kernel | None = None
-    cost_counts: tuple[int, ...] = ()
+    spec: TrajectorySpec  # degree and numbers of control points
+    values: Kernel  # kernel of ``cnpgen.refine.solver.residuals.stage_values``
+    jacobian: Kernel  # kernel of ``cnpgen.refine.solver.residuals.stage_jacobian``
+    cost_term: CostTerm | None = None  # cost term in addition to the duration, or None
+    cost_residuals: Kernel | None = None  # kernel of ``cnpgen.refine.solver.residuals.cost_term_residuals``, or None
+    cost_counts: tuple[int, ...] = ()  # number of residuals of every term of the cost term
+    # Library of ``cnpgen.refine.solver.compiled_backend``, or None for the NumPy backend.
     step_library: CDLL | None = None
 
 
 class Transcription:
-    """One motion on one grid.
-
-    Args:
-        kernels: Residual kernels.
-        grid: The grid.
-        boundary: Boundary conditions of one motion.
-        obstacle_poses: Poses and sizes of its obstacles, shape (width,).
-    """
+    """One motion on one grid, with poses and sizes of its obstacles, shape (width,)."""
 
     def __init__(self, kernels: ResidualKernels, grid: Grid, *, boundary: Boundary, obstacle_poses: Array) -> None:
         spec = kernels.spec
@@ -142,12 +116,7 @@ class Transcription:
         return np.asarray(g.T)
 
     def objective(self, path: Array, rate: Array) -> float:
-        """Return the objective of a motion [s]: its duration and the cost term, without the regularization.
-
-        Args:
-            path: Path control points [rad], shape (C, n).
-            rate: Rate control points [1/s], shape (R,).
-        """
+        """Return the objective of a motion [s], from control points (C, n) and (R,): duration and cost term."""
         if self.kernels.cost_term is None:
             return self.duration(rate)
         e, _, weights = self._cost_residuals(path, rate)
@@ -175,13 +144,7 @@ class Transcription:
         return Linearization(x, cost, gradient, curvature, g.T, jacobian.reshape(len(w), *g.shape), rate)
 
     def rows(self, at: Linearization, k: Indices, residual: Indices) -> Array:
-        """Return the gradients of chosen residuals with respect to the variables, shape (m, nx).
-
-        Args:
-            at: Linearization of the motion.
-            k: Grid point of every row, shape (m,).
-            residual: Index of the residual of every row, shape (m,).
-        """
+        """Return the gradients of residuals with indices (m,) at grid points k, (m,), in the variables: (m, nx)."""
         return self._chain(at.jacobian[:, residual, k].T, k, at.rate, self.grid.bases)
 
     def linearization_errors(self, at: Linearization, step: float) -> Array:
