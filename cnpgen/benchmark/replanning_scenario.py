@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cnpgen.benchmark.pucks import Pucks, hits_from, hits_of
 from cnpgen.errors import RecipeError
-from cnpgen.plans.concatenate import concatenate
+from cnpgen.plans.join import concatenate
 from cnpgen.plans.plans import Plans
 from cnpgen.refine.refine_plans import solve_plans
 from cnpgen.schema.arguments import integer

@@ -12,11 +12,10 @@ from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernel
 from cnpgen.planner.control_point_functions import projected_path
 from cnpgen.planner.expressions import effective_steps
 from cnpgen.planner.model import Model, ModelConfig, Outputs
-from cnpgen.planner.phase_grid import blocks_of_motions
-from cnpgen.planner.task_preprocessor import TaskPreprocessor, ends_of, lanes, make_task_preprocessor, rows
-from cnpgen.planner.tasks import Tasks
+from cnpgen.planner.task_preprocessor import TaskPreprocessor, make_task_preprocessor
+from cnpgen.planner.tasks import Tasks, ends_of, lanes, rows
 from cnpgen.planner.time_parametrization import TimeParametrization, make_time_parametrization
-from cnpgen.planner.time_scaling import TimeScaling, make_time_scaling
+from cnpgen.planner.time_scaling import TimeScaling, blocks_of_motions, make_time_scaling
 from cnpgen.planner.via_points import MAX_LINES, ViaPoints, make_via_points
 from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans
@@ -89,14 +88,7 @@ class InferencePipeline:
         sample_id: NDArray[np.int64] | None = None,
         columns: Mapping[str, Array] | None = None,
     ) -> Plans:
-        """Plan N motions.
-
-        Args:
-            model: A model of the same problem.
-            boundary: Boundary conditions, shape (N, n) each, float64 and finite.
-            sample_id: Dataset samples of the tasks, shape (N,); 0, 1, ... by default.
-            columns: Further columns of the tasks, as ``Plans.columns``.
-        """
+        """Plan N motions; see ``Planner.plan_batch``."""
         tasks, motion = self.planned(model, boundary, (columns or {}).get(OBSTACLE_POSES))
         return Plans(
             problem=model.problem,
@@ -119,12 +111,7 @@ class InferencePipeline:
         return self._with_via_points(self.via_points, model, tasks, motion)
 
     def motion(self, model: Model, tasks: Tasks) -> Motion:
-        """Evaluate the network, project its paths onto the equalities, and fit the rates to the limits.
-
-        Args:
-            model: A model of the same problem.
-            tasks: N tasks from ``prepare``.
-        """
+        """Evaluate the network, project its paths onto the equalities, and fit the rates to the limits."""
         return self._fitted(self._projected(model, tasks, ends_of(tasks.boundary)), tasks.scene.poses)
 
     def _projected(self, model: Model, tasks: Tasks, ends: Array) -> Motion:

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.planner.network.architecture import Architecture, Weights
+from cnpgen.planner.network.architecture import Architecture, Weights, forward
 from cnpgen.planner.network.features import Features
-from cnpgen.planner.network.forward import forward
 from cnpgen.planner.tasks import Tasks
 from cnpgen.problems.problem_record import ProblemRecord
 from cnpgen.schema.argument_types import checked_arguments

@@ -73,9 +73,6 @@ def load_model(name_or_path: str | Path) -> Model:
 def model_for(problem: Problem | StoredProblem) -> Model:
     """Read the only shipped model of a problem.
 
-    Args:
-        problem: The problem, or its record: ``plans.problem``, ``dataset.problem``.
-
     Raises:
         UsageError: There is no shipped model for it, or several.
     """
@@ -143,11 +140,7 @@ def model_content(model: Model) -> Content:
 
 
 def model_from_content(path: Path, content: Content) -> Model:
-    """Make a model from arrays and texts.
-
-    Args:
-        path: Source file, for messages.
-        content: Result of ``model_content``.
+    """Make a model from the result of ``model_content``; the path of its file is for messages.
 
     Raises:
         DatasetError: The content does not fit this version of cnpgen.

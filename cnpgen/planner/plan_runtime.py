@@ -261,16 +261,7 @@ def plan_stop(
     """Plan the fastest valid stop from a state on a motion.
 
     The goals are configurations that the motion passes later, which are on the constraint manifold. The plans are
-    judged in the order of their durations.
-
-    Args:
-        planner: A planner whose model plans from moving states to rest, such as airhockey-online.
-        motion: The motion in execution.
-        time: Time at which the stop begins [s].
-        parameters: Parameters of the problem, if it has any, shape (width,).
-
-    Returns:
-        The stop, or None if no candidate is valid.
+    judged in the order of their durations. None is returned if none of them is valid.
 
     Raises:
         UsageError: The model does not plan from moving states.

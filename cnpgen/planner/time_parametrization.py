@@ -25,7 +25,7 @@ from cnpgen.kernels.compiled_kernel import address_of, aligned_array
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.planner.expressions import coefficient_bounds, speed_bounds, speed_coefficients
-from cnpgen.planner.phase_grid import PhaseGrid, blocks_of_motions, make_phase_grid
+from cnpgen.planner.time_scaling import PhaseGrid, blocks_of_motions, make_phase_grid
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.spline_motion import Motion
@@ -89,13 +89,8 @@ class TimeParametrization(PhaseGrid):
         A motion stays as it is if its largest violation would grow, because its bounded values are not such
         quadratics. For the same reason motions may be slower than necessary.
 
-        Args:
-            motion: N motions, with the problem's numbers of control points.
-            obstacle_poses: Poses and sizes of the obstacles, shape (N, width).
-
-        Returns:
-            The motions, and a mask of those that meet the limits, shape (N,). False also for motions whose control
-            points moved twice: they exceed the limits more between the phases.
+        The mask of motions that meet the limits, shape (N,), is False also for motions whose control points moved
+        twice: they exceed the limits more between the phases.
         """
         rate, violation = np.array(motion.rate, np.float64, order="C"), np.empty(len(motion))
         if self.library is not None:
@@ -218,16 +213,10 @@ def _sweep(rate: Array, coefficients: list[Array], bounds: tuple[Array, Array], 
 
 
 def advance(coefficients: list[Array], bounds: tuple[Array, Array], rates: Array, along: Array) -> Array:
-    """Return the largest step of the rates within the bounds, or the required step back if one is violated.
+    """Return the largest steps of N rates within the bounds, or the required steps back if one is violated.
 
-    Args:
-        coefficients: Constant, square and mixed, shape (m, N, K) each.
-        bounds: Lower and upper bounds, shape (m,) each.
-        rates: r and r', shape (2, N, K).
-        along: Direction of r and r', shape (2, N, K).
-
-    Returns:
-        Steps, shape (N,).
+    Coefficients (constant, square, mixed) have shape (m, N, K) each, bounds (m,) each, r with r' and their directions
+    (2, N, K).
     """
     (constant, square, mixed), (r, r1), (b, b1) = coefficients, rates, along
     value = constant + (square * r + mixed * r1) * r

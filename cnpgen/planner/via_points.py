@@ -10,8 +10,8 @@ from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.tape import GridSpec
 from cnpgen.planner.control_points import lines_at_rest
 from cnpgen.planner.expressions import static_violation
-from cnpgen.planner.phase_grid import blocks_of_motions
 from cnpgen.planner.tasks import Tasks
+from cnpgen.planner.time_scaling import blocks_of_motions
 from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.spline import basis, chebyshev
 from cnpgen.trajectory.spline_motion import Motion
@@ -41,12 +41,7 @@ class ViaPoints:
     def violation(self, motion: Motion, obstacle_poses: Array) -> Array:
         """Return the largest violation of conditions on positions and holding torques by N motions, in tolerances.
 
-        Args:
-            motion: N motions, with the problem's number of path control points.
-            obstacle_poses: Poses and sizes of the obstacles, shape (N, width).
-
-        Returns:
-            Shape (N,); at most 1 if all conditions hold at the phases, inf if a position is not finite.
+        It is at most 1 if all conditions hold at the phases, and inf if a position is not finite.
         """
         return self._violation_at(self.path, motion.path, obstacle_poses)
 
@@ -70,14 +65,9 @@ class ViaPoints:
         return np.nan_to_num(worst, nan=np.inf, posinf=np.inf)
 
     def best_lines(self, lines: Tasks, count: int) -> NDArray[np.intp]:
-        """Return the lines with the smallest violations at a few phases, in their order.
+        """Return the rows of the ``count`` lines of every task with the smallest violations at a few phases.
 
-        Args:
-            lines: All M lines of the first task, then of the next one.
-            count: Number of lines per task, at most M.
-
-        Returns:
-            Rows of lines, shape (N count,).
+        The lines are all M lines of the first task, then of the next one.
         """
         assert lines.correction is not None
         path = lines_at_rest(lines.boundary, lines.correction)

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError, counted
-from cnpgen.plans.format import FLOATS, INTEGERS, NOTES, OBSTACLE_POSES
+from cnpgen.plans.format import FLOATS, INTEGERS, NOTES, OBSTACLE_POSES, PlanStatus
 from cnpgen.plans.plausible import check_boundary_units
-from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem

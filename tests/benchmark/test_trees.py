@@ -27,8 +27,7 @@ from cnpgen.benchmark.planners.state_check import MAX_TIP_HEIGHT_ERROR_M, MAX_UP
 from cnpgen.benchmark.planners.tree import Radii, Tree, radii_of
 from cnpgen.benchmark.suite import load_suite
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.planner.network.architecture import Architecture, initial_parameters
-from cnpgen.planner.network.forward import forward
+from cnpgen.planner.network.architecture import Architecture, forward, initial_parameters
 from cnpgen.plans import Plans, open_problem
 from cnpgen.refine.refine_plans import solve_plans
 from cnpgen.trajectory.sampled_trajectory import Trajectory

@@ -70,12 +70,8 @@ def feature_blocks(
 def published_features(blocks: tuple[str, ...], velocity_limit: Array, acceleration_limit: Array) -> Features:
     """Return states divided by pi and by the limits (paper, section on the neural network: normalized states).
 
-    The paper does not define the normalization; this one is that of the authors' implementation.
-
-    Args:
-        blocks: Blocks of boundary states.
-        velocity_limit: Planning limits [rad/s], shape (n,).
-        acceleration_limit: Planning limits [rad/s^2], shape (n,).
+    The paper does not define the normalization; this one is that of the authors' implementation. Limits are those of
+    planning [rad/s, rad/s^2], shape (n,).
     """
     units = {"q": np.full_like(velocity_limit, np.pi), "dq": velocity_limit, "ddq": acceleration_limit}
     scale = np.concatenate([1 / units[name.partition("_")[2]] for name in blocks])
@@ -100,7 +96,7 @@ def fit_features(parts: Iterable[Tasks], blocks: tuple[str, ...] = USUAL) -> Fea
 
 
 def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
-    """Compute features in their own units.
+    """Compute features in their own units, float64, shape (N, F).
 
     * ``start_q`` to ``goal_dq``, and ``goal_ddq`` if it is given: the states [rad, rad/s, rad/s^2];
     * ``sin_cos``: sines and cosines of start and goal positions, whose products appear in the forward kinematics;
@@ -109,13 +105,6 @@ def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
     * ``parameters``: the parameters of the problem, if it has any;
     * ``scene``: features of the obstacles that samples place (``scene_features``);
     * ``line``: offsets of the interior control points of the path that the network corrects [rad], not standardized.
-
-    Args:
-        tasks: The tasks.
-        blocks: Selected names.
-
-    Returns:
-        float64, shape (N, F).
     """
     parts = [part for name in blocks for part in _block(tasks, name)]
     return np.concatenate(parts, axis=1, dtype=np.float64)

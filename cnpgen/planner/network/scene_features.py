@@ -82,15 +82,7 @@ class SceneFeatures:
     path: Array
 
     def __call__(self, path: Array, scene: Scene) -> Array:
-        """Compute the features of N paths.
-
-        Args:
-            path: Control points [rad], shape (N, C, n).
-            scene: Obstacles of each path.
-
-        Returns:
-            Shape (N, ``count_scene_features``).
-        """
+        """Compute the features of N paths, from control points [rad], shape (N, C, n), and the obstacles of each."""
         features = np.empty((len(path), count_scene_features(path.shape[2])))
         for first in range(0, len(path), TASKS_PER_BLOCK):
             rows = slice(first, first + TASKS_PER_BLOCK)
