@@ -34,13 +34,9 @@ OFFSET_FRACTION = 0.5  # of the offsets from the line that such motions keep
 
 @dataclass(frozen=True)
 class LoadedProblem:
-    """A problem loaded from its record.
+    """A problem loaded from its record, and the kernels of ``problem.for_planning``.
 
-    Attributes:
-        record: Text of the problem and its URDF.
-        problem: The problem; its URDF file exists only inside ``loaded_problem``.
-        robot: Its robot.
-        kernels: Library of the kernels of ``problem.for_planning``.
+    The URDF file exists only inside ``loaded_problem``.
     """
 
     record: ProblemRecord
@@ -64,14 +60,9 @@ def loaded_problem(record: ProblemRecord, backend: str | None = None) -> Iterato
 
 @dataclass(frozen=True)
 class InferencePipeline:
-    """Steps that make plans from network outputs, for one problem.
+    """Steps that make plans from network outputs, for one problem; those that its model does not use are None.
 
-    Attributes:
-        prepare: Preprocessor of tasks.
-        path: Kernel of ``control_point_functions.projected_path``.
-        time_scaling: Uniform time scaling of motions from rest to rest; None for other models.
-        time_parametrization: Fit of rates to the limits; None if disabled.
-        via_points: Search of lines through via points for plans with violations; None if the model has no via points.
+    ``path`` is the kernel of ``control_point_functions.projected_path``.
     """
 
     prepare: TaskPreprocessor

@@ -71,11 +71,7 @@ def load_model(name_or_path: str | Path) -> Model:
 
 
 def model_for(problem: Problem | StoredProblem) -> Model:
-    """Read the only shipped model of a problem.
-
-    Raises:
-        UsageError: There is no shipped model for it, or several.
-    """
+    """Read the shipped model of a problem; raise UsageError if there is none, or several."""
     record = as_record(problem)
     models = {name: load_model(path) for name, path in shipped_models().items()}
     matches = [name for name, model in models.items() if model.problem.comparable_sha256 == record.comparable_sha256]

@@ -146,17 +146,10 @@ class PuckModel:
 
 
 class MovingHits:
-    """Arguments of ``plan_hits`` for N moving pucks, brought to one length.
+    """Arguments of ``plan_hits`` for N moving pucks, checked and brought to one length.
 
-    Args:
-        n: Number of joints.
-        arguments: State, puck, velocity, target, speed share and meeting time; the earliest meeting for None.
-        model: Motion and contact of the puck.
-        distance: Distance of the centres at the goal [m].
-        overlap: Path of the mallet from the contact to the goal [m].
-
-    Raises:
-        UsageError: As ``plan_hits``.
+    They are state, puck, velocity, target, speed share and meeting time, None for the earliest. ``distance`` is that of
+    the centres at the goal, and ``overlap`` the path of the mallet from the contact to the goal [m].
     """
 
     def __init__(self, n: int, arguments: HitArguments, *, model: PuckModel, distance: float, overlap: float) -> None:

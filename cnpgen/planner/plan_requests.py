@@ -42,13 +42,7 @@ CERTIFIED_STAGE = "certified-plan"  # the stage that plans every sample
 
 @dataclass(frozen=True)
 class Requests:
-    """N planning tasks.
-
-    Attributes:
-        boundary: Boundary conditions.
-        sample_id: Dataset rows of the tasks, shape (N,).
-        columns: Further columns of the tasks.
-    """
+    """N planning tasks: boundary conditions, dataset rows, shape (N,), and further columns of the tasks."""
 
     boundary: Boundary
     sample_id: NDArray[np.int64]
@@ -144,8 +138,7 @@ def scene_requests(
     parked = Counter(shape_of(obstacle) for obstacle in problem.obstacle if obstacle.position == PARKED_POSITION_M)
     checked = [checked_scene(scene) for scene in scenes]
     plans = scene_plans(problem.with_obstacles(problem.own_obstacles), checked, goals=goals, capacity=parked)
-    columns = {OBSTACLE_POSES: plans.columns[OBSTACLE_POSES]}
-    return Requests(plans.boundary, plans.sample_id, columns)
+    return Requests(plans.boundary, plans.sample_id, context_columns(plans.columns))
 
 
 def context_columns(columns: Mapping[str, NDArray[Any]]) -> dict[str, Array]:
@@ -176,12 +169,7 @@ def _check_recorded_problem(file: BoundaryFile, model: Model) -> None:
 
 
 def checked_boundary(where: str, columns: Mapping[str, NDArray[Any]], model: Model) -> Boundary:
-    """Return the boundary conditions among named columns; missing ones are zero.
-
-    Raises:
-        DatasetError: A shape is wrong, a value is not finite, or goal accelerations are prescribed that the model
-            leaves free.
-    """
+    """Return the boundary conditions of ``boundary_in``; raise DatasetError for goal accelerations if they are free."""
     if "goal_ddq" in columns and model.fixed_at_goal == 2:
         raise DatasetError(f"{where} prescribes goal accelerations (goal_ddq), and the model leaves them free")
     return boundary_in(where, columns, len(model.problem.joint_names))

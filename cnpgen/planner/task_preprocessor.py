@@ -13,7 +13,7 @@ from cnpgen.planner.control_point_functions import line_change, tips_at_ends
 from cnpgen.planner.control_points import along_line, lines_at_rest
 from cnpgen.planner.expressions import effective_steps
 from cnpgen.planner.model import ModelConfig
-from cnpgen.planner.network.scene_features import SceneFeatures, make_scene_features
+from cnpgen.planner.network.features import SceneFeatures, make_scene_features
 from cnpgen.planner.tasks import (
     MIN_EXPECTED_TIME_S,
     MIN_TRAVEL_TIME_S,

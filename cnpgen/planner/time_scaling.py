@@ -68,12 +68,7 @@ def make_phase_grid(problem: Problem, kernels: KernelLibrary, intervals: int) ->
 
 @dataclass(frozen=True)
 class TimeScaling(PhaseGrid):
-    """Uniform time scaling of one problem's motions; made by ``make_time_scaling``.
-
-    Attributes:
-        residuals: Kernel of ``expressions.speed_residuals``.
-        bounds: Bounds of the residuals.
-    """
+    """Uniform time scaling of a problem's motions, by the kernel of ``expressions.speed_residuals`` and its bounds."""
 
     residuals: Kernel
     bounds: SpeedBounds

@@ -48,13 +48,9 @@ SAID = (*ATTRIBUTES, *_OF_SHARDS)  # attributes
 
 @dataclass(frozen=True, eq=False)
 class BoundaryFile:
-    """Contents of a file of N boundary problems; only names are checked.
+    """Present attributes of ``SAID`` and columns of ``ASKED`` in a file of N boundary problems; only names are checked.
 
-    Attributes:
-        path: Path of the file.
-        attributes: Present attributes among ``SAID``.
-        columns: Present columns among ``ASKED``: name -> values.
-        has_checksum: Whether the file has a checksum, which was verified.
+    ``has_checksum`` is whether the file has a checksum, which was verified.
     """
 
     path: Path
@@ -84,11 +80,7 @@ class BoundaryFile:
         return spec if any(each.fingerprint == mine for each in spec.spec_versions) else None
 
     def check_shard(self) -> None:
-        """Compare a shard in its dataset with the specification; see ``read_rows``.
-
-        Raises:
-            DatasetError: They differ, or a value is not finite.
-        """
+        """Raise DatasetError for a shard that differs from its dataset's specification; see ``read_rows``."""
         if spec := self.spec():
             folder, name = self.path.absolute().parents[1], "/".join(self.path.absolute().parts[-2:])
             for task in shards(spec):
@@ -107,11 +99,7 @@ class BoundaryFile:
         )
 
     def check_obstacles(self, problem: ProblemRecord) -> None:
-        """Check that the file has the obstacles of its samples if they place those of the problem.
-
-        Raises:
-            DatasetError: They are missing.
-        """
+        """Raise DatasetError if the file lacks the obstacles of its samples, and they place those of the problem."""
         if OBSTACLE_POSES not in self.columns and open_problem(problem)[0].has_sample_obstacles:
             remedy = "give the folder of its dataset" if self.is_shard else f"expected {OBSTACLE_POSES}"
             raise DatasetError(f"{self.path} lacks the obstacles of its samples: {remedy}")
@@ -178,10 +166,7 @@ def read_boundary_file(path: Path) -> BoundaryFile:
 def boundary_in(where: str, columns: Mapping[str, NDArray[Any]], n: int) -> Boundary:
     """Read boundary conditions of n joints from columns; missing ones are zero, missing goal accelerations are free.
 
-    The columns, name -> values of shape (N, n), have a source for messages.
-
-    Raises:
-        DatasetError: A shape is wrong, or a value is not finite.
+    Wrong shapes of columns, name -> values of shape (N, n), and values that are not finite raise DatasetError.
     """
     given = {name: columns[name] for name in CONDITIONS if name in columns}
     try:
@@ -255,10 +240,7 @@ def _of_folder(folder: Path, split: str, start: int, n: int | None) -> Plans:
 def scene_columns(
     dataset: StoredDataset, split: str, rows: range, columns: Mapping[str, NDArray[Any]]
 ) -> dict[str, NDArray[Any]]:
-    """Return the column with the obstacles of rows of a dataset; none if its samples have no scenes.
-
-    The columns of the rows contain ``scene_id``.
-    """
+    """Return the column with the obstacles of rows of a dataset, by ``scene_id``; none if samples have no scenes."""
     if not dataset.spec.scene_obstacles:
         return {}
     scenes = dataset.read_scenes(split, start=rows.start, stop=rows.stop)
@@ -267,11 +249,7 @@ def scene_columns(
 
 
 def chosen_rows(folder: Path, spec: DatasetSpec, *, split: str, start: int, n: int | None) -> range:
-    """Return n rows of a split from ``start`` on as a range; by default all remaining rows.
-
-    Raises:
-        UsageError: The split or the rows do not exist.
-    """
+    """Return n rows of a split from ``start`` on, by default all remaining ones; raise UsageError for others."""
     start = integer("start", start, least=0)
     if split not in spec.splits:
         raise UsageError(f"{folder} {lacks('split', split, spec.splits)}", concerns="split")

@@ -45,11 +45,7 @@ class Exported:
 
 
 def load_exporter(name: str) -> Exporter:
-    """Load an export format by its registered name.
-
-    Raises:
-        UsageError: The format is unknown, defined twice, cannot be imported, or has no suffix.
-    """
+    """Load an export format by its registered name; raise UsageError for an unknown or invalid one."""
     try:
         kind: type[Exporter] = registry.load(registry.EXPORTERS, name)
     except RecipeError as error:

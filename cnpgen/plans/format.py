@@ -60,11 +60,7 @@ KNOWN = frozenset(plan_fields((), ()))  # names with a fixed definition
 
 
 def refuse_misspelt(path: Path, names: Collection[str], asked: Collection[str]) -> None:
-    """Raise DatasetError for a misspelled name of a missing optional dataset among names, which would be ignored.
-
-    Raises:
-        DatasetError: A name is misspelled.
-    """
+    """Raise DatasetError for a misspelled name of a missing optional dataset among names, which would be ignored."""
     missing = [name for name in asked if name not in names]
     for name in names:
         meant = difflib.get_close_matches(name.lower(), missing, n=1, cutoff=MIN_SIMILARITY)

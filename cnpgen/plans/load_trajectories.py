@@ -178,11 +178,7 @@ def _check_parameters(record: ProblemRecord, parameters: Mapping[str, float]) ->
 
 
 class _Reader:
-    """Reader of one trajectory of a table.
-
-    Attributes:
-        used: Names of the columns that were read.
-    """
+    """Reader of one trajectory of a table; ``used`` has the names of the columns that were read."""
 
     def __init__(self, table: TrajectoryTable, options: _Options) -> None:
         self.table, self.options = table, options
@@ -329,7 +325,8 @@ class _Reader:
         if values.ndim != ndim or values.dtype.kind not in "biuf":
             if values.ndim != 1 or ndim != 1:
                 raise self._error(f"{name} must have {ndim} dimensions of numbers, got shape {values.shape}")
-            row = next((k for k, value in enumerate(values.tolist()) if not _is_number(value)), 0)  # or numbers as texts
+            # The column has texts; the first one that is not a number is named.
+            row = next((k for k, value in enumerate(values.tolist()) if not _is_number(value)), 0)
             place = f"line {self.table.lines[row]}" if self.table.lines else f"row {row}"
             raise self._error(f"{place}: {name} must be a number, got {values[row].item()!r:.60}")
         return values.astype(float)

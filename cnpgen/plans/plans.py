@@ -242,11 +242,7 @@ def make_plans(
 
 
 def check_made(plans: Plans) -> None:
-    """Check that plans have motions.
-
-    Raises:
-        UsageError: A plan has no control points.
-    """
+    """Raise UsageError for a plan without control points."""
     waiting = np.isnan(plans.path_control_points).all(axis=(1, 2))
     if waiting.any():
         raise UsageError(

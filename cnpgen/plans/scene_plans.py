@@ -97,11 +97,7 @@ def scene_plans(
 
 
 def goal_states(scene: SceneProblem, robot: Robot) -> Array:
-    """Return the goal states of a scene in the order of the planned joints [rad], shape (G, n), G > 0.
-
-    Raises:
-        SceneError: The scene has none, lacks a planned joint, or a state is outside the limits.
-    """
+    """Return the goal states of a scene by ``joint_order``, shape (G, n); raise SceneError for a scene without any."""
     if not len(scene.goal_q):
         raise SceneError(f"{scene.place} has no goal state")
     return joint_order(scene, robot, scene.goal_q, "goal")

@@ -13,7 +13,7 @@ from cnpgen.planner.control_points import control_points
 from cnpgen.planner.inference_pipeline import loaded_problem, make_inference_pipeline
 from cnpgen.planner.model_file import load_model, model_content, model_from_content
 from cnpgen.planner.network.architecture import forward, initial_parameters
-from cnpgen.planner.network.scene_features import (
+from cnpgen.planner.network.features import (
     BASIS,
     MAX_DISTANCE_M,
     MIN_DISTANCE_M,
