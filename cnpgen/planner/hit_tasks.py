@@ -1,7 +1,5 @@
 """Tasks of hits: state of the arm, puck and target become the columns of a boundary problem."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

@@ -4,8 +4,6 @@ A frame has the positions and velocities as ``observation.state``, goal, task co
 ``observation.environment_state``, and the positions at the next frame as ``action``.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Readers check names, shapes and types. Values are not checked, except that tip positions must be those of the joints.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import warnings

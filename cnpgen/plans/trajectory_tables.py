@@ -1,7 +1,5 @@
 """Files of sampled trajectories as tables: CSV, JSON, YAML, NPZ, HDF5, Parquet, and messages of ROS and MoveIt."""
 
-from __future__ import annotations
-
 import json
 import re
 import zipfile

@@ -3,8 +3,6 @@
 All parameters are in one vector.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
