@@ -148,7 +148,7 @@ def _split(values: Vec, n: int) -> list[Vec]:
 
 
 def _sums(points: list[Vec], others: list[Vec]) -> list[Vec]:
-    return [[x + y for x, y in zip(*pair, strict=True)] for pair in zip(points, others, strict=True)]
+    return [add(*pair) for pair in zip(points, others, strict=True)]
 
 
 def _column(points: list[Vec]) -> Any:
@@ -179,8 +179,8 @@ def projection_change(
         step = _gauss_newton(equality, q, obstacle_poses, table[:, interior], response)
         if within_limits:
             step = [clipped_to_limits(robot, *pair) for pair in zip(control[interior], step, strict=True)]
-        control[interior] = [add(*pair) for pair in zip(control[interior], step, strict=True)]
-        total = [add(*pair) for pair in zip(total, step, strict=True)]
+        control[interior] = _sums(control[interior], step)
+        total = _sums(total, step)
     return total
 
 

@@ -111,23 +111,24 @@ def _boundary(
 ) -> tuple[Boundary, float]:
     """Return the boundary conditions of one trajectory and the change of their positions by snapping [rad]."""
     estimate = sampled_boundary(trajectory.t, trajectory.q, trajectory.dq)
-    q, still = trajectory.q, np.zeros(trajectory.q.shape[1])
-    start: State = q[0], estimate.start_dq[0], estimate.start_ddq[0]
-    goal: State = q[-1], estimate.goal_dq[0], still
-    if trajectory.ddq is not None:
-        start, goal = (*start[:2], trajectory.ddq[0]), (*goal[:2], trajectory.ddq[-1])
     speed_error = noise[1] if trajectory.dq is not None else 2 * noise[0] / REST_WINDOW_S
     acceleration_error = noise[2] if trajectory.ddq is not None else 4 * speed_error / REST_WINDOW_S
-    moving = [_at_rest_within(state, speed_error, acceleration_error) for state in (start, goal)]
-    moving = [
-        (state[0], still, still) if at_rest in {True, end} else state
-        for state, end in zip(moving, ("start", "goal"), strict=True)
-    ]
     allowed = max(MIN_SNAP_RAD, SNAP_FACTOR * float(noise[0]))
     given = [trajectory.dq is not None, trajectory.ddq is not None]
     snapper.set_parameters(trajectory.parameters)
-    first, moved_first = _snapped(snapper, moving[0], "start", given, allowed)
-    last, moved_last = _snapped(snapper, moving[1], "goal", given, allowed)
+    estimated = estimate.start_ddq[0], np.zeros(trajectory.q.shape[1])
+    accelerations = estimated if trajectory.ddq is None else trajectory.ddq[[0, -1]]
+    ends: tuple[tuple[End, Array, Array, Array], ...] = (
+        ("start", trajectory.q[0], estimate.start_dq[0], accelerations[0]),
+        ("goal", trajectory.q[-1], estimate.goal_dq[0], accelerations[1]),
+    )
+    snapped = []
+    for end, q, velocity, acceleration in ends:
+        rests = at_rest in {True, end}
+        dq = np.where(rests | (np.abs(velocity) <= speed_error), 0.0, velocity)
+        ddq = np.where(rests | (np.abs(acceleration) <= acceleration_error), 0.0, acceleration)
+        snapped.append(_snapped(snapper, (q, dq, ddq), end, given, allowed))
+    (first, moved_first), (last, moved_last) = snapped
     change = float(np.maximum(moved_first, moved_last))  # nan if one of them is
     parameters = None if trajectory.parameters is None else trajectory.parameters[None]
     start_q, start_dq, start_ddq, goal_q, goal_dq = (part[None] for part in (*first, *last[:2]))
@@ -154,12 +155,6 @@ def _snapped(
         if change <= allowed:
             return found, change
     return state, float("nan")
-
-
-def _at_rest_within(state: State, speed_error: float, acceleration_error: float) -> State:
-    """Return a state with derivatives of zero where they are within their errors."""
-    q, dq, ddq = state
-    return q, np.where(np.abs(dq) <= speed_error, 0.0, dq), np.where(np.abs(ddq) <= acceleration_error, 0.0, ddq)
 
 
 def _fit_samples(trajectory: Trajectory, points: int) -> tuple[Array, Array, Array | None]:

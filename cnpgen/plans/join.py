@@ -83,7 +83,11 @@ def join_plans(first: Plans | JoinedPlans, following: Plans, *, at: ArrayLike | 
         UsageError: The numbers of plans or times or the problems differ, a time is outside its plan, a plan has no
             motion, or there is a discontinuity.
     """
-    joined = first if isinstance(first, JoinedPlans) else _alone(first)
+    if isinstance(first, Plans):
+        check_made(first)
+        joined = JoinedPlans((first,), np.zeros((1, len(first))))
+    else:
+        joined = first
     if len(following) != len(joined):
         raise UsageError(
             f"{len(joined)} plans are followed by {len(following)}, expected one for each", concerns="following"
@@ -103,11 +107,6 @@ def join_plans(first: Plans | JoinedPlans, following: Plans, *, at: ArrayLike | 
     found = JoinedPlans((*joined.parts, following), np.concatenate([joined.begins, begins[None]]))
     _ = found.motion  # raises an error for discontinuities
     return found
-
-
-def _alone(plans: Plans) -> JoinedPlans:
-    check_made(plans)
-    return JoinedPlans((plans,), np.zeros((1, len(plans))))
 
 
 def concatenate(parts: Sequence[Plans]) -> Plans:
