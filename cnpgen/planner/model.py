@@ -33,7 +33,7 @@ class ModelConfig:
         within_limits: Whether control points are clipped to the joint limits after each of these steps, and without any
             of them once.
         time_parametrized: Whether rates are fitted to the limits after the network (``time_parametrization``).
-        via_points: Via points of alternative lines for plans with violations [rad], n numbers each (``via_points``).
+        via_points: Via points of alternative lines for plans with violations [rad], n numbers each (``ViaPoints``).
         iterations: Number of evaluations of the network; each one after the first corrects the path of the one before.
     """
 

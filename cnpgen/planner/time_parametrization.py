@@ -164,8 +164,7 @@ def make_time_parametrization(
 ) -> TimeParametrization:
     """Load the time parametrization of one problem; ``at_rest`` is whether motions begin and end at rest.
 
-    Raises:
-        UsageError: The problem bounds the jerk, which is no quadratic of the rate.
+    A problem that bounds the jerk, which is no quadratic of the rate, raises UsageError.
     """
     if problem.path_orders > 3:
         raise UsageError(f"plans of {problem.name!r} cannot be time-parametrized: it bounds the jerk")

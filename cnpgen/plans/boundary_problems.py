@@ -86,11 +86,7 @@ class BoundaryFile:
                     read_rows(Shard(folder, spec, task))
 
     def problem(self, *, required: bool = True) -> ProblemRecord | None:
-        """Return the problem named by the file or by its dataset; None if neither names one; see ``stored_problem``.
-
-        Raises:
-            DatasetError: The named problem is damaged or cannot be found.
-        """
+        """Return the problem named by the file or by its dataset; None if neither names one; see ``stored_problem``."""
         spec = self.spec()
         return (
             stored_problem(self.path, self.attributes, required=required) if spec is None else as_record(spec.problem)
@@ -103,23 +99,14 @@ class BoundaryFile:
             raise DatasetError(f"{self.path} lacks the obstacles of its samples: {remedy}")
 
     def boundary(self, robot: Robot, *, allow_large_angles: bool = False) -> Boundary:
-        """Return the boundary conditions of motions of a robot, shape (N, n) each.
-
-        Raises:
-            DatasetError: A shape is wrong, or a value is not finite.
-            UnitError: A value is so far outside of its range that it is probably in degrees or millimetres.
-        """
+        """Return the boundary conditions of a robot's motions, shape (N, n) each; raise DatasetError or UnitError."""
         boundary = boundary_in(str(self.path), self.columns, robot.n)
         if not allow_large_angles:
             check_boundary_units(robot, boundary, where=str(self.path))
         return boundary
 
     def sample_id(self, rows: int) -> NDArray[np.int64]:
-        """Return the sample IDs of the N boundary problems, shape (N,); 0, 1, ... by default.
-
-        Raises:
-            DatasetError: The sample IDs are not N integers, or not the indices of the rows of a shard.
-        """
+        """Return N sample IDs, 0, 1, ... by default; raise DatasetError for others than integers or a shard's rows."""
         ids = self.columns.get("sample_id", np.arange(rows))
         if ids.shape != (rows,) or ids.dtype.kind not in "iu":
             raise DatasetError(f"{self.path}: sample_id must hold {rows} integers, got {ids.dtype} of {ids.shape}")

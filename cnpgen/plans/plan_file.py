@@ -1,11 +1,10 @@
 """Plan files: HDF5 with one dataset per field, and the whole problem in its attributes.
 
-Readers check names, shapes and types. Values are not checked, except that tip positions must be those of the joints.
+Readers check names, shapes and types, not values.
 """
 
 import io
 import os
-import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import DatasetError, RecipeError, UsageError, counted, nearest
+from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
 from cnpgen.plans.format import (
     ATTRIBUTES,
     CONDITIONS,
@@ -30,6 +29,7 @@ from cnpgen.plans.format import (
     refuse_misspelt,
 )
 from cnpgen.plans.plans import Plans, make_plans
+from cnpgen.plans.tips import correct_tips
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record, record_problem
@@ -42,8 +42,6 @@ from cnpgen.store.files.kind import PLANS
 from cnpgen.store.paths import ANY_HDF5, file_kind, require_file
 from cnpgen.store.shard import field_attributes
 from cnpgen.trajectory.boundary import Boundary
-
-TIP_TOLERANCE_M = 1e-5  # maximum deviation of a tip position from forward kinematics, float32 included
 
 
 @checked_arguments
@@ -324,24 +322,3 @@ def _write_attributes(item: Any, attributes: Mapping[str, Any]) -> None:
         elif value not in {"", "[]"}:
             data = value.encode()
             item.attrs[name] = np.array(data, h5py.string_dtype("utf-8", len(data)))
-
-
-def correct_tips(plans: Plans, *, where: str = "") -> Plans:
-    """Replace tip positions that are inconsistent with the joints, with a warning that begins with ``where``.
-
-    Tip positions define the ends of the tip and the obstacles below the object. The joints have priority, since plans
-    are executed with them and control points match them.
-    """
-    found = {}
-    for end in ("start", "goal"):
-        name, recorded = f"{end}_xyz", plans.columns[f"{end}_xyz"]
-        tip = plans.problem.tip_positions(getattr(plans.boundary, f"{end}_q"))
-        off = np.linalg.norm(recorded - tip, axis=1)
-        wrong = ~(off <= TIP_TOLERANCE_M) & np.isfinite(tip).all(axis=1)
-        if wrong.any():
-            first = int(np.argmax(wrong))
-            text = f"{where}{name} of {counted(int(wrong.sum()), 'plan')} is not where {end}_q puts the tip"
-            detail = f"the first is plan {first}, {off[first]:.3g} m off"
-            warnings.warn(f"{text} ({detail}): the joint positions are used", RuntimeWarning, stacklevel=3)
-            found[name] = np.where(wrong[:, None], tip, recorded)
-    return replace(plans, columns={**plans.columns, **found}) if found else plans

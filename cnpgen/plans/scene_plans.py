@@ -102,10 +102,9 @@ def goal_states(scene: SceneProblem, robot: Robot) -> Array:
 
 
 def joint_order(scene: SceneProblem, robot: Robot, states: Array, end: str) -> Array:
-    """Return states of a scene in the order of the planned joints [rad], shape (G, n).
+    """Return states of a scene in the order of the planned joints [rad], shape (G, n), clipped to the limits.
 
-    Raises:
-        SceneError: The scene lacks a planned joint, or a position is outside its limits by more than 1e-3 rad.
+    A missing joint, or a position outside of its limits by more than 1e-3 rad, raises SceneError.
     """
     if scene.joint_names:
         missing = [name for name in robot.joint_names if name not in scene.joint_names]

@@ -180,12 +180,7 @@ def _read_parquet(path: Path) -> Iterator[TrajectoryTable]:
 
 
 def read_parquet(path: Path) -> Any:
-    """Read a Parquet file as a table of pyarrow.
-
-    Raises:
-        UsageError: The file is damaged or too large.
-        MissingExtraError: pyarrow is not installed.
-    """
+    """Read a Parquet file as a table of pyarrow; raise UsageError if it is damaged or too large."""
     with requires_extra("parquet", "pyarrow"):
         import pyarrow
         import pyarrow.parquet

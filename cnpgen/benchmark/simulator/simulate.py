@@ -20,8 +20,8 @@ from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.benchmark.simulator.tip import Tip
 from cnpgen.errors import UsageError, counted
 from cnpgen.machine.workers import distribute, worker_count
-from cnpgen.plans.plan_file import correct_tips
 from cnpgen.plans.plans import Plans
+from cnpgen.plans.tips import correct_tips
 from cnpgen.problems.problem_record import open_problem, with_payload_of
 from cnpgen.robots.table_frame import table_frame, upright_axes
 from cnpgen.schema.argument_types import checked_arguments

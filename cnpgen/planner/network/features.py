@@ -118,7 +118,7 @@ def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
     * ``tips``: tip positions at start and goal [m];
     * ``expected_time``: its logarithm;
     * ``parameters``: the parameters of the problem, if it has any;
-    * ``scene``: features of the obstacles that samples place (``scene_features``);
+    * ``scene``: features of the obstacles that samples place (``SceneFeatures``);
     * ``line``: offsets of the interior control points of the path that the network corrects [rad], not standardized.
     """
     parts = [part for name in blocks for part in _block(tasks, name)]
@@ -225,11 +225,7 @@ class SceneFeatures:
 
 
 def make_scene_features(robot: Robot, spec: TrajectorySpec, kernels: KernelLibrary) -> SceneFeatures:
-    """Load the features of a robot's scenes.
-
-    Raises:
-        UsageError: The robot has no link geometry.
-    """
+    """Load the features of a robot's scenes; raise UsageError for a robot without link geometry."""
     if robot.shape is None:
         raise UsageError('features of scenes need geometry = "urdf" in [robot]', concerns="problem")
     radii = [capsule.radius for capsule in robot.shape.moving_capsules for _ in _shares(capsule)]

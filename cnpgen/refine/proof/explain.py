@@ -83,7 +83,7 @@ def explain_plans(plans: "Plans", indices: Sequence[int] | None = None) -> dict[
         UsageError: An index is out of range.
     """
     from cnpgen.plans.format import PlanStatus
-    from cnpgen.plans.plan_file import correct_tips
+    from cnpgen.plans.tips import correct_tips
     from cnpgen.problems.problem_record import open_problem
 
     indices = None if indices is None else [integer("indices", index) for index in indices]
