@@ -50,11 +50,8 @@ class _TimeParametrization(ctypes.Structure):
     _fields_ = (
         *((name, c_long) for name in ("joints", "pose_width", "path_points", "points")),
         *((name, c_long) for name in ("phases", "rows", "first", "last", "moves")),
-        *(
-            (name, c_void_p)
-            for name in ("path", "rate", "lower", "upper", "path_span", "span", "order", "step_fractions")
-        ),
-        *((name, c_void_p) for name in ("coefficients", "violation")),
+        *((name, c_void_p) for name in ("path", "rate", "lower", "upper", "path_span", "span")),
+        *((name, c_void_p) for name in ("order", "step_fractions", "coefficients", "violation")),
         *((name, c_double) for name in ("max_increase", "max_decrease", "margin", "min_increase", "tolerance")),
     )
 
