@@ -103,9 +103,6 @@ def along_line(count: int, dtype: str = "float64") -> Array:
     return np.linspace(0, 1, count, dtype=dtype)[:, None]
 
 
-Array = NDArray[Any]
-
-
 @dataclass(frozen=True)
 class Projection:
     """Projection of one problem's paths onto its equalities; made by ``make_projection``.
