@@ -190,7 +190,7 @@ def plan_moving_hits(
     iteration converges if the puck is slower than the mallet.
     """
     time, speed = hits.meeting_time.copy(), np.full(len(hits.puck), EXPECTED_HIT_SPEED_M_S)
-    reasons, active = [""] * len(hits.puck), np.arange(len(hits.puck))
+    reasons, active = np.full(len(hits.puck), "", object), np.arange(len(hits.puck))
     for iteration in range(MAX_MEETING_ITERATIONS):
         position, puck_velocity = hits.model.predict(hits.puck[active], hits.velocity[active], time[active])
         angle = hits.model.hit_angle(puck_velocity, speed[active], hits.target[active] - position)
@@ -203,8 +203,7 @@ def plan_moving_hits(
             share=hits.share[active],
             angle=angle,
         )
-        for row, reason in zip(active.tolist(), tasks.why(), strict=True):
-            reasons[row] = reason
+        reasons[active] = tasks.why()
         active = active[tasks.alive]
         speed[active] = tasks["hit_speed"][0]
         if hits.waits and iteration == 0 and len(active):
@@ -221,17 +220,14 @@ def plan_moving_hits(
     else:
         delay, reason = hits.meeting_time[active] - contact, TOO_LATE
         accepted = delay >= 0
-    for row in active[~accepted].tolist():
-        reasons[row] = reason
+    reasons[active[~accepted]] = reason
     touched = _touched_early(completion, hits, plans, delay)
-    for row in active[accepted & touched].tolist():
-        reasons[row] = PuckContact.reason
+    reasons[active[accepted & touched]] = PuckContact.reason
     start = completion.tip_positions(hits.state[0].T)[:2].T
     touching = np.linalg.norm(hits.puck - start, axis=1) < hits.distance + hits.overlap
-    for row in np.flatnonzero(touching).tolist():
-        reasons[row] = PuckContact.boundary_reason
+    reasons[touching] = PuckContact.boundary_reason
     accepted &= ~touched & ~touching[active]
-    return hits.with_pucks(plans[accepted], delay[accepted]), tuple(reasons), delay[accepted]
+    return hits.with_pucks(plans[accepted], delay[accepted]), tuple(reasons.tolist()), delay[accepted]
 
 
 def _touched_early(completion: Completion, hits: MovingHits, plans: Plans, delay: Array) -> NDArray[np.bool_]:

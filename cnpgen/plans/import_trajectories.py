@@ -228,7 +228,6 @@ class StateSnapper:
         q, dq, ddq = np.split(x * self._scale, 3)
         self._world.set_state(q, dq, ddq, self._poses)
         conditions = [condition for part in self._constraints for condition in part.measured_at(self._world, end)]
-        values = [np.array(condition.g, float) for condition in conditions]
-        bounds = ([getattr(condition, side) for condition in conditions] for side in ("lower", "upper"))
-        lower, upper = (np.concatenate([np.empty(0), *rows]) for rows in bounds)
-        return np.concatenate([np.empty(0), *values]), lower, upper
+        parts = ([getattr(condition, name) for condition in conditions] for name in ("g", "lower", "upper"))
+        g, lower, upper = (np.concatenate([np.empty(0), *part]) for part in parts)
+        return g, lower, upper

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -54,20 +54,6 @@ class LoadedTrajectories:
     ignored: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class _Options:
-    """Options of reading a table; see ``load_trajectories``."""
-
-    record: ProblemRecord
-    joints: tuple[str, ...]
-    degrees: bool
-    rate: float | None
-    separate_by: str | None
-    unwrap: bool
-    parameters: Mapping[str, float]
-    velocity_limit: Array
-
-
 @checked_arguments
 def load_trajectories(
     path: str | Path,
@@ -107,10 +93,12 @@ def load_trajectories(
         raise UsageError(f"must be above 0, got {rate}", argument="rate")
     _check_parameters(record, parameters or {})
     robot = open_problem(record)[1]
-    options = _Options(record, names, unit == "deg", rate, separate_by, unwrap, parameters or {}, robot.velocity_limit)
     try:
         tables = [part for table in read_trajectory_tables(Path(path)) for part in _separated(table, separate_by)]
-        readers = [_Reader(table, options) for table in tables]
+        readers = [
+            _Reader(table, record, names, unit == "deg", rate, unwrap, parameters or {}, robot.velocity_limit)
+            for table in tables
+        ]
         trajectories = tuple(reader.trajectory() for reader in readers)
     except UsageError as error:
         error.argument = error.argument or "path"
@@ -175,12 +163,19 @@ def _check_parameters(record: ProblemRecord, parameters: Mapping[str, float]) ->
             raise UsageError(f"{name!r} is not a parameter of {record.name!r}: {expected}", argument="parameters")
 
 
+@dataclass
 class _Reader:
     """Reader of one trajectory of a table; ``used`` has the names of the columns that were read."""
 
-    def __init__(self, table: TrajectoryTable, options: _Options) -> None:
-        self.table, self.options = table, options
-        self.used: set[str] = set()
+    table: TrajectoryTable
+    record: ProblemRecord
+    joints: tuple[str, ...]
+    degrees: bool
+    rate: float | None
+    unwrap: bool
+    parameters: Mapping[str, float]
+    velocity_limit: Array
+    used: set[str] = field(default_factory=set)
 
     def trajectory(self) -> Trajectory:
         """Return the trajectory; its parameters are None if some are missing."""
@@ -194,14 +189,14 @@ class _Reader:
         for name, values in (("times", t), *columns.items()):
             if values is not None and len(values) != len(q):
                 raise self._error(f"{len(values)} {name} for {len(q)} positions")
-        if self.options.unwrap:
-            turning = [not sliding for sliding in self.options.record.sliding_joints]
+        if self.unwrap:
+            turning = [not sliding for sliding in self.record.sliding_joints]
             q[:, turning] = np.unwrap(q[:, turning], axis=0)
         parameters = self._parameters()
         phase = self._numbers(PHASE_COLUMN, ndim=1) if PHASE_COLUMN in self.table.columns else None
         try:
             if parameters is not None:
-                self.options.record.parameters.checked(parameters)
+                self.record.parameters.checked(parameters)
             trajectory = Trajectory(t - t[0], q, columns["dq"], columns["ddq"], parameters, phase)
         except UsageError as error:
             raise self._error(str(error)) from error
@@ -218,8 +213,8 @@ class _Reader:
 
     def _parameters(self) -> Array | None:
         """Return the values of the problem's parameters, shape (p,)."""
-        ranges, plain = self.options.record.parameters, {_plain(name): name for name in self.table.columns}
-        found = dict(self.options.parameters)
+        ranges, plain = self.record.parameters, {_plain(name): name for name in self.table.columns}
+        found = dict(self.parameters)
         for parameter, unit in zip(ranges.names, ranges.value_units, strict=True):
             if (name := plain.get(parameter)) is None:
                 continue
@@ -233,7 +228,7 @@ class _Reader:
 
     def _times(self, count: int) -> Array:
         """Return the times of the samples [s]."""
-        name, rate = self._time_column(), self.options.rate
+        name, rate = self._time_column(), self.rate
         if rate is not None and (name is None or not self._has_times_of_rate(name, rate)):
             return np.asarray(np.arange(count) / rate)
         if name is None:
@@ -263,10 +258,10 @@ class _Reader:
     def _check_times(self, trajectory: Trajectory) -> None:
         """Check that times without a unit are in seconds: milliseconds make long steps and slow joints."""
         name, step = self._time_column(), float(np.median(np.diff(trajectory.t)))
-        if name is None or self.options.rate is not None or _UNIT.search(name) or step < MIN_DOUBTFUL_STEP_S:
+        if name is None or self.rate is not None or _UNIT.search(name) or step < MIN_DOUBTFUL_STEP_S:
             return
         speeds = np.abs(np.diff(trajectory.q, axis=0)) / np.diff(trajectory.t)[:, None]
-        share = float((speeds / self.options.velocity_limit).max())
+        share = float((speeds / self.velocity_limit).max())
         if 0 < share < MAX_DOUBTFUL_SPEED:
             slow = f"all joints are slower than {share:.2g} of their velocity limits"
             text = f"{self.table.place}: {name} has steps of {step:.3g} s, and {slow}"
@@ -276,7 +271,7 @@ class _Reader:
         """Return positions, velocities or accelerations of the problem's joints, shape (K, n), or None."""
         for name, values in self.table.columns.items():
             if _plain(name).lower() in KIND_NAMES[kind] and values.ndim == 2:
-                return self._selected(name) * self._factors([name] * len(self.options.joints), kind)
+                return self._selected(name) * self._factors([name] * len(self.joints), kind)
         names = self._scalar_columns(kind)
         if names is None:
             return None
@@ -285,7 +280,7 @@ class _Reader:
 
     def _selected(self, name: str) -> Array:
         """Return the problem's joints of an array with one column per joint."""
-        values, joints = self._numbers(name, ndim=2), self.options.joints
+        values, joints = self._numbers(name, ndim=2), self.joints
         width, named = values.shape[1], self.table.joint_names
         if named and len(named) != width:
             raise self._error(f"{name} has {width} columns, joint_names has {len(named)}")
@@ -303,7 +298,7 @@ class _Reader:
     def _scalar_columns(self, kind: str) -> list[str] | None:
         """Return the column of every joint, or None without any; positions may have the joint's name alone."""
         plain = {_plain(name).lower(): name for name, values in self.table.columns.items() if values.ndim == 1}
-        joints = self.options.joints
+        joints = self.joints
         naming = [list(joints)]
         if not any(joint.isdecimal() for joint in joints):
             naming += [[str(k + first) for k in range(len(joints))] for first in (0, 1)]
@@ -332,8 +327,8 @@ class _Reader:
     def _factors(self, names: Sequence[str], kind: str) -> Array:
         """Return the factors to SI units of the columns of a kind, one per joint, shape (n,)."""
         exponent = {"q": "", "dq": "/s", "ddq": "/s^2"}[kind]
-        turning = ("rad", _DEGREE if self.options.degrees else 1.0)
-        units = [("m", 1.0) if slides else turning for slides in self.options.record.sliding_joints]
+        turning = ("rad", _DEGREE if self.degrees else 1.0)
+        units = [("m", 1.0) if slides else turning for slides in self.record.sliding_joints]
         parts = zip(names, units, strict=True)
         return np.array([self._factor(name, unit + exponent, usual) for name, (unit, usual) in parts])
 
@@ -349,7 +344,7 @@ class _Reader:
 
     def _missing(self) -> str:
         """Return the message for missing positions."""
-        joint, columns = self.options.joints[0], ", ".join(list(self.table.columns)[:12])
+        joint, columns = self.joints[0], ", ".join(list(self.table.columns)[:12])
         expected = f"q {joint}, {joint}_position, {joint} and so on, or an array q"
         return f"no columns with joint positions, expected {expected}; there are {columns or 'no columns'}"
 
