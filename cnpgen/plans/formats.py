@@ -29,12 +29,7 @@ _WITHOUT_POINT = re.compile(r"(?<![\d.])(\d+)(?=e[+-])")
 
 @dataclass(frozen=True)
 class NumpyArchive(Exporter):
-    """One NumPy archive with all plans.
-
-    The arrays of a plan are ``plan_00000_t`` and ``_path_phase`` (K,), and ``plan_00000_q``, ``_dq``, ``_ddq``,
-    ``_jerk`` (K, n), numbered by its index, and one number per parameter, such as ``plan_00000_payload_mass``.
-    Further arrays are ``plan``, ``sample_id``, ``joint_names``, ``held_joint_names`` and ``held_joint_positions``.
-    """
+    """One NumPy archive with the arrays of all plans, numbered by their indices ('cnpgen docs plan-format')."""
 
     suffix = ".npz"
     single_file = True
@@ -63,11 +58,7 @@ class NumpyArchive(Exporter):
 
 @dataclass(frozen=True)
 class CsvTables(Exporter):
-    """A folder with one CSV table per plan; numbers read back as the same float64.
-
-    ``path_phase`` is the phase of the plan. Parameters of the problem are columns of equal values, such as
-    ``payload_mass [kg]``.
-    """
+    """A folder with one CSV table per plan; numbers read back as the same float64 ('cnpgen docs plan-format')."""
 
     suffix = ".csv"
 
@@ -89,11 +80,9 @@ class CsvTables(Exporter):
 
 @dataclass(frozen=True)
 class ParquetTable(Exporter):
-    """One Parquet file with all plans, one row per sample.
+    """One Parquet file with all plans, one row per sample ('cnpgen docs plan-format'); every plan is a row group.
 
-    Columns are ``plan``, ``sample_id``, ``t`` [s], ``q``, ``dq``, ``ddq`` and ``jerk`` as lists of n values,
-    ``path_phase`` and the parameters of the problem, such as ``payload_mass [kg]``. The metadata have the names of the
-    joints and the units. Every plan is a row group.
+    The metadata have the names of the joints and the units.
     """
 
     suffix = ".parquet"
@@ -146,10 +135,7 @@ class JointTrajectory(Exporter):
 
 @dataclass(frozen=True)
 class TrajectoryControllerGoal(Exporter):
-    """A folder with one goal of ``control_msgs/action/FollowJointTrajectory`` per plan, as YAML.
-
-    ``ros2 action send_goal`` takes the content as its goal.
-    """
+    """A folder with one YAML file per plan: a goal of ``FollowJointTrajectory`` for ``ros2 action send_goal``."""
 
     suffix = ".yaml"
 
