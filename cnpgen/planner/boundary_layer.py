@@ -3,6 +3,8 @@
 It combines boundary conditions, line, expected time and network outputs on the CPU, in float64.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path

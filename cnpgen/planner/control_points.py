@@ -9,6 +9,8 @@ against other terms of the loss. Paths meet the equalities at eleven phases to s
 the spline can.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from functools import lru_cache, partial

@@ -1,5 +1,7 @@
 """A trained model: network parameters, definition of its inputs and outputs, and training metadata."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property

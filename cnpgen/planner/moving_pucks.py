@@ -6,6 +6,8 @@ tangential part, which friction reduces at most to rolling (Stronge, Impact Mech
 homogeneous disc: rolling transfers a third of it.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from functools import cache
 

@@ -1,5 +1,7 @@
 """Plan air hockey hits: from arm state, puck and target to a boundary problem and its plan."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 

@@ -1,5 +1,7 @@
 """Read planning tasks from datasets, HDF5 files and scenes, and check them against a model."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,5 +1,7 @@
 """Plan motions from boundary conditions with a trained model, in a fraction of a millisecond; online replanning."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial

@@ -1,5 +1,7 @@
 """Sampled motions that are evaluated in microseconds: quintic Hermite interpolation on a grid of one millisecond."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from math import ceil
 from typing import NamedTuple

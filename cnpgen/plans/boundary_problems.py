@@ -1,5 +1,7 @@
 """Boundary problems of a dataset or file, as plans without motions; rows of a certified dataset have motions."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Evaluation of sets of plans by the independent verdict, in several processes."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass

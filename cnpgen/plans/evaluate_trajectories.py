@@ -1,5 +1,7 @@
 """Evaluation of sampled trajectories of any planner by the independent verdict."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,5 +1,7 @@
 """Export of plans: selection, sampling in time, and writing in a registered format."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields

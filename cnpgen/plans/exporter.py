@@ -1,5 +1,7 @@
 """Contract of export formats: plans sampled in time, written to files."""
 
+from __future__ import annotations
+
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping

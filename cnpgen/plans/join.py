@@ -1,5 +1,7 @@
 """Concatenated and joined plans: more plans, or sequences in which a plan is cut at a time and continued by another."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

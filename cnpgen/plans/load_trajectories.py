@@ -1,5 +1,7 @@
 """Sampled trajectories of any planner, loaded in the order and the units of a problem."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -3,6 +3,8 @@
 Readers check names, shapes and types, not values.
 """
 
+from __future__ import annotations
+
 import io
 import os
 from collections.abc import Mapping

@@ -1,5 +1,7 @@
 """Scene problems as boundary problems of one problem whose obstacles differ from plan to plan."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace

@@ -3,6 +3,8 @@
 All parameters are in one vector.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any

@@ -3,6 +3,8 @@
 Features of the obstacles that samples place do not depend on their order: they are signed distances at points.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
