@@ -85,11 +85,11 @@ def join_plans(first: Plans | JoinedPlans, following: Plans, *, at: ArrayLike | 
         UsageError: The numbers of plans or times or the problems differ, a time is outside its plan, a plan has no
             motion, or there is a discontinuity.
     """
-    if isinstance(first, Plans):
+    if isinstance(first, JoinedPlans):
+        joined = first
+    else:
         check_made(first)
         joined = JoinedPlans((first,), np.zeros((1, len(first))))
-    else:
-        joined = first
     if len(following) != len(joined):
         raise UsageError(
             f"{len(joined)} plans are followed by {len(following)}, expected one for each", concerns="following"
