@@ -33,8 +33,8 @@ from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
 from cnpgen.planner.planner import Planner
-from cnpgen.plans.concatenate import concatenate
 from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.plans.join import concatenate
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
 from cnpgen.refine.options import DEFAULT_OPTIONS

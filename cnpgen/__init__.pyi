@@ -20,9 +20,9 @@ from cnpgen.plans.evaluate_trajectories import evaluate_trajectories as evaluate
 from cnpgen.plans.export import export_plans as export_plans
 from cnpgen.plans.join import join_plans as join_plans
 from cnpgen.plans.plan_file import load_plans as load_plans
+from cnpgen.plans.plan_file import save_plans as save_plans
 from cnpgen.plans.plans import Plans as Plans
 from cnpgen.plans.plans import make_plans as make_plans
-from cnpgen.plans.save import save_plans as save_plans
 from cnpgen.problems.problem import Problem as Problem
 from cnpgen.problems.problem_file import load_problem as load_problem
 from cnpgen.problems.robot_model import RobotModel as RobotModel

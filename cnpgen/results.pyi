@@ -16,6 +16,7 @@ from cnpgen.make.make_dataset import MadeDataset as MadeDataset
 from cnpgen.planner.control_points import ControlPoints as ControlPoints
 from cnpgen.planner.model import ModelConfig as ModelConfig
 from cnpgen.planner.model import Outputs as Outputs
+from cnpgen.planner.moving_pucks import PuckModel as PuckModel
 from cnpgen.planner.network.architecture import Architecture as Architecture
 from cnpgen.planner.network.architecture import Layer as Layer
 from cnpgen.planner.network.features import Features as Features
@@ -23,14 +24,13 @@ from cnpgen.planner.plan_hits import PlannedHits as PlannedHits
 from cnpgen.planner.plan_runtime import PlanRuntime as PlanRuntime
 from cnpgen.planner.plan_runtime import Switch as Switch
 from cnpgen.planner.plan_runtime import SwitchOutcome as SwitchOutcome
-from cnpgen.planner.puck_model import PuckModel as PuckModel
 from cnpgen.planner.set_points import SetPoint as SetPoint
 from cnpgen.planner.tasks import Tasks as Tasks
 from cnpgen.plans.evaluate import Evaluation as Evaluation
 from cnpgen.plans.export import Exported as Exported
+from cnpgen.plans.format import PlanStatus as PlanStatus
 from cnpgen.plans.join import JoinedPlans as JoinedPlans
 from cnpgen.plans.plans import PlanIndexError as PlanIndexError
-from cnpgen.plans.status import PlanStatus as PlanStatus
 from cnpgen.problems.robot_model import ConstraintValues as ConstraintValues
 from cnpgen.refine.objective_values import objective_values as objective_values
 from cnpgen.refine.proof.explain import Explanation as Explanation

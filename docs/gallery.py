@@ -23,7 +23,7 @@ from cnpgen.cli.view.page import page_of
 from cnpgen.cli.view.view_scene import scene_of_plans
 from cnpgen.errors import CnpgenError
 from cnpgen.plans import Plans, open_problem
-from cnpgen.plans.concatenate import concatenate
+from cnpgen.plans.join import concatenate
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.recipes import load_pipeline
 from cnpgen.store.dataset_plot import plot_dataset

@@ -21,7 +21,7 @@ from cnpgen.pipelines.stages.given_positions import MAX_TASKS, GivenPositions
 from cnpgen.pipelines.stages.hit_angle import HitAngleToGoal
 from cnpgen.pipelines.stages.hitting_configuration import HittingConfiguration
 from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
-from cnpgen.plans.concatenate import concatenate
+from cnpgen.plans.join import concatenate
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.load_robot import load_robot

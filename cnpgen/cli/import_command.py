@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     from cnpgen.cli.refine_command import check_place
     from cnpgen.plans.import_trajectories import import_trajectories
-    from cnpgen.plans.save import save_plans
+    from cnpgen.plans.plan_file import save_plans
     from cnpgen.store.files.kind import PLANS
     from cnpgen.store.paths import file_kind
 

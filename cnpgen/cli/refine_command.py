@@ -140,7 +140,7 @@ def refine_and_save(
 
 def check_place(out: Path, *, force: bool) -> None:
     """Refuse an output path before any work if it cannot be written or exists."""
-    from cnpgen.plans.save import check_replaceable
+    from cnpgen.plans.plan_file import check_replaceable
     from cnpgen.store.files.atomic import check_writable
 
     if out.suffix != ".h5" or out.is_dir() or not out.parent.is_dir():

@@ -140,7 +140,7 @@ def _scene_of_trajectories(arguments: argparse.Namespace, rows: Sequence[int]) -
 def _samples(arguments: argparse.Namespace, rows: Sequence[int]) -> "tuple[Plans, int]":
     """Read rows of a dataset, and count those of the split."""
     from cnpgen.plans.boundary_problems import load_boundary_problems
-    from cnpgen.plans.concatenate import concatenate
+    from cnpgen.plans.join import concatenate
     from cnpgen.problems.problem_file import load_problem_behind
     from cnpgen.problems.problem_record import record_problem
     from cnpgen.store.reader import open_dataset

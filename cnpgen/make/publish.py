@@ -19,7 +19,7 @@ from typing import Any
 
 from cnpgen.errors import MachineError, UsageError, requires_extra
 from cnpgen.loader.load import load_dataset
-from cnpgen.plans.parquet_table import fixed_lists, write_parquet
+from cnpgen.plans.formats import fixed_lists, write_parquet
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.card import PARQUET, card_notes, card_text
 from cnpgen.store.croissant import ParquetFile, croissant_of_tables

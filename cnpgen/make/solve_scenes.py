@@ -20,8 +20,8 @@ from cnpgen.make.goal_poses import (
     states_of_pose,
 )
 from cnpgen.pipelines.families.resting_states import RestingStates
-from cnpgen.plans.concatenate import concatenate
 from cnpgen.plans.format import GOAL_OPTION
+from cnpgen.plans.join import concatenate
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.scene_plans import capacity_of, goal_states, joint_order, scene_plans, with_wider_capacity
 from cnpgen.problems.load_robot import load_robot

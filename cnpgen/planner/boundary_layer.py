@@ -17,9 +17,8 @@ from cnpgen.errors import UsageError
 from cnpgen.kernels.library import Backend, choose_backend, problem_kernels
 from cnpgen.machine.threads import one_thread
 from cnpgen.planner import control_points
-from cnpgen.planner.control_points import ControlPoints
+from cnpgen.planner.control_points import ControlPoints, Projection, make_projection
 from cnpgen.planner.model import ModelConfig
-from cnpgen.planner.projection import Projection, make_projection
 from cnpgen.planner.task_preprocessor import TaskPreprocessor, make_task_preprocessor
 from cnpgen.planner.tasks import EXPECTED_TIMES, Tasks
 from cnpgen.plans.plans import Plans, make_plans

@@ -3,19 +3,28 @@
 ``C_{3+i} = line_i + correction_i + scale phi_i`` with the line from C_2 to C_{C-N_d}, and ``rate = e^o / T_expected``.
 The boundary control points follow from the rates, so that boundary conditions hold by construction. The line depends
 on two of them, so gradients of the path reach the rates both directly and through the line.
+
+During training, a ``Projection`` moves paths onto the manifold's equalities, so that the network need not trade them
+against other terms of the loss. Paths meet the equalities at eleven phases to second order, and between them as well as
+the spline can.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.planner.tasks import Tasks
+from cnpgen.kernels.kernel import Kernel
+from cnpgen.kernels.library import KernelLibrary
+from cnpgen.planner.control_point_functions import path_change, path_change_adjoint
+from cnpgen.planner.expressions import effective_steps
+from cnpgen.planner.tasks import Tasks, lanes
+from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.boundary import Boundary, boundary_derivatives, goal_points, start_points
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
@@ -39,14 +48,9 @@ class ControlPoints:
 
 
 def control_points(tasks: Tasks, phi: Array, log_rate: Array, *, scale: float, spec: TrajectorySpec) -> ControlPoints:
-    """Compute control points in the dtype of the arguments.
+    """Compute control points in the dtype of the arguments; ``scale`` is the factor of phi [rad], the paper's pi.
 
-    Args:
-        tasks: N tasks.
-        phi: Output of the configuration head, in (-1, 1), shape (N, m n).
-        log_rate: Output of the time head, shape (N, R).
-        scale: Factor of phi [rad] (the paper's pi).
-        spec: Degree and numbers of control points.
+    The outputs of the configuration head, phi in (-1, 1), have shape (N, m n), those of the time head (N, R).
     """
     boundary = tasks.boundary
     rate = np.exp(log_rate)
@@ -72,16 +76,8 @@ def vjp(
 ) -> tuple[Array, Array]:
     """Convert gradients with respect to the control points to gradients with respect to the network's outputs.
 
-    Args:
-        tasks: N tasks.
-        points: Result of ``control_points``.
-        path_gradient: Gradient with respect to ``points.path``, shape (N, C, n).
-        rate_gradient: Gradient with respect to ``points.rate``, shape (N, R).
-        scale: Factor of phi [rad], as in ``control_points``.
-        spec: Degree and numbers of control points.
-
-    Returns:
-        Gradients with respect to phi, shape (N, m n), and to the logarithms of the rates, shape (N, R).
+    The gradients of ``points``, the result of ``control_points``, have shapes (N, C, n) and (N, R). Those of phi and of
+    the logarithms of the rates have shapes (N, m n) and (N, R).
     """
     interior = path_gradient[:, 3 : spec.path_control_points - tasks.boundary.fixed_at_goal]
     along = along_line(interior.shape[1], interior.dtype.name)[:, 0]
@@ -89,8 +85,8 @@ def vjp(
     total[:, 2] += (1 - along) @ interior
     total[:, spec.path_control_points - tasks.boundary.fixed_at_goal] += along @ interior
     rates = rate_gradient.copy()
-    for partial in boundary_derivatives(tasks.boundary, points.rate, spec):
-        rates[:, partial.variable] += np.einsum("ij,ij->i", total[:, partial.point], partial.derivative)
+    for effect in boundary_derivatives(tasks.boundary, points.rate, spec):
+        rates[:, effect.variable] += np.einsum("ij,ij->i", total[:, effect.point], effect.derivative)
     rates *= points.rate
     return scale * interior.reshape(len(interior), math.prod(interior.shape[1:])), rates
 
@@ -107,3 +103,43 @@ def lines_at_rest(boundary: Boundary, correction: Array) -> Array:
 def along_line(count: int, dtype: str = "float64") -> Array:
     """Return the interior control points' fractions of the line from C_2 to C_{C-N_d}, shape (m, 1)."""
     return np.linspace(0, 1, count, dtype=dtype)[:, None]
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Projection of one problem's paths onto its equalities; made by ``make_projection``.
+
+    Attributes:
+        change: Kernel of ``control_point_functions.path_change``.
+        adjoint: Kernel of ``control_point_functions.path_change_adjoint``.
+        interior: Slice of the path control points that move.
+    """
+
+    change: Kernel
+    adjoint: Kernel
+    interior: slice
+
+    def project(self, path: Array, obstacle_poses: Array) -> Array:
+        """Return projected control points of paths [rad], shape (N, C, n); boundary control points stay."""
+        (change,) = self.change(lanes(path), lanes(obstacle_poses))
+        projected = path.copy()
+        inner = projected[:, self.interior]
+        inner += change.T.reshape(inner.shape)
+        return projected
+
+    def vjp(self, path: Array, obstacle_poses: Array, gradient: Array) -> Array:
+        """Convert the gradient with respect to the result of ``project`` to that with respect to its argument."""
+        (through_change,) = self.adjoint(lanes(path), lanes(obstacle_poses), lanes(gradient[:, self.interior]))
+        total: Array = gradient + through_change.T.reshape(path.shape).astype(gradient.dtype, copy=False)
+        return total
+
+
+def make_projection(
+    problem: Problem, kernels: KernelLibrary, *, steps: int, fixed_at_goal: int = 2, within_limits: bool = False
+) -> Projection | None:
+    """Load the projection of a problem by Gauss-Newton steps; None if there are no steps or no equalities."""
+    if not effective_steps(kernels, steps):
+        return None
+    interior = slice(3, problem.trajectory.path_control_points - fixed_at_goal)
+    load = partial(kernels.load, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits)
+    return Projection(load(path_change), load(path_change_adjoint), interior)

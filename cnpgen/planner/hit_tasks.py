@@ -1,9 +1,7 @@
 """Tasks of hits: state of the arm, puck and target become the columns of a boundary problem."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,10 +16,9 @@ from cnpgen.pipelines.stages.stage import TaskBatch
 from cnpgen.planner.inference_pipeline import loaded_problem
 from cnpgen.planner.model import Model
 from cnpgen.planner.plan_requests import drawing_stages
-from cnpgen.plans.format import CONDITIONS, UNITS
-from cnpgen.plans.plausible import are_usual
+from cnpgen.plans.format import CONDITIONS
+from cnpgen.plans.plausible import check_units_of_states
 from cnpgen.robots.plausible_values import MAX_LIMIT_RATIO, check_plausible
-from cnpgen.robots.robot import Robot
 from cnpgen.schema.arguments import check_memory_of_rows, concerning, numbers
 from cnpgen.trajectory.boundary import Boundary
 
@@ -72,7 +69,9 @@ def hit_tasks(
             f"must be positions, velocities and accelerations, got {len(state)} values or arrays", argument="state"
         )
     parts = [lanes("state", values, {n}) for values in state]
-    _check_state(completion.context.robot, parts)
+    with concerning("state"):
+        states = {name: values.T for name, values in zip(HIT_COLUMNS[:3], parts, strict=True)}
+        check_units_of_states(completion.context.robot, states, noun="hit")
     centre, goal = lanes("puck", puck, {2, 3}), lanes("target", target, {2})
     direction = goal - centre[:2]
     if not np.count_nonzero(direction, axis=0).all():
@@ -103,17 +102,6 @@ def _parameter_columns(context: Context, parameters: ArrayLike | None) -> dict[s
         return {}
     values = context.robot.nominal_parameters if parameters is None else numbers("parameters", parameters)
     return {"parameters": ranges.checked(values).T}
-
-
-def _check_state(robot: Robot, parts: Sequence[Array]) -> None:
-    """Check that positions, velocities and accelerations of the arm, shape (n, N) each, are not in degrees."""
-    columns = {name: values.T for name, values in zip(HIT_COLUMNS[:3], parts, strict=True)}
-    if are_usual(robot, list(columns.values())):
-        return
-    with concerning("state"):
-        check_plausible(
-            robot, columns, {name: robot.units(UNITS[name.rpartition("_")[2]]) for name in columns}, noun="hit"
-        )
 
 
 def _check_distance(completion: Completion, contact_distance: float, positions: Mapping[str, Array]) -> None:

@@ -1,4 +1,7 @@
-"""Run the steps before and after the network: prepare tasks, project paths and fit rates to the limits."""
+"""Run the steps before and after the network: prepare tasks, project paths and fit rates to the limits.
+
+Plans that violate static conditions are planned again along alternative lines through via points of the model.
+"""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -7,17 +10,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.kernel import Kernel
+from cnpgen.kernels.kernel import GridKernel, Kernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
+from cnpgen.kernels.tape import GridSpec
 from cnpgen.planner.control_point_functions import projected_path
-from cnpgen.planner.expressions import effective_steps
+from cnpgen.planner.control_points import lines_at_rest
+from cnpgen.planner.expressions import effective_steps, static_violation
 from cnpgen.planner.model import Model, ModelConfig, Outputs
-from cnpgen.planner.phase_grid import blocks_of_motions
-from cnpgen.planner.task_preprocessor import TaskPreprocessor, ends_of, lanes, make_task_preprocessor, rows
-from cnpgen.planner.tasks import Tasks
+from cnpgen.planner.task_preprocessor import TaskPreprocessor, make_task_preprocessor
+from cnpgen.planner.tasks import Tasks, ends_of, lanes, rows
 from cnpgen.planner.time_parametrization import TimeParametrization, make_time_parametrization
-from cnpgen.planner.time_scaling import TimeScaling, make_time_scaling
-from cnpgen.planner.via_points import MAX_LINES, ViaPoints, make_via_points
+from cnpgen.planner.time_scaling import TimeScaling, blocks_of_motions, make_time_scaling
 from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.load_robot import load_robot
@@ -25,23 +28,94 @@ from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary, anchor_line
+from cnpgen.trajectory.spline import basis, chebyshev
 from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
 
 SLOW_DURATION = 1.8  # in expected times, above which a motion nearer to the straight line may be faster
 OFFSET_FRACTION = 0.5  # of the offsets from the line that such motions keep
+STATIC_INTERVALS = 32  # between phases
+COARSE_PHASES = slice(2, None, 4)  # that most violating motions fail at
+MOTIONS_PER_CALL = 512  # of the kernel
+MAX_LINES = 4  # that motions are planned along
+
+
+@dataclass(frozen=True)
+class ViaPoints:
+    """Via points of one problem's model, and the check of static conditions; made by ``make_via_points``.
+
+    Attributes:
+        via_points: Configurations [rad], shape (M, n).
+        static_violation: Kernel of ``expressions.static_violation`` at phases of motions, in single precision.
+        path: Basis of p at K phases, shape (K, C), float32.
+    """
+
+    via_points: Array
+    static_violation: GridKernel
+    path: NDArray[np.float32]
+
+    def violation(self, motion: Motion, obstacle_poses: Array) -> Array:
+        """Return the largest violation of conditions on positions and holding torques by N motions, in tolerances.
+
+        It is at most 1 if all conditions hold at the phases, and inf if a position is not finite.
+        """
+        return self._violation_at(self.path, motion.path, obstacle_poses)
+
+    def lower_bound(self, motion: Motion, obstacle_poses: Array) -> Array:
+        """Return lower bounds of ``violation`` that are above 1 for the same motions, in a fraction of the time.
+
+        Motions with a violation at one of a few phases are not checked at the others.
+        """
+        bound = self._violation_at(self.path[COARSE_PHASES], motion.path, obstacle_poses)
+        unclear = np.flatnonzero(bound <= 1)
+        bound[unclear] = self.violation(motion[unclear], obstacle_poses[unclear])
+        return bound
+
+    def _violation_at(self, basis_of_p: NDArray[np.float32], path: Array, obstacle_poses: Array) -> Array:
+        values = np.empty((1, len(basis_of_p), len(path)), np.float32)
+        for block in blocks_of_motions(len(path), MOTIONS_PER_CALL):
+            q = np.matmul(basis_of_p, path[block].transpose(2, 1, 0).astype(np.float32, order="C"))
+            poses = obstacle_poses[block].T.astype(np.float32, order="C")
+            self.static_violation(q, poses, out=[values[..., block]])
+        worst: Array = values[0].max(axis=0).astype(np.float64)
+        return np.nan_to_num(worst, nan=np.inf, posinf=np.inf)
+
+    def best_lines(self, lines: Tasks, count: int) -> NDArray[np.intp]:
+        """Return the rows of the ``count`` lines of every task with the smallest violations at a few phases.
+
+        The lines are all M lines of the first task, then of the next one.
+        """
+        assert lines.correction is not None
+        path = lines_at_rest(lines.boundary, lines.correction)
+        violation = self._violation_at(self.path[COARSE_PHASES], path, lines.scene.poses)
+        order = violation.reshape(-1, len(self.via_points)).argsort(axis=1, kind="stable")[:, :count]
+        return np.asarray((order + len(self.via_points) * np.arange(len(order))[:, None]).ravel())
+
+    @staticmethod
+    def candidates(violation: Array, count: int) -> NDArray[np.intp]:
+        """Return rows of motions: for every task those without violation, or else the one with the smallest.
+
+        Violations, shape (N count,), are those along ``count`` lines of the first task, then of the next one.
+        """
+        of_task = violation.reshape(-1, count)
+        least = of_task.min(axis=1, keepdims=True)
+        return np.flatnonzero(of_task <= np.maximum(least, 1))
+
+
+def make_via_points(problem: Problem, kernels: KernelLibrary, via_points: Array) -> ViaPoints:
+    """Load the check of via points [rad], shape (M, n), for one problem."""
+    spec = problem.trajectory
+    path = basis(chebyshev(STATIC_INTERVALS), spec.path_control_points, spec.degree)
+    kernel = kernels.load_grid(static_violation, GridSpec(("point", "lane"), ("point",)), dtype="float32")
+    return ViaPoints(via_points, kernel, path.astype(np.float32))
 
 
 @dataclass(frozen=True)
 class LoadedProblem:
-    """A problem loaded from its record.
+    """A problem loaded from its record, and the kernels of ``problem.for_planning``.
 
-    Attributes:
-        record: Text of the problem and its URDF.
-        problem: The problem; its URDF file exists only inside ``loaded_problem``.
-        robot: Its robot.
-        kernels: Library of the kernels of ``problem.for_planning``.
+    The URDF file exists only inside ``loaded_problem``.
     """
 
     record: ProblemRecord
@@ -65,14 +139,9 @@ def loaded_problem(record: ProblemRecord, backend: str | None = None) -> Iterato
 
 @dataclass(frozen=True)
 class InferencePipeline:
-    """Steps that make plans from network outputs, for one problem.
+    """Steps that make plans from network outputs, for one problem; those that its model does not use are None.
 
-    Attributes:
-        prepare: Preprocessor of tasks.
-        path: Kernel of ``control_point_functions.projected_path``.
-        time_scaling: Uniform time scaling of motions from rest to rest; None for other models.
-        time_parametrization: Fit of rates to the limits; None if disabled.
-        via_points: Search of lines through via points for plans with violations; None if the model has no via points.
+    ``path`` is the kernel of ``control_point_functions.projected_path``.
     """
 
     prepare: TaskPreprocessor
@@ -89,14 +158,7 @@ class InferencePipeline:
         sample_id: NDArray[np.int64] | None = None,
         columns: Mapping[str, Array] | None = None,
     ) -> Plans:
-        """Plan N motions.
-
-        Args:
-            model: A model of the same problem.
-            boundary: Boundary conditions, shape (N, n) each, float64 and finite.
-            sample_id: Dataset samples of the tasks, shape (N,); 0, 1, ... by default.
-            columns: Further columns of the tasks, as ``Plans.columns``.
-        """
+        """Plan N motions; see ``Planner.plan_batch``."""
         tasks, motion = self.planned(model, boundary, (columns or {}).get(OBSTACLE_POSES))
         return Plans(
             problem=model.problem,
@@ -119,12 +181,7 @@ class InferencePipeline:
         return self._with_via_points(self.via_points, model, tasks, motion)
 
     def motion(self, model: Model, tasks: Tasks) -> Motion:
-        """Evaluate the network, project its paths onto the equalities, and fit the rates to the limits.
-
-        Args:
-            model: A model of the same problem.
-            tasks: N tasks from ``prepare``.
-        """
+        """Evaluate the network, project its paths onto the equalities, and fit the rates to the limits."""
         return self._fitted(self._projected(model, tasks, ends_of(tasks.boundary)), tasks.scene.poses)
 
     def _projected(self, model: Model, tasks: Tasks, ends: Array) -> Motion:

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.planner.network.architecture import Architecture, Weights
+from cnpgen.planner.network.architecture import Architecture, Weights, forward
 from cnpgen.planner.network.features import Features
-from cnpgen.planner.network.forward import forward
 from cnpgen.planner.tasks import Tasks
 from cnpgen.problems.problem_record import ProblemRecord
 from cnpgen.schema.argument_types import checked_arguments
@@ -36,7 +35,7 @@ class ModelConfig:
         within_limits: Whether control points are clipped to the joint limits after each of these steps, and without any
             of them once.
         time_parametrized: Whether rates are fitted to the limits after the network (``time_parametrization``).
-        via_points: Via points of alternative lines for plans with violations [rad], n numbers each (``via_points``).
+        via_points: Via points of alternative lines for plans with violations [rad], n numbers each (``ViaPoints``).
         iterations: Number of evaluations of the network; each one after the first corrects the path of the one before.
     """
 

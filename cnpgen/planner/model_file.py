@@ -71,14 +71,7 @@ def load_model(name_or_path: str | Path) -> Model:
 
 
 def model_for(problem: Problem | StoredProblem) -> Model:
-    """Read the only shipped model of a problem.
-
-    Args:
-        problem: The problem, or its record: ``plans.problem``, ``dataset.problem``.
-
-    Raises:
-        UsageError: There is no shipped model for it, or several.
-    """
+    """Read the shipped model of a problem; raise UsageError if there is none, or several."""
     record = as_record(problem)
     models = {name: load_model(path) for name, path in shipped_models().items()}
     matches = [name for name, model in models.items() if model.problem.comparable_sha256 == record.comparable_sha256]
@@ -143,11 +136,7 @@ def model_content(model: Model) -> Content:
 
 
 def model_from_content(path: Path, content: Content) -> Model:
-    """Make a model from arrays and texts.
-
-    Args:
-        path: Source file, for messages.
-        content: Result of ``model_content``.
+    """Make a model from the result of ``model_content``; the path of its file is for messages.
 
     Raises:
         DatasetError: The content does not fit this version of cnpgen.

@@ -12,10 +12,9 @@ from cnpgen.errors import UsageError, counted
 from cnpgen.machine.threads import one_thread
 from cnpgen.pipelines.completion import Completion
 from cnpgen.planner.hit_tasks import State, boundary_of_tasks, hit_tasks, load_completion
-from cnpgen.planner.moving_pucks import Meeting, plan_moving_hits
+from cnpgen.planner.moving_pucks import MovingHits, PuckModel, plan_moving_hits
 from cnpgen.planner.planner import Planner, plan_tasks
-from cnpgen.planner.puck_model import PuckModel
-from cnpgen.plans.boundary_file import CONTEXT
+from cnpgen.plans.boundary_problems import CONTEXT
 from cnpgen.plans.join import JoinedPlans, join_plans
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.puck_contact import PuckContact
@@ -134,9 +133,10 @@ def plan_hits(
         if parameters is not None:
             raise UsageError("must be None for moving pucks", argument="parameters")
         velocity = np.zeros(2) if puck_velocity is None else puck_velocity
-        meeting = Meeting(puck_model or PuckModel(), distance, overlap, meeting_time)
-        found = plan_moving_hits(planner, completion, meeting, state, puck, velocity, target, share=speed_share)
-        hits = PlannedHits(*found, overlap)
+        arguments = state, puck, velocity, target, speed_share, meeting_time
+        model = puck_model or PuckModel()
+        moving = MovingHits(planner.robot.n, arguments, model=model, distance=distance, overlap=overlap)
+        hits = PlannedHits(*plan_moving_hits(planner, completion, moving), overlap)
     return hits if home is None else replace(hits, return_plans=_plan_returns(planner, hits, numbers("home", home)))
 
 

@@ -14,8 +14,15 @@ from numpy.typing import NDArray
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.planner.model import Model
 from cnpgen.planner.planner import Planner
-from cnpgen.plans.boundary_file import ASKED, CONTEXT, BoundaryFile, boundary_in, read_boundary_file
-from cnpgen.plans.boundary_problems import chosen_rows, scene_columns
+from cnpgen.plans.boundary_problems import (
+    ASKED,
+    CONTEXT,
+    BoundaryFile,
+    boundary_in,
+    chosen_rows,
+    read_boundary_file,
+    scene_columns,
+)
 from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.plausible import check_boundary_units
@@ -23,7 +30,6 @@ from cnpgen.plans.scene_plans import scene_plans, shape_of
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
 from cnpgen.problems.scenes.scene_problem import SceneProblem, checked_scene
 from cnpgen.robots.scene import PARKED_POSITION_M
-from cnpgen.store.dataset_spec import DatasetSpec
 from cnpgen.store.files.documents import canonical_sha256
 from cnpgen.store.reader import open_dataset
 from cnpgen.store.scene_table import SCENE_ID
@@ -36,13 +42,7 @@ CERTIFIED_STAGE = "certified-plan"  # the stage that plans every sample
 
 @dataclass(frozen=True)
 class Requests:
-    """N planning tasks.
-
-    Attributes:
-        boundary: Boundary conditions.
-        sample_id: Dataset rows of the tasks, shape (N,).
-        columns: Further columns of the tasks.
-    """
+    """N planning tasks: boundary conditions, dataset rows, shape (N,), and further columns of the tasks."""
 
     boundary: Boundary
     sample_id: NDArray[np.int64]
@@ -52,22 +52,16 @@ class Requests:
 def read_rows(
     folder: Path, model: Model, *, split: str = "validation", first: int = 0, n: int | None = None, other: bool = False
 ) -> Requests:
-    """Read rows of a dataset.
+    """Read n rows of a dataset, by default all from the first one on, for a model that will plan.
 
-    Args:
-        folder: The dataset.
-        model: The model that will plan.
-        split: Name of the split.
-        first: Index of the first row.
-        n: Number of rows; by default all that follow.
-        other: Whether to accept rows drawn by another recipe than the training rows.
+    Rows drawn by another recipe than the training rows are accepted if ``other`` is set.
 
     Raises:
         DatasetError: The dataset is damaged, of another problem, or drawn by another recipe.
         UsageError: There are no such rows.
     """
     dataset = open_dataset(folder)
-    check_drawing(str(folder), dataset.spec, model, other=other)
+    check_stages(str(folder), as_record(dataset.spec.problem), dataset.spec.stages, model, other=other)
     rows = chosen_rows(folder, dataset.spec, split=split, start=first, n=n)
     stored = {column.name for column in dataset.spec.fields}
     names = [name for name in (*ASKED, SCENE_ID) if name in stored]
@@ -80,11 +74,7 @@ def read_rows(
 def read_file(path: Path, model: Model, *, other: bool = False, allow_large_angles: bool = False) -> Requests:
     """Read boundary conditions from an HDF5 file: a shard, a plan file, or boundary conditions alone.
 
-    Args:
-        path: The file, as read by ``read_boundary_file``.
-        model: The model that will plan.
-        other: Whether to accept rows of a shard drawn by another recipe than the training rows.
-        allow_large_angles: Whether to accept boundary conditions that are probably in degrees or millimetres.
+    Rows of a shard drawn by another recipe than the training rows are accepted if ``other`` is set.
 
     Raises:
         UnitError: Boundary conditions are probably in degrees or millimetres.
@@ -148,8 +138,7 @@ def scene_requests(
     parked = Counter(shape_of(obstacle) for obstacle in problem.obstacle if obstacle.position == PARKED_POSITION_M)
     checked = [checked_scene(scene) for scene in scenes]
     plans = scene_plans(problem.with_obstacles(problem.own_obstacles), checked, goals=goals, capacity=parked)
-    columns = {OBSTACLE_POSES: plans.columns[OBSTACLE_POSES]}
-    return Requests(plans.boundary, plans.sample_id, columns)
+    return Requests(plans.boundary, plans.sample_id, context_columns(plans.columns))
 
 
 def context_columns(columns: Mapping[str, NDArray[Any]]) -> dict[str, Array]:
@@ -161,7 +150,7 @@ def _check_shard(file: BoundaryFile, model: Model, *, other: bool) -> None:
     """Check a shard by its dataset's specification, or by its recipe's digest if it lies outside its dataset."""
     spec = file.spec()
     if spec is not None:
-        check_drawing(str(file.path), spec, model, other=other)
+        check_stages(str(file.path), as_record(spec.problem), spec.stages, model, other=other)
     elif not other and file.text("recipe_sha256") != model.training.get("dataset", {}).get("recipe_sha256", ""):
         raise DatasetError(
             f"{file.path} is a shard outside its dataset, drawn by another recipe than the model's training rows;"
@@ -180,12 +169,7 @@ def _check_recorded_problem(file: BoundaryFile, model: Model) -> None:
 
 
 def checked_boundary(where: str, columns: Mapping[str, NDArray[Any]], model: Model) -> Boundary:
-    """Return the boundary conditions among named columns; missing ones are zero.
-
-    Raises:
-        DatasetError: A shape is wrong, a value is not finite, or goal accelerations are prescribed that the model
-            leaves free.
-    """
+    """Return the boundary conditions of ``boundary_in``; raise DatasetError for goal accelerations if they are free."""
     if "goal_ddq" in columns and model.fixed_at_goal == 2:
         raise DatasetError(f"{where} prescribes goal accelerations (goal_ddq), and the model leaves them free")
     return boundary_in(where, columns, len(model.problem.joint_names))
@@ -204,11 +188,6 @@ def check_problem(where: str, record: ProblemRecord, model: Model) -> None:
 def drawing_stages(stages: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     """Return the stages that draw rows: all but the stage that certifies them."""
     return [stage for stage in stages if stage.get("use") != CERTIFIED_STAGE]
-
-
-def check_drawing(where: str, spec: DatasetSpec, model: Model, *, other: bool) -> None:
-    """Raise an error for rows of another problem, and unless ``other`` for rows drawn by another recipe."""
-    check_stages(where, as_record(spec.problem), spec.stages, model, other=other)
 
 
 def check_stages(

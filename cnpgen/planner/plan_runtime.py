@@ -261,19 +261,8 @@ def plan_stop(
     """Plan the fastest valid stop from a state on a motion.
 
     The goals are configurations that the motion passes later, which are on the constraint manifold. The plans are
-    judged in the order of their durations.
-
-    Args:
-        planner: A planner whose model plans from moving states to rest, such as airhockey-online.
-        motion: The motion in execution.
-        time: Time at which the stop begins [s].
-        parameters: Parameters of the problem, if it has any, shape (width,).
-
-    Returns:
-        The stop, or None if no candidate is valid.
-
-    Raises:
-        UsageError: The model does not plan from moving states.
+    judged in the order of their durations. The result is None if none of them is valid. Models that do not plan from
+    moving states raise UsageError.
     """
     q, dq, ddq = (values[0] for values in motion.at(np.array([time])))
     goals = motion.at(time + BRAKING_LOOKAHEADS_S).q

@@ -132,8 +132,7 @@ class Planner:
         """
         states = start_q, start_dq, start_ddq, goal_q, goal_dq, goal_ddq
         boundary = boundary_of(self.robot.n, *states, parameters)
-        self._check_memory("start_q", boundary)
-        check_boundary_units(self.robot, boundary, allow_large_angles=allow_large_angles)
+        self._check_size_and_units("start_q", boundary, allow_large_angles=allow_large_angles)
         return self._inference.plan(self.model, self._checked(boundary))
 
     @checked_arguments
@@ -158,8 +157,7 @@ class Planner:
         Raises:
             UsageError: See ``plan``.
         """
-        self._check_memory("boundary", boundary)
-        check_boundary_units(self.robot, boundary, argument="boundary", allow_large_angles=allow_large_angles)
+        self._check_size_and_units("boundary", boundary, "boundary", allow_large_angles=allow_large_angles)
         return plan_tasks(self, boundary, sample_id, columns)
 
     @checked_arguments
@@ -208,17 +206,19 @@ class Planner:
         boundary, columns = boundary_of(self.robot.n, *states, parameters), dict[str, Array]()
         if (poses := plans.columns.get(OBSTACLE_POSES)) is not None:
             columns[OBSTACLE_POSES] = np.broadcast_to(poses, (len(boundary), poses.shape[1]))
-        self._check_memory("plans", boundary)
-        check_boundary_units(self.robot, boundary)
+        self._check_size_and_units("plans", boundary)
         new = plan_tasks(self, boundary, None, columns)
         times = np.broadcast_to(numbers("time", time), (len(plans),))
         if len(plans) == 1:
             plans, times = plans[np.zeros(len(new), int)], np.repeat(times, len(new))
         return reuse_previous_plan(plans, times, new, acceleration_limit=self.robot.acceleration_limit)
 
-    def _check_memory(self, argument: str, boundary: Boundary) -> None:
-        """Refuse plans that exceed the memory."""
-        check_memory(argument, len(boundary), len(boundary) * self._numbers_per_plan)
+    def _check_size_and_units(
+        self, many: str, boundary: Boundary, concerned: str | None = None, *, allow_large_angles: bool = False
+    ) -> None:
+        """Refuse plans that exceed the memory, and units other than SI; the names are arguments of the caller."""
+        check_memory(many, len(boundary), len(boundary) * self._numbers_per_plan)
+        check_boundary_units(self.robot, boundary, argument=concerned, allow_large_angles=allow_large_angles)
 
     def _checked(self, boundary: Boundary) -> Boundary:
         """Set conditions that were zero in all training rows to exactly zero; check that they are zero to rounding."""
@@ -260,14 +260,8 @@ def plan_tasks(
 def reuse_previous_plan(old: Plans, time: Array, new: Plans, *, acceleration_limit: Array) -> Plans:
     """Replace new plans by the remaining trajectory of old ones to the same goal, unless the new ones are faster.
 
-    Args:
-        old: N plans.
-        time: Time at which the new plans take over, since the start of the old ones [s], shape (N,).
-        new: N plans from the states at these times.
-        acceleration_limit: Limits of the joints [rad/s^2], shape (n,).
-
-    Returns:
-        The new plans, some replaced; all with more control points if a remaining trajectory needs them.
+    The N new plans take over at times since the start of the old ones [s], shape (N,). All have more control points if
+    a remaining trajectory needs them.
     """
     remaining_time = old.duration - time
     reused = np.flatnonzero(

@@ -1,9 +1,7 @@
 """Prepare tasks from boundary conditions: tip positions, obstacles, expected time, projected line."""
 
-import math
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +13,17 @@ from cnpgen.planner.control_point_functions import line_change, tips_at_ends
 from cnpgen.planner.control_points import along_line, lines_at_rest
 from cnpgen.planner.expressions import effective_steps
 from cnpgen.planner.model import ModelConfig
-from cnpgen.planner.network.scene_features import SceneFeatures, make_scene_features
-from cnpgen.planner.tasks import MIN_EXPECTED_TIME_S, MIN_TRAVEL_TIME_S, Tasks, expected_time, reaching_time
+from cnpgen.planner.network.features import SceneFeatures, make_scene_features
+from cnpgen.planner.tasks import (
+    MIN_EXPECTED_TIME_S,
+    MIN_TRAVEL_TIME_S,
+    Tasks,
+    ends_of,
+    expected_time,
+    lanes,
+    reaching_time,
+    rows,
+)
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.obstacle import Obstacle
@@ -26,21 +33,6 @@ from cnpgen.robots.solid import place_obstacles
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
-
-
-def lanes(values: NDArray[Any]) -> Array:
-    """Reshape (N, ...) to (width, N), float64."""
-    return np.ascontiguousarray(values.reshape(len(values), math.prod(values.shape[1:])).T, np.float64)
-
-
-def rows(values: Array, n: int) -> Array:
-    """Reshape (points n, N) to (N, points, n)."""
-    return np.ascontiguousarray(values.T).reshape(values.shape[1], values.shape[0] // n, n)
-
-
-def ends_of(boundary: Boundary) -> Array:
-    """Return boundary conditions of N motions, shape (5 n, N), or (6 n, N) with goal_ddq."""
-    return np.ascontiguousarray(np.concatenate(list(boundary.conditions().values()), axis=1).T)
 
 
 @dataclass(frozen=True)
@@ -79,14 +71,9 @@ class TaskPreprocessor:
         ends: Array | None = None,
         obstacle_poses: Array | None = None,
     ) -> Tasks:
-        """Prepare N tasks, in float64.
+        """Prepare N tasks, in float64, with lines through via points [rad], shape (N, n), at half their length.
 
-        Args:
-            boundary: Boundary conditions, shape (N, n) each.
-            via_point: Via points of the lines at half their length before projection [rad], shape (N, n); none by
-                default.
-            ends: Result of ``ends_of``, if already computed.
-            obstacle_poses: Poses and sizes of obstacles that samples place, shape (N, width).
+        ``ends`` is the result of ``ends_of``, if already computed. Poses are those of obstacles that samples place.
 
         Raises:
             UsageError: Obstacle poses are missing, have a wrong shape or are not finite, or the problem places them.

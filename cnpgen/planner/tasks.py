@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce
@@ -68,6 +69,21 @@ class Tasks:
     def _converted(self, convert: Callable[[Any], Any]) -> Tasks:
         parts: dict[str, Any] = {name: None if part is None else convert(part) for name, part in vars(self).items()}
         return Tasks(**parts)
+
+
+def lanes(values: NDArray[Any]) -> NDArray[np.float64]:
+    """Reshape (N, ...) to (width, N), float64."""
+    return np.ascontiguousarray(values.reshape(len(values), math.prod(values.shape[1:])).T, np.float64)
+
+
+def rows(values: Array, n: int) -> Array:
+    """Reshape (points n, N) to (N, points, n)."""
+    return np.ascontiguousarray(values.T).reshape(values.shape[1], values.shape[0] // n, n)
+
+
+def ends_of(boundary: Boundary) -> Array:
+    """Return boundary conditions of N motions, shape (5 n, N), or (6 n, N) with goal_ddq."""
+    return np.ascontiguousarray(np.concatenate(list(boundary.conditions().values()), axis=1).T)
 
 
 def expected_time(boundary: Boundary, velocity_limit: Array, *, least: float = MIN_EXPECTED_TIME_S) -> Array:

@@ -25,7 +25,7 @@ from cnpgen.kernels.compiled_kernel import address_of, aligned_array
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.planner.expressions import coefficient_bounds, speed_bounds, speed_coefficients
-from cnpgen.planner.phase_grid import PhaseGrid, blocks_of_motions, make_phase_grid
+from cnpgen.planner.time_scaling import PhaseGrid, blocks_of_motions, make_phase_grid
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.spline_motion import Motion
@@ -50,11 +50,8 @@ class _TimeParametrization(ctypes.Structure):
     _fields_ = (
         *((name, c_long) for name in ("joints", "pose_width", "path_points", "points")),
         *((name, c_long) for name in ("phases", "rows", "first", "last", "moves")),
-        *(
-            (name, c_void_p)
-            for name in ("path", "rate", "lower", "upper", "path_span", "span", "order", "step_fractions")
-        ),
-        *((name, c_void_p) for name in ("coefficients", "violation")),
+        *((name, c_void_p) for name in ("path", "rate", "lower", "upper", "path_span", "span")),
+        *((name, c_void_p) for name in ("order", "step_fractions", "coefficients", "violation")),
         *((name, c_double) for name in ("max_increase", "max_decrease", "margin", "min_increase", "tolerance")),
     )
 
@@ -89,13 +86,8 @@ class TimeParametrization(PhaseGrid):
         A motion stays as it is if its largest violation would grow, because its bounded values are not such
         quadratics. For the same reason motions may be slower than necessary.
 
-        Args:
-            motion: N motions, with the problem's numbers of control points.
-            obstacle_poses: Poses and sizes of the obstacles, shape (N, width).
-
-        Returns:
-            The motions, and a mask of those that meet the limits, shape (N,). False also for motions whose control
-            points moved twice: they exceed the limits more between the phases.
+        The mask of motions that meet the limits, shape (N,), is False also for motions whose control points moved
+        twice: they exceed the limits more between the phases.
         """
         rate, violation = np.array(motion.rate, np.float64, order="C"), np.empty(len(motion))
         if self.library is not None:
@@ -169,8 +161,7 @@ def make_time_parametrization(
 ) -> TimeParametrization:
     """Load the time parametrization of one problem; ``at_rest`` is whether motions begin and end at rest.
 
-    Raises:
-        UsageError: The problem bounds the jerk, which is no quadratic of the rate.
+    A problem that bounds the jerk, which is no quadratic of the rate, raises UsageError.
     """
     if problem.path_orders > 3:
         raise UsageError(f"plans of {problem.name!r} cannot be time-parametrized: it bounds the jerk")
@@ -218,16 +209,10 @@ def _sweep(rate: Array, coefficients: list[Array], bounds: tuple[Array, Array], 
 
 
 def advance(coefficients: list[Array], bounds: tuple[Array, Array], rates: Array, along: Array) -> Array:
-    """Return the largest step of the rates within the bounds, or the required step back if one is violated.
+    """Return the largest steps of N rates within the bounds, or the required steps back if one is violated.
 
-    Args:
-        coefficients: Constant, square and mixed, shape (m, N, K) each.
-        bounds: Lower and upper bounds, shape (m,) each.
-        rates: r and r', shape (2, N, K).
-        along: Direction of r and r', shape (2, N, K).
-
-    Returns:
-        Steps, shape (N,).
+    Coefficients (constant, square, mixed) have shape (m, N, K) each, bounds (m,) each, r with r' and their directions
+    (2, N, K).
     """
     (constant, square, mixed), (r, r1), (b, b1) = coefficients, rates, along
     value = constant + (square * r + mixed * r1) * r

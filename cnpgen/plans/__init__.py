@@ -1,10 +1,9 @@
 """Plans: motions for boundary problems, and their file format."""
 
-from cnpgen.plans.concatenate import concatenate
-from cnpgen.plans.plan_file import load_plans
+from cnpgen.plans.format import PlanStatus
+from cnpgen.plans.join import concatenate
+from cnpgen.plans.plan_file import load_plans, save_plans
 from cnpgen.plans.plans import PlanIndexError, Plans, make_plans, screen
-from cnpgen.plans.save import save_plans
-from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.problem_record import ProblemRecord, open_problem, record_problem
 
 __all__ = [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +11,159 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, UsageError, lacks
-from cnpgen.plans.boundary_file import CONTEXT, read_boundary_file
-from cnpgen.plans.format import GOAL_OPTION, OBSTACLE_POSES
-from cnpgen.plans.plan_file import agreed_problem
+from cnpgen.plans.format import (
+    ATTRIBUTES,
+    CONDITIONS,
+    FORMAT,
+    GOAL_OPTION,
+    OBSTACLE_POSES,
+    PLAN_FILE_VERSION,
+    refuse_misspelt,
+)
+from cnpgen.plans.plan_file import agreed_problem, stored_problem
 from cnpgen.plans.plans import Plans, make_plans
+from cnpgen.plans.plausible import check_boundary_units
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
+from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene_arrays import scene_poses
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
-from cnpgen.store.dataset_spec import DatasetSpec, StoredProblem
-from cnpgen.store.paths import require_folder
+from cnpgen.store.checked_shard import Shard, read_rows
+from cnpgen.store.dataset_spec import DatasetSpec, StoredProblem, load_dataset_spec, shards
+from cnpgen.store.files.checksum_file import verify_checksum
+from cnpgen.store.files.hdf5 import opened_hdf5
+from cnpgen.store.paths import HDF5_KINDS, require_file, require_folder
 from cnpgen.store.reader import StoredDataset, open_dataset
 from cnpgen.store.scene_table import SCENE_ID
-from cnpgen.trajectory.boundary import Boundary
+from cnpgen.store.shard import SHARD_FORMAT
+from cnpgen.trajectory.boundary import Boundary, boundary_of
+
+CONTEXT = ("hit_angle", "hit_speed")  # dataset columns that plans keep
+ASKED = (*CONDITIONS, "sample_id", OBSTACLE_POSES, GOAL_OPTION, *CONTEXT)
+_OF_SHARDS = ("specification_fingerprint", "recipe_sha256", "first_sample_id", "rows")
+SAID = (*ATTRIBUTES, *_OF_SHARDS)  # attributes
+
+
+@dataclass(frozen=True, eq=False)
+class BoundaryFile:
+    """Present attributes of ``SAID`` and columns of ``ASKED`` in a file of N boundary problems; only names are checked.
+
+    ``has_checksum`` is whether the file has a checksum, which was verified.
+    """
+
+    path: Path
+    attributes: Mapping[str, Any]
+    columns: Mapping[str, NDArray[Any]]
+    has_checksum: bool
+
+    @property
+    def is_shard(self) -> bool:
+        """Whether it is a shard of a dataset."""
+        return self.text("format") == SHARD_FORMAT
+
+    def text(self, name: str) -> str:
+        """Return an attribute as text; empty if it is missing."""
+        value = self.attributes.get(name, "")
+        return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
+
+    def spec(self) -> DatasetSpec | None:
+        """Return the specification of the dataset that contains a shard; None for separate shards and other files."""
+        if not self.is_shard:
+            return None
+        try:
+            spec = load_dataset_spec(self.path.absolute().parents[1])
+        except (DatasetError, IndexError):
+            return None
+        mine = self.text("specification_fingerprint")
+        return spec if any(each.fingerprint == mine for each in spec.spec_versions) else None
+
+    def check_shard(self) -> None:
+        """Raise DatasetError for a shard that differs from its dataset's specification; see ``read_rows``."""
+        if spec := self.spec():
+            folder, name = self.path.absolute().parents[1], "/".join(self.path.absolute().parts[-2:])
+            for task in shards(spec):
+                if task.file == name:
+                    read_rows(Shard(folder, spec, task))
+
+    def problem(self, *, required: bool = True) -> ProblemRecord | None:
+        """Return the problem named by the file or by its dataset; None if neither names one; see ``stored_problem``."""
+        spec = self.spec()
+        return (
+            stored_problem(self.path, self.attributes, required=required) if spec is None else as_record(spec.problem)
+        )
+
+    def check_obstacles(self, problem: ProblemRecord) -> None:
+        """Raise DatasetError if the file lacks the obstacles of its samples, and they place those of the problem."""
+        if OBSTACLE_POSES not in self.columns and open_problem(problem)[0].has_sample_obstacles:
+            remedy = "give the folder of its dataset" if self.is_shard else f"expected {OBSTACLE_POSES}"
+            raise DatasetError(f"{self.path} lacks the obstacles of its samples: {remedy}")
+
+    def boundary(self, robot: Robot, *, allow_large_angles: bool = False) -> Boundary:
+        """Return the boundary conditions of a robot's motions, shape (N, n) each; raise DatasetError or UnitError."""
+        boundary = boundary_in(str(self.path), self.columns, robot.n)
+        if not allow_large_angles:
+            check_boundary_units(robot, boundary, where=str(self.path))
+        return boundary
+
+    def sample_id(self, rows: int) -> NDArray[np.int64]:
+        """Return N sample IDs, 0, 1, ... by default; raise DatasetError for others than integers or a shard's rows."""
+        ids = self.columns.get("sample_id", np.arange(rows))
+        if ids.shape != (rows,) or ids.dtype.kind not in "iu":
+            raise DatasetError(f"{self.path}: sample_id must hold {rows} integers, got {ids.dtype} of {ids.shape}")
+        if self.is_shard and not self._has_indices(ids):
+            raise DatasetError(f"{self.path}: sample_id is not the index of the row in the split")
+        return ids.astype(np.int64)
+
+    def _has_indices(self, ids: NDArray[Any]) -> bool:
+        """Return whether sample IDs are the indices of all rows of a shard, by its attributes."""
+        first, rows = (self.attributes.get(name) for name in ("first_sample_id", "rows"))
+        if not isinstance(first, int | np.integer) or not isinstance(rows, int | np.integer):
+            return False
+        return len(ids) == rows and ("sample_id" not in self.columns or np.array_equal(ids, first + np.arange(rows)))
+
+
+def read_boundary_file(path: Path) -> BoundaryFile:
+    """Read an HDF5 file of boundary conditions; see ``load_boundary_problems``.
+
+    Raises:
+        UsageError: The file does not exist or is of another kind.
+        DatasetError: The file is damaged, or a required name is missing or misspelled.
+        MachineError: The file cannot be read.
+    """
+    require_file(path, "a dataset or an HDF5 file of boundary conditions", kinds=HDF5_KINDS)
+    has_checksum = verify_checksum(path, kind=FORMAT, version=PLAN_FILE_VERSION)
+    with opened_hdf5(path) as file:
+        attributes = file.attributes.some(SAID)
+        columns = {name: file[name].read() for name in ASKED if name in file}
+        names = file.names()
+    found = BoundaryFile(path, attributes, columns, has_checksum)
+    found.check_shard()
+    if not has_checksum and not found.is_shard:  # files of cnpgen are complete
+        refuse_misspelt(path, names, ASKED)
+    missing = [name for name in ("start_q", "goal_q") if name not in columns]
+    if missing:
+        tasks = any(name.startswith("goal_xyz") for name in names)
+        hint = "; of tasks in the workspace 'cnpgen complete' makes them" if tasks else ""
+        raise DatasetError(f"{path} lacks {' and '.join(missing)}: boundary conditions are needed to plan{hint}")
+    return found
+
+
+def boundary_in(where: str, columns: Mapping[str, NDArray[Any]], n: int) -> Boundary:
+    """Read boundary conditions of n joints from columns; missing ones are zero, missing goal accelerations are free.
+
+    Wrong shapes of columns, name -> values of shape (N, n), and values that are not finite raise DatasetError.
+    """
+    given = {name: columns[name] for name in CONDITIONS if name in columns}
+    try:
+        boundary = boundary_of(n, *map(given.get, CONDITIONS))  # type: ignore[arg-type]
+    except UsageError as error:
+        raise DatasetError(f"{where}: {error}") from error
+    for name, values in given.items():  # in files, one row does not broadcast to all
+        width = values.shape[-1] if name == "parameters" else n
+        if values.size != len(boundary) * width:
+            raise DatasetError(f"{where}: {name} has shape {values.shape}, expected ({len(boundary)}, {width})")
+    return boundary
 
 
 @checked_arguments
@@ -87,10 +226,7 @@ def _of_folder(folder: Path, split: str, start: int, n: int | None) -> Plans:
 def scene_columns(
     dataset: StoredDataset, split: str, rows: range, columns: Mapping[str, NDArray[Any]]
 ) -> dict[str, NDArray[Any]]:
-    """Return the column with the obstacles of rows of a dataset; none if its samples have no scenes.
-
-    The columns of the rows contain ``scene_id``.
-    """
+    """Return the column with the obstacles of rows of a dataset, by ``scene_id``; none if samples have no scenes."""
     if not dataset.spec.scene_obstacles:
         return {}
     scenes = dataset.read_scenes(split, start=rows.start, stop=rows.stop)
@@ -99,11 +235,7 @@ def scene_columns(
 
 
 def chosen_rows(folder: Path, spec: DatasetSpec, *, split: str, start: int, n: int | None) -> range:
-    """Return n rows of a split from ``start`` on as a range; by default all remaining rows.
-
-    Raises:
-        UsageError: The split or the rows do not exist.
-    """
+    """Return n rows of a split from ``start`` on, by default all remaining ones; raise UsageError for others."""
     start = integer("start", start, least=0)
     if split not in spec.splits:
         raise UsageError(f"{folder} {lacks('split', split, spec.splits)}", concerns="split")

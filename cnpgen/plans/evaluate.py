@@ -15,8 +15,8 @@ from cnpgen.errors import UsageError, counted
 from cnpgen.judges.plans import Reason, Verdict, judge, summarize_verdicts
 from cnpgen.judges.plans.judge import check_step
 from cnpgen.machine.workers import distribute, worker_count
+from cnpgen.plans.format import PlanStatus
 from cnpgen.plans.plans import Plans
-from cnpgen.plans.status import PlanStatus
 from cnpgen.plans.tips import correct_tips
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.schema.argument_types import checked_arguments

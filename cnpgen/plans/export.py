@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, RecipeError, UsageError
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan, sample_plan
+from cnpgen.plans.format import PlanStatus
 from cnpgen.plans.join import JoinedPlans
 from cnpgen.plans.plans import Plans, screen
-from cnpgen.plans.status import PlanStatus
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
@@ -45,11 +45,7 @@ class Exported:
 
 
 def load_exporter(name: str) -> Exporter:
-    """Load an export format by its registered name.
-
-    Raises:
-        UsageError: The format is unknown, defined twice, cannot be imported, or has no suffix.
-    """
+    """Load an export format by its registered name; raise UsageError for an unknown or invalid one."""
     try:
         kind: type[Exporter] = registry.load(registry.EXPORTERS, name)
     except RecipeError as error:
@@ -146,12 +142,9 @@ def _chosen(plans: Plans | JoinedPlans, only: Sequence[int] | None) -> list[int]
 def _refused(plans: Plans | JoinedPlans, rate: float, chosen: list[int]) -> dict[int, str]:
     """Return the plans that cannot be sampled: index -> message."""
     unknown = np.full(len(plans), PlanStatus.UNKNOWN, np.uint8)  # joined plans have only plans that can be evaluated
-    statuses, found = unknown if isinstance(plans, JoinedPlans) else screen(plans), {}
-    for index in chosen:
-        why = _why_not(plans, index, PlanStatus(statuses[index]), rate)
-        if why:
-            found[index] = f"plan {index} (sample {plans.sample_id[index]}): {why}"
-    return found
+    statuses = unknown if isinstance(plans, JoinedPlans) else screen(plans)
+    reasons = {index: _why_not(plans, index, PlanStatus(statuses[index]), rate) for index in chosen}
+    return {index: f"plan {index} (sample {plans.sample_id[index]}): {why}" for index, why in reasons.items() if why}
 
 
 def _why_not(plans: Plans | JoinedPlans, index: int, status: PlanStatus, rate: float) -> str:

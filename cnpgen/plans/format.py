@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Collection
+from enum import IntEnum
 from pathlib import Path
 
 from cnpgen.errors import DatasetError
@@ -59,13 +60,33 @@ KNOWN = frozenset(plan_fields((), ()))  # names with a fixed definition
 
 
 def refuse_misspelt(path: Path, names: Collection[str], asked: Collection[str]) -> None:
-    """Raise DatasetError for a misspelled name of a missing optional dataset among names, which would be ignored.
-
-    Raises:
-        DatasetError: A name is misspelled.
-    """
+    """Raise DatasetError for a misspelled name of a missing optional dataset among names, which would be ignored."""
     missing = [name for name in asked if name not in names]
     for name in names:
         meant = difflib.get_close_matches(name.lower(), missing, n=1, cutoff=MIN_SIMILARITY)
         if meant and name not in KNOWN:
             raise DatasetError(f"{path}: {name!r} is almost {meant[0]!r}, which the file lacks: rename or remove it")
+
+
+class PlanStatus(IntEnum):
+    """Status of a plan; the first one that applies.
+
+    Files store the names with the values, so that members can be added later.
+    """
+
+    UNKNOWN = 0
+    VALID = 1
+    INVALID = 2
+    NOT_FINITE = 3
+    NOT_FORWARD = 4
+
+    @property
+    def text(self) -> str:
+        """Text of the status."""
+        return {
+            PlanStatus.UNKNOWN: "not checked yet",
+            PlanStatus.VALID: "satisfies every constraint and the boundary conditions at every time",
+            PlanStatus.INVALID: "violates a constraint or a boundary condition",
+            PlanStatus.NOT_FINITE: "a boundary condition or a control point is not a finite number",
+            PlanStatus.NOT_FORWARD: "the rate ds/dt is not positive throughout",
+        }[self]

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import UsageError
+from cnpgen.errors import UsageError, requires_extra
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan, parameter_columns
 from cnpgen.plans.format import UNITS
-from cnpgen.plans.trajectory_tables import PHASE_COLUMN
+from cnpgen.plans.trajectory_tables import JOINT_NAMES_KEY, PHASE_COLUMN, PLAN_COLUMN
 from cnpgen.store.files.atomic import committing, write_file
 from cnpgen.store.files.hdf5 import create_hdf5
 from cnpgen.store.joint_units import unit_of, units_of_joints
@@ -29,12 +29,7 @@ _WITHOUT_POINT = re.compile(r"(?<![\d.])(\d+)(?=e[+-])")
 
 @dataclass(frozen=True)
 class NumpyArchive(Exporter):
-    """One NumPy archive with all plans.
-
-    The arrays of a plan are ``plan_00000_t`` and ``_path_phase`` (K,), and ``plan_00000_q``, ``_dq``, ``_ddq``,
-    ``_jerk`` (K, n), numbered by its index, and one number per parameter, such as ``plan_00000_payload_mass``.
-    Further arrays are ``plan``, ``sample_id``, ``joint_names``, ``held_joint_names`` and ``held_joint_positions``.
-    """
+    """One NumPy archive with the arrays of all plans, numbered by their indices ('cnpgen docs plan-format')."""
 
     suffix = ".npz"
     single_file = True
@@ -63,11 +58,7 @@ class NumpyArchive(Exporter):
 
 @dataclass(frozen=True)
 class CsvTables(Exporter):
-    """A folder with one CSV table per plan; numbers read back as the same float64.
-
-    ``path_phase`` is the phase of the plan. Parameters of the problem are columns of equal values, such as
-    ``payload_mass [kg]``.
-    """
+    """A folder with one CSV table per plan; numbers read back as the same float64 ('cnpgen docs plan-format')."""
 
     suffix = ".csv"
 
@@ -85,6 +76,42 @@ class CsvTables(Exporter):
         columns += [*phase, *(np.full(len(plan.t), value) for value in plan.parameters)]
         writer.writerows(np.column_stack([plan.t, *columns]).tolist())
         write_file(path, text.getvalue())
+
+
+@dataclass(frozen=True)
+class ParquetTable(Exporter):
+    """One Parquet file with all plans, one row per sample ('cnpgen docs plan-format'); every plan is a row group.
+
+    The metadata have the names of the joints and the units.
+    """
+
+    suffix = ".parquet"
+    single_file = True
+
+    def write(self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet) -> None:
+        """Write the table plan by plan; see ``Exporter.write``."""
+        with requires_extra("parquet", "pyarrow"):
+            import pyarrow
+            import pyarrow.parquet
+
+        units = {"t": "s"} | {name: units_of_joints(unit, exported.prismatic) for name, unit in UNITS.items()}
+        held = json.dumps(exported.held_joints)
+        metadata = {JOINT_NAMES_KEY: json.dumps(exported.joint_names), "units": json.dumps(units), "held_joints": held}
+        lists = {name: pyarrow.list_(pyarrow.float64(), len(exported.joint_names)) for name in UNITS}
+        whole = {PLAN_COLUMN: pyarrow.int64(), "sample_id": pyarrow.int64()}
+        parameters = dict.fromkeys(parameter_columns(exported.parameters), pyarrow.float64())
+        phase = {} if exported.motion is None else {PHASE_COLUMN: pyarrow.float64()}
+        schema = pyarrow.schema({**whole, "t": pyarrow.float64(), **lists, **phase, **parameters}, metadata=metadata)
+        samples = dict(zip(exported.index.tolist(), exported.sample_id.tolist(), strict=True))
+        with committing(path) as temporary, pyarrow.parquet.ParquetWriter(temporary, schema) as writer:
+            for plan in plans:
+                count = len(plan.t)
+                whole_values = [np.full(count, plan.index), np.full(count, samples[plan.index]), plan.t]
+                columns = [pyarrow.array(values) for values in whole_values]
+                columns += [fixed_lists(getattr(plan, name)) for name in UNITS]
+                columns += [pyarrow.array(plan.phase)] if phase else []
+                columns += [pyarrow.array(np.full(count, value)) for value in plan.parameters]
+                writer.write_table(pyarrow.table(columns, schema=schema))
 
 
 @dataclass(frozen=True)
@@ -108,10 +135,7 @@ class JointTrajectory(Exporter):
 
 @dataclass(frozen=True)
 class TrajectoryControllerGoal(Exporter):
-    """A folder with one goal of ``control_msgs/action/FollowJointTrajectory`` per plan, as YAML.
-
-    ``ros2 action send_goal`` takes the content as its goal.
-    """
+    """A folder with one YAML file per plan: a goal of ``FollowJointTrajectory`` for ``ros2 action send_goal``."""
 
     suffix = ".yaml"
 
@@ -194,3 +218,21 @@ def _spline_columns(motion: Motion, exported: ExportedSet) -> dict[str, NDArray[
         "q_goal": motion.path[:, -1],
         "duration": motion.duration(),
     }
+
+
+def fixed_lists(values: NDArray[Any]) -> Any:
+    """Return an array of shape (K, w) as K lists of w values."""
+    import pyarrow
+
+    flat = pyarrow.array(np.ascontiguousarray(values).ravel())
+    return pyarrow.FixedSizeListArray.from_arrays(flat, values.shape[1])
+
+
+def write_parquet(path: Path, table: Any) -> None:
+    """Write a table of pyarrow, atomically."""
+    import pyarrow.parquet
+
+    buffer = io.BytesIO()
+    pyarrow.parquet.write_table(table, buffer)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_file(path, buffer.getvalue())

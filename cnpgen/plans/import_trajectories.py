@@ -10,13 +10,15 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cnpgen.judges.plans.continuous_collision import is_contact
 from cnpgen.machine.threads import one_thread
 from cnpgen.plans.evaluate_trajectories import check_trajectories, non_negative
 from cnpgen.plans.plans import Plans, make_plans
-from cnpgen.plans.snap_boundary import State, StateSnapper
 from cnpgen.problems.constraints.constraint import End
+from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_record, open_problem
+from cnpgen.robots.robot import Robot
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.trajectory.boundary import Boundary, join_boundaries
@@ -25,8 +27,10 @@ from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.trajectory.samples import sampled_boundary
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.trajectory.trajectory_spec import MAX_CONTROL_POINTS, TrajectorySpec
+from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
+State = tuple[Array, Array, Array]
 
 MAX_FIT_ERROR_RAD = 2e-3  # of the positions at the samples, plus the noise, with more control points otherwise
 GROWTH = (1.0, 1.6, 2.6)  # of the number of control points of the path
@@ -35,6 +39,11 @@ MIN_SAMPLES_PER_POINT = 2  # of the path, from which velocities of the samples a
 REST_WINDOW_S = 0.05  # in which noise of the positions looks like a velocity
 MIN_SNAP_RAD = 1e-3  # distance by which positions may always be moved
 SNAP_FACTOR = 3.0  # largest change of positions by snapping, relative to the noise
+MAX_ITERATIONS = 12  # of snapping
+DIFFERENCE = 1e-6  # of central differences, in units of the scaled state
+BOUND_INSET = 1e-6  # distance from a violated bound, relative to its range, at which a state is placed
+MAX_RESIDUAL = 1e-10  # at which the iteration ends
+SCALES = (1.0, 100.0, 1e5)  # a change of 1 mrad counts as much as one of 0.1 rad/s, or of 100 rad/s^2
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,23 +111,24 @@ def _boundary(
 ) -> tuple[Boundary, float]:
     """Return the boundary conditions of one trajectory and the change of their positions by snapping [rad]."""
     estimate = sampled_boundary(trajectory.t, trajectory.q, trajectory.dq)
-    q, still = trajectory.q, np.zeros(trajectory.q.shape[1])
-    start: State = q[0], estimate.start_dq[0], estimate.start_ddq[0]
-    goal: State = q[-1], estimate.goal_dq[0], still
-    if trajectory.ddq is not None:
-        start, goal = (*start[:2], trajectory.ddq[0]), (*goal[:2], trajectory.ddq[-1])
     speed_error = noise[1] if trajectory.dq is not None else 2 * noise[0] / REST_WINDOW_S
     acceleration_error = noise[2] if trajectory.ddq is not None else 4 * speed_error / REST_WINDOW_S
-    moving = [_at_rest_within(state, speed_error, acceleration_error) for state in (start, goal)]
-    moving = [
-        (state[0], still, still) if at_rest in {True, end} else state
-        for state, end in zip(moving, ("start", "goal"), strict=True)
-    ]
     allowed = max(MIN_SNAP_RAD, SNAP_FACTOR * float(noise[0]))
     given = [trajectory.dq is not None, trajectory.ddq is not None]
     snapper.set_parameters(trajectory.parameters)
-    first, moved_first = _snapped(snapper, moving[0], "start", given, allowed)
-    last, moved_last = _snapped(snapper, moving[1], "goal", given, allowed)
+    estimated = estimate.start_ddq[0], np.zeros(trajectory.q.shape[1])
+    accelerations = estimated if trajectory.ddq is None else trajectory.ddq[[0, -1]]
+    ends: tuple[tuple[End, Array, Array, Array], ...] = (
+        ("start", trajectory.q[0], estimate.start_dq[0], accelerations[0]),
+        ("goal", trajectory.q[-1], estimate.goal_dq[0], accelerations[1]),
+    )
+    snapped = []
+    for end, q, velocity, acceleration in ends:
+        rests = at_rest in {True, end}
+        dq = np.where(rests | (np.abs(velocity) <= speed_error), 0.0, velocity)
+        ddq = np.where(rests | (np.abs(acceleration) <= acceleration_error), 0.0, acceleration)
+        snapped.append(_snapped(snapper, (q, dq, ddq), end, given, allowed))
+    (first, moved_first), (last, moved_last) = snapped
     change = float(np.maximum(moved_first, moved_last))  # nan if one of them is
     parameters = None if trajectory.parameters is None else trajectory.parameters[None]
     start_q, start_dq, start_ddq, goal_q, goal_dq = (part[None] for part in (*first, *last[:2]))
@@ -145,12 +155,6 @@ def _snapped(
         if change <= allowed:
             return found, change
     return state, float("nan")
-
-
-def _at_rest_within(state: State, speed_error: float, acceleration_error: float) -> State:
-    """Return a state with derivatives of zero where they are within their errors."""
-    q, dq, ddq = state
-    return q, np.where(np.abs(dq) <= speed_error, 0.0, dq), np.where(np.abs(ddq) <= acceleration_error, 0.0, ddq)
 
 
 def _fit_samples(trajectory: Trajectory, points: int) -> tuple[Array, Array, Array | None]:
@@ -181,3 +185,49 @@ def _fitted(
         if (errors <= max_error).all():
             break
     return motions, errors
+
+
+class StateSnapper:
+    """Moves boundary states onto the constraints of a problem by Gauss-Newton steps of minimum norm.
+
+    Distances between bodies are not considered.
+    """
+
+    def __init__(self, problem: Problem, robot: Robot) -> None:
+        self._constraints = [constraint for constraint in problem.constraint if not is_contact(constraint)]
+        self._world = World(robot, problem.obstacle, problem.object_size)
+        self._problem = problem
+        self.set_parameters(None)
+        self._scale = np.repeat(SCALES, robot.n)
+
+    def set_parameters(self, parameters: Array | None) -> None:
+        """Set the values of the problem's parameters, shape (p,); nominal for None."""
+        rows = None if parameters is None else parameters[None]
+        nowhere = np.zeros((1, 3))
+        self._poses = scene_of(self._problem, nowhere, nowhere, nowhere, rows).poses[0]
+
+    def __call__(self, state: State, end: End) -> State:
+        """Move a state at an end, or return the last one that was reached if the constraints cannot be met."""
+        x = np.concatenate(state) / self._scale
+        for _ in range(MAX_ITERATIONS):
+            g, lower, upper = self._values(x, end)
+            inset = BOUND_INSET * np.where(np.isfinite(upper - lower), upper - lower, 1.0)
+            residual = np.where(g < lower, g - lower - inset, np.where(g > upper, g - upper + inset, 0.0))
+            rows = np.flatnonzero(np.abs(residual) > MAX_RESIDUAL)
+            if not len(rows) or not np.isfinite(g).all():
+                break
+            steps = DIFFERENCE * np.eye(len(x))
+            changes = [self._values(x + step, end)[0][rows] - self._values(x - step, end)[0][rows] for step in steps]
+            jacobian = np.stack(changes, axis=1) / (2 * DIFFERENCE)
+            x = x - np.linalg.lstsq(jacobian, residual[rows], rcond=1e-8)[0]
+        q, dq, ddq = np.split(x * self._scale, 3)
+        return q, dq, ddq
+
+    def _values(self, x: Array, end: End) -> tuple[Array, Array, Array]:
+        """Return the values and both bounds of all conditions, shape (m,) each."""
+        q, dq, ddq = np.split(x * self._scale, 3)
+        self._world.set_state(q, dq, ddq, self._poses)
+        conditions = [condition for part in self._constraints for condition in part.measured_at(self._world, end)]
+        parts = ([getattr(condition, name) for condition in conditions] for name in ("g", "lower", "upper"))
+        g, lower, upper = (np.concatenate([np.empty(0), *part]) for part in parts)
+        return g, lower, upper

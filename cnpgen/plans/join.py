@@ -1,19 +1,22 @@
-"""Joined plans: sequences in which a plan is cut at a time and continued by another plan."""
+"""Concatenated and joined plans: more plans, or sequences in which a plan is cut at a time and continued by another."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.plans.format import NOTES, PlanStatus
 from cnpgen.plans.plans import Plans, check_made
-from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.problem_record import ProblemRecord
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import numbers
+from cnpgen.trajectory.boundary import join_boundaries
 from cnpgen.trajectory.joined import JoinedMotion
 
 Array = NDArray[np.float64]
@@ -82,7 +85,11 @@ def join_plans(first: Plans | JoinedPlans, following: Plans, *, at: ArrayLike | 
         UsageError: The numbers of plans or times or the problems differ, a time is outside its plan, a plan has no
             motion, or there is a discontinuity.
     """
-    joined = first if isinstance(first, JoinedPlans) else _alone(first)
+    if isinstance(first, JoinedPlans):
+        joined = first
+    else:
+        check_made(first)
+        joined = JoinedPlans((first,), np.zeros((1, len(first))))
     if len(following) != len(joined):
         raise UsageError(
             f"{len(joined)} plans are followed by {len(following)}, expected one for each", concerns="following"
@@ -104,6 +111,40 @@ def join_plans(first: Plans | JoinedPlans, following: Plans, *, at: ArrayLike | 
     return found
 
 
-def _alone(plans: Plans) -> JoinedPlans:
-    check_made(plans)
-    return JoinedPlans((plans,), np.zeros((1, len(plans))))
+def concatenate(parts: Sequence[Plans]) -> Plans:
+    """Concatenate plans of the same problem with the same numbers of control points and columns.
+
+    Raises:
+        UsageError: The plans are not compatible.
+    """
+    if not parts:
+        raise UsageError("there are no plans to join")
+    first = parts[0]
+    for index, other in enumerate(parts[1:], 1):
+        for what, mine, its in _kinds(first, other):
+            if mine != its:
+                raise UsageError(f"plans cannot be joined: {what} is {its} in part {index}, but {mine} in part 0")
+    sources, options = (list(dict.fromkeys(getattr(part, name) for part in parts)) for name in NOTES)
+    return replace(
+        first,
+        source="; ".join(filter(None, sources)),
+        refined_with=options[0] if len(options) == 1 else "",
+        boundary=join_boundaries([part.boundary for part in parts]),
+        path_control_points=np.concatenate([part.path_control_points for part in parts]),
+        rate_control_points=np.concatenate([part.rate_control_points for part in parts]),
+        columns={name: np.concatenate([part.columns[name] for part in parts]) for name in first.columns},
+        sample_id=np.concatenate([part.sample_id for part in parts]),
+        status=np.concatenate([part.status for part in parts]),
+    )
+
+
+def _kinds(first: Plans, other: Plans) -> Iterator[tuple[str, Any, Any]]:
+    """Yield the properties that concatenated plans must share."""
+    yield "the problem", first.problem.comparable_sha256, other.problem.comparable_sha256
+    yield "the degree", first.degree, other.degree
+    for name in ("path_control_points", "rate_control_points"):
+        yield f"the shape of a plan's {name}", getattr(first, name).shape[1:], getattr(other, name).shape[1:]
+    yield "goal_ddq", first.boundary.goal_ddq is not None, other.boundary.goal_ddq is not None
+    yield "the set of columns", sorted(first.columns), sorted(other.columns)
+    for name, values in first.columns.items():
+        yield f"the shape of column {name!r}", values.shape[1:], other.columns[name].shape[1:]

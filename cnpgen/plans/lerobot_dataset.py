@@ -4,8 +4,6 @@ A frame has the positions and velocities as ``observation.state``, goal, task co
 ``observation.environment_state``, and the positions at the next frame as ``action``.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -17,11 +15,12 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError, requires_extra
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan
-from cnpgen.plans.parquet_table import fixed_lists, write_parquet
+from cnpgen.plans.formats import fixed_lists, write_parquet
 from cnpgen.plans.trajectory_tables import LEROBOT_ENVIRONMENT, LEROBOT_INFO
 from cnpgen.store.files.atomic import write_file
 
 Values = NDArray[Any]
+Episode = dict[str, Values]  # of one plan: values of the K frames, shape (K,) or (K, w)
 
 LEROBOT_VERSION = "v3.0"
 MAX_CHUNK_FILES = 1000  # in a folder
@@ -57,22 +56,13 @@ class LeRobotDataset(Exporter):
         if (path / LEROBOT_INFO).exists():
             (path / LEROBOT_INFO).unlink()  # an incomplete dataset has none
         names = _names(exported)
-        episodes = _write_frames(path, plans, exported, names)
+        episodes, files = _write_frames(path, plans, exported, names)
         task = f"{exported.problem}: move to the goal"
-        _write_episodes(path, episodes, task)
+        _write_episodes(path, episodes, files, task)
         _write_tasks(path, task)
-        totals = _statistics({key: np.concatenate([e.columns[key] for e in episodes]) for key in episodes[0].columns})
-        write_file(path / "meta" / "stats.json", json.dumps(totals, indent=2))
-        info = _info(exported, names, [len(episode.columns["index"]) for episode in episodes])
+        write_file(path / "meta" / "stats.json", json.dumps(_statistics(_joined(episodes)), indent=2))
+        info = _info(exported, names, [len(episode["index"]) for episode in episodes])
         write_file(path / LEROBOT_INFO, json.dumps(info, indent=2))
-
-
-@dataclass(frozen=True, eq=False)
-class _Episode:
-    """One plan: values of the frames, shape (K,) or (K, w), and the index of the data file."""
-
-    columns: Mapping[str, Values]
-    file: int
 
 
 def _names(exported: ExportedSet) -> dict[str, list[str]]:
@@ -83,31 +73,35 @@ def _names(exported: ExportedSet) -> dict[str, list[str]]:
         for name, values in exported.environment.items()
         for k in range(values.shape[1])
     ]
-    names = {STATE: [*joints, *(f"{joint}_velocity" for joint in joints)], ACTION: list(joints)}
-    return {STATE: names[STATE], **({ENVIRONMENT: environment} if environment else {}), ACTION: names[ACTION]}
+    state = [*joints, *(f"{joint}_velocity" for joint in joints)]
+    return {STATE: state, **({ENVIRONMENT: environment} if environment else {}), ACTION: list(joints)}
 
 
 def _write_frames(
     path: Path, plans: Iterable[SampledPlan], exported: ExportedSet, names: Mapping[str, list[str]]
-) -> list[_Episode]:
-    """Write the files of frames; return the episodes."""
+) -> tuple[list[Episode], list[int]]:
+    """Write the files of frames; return the episodes and the index of the file of each."""
     environment = np.concatenate([np.empty((len(exported.index), 0)), *exported.environment.values()], axis=1)
-    episodes: list[_Episode] = []
-    pending: list[_Episode] = []
-    file = size = first = 0
+    episodes: list[Episode] = []
+    files: list[int] = []
+    file = size = first = begin = 0
     for number, plan in enumerate(plans):
         columns = _frames(plan, exported.rate, environment[number], number, first)
         columns = {name: columns[name] for name in (*names, *_INDICES, "task_index")}
         added = sum(values.nbytes for values in columns.values())
-        if pending and size + added > MAX_DATA_FILE_MB * 2**20:
-            _write_file(path, pending, file)
-            pending, file, size = [], file + 1, 0
-        episode = _Episode(columns, file)
-        pending.append(episode)
-        episodes.append(episode)
+        if size and size + added > MAX_DATA_FILE_MB * 2**20:
+            _write_file(path, episodes[begin:], file)
+            begin, file, size = number, file + 1, 0
+        episodes.append(columns)
+        files.append(file)
         size, first = size + added, first + len(columns["index"])
-    _write_file(path, pending, file)
-    return episodes
+    _write_file(path, episodes[begin:], file)
+    return episodes, files
+
+
+def _joined(episodes: list[Episode]) -> Episode:
+    """Return the columns of several episodes, one after the other."""
+    return {name: np.concatenate([episode[name] for episode in episodes]) for name in episodes[0]}
 
 
 def _frames(plan: SampledPlan, rate: float, environment: Values, number: int, first: int) -> dict[str, Values]:
@@ -126,38 +120,33 @@ def _frames(plan: SampledPlan, rate: float, environment: Values, number: int, fi
     }
 
 
-def _write_file(path: Path, episodes: list[_Episode], file: int) -> None:
+def _write_file(path: Path, episodes: list[Episode], file: int) -> None:
     """Write the frames of some episodes."""
     import pyarrow
 
-    joined = {name: np.concatenate([e.columns[name] for e in episodes]) for name in episodes[0].columns}
-    columns = {name: fixed_lists(values) if values.ndim == 2 else values for name, values in joined.items()}
-    write_parquet(path / _data_path(file), pyarrow.table(columns))
-
-
-def _data_path(file: int) -> str:
     chunk, index = divmod(file, MAX_CHUNK_FILES)
-    return DATA_PATH.format(chunk_index=chunk, file_index=index)
+    columns = {name: fixed_lists(values) if values.ndim == 2 else values for name, values in _joined(episodes).items()}
+    write_parquet(path / DATA_PATH.format(chunk_index=chunk, file_index=index), pyarrow.table(columns))
 
 
-def _write_episodes(path: Path, episodes: list[_Episode], task: str) -> None:
+def _write_episodes(path: Path, episodes: list[Episode], files: list[int], task: str) -> None:
     """Write the table of episodes with their statistics."""
     import pyarrow
 
-    lengths = np.array([len(episode.columns["index"]) for episode in episodes])
-    ends, files = np.cumsum(lengths), np.array([episode.file for episode in episodes])
+    lengths = np.array([len(episode["index"]) for episode in episodes])
+    ends, chunks = np.cumsum(lengths), np.divmod(files, MAX_CHUNK_FILES)
     table: dict[str, Any] = {
         "episode_index": np.arange(len(episodes)),
         "tasks": [[task]] * len(episodes),
         "length": lengths,
-        "data/chunk_index": files // MAX_CHUNK_FILES,
-        "data/file_index": files % MAX_CHUNK_FILES,
+        "data/chunk_index": chunks[0],
+        "data/file_index": chunks[1],
         "dataset_from_index": ends - lengths,
         "dataset_to_index": ends,
         "meta/episodes/chunk_index": np.zeros(len(episodes), np.int64),
         "meta/episodes/file_index": np.zeros(len(episodes), np.int64),
     }
-    statistics = [_statistics(episode.columns) for episode in episodes]
+    statistics = [_statistics(episode) for episode in episodes]
     for name, entry in statistics[0].items():
         for key in entry:
             table[f"stats/{name}/{key}"] = [row[name][key] for row in statistics]

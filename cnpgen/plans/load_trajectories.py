@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -56,20 +56,6 @@ class LoadedTrajectories:
     ignored: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class _Options:
-    """Options of reading a table; see ``load_trajectories``."""
-
-    record: ProblemRecord
-    joints: tuple[str, ...]
-    degrees: bool
-    rate: float | None
-    separate_by: str | None
-    unwrap: bool
-    parameters: Mapping[str, float]
-    velocity_limit: Array
-
-
 @checked_arguments
 def load_trajectories(
     path: str | Path,
@@ -109,24 +95,22 @@ def load_trajectories(
         raise UsageError(f"must be above 0, got {rate}", argument="rate")
     _check_parameters(record, parameters or {})
     robot = open_problem(record)[1]
-    options = _Options(record, names, unit == "deg", rate, separate_by, unwrap, parameters or {}, robot.velocity_limit)
     try:
-        found = [
-            (part.place, *_trajectory(part, options))
-            for table in read_trajectory_tables(Path(path))
-            for part in _separated(table, separate_by)
+        tables = [part for table in read_trajectory_tables(Path(path)) for part in _separated(table, separate_by)]
+        readers = [
+            _Reader(table, record, names, unit == "deg", rate, unwrap, parameters or {}, robot.velocity_limit)
+            for table in tables
         ]
+        trajectories = tuple(reader.trajectory() for reader in readers)
     except UsageError as error:
         error.argument = error.argument or "path"
         raise
-    if not found:
+    if not trajectories:
         raise UsageError(f"{path} holds no trajectory", argument="path")
     if unit == "rad":
-        _check_unit(path, robot, [trajectory.q for _, trajectory, _ in found])
-    ignored = dict.fromkeys(name for *_, unused in found for name in unused)
-    return LoadedTrajectories(
-        tuple(trajectory for _, trajectory, _ in found), tuple(place for place, *_ in found), tuple(ignored)
-    )
+        _check_unit(path, robot, [trajectory.q for trajectory in trajectories])
+    ignored = dict.fromkeys(name for reader in readers for name in reader.unused())
+    return LoadedTrajectories(trajectories, tuple(table.place for table in tables), tuple(ignored))
 
 
 def _check_unit(path: str | Path, robot: Robot, positions: Sequence[Array]) -> None:
@@ -172,32 +156,6 @@ def _separated(table: TrajectoryTable, separate_by: str | None) -> Iterator[Traj
         yield table
 
 
-def _trajectory(table: TrajectoryTable, options: _Options) -> tuple[Trajectory, list[str]]:
-    """Return one trajectory and the names of unused columns."""
-    used: set[str] = set()
-    columns = {kind: _kind(table, kind, options, used) for kind in KIND_NAMES}
-    q = columns["q"]
-    if q is None:
-        raise UsageError(f"{table.place}: {_missing(table, options)}")
-    if not len(q):
-        raise UsageError(f"{table.place}: there are no positions, expected at least one row")
-    t = _times(table, options, len(q), used)
-    for name, values in (("times", t), *columns.items()):
-        if values is not None and len(values) != len(q):
-            raise UsageError(f"{table.place}: {len(values)} {name} for {len(q)} positions")
-    if options.unwrap:
-        turning = [not sliding for sliding in options.record.sliding_joints]
-        q[:, turning] = np.unwrap(q[:, turning], axis=0)
-    try:
-        constants = _parameters(table, options, used), _phase(table, used)
-        trajectory = Trajectory(t - t[0], q, columns["dq"], columns["ddq"], *constants)
-    except UsageError as error:
-        raise UsageError(f"{table.place}: {error}") from error
-    _check_times(table, trajectory, options)
-    unused = [name for name in table.columns if name not in used and not _plain(name).lower().startswith(UNUSED_KINDS)]
-    return trajectory, unused
-
-
 def _check_parameters(record: ProblemRecord, parameters: Mapping[str, float]) -> None:
     """Check the names of stated parameters."""
     known = record.parameters.names
@@ -207,128 +165,190 @@ def _check_parameters(record: ProblemRecord, parameters: Mapping[str, float]) ->
             raise UsageError(f"{name!r} is not a parameter of {record.name!r}: {expected}", argument="parameters")
 
 
-def _parameters(table: TrajectoryTable, options: _Options, used: set[str]) -> Array | None:
-    """Return the values of the problem's parameters, shape (p,); None if some are missing."""
-    ranges, plain = options.record.parameters, {_plain(name): name for name in table.columns}
-    found = dict(options.parameters)
-    units = dict(zip(ranges.names, ranges.value_units, strict=True))
-    for parameter, unit in units.items():
-        if (name := plain.get(parameter)) is None:
-            continue
-        used.add(name)
-        values = np.unique(_numbers(table, name, ndim=table.columns[name].ndim and 1))
-        if len(values) != 1:
-            raise UsageError(f"{table.place}: {name} must have one value, got {values[0]:g} and {values[-1]:g}")
-        found[parameter] = float(values[0]) * _factor(table, name, unit, 1.0)
-    if not units or found.keys() != units.keys():
+@dataclass
+class _Reader:
+    """Reader of one trajectory of a table; ``used`` has the names of the columns that were read."""
+
+    table: TrajectoryTable
+    record: ProblemRecord
+    joints: tuple[str, ...]
+    degrees: bool
+    rate: float | None
+    unwrap: bool
+    parameters: Mapping[str, float]
+    velocity_limit: Array
+    used: set[str] = field(default_factory=set)
+
+    def trajectory(self) -> Trajectory:
+        """Return the trajectory; its parameters are None if some are missing."""
+        columns = {kind: self._kind(kind) for kind in KIND_NAMES}
+        q = columns["q"]
+        if q is None:
+            raise self._error(self._missing())
+        if not len(q):
+            raise self._error("there are no positions, expected at least one row")
+        t = self._times(len(q))
+        for name, values in (("times", t), *columns.items()):
+            if values is not None and len(values) != len(q):
+                raise self._error(f"{len(values)} {name} for {len(q)} positions")
+        if self.unwrap:
+            turning = [not sliding for sliding in self.record.sliding_joints]
+            q[:, turning] = np.unwrap(q[:, turning], axis=0)
+        parameters = self._parameters()
+        phase = self._numbers(PHASE_COLUMN, ndim=1) if PHASE_COLUMN in self.table.columns else None
+        try:
+            if parameters is not None:
+                self.record.parameters.checked(parameters)
+            trajectory = Trajectory(t - t[0], q, columns["dq"], columns["ddq"], parameters, phase)
+        except UsageError as error:
+            raise self._error(str(error)) from error
+        self._check_times(trajectory)
+        return trajectory
+
+    def unused(self) -> list[str]:
+        """Return the names of the columns that were not read, except those of known other kinds."""
+        names = [name for name in self.table.columns if name not in self.used]
+        return [name for name in names if not _plain(name).lower().startswith(UNUSED_KINDS)]
+
+    def _error(self, text: str, **details: Any) -> UsageError:
+        return UsageError(f"{self.table.place}: {text}", **details)
+
+    def _parameters(self) -> Array | None:
+        """Return the values of the problem's parameters, shape (p,)."""
+        ranges, plain = self.record.parameters, {_plain(name): name for name in self.table.columns}
+        found = dict(self.parameters)
+        for parameter, unit in zip(ranges.names, ranges.value_units, strict=True):
+            if (name := plain.get(parameter)) is None:
+                continue
+            values = np.unique(self._numbers(name, ndim=self.table.columns[name].ndim and 1))
+            if len(values) != 1:
+                raise self._error(f"{name} must have one value, got {values[0]:g} and {values[-1]:g}")
+            found[parameter] = float(values[0]) * self._factor(name, unit, 1.0)
+        if not ranges or found.keys() != set(ranges.names):
+            return None
+        return np.array([found[name] for name in ranges.names])
+
+    def _times(self, count: int) -> Array:
+        """Return the times of the samples [s]."""
+        name, rate = self._time_column(), self.rate
+        if rate is not None and (name is None or not self._has_times_of_rate(name, rate)):
+            return np.asarray(np.arange(count) / rate)
+        if name is None:
+            text = f"no column of times ({', '.join(TIME_NAMES)}): state {{rate}}"
+            raise self._error(text, remedies={"rate": 100})
+        return self._seconds(name)
+
+    def _seconds(self, name: str) -> Array:
+        return self._numbers(name, ndim=1) * self._factor(name, "s", 1.0)
+
+    def _has_times_of_rate(self, name: str, rate: float) -> bool:
+        """Return whether the file has increasing times; raise UsageError if they do not agree with a stated rate."""
+        try:
+            steps = np.diff(self._seconds(name))
+        except UsageError:
+            return False
+        step = float(np.median(steps)) if len(steps) else 0.0
+        if step > 0 and abs(step * rate - 1) > MAX_RATE_DEVIATION:
+            steps_of = f"{name} of {self.table.place} has steps of {step:.3g} s"
+            text = f"must agree with the times of the file, got {rate:g} Hz; {steps_of}: omit it"
+            raise UsageError(text, argument="rate")
+        return step > 0
+
+    def _time_column(self) -> str | None:
+        return next((name for name in self.table.columns if _plain(name).lower() in TIME_NAMES), None)
+
+    def _check_times(self, trajectory: Trajectory) -> None:
+        """Check that times without a unit are in seconds: milliseconds make long steps and slow joints."""
+        name, step = self._time_column(), float(np.median(np.diff(trajectory.t)))
+        if name is None or self.rate is not None or _UNIT.search(name) or step < MIN_DOUBTFUL_STEP_S:
+            return
+        speeds = np.abs(np.diff(trajectory.q, axis=0)) / np.diff(trajectory.t)[:, None]
+        share = float((speeds / self.velocity_limit).max())
+        if 0 < share < MAX_DOUBTFUL_SPEED:
+            slow = f"all joints are slower than {share:.2g} of their velocity limits"
+            text = f"{self.table.place}: {name} has steps of {step:.3g} s, and {slow}"
+            raise UnitError(f"{text}; name the column '{name} [ms]' or '{name} [s]'", concerns="path")
+
+    def _kind(self, kind: str) -> Array | None:
+        """Return positions, velocities or accelerations of the problem's joints, shape (K, n), or None."""
+        for name, values in self.table.columns.items():
+            if _plain(name).lower() in KIND_NAMES[kind] and values.ndim == 2:
+                return self._selected(name) * self._factors([name] * len(self.joints), kind)
+        names = self._scalar_columns(kind)
+        if names is None:
+            return None
+        columns = np.stack([self._numbers(name, ndim=1) for name in names], axis=1)
+        return np.asarray(columns * self._factors(names, kind))
+
+    def _selected(self, name: str) -> Array:
+        """Return the problem's joints of an array with one column per joint."""
+        values, joints = self._numbers(name, ndim=2), self.joints
+        width, named = values.shape[1], self.table.joint_names
+        if named and len(named) != width:
+            raise self._error(f"{name} has {width} columns, joint_names has {len(named)}")
+        if named:
+            missing = [joint for joint in joints if joint not in named]
+            if missing:
+                raise self._error(f"there is no joint {missing[0]!r}, only {', '.join(named)}")
+            return values[:, [named.index(joint) for joint in joints]]
+        if all(joint.isdecimal() and int(joint) < width for joint in joints):
+            return values[:, [int(joint) for joint in joints]]
+        if width != len(joints):
+            raise self._error(f"{name} has {width} columns, the problem plans {len(joints)} joints")
+        return values
+
+    def _scalar_columns(self, kind: str) -> list[str] | None:
+        """Return the column of every joint, or None without any; positions may have the joint's name alone."""
+        plain = {_plain(name).lower(): name for name, values in self.table.columns.items() if values.ndim == 1}
+        joints = self.joints
+        naming = [list(joints)]
+        if not any(joint.isdecimal() for joint in joints):
+            naming += [[str(k + first) for k in range(len(joints))] for first in (0, 1)]
+        for names in naming:
+            found = [_column_of(plain, name.lower(), kind) for name in names]
+            if all(found):
+                return [name for name in found if name]
+            if any(found) and names is naming[0]:
+                missing = names[found.index(None)]
+                raise self._error(f"no column with the {KIND_NAMES[kind][1]} of {missing!r}")
         return None
-    values = np.array([found[name] for name in units])
-    try:
-        ranges.checked(values)
-    except UsageError as error:
-        raise UsageError(f"{table.place}: {error}", argument=error.argument) from error
-    return values
 
+    def _numbers(self, name: str, *, ndim: int) -> Array:
+        """Return a column as numbers."""
+        self.used.add(name)
+        values = self.table.columns[name]
+        if values.ndim != ndim or values.dtype.kind not in "biuf":
+            if values.ndim != 1 or ndim != 1:
+                raise self._error(f"{name} must have {ndim} dimensions of numbers, got shape {values.shape}")
+            # The column has texts; the first one that is not a number is named.
+            row = next((k for k, value in enumerate(values.tolist()) if not _is_number(value)), 0)
+            place = f"line {self.table.lines[row]}" if self.table.lines else f"row {row}"
+            raise self._error(f"{place}: {name} must be a number, got {values[row].item()!r:.60}")
+        return values.astype(float)
 
-def _phase(table: TrajectoryTable, used: set[str]) -> Array | None:
-    """Return the phases of an exported plan, shape (K,), or None."""
-    if PHASE_COLUMN not in table.columns:
-        return None
-    used.add(PHASE_COLUMN)
-    return _numbers(table, PHASE_COLUMN, ndim=1)
+    def _factors(self, names: Sequence[str], kind: str) -> Array:
+        """Return the factors to SI units of the columns of a kind, one per joint, shape (n,)."""
+        exponent = {"q": "", "dq": "/s", "ddq": "/s^2"}[kind]
+        turning = ("rad", _DEGREE if self.degrees else 1.0)
+        units = [("m", 1.0) if slides else turning for slides in self.record.sliding_joints]
+        parts = zip(names, units, strict=True)
+        return np.array([self._factor(name, unit + exponent, usual) for name, (unit, usual) in parts])
 
+    def _factor(self, name: str, unit: str, default: float) -> float:
+        """Return the factor to SI of a column by the unit in its name, such as ``[deg/s]``; a default without one."""
+        match = _UNIT.search(name)
+        if not match:
+            return default
+        si, factor = KNOWN_UNITS.get(match[1].strip(), ("", 1))
+        if si != unit:
+            raise self._error(f"{name} must have a unit of {unit}, got {match[1]!r}")
+        return float(factor)
 
-def _times(table: TrajectoryTable, options: _Options, count: int, used: set[str]) -> Array:
-    """Return the times of the samples [s]."""
-    name = _time_column(table)
-    if name is not None:
-        used.add(name)
-    if options.rate is not None and (name is None or not _has_times_of_rate(table, name, options.rate)):
-        return np.asarray(np.arange(count) / options.rate)
-    if name is None:
-        raise UsageError(
-            f"{table.place}: no column of times ({', '.join(TIME_NAMES)}): state {{rate}}", remedies={"rate": 100}
-        )
-    return _numbers(table, name, ndim=1) * _factor(table, name, "s", 1.0)
-
-
-def _has_times_of_rate(table: TrajectoryTable, name: str, rate: float) -> bool:
-    """Return whether the file has increasing times; raise UsageError if they do not agree with a stated rate."""
-    try:
-        steps = np.diff(_numbers(table, name, ndim=1)) * _factor(table, name, "s", 1.0)
-    except UsageError:
-        return False
-    step = float(np.median(steps)) if len(steps) else 0.0
-    if step > 0 and abs(step * rate - 1) > MAX_RATE_DEVIATION:
-        text = (
-            f"must agree with the times of the file, got {rate:g} Hz; {name} of {table.place} has steps of {step:.3g} s"
-        )
-        raise UsageError(f"{text}: omit it", argument="rate")
-    return step > 0
-
-
-def _time_column(table: TrajectoryTable) -> str | None:
-    return next((name for name in table.columns if _plain(name).lower() in TIME_NAMES), None)
-
-
-def _check_times(table: TrajectoryTable, trajectory: Trajectory, options: _Options) -> None:
-    """Check that times without a unit are in seconds: milliseconds make long steps and slow joints."""
-    name, step = _time_column(table), float(np.median(np.diff(trajectory.t)))
-    if name is None or options.rate is not None or _UNIT.search(name) or step < MIN_DOUBTFUL_STEP_S:
-        return
-    speeds = np.abs(np.diff(trajectory.q, axis=0)) / np.diff(trajectory.t)[:, None]
-    share = float((speeds / options.velocity_limit).max())
-    if 0 < share < MAX_DOUBTFUL_SPEED:
-        text = f"{name} has steps of {step:.3g} s, and all joints are slower than {share:.2g} of their velocity limits"
-        raise UnitError(f"{table.place}: {text}; name the column '{name} [ms]' or '{name} [s]'", concerns="path")
-
-
-def _kind(table: TrajectoryTable, kind: str, options: _Options, used: set[str]) -> Array | None:
-    """Return positions, velocities or accelerations of the problem's joints, shape (K, n), or None."""
-    for name, values in table.columns.items():
-        if _plain(name).lower() in KIND_NAMES[kind] and values.ndim == 2:
-            used.add(name)
-            return _selected(table, name, options) * _factors(table, [name], kind, options)
-    names = _scalar_columns(table, kind, options)
-    if names is None:
-        return None
-    used.update(names)
-    values = np.stack([_numbers(table, name, ndim=1) for name in names], axis=1)
-    return np.asarray(values * _factors(table, names, kind, options))
-
-
-def _selected(table: TrajectoryTable, name: str, options: _Options) -> Array:
-    """Return the problem's joints of an array with one column per joint."""
-    values = _numbers(table, name, ndim=2)
-    width, named = values.shape[1], table.joint_names
-    if named and len(named) != width:
-        raise UsageError(f"{table.place}: {name} has {width} columns, joint_names has {len(named)}")
-    if named:
-        missing = [joint for joint in options.joints if joint not in named]
-        if missing:
-            raise UsageError(f"{table.place}: there is no joint {missing[0]!r}, only {', '.join(named)}")
-        return values[:, [named.index(joint) for joint in options.joints]]
-    if all(joint.isdecimal() and int(joint) < width for joint in options.joints):
-        return values[:, [int(joint) for joint in options.joints]]
-    if width != len(options.joints):
-        raise UsageError(f"{table.place}: {name} has {width} columns, the problem plans {len(options.joints)} joints")
-    return values
-
-
-def _scalar_columns(table: TrajectoryTable, kind: str, options: _Options) -> list[str] | None:
-    """Return the column of every joint, or None if there is none for any; positions may have the joint's name alone."""
-    plain = {_plain(name).lower(): name for name, values in table.columns.items() if values.ndim == 1}
-    naming = [list(options.joints)]
-    if not any(joint.isdecimal() for joint in options.joints):
-        naming += [[str(k + first) for k in range(len(options.joints))] for first in (0, 1)]
-    for joints in naming:
-        found = [_column_of(plain, joint.lower(), kind) for joint in joints]
-        if all(found):
-            return [name for name in found if name]
-        if any(found) and joints is naming[0]:
-            missing = joints[found.index(None)]
-            raise UsageError(f"{table.place}: no column with the {KIND_NAMES[kind][1]} of {missing!r}")
-    return None
+    def _missing(self) -> str:
+        """Return the message for missing positions."""
+        joint, columns = self.joints[0], ", ".join(list(self.table.columns)[:12])
+        expected = f"q {joint}, {joint}_position, {joint} and so on, or an array q"
+        return f"no columns with joint positions, expected {expected}; there are {columns or 'no columns'}"
 
 
 def _column_of(plain: dict[str, str], joint: str, kind: str) -> str | None:
@@ -343,18 +363,6 @@ def _column_of(plain: dict[str, str], joint: str, kind: str) -> str | None:
     return None
 
 
-def _numbers(table: TrajectoryTable, name: str, *, ndim: int) -> Array:
-    """Return a column as numbers."""
-    values = table.columns[name]
-    if values.ndim != ndim or values.dtype.kind not in "biuf":
-        if values.ndim != 1 or ndim != 1:
-            raise UsageError(f"{table.place}: {name} must have {ndim} dimensions of numbers, got shape {values.shape}")
-        row = next((k for k, value in enumerate(values.tolist()) if not _is_number(value)), 0)  # or numbers as texts
-        place = f"line {table.lines[row]}" if table.lines else f"row {row}"
-        raise UsageError(f"{table.place}: {place}: {name} must be a number, got {values[row].item()!r:.60}")
-    return values.astype(float)
-
-
 def _is_number(value: Any) -> bool:
     try:
         float(value)
@@ -363,36 +371,6 @@ def _is_number(value: Any) -> bool:
     return True
 
 
-def _factors(table: TrajectoryTable, names: Sequence[str], kind: str, options: _Options) -> Array:
-    """Return the factors to SI units of the columns of a kind, shape (n,)."""
-    exponent = {"q": "", "dq": "/s", "ddq": "/s^2"}[kind]
-    sliding = options.record.sliding_joints
-    columns = [names[0]] * len(sliding) if len(names) == 1 else names
-    defaults = (1.0 if slides or not options.degrees else _DEGREE for slides in sliding)
-    parts = zip(columns, sliding, defaults, strict=True)
-    return np.array(
-        [_factor(table, name, ("m" if slides else "rad") + exponent, usual) for name, slides, usual in parts]
-    )
-
-
-def _factor(table: TrajectoryTable, name: str, unit: str, default: float) -> float:
-    """Return the factor to SI of a column by the unit in its name, such as ``[deg/s]``; a default without one."""
-    match = _UNIT.search(name)
-    if not match:
-        return default
-    si, factor = KNOWN_UNITS.get(match[1].strip(), ("", 1))
-    if si != unit:
-        raise UsageError(f"{table.place}: {name} must have a unit of {unit}, got {match[1]!r}")
-    return float(factor)
-
-
 def _plain(name: str) -> str:
     """Return the name of a column without its unit."""
     return _UNIT.sub("", name).strip()
-
-
-def _missing(table: TrajectoryTable, options: _Options) -> str:
-    """Return the message for missing positions."""
-    columns = ", ".join(list(table.columns)[:12])
-    expected = f"q {options.joints[0]}, {options.joints[0]}_position, {options.joints[0]} and so on, or an array q"
-    return f"no columns with joint positions, expected {expected}; there are {columns or 'no columns'}"

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError, counted
-from cnpgen.plans.format import FLOATS, INTEGERS, NOTES, OBSTACLE_POSES
+from cnpgen.plans.format import FLOATS, INTEGERS, NOTES, OBSTACLE_POSES, PlanStatus
 from cnpgen.plans.plausible import check_boundary_units
-from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
@@ -242,11 +241,7 @@ def make_plans(
 
 
 def check_made(plans: Plans) -> None:
-    """Check that plans have motions.
-
-    Raises:
-        UsageError: A plan has no control points.
-    """
+    """Raise UsageError for a plan without control points."""
     waiting = np.isnan(plans.path_control_points).all(axis=(1, 2))
     if waiting.any():
         raise UsageError(

@@ -2,7 +2,7 @@
 
 import inspect
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,11 +27,8 @@ def check_boundary_units(
         UnitError: A value is probably in another unit.
     """
     columns = {name: np.asarray(values) for name, values in boundary.conditions().items()}
-    if are_usual(robot, list(columns.values())):
-        return
-    units = {name: robot.units(UNITS[name.rpartition("_")[2]]) for name in columns}
     try:
-        check_plausible(robot, columns, units, noun="plan")
+        check_units_of_states(robot, columns, noun="plan")
     except UnitError as error:
         text = f"{where}: {error}" if where else str(error)
         if allow_large_angles:
@@ -44,7 +41,14 @@ def check_boundary_units(
         ) from error
 
 
-def are_usual(robot: Robot, states: Sequence[NDArray[Any]]) -> bool:
+def check_units_of_states(robot: Robot, columns: Mapping[str, NDArray[Any]], *, noun: str) -> None:
+    """Raise UnitError for columns such as ``start_dq``, shape (N, n) each, that are probably in another unit."""
+    if not _are_usual(robot, list(columns.values())):
+        units = {name: robot.units(UNITS[name.rpartition("_")[2]]) for name in columns}
+        check_plausible(robot, columns, units, noun=noun)
+
+
+def _are_usual(robot: Robot, states: Sequence[NDArray[Any]]) -> bool:
     """Return whether states are within the limits of the joints: a fast check.
 
     The states are positions, velocities and accelerations of one state, or of two without or with the last

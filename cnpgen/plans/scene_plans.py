@@ -83,6 +83,8 @@ def scene_plans(
         raise UsageError(f"must have shape {start.shape}, got {goal_q.shape}", argument="goals")
     zero, spec, count = np.zeros_like(start), problem.trajectory, len(scenes)
     poses = np.array([_obstacle_poses(full, len(problem.obstacle), scene) for scene in scenes])
+    files = list(dict.fromkeys(scene.source for scene in scenes if scene.source))
+    others = f" and {len(files) - 1} other files" if len(files) > 1 else ""
     return make_plans(
         record,
         Boundary(start, zero, zero, goal_q, zero, None),
@@ -90,31 +92,21 @@ def scene_plans(
         rate_control_points=np.full((count, spec.rate_control_points), np.nan),
         columns={OBSTACLE_POSES: poses},
         sample_id=np.arange(count) if sample_id is None else numbers("sample_id", sample_id, "int64"),
-        source=_source(scenes),
+        source=f"scenes of {files[0]}{others}" if files else "",
     )
 
 
-def _source(scenes: Sequence[SceneProblem]) -> str:
-    files = list(dict.fromkeys(scene.source for scene in scenes if scene.source))
-    return f"scenes of {files[0]}" + (f" and {len(files) - 1} other files" if len(files) > 1 else "") if files else ""
-
-
 def goal_states(scene: SceneProblem, robot: Robot) -> Array:
-    """Return the goal states of a scene in the order of the planned joints [rad], shape (G, n), G > 0.
-
-    Raises:
-        SceneError: The scene has none, lacks a planned joint, or a state is outside the limits.
-    """
+    """Return the goal states of a scene by ``joint_order``, shape (G, n); raise SceneError for a scene without any."""
     if not len(scene.goal_q):
         raise SceneError(f"{scene.place} has no goal state")
     return joint_order(scene, robot, scene.goal_q, "goal")
 
 
 def joint_order(scene: SceneProblem, robot: Robot, states: Array, end: str) -> Array:
-    """Return states of a scene in the order of the planned joints [rad], shape (G, n).
+    """Return states of a scene in the order of the planned joints [rad], shape (G, n), clipped to the limits.
 
-    Raises:
-        SceneError: The scene lacks a planned joint, or a position is outside its limits by more than 1e-3 rad.
+    A missing joint, or a position outside of its limits by more than 1e-3 rad, raises SceneError.
     """
     if scene.joint_names:
         missing = [name for name in robot.joint_names if name not in scene.joint_names]

@@ -1,7 +1,5 @@
 """Files of sampled trajectories as tables: CSV, JSON, YAML, NPZ, HDF5, Parquet, and messages of ROS and MoveIt."""
 
-from __future__ import annotations
-
 import json
 import re
 import zipfile
@@ -182,12 +180,7 @@ def _read_parquet(path: Path) -> Iterator[TrajectoryTable]:
 
 
 def read_parquet(path: Path) -> Any:
-    """Read a Parquet file as a table of pyarrow.
-
-    Raises:
-        UsageError: The file is damaged or too large.
-        MissingExtraError: pyarrow is not installed.
-    """
+    """Read a Parquet file as a table of pyarrow; raise UsageError if it is damaged or too large."""
     with requires_extra("parquet", "pyarrow"):
         import pyarrow
         import pyarrow.parquet

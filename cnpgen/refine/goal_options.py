@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.machine.times import NO_TIME
-from cnpgen.plans.concatenate import concatenate
 from cnpgen.plans.format import GOAL_OPTION
+from cnpgen.plans.join import concatenate
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.joint import JointVelocity
 from cnpgen.problems.problem_record import open_problem

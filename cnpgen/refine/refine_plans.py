@@ -17,9 +17,8 @@ from cnpgen.machine.engine import Engine, assembled
 from cnpgen.machine.threads import one_thread
 from cnpgen.machine.times import Stopwatch
 from cnpgen.machine.versions import __version__
-from cnpgen.plans.format import GOAL_OPTION, OBSTACLE_POSES
+from cnpgen.plans.format import GOAL_OPTION, OBSTACLE_POSES, PlanStatus
 from cnpgen.plans.plans import Plans, screen
-from cnpgen.plans.status import PlanStatus
 from cnpgen.plans.tips import correct_tips
 from cnpgen.refine.goal_options import Progress, refine_goal_options
 from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions

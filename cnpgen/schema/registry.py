@@ -104,7 +104,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "csv": "cnpgen.plans.formats:CsvTables",
         "joint-trajectory": "cnpgen.plans.formats:JointTrajectory",
         "ros2-control": "cnpgen.plans.formats:TrajectoryControllerGoal",
-        "parquet": "cnpgen.plans.parquet_table:ParquetTable",
+        "parquet": "cnpgen.plans.formats:ParquetTable",
         "lerobot": "cnpgen.plans.lerobot_dataset:LeRobotDataset",
         "mpd": "cnpgen.plans.formats:PathSplines",
     },

@@ -12,11 +12,11 @@ from cnpgen.losses.margins import Margins, suggested_margins
 from cnpgen.losses.metric import Metric, suggested_weights
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.machine.versions import __version__
+from cnpgen.planner.control_points import make_projection
 from cnpgen.planner.inference_pipeline import InferencePipeline, LoadedProblem, make_inference_pipeline
 from cnpgen.planner.model import Model, ModelConfig, is_rest_to_rest
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
 from cnpgen.planner.network.features import SCENE, Features, count_features, feature_blocks, published_features
-from cnpgen.planner.projection import make_projection
 from cnpgen.planner.tasks import Tasks
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.format import OBSTACLE_POSES

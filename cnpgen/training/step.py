@@ -8,11 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.losses.plan_loss import LossValue
-from cnpgen.planner.control_points import ControlPoints, control_points, vjp
-from cnpgen.planner.network.architecture import Architecture
+from cnpgen.planner.control_points import ControlPoints, Projection, control_points, vjp
+from cnpgen.planner.network.architecture import Architecture, backward, forward
 from cnpgen.planner.network.features import Features
-from cnpgen.planner.network.forward import backward, forward
-from cnpgen.planner.projection import Projection
 from cnpgen.planner.tasks import Tasks
 from cnpgen.training.adam import Adam, Clipping
 from cnpgen.training.settings import TrainingSettings

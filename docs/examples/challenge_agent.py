@@ -13,8 +13,7 @@ import numpy as np
 from air_hockey_challenge.framework import AgentBase
 
 import cnpgen
-from cnpgen.planner.puck_model import PuckModel
-from cnpgen.results import PlanRuntime
+from cnpgen.results import PlanRuntime, PuckModel
 
 TICK_S, TICKS_PER_STEP = 1e-3, 20
 GOAL = np.array([2.49, 0.0])  # m, in the robot's frame

@@ -34,8 +34,7 @@ from cnpgen.benchmark.planners.sst import (
 )
 from cnpgen.benchmark.suite import load_suite
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.planner.network.architecture import Architecture, initial_parameters
-from cnpgen.planner.network.forward import forward
+from cnpgen.planner.network.architecture import Architecture, forward, initial_parameters
 from cnpgen.plans import Plans, open_problem
 from cnpgen.refine.refine_plans import solve_plans
 from cnpgen.trajectory.sampled_trajectory import Trajectory

@@ -17,7 +17,7 @@ from cnpgen.cli.main import main
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.model_file import load_model
 from cnpgen.plans import load_plans
-from cnpgen.plans.status import PlanStatus
+from cnpgen.plans.format import PlanStatus
 from tests.conftest import HANGING, columns_of, some
 
 SMALL = ["--steps", "40", "--hidden", "16", "--layers", "2", "--batch-size", "32", "--check", "2", "--workers", "1"]

@@ -9,10 +9,10 @@ import numpy as np
 
 from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.losses.plan_loss import PlanLoss
+from cnpgen.planner.control_points import Projection, make_projection
 from cnpgen.planner.inference_pipeline import LoadedProblem, make_inference_pipeline
 from cnpgen.planner.model import Model, ModelConfig
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
-from cnpgen.planner.projection import Projection, make_projection
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_record import record_problem
 from cnpgen.training.settings import TrainingSettings

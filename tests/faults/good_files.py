@@ -13,7 +13,7 @@ from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.planner.model_file import save_model
-from cnpgen.plans.save import save_plans
+from cnpgen.plans.plan_file import save_plans
 from cnpgen.refine.refinement_journal import open_journal
 from cnpgen.refine.task import Attempt, Outcome
 from cnpgen.schema.catalogue import list_recipes, recipes_root

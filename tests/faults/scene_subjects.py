@@ -18,9 +18,8 @@ from cnpgen.plans.evaluate_trajectories import evaluate_trajectories
 from cnpgen.plans.export import export_plans
 from cnpgen.plans.import_trajectories import import_trajectories
 from cnpgen.plans.load_trajectories import load_trajectories
-from cnpgen.plans.plan_file import load_plans
+from cnpgen.plans.plan_file import load_plans, save_plans
 from cnpgen.plans.plans import screen
-from cnpgen.plans.save import save_plans
 from cnpgen.plans.scene_plans import scene_plans
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem

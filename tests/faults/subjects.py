@@ -25,8 +25,7 @@ from cnpgen.make.task_table import read_tasks
 from cnpgen.planner.model_file import MODEL_KIND, MODEL_VERSION, load_model
 from cnpgen.planner.plan_requests import read_file
 from cnpgen.planner.planner import Planner
-from cnpgen.plans.boundary_file import read_boundary_file
-from cnpgen.plans.boundary_problems import load_boundary_problems
+from cnpgen.plans.boundary_problems import load_boundary_problems, read_boundary_file
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.format import PLAN_FILE_VERSION
 from cnpgen.plans.plan_file import load_plans

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import MAX_LINE_LENGTH, DatasetError, RecipeError, UsageError
-from cnpgen.planner.puck_model import PuckModel
+from cnpgen.planner.moving_pucks import PuckModel
 from cnpgen.plans import PlanStatus, load_plans, save_plans
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import screen

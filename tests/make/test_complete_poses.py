@@ -10,7 +10,7 @@ import pytest
 import cnpgen
 from cnpgen.cli.main import main
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.plans.concatenate import concatenate
+from cnpgen.plans.join import concatenate
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.goal_options import min_durations, refine_goal_options

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import UsageError
-from cnpgen.planner.network.architecture import Architecture, initial_parameters
-from cnpgen.planner.network.forward import Activations, backward, forward
+from cnpgen.planner.network.architecture import Activations, Architecture, backward, forward, initial_parameters
 
 SMALL = Architecture(inputs=5, hidden=7, layers=3, path_outputs=6, rate_outputs=4)
 

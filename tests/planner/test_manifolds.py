@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cnpgen.kernels.library import problem_kernels
-from cnpgen.planner.projection import make_projection
+from cnpgen.planner.control_points import make_projection
 from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.world import World

@@ -8,10 +8,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from cnpgen.errors import UsageError
-from cnpgen.planner.moving_pucks import NO_MEETING, TOO_LATE
+from cnpgen.planner.moving_pucks import NO_MEETING, TOO_LATE, PuckModel
 from cnpgen.planner.plan_hits import plan_hits
 from cnpgen.planner.planner import Planner
-from cnpgen.planner.puck_model import PuckModel
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.problems.problem_record import open_problem
 from tests.conftest import Arm

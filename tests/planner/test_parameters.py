@@ -11,9 +11,8 @@ from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.plan_hits import plan_hits
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
-from cnpgen.plans.plan_file import load_plans
+from cnpgen.plans.plan_file import load_plans, save_plans
 from cnpgen.plans.plans import Plans
-from cnpgen.plans.save import save_plans
 from cnpgen.problems.obstacles import table_frame_of
 from cnpgen.problems.problem_file import load_problem
 

@@ -11,8 +11,8 @@ from cnpgen.errors import UsageError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.plans.format import PlanStatus
 from cnpgen.plans.join import join_plans
-from cnpgen.plans.status import PlanStatus
 from cnpgen.refine.refine_plans import refine_plans
 from cnpgen.robots.plausible_values import UnitError
 from cnpgen.trajectory.boundary import Boundary

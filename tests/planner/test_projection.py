@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cnpgen.planner.control_points import control_points
+from cnpgen.planner.control_points import control_points, make_projection
 from cnpgen.planner.inference_pipeline import make_inference_pipeline
-from cnpgen.planner.projection import make_projection
-from cnpgen.planner.task_preprocessor import ends_of, lanes, rows
+from cnpgen.planner.tasks import ends_of, lanes, rows
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
 from tests.conftest import columns_of, needs_compiler, some
 from tests.examples.models import (

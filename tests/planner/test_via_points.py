@@ -7,11 +7,10 @@ import pytest
 
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.boundary_layer import BoundaryLayer
-from cnpgen.planner.inference_pipeline import SLOW_DURATION, loaded_problem
+from cnpgen.planner.inference_pipeline import SLOW_DURATION, ViaPoints, loaded_problem, make_via_points
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model
 from cnpgen.planner.planner import Planner
-from cnpgen.planner.via_points import ViaPoints, make_via_points
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion

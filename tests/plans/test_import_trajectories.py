@@ -11,7 +11,7 @@ from cnpgen.errors import UsageError
 from cnpgen.plans import Plans
 from cnpgen.plans.export import export_plans
 from cnpgen.plans.exporter import sample_plan
-from cnpgen.plans.snap_boundary import StateSnapper
+from cnpgen.plans.import_trajectories import StateSnapper
 from cnpgen.trajectories import Trajectory, import_trajectories, largest_error
 from tests.examples.plan_files import plans_of
 from tests.examples.plans import PROBLEMS, ROBOTS, load

@@ -12,10 +12,10 @@ from cnpgen.errors import UsageError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.export import export_plans
+from cnpgen.plans.format import PlanStatus
 from cnpgen.plans.join import join_plans
+from cnpgen.plans.plan_file import save_plans
 from cnpgen.plans.plans import Plans
-from cnpgen.plans.save import save_plans
-from cnpgen.plans.status import PlanStatus
 
 
 def unsolved(plans: Plans) -> Plans:

@@ -12,8 +12,8 @@ from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.export import export_plans
 from cnpgen.plans.join import join_plans
+from cnpgen.plans.plan_file import save_plans
 from cnpgen.plans.plans import Plans
-from cnpgen.plans.save import save_plans
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.refine.refine_plans import refine_plans, solve_plans
 from tests.conftest import some

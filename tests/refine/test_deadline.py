@@ -12,9 +12,8 @@ from cnpgen.errors import UsageError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
-from cnpgen.plans.plan_file import load_plans
+from cnpgen.plans.plan_file import load_plans, save_plans
 from cnpgen.plans.plans import Plans
-from cnpgen.plans.save import save_plans
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.refine_plans import refine_plans, solve_plans
 from cnpgen.refine.solver import sqp

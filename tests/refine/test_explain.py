@@ -12,8 +12,8 @@ import pytest
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
+from cnpgen.plans.plan_file import save_plans
 from cnpgen.plans.plans import Plans
-from cnpgen.plans.save import save_plans
 from cnpgen.refine.proof import table_proof
 from cnpgen.refine.proof.explain import Explanation, Feasibility, explain_failure, explain_plans
 from cnpgen.refine.proof.reachable_positions import EndState, JointLimits, end_states, joint_limits, sample_times

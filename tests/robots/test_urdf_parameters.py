@@ -9,8 +9,7 @@ import pytest
 
 from cnpgen.errors import CnpgenError, RecipeError
 from cnpgen.plans.evaluate import evaluate_plans
-from cnpgen.plans.plan_file import load_plans
-from cnpgen.plans.save import save_plans
+from cnpgen.plans.plan_file import load_plans, save_plans
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import ProblemRecord, open_problem, record_problem

@@ -231,7 +231,7 @@ def test_nothing_else_in_the_package_opens_hdf5() -> None:
     makers = {
         "store/files/checksum_file.py",
         "store/shard.py",
-        "plans/save.py",
+        "plans/plan_file.py",
         "problems/scenes/mpinets_scenes.py",
         "plans/formats.py",
     }

@@ -12,9 +12,8 @@ from cnpgen.kernels.library import problem_kernels
 from cnpgen.planner.control_points import control_points
 from cnpgen.planner.inference_pipeline import loaded_problem, make_inference_pipeline
 from cnpgen.planner.model_file import load_model, model_content, model_from_content
-from cnpgen.planner.network.architecture import initial_parameters
-from cnpgen.planner.network.forward import forward
-from cnpgen.planner.network.scene_features import (
+from cnpgen.planner.network.architecture import forward, initial_parameters
+from cnpgen.planner.network.features import (
     BASIS,
     MAX_DISTANCE_M,
     MIN_DISTANCE_M,
@@ -24,7 +23,7 @@ from cnpgen.planner.network.scene_features import (
 )
 from cnpgen.planner.plan_requests import plan_scenes, scene_requests
 from cnpgen.planner.planner import Planner
-from cnpgen.planner.task_preprocessor import ends_of
+from cnpgen.planner.tasks import ends_of
 from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plan_file import load_plans
 from cnpgen.problems.load_robot import load_robot

@@ -10,8 +10,8 @@ import pytest
 
 from cnpgen.errors import UsageError
 from cnpgen.make.make_dataset import make_dataset
+from cnpgen.planner.inference_pipeline import ViaPoints
 from cnpgen.planner.model_file import save_model
-from cnpgen.planner.via_points import ViaPoints
 from cnpgen.problems.problem_record import record_problem
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.training import prepare

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.machine.versions import __version__
-from cnpgen.planner.network.architecture import Architecture, Weights, initial_parameters
-from cnpgen.planner.network.forward import backward, forward
+from cnpgen.planner.network.architecture import Architecture, Weights, backward, forward, initial_parameters
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.solid import pose_width

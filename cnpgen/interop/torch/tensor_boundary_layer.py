@@ -7,9 +7,9 @@ from cnpgen.interop.torch.tensor_tape import TensorTape
 from cnpgen.interop.torch.torch_plans import real_tensor
 from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.planner.boundary_layer import BoundaryLayer
+from cnpgen.planner.control_point_functions import MAX_STEP_RAD, PROJECTION_DAMPING, collocation
 from cnpgen.planner.control_points import along_line
 from cnpgen.planner.expressions import effective_steps
-from cnpgen.planner.gauss_newton import MAX_STEP_RAD, PROJECTION_DAMPING, collocation
 from cnpgen.planner.tasks import Tasks
 from cnpgen.problems.equalities import equality_residuals
 from cnpgen.problems.load_robot import load_robot
@@ -71,7 +71,7 @@ class TensorBoundaryLayer:
         return self._projected(path, torch.tensor(tasks.scene.poses, **kind)), rate
 
     def _projected(self, path: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
-        """Project the interior control points onto the equalities, as ``cnpgen.planner.gauss_newton`` does."""
+        """Project the interior control points onto the equalities, as ``projection_change`` of the planner does."""
         kind = {"device": path.device, "dtype": path.dtype}
         table, response = torch.tensor(self._table, **kind), torch.tensor(self._response, **kind)
         coupling = table[:, self._interior] @ response

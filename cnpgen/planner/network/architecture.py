@@ -1,4 +1,7 @@
-"""The architecture of the network (paper, section on the neural network), with all parameters in one vector."""
+"""The architecture of the network (paper, section on the neural network), its forward and its backward pass.
+
+All parameters are in one vector.
+"""
 
 from __future__ import annotations
 
@@ -105,16 +108,8 @@ class Architecture:
 def initial_parameters(architecture: Architecture, *, seed: int, head_scale: float, rate_bias: float) -> Array:
     """Draw parameters by Glorot's uniform distribution; biases are zero except that of the time head.
 
-    With small last layers an untrained network plans the straight line at a constant rate.
-
-    Args:
-        architecture: The architecture.
-        seed: Seed.
-        head_scale: Factor of both heads' last weights.
-        rate_bias: Bias of the time head: logarithm of the initial (expected time / duration).
-
-    Returns:
-        float32, shape (n_parameters,).
+    With small last layers, by the factor ``head_scale`` of both heads' last weights, an untrained network plans the
+    straight line at a constant rate. The bias of the time head is the logarithm of (expected time / duration).
     """
     random = np.random.Generator(np.random.Philox(key=seed))
     parameters = np.zeros(architecture.n_parameters, np.float32)
@@ -124,3 +119,76 @@ def initial_parameters(architecture: Architecture, *, seed: int, head_scale: flo
         layer.weight(parameters)[:] = random.uniform(-bound, bound, (layer.inputs, layer.outputs))
     rate.bias(parameters)[:] = rate_bias
     return parameters
+
+
+@dataclass(frozen=True)
+class Activations:
+    """Outputs of every layer for N inputs, as needed by the backward pass.
+
+    Attributes:
+        trunk: The input and every trunk layer's output, shape (N, inputs) and (N, hidden).
+        path_hidden: The configuration head's hidden layer, shape (N, hidden).
+        path: The configuration head, in (-1, 1), shape (N, path_outputs): the paper's phi.
+        log_rate: The time head before its exponential, shape (N, rate_outputs).
+    """
+
+    trunk: tuple[Array, ...]
+    path_hidden: Array
+    path: Array
+    log_rate: Array
+
+
+def forward(weights: Weights, features: Array) -> Activations:
+    """Evaluate the network for inputs of shape (N, inputs), float32 or float64 as the weights."""
+    *trunk_weights, hidden_weights, path_weights, (rate_weight, rate_bias) = weights
+    trunk = [features]
+    for layer in trunk_weights:
+        trunk.append(_tanh_layer(layer, trunk[-1]))
+    hidden = _tanh_layer(hidden_weights, trunk[-1])
+    log_rate = trunk[-1] @ rate_weight
+    log_rate += rate_bias
+    return Activations(tuple(trunk), hidden, _tanh_layer(path_weights, hidden), log_rate)
+
+
+def _tanh_layer(layer: tuple[Array, Array], x: Array) -> Array:
+    weight, bias = layer
+    y: Array = x @ weight
+    y += bias
+    np.tanh(y, out=y)
+    return y
+
+
+def backward(
+    weights: Weights, activations: Activations, *, path_gradient: Array, log_rate_gradient: Array, out: Weights
+) -> None:
+    """Write the gradient of a scalar with respect to all weights to ``out``.
+
+    The gradients are those with respect to ``path`` and ``log_rate`` of the activations, and have their shapes.
+    """
+    top, hidden = activations.trunk[-1], activations.path_hidden
+    gradient = _through_tanh(path_gradient, activations.path)
+    _weight_gradient(hidden, gradient, out[-2])
+    gradient = _through_tanh(gradient @ weights[-2][0].T, hidden)
+    _weight_gradient(top, gradient, out[-3])
+    _weight_gradient(top, log_rate_gradient, out[-1])
+    gradient = gradient @ weights[-3][0].T
+    gradient += log_rate_gradient @ weights[-1][0].T
+    for index in range(len(weights) - 4, -1, -1):
+        gradient = _through_tanh(gradient, activations.trunk[index + 1])
+        _weight_gradient(activations.trunk[index], gradient, out[index])
+        if index:  # the gradient of the features is not needed
+            gradient = gradient @ weights[index][0].T
+
+
+def _through_tanh(gradient: Array, y: Array) -> Array:
+    """Return the gradient before a tanh from that after it: times ``1 - y^2``."""
+    derivative: Array = y * y
+    np.subtract(1.0, derivative, out=derivative)
+    derivative *= gradient
+    return derivative
+
+
+def _weight_gradient(x: Array, gradient: Array, out: tuple[Array, Array]) -> None:
+    """Write the gradient of a layer's weights from its input and the gradient of its output."""
+    np.matmul(x.T, gradient, out=out[0])
+    np.sum(gradient, axis=0, out=out[1])

@@ -90,7 +90,7 @@ def explain_plans(plans: "Plans", indices: Sequence[int] | None = None) -> dict[
     Raises:
         UsageError: An index is out of range.
     """
-    from cnpgen.plans.status import PlanStatus
+    from cnpgen.plans.format import PlanStatus
     from cnpgen.plans.tips import correct_tips
     from cnpgen.problems.problem_record import open_problem
 

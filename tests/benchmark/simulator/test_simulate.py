@@ -17,7 +17,7 @@ from cnpgen.benchmark.simulator.tip import Tip
 from cnpgen.errors import UsageError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.plans import Plans, make_plans
-from cnpgen.plans.concatenate import concatenate
+from cnpgen.plans.join import concatenate
 from cnpgen.refine.refine_plans import solve_plans
 from cnpgen.schema.catalogue import list_recipes
 from tests.examples.plans import ROBOTS, load
