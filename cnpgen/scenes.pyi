@@ -1,4 +1,4 @@
-from cnpgen.loader.batch_observer import BatchObserver as BatchObserver
+from cnpgen.loader.batch import BatchObserver as BatchObserver
 from cnpgen.make.solve_scenes import SolvedScenes as SolvedScenes
 from cnpgen.make.solve_scenes import solve_scenes as solve_scenes
 from cnpgen.pipelines.families.catalog import load_family as load_family

@@ -12,7 +12,7 @@ from cnpgen.benchmark.replanning_scenario import ExecutedPrefix, ReplanningScena
 from cnpgen.errors import CnpgenError, nearest
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.make.recipe_file import load_dataset_recipe
-from cnpgen.pipelines.stages.given_positions import MAX_TASKS
+from cnpgen.pipelines.stages.draw import MAX_TASKS
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.scene_plans import scene_plans
 from cnpgen.problems.problem import Problem

@@ -72,7 +72,7 @@ def _model(name: str, file: Path) -> dict[str, Any]:
 
 
 def _pipeline(name: str, _: Path) -> dict[str, Any]:
-    from cnpgen.pipelines.pipeline_file import load_pipeline
+    from cnpgen.pipelines.pipeline import load_pipeline
 
     recipe = load_pipeline(name)
     count = len(recipe.stage)

@@ -14,14 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from cnpgen.errors import DatasetError, MissingExtraError, UsageError, lacks
-from cnpgen.loader.batch_observer import observer_of
-from cnpgen.loader.batch_partition import BatchPartition
-from cnpgen.loader.batches import Batches, Observe
-from cnpgen.loader.columns import select_columns
+from cnpgen.loader.batch import observer_of
+from cnpgen.loader.batches import Batches, BatchPartition, Observe, checked_position
 from cnpgen.loader.gather import Rows, Split, gather
 from cnpgen.loader.normalization import Normalization, make_normalization
-from cnpgen.loader.position import checked_position
-from cnpgen.loader.row_format import RowFormat, make_row_format
+from cnpgen.loader.row_format import RowFormat, make_row_format, select_columns
 from cnpgen.loader.scene_columns import OBSTACLE_POSES, problem_obstacles, scene_fields
 from cnpgen.loader.shard_reader import ShardReader, SplitShards
 from cnpgen.robots.observation.observations import Observation

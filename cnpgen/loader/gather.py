@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.loader.columns import Columns
-from cnpgen.loader.row_format import RowFormat
+from cnpgen.loader.row_format import Columns, RowFormat
 from cnpgen.loader.shard_reader import SplitShards
 from cnpgen.schema.arguments import reject_masked
 from cnpgen.store.shard import storage_dtype

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.library import problem_kernels
 from cnpgen.machine.threads import one_thread
+from cnpgen.make.on_plan import SHA256, load_stage_planner, model_sha256, planner_boundary
 from cnpgen.make.recipe import DatasetRecipe
-from cnpgen.make.stage_planner import SHA256, load_stage_planner, model_sha256, planner_boundary
-from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction
 from cnpgen.plans.format import BOUNDARY, OBSTACLE_POSES
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.refine_engine import Solver, load_solver
@@ -24,7 +23,6 @@ from cnpgen.store.field import Field
 from cnpgen.store.scene_table import OBSTACLE_KINDS, SceneTable
 from cnpgen.trajectory.spline_motion import Motion
 
-Array = NDArray[np.float64]
 Counts = tuple[int, ...]  # obstacles of each kind
 
 PLACES_PER_STEP = 2  # numbers of places are multiples of it, so that scenes share solvers

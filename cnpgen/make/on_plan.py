@@ -1,27 +1,75 @@
 """Stages for replanning: starts on planned or refined motions, and goals of these motions."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.machine.threads import one_thread
-from cnpgen.make.stage_planner import SHA256, load_stage_planner, planner_boundary
-from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.boundary_motion import onto_table, velocity_of_tip
 from cnpgen.pipelines.stages.draw import position_field
-from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction, leave
-from cnpgen.plans.format import BOUNDARY
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction, leave
+from cnpgen.plans.format import BOUNDARY, CONDITIONS
 from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.problem_record import record_problem
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
+from cnpgen.store.files.atomic import file_sha256
+from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion, states_at_times
 
+if TYPE_CHECKING:
+    from cnpgen.planner.planner import Planner
+
+
+SHA256 = "^([0-9a-f]{64})?$"
 STATES_PER_REFINED_PLAN = 40  # a refined plan takes about 20 ms, a state on it is cheap
 START = ("start_q", "start_dq", "start_ddq")
 GOAL = ("goal_q", "goal_dq", "goal_xyz", "hit_angle", "hit_speed", "hit_speed_max", "home_q")
+
+
+def model_sha256(model: str) -> str:
+    """Return the sha256 of the file of a model, by the name of a shipped one or the file's path.
+
+    Raises:
+        UsageError: There is no such model.
+    """
+    from cnpgen.planner.model_file import find_model
+
+    return file_sha256(find_model(model))
+
+
+def load_stage_planner(model: str, sha256: str, context: Context) -> "Planner":
+    """Load the planner of a stage, a shipped model or a model file with the digest ``sha256``.
+
+    Raises:
+        RecipeError: The file has another sha256, or the model is for another problem.
+        UsageError: There is no such model.
+    """
+    from cnpgen.planner.model_file import load_model
+    from cnpgen.planner.planner import Planner
+
+    digest = model_sha256(model)
+    if digest != sha256:
+        raise RecipeError([f"sha256: the file of model {model!r} has {digest}, expected {sha256}"])
+    loaded, problem = load_model(model), record_problem(context.problem)
+    if loaded.problem.comparable_sha256 != problem.comparable_sha256:
+        differs = ", ".join(problem.differences(loaded.problem)[:4])
+        raise RecipeError([f"model: {model!r} plans for another problem, they differ in {differs}; leave it out"])
+    return Planner(loaded, backend=context.kernels.backend)
+
+
+def planner_boundary(columns: Mapping[str, Array], planner: "Planner") -> Boundary:
+    """Return the boundary conditions of N rows for a planner, from columns of shape (N, width).
+
+    Goal accelerations are omitted if the planner leaves them free.
+    """
+    names = [name for name in CONDITIONS if name != "goal_ddq" or planner.model.fixed_at_goal == 3]
+    return Boundary(**{name: columns[name] for name in names if name in columns})
 
 
 @dataclass(frozen=True, kw_only=True)

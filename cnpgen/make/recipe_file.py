@@ -10,8 +10,7 @@ from typing import Any
 
 from cnpgen.errors import PluginError, RecipeError, UsageError
 from cnpgen.make.recipe import DatasetRecipe, recipe_digest
-from cnpgen.pipelines.pipeline import Pipeline, listed_tasks
-from cnpgen.pipelines.pipeline_file import read_pipeline
+from cnpgen.pipelines.pipeline import Pipeline, listed_tasks, read_pipeline
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.checks import tables
 from cnpgen.problems.problem import Problem

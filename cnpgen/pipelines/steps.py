@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cnpgen.errors import RecipeError
-from cnpgen.pipelines.acceptance import bookkeeping_fields
-from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.pipeline import Pipeline
-from cnpgen.pipelines.stages.stage import Stage, StageFunction
+from cnpgen.pipelines.stages.stage import Context, Stage, StageFunction
 from cnpgen.schema import registry
 from cnpgen.store.field import Field
+from cnpgen.store.scene_table import SCENE_ID
 
 REQUIRED_COLUMNS = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "start_xyz", "goal_xyz")  # of every sample
 
@@ -73,6 +72,16 @@ def stored_fields(steps: Sequence[PipelineStep], context: Context) -> tuple[Fiel
         raise RecipeError(mistakes)
     known = [fields.pop(name) for name in FIELD_ORDER if name in fields]
     return (*known, *fields.values(), *bookkeeping_fields(scenes=any(step.stage.draws_scenes for step in steps)))
+
+
+def bookkeeping_fields(*, scenes: bool = False) -> tuple[Field, ...]:
+    """Return the bookkeeping fields of every dataset, and with ``scenes`` that of the scene of a row."""
+    text = "sample_id of the first row in the same scene"
+    return (
+        *((Field(SCENE_ID, "1", text, role="context", dtype="int64"),) if scenes else ()),
+        Field("attempts", "1", "candidates per accepted row, including this row", role="diagnostic", dtype="int64"),
+        Field("sample_id", "1", "index of the row in its split", role="diagnostic", dtype="int64"),
+    )
 
 
 def _definition(field: Field) -> dict[str, object]:

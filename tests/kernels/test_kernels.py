@@ -618,7 +618,7 @@ def repository() -> Path:
 WARM_START = """
 import sys
 from cnpgen.kernels.library import choose_backend
-from cnpgen.pipelines.pipeline_file import load_pipeline
+from cnpgen.pipelines.pipeline import load_pipeline
 
 from cnpgen.pipelines.prepared import PreparedPipeline
 backend, folder = choose_backend(sys.argv[1])

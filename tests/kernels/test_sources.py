@@ -10,7 +10,7 @@ import pytest
 
 from cnpgen.kernels import library as library_module
 from cnpgen.kernels.library import BUILDER_PACKAGES, PACKAGE_FOLDER, KernelLibrary
-from cnpgen.pipelines.stages.braking import tip_state
+from cnpgen.pipelines.stages.reach import tip_state
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 

@@ -11,8 +11,8 @@ from torch.utils import data
 from cnpgen.errors import UsageError
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.batches import Batches
-from cnpgen.loader.columns import Columns
 from cnpgen.loader.normalization import Normalization
+from cnpgen.loader.row_format import Columns
 
 MAX_WORKERS = 1024
 

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.families.family import Layout, SceneFamily
 from cnpgen.pipelines.stages.batch_scenes import BatchScenes, batch_scenes
-from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
+from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.scenes.scene_problem import MAX_BASE_DEPTH_M
 from cnpgen.robots.scene_arrays import rotations_of, sample_obstacles

@@ -20,10 +20,9 @@ import numpy as np
 from cnpgen.errors import UsageError
 from cnpgen.kernels.symbolic.kinematics import forward_kinematics
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, cross, dot, symbols
-from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.candidate_table import hit_direction, table_normal, velocity_factor
 from cnpgen.pipelines.stages.hitting_newton import along, direction_symbols
-from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from cnpgen.kernels.symbolic.kinematics import tip_position
-from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.draw import check_reach, uniform
 from cnpgen.pipelines.stages.ik import GuessedIK
-from cnpgen.pipelines.stages.stage import CandidateBatch, StageFunction
+from cnpgen.pipelines.stages.stage import CandidateBatch, Context, StageFunction
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
 

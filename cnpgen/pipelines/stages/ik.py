@@ -10,10 +10,9 @@ from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.kinematics import Kinematics, forward_kinematics
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, gram, scale, solve, subtract, symbols
 from cnpgen.kernels.tape import Loop
-from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.candidate_table import upright_axes
 from cnpgen.pipelines.stages.draw import uniform
-from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
+from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.robots.plausible_values import find_implausible_value
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import Range, field

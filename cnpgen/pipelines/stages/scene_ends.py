@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.kernels.tape import Loop
-from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.batch_scenes import BatchScenes
 from cnpgen.pipelines.stages.draw import position_field
 from cnpgen.pipelines.stages.draw_scenes import scenes_of
 from cnpgen.pipelines.stages.ik import MAX_POSE_IK_STEPS, POSE_TOLERANCE, pose_ik_step
 from cnpgen.pipelines.stages.scene_clearance import SceneClearance
-from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction, leave
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction, leave
 from cnpgen.pipelines.stages.torque import torque_ratio
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
