@@ -93,11 +93,7 @@ class BatchObserver:
 
 
 def observer_of(spec: DatasetSpec, kind: str | Observation, *, seed: int) -> BatchObserver:
-    """Return the observer of the scenes of a dataset, for batches with the field ``obstacle_poses``.
-
-    Raises:
-        DatasetError: The dataset has no scenes.
-    """
+    """Return the observer of the scenes of a dataset, for batches with the field ``obstacle_poses``."""
     if not spec.scene_obstacles:
         text = f"{spec.name} has no scenes to observe: expected a dataset such as panda-scenes, or a BatchObserver"
         raise DatasetError(text)

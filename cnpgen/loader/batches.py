@@ -56,12 +56,9 @@ class BatchPartition:
         return rows - (rows - first) % self.batch_size if self.drop_last else rows
 
     def check_ranks(self, rows: int, *, first: int = 0) -> None:
-        """Raise an error if the last batch has no row for some ranks, since their mean loss would be nan.
+        """Raise UsageError if the last batch has no row for some ranks, since their mean loss would be nan.
 
         The batches begin at position ``first``.
-
-        Raises:
-            UsageError: The last batch has fewer rows than there are ranks.
         """
         remainder = (self.end(rows, first=first) - first) % self.batch_size
         if 0 < remainder < self.world:
@@ -88,11 +85,7 @@ class Position:
 
 
 def checked_position(*, seed: Any, shuffle: Any, epoch: Any, row: Any = 0) -> Position:
-    """Make a position of unchecked arguments.
-
-    Raises:
-        UsageError: Seed, epoch or row is not a non-negative integer, or shuffle is not a bool.
-    """
+    """Make a position of unchecked arguments."""
     numbers = {"seed": seed, "epoch": epoch, "row": row}
     return Position(
         shuffle=flag("shuffle", shuffle), **{name: integer(name, value, least=0) for name, value in numbers.items()}
@@ -106,12 +99,7 @@ def position_to_json(position: Position, source: SplitShards) -> dict[str, Any]:
 
 
 def position_from_json(state: Mapping[str, Any], source: SplitShards) -> Position:
-    """Rebuild a position.
-
-    Raises:
-        UsageError: The argument is not the state of a loader.
-        DatasetError: The state is of another dataset, split or format version.
-    """
+    """Rebuild a position; raise an error if it is not of these rows."""
     if not isinstance(state, Mapping) or state.get("format") != LOADER_STATE_FORMAT:
         raise UsageError(f"a loader's state must be what state() returned, got {state!r:.100}")
     if state.get("format_version") != LOADER_STATE_VERSION:

@@ -251,16 +251,10 @@ class Dataset:
 
 
 def make_frame(rows: Mapping[str, NDArray[Any]], fields: Sequence[Field], *, library: str | None) -> Any:
-    """Convert rows, of shape (rows, width) or (rows,) each, to a table with columns in the order of the fields.
+    """Convert rows, of shape (rows, width) or (rows,) each, to a ``DataFrame`` with columns in the order of the fields.
 
-    The library is "polars" or "pandas"; by default the installed one, polars if both are.
-
-    Returns:
-        A ``DataFrame``; with pandas, ``attrs["units"]`` contains the units of the columns.
-
-    Raises:
-        UsageError: The library is not supported.
-        MissingExtraError: The library is not installed.
+    The library is "polars" or "pandas"; by default the installed one, polars if both are. With pandas,
+    ``attrs["units"]`` contains the units of the columns.
     """
     name = _installed(library)
     columns = {

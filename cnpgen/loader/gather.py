@@ -26,15 +26,9 @@ class RowError(UsageError, IndexError):
 
 
 def gather(source: SplitShards, indices: ArrayLike, layout: Columns) -> Rows:
-    """Read single rows by their indices, shape (k,); negative ones count from the end.
+    """Read single rows by their indices, shape (k,), in their order; negative ones count from the end.
 
-    Returns:
-        Field name -> values as stored, shape (k, width) or (k,), in the order of the indices.
-
-    Raises:
-        RowError: The split has no such row.
-        UsageError: The indices are not integers.
-        DatasetError: A shard is missing or damaged.
+    Values are as stored, shape (k, width) or (k,).
     """
     rows = _checked(indices, source)
     columns = {f.name: np.empty(f.shape(len(rows)), storage_dtype(f, source.stored)) for f in layout.fields}

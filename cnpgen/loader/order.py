@@ -58,14 +58,11 @@ class Order:
 
 
 def permutation(size: int, *, seed: int, key: tuple[int, ...]) -> NDArray[np.int64]:
-    """Return a uniformly random permutation that does not depend on the version of NumPy.
+    """Return a uniformly random permutation, shape (size,), that does not depend on the version of NumPy.
 
     NumPy guarantees the raw output of bit generators, but not that of ``Generator.permutation``. The rows are sorted by
     raw random numbers, the last bits of which are replaced by the row index. For up to 2^20 rows, 44 bits remain
     random, so ties are negligible. Seed and key are not negative.
-
-    Returns:
-        Permutation of 0 to ``size - 1``, shape (size,).
     """
     raw = np.random.SFC64(np.random.SeedSequence(seed, spawn_key=key)).random_raw(size)
     mask = np.uint64((1 << max(size - 1, 1).bit_length()) - 1)

@@ -63,10 +63,6 @@ def select_columns(spec: DatasetSpec, names: Iterable[str] | None) -> Columns:
 
     By default these are all float fields except for diagnostics, in the order of the specification. Fields of scenes
     have to be named.
-
-    Raises:
-        DatasetError: There is no such field.
-        UsageError: The names are a single text, empty or not unique.
     """
     if names is None:
         return Columns(tuple(field for field in spec.fields if field.dtype == "float" and field.role != "diagnostic"))
@@ -112,10 +108,6 @@ def make_row_format(
 
     ``own`` is the normalization of the dataset, None without training rows. By default, rows have all float fields
     except for diagnostics, in the stored type.
-
-    Raises:
-        DatasetError: There is no such field, or there are no statistics for its normalization.
-        UsageError: The names, the normalization or the type are invalid.
     """
     normalization = normalize if isinstance(normalize, Normalization) else _own(spec, own, normalize)
     layout = select_columns(spec, fields)

@@ -43,15 +43,7 @@ class ShardReader:
         return self.__dict__ | {"_maps": {}, "_scenes": None}
 
     def read(self, shard: Shard, fields: Sequence[Field]) -> Rows:
-        """Read whole fields of a shard into memory.
-
-        Returns:
-            Field name -> values as stored, shape (rows, width) or (rows,).
-
-        Raises:
-            DatasetError: The shard is missing, damaged, of another specification or lacks a field.
-            MachineError: The shard cannot be read.
-        """
+        """Read whole fields of a shard into memory: values as stored, shape (rows, width) or (rows,)."""
         fields, of_scenes = self._split(shard, fields)
         placements = self._header(shard, fields)
         columns = read_columns(shard, placements, [field.name for field in fields])
@@ -65,14 +57,8 @@ class ShardReader:
     def map(self, shard: Shard, fields: Sequence[Field]) -> dict[str, NDArray[Any] | SceneColumn]:
         """Map fields of a shard into memory, to use some of their rows; they are read the first time.
 
-        The system ends a process that uses a part of a map after the file was cut off there.
-
-        Returns:
-            As ``read`` does, but read-only if mapped; fields of scenes are computed for the rows that are used.
-
-        Raises:
-            DatasetError: The shard is missing, damaged, of another specification or lacks a field.
-            MachineError: The shard cannot be read.
+        Mapped values are read-only; fields of scenes are computed for the rows that are used. The system ends a process
+        that uses a part of a map after the file was cut off there.
         """
         fields, of_scenes = self._split(shard, fields)
         scenes = self._scene_columns(shard, of_scenes)

@@ -52,12 +52,7 @@ def empty_packed(rows: int, row_format: RowFormat) -> Packed:
 
 
 def pack(shards: Sequence[Shard], row_format: RowFormat, reader: ShardReader, *, out: Packed) -> None:
-    """Read whole shards into ``out``, one after the other.
-
-    Raises:
-        DatasetError: A shard is missing or damaged, or the normalization has no statistics of a field.
-        MachineError: A shard cannot be read.
-    """
+    """Read whole shards into ``out``, one after the other."""
     layout, first, normalization = row_format.layout, 0, row_format.normalization
     scaling = None if normalization is None else normalization.side_by_side(layout.floats)
     for shard in shards:
@@ -124,12 +119,7 @@ class InMemoryRows:
     def load(self, shards: Sequence[int]) -> NDArray[np.int64]:
         """Load shards, by their indices within the split, that are not in memory yet.
 
-        Returns:
-            Positions of their rows in ``packed``, in the order of the shards, shape (rows,).
-
-        Raises:
-            DatasetError: A shard is missing or damaged, or the normalization has no statistics of a field.
-            MachineError: A shard cannot be read.
+        Return the positions of their rows in ``packed``, in the order of the shards, shape (rows,).
         """
         positions = [np.empty(0, np.int64)]
         for index in shards:
@@ -178,12 +168,7 @@ class Windows:
         self._process = os.getpid()
 
     def batch(self, first: int, last: int, *, rank: int = 0, world: int = 1) -> Batch:
-        """Return the rows at the positions ``range(first + rank, last, world)``, in new arrays.
-
-        Raises:
-            DatasetError: A shard is missing or damaged, or the normalization has no statistics of a field.
-            MachineError: A shard cannot be read.
-        """
+        """Return the rows at the positions ``range(first + rank, last, world)``, in new arrays."""
         tables, integers = [], []
         for packed, rows in self._rows_by_window(first + rank, last, world):
             tables.append(packed.table.take(rows, axis=0))

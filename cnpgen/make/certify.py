@@ -101,9 +101,6 @@ def certified(recipe: DatasetRecipe, *, model: str | Path | None = None) -> Data
     """Return the recipe of the certified dataset, with one more stage and the name ``NAME-certified``.
 
     The model plans the initial guesses. The recipe of a certified dataset is returned unchanged.
-
-    Raises:
-        UsageError: There is no such model.
     """
     if any(isinstance(stage, CertifiedPlan) for stage in recipe.pipeline.stage):
         return recipe

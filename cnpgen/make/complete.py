@@ -172,15 +172,7 @@ def read_tasks(path: Path, fields: Mapping[str, Field], *, flat: bool) -> dict[s
     """Read tasks with known fields from a table; on a table (``flat``), positions need no z.
 
     The file is CSV with column names in the first line, or HDF5 whose datasets are columns or whole fields of shape (N,
-    width), in SI units.
-
-    Returns:
-        Name -> values, shape (N,) or (N, width); (N, 2) for positions without z.
-
-    Raises:
-        UsageError: The file does not exist or is of another kind.
-        DatasetError: The file is damaged, has no tasks, an unknown column, or a value that is not a finite number.
-        MachineError: The file cannot be read.
+    width), in SI units. Values have shape (N,) or (N, width); (N, 2) for positions without z.
     """
     require_file(path, "a table of tasks, CSV or HDF5", kinds=("a text file", *HDF5_KINDS))
     with machine_errors("read", path):

@@ -77,13 +77,10 @@ def states_of_pose(
     start: Array,
     random: np.random.Generator,
 ) -> tuple[Array, Array]:
-    """Return joint positions with a goal pose of a frame.
+    """Return joint positions [rad] that can end a motion, nearest to the start (n,) first, and all with a goal pose.
 
-    Robots without link geometry have no ``states`` of rest in a scene. ``random`` draws the seeds.
-
-    Returns:
-        Joint positions that can end a motion, the nearest to the start (n,) first, and all with this pose [rad], shape
-        (G, n) and (H, n).
+    The shapes are (G, n) and (H, n). Robots without link geometry have no ``states`` of rest in a scene. ``random``
+    draws the seeds.
     """
     positions, rotations = np.tile(pose.position, (POSE_SEEDS, 1)), np.tile(pose.rotation, (POSE_SEEDS, 1, 1))
     tolerances = [np.tile(np.broadcast_to(each, 3), (POSE_SEEDS, 1)) for each in pose.tolerances]
@@ -113,11 +110,7 @@ def nearest_states(states: Array, start: Array, robot: Robot, *, min_difference:
 
 
 def problem_of_poses(recipe: object) -> Problem | None:
-    """Return the problem if an argument is one, or the name or the file of one; otherwise None.
-
-    Raises:
-        RecipeError: The file has mistakes.
-    """
+    """Return the problem if an argument is one, or the name or the file of one; otherwise None."""
     if isinstance(recipe, Problem):
         return recipe
     if not isinstance(recipe, str | Path):
@@ -162,14 +155,10 @@ class PoseTasks:
             raise UsageError("tasks must give goal_xyz, the tip position of the goal", concerns="goal_xyz")
 
     def complete(self, rows: Mapping[str, Array]) -> tuple[Plans, tuple[str, ...]]:
-        """Compute goal states of N tasks independently of each other.
+        """Compute goal states of N tasks, rows of shape (N, width) or (1, width), independently of each other.
 
-        Args:
-            rows: Name -> values, shape (N, width) or (1, width) for all tasks.
-
-        Returns:
-            The goal states of all tasks as boundary problems, at most ``MAX_GOAL_STATES`` for each, the nearest
-            first; and the reason of each task without any.
+        The goal states of all tasks are boundary problems, at most ``MAX_GOAL_STATES`` for each, the nearest first.
+        Tasks without any have a reason.
         """
         count = max(map(len, rows.values()))
         given = {name: np.broadcast_to(values, (count, values.shape[1])) for name, values in rows.items()}

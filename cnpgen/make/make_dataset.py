@@ -279,11 +279,7 @@ def existing_shards(folder: Path, tasks: Sequence[ShardTask]) -> list[ShardTask]
 def find_damaged(
     folder: Path, spec: DatasetSpec, tasks: Sequence[ShardTask], *, progress: Callable[[int, None], None] | None = None
 ) -> dict[ShardTask, str]:
-    """Compare existing shards with their sidecars and the specification; return damaged shard -> description, in order.
-
-    Raises:
-        MachineError: A file cannot be read.
-    """
+    """Compare existing shards with their sidecars and the specification; return damaged shard -> description."""
     damaged = {}
     pool = ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_THREADS))  # sha256 releases the GIL
     try:
@@ -308,11 +304,7 @@ def _problem(folder: Path, spec: DatasetSpec, task: ShardTask) -> str:
 
 
 def delete_shards(folder: Path, tasks: Sequence[ShardTask]) -> None:
-    """Delete shards and the manifest of a dataset, which is unfinished from then on.
-
-    Raises:
-        MachineError: A file cannot be deleted.
-    """
+    """Delete shards and the manifest of a dataset, which is unfinished from then on."""
     # First the manifest and the sidecars, which mark data as complete.
     for name in (MANIFEST, *(name for task in tasks for name in (task.sidecar, task.file))):
         with machine_errors("delete", folder / name):

@@ -92,12 +92,7 @@ def _require_inside(folder: Path, names: Sequence[str] = (*DOCUMENTS, WORK)) -> 
 
 
 def _owners(folders: Sequence[Path], out: Path, spec: DatasetSpec) -> dict[ShardTask, Path]:
-    """Return the folder of each shard to copy.
-
-    Raises:
-        UsageError: Two folders have the same shard.
-        DatasetError: A shard is missing in all folders.
-    """
+    """Return the folder of each shard to copy; raise an error for a shard in two folders or in none."""
     owners: dict[ShardTask, Path] = {}
     missing = []
     for task in shards(spec):

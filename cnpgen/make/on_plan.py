@@ -33,11 +33,7 @@ GOAL = ("goal_q", "goal_dq", "goal_xyz", "hit_angle", "hit_speed", "hit_speed_ma
 
 
 def model_sha256(model: str) -> str:
-    """Return the sha256 of the file of a model, by the name of a shipped one or the file's path.
-
-    Raises:
-        UsageError: There is no such model.
-    """
+    """Return the sha256 of the file of a model, by the name of a shipped one or the file's path."""
     from cnpgen.planner.model_file import find_model
 
     return file_sha256(find_model(model))
@@ -46,9 +42,7 @@ def model_sha256(model: str) -> str:
 def load_stage_planner(model: str, sha256: str, context: Context) -> "Planner":
     """Load the planner of a stage, a shipped model or a model file with the digest ``sha256``.
 
-    Raises:
-        RecipeError: The file has another sha256, or the model is for another problem.
-        UsageError: There is no such model.
+    Raise RecipeError if the file has another sha256, or the model is for another problem.
     """
     from cnpgen.planner.model_file import load_model
     from cnpgen.planner.planner import Planner

@@ -44,12 +44,7 @@ def load_dataset_recipe(name_or_path: str | Path, *, relative_to: Path | None = 
 
 
 def as_dataset_recipe(recipe: object) -> DatasetRecipe:
-    """Return a dataset recipe from a recipe, a name or a path.
-
-    Raises:
-        UsageError: The argument has another type.
-        RecipeError: The files have mistakes; the error lists all of them.
-    """
+    """Return a dataset recipe from a recipe, a name or a path."""
     if isinstance(recipe, DatasetRecipe):
         return recipe
     if isinstance(recipe, str | Path):
@@ -63,12 +58,7 @@ def as_dataset_recipe(recipe: object) -> DatasetRecipe:
 
 
 def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> DatasetRecipe:
-    """Rebuild a recipe from its resolved form in a specification; its URDF file belongs into ``folder``.
-
-    Raises:
-        RecipeError: This version of cnpgen does not support the content.
-        PluginError: A required package is not installed.
-    """
+    """Rebuild a recipe from its resolved form in a specification; its URDF file belongs into ``folder``."""
     pipeline_table = content["pipeline"]
     missing = missing_kinds(registry.STAGES, tables(pipeline_table, "stage"))
     missing += missing_kinds_of_problem(pipeline_table["problem"])
@@ -93,13 +83,7 @@ def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> 
 
 @contextmanager
 def restored(spec: DatasetSpec) -> Iterator[DatasetRecipe]:
-    """Rebuild the recipe of a specification; its URDF is in a temporary folder for the duration of the block.
-
-    Raises:
-        RecipeError: This version of cnpgen does not support the recipe.
-        PluginError: A required package is not installed.
-        DatasetError: The specification holds no recipe.
-    """
+    """Rebuild the recipe of a specification; its URDF is in a temporary folder for the duration of the block."""
     urdf, _ = spec.problem.urdf, spec.stages
     with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
         yield restore_dataset_recipe(dict(spec.recipe), urdf, Path(folder))
@@ -134,11 +118,7 @@ def _wrapped(pipeline: Pipeline) -> DatasetRecipe:
 
 
 def load_notes(recipe: DatasetRecipe) -> str:
-    """Read the notes of a recipe, the file of the same name with suffix ``.md``; empty if it does not exist.
-
-    Raises:
-        RecipeError: The file cannot be read, is a link to another folder, is too large or is not UTF-8.
-    """
+    """Read the notes of a recipe, the file of the same name with suffix ``.md``; empty if it does not exist."""
     if not recipe.path.name:  # built in Python
         return ""
     card = recipe.path.with_suffix(".md")

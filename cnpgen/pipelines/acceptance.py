@@ -37,13 +37,10 @@ ZERO_VELOCITY_ROUNDING_M_S = 1e-14  # rounding error of a velocity that is zero 
 
 
 def acceptance(context: Context, written: set[str], *, given: Collection[End] = ()) -> StageFunction:
-    """Prepare the acceptance check of the columns that the stages write.
+    """Prepare the check of the columns that the stages write, which rejects under the first violated constraint.
 
     Accelerations and torques of the goal are checked if ``goal_ddq`` is among them. The tolerances of motions apply to
     ``given`` ends, whose state is from the user, for example a measurement; to others those of boundary states.
-
-    Returns:
-        A stage function that rejects candidates under the reason of the first violated constraint.
     """
     ends: tuple[End, ...] = ("start", "goal")
     hit = {"start": (), "goal": ("hit_angle", "hit_speed") if "hit_angle" in written else ()}
@@ -95,11 +92,8 @@ def boundary_unmet(
 
     For a hit it is ``(q, dq, ddq, obstacle_poses, position, angle, speed) -> unmet``: the tip velocity must be
     horizontal, along the angle, at the speed. Conditions on derivatives of q higher than ``needs`` are omitted. Unless
-    the state is ``exact``, the tolerances of motions apply, and conditions for boundary states only are omitted.
-    ``cnpgen.pipelines.acceptance`` checks conservative conditions.
-
-    Returns:
-        A function whose result has one row per constraint, one for the tip position, and one for a hit.
+    the state is ``exact``, the tolerances of motions apply, and conditions for boundary states only are omitted. The
+    narrow phase checks conservative conditions. There is a row per constraint, for the tip position, and for a hit.
     """
     import casadi as ca
 

@@ -29,10 +29,6 @@ class Completion:
         context: Problem, robot and kernels.
         given: Columns of the tasks: name -> field.
         height: Tip height on the problem's table [m], the default z of positions; None without a table.
-
-    Raises:
-        UsageError: The pipeline does not accept a column, or requires further columns.
-        RecipeError: The stages are inconsistent with each other or with the problem.
     """
 
     def __init__(self, pipeline: Pipeline, context: Context, given: Collection[str]) -> None:
@@ -59,14 +55,9 @@ class Completion:
         return sum(max(field.width, 1) for field in self._fields)
 
     def __call__(self, columns: Mapping[str, Array]) -> TaskBatch:
-        """Complete N tasks independently of each other.
+        """Complete N tasks independently of each other; unsolved tasks are rejected with an outcome.
 
-        Args:
-            columns: Given columns, name -> values, float64, shape (width, N), or (width, 1) for all tasks. Positions on
-                a table may omit the height.
-
-        Returns:
-            The tasks; unsolved tasks are rejected with an outcome.
+        The given columns have shape (width, N), or (width, 1) for all tasks. Positions on a table may omit the height.
         """
         candidates = TaskBatch(max(values.shape[1] for values in columns.values()))
         for name, values in columns.items():
@@ -90,11 +81,7 @@ class Completion:
         return np.asarray(position)
 
     def rows(self, tasks: TaskBatch) -> dict[str, Array]:
-        """Return the fields of the M solved tasks in the layout of a dataset.
-
-        Returns:
-            Name -> values, shape (M, width), or (M,) for scalars; ``tasks.alive`` has the indices of the tasks.
-        """
+        """Return the fields of the M solved tasks in the layout of a dataset, shape (M, width), or (M,) for scalars."""
         fields = [field for field in self._fields if field.name in tasks.columns]
         return {
             field.name: np.ascontiguousarray(tasks[field.name].T) if field.width else tasks[field.name][0]
@@ -145,11 +132,7 @@ def given_fields(steps: Iterable[PipelineStep], context: Context) -> dict[str, F
 
 
 def _check(pipeline: Pipeline, fields: Mapping[str, Field], given: Collection[str]) -> None:
-    """Check the columns of tasks.
-
-    Raises:
-        UsageError: The pipeline does not accept a column, two columns exclude each other, or no goal is given.
-    """
+    """Raise UsageError for columns that the pipeline does not accept or that exclude each other, or without a goal."""
     for name in given:
         if name not in fields:
             raise UsageError(f"the pipeline {pipeline.name!r} {lacks('column to give', name, fields)}", concerns=name)

@@ -43,8 +43,7 @@ class Pipeline:
 def listed_tasks(pipeline: Pipeline) -> int | None:
     """Return the number of listed tasks of a pipeline; None if no stage lists tasks.
 
-    Raises:
-        RecipeError: More than one stage lists tasks.
+    Raise RecipeError if more than one stage lists tasks.
     """
     listed = [stage.tasks for stage in pipeline.stage if stage.tasks is not None]
     if len(listed) > 1:
@@ -95,12 +94,7 @@ def _with_places(pipeline: Pipeline, where: RecipeLocation, mistakes: list[str])
 
 
 def restore_pipeline(name: str, stages: Sequence[Mapping[str, Any]], problem: Problem) -> Pipeline:
-    """Rebuild a pipeline from the resolved stages of a dataset or model specification.
-
-    Raises:
-        RecipeError: This version of cnpgen does not support the stages.
-        PluginError: A required package is not installed.
-    """
+    """Rebuild a pipeline from the resolved stages of a dataset or model specification."""
     tables = [dict(stage) for stage in stages]
     if missing := missing_kinds(registry.STAGES, list(enumerate(tables))):
         raise PluginError(missing)

@@ -52,9 +52,6 @@ class PreparedPipeline:
         block_rows: Rows per block.
         tasks: Number of listed tasks, all in one block; None for an unlimited pipeline.
         families: Names of the families of scenes; empty without scenes.
-
-    Raises:
-        RecipeError: The stages are inconsistent with each other or with the problem.
     """
 
     def __init__(self, pipeline: Pipeline, *, backend: Backend, cache_folder: Path, dtype: str = "float64") -> None:
@@ -74,21 +71,14 @@ class PreparedPipeline:
             self._accept = acceptance(self.context, written)
 
     def block(self, seed: int, split: str, index: int, *, first: int = 0, stop: int | None = None) -> Block:
-        """Compute rows ``first`` to ``stop``, exclusive, of a block of a split; all rows by default.
-
-        Raises:
-            RecipeError: The accepted fraction of the candidates is below ``MIN_ACCEPTANCE``.
-        """
+        """Compute rows ``first`` to ``stop``, exclusive, of a block of a split; all rows by default."""
         (block,) = self.chunks(seed, split, index, [(first, self.block_rows if stop is None else stop)])
         return block
 
     def chunks(self, seed: int, split: str, index: int, ranges: Sequence[tuple[int, int]]) -> Iterator[Block]:
         """Compute several ranges of rows of one block, sampled only once, and yield each as soon as it is complete.
 
-        The ranges (first, exclusive end) ascend without overlap.
-
-        Raises:
-            RecipeError: The accepted fraction of the candidates is below ``MIN_ACCEPTANCE``.
+        The ranges (first, exclusive end) ascend without overlap. Raise RecipeError if too few candidates are accepted.
         """
         random = random_generator(seed, split, index)
         waiting = deque(BlockChunk(self.fields, first, stop) for first, stop in ranges)

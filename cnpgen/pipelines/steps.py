@@ -51,11 +51,7 @@ def steps_of(pipeline: Pipeline) -> list[PipelineStep]:
 
 
 def stored_fields(steps: Sequence[PipelineStep], context: Context) -> tuple[Field, ...]:
-    """Merge the outputs of the stages, in stored order.
-
-    Raises:
-        RecipeError: Two stages declare a field differently, for example in different units.
-    """
+    """Merge the outputs of the stages, in stored order; raise RecipeError if two stages declare a field differently."""
     fields: dict[str, Field] = {}
     first: dict[str, PipelineStep] = {}
     mistakes = []
@@ -97,8 +93,7 @@ def _declared(field: Field, other: Field) -> str:
 def written_columns(path: Path, steps: Sequence[PipelineStep], context: Context) -> set[str]:
     """Return the columns that the stages of a pipeline write.
 
-    Raises:
-        RecipeError: No earlier stage writes an input of a stage, or no stage writes a required column.
+    Raise RecipeError if no earlier stage writes an input of a stage, or no stage writes a required column.
     """
     written: set[str] = set()
     mistakes = []
@@ -119,11 +114,7 @@ def written_columns(path: Path, steps: Sequence[PipelineStep], context: Context)
 def prepare_steps(
     steps: Sequence[PipelineStep], prepare: Callable[[Stage], StageFunction]
 ) -> list[tuple[str, StageFunction]]:
-    """Prepare and label every stage.
-
-    Raises:
-        RecipeError: Stages cannot be prepared; the error lists all mistakes with file and stage.
-    """
+    """Prepare and label every stage; raise RecipeError with all mistakes, each with file and stage."""
     functions, mistakes = [], []
     for step in steps:
         try:

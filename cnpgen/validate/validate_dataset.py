@@ -44,12 +44,7 @@ class Regeneration:
 
 
 def regenerate_blocks(folder: Path, spec: DatasetSpec, tasks: list[ShardTask], count: int) -> Regeneration:
-    """Regenerate ``count`` random blocks of some shards, or all, and compare them with the stored rows.
-
-    Raises:
-        MachineError: The backend of the dataset does not work on this machine.
-        UsageError: The block size of this version differs.
-    """
+    """Regenerate ``count`` random blocks of some shards, or all, and compare them with the stored rows."""
     size = spec.block_rows
     blocks = [(task, block) for task in tasks for block in blocks_of(task, size)]
     backend, cache_folder = backend_of(folder, spec)
@@ -79,11 +74,7 @@ def regenerate_blocks(folder: Path, spec: DatasetSpec, tasks: list[ShardTask], c
 
 
 def backend_of(folder: Path, spec: DatasetSpec) -> tuple[Backend, Path]:
-    """Return the backend of a dataset and its cache folder.
-
-    Raises:
-        MachineError: The backend does not work on this machine.
-    """
+    """Return the backend of a dataset, which has to work on this machine, and its cache folder."""
     try:
         return choose_backend(spec.backend)
     except MachineError as error:

@@ -75,11 +75,7 @@ class DrawScenes(Stage):
         return work
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
-        """Refuse tasks: the obstacles of a task are those of its problem.
-
-        Raises:
-            UsageError: Always.
-        """
+        """Refuse tasks: their obstacles are those of the problem."""
         name = context.problem.name
         raise UsageError(
             f"tasks have no scenes: complete poses among the obstacles of the problem {name!r}, or use a scene file",
@@ -142,11 +138,7 @@ def base_depths(table: SceneTable) -> NDArray[np.float64]:
 
 
 def scenes_of(candidates: CandidateBatch) -> BatchScenes:
-    """Return the scenes of candidates.
-
-    Raises:
-        RecipeError: No stage has drawn scenes.
-    """
+    """Return the scenes of candidates; raise RecipeError if no stage has drawn any."""
     if candidates.scenes is None:
         raise RecipeError(["needs scenes: expected a stage draw-scenes before it"])
     return candidates.scenes

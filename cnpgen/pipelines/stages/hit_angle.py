@@ -102,11 +102,7 @@ class BehindPuck(Stage):
         return (position_field("goal", low, high),)
 
     def prepare(self, context: Context) -> StageFunction:
-        """Return the stage function.
-
-        Raises:
-            RecipeError: The distance differs from that of the problem's constraint ``puck-contact``.
-        """
+        """Return the stage function; the distance must be that of the constraint ``puck-contact``."""
         contact = context.problem.first(PuckContact)
         if contact is not None and contact.contact_distance != self.distance:
             raise RecipeError(
@@ -120,12 +116,9 @@ class BehindPuck(Stage):
 
 
 def behind(puck: Array, angle: Array, distance: float) -> Array:
-    """Return positions at a distance behind pucks along horizontal hit directions.
+    """Return positions at a distance [m] behind pucks, shape (3, N), or (2, N) without height, along hit directions.
 
-    Args:
-        puck: Positions of the pucks [m], shape (3, N), or (2, N) without height.
-        angle: Hit directions about world z [rad], shape (1, N).
-        distance: Distance behind the puck [m].
+    The directions are angles about world z [rad], shape (1, N).
     """
     along = np.concatenate([np.cos(angle), np.sin(angle), np.zeros(angle.shape)])
     moved: Array = puck - distance * along[: len(puck)]

@@ -169,14 +169,11 @@ def _within(robot: Robot, q: Vec) -> Scalar:
 
 
 def within_limits(robot: Robot, kernel: Kernel, q: Array, *parameters: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Move optima outside joint limits to nearby optima within, by an active-set method with ``held_step``.
+    """Move optima q [rad], shape (n, N), outside joint limits to nearby optima within, by an active-set method.
 
     Joints outside their limits are set to the limit and held. Joints that leave their limits after a solve for the
-    others are held, too. Of the held joints with an inward gradient, the one with the largest is released. The optima q
-    have shape (n, N) [rad]; positions, directions and homes are further arguments of the kernel.
-
-    Returns:
-        ``(q, found)``: configurations within the limits [rad], shape (n, N), and a mask of the optima, shape (N,).
+    others are held, too. Of the held joints with an inward gradient, the one with the largest is released. Positions,
+    directions and homes are further arguments of the kernel. Return configurations and the mask of optima, shape (N,).
     """
     low, high = robot.position_lower[:, None], robot.position_upper[:, None]
     side = np.where(q > high, 1.0, np.where(q < low, -1.0, 0.0))  # sign of the limit on which a joint is held, else 0

@@ -113,12 +113,9 @@ class HittingVelocity(Stage):
 def hitting_velocity(robot: Robot, *, min_speed: float) -> Any:
     """Build the linear program as an SX function ``(q, d) -> (dq, speed, found)``, or of (q, d, normal).
 
-    Hits are at least as fast as ``min_speed`` [m/s].
-
-    Returns:
-        A ``casadi.Function`` with arguments of width n, 2; dq [rad/s] maximizes the tip's speed [m/s] along d. If
-        samples tilt the table, the directions have width 3, and the normal of the table is the third argument.
-        ``found`` is 0 for slower hits, and if the Jacobian is singular and dq is not finite.
+    The joint velocity dq [rad/s] maximizes the tip's speed [m/s] along d, which has width 2. If samples tilt the table,
+    directions have width 3, and the normal of the table is the third argument. ``found`` is 0 for hits that are slower
+    than ``min_speed`` [m/s], and if the Jacobian is singular and dq is not finite.
     """
     import casadi as ca
 

@@ -135,13 +135,10 @@ class BrakingReach(Stage):
 def overshoot(
     tip: Kernel, brake: Kernel, table: Table, q: Array, dq: Array, *, margin: float = 0.0
 ) -> NDArray[np.float64]:
-    """Return the overshoot of full braking, by both kernels, over the worst edge of the table.
+    """Return the overshoot of full braking over the worst edge of the table [m], shape (n,), by both kernels.
 
-    It is computed for states (q, dq) [rad, rad/s], shape (joints, n) each, reversed for the goal, that come closer to
-    an edge than the margin [m].
-
-    Returns:
-        Distance outside the edge [m], shape (n,); -inf if a straight line stays inside by the margin for 80 ms.
+    It is -inf if a straight line stays inside by the margin [m] for 80 ms. The states (q, dq) [rad, rad/s] have shape
+    (joints, n) each; those of goals are reversed.
     """
     # for both edges across x and across y
     position, velocity = (np.repeat(values[:2], 2, axis=0) for values in tip(q, dq))
