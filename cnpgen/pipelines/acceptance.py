@@ -155,7 +155,9 @@ def narrow_phase_of(context: Context, end: End, *, exact: bool = True) -> Decide
             if problem.constraint[row].uses_obstacles and not one_scene:
                 continue
             candidates = np.flatnonzero(remaining[row])
-            tolerance = _tolerance(problem.constraint[row], context.dtype, exact=exact)
+            tolerance = BOUNDARY_TOLERANCES[context.dtype]["position"]
+            if not exact:
+                tolerance = max(tolerance, problem.constraint[row].effective_tolerance)
             q, dq, ddq = (np.ascontiguousarray(values[:, candidates], float) for values in state)
             path.set_path(q, dq, ddq, obstacle_poses[:, 0])
             met = problem.constraint[row].met(path, tolerance)
@@ -216,12 +218,6 @@ def _one_by_one(context: Context, end: End, *, exact: bool) -> Callable[[States,
         return violated
 
     return measure
-
-
-def _tolerance(constraint: Constraint, dtype: str, *, exact: bool) -> float:
-    """Return the tolerance of a boundary state for conditions in units of length [m]."""
-    tolerance = BOUNDARY_TOLERANCES[dtype]["position"]
-    return tolerance if exact else max(tolerance, constraint.effective_tolerance)
 
 
 def _violates(constraint: Constraint, world: World, end: End, dtype: str, *, exact: bool) -> bool:

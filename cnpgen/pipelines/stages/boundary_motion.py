@@ -2,6 +2,7 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -201,10 +202,8 @@ def table_velocity(robot: Robot) -> Any:
     kin = forward_kinematics(robot.chain, q)
     limit = [float(x) for x in robot.velocity_limit]
     on_manifold = _project([x * bound for x, bound in zip(u, limit, strict=True)], [c[2] for c in kin.jacobian], limit)
-    largest: Scalar = ca.SX(0)
-    for x, bound in zip(on_manifold, limit, strict=True):
-        largest = ca.fmax(largest, ca.fabs(x) / bound)
-    dq = scale(on_manifold, s[0] / largest)
+    ratios = (ca.fabs(x) / bound for x, bound in zip(on_manifold, limit, strict=True))
+    dq = scale(on_manifold, s[0] / reduce(ca.fmax, ratios, ca.SX(0)))
     return ca.Function("table_velocity", [q_sx, u_sx, s_sx], [ca.vertcat(*dq), ca.vertcat(*tip_velocity(kin, dq))])
 
 

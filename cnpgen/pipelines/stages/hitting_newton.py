@@ -55,8 +55,7 @@ def direction_symbols(robot: Robot) -> tuple[Any, Vec]:
 
 def along(direction: Vec, vector: Vec) -> Scalar:
     """Return the component of a vector along a direction of 2 or 3 components."""
-    first = direction[0] * vector[0] + direction[1] * vector[1]
-    return first if len(direction) == 2 else first + direction[2] * vector[2]
+    return dot(direction, vector[: len(direction)])
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,9 @@ class BallisticReach(Stage):
                 candidates.reject(ahead[0] > 0, f"the start {reason}")
             if self.goal_time:
                 goal = on_table(context, candidates, candidates["goal_xyz"])[:2]
-                _, both = over(goal, self.goal_time * hit_velocity(candidates), *corners)
+                angle, speed = candidates["hit_angle"], candidates["hit_speed"]
+                velocity = np.concatenate([speed * np.cos(angle), speed * np.sin(angle)])
+                _, both = over(goal, self.goal_time * velocity, *corners)
                 candidates.reject(both[0] > 0, f"the hit {reason}")
 
         return work
@@ -94,12 +96,6 @@ def over_table(*, sides: list[list[float]] | None) -> Any:
 
     ahead, behind = is_over(add(p, d)), is_over(subtract(p, d))
     return ca.Function("over_table", given, [ahead, ca.logic_and(ahead, behind)])
-
-
-def hit_velocity(candidates: CandidateBatch) -> Array:
-    """Return the velocity of the tip on the table at the goal [m/s], shape (2, n)."""
-    angle, speed = candidates["hit_angle"], candidates["hit_speed"]
-    return np.concatenate([speed * np.cos(angle), speed * np.sin(angle)])
 
 
 @dataclass(frozen=True, kw_only=True)

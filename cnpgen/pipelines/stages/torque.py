@@ -1,6 +1,7 @@
 """Stage: the torque that holds the arm and its payload still, by inverse dynamics."""
 
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -51,8 +52,7 @@ def torque_ratio(robot: Robot) -> Any:
 
     (q_sx, q), (parameters_sx, parameters) = symbols("q", robot.n), symbols("parameters", len(robot.parameters))
     zero = [0.0] * robot.n
-    largest = ca.SX(0)
-    state = SymbolicState(robot, q, zero, zero, parameters, (), None)
-    for torque, limit in zip(state.torque, robot.torque_limit, strict=True):
-        largest = ca.fmax(largest, ca.fabs(torque) / float(limit))
-    return ca.Function("torque_ratio", [q_sx, parameters_sx] if parameters else [q_sx], [largest])
+    torque = SymbolicState(robot, q, zero, zero, parameters, (), None).torque
+    ratios = (ca.fabs(value) / limit for value, limit in zip(torque, robot.torque_limit.tolist(), strict=True))
+    arguments = [q_sx, parameters_sx] if parameters else [q_sx]
+    return ca.Function("torque_ratio", arguments, [reduce(ca.fmax, ratios, ca.SX(0))])
