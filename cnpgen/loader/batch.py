@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import DatasetError
 from cnpgen.loader.normalization import Normalization
 from cnpgen.loader.row_format import Columns
-from cnpgen.loader.scene_columns import OBSTACLE_POSES, problem_obstacles
+from cnpgen.loader.shard_reader import OBSTACLE_POSES, problem_obstacles
 from cnpgen.problems.scenes.observe import MAX_SEED, Scenes, observe
 from cnpgen.robots.observation.observations import Observation
 from cnpgen.robots.obstacle import Obstacle

@@ -19,8 +19,7 @@ from cnpgen.loader.batches import Batches, BatchPartition, Observe, checked_posi
 from cnpgen.loader.gather import Rows, Split, gather
 from cnpgen.loader.normalization import Normalization, make_normalization
 from cnpgen.loader.row_format import RowFormat, make_row_format, select_columns
-from cnpgen.loader.scene_columns import OBSTACLE_POSES, problem_obstacles, scene_fields
-from cnpgen.loader.shard_reader import ShardReader, SplitShards
+from cnpgen.loader.shard_reader import OBSTACLE_POSES, ShardReader, SplitShards, problem_obstacles, scene_fields
 from cnpgen.robots.observation.observations import Observation
 from cnpgen.robots.scene import Scene
 from cnpgen.schema.argument_types import checked_arguments

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
-from cnpgen.loader.scene_columns import OBSTACLE_POSES
+from cnpgen.loader.shard_reader import OBSTACLE_POSES
 from cnpgen.store.field import Field
 from cnpgen.store.scene_table import SCENE_ARRAYS
 from cnpgen.store.statistics import FieldStatistics

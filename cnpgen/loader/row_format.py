@@ -10,7 +10,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.loader.normalization import Normalization
-from cnpgen.loader.scene_columns import scene_fields
+from cnpgen.loader.shard_reader import scene_fields
 from cnpgen.store.dataset_spec import DatasetSpec
 from cnpgen.store.field import Field
 

@@ -17,9 +17,8 @@ from cnpgen.make.goal_poses import MAX_GOAL_STATES, PoseTasks, problem_of_poses
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.make.recipe_file import as_dataset_recipe
 from cnpgen.pipelines.completion import Completion, given_fields, table_height
-from cnpgen.pipelines.pipeline import Pipeline
+from cnpgen.pipelines.pipeline import Pipeline, steps_of
 from cnpgen.pipelines.stages.stage import Context, load_context
-from cnpgen.pipelines.steps import steps_of
 from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem

@@ -7,9 +7,8 @@ import numpy as np
 from cnpgen.errors import UsageError, lacks
 from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.pipelines.acceptance import acceptance
-from cnpgen.pipelines.pipeline import Pipeline
+from cnpgen.pipelines.pipeline import Pipeline, PipelineStep, prepare_steps, steps_of, stored_fields, written_columns
 from cnpgen.pipelines.stages.stage import Array, Context, TaskBatch
-from cnpgen.pipelines.steps import PipelineStep, prepare_steps, steps_of, stored_fields, written_columns
 from cnpgen.problems.constraints.constraint import End
 from cnpgen.problems.constraints.puck_contact import PuckContact
 from cnpgen.problems.constraints.table import Table

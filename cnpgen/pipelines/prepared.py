@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.kernels.library import Backend
 from cnpgen.pipelines.acceptance import acceptance
-from cnpgen.pipelines.pipeline import Pipeline, listed_tasks
+from cnpgen.pipelines.pipeline import Pipeline, listed_tasks, prepare_steps, steps_of, stored_fields, written_columns
 from cnpgen.pipelines.stages.draw_scenes import DrawScenes
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, load_context
-from cnpgen.pipelines.steps import prepare_steps, steps_of, stored_fields, written_columns
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES
 from cnpgen.store.field import Field
 from cnpgen.store.sampling_statistics import DensityMap, SamplingStatistics

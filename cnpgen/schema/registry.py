@@ -41,7 +41,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "hit-angle-to-goal": "cnpgen.pipelines.stages.hit_angle:HitAngleToGoal",
         "hit-angle-in-cone": "cnpgen.pipelines.stages.hit_angle:HitAngleInCone",
         "behind-puck": "cnpgen.pipelines.stages.hit_angle:BehindPuck",
-        "home": "cnpgen.pipelines.stages.home:Home",
+        "home": "cnpgen.pipelines.stages.ik:Home",
         "hitting-configuration": "cnpgen.pipelines.stages.hitting_configuration:HittingConfiguration",
         "hitting-velocity": "cnpgen.pipelines.stages.hitting_velocity:HittingVelocity",
         "at-rest": "cnpgen.pipelines.stages.boundary_motion:AtRest",

@@ -1,4 +1,4 @@
-"""Inverse kinematics: stages for positions of start and goal, free or vertical, and a step for poses of the tip."""
+"""Inverse kinematics: stages for positions of start, home and goal, free or vertical, and their step."""
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from cnpgen.errors import RecipeError
-from cnpgen.kernels.symbolic.kinematics import Kinematics, forward_kinematics
+from cnpgen.kernels.symbolic.kinematics import Kinematics, forward_kinematics, tip_position
 from cnpgen.kernels.symbolic.linalg import (
     Scalar,
     Vec,
@@ -19,11 +19,10 @@ from cnpgen.kernels.symbolic.linalg import (
     solve,
     subtract,
     symbols,
-    transposed_times,
 )
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.stages.candidate_table import upright_axes
-from cnpgen.pipelines.stages.draw import uniform
+from cnpgen.pipelines.stages.draw import check_reach, uniform
 from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.robots.plausible_values import find_implausible_value
 from cnpgen.robots.robot import Robot
@@ -38,13 +37,6 @@ IK_DAMPING = 1e-9
 # The damping vanishes with the error e, so convergence stays quadratic.
 MAX_LIMIT_DAMPING = 1e-2
 LIMIT_DAMPING_RATE = 1e-1
-# Inverse kinematics of poses
-METERS_PER_RADIAN = 0.3  # weight of an angle against a distance
-POSE_TOLERANCE = 1e-9  # m and weighted rad, before the last step
-MAX_POSE_IK_STEPS = 30
-MAX_POSE_IK_STEP_RAD = 0.5  # of any joint
-POSE_DAMPING = 1e-3  # relative to the squared error (Sugihara 2011)
-MIN_DAMPING = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -241,11 +233,11 @@ def ik_step(robot: Robot, *, vertical: bool, max_step: float, hold: bool = False
         ca.logic_and(float(low) <= x, x <= float(high))
         for x, low, high in zip(target, robot.position_lower, robot.position_upper, strict=True)
     ]
-    moved = [ca.if_else(ok, 0.0, x - at) for ok, x, at in zip(free, _clip(target, robot), q, strict=True)]
+    moved = [ca.if_else(ok, 0.0, x - at) for ok, x, at in zip(free, clip_to_limits(target, robot), q, strict=True)]
     rest = [factor * e - dot(row, moved) for e, row in zip(error, rows, strict=True)]
     left = [[x * ok for x, ok in zip(row, free, strict=True)] for row in rows]
     again, _ = clipped_step(left, rest, max_step, IK_DAMPING + ca.fmin(MAX_LIMIT_DAMPING, LIMIT_DAMPING_RATE * square))
-    following = _clip(add(add(q, moved), again), robot)
+    following = clip_to_limits(add(add(q, moved), again), robot)
     given = [q_sx, p_sx, *([held_sx] if hold else []), *([axes_sx] if turned else [])]
     return ca.Function("ik", given, [ca.vertcat(*following), ca.sqrt(square)])
 
@@ -273,13 +265,14 @@ def clipped_step(rows: list[Vec], error: Vec, max_step: float, damping: Scalar) 
     """Return the least-norm step that corrects the error, shortened to ``max_step``, and the factor of shortening."""
     import casadi as ca
 
-    step = transposed_times(rows, solve(gram(rows, damping), error))
+    weights = solve(gram(rows, damping), error)
+    step = [dot(column, weights) for column in zip(*rows, strict=True)]
     largest = reduce(ca.fmax, map(ca.fabs, step))
     factor = ca.fmin(1.0, max_step / ca.fmax(largest, 1e-9))
     return scale(step, factor), factor
 
 
-def _clip(q: Vec, robot: Robot) -> Vec:
+def clip_to_limits(q: Vec, robot: Robot) -> Vec:
     """Move joint positions outside their limits to the limits."""
     import casadi as ca
 
@@ -287,26 +280,55 @@ def _clip(q: Vec, robot: Robot) -> Vec:
     return [ca.fmin(ca.fmax(x, low), high) for x, low, high in bounds]
 
 
-def pose_ik_step(robot: Robot) -> Any:
-    """Build ``(q, position, rotation by rows) -> (next q, |error|)``; steps end at the joint limits.
+@dataclass(frozen=True, kw_only=True)
+class Home(GuessedIK):
+    """Stage: home is the start, the base, or a configuration for a random position, with given fractions."""
 
-    The error is the distance from the position, and the rotation vector to the rotation times ``METERS_PER_RADIAN``,
-    stretched to twice the tangent of half the angle, so that rotations by 180 degrees are no fixed point.
-    """
-    import casadi as ca
+    inputs = ("start_q", "start_xyz")
+    at_start: float = field("fraction of homes at the start configuration", low=0.0, high=1.0)
+    at_base: float = field("fraction of homes at the base configuration", low=0.0, high=1.0, default=0.0)
+    position: tuple[Range, Range, Range] = field("box of tip positions of the other homes: x, y, z", unit="m")
 
-    (q_sx, q), (p_sx, p), (r_sx, r) = symbols("q", robot.n), symbols("p", 3), symbols("r", 9)
-    kin = forward_kinematics(robot.chain, q)
-    target = [r[0:3], r[3:6], r[6:9]]
-    relative = [[dot(a, b) for b in kin.rotation] for a in target]  # target times the transposed rotation
-    trace = relative[0][0] + relative[1][1] + relative[2][2]
-    stretch = METERS_PER_RADIAN * 2.0 / ca.fmax(1.0 + trace, 1e-2)
-    turn = [relative[2][1] - relative[1][2], relative[0][2] - relative[2][0], relative[1][0] - relative[0][1]]
-    error = [*subtract(p, kin.tip), *scale(turn, stretch)]
-    axes = [axis if turns else [0.0] * 3 for axis, turns in zip(kin.axes, kin.turning, strict=True)]
-    rows = [[column[row] for column in kin.jacobian] for row in range(3)]
-    rows += [[METERS_PER_RADIAN * axis[row] for axis in axes] for row in range(3)]
-    square = dot(error, error)
-    step, _ = clipped_step(rows, error, MAX_POSE_IK_STEP_RAD, POSE_DAMPING * square + MIN_DAMPING)
-    following = _clip(add(q, step), robot)
-    return ca.Function("pose_ik", [q_sx, p_sx, r_sx], [ca.vertcat(*following), ca.sqrt(square)])
+    def find_mistakes(self) -> Iterator[tuple[str, str]]:
+        if self.at_start + self.at_base > 1:
+            yield "at_base", f"the fractions must not be more than 1 together, got {self.at_start + self.at_base:g}"
+
+    def describe(self) -> str:
+        elsewhere = max(1 - self.at_start - self.at_base, 0.0)
+        return (
+            f"choose a home: the start configuration in {100 * self.at_start:.4g} % of the cases, the base in"
+            f" {100 * self.at_base:.4g} %, one for a random position{self._how()} from {self._origin()} in"
+            f" {100 * elsewhere:.4g} %"
+        )
+
+    def outputs(self, context: Context) -> tuple[Field, ...]:
+        text = "joint positions that those at the goal are chosen close to"
+        return (context.joint_field("home_q", "rad", text, "diagnostic"),)
+
+    def writes(self, context: Context) -> tuple[str, ...]:
+        """List the home configuration and its tip position."""
+        return "home_q", "home_xyz"
+
+    def prepare(self, context: Context) -> StageFunction:
+        check_reach(context, (("position", self.position),))
+        guess_home, tip = self._solve_guessed(context, "home"), context.kernels.load(tip_position)
+        base = context.robot.base[:, None]
+
+        def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            candidates["home_xyz"] = uniform(candidates.draw(random, 3), self.position)
+            candidates["home_choice"] = candidates.draw(random, 1)
+            guess_home(candidates, random)
+            choice, elsewhere = candidates["home_choice"][0], candidates["home_q"]
+            home = np.where(choice < self.at_start + self.at_base, base, elsewhere)
+            candidates["home_q"] = np.where(choice < self.at_start, candidates["start_q"], home)
+            (candidates["home_xyz"],) = tip(candidates["home_q"])
+
+        return work
+
+    def complete(self, context: Context, given: Collection[str]) -> StageFunction:
+        """Use the start: goals of tasks are chosen near the start configuration."""
+
+        def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
+            candidates["home_q"], candidates["home_xyz"] = candidates["start_q"], candidates["start_xyz"]
+
+        return work

@@ -2,18 +2,19 @@
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
-from cnpgen.kernels.symbolic.kinematics import tip_position
+from cnpgen.kernels.symbolic.kinematics import forward_kinematics, tip_position
+from cnpgen.kernels.symbolic.linalg import add, dot, scale, subtract, symbols
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.stages.batch_scenes import BatchScenes
 from cnpgen.pipelines.stages.draw import position_field
 from cnpgen.pipelines.stages.draw_scenes import scenes_of
-from cnpgen.pipelines.stages.ik import MAX_POSE_IK_STEPS, POSE_TOLERANCE, pose_ik_step
+from cnpgen.pipelines.stages.ik import clip_to_limits, clipped_step
 from cnpgen.pipelines.stages.scene_clearance import SceneClearance
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction, leave
 from cnpgen.pipelines.stages.torque import torque_ratio
@@ -30,6 +31,13 @@ FIRST_PHASES = (0.5, 0.25, 0.75)  # of a straight line, checked first
 OTHER_PHASES = tuple(k / 16 for k in range(1, 16, 2))
 NO_ENDS = "no collision-free start and goal in the scene"
 NUMBERS_PER_PAIR = 5  # random numbers: kind of start, and two for each of two states, less one
+# Inverse kinematics of poses
+METERS_PER_RADIAN = 0.3  # weight of an angle against a distance
+POSE_TOLERANCE = 1e-9  # m and weighted rad, before the last step
+MAX_POSE_IK_STEPS = 30
+MAX_POSE_IK_STEP_RAD = 0.5  # of any joint
+POSE_DAMPING = 1e-3  # relative to the squared error (Sugihara 2011)
+MIN_DAMPING = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -284,3 +292,28 @@ def _across(axis: Array) -> tuple[Array, Array]:
     first = np.cross(helper, axis)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return first, np.cross(axis, first)
+
+
+def pose_ik_step(robot: Robot) -> Any:
+    """Build ``(q, position, rotation by rows) -> (next q, |error|)``; steps end at the joint limits.
+
+    The error is the distance from the position, and the rotation vector to the rotation times ``METERS_PER_RADIAN``,
+    stretched to twice the tangent of half the angle, so that rotations by 180 degrees are no fixed point.
+    """
+    import casadi as ca
+
+    (q_sx, q), (p_sx, p), (r_sx, r) = symbols("q", robot.n), symbols("p", 3), symbols("r", 9)
+    kin = forward_kinematics(robot.chain, q)
+    target = [r[0:3], r[3:6], r[6:9]]
+    relative = [[dot(a, b) for b in kin.rotation] for a in target]  # target times the transposed rotation
+    trace = relative[0][0] + relative[1][1] + relative[2][2]
+    stretch = METERS_PER_RADIAN * 2.0 / ca.fmax(1.0 + trace, 1e-2)
+    turn = [relative[2][1] - relative[1][2], relative[0][2] - relative[2][0], relative[1][0] - relative[0][1]]
+    error = [*subtract(p, kin.tip), *scale(turn, stretch)]
+    axes = [axis if turns else [0.0] * 3 for axis, turns in zip(kin.axes, kin.turning, strict=True)]
+    rows = [[column[row] for column in kin.jacobian] for row in range(3)]
+    rows += [[METERS_PER_RADIAN * axis[row] for axis in axes] for row in range(3)]
+    square = dot(error, error)
+    step, _ = clipped_step(rows, error, MAX_POSE_IK_STEP_RAD, POSE_DAMPING * square + MIN_DAMPING)
+    following = clip_to_limits(add(q, step), robot)
+    return ca.Function("pose_ik", [q_sx, p_sx, r_sx], [ca.vertcat(*following), ca.sqrt(square)])
