@@ -11,7 +11,7 @@ from cnpgen.benchmark.pucks import Pucks, hits_of
 from cnpgen.benchmark.replanning_scenario import ExecutedPrefix, ReplanningScenario, scenario_problems
 from cnpgen.errors import CnpgenError, nearest
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
-from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.pipelines.stages.draw import MAX_TASKS
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.scene_plans import scene_plans

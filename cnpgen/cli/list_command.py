@@ -57,7 +57,7 @@ def list_all(what: str) -> list[dict[str, Any]]:
 
 
 def _dataset(name: str, _: Path) -> dict[str, Any]:
-    from cnpgen.make.recipe_file import load_dataset_recipe
+    from cnpgen.make.recipe import load_dataset_recipe
 
     recipe = load_dataset_recipe(name)
     rows = sum(recipe.splits.values())

@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from cnpgen.errors import DatasetError, UsageError, counted, nearest
 from cnpgen.kernels.library import choose_backend
 from cnpgen.make.goal_poses import MAX_GOAL_STATES, PoseTasks, problem_of_poses
-from cnpgen.make.recipe import DatasetRecipe
-from cnpgen.make.recipe_file import as_dataset_recipe
+from cnpgen.make.recipe import DatasetRecipe, as_dataset_recipe
 from cnpgen.pipelines.completion import Completion, given_fields, table_height
 from cnpgen.pipelines.pipeline import Pipeline, steps_of
 from cnpgen.pipelines.stages.stage import Context, load_context

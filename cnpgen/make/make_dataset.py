@@ -17,8 +17,7 @@ from cnpgen.errors import DatasetError, UsageError
 from cnpgen.machine.engine import Engine, assembled
 from cnpgen.make.certify import certified
 from cnpgen.make.make_shards import Job, make_shards
-from cnpgen.make.recipe import DatasetRecipe
-from cnpgen.make.recipe_file import as_dataset_recipe, load_notes
+from cnpgen.make.recipe import DatasetRecipe, as_dataset_recipe, load_notes
 from cnpgen.make.resolve_spec import dataset_folder, draw_up
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS
 from cnpgen.schema.argument_types import checked_arguments

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import MachineError
 from cnpgen.kernels.library import Backend, choose_backend
 from cnpgen.machine.versions import versions
-from cnpgen.make.recipe_file import makes_its_rows, restored
+from cnpgen.make.recipe import makes_its_rows, restored
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.prepared import Block, PreparedPipeline
 from cnpgen.robots.scene_arrays import scene_poses

@@ -13,8 +13,7 @@ from cnpgen.kernels.library import Backend, choose_backend
 from cnpgen.machine.engine import Engine
 from cnpgen.machine.versions import versions
 from cnpgen.make.make_shards import Job, blocks_of, prepare, shard_columns
-from cnpgen.make.recipe import DatasetRecipe, recipe_digest, resolved_digest
-from cnpgen.make.recipe_file import restored
+from cnpgen.make.recipe import DatasetRecipe, recipe_digest, resolved_digest, restored
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.store.check import REPLACE_HINT, Finding, check_dataset

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from cnpgen.cli.main import main
-from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.pipelines.pipeline import load_pipeline
 from cnpgen.problems.problem import resolved
 from cnpgen.problems.problem_file import load_problem

@@ -15,7 +15,7 @@ from cnpgen.cli.describe import (
     recipe_to_dict,
     table,
 )
-from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.pipelines.pipeline import load_pipeline
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.schema.catalogue import list_recipes

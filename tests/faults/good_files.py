@@ -11,8 +11,7 @@ import numpy as np
 from cnpgen.benchmark.results_file import answer_to_dict, open_results
 from cnpgen.benchmark.suite import list_suites
 from cnpgen.make.make_dataset import make_dataset
-from cnpgen.make.recipe import DatasetRecipe
-from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.recipe import DatasetRecipe, load_dataset_recipe
 from cnpgen.planner.model_file import save_model
 from cnpgen.plans.save import save_plans
 from cnpgen.refine.refinement_journal import open_journal

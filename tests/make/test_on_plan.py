@@ -18,7 +18,7 @@ from cnpgen.make.on_plan import (
     model_sha256,
     of_plan,
 )
-from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.pipelines.completion import Completion
 from cnpgen.pipelines.prepared import random_generator
 from cnpgen.pipelines.stages.stage import CandidateBatch, load_context

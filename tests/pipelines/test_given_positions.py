@@ -8,7 +8,7 @@ import pytest
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.make.make_dataset import make_dataset
-from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.pipelines.pipeline import load_pipeline
 from cnpgen.pipelines.stages.hit_angle import BehindPuck
 from cnpgen.pipelines.stages.stage import CandidateBatch, Context
