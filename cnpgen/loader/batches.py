@@ -199,8 +199,11 @@ class Batches:
         """
         source, partition = self._source, self._partition
         begin = position = self._position = self._forward(self._position)
-        windows, end = self._windows(begin), partition.end(source.rows, first=begin.row)
-        row = begin.row
+        rows = tuple(shard.rows for shard in source.shards)
+        order = Order(source.split, rows, begin.seed, begin.epoch, begin.shuffle)
+        self._in_memory = self._in_memory or make_in_memory_rows(source, self._row_format)
+        windows = Windows(source, self._row_format, order, self._in_memory)
+        row, end = begin.row, partition.end(source.rows, first=begin.row)
         while (first := row + partition.worker * partition.batch_size) < end:
             batch = windows.batch(
                 first, min(first + partition.batch_size, end), rank=partition.rank, world=partition.world
@@ -210,13 +213,6 @@ class Batches:
             yield batch if self._observe is None else replace(batch, observations=self._observe(batch))
             if self._position is not position:
                 raise UsageError("within this loop, another loop over the same batches ran or load_state was called")
-
-    def _windows(self, begin: Position) -> Windows:
-        """Return the windows of an epoch."""
-        rows = tuple(shard.rows for shard in self._source.shards)
-        order = Order(self._source.split, rows, begin.seed, begin.epoch, begin.shuffle)
-        self._in_memory = self._in_memory or make_in_memory_rows(self._source, self._row_format)
-        return Windows(self._source, self._row_format, order, self._in_memory)
 
     def _forward(self, position: Position) -> Position:
         """Return the first position of the next epoch if no batch remains in this one, otherwise the position."""

@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from cnpgen.errors import DatasetError, MissingExtraError, UsageError, lacks
 from cnpgen.loader.batch import observer_of
 from cnpgen.loader.batches import Batches, BatchPartition, Observe, checked_position
-from cnpgen.loader.gather import Rows, Split, gather
+from cnpgen.loader.gather import Split, gather
 from cnpgen.loader.normalization import Normalization, make_normalization
 from cnpgen.loader.row_format import RowFormat, make_row_format, select_columns
-from cnpgen.loader.shard_reader import OBSTACLE_POSES, ShardReader, SplitShards, problem_obstacles, scene_fields
+from cnpgen.loader.shard_reader import OBSTACLE_POSES, Rows, ShardReader, SplitShards, problem_obstacles, scene_fields
 from cnpgen.robots.observation.observations import Observation
 from cnpgen.robots.scene import Scene
 from cnpgen.schema.argument_types import checked_arguments

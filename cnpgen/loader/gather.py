@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.loader.row_format import Columns, RowFormat
-from cnpgen.loader.shard_reader import SplitShards
+from cnpgen.loader.shard_reader import Rows, SplitShards
 from cnpgen.schema.arguments import reject_masked
 from cnpgen.store.shard import storage_dtype
 
-Rows = dict[str, NDArray[Any]]
 Indices = NDArray[np.int64]
 
 MAX_READ_ROWS_PER_ROW = 8  # of a shard whose file is read and not mapped

@@ -167,20 +167,15 @@ class ShardReader:
         """Map a shard into memory; None if the file system does not support it."""
         if (existing := self._maps.get(shard.path)) is not None:
             return existing
-        mapped = _mapped(shard)
-        if mapped is not None:
-            for oldest in list(self._maps)[: max(len(self._maps) - MAX_MEMORY_MAPS + 1, 0)]:
-                self._maps.pop(oldest, None)  # stays mapped as long as arrays of it are in use
-            self._maps[shard.path] = mapped
+        try:
+            with shard.path.open("rb") as file:
+                mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        except (OSError, ValueError):  # the file is then read without mapping
+            return None
+        for oldest in list(self._maps)[: max(len(self._maps) - MAX_MEMORY_MAPS + 1, 0)]:
+            self._maps.pop(oldest, None)  # stays mapped as long as arrays of it are in use
+        self._maps[shard.path] = mapped
         return mapped
-
-
-def _mapped(shard: Shard) -> mmap.mmap | None:
-    try:
-        with shard.path.open("rb") as file:
-            return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    except (OSError, ValueError):  # the file is then read without mapping
-        return None
 
 
 @dataclass(frozen=True, eq=False)

@@ -174,7 +174,11 @@ def read_tasks(path: Path, fields: Mapping[str, Field], *, flat: bool) -> dict[s
     """
     require_file(path, "a table of tasks, CSV or HDF5", kinds=("a text file", *HDF5_KINDS))
     with machine_errors("read", path):
-        columns = _hdf5_columns(path) if is_hdf5(path) else _csv_columns(path)
+        if is_hdf5(path):
+            columns = _hdf5_columns(path)
+        else:
+            table = read_csv_table(path, example="goal_xyz.x,goal_xyz.y")
+            columns = {name: table.numbers(name) for name in table.names}
     if columns and not any(values.size for values in columns.values()):
         raise DatasetError(f"{path} has no tasks: it names columns ({', '.join(columns)}), but has no numbers")
     known = {**fields, **{column: field for field in fields.values() for column in field.columns}}
@@ -214,8 +218,3 @@ def _hdf5_columns(path: Path) -> dict[str, Array]:
         shapes = ", ".join(f"{name} {values.shape}" for name, values in columns.items())
         raise DatasetError(f"{path}: columns must have one value per task each, got {shapes}")
     return columns
-
-
-def _csv_columns(path: Path) -> dict[str, Array]:
-    table = read_csv_table(path, example="goal_xyz.x,goal_xyz.y")
-    return {name: table.numbers(name) for name in table.names}

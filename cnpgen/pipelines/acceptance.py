@@ -178,7 +178,12 @@ def narrow_phase_of_scenes(context: Context, end: End, *, exact: bool = True) ->
     problem, clearance = context.problem, SceneClearance(context)
     by_distance = np.array([isinstance(each, RobotClearance | SelfClearance) for each in problem.constraint], bool)
     measure_one_by_one = _one_by_one(context, end, exact=exact)
-    conservative = _conservative(context, end) & ~by_distance
+    obstacles, width = problem.obstacle, problem.scene_width
+    _, symbolic_state = SymbolicState.of_symbols(context.robot, obstacles, problem.object_size, width)
+    conservative = ~by_distance  # the constraints with conservative conditions
+    for row in np.flatnonzero(conservative):
+        conditions = problem.constraint[row].symbolic_at(symbolic_state, end)
+        conservative[row] = any(condition.sufficient for condition in conditions)
 
     def decide_states(state: States, obstacle_poses: Array, mask: Mask, candidates: CandidateBatch | None) -> Mask:
         q, remaining = np.ascontiguousarray(state[0], float), np.zeros((len(by_distance), len(mask)), bool)
@@ -190,17 +195,6 @@ def narrow_phase_of_scenes(context: Context, end: End, *, exact: bool = True) ->
         return measure_one_by_one(state, obstacle_poses, remaining)
 
     return decide_states
-
-
-def _conservative(context: Context, end: End) -> Mask:
-    """Return which constraints have conservative conditions at an end, shape (constraints,)."""
-    robot, problem = context.robot, context.problem
-    _, state = SymbolicState.of_symbols(robot, problem.obstacle, problem.object_size, problem.scene_width)
-    each = (
-        () if isinstance(constraint, RobotClearance | SelfClearance) else constraint.symbolic_at(state, end)
-        for constraint in problem.constraint
-    )
-    return np.array([any(condition.sufficient for condition in conditions) for conditions in each], bool)
 
 
 def _one_by_one(context: Context, end: End, *, exact: bool) -> Callable[[States, Array, Mask], Mask]:

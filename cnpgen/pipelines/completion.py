@@ -64,7 +64,11 @@ class Completion:
             whole = self._on_table(values, columns.get("parameters")) if flat else values
             same = whole if whole.shape[1] == candidates.size else np.broadcast_to(whole, (len(whole), candidates.size))
             candidates[name] = np.ascontiguousarray(same)
-        self._derive(candidates)
+        for name in self._derived:
+            if name == "start_q":
+                candidates[name] = np.repeat(self.context.robot.base[:, None], candidates.size, axis=1)
+            else:
+                candidates[name] = self.tip_positions(candidates[name.replace("xyz", "q")])
         for label, run_stage in self._stages:
             candidates.stage = label
             run_stage(candidates, self._random)
@@ -100,13 +104,6 @@ class Completion:
         direction = np.stack([np.cos(angle), np.sin(angle), np.zeros(tasks.size)], axis=1)
         touching = contact.touches(start, contact.scene_values(goal, direction)) & (tasks.outcome > 0)
         tasks.outcome[touching] = 1 + tasks.reasons.index(contact.boundary_reason)
-
-    def _derive(self, candidates: TaskBatch) -> None:
-        for name in self._derived:
-            if name == "start_q":
-                candidates[name] = np.repeat(self.context.robot.base[:, None], candidates.size, axis=1)
-            else:
-                candidates[name] = self.tip_positions(candidates[name.replace("xyz", "q")])
 
     def _on_table(self, values: Array, parameters: Array | None) -> Array:
         """Return positions on the table of the tasks, shape (2, N), in the world frame, shape (3, N)."""

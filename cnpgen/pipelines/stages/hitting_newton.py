@@ -106,17 +106,12 @@ def expand(robot: Robot, q: Vec, d: Vec, home: Vec) -> Expansion:
     direction = [*d, 0.0] if len(d) == 2 else d
     weight = [1.0 / float(value) ** 2 for value in robot.rated_velocity]
     gain = [along(d, column) for column in kin.jacobian]
-    second = _second_derivatives(kin)
+    pairs = range(robot.n)
+    upper = {(j, k): cross(kin.axes[j], kin.jacobian[k]) for j in pairs for k in pairs if j <= k}  # z_min x J_max
+    second = [[upper[min(j, k), max(j, k)] for k in pairs] for j in pairs]
     gain_gradient = [[along(d, entry) for entry in row] for row in second]
     gradient = [2.0 * dot(gain_gradient[j], gain) + 2.0 * weight[j] * (home[j] - q[j]) for j in range(robot.n)]
     return Expansion(kin, gradient, direction, gain, second, gain_gradient, weight)
-
-
-def _second_derivatives(kin: Kinematics) -> list[list[Vec]]:
-    """Return ``d^2 p / dq_j dq_k = z_min x J_max``."""
-    n = len(kin.axes)
-    upper = {(j, k): cross(kin.axes[j], kin.jacobian[k]) for j in range(n) for k in range(j, n)}
-    return [[upper[min(j, k), max(j, k)] for k in range(n)] for j in range(n)]
 
 
 def _rates(kin: Kinematics, rate: Vec) -> tuple[list[Vec], list[Vec]]:
