@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
-from cnpgen.loader.normalization import Normalization
-from cnpgen.loader.row_format import Columns
+from cnpgen.loader.row_format import Columns, Normalization
 from cnpgen.loader.shard_reader import OBSTACLE_POSES, problem_obstacles
 from cnpgen.problems.scenes.observe import MAX_SEED, Scenes, observe
 from cnpgen.robots.observation.observations import Observation

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.loader.batch import Batch
-from cnpgen.loader.order import Order
 from cnpgen.loader.row_format import RowFormat
 from cnpgen.loader.shard_reader import SplitShards
-from cnpgen.loader.windows import InMemoryRows, Windows, make_in_memory_rows
+from cnpgen.loader.windows import InMemoryRows, Order, Windows, make_in_memory_rows
 from cnpgen.schema.arguments import flag, integer
 
 LOADER_STATE_FORMAT = "cnpgen-loader-state"

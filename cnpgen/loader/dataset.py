@@ -17,8 +17,7 @@ from cnpgen.errors import DatasetError, MissingExtraError, UsageError, lacks
 from cnpgen.loader.batch import observer_of
 from cnpgen.loader.batches import Batches, BatchPartition, Observe, checked_position
 from cnpgen.loader.gather import Split, gather
-from cnpgen.loader.normalization import Normalization, make_normalization
-from cnpgen.loader.row_format import RowFormat, make_row_format, select_columns
+from cnpgen.loader.row_format import Normalization, RowFormat, make_normalization, make_row_format, select_columns
 from cnpgen.loader.shard_reader import OBSTACLE_POSES, Rows, ShardReader, SplitShards, problem_obstacles, scene_fields
 from cnpgen.robots.observation.observations import Observation
 from cnpgen.robots.scene import Scene

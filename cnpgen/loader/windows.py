@@ -1,14 +1,19 @@
-"""The windows of an epoch: groups of shards that are packed into one table and shuffled together.
+"""The order of the rows of a split in one epoch, and its windows: shards that are packed and shuffled together.
 
-Small splits stay in memory; otherwise a thread packs one window ahead.
+The order is computed from seed, epoch and shard sizes; nothing is stored. In every epoch, the shards are permuted and
+distributed over windows of about 2^18 rows. Within a window, the rows of all its shards are permuted together. A split
+of less than 1.5 windows is therefore shuffled uniformly. In larger splits, the rows of a shard stay within one window
+per epoch. Small splits stay in memory; otherwise a thread packs one window ahead.
 """
 
+import hashlib
 import math
 import os
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
+from functools import cached_property
 from threading import Thread
 from typing import Any, TypeVar
 
@@ -16,14 +21,70 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.loader.batch import Batch
-from cnpgen.loader.order import Order
 from cnpgen.loader.row_format import RowFormat
 from cnpgen.loader.shard_reader import ShardReader, SplitShards
 from cnpgen.store.checked_shard import Shard
 
+WINDOW_ROWS = 1 << 18
 MAX_IN_MEMORY_BYTES = 1 << 28
 _CHUNK_VALUES = 1 << 15  # float64 numbers that fit into the L2 cache of a processor
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Window:
+    """Shards, by their index in the split, whose rows are shuffled together, from a position in the epoch on."""
+
+    first: int
+    rows: int
+    shards: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Order:
+    """The order of one epoch of a split with shards of some rows; splits are shuffled independently."""
+
+    split: str
+    shard_rows: tuple[int, ...]
+    seed: int
+    epoch: int
+    shuffle: bool = True
+
+    @cached_property
+    def windows(self) -> tuple[Window, ...]:
+        """The windows of the epoch, in order."""
+        shards = self._permuted(len(self.shard_rows), stage=0)
+        count = min(max(round(sum(self.shard_rows) / WINDOW_ROWS), 1), max(len(shards), 1))
+        windows, first = [], 0
+        for members in np.array_split(shards, count):
+            rows = sum(self.shard_rows[shard] for shard in members)
+            windows.append(Window(first, rows, tuple(members.tolist())))
+            first += rows
+        return tuple(windows)
+
+    def rows_of(self, window: int) -> NDArray[np.int64]:
+        """Return the order of the rows of a window: indices into the concatenated rows of its shards, shape (rows,)."""
+        return self._permuted(self.windows[window].rows, stage=1 + window)
+
+    def _permuted(self, size: int, *, stage: int) -> NDArray[np.int64]:
+        if not self.shuffle:
+            return np.arange(size)
+        words = np.frombuffer(hashlib.sha256(self.split.encode()).digest(), "<u4").tolist()
+        return permutation(size, seed=self.seed, key=(*words, self.epoch, stage))
+
+
+def permutation(size: int, *, seed: int, key: tuple[int, ...]) -> NDArray[np.int64]:
+    """Return a uniformly random permutation, shape (size,), that does not depend on the version of NumPy.
+
+    NumPy guarantees the raw output of bit generators, but not that of ``Generator.permutation``. The rows are sorted by
+    raw random numbers, the last bits of which are replaced by the row index. For up to 2^20 rows, 44 bits remain
+    random, so ties are negligible. Seed and key are not negative.
+    """
+    raw = np.random.SFC64(np.random.SeedSequence(seed, spawn_key=key)).random_raw(size)
+    mask = np.uint64((1 << max(size - 1, 1).bit_length()) - 1)
+    keys = (raw & ~mask) | np.arange(size, dtype=np.uint64)
+    keys.sort()
+    return (keys & mask).view(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +97,9 @@ class Packed:
     def part(self, first: int, last: int) -> "Packed":
         """Return the rows from ``first`` to ``last`` as views."""
         return Packed(self.table[first:last], {name: values[first:last] for name, values in self.integers.items()})
+
+
+Loaded = tuple[Packed, NDArray[np.int64]]
 
 
 def row_bytes(row_format: RowFormat) -> int:
@@ -135,9 +199,6 @@ class InMemoryRows:
 def make_in_memory_rows(source: SplitShards, row_format: RowFormat) -> InMemoryRows | None:
     """Allocate memory for a whole split if it needs at most 256 MiB; otherwise return None."""
     return InMemoryRows(source, row_format) if source.rows * row_bytes(row_format) <= MAX_IN_MEMORY_BYTES else None
-
-
-Loaded = tuple[Packed, NDArray[np.int64]]
 
 
 def start(task: Callable[[], T]) -> "Future[T]":

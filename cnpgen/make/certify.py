@@ -53,7 +53,6 @@ class CertifiedPlan(Stage):
         )
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the fields of the control points, flattened point by point, and of the duration."""
         spec, joints = context.problem.trajectory, context.robot.joint_names
         points, rates = spec.path_control_points, spec.rate_control_points
         path_names = tuple(f"C{point}.{joint}" for point in range(points) for joint in joints)
@@ -67,7 +66,6 @@ class CertifiedPlan(Stage):
         )
 
     def task_inputs(self, context: Context) -> tuple[Field, ...]:
-        """Return no fields: tasks have no plans."""
         return ()
 
     def prepare(self, context: Context) -> StageFunction:

@@ -12,7 +12,7 @@ from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.machine.threads import one_thread
 from cnpgen.pipelines.stages.boundary_motion import onto_table, velocity_of_tip
 from cnpgen.pipelines.stages.draw import position_field
-from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction, leave
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction, fraction, leave
 from cnpgen.plans.format import BOUNDARY, CONDITIONS
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem_record import record_problem
@@ -74,12 +74,9 @@ class StartOnPlan(Stage):
     replaces = ("goal_q", "goal_dq")
     model: str = field("planner: name of a shipped model, or path of a model file")
     sha256: str = field("sha256 of the model file; another file gives other samples", pattern=SHA256)
-    moved: float = field("fraction of the starts that are moved onto plans", low=0.0, high=1.0)
-    refined: float = field(
-        f"fraction of the moved ones that are on refined plans, up to {STATES_PER_REFINED_PLAN} on each",
-        low=0.0,
-        high=1.0,
-        default=0.0,
+    moved: float = fraction("fraction of the starts that are moved onto plans")
+    refined: float = fraction(
+        f"fraction of the moved ones that are on refined plans, up to {STATES_PER_REFINED_PLAN} on each", default=0.0
     )
     times: Range = field("time on the plan as a fraction of its duration")
 
@@ -91,7 +88,6 @@ class StartOnPlan(Stage):
         )
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the fields of the state and the tip position at the start."""
         quantities = (("rad", "positions"), ("rad/s", "velocities"), ("rad/s^2", "accelerations"))
         states = (
             context.joint_field(name, unit, f"joint {quantity} at the start")
@@ -102,7 +98,6 @@ class StartOnPlan(Stage):
         return (*states, position_field("start", [*low, table.z], [*high, table.z]))
 
     def writes(self, context: Context) -> tuple[str, ...]:
-        """List the outputs, the tip velocity, and the goals of the plans."""
         return (*(field.name for field in self.outputs(context)), "start_tip_velocity", *map(of_plan, GOAL))
 
     def prepare(self, context: Context) -> StageFunction:
@@ -128,7 +123,6 @@ class StartOnPlan(Stage):
         return work
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
-        """Keep the start of tasks."""
         return leave
 
     def _maker(
@@ -160,7 +154,7 @@ class GoalOfPlan(Stage):
     """Stage: keep the goal of the motion that contains the start, in a fraction of the cases."""
 
     inputs = tuple(f"planned_{name}" for name in GOAL)
-    share: float = field("fraction of the plans that are refined", low=0.0, high=1.0)
+    share: float = fraction("fraction of the plans that are refined")
 
     def describe(self) -> str:
         return f"in {100 * self.share:.4g} % of the cases take the goal of the motion that the start is on"
@@ -175,7 +169,6 @@ class GoalOfPlan(Stage):
         return work
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
-        """Keep the goal of tasks."""
         return leave
 
 

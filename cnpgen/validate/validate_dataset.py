@@ -1,7 +1,7 @@
 """Validation of a dataset: its files, every row with Pinocchio and Coal, and regenerated random blocks."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -145,10 +145,7 @@ class ValidationReport:
             "folder": str(self.folder),
             "ok": self.ok,
             "rows": self.rows,
-            "findings": [
-                {"file": item.file, "problem": item.problem, "note": item.note, "hint": item.hint}
-                for item in self.findings
-            ],
+            "findings": [asdict(finding) for finding in self.findings],
             "deep": self.deep.to_dict() if self.deep else None,
             "plans": dict(zip(("judged", "valid"), self.plans, strict=True)) if self.plans else None,
             "blocks": self.blocks,

@@ -40,7 +40,6 @@ class Collision(Stage):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Configurations, and the tip positions above the obstacles."""
         return (*(f"{end}_q" for end in self._ends()), "start_xyz", "goal_xyz")
 
     def describe(self) -> str:
@@ -55,7 +54,6 @@ class Collision(Stage):
         return tuple(Field(f"{end}_clearance", "m", text.format(end), role="diagnostic") for end in self._ends())
 
     def prepare(self, context: Context) -> StageFunction:
-        """Load the kernel or build the geometry."""
         clearance = context.constraint(RobotClearance)
         if context.robot.shape is not None:
             return self._by_convex_parts(context, clearance.distance)

@@ -41,7 +41,6 @@ class DrawPositions(Stage):
         )
 
     def prepare(self, context: Context) -> StageFunction:
-        """Check that the boxes are reachable and return the stage function."""
         check_reach(context, (("start", self.start), ("goal", self.goal)))
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
@@ -73,7 +72,6 @@ class DrawGoal(Stage):
         return (position_field("goal", [axis.low for axis in self.goal], [axis.high for axis in self.goal]),)
 
     def prepare(self, context: Context) -> StageFunction:
-        """Check that the box is reachable and return the stage function."""
         check_reach(context, (("goal", self.goal),))
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
@@ -162,7 +160,6 @@ class GivenPositions(Stage):
         return positions if self.start else (*positions, base)
 
     def prepare(self, context: Context) -> StageFunction:
-        """List the positions."""
         columns = {"start_xyz": self._starts(context).T, "goal_xyz": self._goals().T}
         if not self.start:
             columns["start_q"] = context.robot.base[:, None]

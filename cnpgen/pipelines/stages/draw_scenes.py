@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.pipelines.families.family import Layout, SceneFamily
-from cnpgen.pipelines.stages.batch_scenes import BatchScenes, batch_scenes
+from cnpgen.pipelines.stages.batch_scenes import batch_scenes
 from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.scenes.scene_problem import MAX_BASE_DEPTH_M
@@ -49,11 +49,9 @@ class DrawScenes(Stage):
         return f"draw scenes for {self.per_scene} candidates each ({', '.join(each)})"
 
     def writes(self, context: Context) -> tuple[str, ...]:
-        """List the index of the scene."""
         return ("scene",)
 
     def prepare(self, context: Context) -> StageFunction:
-        """Check the obstacles of the problem and return the stage function."""
         self._check(context)
         obstacles, capacity, shares = context.problem.obstacle, sum(self.capacity.values()), self._shares()
 
@@ -135,10 +133,3 @@ def base_depths(table: SceneTable) -> NDArray[np.float64]:
     ]
     depth = np.select([kind == code for code in range(len(depths))], depths, -np.inf)
     return np.asarray(depth.max(axis=1))
-
-
-def scenes_of(candidates: CandidateBatch) -> BatchScenes:
-    """Return the scenes of candidates; raise RecipeError if no stage has drawn any."""
-    if candidates.scenes is None:
-        raise RecipeError(["needs scenes: expected a stage draw-scenes before it"])
-    return candidates.scenes

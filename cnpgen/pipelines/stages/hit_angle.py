@@ -67,7 +67,6 @@ class HitAngleInCone(_HitAngle):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Positions of both ends of the line."""
         return f"{self.origin}_xyz", "goal_xyz"
 
     def describe(self) -> str:
@@ -102,7 +101,6 @@ class BehindPuck(Stage):
         return (position_field("goal", low, high),)
 
     def prepare(self, context: Context) -> StageFunction:
-        """Return the stage function; the distance must be that of the constraint ``puck-contact``."""
         contact = context.problem.first(PuckContact)
         if contact is not None and contact.contact_distance != self.distance:
             raise RecipeError(

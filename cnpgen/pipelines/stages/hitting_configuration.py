@@ -61,7 +61,6 @@ class HittingConfiguration(Stage):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Position and angle of the hit, and the home if goals are near it."""
         return ("goal_xyz", "hit_angle", "home_q") if self.near == "home" else ("goal_xyz", "hit_angle")
 
     def describe(self) -> str:

@@ -22,7 +22,7 @@ from cnpgen.kernels.symbolic.kinematics import forward_kinematics
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, cross, dot, symbols
 from cnpgen.pipelines.stages.candidate_table import hit_direction, table_normal, velocity_factor
 from cnpgen.pipelines.stages.hitting_newton import along, direction_symbols
-from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction, fraction
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
@@ -37,7 +37,7 @@ class HittingVelocity(Stage):
     """Stage: joint velocities of the goal, exactly along the hit, at the maximum speed or scaled down."""
 
     inputs = ("goal_q", "hit_angle")
-    full_speed: float = field("fraction of the hits at the maximum speed; the others are scaled", low=0.0, high=1.0)
+    full_speed: float = fraction("fraction of the hits at the maximum speed; the others are scaled")
     min_speed: float = field("minimum of the maximum speed of a hit", unit="m/s", default=1e-3, low=1e-9)
 
     def describe(self) -> str:
@@ -47,7 +47,6 @@ class HittingVelocity(Stage):
         return f"solve the linear program for the fastest joint velocity along the hit{slower}"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the joint velocity and the speeds."""
         text = "highest possible speed along the hit at the goal configuration"
         return (
             context.joint_field("goal_dq", "rad/s", "joint velocities at the goal", "target"),
@@ -70,7 +69,6 @@ class HittingVelocity(Stage):
         return self.outputs(context)[1], share
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
-        """Load the kernel for the given speed or share."""
         if {"hit_speed", SPEED_SHARE_COLUMN} <= set(given):
             raise UsageError(f"hit_speed and {SPEED_SHARE_COLUMN} both define the speed of the hit: give one of them")
 

@@ -23,7 +23,7 @@ from cnpgen.kernels.symbolic.linalg import (
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.stages.candidate_table import upright_axes
 from cnpgen.pipelines.stages.draw import check_reach, uniform
-from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
+from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction, fraction
 from cnpgen.robots.plausible_values import find_implausible_value
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import Range, field
@@ -51,12 +51,8 @@ class GuessedIK(Stage):
         "maximum change of a joint per iteration", unit="rad", default=0.4, low=1e-3, plausible=np.pi
     )
     guess: tuple[Range, ...] = field("box of random guesses; default: the base configuration", unit="rad", default=())
-    at_limit: float = field(
-        "fraction of the guesses with one random joint held on one of its limits",
-        low=0.0,
-        high=1.0,
-        default=0.0,
-        since_version=2,
+    at_limit: float = fraction(
+        "fraction of the guesses with one random joint held on one of its limits", default=0.0, since_version=2
     )
 
     def _how(self) -> str:
@@ -143,10 +139,8 @@ class GoalIK(GuessedIK):
     guess: tuple[Range, ...] = field(
         "box of random guesses; default: the start configuration", unit="rad", default=(), since_version=2
     )
-    from_start: float = field(
+    from_start: float = fraction(
         "fraction of the goals that start from the start configuration in spite of guesses",
-        low=0.0,
-        high=1.0,
         default=0.0,
         since_version=2,
     )
@@ -285,8 +279,8 @@ class Home(GuessedIK):
     """Stage: home is the start, the base, or a configuration for a random position, with given fractions."""
 
     inputs = ("start_q", "start_xyz")
-    at_start: float = field("fraction of homes at the start configuration", low=0.0, high=1.0)
-    at_base: float = field("fraction of homes at the base configuration", low=0.0, high=1.0, default=0.0)
+    at_start: float = fraction("fraction of homes at the start configuration")
+    at_base: float = fraction("fraction of homes at the base configuration", default=0.0)
     position: tuple[Range, Range, Range] = field("box of tip positions of the other homes: x, y, z", unit="m")
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
@@ -306,7 +300,6 @@ class Home(GuessedIK):
         return (context.joint_field("home_q", "rad", text, "diagnostic"),)
 
     def writes(self, context: Context) -> tuple[str, ...]:
-        """List the home configuration and its tip position."""
         return "home_q", "home_xyz"
 
     def prepare(self, context: Context) -> StageFunction:

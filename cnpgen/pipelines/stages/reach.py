@@ -39,7 +39,6 @@ class BallisticReach(Stage):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Positions and velocities of the checked ends."""
         start = ("start_xyz", "start_tip_velocity") if self.start_time else ()
         return start + (("goal_xyz", "hit_angle", "hit_speed") if self.goal_time else ())
 

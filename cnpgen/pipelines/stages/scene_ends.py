@@ -13,10 +13,9 @@ from cnpgen.kernels.symbolic.linalg import add, dot, scale, subtract, symbols
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.stages.batch_scenes import BatchScenes
 from cnpgen.pipelines.stages.draw import position_field
-from cnpgen.pipelines.stages.draw_scenes import scenes_of
 from cnpgen.pipelines.stages.ik import clip_to_limits, clipped_step
 from cnpgen.pipelines.stages.scene_clearance import SceneClearance
-from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction, leave
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction, fraction, leave
 from cnpgen.pipelines.stages.torque import torque_ratio
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
@@ -45,9 +44,9 @@ class SceneEnds(Stage):
     """Stage: goals at grasps of the scene, and starts at other grasps, near the base configuration or random."""
 
     inputs = ("scene",)
-    neutral: float = field("share of starts near the base configuration", default=0.4, low=0.0, high=1.0)
-    grasp: float = field("share of starts at another grasp", default=0.4, low=0.0, high=1.0)
-    random: float = field("share of random starts", default=0.2, low=0.0, high=1.0)
+    neutral: float = fraction("share of starts near the base configuration", default=0.4)
+    grasp: float = fraction("share of starts at another grasp", default=0.4)
+    random: float = fraction("share of random starts", default=0.2)
     spread: float = field(
         "standard deviation of starts around the base configuration", unit="rad", default=0.1, low=0.0, plausible=np.pi
     )
@@ -58,9 +57,7 @@ class SceneEnds(Stage):
         low=0.0,
         plausible=1.0,
     )
-    straight: float = field(
-        "share of the samples whose straight line may be free of collisions", default=0.1, low=0.0, high=1.0
-    )
+    straight: float = fraction("share of the samples whose straight line may be free of collisions", default=0.1)
     grasps: int = field("grasps of a scene that are tried", default=8, low=1, high=100)
     poses: int = field("random poses at each grasp", default=12, low=1, high=100)
 
@@ -87,19 +84,17 @@ class SceneEnds(Stage):
         )
 
     def task_inputs(self, context: Context) -> tuple[Field, ...]:
-        """List the joint positions, which tasks give."""
         return self.outputs(context)[:2]
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
-        """Keep the joint positions of tasks."""
         return leave
 
     def prepare(self, context: Context) -> StageFunction:
-        """Load the kernels and the collision checks."""
         states, tip = _EndStates(context, self), context.kernels.load(tip_position)
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
-            scenes = scenes_of(candidates)
+            scenes = candidates.scenes
+            assert scenes is not None  # as a stage has written the column "scene"
             pools = states.pools(scenes, random)
             numbers = candidates.draw(random, 1 + NUMBERS_PER_PAIR * MAX_PAIRS_PER_CANDIDATE)
             start, goal = states.pairs(scenes, pools, candidates.scene, numbers)

@@ -18,6 +18,7 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.schema import registry
+from cnpgen.schema.keys import field as key
 from cnpgen.store.field import Field
 
 Kind = TypeVar("Kind", bound=Constraint)
@@ -234,6 +235,11 @@ class Stage(ABC):
         if known and missing:
             raise UsageError(f"{', '.join(known)}: tasks that give this must also give {', '.join(missing)}")
         return leave if known else self.prepare(context)
+
+
+def fraction(doc: str, **options: Any) -> Any:
+    """Declare a key with a number from 0 to 1; see ``field``."""
+    return key(doc, low=0.0, high=1.0, **options)
 
 
 def leave(candidates: CandidateBatch, random: np.random.Generator) -> None:

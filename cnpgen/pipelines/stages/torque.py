@@ -22,7 +22,6 @@ class GravityTorque(Stage):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Joint positions of the end."""
         return (f"{self.end}_q",)
 
     def describe(self) -> str:
