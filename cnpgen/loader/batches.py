@@ -91,12 +91,6 @@ def checked_position(*, seed: Any, shuffle: Any, epoch: Any, row: Any = 0) -> Po
     )
 
 
-def position_to_json(position: Position, source: SplitShards) -> dict[str, Any]:
-    """Return a position with the fingerprint and split of its rows as a small JSON-able dict."""
-    head = {"format": LOADER_STATE_FORMAT, "format_version": LOADER_STATE_VERSION}
-    return head | {"fingerprint": source.fingerprint, "split": source.split, **asdict(position)}
-
-
 def position_from_json(state: Mapping[str, Any], source: SplitShards) -> Position:
     """Rebuild a position; raise an error if it is not of these rows."""
     if not isinstance(state, Mapping) or state.get("format") != LOADER_STATE_FORMAT:
@@ -245,7 +239,8 @@ class Batches:
                 "the workers of a DataLoader read batches ahead, so the number of used batches is unknown: pass it with"
                 " state(epoch=..., batch=...), or set num_workers=0"
             )
-        return position_to_json(position, self._source)
+        head = {"format": LOADER_STATE_FORMAT, "format_version": LOADER_STATE_VERSION}
+        return head | {"fingerprint": self._source.fingerprint, "split": self._source.split, **asdict(position)}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore the position of ``state()``: the next loop continues with the following batch.

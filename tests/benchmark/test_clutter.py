@@ -13,8 +13,8 @@ from cnpgen.benchmark.benchmark_planner import load_planner
 from cnpgen.benchmark.planners.free_search import has_manifold
 from cnpgen.benchmark.suite import list_suites
 from cnpgen.errors import RecipeError
-from cnpgen.pipelines.families.catalog import FAMILIES
 from cnpgen.pipelines.families.resting_states import RestingStates
+from cnpgen.pipelines.families.scene_generator import FAMILIES
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.scenes import SceneProblem, load_scenes, save_scenes
 from cnpgen.trajectory.sampled_trajectory import Trajectory
