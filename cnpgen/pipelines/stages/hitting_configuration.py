@@ -1,10 +1,6 @@
 """Stage: the hitting configuration, the joint positions at the puck that allow the fastest tip motion along the hit.
 
-``hitting_newton`` defines the objective and the Newton steps. They eliminate the constraint through three joints that
-must be free to move. An active-set method solves optima outside joint limits again. There any joint may be held on its
-limit, so the step is computed in all joints. With ``J_F`` the Jacobian without the columns of held joints,
-maximize ``g . s + s^T H s / 2`` subject to ``J_F s = p - FK(q)``. Adding a large multiple of ``J_F^T J_F`` to ``-H``
-changes no solution and makes it positive definite near a solution. Two symmetric solves without pivoting then suffice.
+``hitting_newton`` defines the objective and the Newton steps. An active-set method moves optima within the joint limits.
 """
 
 from dataclasses import dataclass
@@ -16,32 +12,16 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.kernel import Kernel
-from cnpgen.kernels.symbolic.linalg import (
-    Scalar,
-    Vec,
-    add,
-    dot,
-    factorize,
-    gram,
-    scale,
-    solve,
-    substitute,
-    subtract,
-    symbols,
-)
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, symbols
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.stages.candidate_table import hit_direction
 from cnpgen.pipelines.stages.hitting_newton import (
     MAX_NEWTON_STEPS,
     NEWTON_TOLERANCE_RAD,
-    Expansion,
     basic_joints,
-    direction_symbols,
-    expand,
+    held_step,
     newton_step,
     objective,
-    safeguard,
-    shortened,
 )
 from cnpgen.pipelines.stages.ik import IK_TOLERANCE, MAX_IK_STEPS, ik_step
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction
@@ -50,7 +30,6 @@ from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 
 REASONS = "no hitting configuration", "joint position limit at the goal"
-CONSTRAINT_WEIGHT = 1e3  # weight of J_F^T J_F relative to -H: both are in m^2/rad^2, and of order 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,50 +178,3 @@ def _change(held: Array, outside: Array, pull: Array) -> Array:
     inwards = -held * pull
     released = (inwards == inwards.max(axis=0)) & (inwards > 0) & ~outside.any(axis=0)
     return np.where(released, -held, np.where(held == 0, outside, 0.0))
-
-
-def held_step(robot: Robot) -> Any:
-    """Build one Newton step in the joints that are not held: ``((q, pull), p, d, q0, held) -> (next, |step|)``.
-
-    ``held`` is 1 for joints that stay constant. ``pull`` is the gradient of the Lagrangian, an output that the step
-    does not use.
-    """
-    import casadi as ca
-
-    n = robot.n
-    widths = (("state", 2 * n), ("p", 3), ("q0", n), ("held", n))
-    (state_sx, state), (p_sx, p), (home_sx, home), (held_sx, held) = (symbols(*item) for item in widths)
-    d_sx, d = direction_symbols(robot)
-    q = state[:n]
-    here = expand(robot, q, d, home)
-    step, pull = _step(here, subtract(p, here.kin.tip), [1.0 - x for x in held])
-    moved, length = shortened(q, step)
-    following = ca.vertcat(moved, *pull)
-    return ca.Function("hitting_limits", [state_sx, p_sx, d_sx, home_sx, held_sx], [following, length])
-
-
-def _step(here: Expansion, miss: Vec, free: Vec) -> tuple[Vec, Vec]:
-    """Return the Newton step in the joints with ``free`` 1, 0 in the others, and the gradient of the Lagrangian."""
-    n, jacobian = here.n, here.kin.jacobian
-    rows = [[column[row] * x for column, x in zip(jacobian, free, strict=True)] for row in range(3)]
-    gradient = [g * x for g, x in zip(here.gradient, free, strict=True)]
-    multiplier = solve(gram(rows), [dot(row, gradient) for row in rows])
-    pull = [g - dot(column, multiplier) for g, column in zip(here.gradient, jacobian, strict=True)]
-    hessian = here.hessian(multiplier)
-
-    def stiff(i: int, j: int) -> Scalar:
-        value = (
-            CONSTRAINT_WEIGHT * dot([row[i] for row in rows], [row[j] for row in rows])
-            - free[i] * free[j] * hessian[i][j]
-        )
-        return value + (1.0 - free[i]) if i == j else value
-
-    factors = factorize([[stiff(i, j) for j in range(i + 1)] for i in range(n)], safeguard)
-    towards = [dot([row[j] for row in rows], miss) for j in range(n)]
-    step = substitute(*factors, add(gradient, scale(towards, CONSTRAINT_WEIGHT)))
-    spread = [substitute(*factors, row) for row in rows]
-    lower = [[dot(rows[i], spread[j]) for j in range(i + 1)] for i in range(3)]
-    force = solve(lower, [dot(row, step) - e for row, e in zip(rows, miss, strict=True)])
-    for amount, column in zip(force, spread, strict=True):
-        step = subtract(step, scale(column, amount))
-    return step, pull

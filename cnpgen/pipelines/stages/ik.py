@@ -9,17 +9,7 @@ import numpy as np
 
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.kinematics import Kinematics, forward_kinematics, tip_position
-from cnpgen.kernels.symbolic.linalg import (
-    Scalar,
-    Vec,
-    add,
-    dot,
-    gram,
-    scale,
-    solve,
-    subtract,
-    symbols,
-)
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, gram, scale, solve, subtract, symbols
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.stages.candidate_table import upright_axes
 from cnpgen.pipelines.stages.draw import check_reach, uniform
