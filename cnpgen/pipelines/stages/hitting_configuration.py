@@ -1,6 +1,6 @@
 """Stage: the hitting configuration, the joint positions at the puck that allow the fastest tip motion along the hit.
 
-``hitting_newton`` defines the objective and the Newton steps. An active-set method moves optima within the joint limits.
+``hitting_newton`` defines the objective and its Newton steps. An active-set method moves optima within joint limits.
 """
 
 from dataclasses import dataclass
