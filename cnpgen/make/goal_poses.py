@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError, lacks
 from cnpgen.pipelines.families.resting_states import RestingStates, seeds_of
+from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.format import GOAL_OPTION
-from cnpgen.plans.plans import Plans, make_plans
+from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.load_robot import load_robot
@@ -27,7 +29,6 @@ from cnpgen.schema.catalogue import list_recipes
 from cnpgen.schema.toml import kind_of_file
 from cnpgen.schema.units import PLAUSIBLE_MAX, suggested_unit
 from cnpgen.store.field import Field
-from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.pose_ik import PoseKinematics, PoseTolerance, solve_pose_ik
 from cnpgen.world.world import World
 
@@ -154,31 +155,24 @@ class PoseTasks:
         if "goal_xyz" not in names:
             raise UsageError("tasks must give goal_xyz, the tip position of the goal", concerns="goal_xyz")
 
-    def complete(self, rows: Mapping[str, Array]) -> tuple[Plans, tuple[str, ...]]:
-        """Compute goal states of N tasks, rows of shape (N, width) or (1, width), independently of each other.
+    def complete(self, columns: Mapping[str, Array]) -> tuple[Plans, tuple[str, ...]]:
+        """Compute goal states of N tasks, columns of shape (N, width) or (1, width), independently of each other.
 
         The goal states of all tasks are boundary problems, at most ``MAX_GOAL_STATES`` for each, the nearest first.
         Tasks without any have a reason.
         """
-        count = max(map(len, rows.values()))
-        given = {name: np.broadcast_to(values, (count, values.shape[1])) for name, values in rows.items()}
+        count = max(map(len, columns.values()))
+        given = {name: np.broadcast_to(values, (count, values.shape[1])) for name, values in columns.items()}
         given.setdefault("start_q", np.broadcast_to(self.robot.base, (count, self.robot.n)))
         found = [self._goals(task, given) for task in range(count)]
         reasons = tuple(goals if isinstance(goals, str) else "" for goals in found)
         states = [np.empty((0, self.robot.n)) if isinstance(goals, str) else goals for goals in found]
         goal, tasks = np.concatenate(states), np.repeat(np.arange(count), [len(each) for each in states])
         numbers = np.concatenate([np.arange(len(each), dtype=float) for each in states])
-        spec, zero, start = self._problem.trajectory, np.zeros_like(goal), given["start_q"][tasks]
-        plans = make_plans(
-            record_problem(self._problem),
-            Boundary(start, zero, zero, goal, zero, None),
-            path_control_points=np.full((len(goal), spec.path_control_points, self.robot.n), np.nan),
-            rate_control_points=np.full((len(goal), spec.rate_control_points), np.nan),
-            columns={GOAL_OPTION: numbers},
-            sample_id=tasks,
-            source=f"goal poses of {self._problem.name}",
-        )
-        return plans, reasons
+        rows: dict[str, NDArray[Any]] = {name: np.zeros_like(goal) for name in ("start_dq", "start_ddq", "goal_dq")}
+        rows |= {"start_q": given["start_q"][tasks], "goal_q": goal, GOAL_OPTION: numbers, "sample_id": tasks}
+        source = f"goal poses of {self._problem.name}"
+        return plans_of_rows(record_problem(self._problem), rows, source=source), reasons
 
     def _goals(self, task: int, given: Mapping[str, Array]) -> Array | str:
         """Return the goal states of a task, shape (G, n), or the reason why there are none."""

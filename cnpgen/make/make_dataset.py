@@ -174,7 +174,9 @@ def _missing_shards(
     job: Job, tasks: list[ShardTask], begin: Begin | None, progress: Progress | None
 ) -> tuple[list[ShardTask], list[str]]:
     """Compare existing shards with their records; return the shards to generate and the damaged files."""
-    existing = existing_shards(job.folder, tasks)
+    # Without a manifest, a shard without sidecar is unfinished, not lost: an interrupted run may leave it.
+    finished = (job.folder / MANIFEST).exists()
+    existing = [task for task in tasks if finished or (job.folder / task.sidecar).exists()]
     if existing and begin is not None:
         begin("checking", job.folder, sum(task.rows for task in existing), 0)
     damaged = find_damaged(job.folder, job.spec, existing, progress=progress)
@@ -264,15 +266,6 @@ def _check(part: tuple[int, int] | None, *, force: bool) -> None:
     if force:
         text = "{force} would delete what the other parts have made: remove the folder, then start the parts"
         raise UsageError(text, remedies={"force": True})
-
-
-def existing_shards(folder: Path, tasks: Sequence[ShardTask]) -> list[ShardTask]:
-    """List the existing shards: all of a finished dataset, otherwise those with a sidecar.
-
-    Without a manifest, a shard without sidecar is unfinished, not lost: an interrupted run may leave it.
-    """
-    finished = (folder / MANIFEST).exists()
-    return [task for task in tasks if finished or (folder / task.sidecar).exists()]
 
 
 def find_damaged(
