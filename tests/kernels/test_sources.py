@@ -96,7 +96,7 @@ def tapes(folder: Path) -> set[str]:
     return {path.name for path in (folder / "tape").iterdir()}
 
 
-@pytest.mark.parametrize("changed", ["problems/constraints/joint.py", "pipelines/stages/braking.py", "robots/chain.py"])
+@pytest.mark.parametrize("changed", ["problems/constraints/joint.py", "pipelines/stages/reach.py", "robots/chain.py"])
 def test_a_change_in_a_subfolder_of_a_package_changes_the_key_of_a_tape(
     copy: Path, tmp_path: Path, changed: str
 ) -> None:

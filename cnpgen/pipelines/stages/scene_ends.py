@@ -214,8 +214,7 @@ class _EndStates:
         for attempt in range(MAX_PAIRS_PER_CANDIDATE):
             first = 1 + NUMBERS_PER_PAIR * attempt
             q, aim, key = self._pair(pools, scene[pending], numbers[first : first + NUMBERS_PER_PAIR, pending])
-            is_new = ~np.isin(key, used)
-            is_new[is_new] = _is_first(key[is_new])
+            is_new = _is_first(np.append(used, key))[len(used) :]
             exists = is_new & np.isfinite(q).all(axis=0)
             accepted = exists & may_be_straight[pending]
             lines = np.flatnonzero(exists & ~accepted)
