@@ -184,16 +184,11 @@ def _smallest_ratio(b: list[Vec], limit: list[float], target: Vec) -> Vec:
     ratio = ca.fmax(ratio, 0.0)
     length = ca.sqrt(dot(pivot, pivot))
     parallel = [ca.fabs(dot(x, z)) <= PARALLEL_TOLERANCE * length * ca.sqrt(dot(x, x)) for x in b]
-    v = [
-        ca.if_else(same, 0.0, ratio * bound * ca.sign(dot(x, z)))
-        for same, bound, x in zip(parallel, limit, b, strict=True)
-    ]
+    joints = list(zip(parallel, limit, b, strict=True))
+    v = [ca.if_else(same, 0.0, ratio * bound * ca.sign(dot(x, z))) for same, bound, x in joints]
     left = [target[c] - dot([x[c] for x in b], v) for c in range(2)]
-    shares = [ca.if_else(same, bound * dot(x, pivot), 0.0) for same, bound, x in zip(parallel, limit, b, strict=True)]
+    shares = [ca.if_else(same, bound * dot(x, pivot), 0.0) for same, bound, x in joints]
     total = sum(map(ca.fabs, shares), 0.0)
     amount = dot(left, pivot) / ca.if_else(total > 0, total, 1.0)
-    along = [
-        ca.if_else(same, amount * bound * ca.sign(dot(x, pivot)), 0.0)
-        for same, bound, x in zip(parallel, limit, b, strict=True)
-    ]
+    along = [ca.if_else(same, amount * bound * ca.sign(dot(x, pivot)), 0.0) for same, bound, x in joints]
     return [x + w for x, w in zip(v, along, strict=True)]

@@ -62,8 +62,8 @@ class SceneEnds(Stage):
     poses: int = field("random poses at each grasp", default=12, low=1, high=100)
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        if abs(self.neutral + self.grasp + self.random - 1) > 1e-9:
-            total = self.neutral + self.grasp + self.random
+        total = self.neutral + self.grasp + self.random
+        if abs(total - 1) > 1e-9:
             yield "random", f"the shares of starts must add up to 1, got {total:g}"
 
     def describe(self) -> str:
