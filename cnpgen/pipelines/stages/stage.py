@@ -21,7 +21,13 @@ from cnpgen.schema import registry
 from cnpgen.schema.keys import field as key
 from cnpgen.store.field import Field
 
+if TYPE_CHECKING:
+    from cnpgen.pipelines.stages.batch_scenes import BatchScenes
+
+Array = NDArray[np.float64]
 Kind = TypeVar("Kind", bound=Constraint)
+
+BLOCK_ROWS = 4096  # rows per block, unless a stage requires fewer
 
 
 @dataclass(frozen=True)
@@ -76,14 +82,6 @@ def load_context(problem: Problem, backend: Backend, cache_folder: Path, dtype: 
     """Load the robot of a problem and open its kernel library."""
     robot = load_robot(problem)
     return Context(problem, robot, problem_kernels(problem, robot, backend, cache_folder), dtype)
-
-
-if TYPE_CHECKING:
-    from cnpgen.pipelines.stages.batch_scenes import BatchScenes
-
-Array = NDArray[np.float64]
-
-BLOCK_ROWS = 4096  # rows per block, unless a stage requires fewer
 
 
 class CandidateBatch:
