@@ -23,7 +23,7 @@ from common import arguments, cpu_of, median, progress, report, table
 import cnpgen
 from cnpgen.benchmark.hypothesis_tests import wilson
 from cnpgen.make.make_dataset import make_dataset
-from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import Plans
 from cnpgen.refine.refine_plans import refine_plans

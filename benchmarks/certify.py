@@ -16,7 +16,7 @@ from common import arguments, progress, report, table, verdict
 
 from cnpgen.kernels.library import choose_backend
 from cnpgen.make.certify import CertifiedPlan, certified
-from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.pipelines.prepared import PreparedPipeline
 
 RECIPES = ("airhockey-hit", "airhockey-replan", "heavy-object")

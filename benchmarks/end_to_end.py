@@ -26,7 +26,7 @@ STEPS = (  # before the first row
     ("Python", "pass"),
     ("NumPy", "import numpy"),
     ("cnpgen.make.make_dataset", "import cnpgen.make.make_dataset"),
-    ("recipe", "from cnpgen.make.recipe_file import load_dataset_recipe; recipe = load_dataset_recipe({name!r})"),
+    ("recipe", "from cnpgen.make.recipe import load_dataset_recipe; recipe = load_dataset_recipe({name!r})"),
     ("Pinocchio, Coal", "import pinocchio, coal"),
     (
         "kernels, specification",

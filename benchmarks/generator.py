@@ -15,7 +15,7 @@ from typing import Any
 from common import arguments, installed_recipes, median, progress, report, table, verdict
 
 from cnpgen.kernels.library import choose_backend
-from cnpgen.pipelines.pipeline_file import load_pipeline
+from cnpgen.pipelines.pipeline import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS, CandidateBatch, Stage, StageFunction
 

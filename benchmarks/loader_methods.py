@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.loader import packed
+from cnpgen.loader import windows
 from cnpgen.loader.batches import Batches
 from cnpgen.loader.dataset import Dataset
 
@@ -95,11 +95,11 @@ class Reader:
 
     def streamed(self, **options: Any) -> Tables:
         """Read batches with cnpgen from the files in every epoch, as for a split that exceeds the memory limit."""
-        limit, packed.MAX_IN_MEMORY_BYTES = packed.MAX_IN_MEMORY_BYTES, 0
+        limit, windows.MAX_IN_MEMORY_BYTES = windows.MAX_IN_MEMORY_BYTES, 0
         try:
             yield from (batch.table for batch in self.dataset.batches(self.batch_size, **options))
         finally:
-            packed.MAX_IN_MEMORY_BYTES = limit
+            windows.MAX_IN_MEMORY_BYTES = limit
 
     def torch_batches(self, workers: int) -> Tables:
         """Read cnpgen's batches through a torch DataLoader."""

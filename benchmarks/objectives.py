@@ -16,7 +16,7 @@ from common import arguments, progress, report, table
 
 import cnpgen
 from cnpgen.make.make_dataset import make_dataset
-from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import Plans
 from cnpgen.refine.objective_values import objective_values

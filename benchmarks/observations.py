@@ -12,7 +12,7 @@ import numpy as np
 from common import arguments, cpu_of, median, progress, report, table
 
 from cnpgen.machine.threads import one_thread
-from cnpgen.pipelines.families.catalog import FAMILIES, load_family
+from cnpgen.pipelines.families.scene_generator import FAMILIES, load_family
 from cnpgen.scenes import (
     BasisPoints,
     CameraCloud,

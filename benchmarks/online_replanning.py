@@ -30,7 +30,7 @@ from refiner_problems import Made, make_each
 from cnpgen.machine.threads import one_thread
 from cnpgen.make.complete import complete
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
-from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans

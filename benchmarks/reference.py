@@ -31,7 +31,7 @@ from pinocchio_scipy import (
 )
 
 from cnpgen.kernels.library import choose_backend
-from cnpgen.pipelines.pipeline_file import load_pipeline
+from cnpgen.pipelines.pipeline import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS, CandidateBatch
 

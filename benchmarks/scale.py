@@ -19,8 +19,7 @@ from common import arguments, cpu_of, progress, report, table
 
 import cnpgen
 from cnpgen.cli.dry_run import row_bytes
-from cnpgen.make.make_dataset import finish
-from cnpgen.make.repair import find_damaged
+from cnpgen.make.make_dataset import find_damaged, finish
 from cnpgen.store.dataset_spec import default_shard_size, load_dataset_spec, shards
 from cnpgen.store.layout import DOCUMENTS
 

@@ -22,7 +22,7 @@ from scipy.interpolate import BSpline
 
 from cnpgen.kernels.library import choose_backend
 from cnpgen.make.certify import certified
-from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.problems.load_robot import load_robot
 

@@ -20,7 +20,7 @@ from scenes import make_checker
 
 from cnpgen.kernels.collision.collision_checker import CollisionChecker
 from cnpgen.machine.threads import one_thread
-from cnpgen.pipelines.families.catalog import FAMILIES
+from cnpgen.pipelines.families.scene_generator import FAMILIES
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import Plans

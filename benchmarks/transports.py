@@ -36,8 +36,7 @@ from scene_datasets import plan_states
 import cnpgen
 from cnpgen.make.complete import complete
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
-from cnpgen.make.recipe import DatasetRecipe
-from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.recipe import DatasetRecipe, load_dataset_recipe
 from cnpgen.pipelines.stages.ik import GoalIK, StartIK
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.planner.planner import Planner

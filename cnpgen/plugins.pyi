@@ -1,6 +1,6 @@
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState as SymbolicState
-from cnpgen.pipelines.context import Context as Context
 from cnpgen.pipelines.stages.stage import CandidateBatch as CandidateBatch
+from cnpgen.pipelines.stages.stage import Context as Context
 from cnpgen.pipelines.stages.stage import Stage as Stage
 from cnpgen.plans.exporter import ExportedSet as ExportedSet
 from cnpgen.plans.exporter import Exporter as Exporter

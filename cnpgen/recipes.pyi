@@ -1,7 +1,7 @@
 from cnpgen.make.recipe import DatasetRecipe as DatasetRecipe
-from cnpgen.make.recipe_file import load_dataset_recipe as load_dataset_recipe
+from cnpgen.make.recipe import load_dataset_recipe as load_dataset_recipe
 from cnpgen.pipelines.pipeline import Pipeline as Pipeline
-from cnpgen.pipelines.pipeline_file import load_pipeline as load_pipeline
+from cnpgen.pipelines.pipeline import load_pipeline as load_pipeline
 from cnpgen.problems.problem import Objective as Objective
 from cnpgen.problems.problem_record import ProblemRecord as ProblemRecord
 from cnpgen.robots.obstacle import Obstacle as Obstacle

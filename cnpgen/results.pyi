@@ -9,7 +9,7 @@ from cnpgen.loader.batch import Batch as Batch
 from cnpgen.loader.batches import Batches as Batches
 from cnpgen.loader.gather import RowError as RowError
 from cnpgen.loader.gather import Split as Split
-from cnpgen.loader.normalization import Normalization as Normalization
+from cnpgen.loader.row_format import Normalization as Normalization
 from cnpgen.machine.times import Times as Times
 from cnpgen.make.complete import Completed as Completed
 from cnpgen.make.make_dataset import MadeDataset as MadeDataset

@@ -1,10 +1,10 @@
-from cnpgen.loader.batch_observer import BatchObserver as BatchObserver
+from cnpgen.loader.batch import BatchObserver as BatchObserver
 from cnpgen.make.solve_scenes import SolvedScenes as SolvedScenes
 from cnpgen.make.solve_scenes import solve_scenes as solve_scenes
-from cnpgen.pipelines.families.catalog import load_family as load_family
 from cnpgen.pipelines.families.family import Grasp as Grasp
 from cnpgen.pipelines.families.family import Layout as Layout
 from cnpgen.pipelines.families.family import SceneFamily as SceneFamily
+from cnpgen.pipelines.families.scene_generator import load_family as load_family
 from cnpgen.pipelines.families.scene_generator import make_scenes as make_scenes
 from cnpgen.planner.plan_requests import plan_scenes as plan_scenes
 from cnpgen.plans.scene_plans import scene_plans as scene_plans

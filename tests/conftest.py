@@ -24,10 +24,8 @@ import pytest
 from cnpgen.kernels.compiler import find_compiler
 from cnpgen.kernels.library import Backend, KernelLibrary, default_cache_folder
 from cnpgen.make.make_dataset import make_dataset
-from cnpgen.make.recipe import DatasetRecipe
-from cnpgen.make.recipe_file import load_dataset_recipe
-from cnpgen.pipelines.pipeline import Pipeline
-from cnpgen.pipelines.pipeline_file import load_pipeline
+from cnpgen.make.recipe import DatasetRecipe, load_dataset_recipe
+from cnpgen.pipelines.pipeline import Pipeline, load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.stage import CandidateBatch
 from cnpgen.robots.robot import Robot

@@ -226,8 +226,8 @@ def check(step):
         loaded.setdefault(heavy, step)
 import cnpgen
 check("import cnpgen")
-import cnpgen.make.recipe_file
-check("import cnpgen.make.recipe_file")
+import cnpgen.make.recipe
+check("import cnpgen.make.recipe")
 from cnpgen.cli.main import main
 main(["list"])
 check("list")

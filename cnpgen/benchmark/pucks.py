@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from cnpgen.errors import RecipeError
 from cnpgen.make.complete import complete
 from cnpgen.pipelines.pipeline import Pipeline
-from cnpgen.pipelines.stages.behind_puck import behind
 from cnpgen.pipelines.stages.boundary_motion import TableAcceleration, TableVelocity
-from cnpgen.pipelines.stages.given_positions import MAX_TASKS, GivenPositions
-from cnpgen.pipelines.stages.hit_angle import HitAngleToGoal
+from cnpgen.pipelines.stages.draw import MAX_TASKS, GivenPositions
+from cnpgen.pipelines.stages.hit_angle import HitAngleToGoal, behind
 from cnpgen.pipelines.stages.hitting_configuration import HittingConfiguration
 from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
 from cnpgen.plans.join import concatenate

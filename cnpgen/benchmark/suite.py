@@ -10,8 +10,8 @@ from typing import Any
 from cnpgen.benchmark.pucks import ExecutedPrefix, Pucks, ReplanningScenario, hits_of, scenario_problems
 from cnpgen.errors import CnpgenError, nearest
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
-from cnpgen.make.recipe_file import load_dataset_recipe
-from cnpgen.pipelines.stages.given_positions import MAX_TASKS
+from cnpgen.make.recipe import load_dataset_recipe
+from cnpgen.pipelines.stages.draw import MAX_TASKS
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.scene_plans import scene_plans
 from cnpgen.problems.problem import Problem

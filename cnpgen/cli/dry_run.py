@@ -5,8 +5,7 @@ from typing import Any
 
 from cnpgen.cli.terminal import table
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.make.recipe import DatasetRecipe
-from cnpgen.make.recipe_file import load_notes
+from cnpgen.make.recipe import DatasetRecipe, load_notes
 from cnpgen.make.resolve_spec import dataset_folder, draw_up
 from cnpgen.store.dataset_spec import DatasetSpec, shards
 from cnpgen.store.layout import MANIFEST

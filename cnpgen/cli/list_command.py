@@ -51,7 +51,7 @@ def list_all(what: str) -> list[dict[str, Any]]:
 
 
 def _dataset(name: str, _: Path) -> dict[str, Any]:
-    from cnpgen.make.recipe_file import load_dataset_recipe
+    from cnpgen.make.recipe import load_dataset_recipe
 
     recipe = load_dataset_recipe(name)
     rows = sum(recipe.splits.values())
@@ -66,7 +66,7 @@ def _model(name: str, file: Path) -> dict[str, Any]:
 
 
 def _pipeline(name: str, _: Path) -> dict[str, Any]:
-    from cnpgen.pipelines.pipeline_file import load_pipeline
+    from cnpgen.pipelines.pipeline import load_pipeline
 
     recipe = load_pipeline(name)
     count = len(recipe.stage)

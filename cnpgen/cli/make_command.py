@@ -54,7 +54,7 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from cnpgen.make.recipe_file import load_dataset_recipe
+    from cnpgen.make.recipe import load_dataset_recipe
 
     recipe_names.check_recipe(arguments.recipe, of_dataset="'cnpgen make-dataset NAME --out {0}' resumes it")
     recipe = load_dataset_recipe(arguments.recipe)

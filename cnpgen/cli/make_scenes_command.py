@@ -93,7 +93,7 @@ def _check_place(out: Path, *, force: bool) -> None:
 
 def _listing(*, as_json: bool) -> str:
     """Return the families with their parameters."""
-    from cnpgen.pipelines.families.catalog import FAMILIES
+    from cnpgen.pipelines.families.scene_generator import FAMILIES
     from cnpgen.schema.keys import keys
 
     table: dict[str, Any] = {}

@@ -137,7 +137,7 @@ def _scenes(arguments: argparse.Namespace, model: "Model") -> "Requests":
 def _draws(arguments: argparse.Namespace, model: "Model") -> "Requests":
     """Draw fresh problems of a recipe."""
     from cnpgen.make.draw_boundary_problems import draw_boundary_problems
-    from cnpgen.make.recipe_file import load_dataset_recipe
+    from cnpgen.make.recipe import load_dataset_recipe
     from cnpgen.planner.plan_requests import Requests, check_stages, checked_boundary, context_columns
     from cnpgen.problems.problem import resolved
     from cnpgen.problems.problem_record import record_problem

@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace) -> None:
     folder = arguments.folder
     own = folder.resolve()  # "." has no name
     out = arguments.out or own.with_name(f"{own.name}-hub")
-    published = publish_dataset(folder, arguments.to, out=out, private=arguments.private, dry_run=arguments.dry_run)
-    if published.url:
-        print(f"cnpgen: uploaded {published.folder}", file=sys.stderr)
-    print(published.url or published.folder)
+    url = publish_dataset(folder, arguments.to, out=out, private=arguments.private, dry_run=arguments.dry_run)
+    if url:
+        print(f"cnpgen: uploaded {out}", file=sys.stderr)
+    print(url or out)

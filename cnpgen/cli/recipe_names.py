@@ -118,7 +118,7 @@ suite = partial(_recipe, ("suite", "dataset", "pipeline"))
 
 def family(text: str) -> str:
     """Read the name of a family of scenes."""
-    from cnpgen.pipelines.families.catalog import load_family
+    from cnpgen.pipelines.families.scene_generator import load_family
 
     load_family(text)
     return text

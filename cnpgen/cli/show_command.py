@@ -62,8 +62,8 @@ def _about_kinds(arguments: argparse.Namespace) -> str:
 
 def load_any(name_or_path: str, kind: Kind | None = None) -> "Recipe":
     """Load a recipe of any kind; of several with the same name the one that includes the others."""
-    from cnpgen.make.recipe_file import load_dataset_recipe
-    from cnpgen.pipelines.pipeline_file import load_pipeline
+    from cnpgen.make.recipe import load_dataset_recipe
+    from cnpgen.pipelines.pipeline import load_pipeline
     from cnpgen.problems.problem_file import load_problem
     from cnpgen.schema.catalogue import find_recipe
 

@@ -112,7 +112,7 @@ def _conditions(arguments: argparse.Namespace) -> "Plans":
 
 def _draws(arguments: argparse.Namespace) -> "Plans":
     from cnpgen.make.draw_boundary_problems import draw_boundary_problems
-    from cnpgen.make.recipe_file import load_dataset_recipe
+    from cnpgen.make.recipe import load_dataset_recipe
 
     recipe_names.check_recipe(arguments.what)
     recipe = load_dataset_recipe(arguments.what)

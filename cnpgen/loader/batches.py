@@ -3,24 +3,112 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import UsageError
+from cnpgen.errors import DatasetError, UsageError
 from cnpgen.loader.batch import Batch
-from cnpgen.loader.batch_partition import BatchPartition
-from cnpgen.loader.order import Order
-from cnpgen.loader.packed import InMemoryRows, make_in_memory_rows
-from cnpgen.loader.position import Position, position_from_json, position_to_json
 from cnpgen.loader.row_format import RowFormat
 from cnpgen.loader.shard_reader import SplitShards
-from cnpgen.loader.windows import Windows
-from cnpgen.schema.arguments import integer
+from cnpgen.loader.windows import InMemoryRows, Order, Windows, make_in_memory_rows
+from cnpgen.schema.arguments import flag, integer
 
+LOADER_STATE_FORMAT = "cnpgen-loader-state"
+LOADER_STATE_VERSION = 1  # also raised if the computation of the order changes
 Observe = Callable[[Batch], Mapping[str, NDArray[Any]]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchPartition:
+    """Batches of a fixed number of rows over all ranks; the rows of a batch are distributed over the ranks.
+
+    A rank reads the rows ``rank::world`` of every batch, one of its workers the batches ``worker::workers``. An
+    incomplete last batch of an epoch is omitted by default.
+    """
+
+    batch_size: int
+    rank: int = 0
+    world: int = 1
+    drop_last: bool = True
+    worker: int = 0
+    workers: int = 1
+
+    def __post_init__(self) -> None:
+        for name, minimum in (("batch_size", 1), ("world", 1), ("rank", 0), ("workers", 1), ("worker", 0)):
+            object.__setattr__(self, name, integer(name, getattr(self, name), least=minimum))
+        object.__setattr__(self, "drop_last", flag("drop_last", self.drop_last))
+        for name, value, count in (("rank", self.rank, self.world), ("worker", self.worker, self.workers)):
+            if value >= count:
+                raise UsageError(f"must be one of 0 to {count - 1}, got {value}", argument=name)
+        if self.batch_size % self.world:
+            raise UsageError(
+                f"batch_size counts the rows of all ranks together and must be a multiple of world ({self.world}),"
+                f" got {self.batch_size}",
+                concerns="batch_size",
+            )
+
+    def end(self, rows: int, *, first: int = 0) -> int:
+        """Return the end of the batches that start at position ``first``, of ``rows`` rows."""
+        return rows - (rows - first) % self.batch_size if self.drop_last else rows
+
+    def check_ranks(self, rows: int, *, first: int = 0) -> None:
+        """Raise UsageError if the last batch has no row for some ranks, since their mean loss would be nan.
+
+        The batches begin at position ``first``.
+        """
+        remainder = (self.end(rows, first=first) - first) % self.batch_size
+        if 0 < remainder < self.world:
+            raise UsageError(
+                f"the last batch of {rows} rows has {remainder} for {self.world} ranks: omit it with drop_last=True,"
+                " read all of it on every rank (world=1), or choose another batch_size",
+                concerns="batch_size",
+            )
+
+    def count(self, rows: int) -> int:
+        """Return the number of batches of this worker for ``rows`` rows."""
+        batches = -(-self.end(rows) // self.batch_size)
+        return -(-(batches - self.worker) // self.workers)
+
+
+@dataclass(frozen=True)
+class Position:
+    """A position in the order of an epoch: the number of rows that all ranks together have read."""
+
+    seed: int
+    shuffle: bool
+    epoch: int
+    row: int = 0
+
+
+def checked_position(*, seed: Any, shuffle: Any, epoch: Any, row: Any = 0) -> Position:
+    """Make a position of unchecked arguments."""
+    numbers = {"seed": seed, "epoch": epoch, "row": row}
+    return Position(
+        shuffle=flag("shuffle", shuffle), **{name: integer(name, value, least=0) for name, value in numbers.items()}
+    )
+
+
+def position_from_json(state: Mapping[str, Any], source: SplitShards) -> Position:
+    """Rebuild a position; raise an error if it is not of these rows."""
+    if not isinstance(state, Mapping) or state.get("format") != LOADER_STATE_FORMAT:
+        raise UsageError(f"a loader's state must be what state() returned, got {state!r:.100}")
+    if state.get("format_version") != LOADER_STATE_VERSION:
+        version = state.get("format_version")
+        text = f"the loader's state has format version {version!r}, this cnpgen reads {LOADER_STATE_VERSION}"
+        raise DatasetError(text)
+    for name, value in (("fingerprint", source.fingerprint), ("split", source.split)):
+        if state.get(name) != value:
+            raise DatasetError(f"the loader's state is of another dataset: {name} {state.get(name)!r}, here {value!r}")
+    try:
+        position = checked_position(**{name: state[name] for name in Position.__dataclass_fields__})
+    except KeyError as error:
+        raise UsageError(f"the loader's state lacks {error}") from error
+    if position.row > source.rows:
+        raise DatasetError(f"the loader's state is at row {position.row}; split {source.split!r} has {source.rows}")
+    return position
 
 
 class Batches:
@@ -104,8 +192,11 @@ class Batches:
         """
         source, partition = self._source, self._partition
         begin = position = self._position = self._forward(self._position)
-        windows, end = self._windows(begin), partition.end(source.rows, first=begin.row)
-        row = begin.row
+        rows = tuple(shard.rows for shard in source.shards)
+        order = Order(source.split, rows, begin.seed, begin.epoch, begin.shuffle)
+        self._in_memory = self._in_memory or make_in_memory_rows(source, self._row_format)
+        windows = Windows(source, self._row_format, order, self._in_memory)
+        row, end = begin.row, partition.end(source.rows, first=begin.row)
         while (first := row + partition.worker * partition.batch_size) < end:
             batch = windows.batch(
                 first, min(first + partition.batch_size, end), rank=partition.rank, world=partition.world
@@ -115,13 +206,6 @@ class Batches:
             yield batch if self._observe is None else replace(batch, observations=self._observe(batch))
             if self._position is not position:
                 raise UsageError("within this loop, another loop over the same batches ran or load_state was called")
-
-    def _windows(self, begin: Position) -> Windows:
-        """Return the windows of an epoch."""
-        rows = tuple(shard.rows for shard in self._source.shards)
-        order = Order(self._source.split, rows, begin.seed, begin.epoch, begin.shuffle)
-        self._in_memory = self._in_memory or make_in_memory_rows(self._source, self._row_format)
-        return Windows(self._source, self._row_format, order, self._in_memory)
 
     def _forward(self, position: Position) -> Position:
         """Return the first position of the next epoch if no batch remains in this one, otherwise the position."""
@@ -155,7 +239,8 @@ class Batches:
                 "the workers of a DataLoader read batches ahead, so the number of used batches is unknown: pass it with"
                 " state(epoch=..., batch=...), or set num_workers=0"
             )
-        return position_to_json(position, self._source)
+        head = {"format": LOADER_STATE_FORMAT, "format_version": LOADER_STATE_VERSION}
+        return head | {"fingerprint": self._source.fingerprint, "split": self._source.split, **asdict(position)}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore the position of ``state()``: the next loop continues with the following batch.

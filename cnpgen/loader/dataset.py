@@ -14,16 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from cnpgen.errors import DatasetError, MissingExtraError, UsageError, lacks
-from cnpgen.loader.batch_observer import observer_of
-from cnpgen.loader.batch_partition import BatchPartition
-from cnpgen.loader.batches import Batches, Observe
-from cnpgen.loader.columns import select_columns
-from cnpgen.loader.gather import Rows, Split, gather
-from cnpgen.loader.normalization import Normalization, make_normalization
-from cnpgen.loader.position import checked_position
-from cnpgen.loader.row_format import RowFormat, make_row_format
-from cnpgen.loader.scene_columns import OBSTACLE_POSES, problem_obstacles, scene_fields
-from cnpgen.loader.shard_reader import ShardReader, SplitShards
+from cnpgen.loader.batch import observer_of
+from cnpgen.loader.batches import Batches, BatchPartition, Observe, checked_position
+from cnpgen.loader.gather import Split, gather
+from cnpgen.loader.row_format import Normalization, RowFormat, make_normalization, make_row_format, select_columns
+from cnpgen.loader.shard_reader import OBSTACLE_POSES, Rows, ShardReader, SplitShards, problem_obstacles, scene_fields
 from cnpgen.robots.observation.observations import Observation
 from cnpgen.robots.scene import Scene
 from cnpgen.schema.argument_types import checked_arguments
@@ -254,16 +249,10 @@ class Dataset:
 
 
 def make_frame(rows: Mapping[str, NDArray[Any]], fields: Sequence[Field], *, library: str | None) -> Any:
-    """Convert rows, of shape (rows, width) or (rows,) each, to a table with columns in the order of the fields.
+    """Convert rows, of shape (rows, width) or (rows,) each, to a ``DataFrame`` with columns in the order of the fields.
 
-    The library is "polars" or "pandas"; by default the installed one, polars if both are.
-
-    Returns:
-        A ``DataFrame``; with pandas, ``attrs["units"]`` contains the units of the columns.
-
-    Raises:
-        UsageError: The library is not supported.
-        MissingExtraError: The library is not installed.
+    The library is "polars" or "pandas"; by default the installed one, polars if both are. With pandas,
+    ``attrs["units"]`` contains the units of the columns.
     """
     name = _installed(library)
     columns = {

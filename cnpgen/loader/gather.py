@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.loader.columns import Columns
-from cnpgen.loader.row_format import RowFormat
-from cnpgen.loader.shard_reader import SplitShards
+from cnpgen.loader.row_format import Columns, RowFormat
+from cnpgen.loader.shard_reader import Rows, SplitShards
 from cnpgen.schema.arguments import reject_masked
 from cnpgen.store.shard import storage_dtype
 
-Rows = dict[str, NDArray[Any]]
 Indices = NDArray[np.int64]
 
 MAX_READ_ROWS_PER_ROW = 8  # of a shard whose file is read and not mapped
@@ -27,15 +24,9 @@ class RowError(UsageError, IndexError):
 
 
 def gather(source: SplitShards, indices: ArrayLike, layout: Columns) -> Rows:
-    """Read single rows by their indices, shape (k,); negative ones count from the end.
+    """Read single rows by their indices, shape (k,), in their order; negative ones count from the end.
 
-    Returns:
-        Field name -> values as stored, shape (k, width) or (k,), in the order of the indices.
-
-    Raises:
-        RowError: The split has no such row.
-        UsageError: The indices are not integers.
-        DatasetError: A shard is missing or damaged.
+    Values are as stored, shape (k, width) or (k,).
     """
     rows = _checked(indices, source)
     columns = {f.name: np.empty(f.shape(len(rows)), storage_dtype(f, source.stored)) for f in layout.fields}

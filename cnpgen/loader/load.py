@@ -5,8 +5,7 @@ from pathlib import Path
 
 from cnpgen.errors import DatasetError
 from cnpgen.loader.dataset import Dataset
-from cnpgen.loader.scene_columns import problem_obstacles
-from cnpgen.loader.shard_reader import ShardReader
+from cnpgen.loader.shard_reader import ShardReader, problem_obstacles
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import flag
 from cnpgen.store.checked_shard import Shard

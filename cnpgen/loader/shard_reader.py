@@ -1,4 +1,6 @@
-"""Reading whole fields of shards, and mapping them into memory to use some rows."""
+"""Reading whole fields of shards, of rows and of their scenes, and mapping them into memory to use some rows."""
+
+from __future__ import annotations
 
 import mmap
 from collections.abc import Sequence
@@ -11,18 +13,70 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
-from cnpgen.loader.scene_columns import SceneColumn
 from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.scene_arrays import scene_poses
+from cnpgen.robots.solid import pose_width
+from cnpgen.schema.keys import RecipeLocation
+from cnpgen.schema.parsing import parse, stored_values
 from cnpgen.store.checked_shard import Shard, check_field, check_header, check_values, read_columns, read_scenes
+from cnpgen.store.dataset_spec import DatasetSpec
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.intact import RERUN_HINT, digest_problem
 from cnpgen.store.scene_table import SCENE_ID, SceneTable
 from cnpgen.store.shard import StoredField, storage_dtype
 
+OBSTACLE_POSES = "obstacle_poses"
 Rows = dict[str, NDArray[Any]]
-
 MAX_MEMORY_MAPS = 32  # kept open; each needs a file descriptor, and its pages can be reclaimed by the system
+
+
+def problem_obstacles(spec: DatasetSpec) -> tuple[Obstacle, ...]:
+    """Return the obstacles of the problem of a dataset with scenes, those that samples place included; else none."""
+    if not spec.scene_obstacles:
+        return ()
+    tables = spec.recipe["pipeline"]["problem"]["obstacle"]
+    given = [{key: value for key, value in table.items() if value is not None} for table in tables]
+    with stored_values():
+        parsed = [parse(Obstacle, table, where=RecipeLocation("obstacle"), mistakes=[]) for table in given]
+    return tuple(obstacle for obstacle in parsed if obstacle is not None)
+
+
+def scene_fields(spec: DatasetSpec) -> tuple[Field, ...]:
+    """Return the fields of the scene of each sample; empty for a dataset without scenes.
+
+    ``obstacle_poses`` has the layout of the problem's obstacles (``cnpgen.robots.solid``). The others are the arrays of
+    the shards, flattened: ``obstacle_position`` has shape (N, 3 O).
+    """
+    if not spec.scene_obstacles:
+        return ()
+    text = "poses and sizes of the problem's obstacles in the scene"
+    width = pose_width(problem_obstacles(spec))
+    return (Field(OBSTACLE_POSES, "m", text, width, role="context", frame="world"), *spec.scene_fields)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneColumn:
+    """A field of the scenes of the rows of a shard; indexing computes the values of the selected rows only.
+
+    The index of the scene of each row has shape (rows,).
+    """
+
+    name: str
+    table: SceneTable
+    index: NDArray[np.intp]
+    obstacles: Sequence[Obstacle]
+    dtype: np.dtype[Any]
+
+    def __getitem__(self, rows: Any) -> NDArray[Any]:
+        """Return the values of rows, shape (k, width) or (k,)."""
+        index = self.index[rows]
+        scenes, place = np.unique(index, return_inverse=True)
+        chosen = self.table[scenes]
+        if self.name == OBSTACLE_POSES:
+            return scene_poses(self.obstacles, chosen).astype(self.dtype)[place]
+        values: NDArray[Any] = getattr(chosen, self.name)[place]
+        return values.reshape(len(index), -1) if values.ndim > 1 else values
 
 
 class ShardReader:
@@ -43,15 +97,7 @@ class ShardReader:
         return self.__dict__ | {"_maps": {}, "_scenes": None}
 
     def read(self, shard: Shard, fields: Sequence[Field]) -> Rows:
-        """Read whole fields of a shard into memory.
-
-        Returns:
-            Field name -> values as stored, shape (rows, width) or (rows,).
-
-        Raises:
-            DatasetError: The shard is missing, damaged, of another specification or lacks a field.
-            MachineError: The shard cannot be read.
-        """
+        """Read whole fields of a shard into memory: values as stored, shape (rows, width) or (rows,)."""
         fields, of_scenes = self._split(shard, fields)
         placements = self._header(shard, fields)
         columns = read_columns(shard, placements, [field.name for field in fields])
@@ -65,14 +111,8 @@ class ShardReader:
     def map(self, shard: Shard, fields: Sequence[Field]) -> dict[str, NDArray[Any] | SceneColumn]:
         """Map fields of a shard into memory, to use some of their rows; they are read the first time.
 
-        The system ends a process that uses a part of a map after the file was cut off there.
-
-        Returns:
-            As ``read`` does, but read-only if mapped; fields of scenes are computed for the rows that are used.
-
-        Raises:
-            DatasetError: The shard is missing, damaged, of another specification or lacks a field.
-            MachineError: The shard cannot be read.
+        Mapped values are read-only; fields of scenes are computed for the rows that are used. The system ends a process
+        that uses a part of a map after the file was cut off there.
         """
         fields, of_scenes = self._split(shard, fields)
         scenes = self._scene_columns(shard, of_scenes)
@@ -127,20 +167,15 @@ class ShardReader:
         """Map a shard into memory; None if the file system does not support it."""
         if (existing := self._maps.get(shard.path)) is not None:
             return existing
-        mapped = _mapped(shard)
-        if mapped is not None:
-            for oldest in list(self._maps)[: max(len(self._maps) - MAX_MEMORY_MAPS + 1, 0)]:
-                self._maps.pop(oldest, None)  # stays mapped as long as arrays of it are in use
-            self._maps[shard.path] = mapped
+        try:
+            with shard.path.open("rb") as file:
+                mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        except (OSError, ValueError):  # the file is then read without mapping
+            return None
+        for oldest in list(self._maps)[: max(len(self._maps) - MAX_MEMORY_MAPS + 1, 0)]:
+            self._maps.pop(oldest, None)  # stays mapped as long as arrays of it are in use
+        self._maps[shard.path] = mapped
         return mapped
-
-
-def _mapped(shard: Shard) -> mmap.mmap | None:
-    try:
-        with shard.path.open("rb") as file:
-            return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    except (OSError, ValueError):  # the file is then read without mapping
-        return None
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.library import problem_kernels
 from cnpgen.machine.threads import one_thread
+from cnpgen.make.on_plan import SHA256, load_stage_planner, model_sha256, planner_boundary
 from cnpgen.make.recipe import DatasetRecipe
-from cnpgen.make.stage_planner import SHA256, load_stage_planner, model_sha256, planner_boundary
-from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction
 from cnpgen.plans.format import BOUNDARY, OBSTACLE_POSES
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.refine_engine import Solver, load_solver
@@ -24,7 +23,6 @@ from cnpgen.store.field import Field
 from cnpgen.store.scene_table import OBSTACLE_KINDS, SceneTable
 from cnpgen.trajectory.spline_motion import Motion
 
-Array = NDArray[np.float64]
 Counts = tuple[int, ...]  # obstacles of each kind
 
 PLACES_PER_STEP = 2  # numbers of places are multiples of it, so that scenes share solvers
@@ -55,7 +53,6 @@ class CertifiedPlan(Stage):
         )
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the fields of the control points, flattened point by point, and of the duration."""
         spec, joints = context.problem.trajectory, context.robot.joint_names
         points, rates = spec.path_control_points, spec.rate_control_points
         path_names = tuple(f"C{point}.{joint}" for point in range(points) for joint in joints)
@@ -69,7 +66,6 @@ class CertifiedPlan(Stage):
         )
 
     def task_inputs(self, context: Context) -> tuple[Field, ...]:
-        """Return no fields: tasks have no plans."""
         return ()
 
     def prepare(self, context: Context) -> StageFunction:
@@ -103,9 +99,6 @@ def certified(recipe: DatasetRecipe, *, model: str | Path | None = None) -> Data
     """Return the recipe of the certified dataset, with one more stage and the name ``NAME-certified``.
 
     The model plans the initial guesses. The recipe of a certified dataset is returned unchanged.
-
-    Raises:
-        UsageError: There is no such model.
     """
     if any(isinstance(stage, CertifiedPlan) for stage in recipe.pipeline.stage):
         return recipe

@@ -3,8 +3,7 @@
 from pathlib import Path
 
 from cnpgen.kernels.library import choose_backend
-from cnpgen.make.recipe import MAX_SEED, DatasetRecipe
-from cnpgen.make.recipe_file import as_dataset_recipe
+from cnpgen.make.recipe import MAX_SEED, DatasetRecipe, as_dataset_recipe
 from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans

@@ -8,11 +8,9 @@ from pathlib import Path
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.machine.engine import Engine
-from cnpgen.make.make_dataset import Begin, MadeDataset, Progress, carry_out
+from cnpgen.make.make_dataset import Begin, MadeDataset, Progress, carry_out, delete_shards
 from cnpgen.make.make_shards import Job, prepare
-from cnpgen.make.recipe import DatasetRecipe, split_rows
-from cnpgen.make.recipe_file import makes_its_rows, restored
-from cnpgen.make.repair import delete_shards
+from cnpgen.make.recipe import DatasetRecipe, makes_its_rows, restored, split_rows
 from cnpgen.make.resolve_spec import MAX_ROWS
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer

@@ -1,20 +1,34 @@
-"""Goal states of goal poses: batched inverse kinematics, then the valid states with the fastest straight line."""
+"""Goal poses: batched inverse kinematics, the valid states with the fastest straight line, and tasks of goal poses."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.errors import UsageError, lacks
 from cnpgen.pipelines.families.resting_states import RestingStates, seeds_of
+from cnpgen.plans.boundary_problems import plans_of_rows
+from cnpgen.plans.format import GOAL_OPTION
+from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.problem_record import record_problem
+from cnpgen.problems.scenes.quaternions import quaternion_mistake, rotation_matrix
 from cnpgen.problems.scenes.scene_problem import GoalPose
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
+from cnpgen.schema.catalogue import list_recipes
+from cnpgen.schema.toml import kind_of_file
+from cnpgen.schema.units import PLAUSIBLE_MAX, suggested_unit
+from cnpgen.store.field import Field
 from cnpgen.world.pose_ik import PoseKinematics, PoseTolerance, solve_pose_ik
 from cnpgen.world.world import World
 
@@ -24,6 +38,8 @@ MAX_GOAL_STATES = 5  # of one task that are tried, the nearest first
 POSE_REASON = "no inverse kinematics of the goal"
 POSE_SEEDS = 128  # of the inverse kinematics of a goal pose
 MIN_DIFFERENCE_RAD = 0.3  # rad or m, of two goal states with one pose in their farthest joint
+START_REASON = "start in collision, outside its limits or off a constraint"
+GOAL_REASON = "all goal states in collision or off a constraint"
 
 
 class EndConditions:
@@ -62,13 +78,10 @@ def states_of_pose(
     start: Array,
     random: np.random.Generator,
 ) -> tuple[Array, Array]:
-    """Return joint positions with a goal pose of a frame.
+    """Return joint positions [rad] that can end a motion, nearest to the start (n,) first, and all with a goal pose.
 
-    Robots without link geometry have no ``states`` of rest in a scene. ``random`` draws the seeds.
-
-    Returns:
-        Joint positions that can end a motion, the nearest to the start (n,) first, and all with this pose [rad], shape
-        (G, n) and (H, n).
+    The shapes are (G, n) and (H, n). Robots without link geometry have no ``states`` of rest in a scene. ``random``
+    draws the seeds.
     """
     positions, rotations = np.tile(pose.position, (POSE_SEEDS, 1)), np.tile(pose.rotation, (POSE_SEEDS, 1, 1))
     tolerances = [np.tile(np.broadcast_to(each, 3), (POSE_SEEDS, 1)) for each in pose.tolerances]
@@ -95,3 +108,99 @@ def nearest_states(states: Array, start: Array, robot: Robot, *, min_difference:
         if all(np.abs(states[index] - other).max() >= min_difference for other in chosen):
             chosen.append(states[index])
     return np.array(chosen).reshape(-1, states.shape[1])
+
+
+def problem_of_poses(recipe: object) -> Problem | None:
+    """Return the problem if an argument is one, or the name or the file of one; otherwise None."""
+    if isinstance(recipe, Problem):
+        return recipe
+    if not isinstance(recipe, str | Path):
+        return None
+    if Path(recipe).is_file():
+        return load_problem(recipe) if kind_of_file(Path(recipe)) == "problem" else None
+    others = {**list_recipes("dataset"), **list_recipes("pipeline")}
+    return load_problem(recipe) if str(recipe) in list_recipes("problem").keys() - others.keys() else None
+
+
+class PoseTasks:
+    """Tasks of a problem, with its obstacles, whose goals are poses of the tip.
+
+    Attributes:
+        robot: Its robot.
+        fields: Columns that tasks may have: name -> field.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self._problem, self.robot = problem, load_robot(problem)
+        joints, axes = self.robot.joint_names, ("x", "y", "z")
+        unit = self.robot.units("rad")
+        fields = (
+            Field("start_q", unit, "joint positions at the start, at rest", len(joints), joints),
+            Field("goal_xyz", "m", "position of the tip at the goal", 3, axes),
+            Field("goal_wxyz", "1", "quaternion of the tip's axes at the goal", 4, ("w", *axes)),
+            Field("goal_xyz_tolerance", "m", "accepted displacements along the axes of the goal pose", 3, axes),
+            Field("goal_rotation_tolerance", "1", "accepted rotation vector in these axes [rad]", 3, axes),
+        )
+        self.fields = {field.name: field for field in fields}
+        self._kinematics = PoseKinematics(self.robot)
+        self._conditions = EndConditions(problem, self.robot)
+        self._states = None if self.robot.shape is None else RestingStates(problem, self.robot)
+
+    def check(self, names: Mapping[str, object]) -> None:
+        """Raise UsageError for a column that tasks cannot have, or without goal positions."""
+        for name in names:
+            if name not in self.fields:
+                what = lacks("column to give", name, self.fields)
+                raise UsageError(f"the problem {self._problem.name!r} {what}", concerns=name)
+        if "goal_xyz" not in names:
+            raise UsageError("tasks must give goal_xyz, the tip position of the goal", concerns="goal_xyz")
+
+    def complete(self, columns: Mapping[str, Array]) -> tuple[Plans, tuple[str, ...]]:
+        """Compute goal states of N tasks, columns of shape (N, width) or (1, width), independently of each other.
+
+        The goal states of all tasks are boundary problems, at most ``MAX_GOAL_STATES`` for each, the nearest first.
+        Tasks without any have a reason.
+        """
+        count = max(map(len, columns.values()))
+        given = {name: np.broadcast_to(values, (count, values.shape[1])) for name, values in columns.items()}
+        given.setdefault("start_q", np.broadcast_to(self.robot.base, (count, self.robot.n)))
+        found = [self._goals(task, given) for task in range(count)]
+        reasons = tuple(goals if isinstance(goals, str) else "" for goals in found)
+        states = [np.empty((0, self.robot.n)) if isinstance(goals, str) else goals for goals in found]
+        goal, tasks = np.concatenate(states), np.repeat(np.arange(count), [len(each) for each in states])
+        numbers = np.concatenate([np.arange(len(each), dtype=float) for each in states])
+        rows: dict[str, NDArray[Any]] = {name: np.zeros_like(goal) for name in ("start_dq", "start_ddq", "goal_dq")}
+        rows |= {"start_q": given["start_q"][tasks], "goal_q": goal, GOAL_OPTION: numbers, "sample_id": tasks}
+        source = f"goal poses of {self._problem.name}"
+        return plans_of_rows(record_problem(self._problem), rows, source=source), reasons
+
+    def _goals(self, task: int, given: Mapping[str, Array]) -> Array | str:
+        """Return the goal states of a task, shape (G, n), or the reason why there are none."""
+        start, pose = given["start_q"][task], self._pose(task, given)
+        clear = self._states is None or self._states.are_ends(start[:, None])[0]
+        if not (clear and self._conditions.met(start[:, None])[0]):
+            return START_REASON
+        random = np.random.default_rng(POSE_SEEDS)
+        checks = self._states, self._conditions
+        goals, found = states_of_pose(self._kinematics, *checks, pose, start=start, random=random)
+        if not len(found):
+            return POSE_REASON
+        return goals if len(goals) else GOAL_REASON
+
+    def _pose(self, task: int, given: Mapping[str, Array]) -> GoalPose:
+        """Return the goal pose of a task; without an orientation, any is accepted."""
+        wxyz = given["goal_wxyz"][task] if "goal_wxyz" in given else np.array([1.0, 0.0, 0.0, 0.0])
+        if text := quaternion_mistake(wxyz):
+            raise UsageError(f"{text} in task {task}", argument="goal_wxyz")
+        free = np.zeros(3) if "goal_wxyz" in given else np.full(3, np.pi)
+        tolerances = {"goal_xyz_tolerance": np.zeros(3), "goal_rotation_tolerance": free}
+        for name in tolerances.keys() & given.keys():
+            tolerances[name] = given[name][task]
+            unit = "m" if name == "goal_xyz_tolerance" else "rad"
+            if (largest := float(tolerances[name].max())) > (limit := PLAUSIBLE_MAX[unit]):
+                hint = suggested_unit(largest, unit, high=limit)
+                text = f"must be at most {limit:.4g} {unit}, got {tolerances[name]} in task {task}{hint}"
+                raise UsageError(text, argument=name)
+            if (tolerances[name] < 0).any():
+                raise UsageError(f"must not be negative, got {tolerances[name]} in task {task}", argument=name)
+        return GoalPose("", given["goal_xyz"][task], rotation_matrix(wxyz), *tolerances.values())

@@ -3,37 +3,40 @@
 from __future__ import annotations
 
 import operator
+import os
 import warnings
 from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
 
-from cnpgen.errors import UsageError
+from cnpgen.errors import DatasetError, UsageError
 from cnpgen.machine.engine import Engine, assembled
 from cnpgen.make.certify import certified
 from cnpgen.make.make_shards import Job, make_shards
-from cnpgen.make.recipe import DatasetRecipe
-from cnpgen.make.recipe_file import as_dataset_recipe, load_notes
-from cnpgen.make.repair import delete_shards, existing_shards, find_damaged
+from cnpgen.make.recipe import DatasetRecipe, as_dataset_recipe, load_notes
 from cnpgen.make.resolve_spec import dataset_folder, draw_up
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.check import check_documents
+from cnpgen.store.checked_shard import Shard, read_rows
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shards
+from cnpgen.store.files.atomic import machine_errors
 from cnpgen.store.intact import RERUN_HINT
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.manifest import finalize, source_date
 from cnpgen.store.sampling_statistics import SamplingStatistics
-from cnpgen.store.shard_record import pending
+from cnpgen.store.shard_record import check_committed, pending
 from cnpgen.store.workspace import check_place, find_workspace, open_workspace
 
 # Number of rows up to which a second process takes longer to start than it saves, per backend.
 MAX_ROWS_OF_ONE_PROCESS = {"compiled": 200_000, "numpy": 20_000, "casadi": 5_000}
 MAX_BLOCKS_PER_RUN = 8  # blocks of the shards that a worker generates in one run
 MIN_RUNS_PER_WORKER = 4  # given enough blocks, so that workers finish at similar times
+MAX_THREADS = 8  # that compare shards with their records
 
 # Called with ("checking" or "making", folder, rows, existing rows).
 Begin = Callable[[str, Path, int, int], None]
@@ -171,7 +174,9 @@ def _missing_shards(
     job: Job, tasks: list[ShardTask], begin: Begin | None, progress: Progress | None
 ) -> tuple[list[ShardTask], list[str]]:
     """Compare existing shards with their records; return the shards to generate and the damaged files."""
-    existing = existing_shards(job.folder, tasks)
+    # Without a manifest, a shard without sidecar is unfinished, not lost: an interrupted run may leave it.
+    finished = (job.folder / MANIFEST).exists()
+    existing = [task for task in tasks if finished or (job.folder / task.sidecar).exists()]
     if existing and begin is not None:
         begin("checking", job.folder, sum(task.rows for task in existing), 0)
     damaged = find_damaged(job.folder, job.spec, existing, progress=progress)
@@ -261,3 +266,38 @@ def _check(part: tuple[int, int] | None, *, force: bool) -> None:
     if force:
         text = "{force} would delete what the other parts have made: remove the folder, then start the parts"
         raise UsageError(text, remedies={"force": True})
+
+
+def find_damaged(
+    folder: Path, spec: DatasetSpec, tasks: Sequence[ShardTask], *, progress: Callable[[int, None], None] | None = None
+) -> dict[ShardTask, str]:
+    """Compare existing shards with their sidecars and the specification; return damaged shard -> description."""
+    damaged = {}
+    pool = ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_THREADS))  # sha256 releases the GIL
+    try:
+        for task, problem in zip(tasks, pool.map(partial(_problem, folder, spec), tasks), strict=True):
+            if problem:
+                damaged[task] = problem
+            if progress is not None:
+                progress(task.rows, None)
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return damaged
+
+
+def _problem(folder: Path, spec: DatasetSpec, task: ShardTask) -> str:
+    """Return a description of the damage of a shard; empty for an intact shard."""
+    try:
+        check_committed(folder, spec, task)
+        read_rows(Shard(folder, spec, task))
+    except DatasetError as error:
+        return str(error)
+    return ""
+
+
+def delete_shards(folder: Path, tasks: Sequence[ShardTask]) -> None:
+    """Delete shards and the manifest of a dataset, which is unfinished from then on."""
+    # First the manifest and the sidecars, which mark data as complete.
+    for name in (MANIFEST, *(name for task in tasks for name in (task.sidecar, task.file))):
+        with machine_errors("delete", folder / name):
+            (folder / name).unlink(missing_ok=True)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import MachineError
 from cnpgen.kernels.library import Backend, choose_backend
 from cnpgen.machine.versions import versions
-from cnpgen.make.recipe_file import makes_its_rows, restored
+from cnpgen.make.recipe import makes_its_rows, restored
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.prepared import Block, PreparedPipeline
 from cnpgen.robots.scene_arrays import scene_poses
@@ -53,11 +53,7 @@ class Job:
 
 
 def prepare(job: Job) -> PreparedPipeline:
-    """Prepare the pipeline of a job.
-
-    Raises:
-        MachineError: The backend does not work on this machine, or this version of cnpgen generates other rows.
-    """
+    """Prepare the pipeline of a job; raise MachineError if this version of cnpgen generates other rows."""
     cache_folder = choose_backend(job.backend)[1] if job.cache_folder is None else job.cache_folder
     load = partial(PreparedPipeline, backend=job.backend, cache_folder=cache_folder, dtype=job.spec.dtype)
     if job.pipeline is not None:
@@ -75,11 +71,6 @@ def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, Sam
     """Generate, check and commit shards of one split, in order; yield rows and sampling statistics of each.
 
     The operation is idempotent.
-
-    Raises:
-        RecipeError: The accepted fraction of the candidates is too small.
-        MachineError: The disk or the backend fails.
-        UsageError: Another dataset replaced this one in the folder.
     """
     started, clock = _now(job), time.perf_counter()
     prepared = _prepared(job)
@@ -112,9 +103,7 @@ def shard_columns(
 ) -> Iterator[tuple[dict[str, NDArray[Any]], SamplingStatistics, SceneTable | None]]:
     """Compute the rows of shards of one split; every block is computed once.
 
-    Yields:
-        ``(columns, sampling, scenes)`` of every shard: field name -> values as stored, shape (rows, width) or (rows,),
-        the sampling statistics, and the scenes of the rows, None without scenes.
+    Yield the columns as stored, shape (rows, width) or (rows,), the sampling statistics, and the scenes or None.
     """
     chunks = _chunks(prepared, spec.seed, tasks)
     for task in tasks:
@@ -164,11 +153,7 @@ def spot_check(
 ) -> dict[str, float]:
     """Recompute some rows of a shard with Pinocchio and Coal, to detect errors of the compiler or backend.
 
-    Returns:
-        Largest violation of every check, in its unit.
-
-    Raises:
-        MachineError: A row fails a check.
+    Return the largest violation of every check, in its unit; raise MachineError if a row fails a check.
     """
     from cnpgen.judges.rows.verify import OBSTACLE_POSES, verify_rows
 

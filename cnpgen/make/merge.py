@@ -10,8 +10,7 @@ from pathlib import Path
 from cnpgen.errors import DatasetError, RecipeError, UsageError, listed
 from cnpgen.make.certify import certified
 from cnpgen.make.make_dataset import Begin, MadeDataset, Progress, finish
-from cnpgen.make.recipe import recipe_digest
-from cnpgen.make.recipe_file import load_dataset_recipe, load_notes
+from cnpgen.make.recipe import load_dataset_recipe, load_notes, recipe_digest
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.catalogue import list_recipes
 from cnpgen.store.checked_shard import Shard, read_rows
@@ -92,12 +91,7 @@ def _require_inside(folder: Path, names: Sequence[str] = (*DOCUMENTS, WORK)) -> 
 
 
 def _owners(folders: Sequence[Path], out: Path, spec: DatasetSpec) -> dict[ShardTask, Path]:
-    """Return the folder of each shard to copy.
-
-    Raises:
-        UsageError: Two folders have the same shard.
-        DatasetError: A shard is missing in all folders.
-    """
+    """Return the folder of each shard to copy; raise an error for a shard in two folders or in none."""
     owners: dict[ShardTask, Path] = {}
     missing = []
     for task in shards(spec):

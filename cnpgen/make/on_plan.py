@@ -1,27 +1,69 @@
 """Stages for replanning: starts on planned or refined motions, and goals of these motions."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.machine.threads import one_thread
-from cnpgen.make.stage_planner import SHA256, load_stage_planner, planner_boundary
-from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.boundary_motion import onto_table, velocity_of_tip
 from cnpgen.pipelines.stages.draw import position_field
-from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction, leave
-from cnpgen.plans.format import BOUNDARY
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction, fraction, leave
+from cnpgen.plans.format import BOUNDARY, CONDITIONS
 from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.problem_record import record_problem
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
+from cnpgen.store.files.atomic import file_sha256
+from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion, states_at_times
 
+if TYPE_CHECKING:
+    from cnpgen.planner.planner import Planner
+
+
+SHA256 = "^([0-9a-f]{64})?$"
 STATES_PER_REFINED_PLAN = 40  # a refined plan takes about 20 ms, a state on it is cheap
 START = ("start_q", "start_dq", "start_ddq")
 GOAL = ("goal_q", "goal_dq", "goal_xyz", "hit_angle", "hit_speed", "hit_speed_max", "home_q")
+
+
+def model_sha256(model: str) -> str:
+    """Return the sha256 of the file of a model, by the name of a shipped one or the file's path."""
+    from cnpgen.planner.model_file import find_model
+
+    return file_sha256(find_model(model))
+
+
+def load_stage_planner(model: str, sha256: str, context: Context) -> "Planner":
+    """Load the planner of a stage, a shipped model or a model file with the digest ``sha256``.
+
+    Raise RecipeError if the file has another sha256, or the model is for another problem.
+    """
+    from cnpgen.planner.model_file import load_model
+    from cnpgen.planner.planner import Planner
+
+    digest = model_sha256(model)
+    if digest != sha256:
+        raise RecipeError([f"sha256: the file of model {model!r} has {digest}, expected {sha256}"])
+    loaded, problem = load_model(model), record_problem(context.problem)
+    if loaded.problem.comparable_sha256 != problem.comparable_sha256:
+        differs = ", ".join(problem.differences(loaded.problem)[:4])
+        raise RecipeError([f"model: {model!r} plans for another problem, they differ in {differs}; leave it out"])
+    return Planner(loaded, backend=context.kernels.backend)
+
+
+def planner_boundary(columns: Mapping[str, Array], planner: "Planner") -> Boundary:
+    """Return the boundary conditions of N rows for a planner, from columns of shape (N, width).
+
+    Goal accelerations are omitted if the planner leaves them free.
+    """
+    names = [name for name in CONDITIONS if name != "goal_ddq" or planner.model.fixed_at_goal == 3]
+    return Boundary(**{name: columns[name] for name in names if name in columns})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,12 +74,9 @@ class StartOnPlan(Stage):
     replaces = ("goal_q", "goal_dq")
     model: str = field("planner: name of a shipped model, or path of a model file")
     sha256: str = field("sha256 of the model file; another file gives other samples", pattern=SHA256)
-    moved: float = field("fraction of the starts that are moved onto plans", low=0.0, high=1.0)
-    refined: float = field(
-        f"fraction of the moved ones that are on refined plans, up to {STATES_PER_REFINED_PLAN} on each",
-        low=0.0,
-        high=1.0,
-        default=0.0,
+    moved: float = fraction("fraction of the starts that are moved onto plans")
+    refined: float = fraction(
+        f"fraction of the moved ones that are on refined plans, up to {STATES_PER_REFINED_PLAN} on each", default=0.0
     )
     times: Range = field("time on the plan as a fraction of its duration")
 
@@ -49,7 +88,6 @@ class StartOnPlan(Stage):
         )
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the fields of the state and the tip position at the start."""
         quantities = (("rad", "positions"), ("rad/s", "velocities"), ("rad/s^2", "accelerations"))
         states = (
             context.joint_field(name, unit, f"joint {quantity} at the start")
@@ -60,7 +98,6 @@ class StartOnPlan(Stage):
         return (*states, position_field("start", [*low, table.z], [*high, table.z]))
 
     def writes(self, context: Context) -> tuple[str, ...]:
-        """List the outputs, the tip velocity, and the goals of the plans."""
         return (*(field.name for field in self.outputs(context)), "start_tip_velocity", *map(of_plan, GOAL))
 
     def prepare(self, context: Context) -> StageFunction:
@@ -86,7 +123,6 @@ class StartOnPlan(Stage):
         return work
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
-        """Keep the start of tasks."""
         return leave
 
     def _maker(
@@ -118,7 +154,7 @@ class GoalOfPlan(Stage):
     """Stage: keep the goal of the motion that contains the start, in a fraction of the cases."""
 
     inputs = tuple(f"planned_{name}" for name in GOAL)
-    share: float = field("fraction of the plans that are refined", low=0.0, high=1.0)
+    share: float = fraction("fraction of the plans that are refined")
 
     def describe(self) -> str:
         return f"in {100 * self.share:.4g} % of the cases take the goal of the motion that the start is on"
@@ -133,7 +169,6 @@ class GoalOfPlan(Stage):
         return work
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
-        """Keep the goal of tasks."""
         return leave
 
 

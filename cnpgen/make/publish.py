@@ -13,7 +13,6 @@ import os
 import re
 import shutil
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,23 +40,10 @@ WRITTEN = re.compile(  # paths of tables and shards in the repository
 SOURCE_KEY = b"cnpgen.sha256"  # metadata of a table: the sha256 of its shard
 
 
-@dataclass(frozen=True)
-class Published:
-    """A published dataset.
-
-    Attributes:
-        folder: Folder of the repository on this machine.
-        url: Address of the repository; empty if it was not uploaded.
-    """
-
-    folder: Path
-    url: str = ""
-
-
 @checked_arguments
 def publish_dataset(
     folder: str | Path, to: str, *, out: str | Path, private: bool = False, dry_run: bool = False
-) -> Published:
+) -> str:
     """Write the repository of a dataset and upload it; a second call continues an interrupted one.
 
     Tables and shards of an earlier state of the dataset are removed, from the folder and from the hub.
@@ -68,6 +54,9 @@ def publish_dataset(
         out: Folder of the repository on this machine.
         private: Whether a new repository is private.
         dry_run: Whether to write the folder only.
+
+    Returns:
+        Address of the repository; empty if it was not uploaded.
 
     Raises:
         UsageError: The repository has no valid name or is inside the dataset, or the dataset has no license.
@@ -90,7 +79,7 @@ def publish_dataset(
             " which keeps the samples"
         )
     write_repository(source, spec, target, repository=to)
-    return Published(target) if dry_run else Published(target, upload_folder(target, to, private=private))
+    return "" if dry_run else upload_folder(target, to, private=private)
 
 
 def write_repository(source: Path, spec: DatasetSpec, target: Path, *, repository: str) -> None:

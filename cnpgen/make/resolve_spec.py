@@ -25,9 +25,6 @@ def dataset_folder(recipe: DatasetRecipe, out: str | Path | None) -> Path:
     """Return the folder of a dataset, by default ``NAME-vMAJOR`` in the current folder.
 
     A path with ".." after a missing folder is resolved, since creating that folder could change its target.
-
-    Raises:
-        UsageError: The path is empty.
     """
     if out is None:
         return Path(f"{recipe.name}-v{recipe.version.split('.')[0]}")
@@ -52,11 +49,6 @@ def draw_up(
 
     An unfinished dataset of the recipe in the folder determines the default backend and shard size, unless ``force``
     deletes it.
-
-    Raises:
-        RecipeError: The recipe has mistakes.
-        UsageError: An argument is invalid.
-        MachineError: No backend works.
     """
     total, root, shard_size = _check(recipe, n, seed, shard_size)
     digest, begun = recipe_digest(recipe), workspace.spec
@@ -109,10 +101,9 @@ def _check(
 
 
 def _solved_tasks(prepared: PreparedPipeline, recipe: DatasetRecipe, seed: int, n: int | None) -> int:
-    """Return the number of rows of a dataset of listed tasks: at most one per solved task.
+    """Return the number of rows of a dataset of listed tasks, at most one per solved task.
 
-    Raises:
-        UsageError: More rows are requested, no task is solved, or the recipe has several splits.
+    Raise UsageError if more rows are requested, no task is solved, or the recipe has several splits.
     """
     if len(recipe.splits) > 1:
         splits = ", ".join(recipe.splits)

@@ -1,38 +1,46 @@
 """Acceptance: the last check of every pipeline evaluates the problem's constraints on the values as stored.
 
-The check is independent of the stages: it makes no assumption about their convergence, order or tolerances.
+The check is independent of the stages: it makes no assumption about their convergence, order or tolerances. States that
+conservative conditions do not accept go to a narrow phase: exact checks with Pinocchio and Coal. A capsule contains its
+link: if the capsule has clearance, so has the link. Otherwise the convex parts of the link are checked.
 """
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, dot, subtract, symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
-from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.collision import candidate_poses
-from cnpgen.pipelines.stages.narrow_phase import narrow_phase_of, narrow_phase_of_scenes, unmet
-from cnpgen.pipelines.stages.stage import CandidateBatch, StageFunction
-from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, End
+from cnpgen.pipelines.stages.scene_clearance import SceneClearance
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, StageFunction
+from cnpgen.problems.constraints.clearance import RobotClearance
+from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, Condition, Constraint, End
 from cnpgen.problems.constraints.needs import symbolic_needs
+from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene_arrays import scene_capacity
-from cnpgen.store.field import Field
-from cnpgen.store.scene_table import SCENE_ID
+from cnpgen.world.path import PathWorld
+from cnpgen.world.world import World
 
+Mask = NDArray[np.bool_]
+States = tuple[Array, Array, Array]
+
+Decide = Callable[[States, Array, Mask, CandidateBatch | None], Mask]
+"""Function of the narrow phase, see ``narrow_phase_of``."""
+
+MIN_SCENE_MARGIN_M = 1e-6  # of distances in compiled code, above which Coal does not measure them again
 ZERO_VELOCITY_ROUNDING_M_S = 1e-14  # rounding error of a velocity that is zero in exact arithmetic
 
 
 def acceptance(context: Context, written: set[str], *, given: Collection[End] = ()) -> StageFunction:
-    """Prepare the acceptance check of the columns that the stages write.
+    """Prepare the check of the columns that the stages write, which rejects under the first violated constraint.
 
     Accelerations and torques of the goal are checked if ``goal_ddq`` is among them. The tolerances of motions apply to
     ``given`` ends, whose state is from the user, for example a measurement; to others those of boundary states.
-
-    Returns:
-        A stage function that rejects candidates under the reason of the first violated constraint.
     """
     ends: tuple[End, ...] = ("start", "goal")
     hit = {"start": (), "goal": ("hit_angle", "hit_speed") if "hit_angle" in written else ()}
@@ -84,11 +92,8 @@ def boundary_unmet(
 
     For a hit it is ``(q, dq, ddq, obstacle_poses, position, angle, speed) -> unmet``: the tip velocity must be
     horizontal, along the angle, at the speed. Conditions on derivatives of q higher than ``needs`` are omitted. Unless
-    the state is ``exact``, the tolerances of motions apply, and conditions for boundary states only are omitted.
-    ``cnpgen.pipelines.stages.narrow_phase`` checks conservative conditions.
-
-    Returns:
-        A function whose result has one row per constraint, one for the tip position, and one for a hit.
+    the state is ``exact``, the tolerances of motions apply, and conditions for boundary states only are omitted. The
+    narrow phase checks conservative conditions. There is a row per constraint, for the tip position, and for a hit.
     """
     import casadi as ca
 
@@ -127,11 +132,118 @@ def _direction_unmet(velocity: Vec, angle: Scalar, speed: Scalar, *, dtype: str)
     return ca.logic_not(met)
 
 
-def bookkeeping_fields(*, scenes: bool = False) -> tuple[Field, ...]:
-    """Return the bookkeeping fields of every dataset, and with ``scenes`` that of the scene of a row."""
-    text = "sample_id of the first row in the same scene"
-    return (
-        *((Field(SCENE_ID, "1", text, role="context", dtype="int64"),) if scenes else ()),
-        Field("attempts", "1", "candidates per accepted row, including this row", role="diagnostic", dtype="int64"),
-        Field("sample_id", "1", "index of the row in its split", role="diagnostic", dtype="int64"),
-    )
+def narrow_phase_of(context: Context, end: End, *, exact: bool = True) -> Decide | None:
+    """Prepare the narrow phase of one end; return None if the problem never needs it.
+
+    The tolerances of boundary states apply if it is ``exact``, otherwise those of motions.
+
+    Returns:
+        A function of states ``(q, dq, ddq)``, shape (n, N) each, obstacle poses, shape (width, N), a mask of the states
+        to check, shape (N,), and the candidates. It returns a mask of the violated constraints, shape (constraints, N).
+    """
+    problem, robot = context.problem, context.robot
+    if robot.shape is None and robot.held_shape is None and all(obstacle.upright for obstacle in problem.obstacle):
+        return None
+    kernel = context.kernels.load_by_structure(narrow_phase, end=end, dtype=context.dtype)
+    path = PathWorld(robot, problem.obstacle, problem.object_size)
+
+    def decide_states(state: States, obstacle_poses: Array, mask: Mask, _candidates: CandidateBatch | None) -> Mask:
+        (unmet_counts,) = kernel(*state, obstacle_poses)
+        remaining, violated = (unmet_counts > 0) & mask, np.zeros(unmet_counts.shape, bool)
+        one_scene = bool(np.all(obstacle_poses == obstacle_poses[:, :1]))
+        for row in np.flatnonzero(remaining.any(axis=1)):
+            if problem.constraint[row].uses_obstacles and not one_scene:
+                continue
+            candidates = np.flatnonzero(remaining[row])
+            tolerance = BOUNDARY_TOLERANCES[context.dtype]["position"]
+            if not exact:
+                tolerance = max(tolerance, problem.constraint[row].effective_tolerance)
+            q, dq, ddq = (np.ascontiguousarray(values[:, candidates], float) for values in state)
+            path.set_path(q, dq, ddq, obstacle_poses[:, 0])
+            met = problem.constraint[row].met(path, tolerance)
+            if met is not None:
+                remaining[row, candidates], violated[row, candidates] = False, ~met
+        return violated | measure_one_by_one(state, obstacle_poses, remaining)
+
+    measure_one_by_one = _one_by_one(context, end, exact=exact)
+    return decide_states
+
+
+def narrow_phase_of_scenes(context: Context, end: End, *, exact: bool = True) -> Decide:
+    """Prepare the narrow phase of one end among the obstacles of scenes, see ``narrow_phase_of``.
+
+    Compiled collision checks accept states whose distances are more than ``MIN_SCENE_MARGIN_M`` above the required
+    ones; Coal measures the others.
+    """
+    problem, clearance = context.problem, SceneClearance(context)
+    by_distance = np.array([isinstance(each, RobotClearance | SelfClearance) for each in problem.constraint], bool)
+    measure_one_by_one = _one_by_one(context, end, exact=exact)
+    obstacles, width = problem.obstacle, problem.scene_width
+    _, symbolic_state = SymbolicState.of_symbols(context.robot, obstacles, problem.object_size, width)
+    conservative = ~by_distance  # the constraints with conservative conditions
+    for row in np.flatnonzero(conservative):
+        conditions = problem.constraint[row].symbolic_at(symbolic_state, end)
+        conservative[row] = any(condition.sufficient for condition in conditions)
+
+    def decide_states(state: States, obstacle_poses: Array, mask: Mask, candidates: CandidateBatch | None) -> Mask:
+        q, remaining = np.ascontiguousarray(state[0], float), np.zeros((len(by_distance), len(mask)), bool)
+        clear = np.zeros(len(mask), bool)
+        if candidates is not None and candidates.scenes is not None:
+            clear = clearance.are_clear(q, candidates.scene, candidates.scenes, MIN_SCENE_MARGIN_M, MIN_SCENE_MARGIN_M)
+        remaining[by_distance] = ~clear & mask
+        remaining[conservative] = mask
+        return measure_one_by_one(state, obstacle_poses, remaining)
+
+    return decide_states
+
+
+def _one_by_one(context: Context, end: End, *, exact: bool) -> Callable[[States, Array, Mask], Mask]:
+    """Return a function that measures chosen constraints of states, one by one, with Pinocchio and Coal."""
+    problem = context.problem
+    world = World(context.robot, problem.obstacle, problem.object_size)
+
+    def measure(state: States, obstacle_poses: Array, remaining: Mask) -> Mask:
+        violated = np.zeros(remaining.shape, bool)
+        for candidate in np.flatnonzero(remaining.any(axis=0)):
+            q, dq, ddq = (np.ascontiguousarray(values[:, candidate]) for values in state)
+            world.set_state(q, dq, ddq, obstacle_poses[:, candidate])
+            for row in np.flatnonzero(remaining[:, candidate]):
+                violated[row, candidate] = _violates(problem.constraint[row], world, end, context.dtype, exact=exact)
+        return violated
+
+    return measure
+
+
+def _violates(constraint: Constraint, world: World, end: End, dtype: str, *, exact: bool) -> bool:
+    """Return whether the measured form of a constraint is violated by more than the tolerance of a boundary state."""
+    for condition in constraint.measured_at(world, end):
+        g, tolerance = np.array(condition.g, float), condition.tolerance(dtype)
+        tolerance = tolerance if exact else np.maximum(tolerance, constraint.allowed(condition))
+        if not ((g >= condition.lower - tolerance) & (g <= condition.upper + tolerance)).all():
+            return True
+    return False
+
+
+def narrow_phase(robot: Robot, problem: Problem, *, end: End, dtype: str) -> Any:
+    """Build ``(q, dq, ddq, obstacle_poses) -> unmet``: number of unmet conservative values of every constraint."""
+    import casadi as ca
+
+    columns, state = SymbolicState.of_symbols(robot, problem.obstacle, problem.object_size, problem.scene_width)
+    rows: list[Scalar] = []
+    for constraint in problem.constraint:
+        conditions = [condition for condition in constraint.symbolic_at(state, end) if condition.sufficient]
+        rows.append(sum((unmet(condition, condition.tolerance(dtype)) for condition in conditions), ca.SX(0)))
+    return ca.Function(f"narrow_phase_{end}", columns, [ca.vertcat(*rows)])
+
+
+def unmet(condition: Condition, tolerance: Array) -> Scalar:
+    """Count the values of a condition that violate its bounds by more than a tolerance; nan counts as a violation."""
+    import casadi as ca
+
+    count: Scalar = ca.SX(0)
+    for value, low, high, allowed in zip(condition.g, condition.lower, condition.upper, tolerance, strict=True):
+        if np.isfinite(low):
+            count = count + ca.logic_not(value >= float(low - allowed))
+        if np.isfinite(high):
+            count = count + ca.logic_not(value <= float(high + allowed))
+    return count

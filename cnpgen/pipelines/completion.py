@@ -7,10 +7,8 @@ import numpy as np
 from cnpgen.errors import UsageError, lacks
 from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.pipelines.acceptance import acceptance
-from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.pipeline import Pipeline
-from cnpgen.pipelines.stages.stage import Array, TaskBatch
-from cnpgen.pipelines.steps import PipelineStep, prepare_steps, steps_of, stored_fields, written_columns
+from cnpgen.pipelines.pipeline import Pipeline, PipelineStep, prepare_steps, steps_of, stored_fields, written_columns
+from cnpgen.pipelines.stages.stage import Array, Context, TaskBatch
 from cnpgen.problems.constraints.constraint import End
 from cnpgen.problems.constraints.puck_contact import PuckContact
 from cnpgen.problems.constraints.table import Table
@@ -30,10 +28,6 @@ class Completion:
         context: Problem, robot and kernels.
         given: Columns of the tasks: name -> field.
         height: Tip height on the problem's table [m], the default z of positions; None without a table.
-
-    Raises:
-        UsageError: The pipeline does not accept a column, or requires further columns.
-        RecipeError: The stages are inconsistent with each other or with the problem.
     """
 
     def __init__(self, pipeline: Pipeline, context: Context, given: Collection[str]) -> None:
@@ -60,14 +54,9 @@ class Completion:
         return sum(max(field.width, 1) for field in self._fields)
 
     def __call__(self, columns: Mapping[str, Array]) -> TaskBatch:
-        """Complete N tasks independently of each other.
+        """Complete N tasks independently of each other; unsolved tasks are rejected with an outcome.
 
-        Args:
-            columns: Given columns, name -> values, float64, shape (width, N), or (width, 1) for all tasks. Positions on
-                a table may omit the height.
-
-        Returns:
-            The tasks; unsolved tasks are rejected with an outcome.
+        The given columns have shape (width, N), or (width, 1) for all tasks. Positions on a table may omit the height.
         """
         candidates = TaskBatch(max(values.shape[1] for values in columns.values()))
         for name, values in columns.items():
@@ -75,7 +64,11 @@ class Completion:
             whole = self._on_table(values, columns.get("parameters")) if flat else values
             same = whole if whole.shape[1] == candidates.size else np.broadcast_to(whole, (len(whole), candidates.size))
             candidates[name] = np.ascontiguousarray(same)
-        self._derive(candidates)
+        for name in self._derived:
+            if name == "start_q":
+                candidates[name] = np.repeat(self.context.robot.base[:, None], candidates.size, axis=1)
+            else:
+                candidates[name] = self.tip_positions(candidates[name.replace("xyz", "q")])
         for label, run_stage in self._stages:
             candidates.stage = label
             run_stage(candidates, self._random)
@@ -91,11 +84,7 @@ class Completion:
         return np.asarray(position)
 
     def rows(self, tasks: TaskBatch) -> dict[str, Array]:
-        """Return the fields of the M solved tasks in the layout of a dataset.
-
-        Returns:
-            Name -> values, shape (M, width), or (M,) for scalars; ``tasks.alive`` has the indices of the tasks.
-        """
+        """Return the fields of the M solved tasks in the layout of a dataset, shape (M, width), or (M,) for scalars."""
         fields = [field for field in self._fields if field.name in tasks.columns]
         return {
             field.name: np.ascontiguousarray(tasks[field.name].T) if field.width else tasks[field.name][0]
@@ -115,13 +104,6 @@ class Completion:
         direction = np.stack([np.cos(angle), np.sin(angle), np.zeros(tasks.size)], axis=1)
         touching = contact.touches(start, contact.scene_values(goal, direction)) & (tasks.outcome > 0)
         tasks.outcome[touching] = 1 + tasks.reasons.index(contact.boundary_reason)
-
-    def _derive(self, candidates: TaskBatch) -> None:
-        for name in self._derived:
-            if name == "start_q":
-                candidates[name] = np.repeat(self.context.robot.base[:, None], candidates.size, axis=1)
-            else:
-                candidates[name] = self.tip_positions(candidates[name.replace("xyz", "q")])
 
     def _on_table(self, values: Array, parameters: Array | None) -> Array:
         """Return positions on the table of the tasks, shape (2, N), in the world frame, shape (3, N)."""
@@ -146,11 +128,7 @@ def given_fields(steps: Iterable[PipelineStep], context: Context) -> dict[str, F
 
 
 def _check(pipeline: Pipeline, fields: Mapping[str, Field], given: Collection[str]) -> None:
-    """Check the columns of tasks.
-
-    Raises:
-        UsageError: The pipeline does not accept a column, two columns exclude each other, or no goal is given.
-    """
+    """Raise UsageError for columns that the pipeline does not accept or that exclude each other, or without a goal."""
     for name in given:
         if name not in fields:
             raise UsageError(f"the pipeline {pipeline.name!r} {lacks('column to give', name, fields)}", concerns=name)

@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.kernels.library import Backend
 from cnpgen.pipelines.acceptance import acceptance
-from cnpgen.pipelines.context import load_context
-from cnpgen.pipelines.pipeline import Pipeline, listed_tasks
+from cnpgen.pipelines.pipeline import Pipeline, listed_tasks, prepare_steps, steps_of, stored_fields, written_columns
 from cnpgen.pipelines.stages.draw_scenes import DrawScenes
-from cnpgen.pipelines.stages.stage import Array, CandidateBatch
-from cnpgen.pipelines.steps import prepare_steps, steps_of, stored_fields, written_columns
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, load_context
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES
 from cnpgen.store.field import Field
 from cnpgen.store.sampling_statistics import DensityMap, SamplingStatistics
@@ -53,9 +51,6 @@ class PreparedPipeline:
         block_rows: Rows per block.
         tasks: Number of listed tasks, all in one block; None for an unlimited pipeline.
         families: Names of the families of scenes; empty without scenes.
-
-    Raises:
-        RecipeError: The stages are inconsistent with each other or with the problem.
     """
 
     def __init__(self, pipeline: Pipeline, *, backend: Backend, cache_folder: Path, dtype: str = "float64") -> None:
@@ -75,21 +70,14 @@ class PreparedPipeline:
             self._accept = acceptance(self.context, written)
 
     def block(self, seed: int, split: str, index: int, *, first: int = 0, stop: int | None = None) -> Block:
-        """Compute rows ``first`` to ``stop``, exclusive, of a block of a split; all rows by default.
-
-        Raises:
-            RecipeError: The accepted fraction of the candidates is below ``MIN_ACCEPTANCE``.
-        """
+        """Compute rows ``first`` to ``stop``, exclusive, of a block of a split; all rows by default."""
         (block,) = self.chunks(seed, split, index, [(first, self.block_rows if stop is None else stop)])
         return block
 
     def chunks(self, seed: int, split: str, index: int, ranges: Sequence[tuple[int, int]]) -> Iterator[Block]:
         """Compute several ranges of rows of one block, sampled only once, and yield each as soon as it is complete.
 
-        The ranges (first, exclusive end) ascend without overlap.
-
-        Raises:
-            RecipeError: The accepted fraction of the candidates is below ``MIN_ACCEPTANCE``.
+        The ranges (first, exclusive end) ascend without overlap. Raise RecipeError if too few candidates are accepted.
         """
         random = random_generator(seed, split, index)
         waiting = deque(BlockChunk(self.fields, first, stop) for first, stop in ranges)

@@ -8,11 +8,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.pipelines.completion import Completion
-from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.pipeline_file import restore_pipeline
-from cnpgen.pipelines.stages.behind_puck import behind
+from cnpgen.pipelines.pipeline import restore_pipeline
+from cnpgen.pipelines.stages.hit_angle import behind
 from cnpgen.pipelines.stages.hitting_velocity import SPEED_SHARE_COLUMN
-from cnpgen.pipelines.stages.stage import TaskBatch
+from cnpgen.pipelines.stages.stage import Context, TaskBatch
 from cnpgen.planner.inference_pipeline import loaded_problem
 from cnpgen.planner.model import Model
 from cnpgen.planner.plan_requests import drawing_stages

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.loader.order import Order
+from cnpgen.loader.windows import Order
 from cnpgen.planner.control_points import ControlPoints
 from cnpgen.planner.network.features import Features, feature_blocks, fit_features
 from cnpgen.planner.task_preprocessor import TaskPreprocessor

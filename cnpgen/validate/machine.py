@@ -259,7 +259,7 @@ def _check_cache(findings: _Findings, cache: str) -> bool:
 def _check_recipes(findings: _Findings) -> str:
     """Load every shipped dataset recipe with its robot."""
     try:
-        from cnpgen.make.recipe_file import load_dataset_recipe
+        from cnpgen.make.recipe import load_dataset_recipe
         from cnpgen.problems.load_robot import load_robot
         from cnpgen.schema.catalogue import list_recipes, recipes_root
 

@@ -15,7 +15,7 @@ from cnpgen.judges.rows.hits import hit_rule, repeated_fraction, speed_fractions
 from cnpgen.judges.rows.row_report import RowReport, merge
 from cnpgen.judges.rows.verify import OBSTACLE_POSES, PlanCheck, check_plans, verify_rows
 from cnpgen.machine.engine import Engine, assembled
-from cnpgen.make.recipe_file import restored
+from cnpgen.make.recipe import restored
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.robots.scene_arrays import scene_poses

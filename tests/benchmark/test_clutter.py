@@ -12,8 +12,8 @@ from cnpgen.benchmark import Setting, load_suite
 from cnpgen.benchmark.benchmark_planner import load_planner
 from cnpgen.benchmark.planners.rrtconnect import has_manifold
 from cnpgen.errors import RecipeError
-from cnpgen.pipelines.families.catalog import FAMILIES
 from cnpgen.pipelines.families.resting_states import RestingStates
+from cnpgen.pipelines.families.scene_generator import FAMILIES
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.scenes import SceneProblem, load_scenes, save_scenes
 from cnpgen.schema.catalogue import list_recipes

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from cnpgen.cli.main import main
-from cnpgen.make.recipe_file import load_dataset_recipe
-from cnpgen.pipelines.pipeline_file import load_pipeline
+from cnpgen.make.recipe import load_dataset_recipe
+from cnpgen.pipelines.pipeline import load_pipeline
 from cnpgen.problems.problem import resolved
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import record_problem

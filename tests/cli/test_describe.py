@@ -14,8 +14,8 @@ from cnpgen.cli.describe import (
     recipe_to_dict,
 )
 from cnpgen.cli.terminal import LINE_WIDTH, table
-from cnpgen.make.recipe_file import load_dataset_recipe
-from cnpgen.pipelines.pipeline_file import load_pipeline
+from cnpgen.make.recipe import load_dataset_recipe
+from cnpgen.pipelines.pipeline import load_pipeline
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.schema.catalogue import list_recipes
 from cnpgen.schema.keys import Range

@@ -15,7 +15,7 @@ from cnpgen.cli.init.arm import read_arm
 from cnpgen.cli.init.initial_recipes import INITIAL_JERK_RATE, problem_of
 from cnpgen.cli.init.write import toml
 from cnpgen.cli.main import main
-from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.problems.constraints.joint import JointJerk
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import resolved

@@ -12,7 +12,7 @@ from cnpgen.cli.describe import describe_problem, recipe_to_dict, with_units
 from cnpgen.judges.plans.judge import judge
 from cnpgen.kernels.library import problem_kernels
 from cnpgen.loader.dataset import make_frame
-from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.stages.stage import Context
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem

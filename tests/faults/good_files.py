@@ -10,8 +10,7 @@ import numpy as np
 
 from cnpgen.benchmark.results_file import answer_to_dict, open_results
 from cnpgen.make.make_dataset import make_dataset
-from cnpgen.make.recipe import DatasetRecipe
-from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.recipe import DatasetRecipe, load_dataset_recipe
 from cnpgen.planner.model_file import save_model
 from cnpgen.plans.plan_file import save_plans
 from cnpgen.refine.refinement_journal import open_journal

@@ -20,8 +20,8 @@ from cnpgen.benchmark.suite import load_suite
 from cnpgen.cli.inspect_command import inspection_text
 from cnpgen.errors import CnpgenError
 from cnpgen.loader.load import load_dataset
-from cnpgen.make.recipe_file import load_dataset_recipe
-from cnpgen.make.task_table import read_tasks
+from cnpgen.make.complete import read_tasks
+from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.planner.model_file import MODEL_KIND, MODEL_VERSION, load_model
 from cnpgen.planner.plan_requests import read_file
 from cnpgen.planner.planner import Planner

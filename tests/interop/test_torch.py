@@ -20,7 +20,7 @@ from torch.utils.data import DataLoader
 
 from cnpgen.errors import UsageError
 from cnpgen.interop.torch import BatchDataset, RowDataset, control_points, plan_loss, to_torch
-from cnpgen.loader import order
+from cnpgen.loader import windows
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
 from cnpgen.losses.plan_loss import PlanLoss
@@ -257,7 +257,7 @@ def test_a_batch_of_tensors_is_printed_in_a_line(dataset: Dataset) -> None:
 
 
 def test_a_worker_that_starts_within_a_window_gets_its_part(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(order, "WINDOW_ROWS", 16)
+    monkeypatch.setattr(windows, "WINDOW_ROWS", 16)
     loader = DataLoader(BatchDataset(dataset.batches(3, fields=ALL)), batch_size=None, num_workers=2)
     assert rows(loader) == ids(dataset.batches(3, fields=ALL))
 

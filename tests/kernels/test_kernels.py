@@ -617,7 +617,7 @@ def repository() -> Path:
 WARM_START = """
 import sys
 from cnpgen.kernels.library import choose_backend
-from cnpgen.pipelines.pipeline_file import load_pipeline
+from cnpgen.pipelines.pipeline import load_pipeline
 
 from cnpgen.pipelines.prepared import PreparedPipeline
 backend, folder = choose_backend(sys.argv[1])
@@ -637,7 +637,7 @@ def test_a_warm_start_does_not_import_casadi(prepare: Prepare, backend):
 
 
 def test_kernels_of_a_pipeline_restored_from_a_plan_are_those_of_its_files(prepare: Prepare, tmp_path, monkeypatch):
-    from cnpgen.make.recipe_file import load_dataset_recipe, restore_dataset_recipe
+    from cnpgen.make.recipe import load_dataset_recipe, restore_dataset_recipe
     from cnpgen.problems.problem import resolved
 
     recipe = load_dataset_recipe("airhockey-hit")

@@ -10,7 +10,7 @@ import pytest
 
 from cnpgen.kernels import library as library_module
 from cnpgen.kernels.library import BUILDER_PACKAGES, PACKAGE_FOLDER, KernelLibrary
-from cnpgen.pipelines.stages.braking import tip_state
+from cnpgen.pipelines.stages.reach import tip_state
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 
@@ -97,7 +97,7 @@ def tapes(folder: Path) -> set[str]:
     return {path.name for path in (folder / "tape").iterdir()}
 
 
-@pytest.mark.parametrize("changed", ["problems/constraints/joint.py", "pipelines/stages/braking.py", "robots/chain.py"])
+@pytest.mark.parametrize("changed", ["problems/constraints/joint.py", "pipelines/stages/reach.py", "robots/chain.py"])
 def test_a_change_in_a_subfolder_of_a_package_changes_the_key_of_a_tape(
     copy: Path, tmp_path: Path, changed: str
 ) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.loader import order, packed, windows
+from cnpgen.loader import windows
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
@@ -45,8 +45,8 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 @pytest.fixture(autouse=True, params=["kept in memory", "read in every epoch"])
 def _small_windows(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
-    monkeypatch.setattr(order, "WINDOW_ROWS", 20)
-    monkeypatch.setattr(packed, "MAX_IN_MEMORY_BYTES", 1 << 20 if request.param == "kept in memory" else 0)
+    monkeypatch.setattr(windows, "WINDOW_ROWS", 20)
+    monkeypatch.setattr(windows, "MAX_IN_MEMORY_BYTES", 1 << 20 if request.param == "kept in memory" else 0)
 
 
 def cases(dataset: Dataset, count: int = 12) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -349,7 +349,7 @@ def test_invalid_states_are_refused(plain: Dataset, change: dict[str, Any], mess
 
 
 def test_resuming_does_not_read_previous_windows(plain: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    epoch = order.Order("train", tuple(shard.rows for shard in plain.shards["train"]), 0, 0)
+    epoch = windows.Order("train", tuple(shard.rows for shard in plain.shards["train"]), 0, 0)
     assert len(epoch.windows) > 1
     batches = plain.batches(2)
     batches.load_state(batches.state() | {"row": epoch.windows[-1].first})
@@ -370,7 +370,6 @@ def test_the_next_window_is_read_ahead_by_one_thread_at_a_time(plain: Dataset, m
             running.pop()
 
     monkeypatch.setattr(windows, "pack", counted)
-    monkeypatch.setattr(packed, "pack", counted)
     read = record_reads(monkeypatch)
     rest = iter(plain.batches(1))
     next(rest)
@@ -388,7 +387,7 @@ def test_a_split_that_fits_is_read_once_and_a_larger_one_in_every_epoch(
 ) -> None:
     size = 50 * (2 * 4 + 8)
     for limit, times in ((size, 1), (size - 1, 3)):
-        monkeypatch.setattr(packed, "MAX_IN_MEMORY_BYTES", limit)
+        monkeypatch.setattr(windows, "MAX_IN_MEMORY_BYTES", limit)
         read = record_reads(monkeypatch)
         batches = plain.batches(10, fields=["goal_p", "sample_id"])
         found = [ids(batches) for _ in range(3)]

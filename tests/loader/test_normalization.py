@@ -7,7 +7,7 @@ import pytest
 
 from cnpgen.errors import DatasetError
 from cnpgen.loader.load import load_dataset
-from cnpgen.loader.normalization import Normalization, make_normalization
+from cnpgen.loader.row_format import Normalization, make_normalization
 from cnpgen.store.field import Field
 from cnpgen.store.statistics import column_statistics
 from tests.examples.loader import columns, make

@@ -6,8 +6,8 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from cnpgen.loader import order
-from cnpgen.loader.order import Order, permutation
+from cnpgen.loader import windows
+from cnpgen.loader.windows import Order, permutation
 
 
 @pytest.mark.parametrize("size", [0, 1, 2, 3, 63, 64, 65, 1000])
@@ -37,7 +37,7 @@ def test_the_order_of_a_released_version_does_not_change() -> None:
 def test_the_windows_of_an_epoch_hold_every_shard_once(
     monkeypatch: pytest.MonkeyPatch, shard_rows: tuple[int, ...], shuffle: bool
 ) -> None:
-    monkeypatch.setattr(order, "WINDOW_ROWS", 64)
+    monkeypatch.setattr(windows, "WINDOW_ROWS", 64)
     found = Order("train", shard_rows, 0, 0, shuffle)
     assert sorted(shard for window in found.windows for shard in window.shards) == list(range(len(shard_rows)))
     first = 0
@@ -50,9 +50,9 @@ def test_the_windows_of_an_epoch_hold_every_shard_once(
 
 
 def test_a_window_has_about_the_rows_it_should(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(order, "WINDOW_ROWS", 64)
-    windows = Order("train", (16,) * 37, 0, 0).windows
-    assert {window.rows for window in windows} == {64, 80}
+    monkeypatch.setattr(windows, "WINDOW_ROWS", 64)
+    found = Order("train", (16,) * 37, 0, 0).windows
+    assert {window.rows for window in found} == {64, 80}
     assert [len(Order("train", (16,) * shards, 0, 0).windows) for shards in (1, 4, 5, 6, 7, 8)] == [1, 1, 1, 2, 2, 2]
 
 
@@ -63,7 +63,7 @@ def test_a_split_is_shuffled_uniformly_up_to_the_documented_size(rows: int, coun
 
 
 def test_without_shuffling_rows_are_in_their_stored_order(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(order, "WINDOW_ROWS", 10)
+    monkeypatch.setattr(windows, "WINDOW_ROWS", 10)
     found = Order("train", (8, 8, 8), 5, 1, shuffle=False)
     assert [window.shards for window in found.windows] == [(0, 1), (2,)]
     assert found.rows_of(0).tolist() == list(range(16))
@@ -78,7 +78,7 @@ def test_seed_epoch_split_and_window_each_change_the_order() -> None:
 
 
 def test_windows_of_one_epoch_are_shuffled_differently(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(order, "WINDOW_ROWS", 100)
+    monkeypatch.setattr(windows, "WINDOW_ROWS", 100)
     found = Order("train", (100, 100), 0, 0)
     assert not np.array_equal(found.rows_of(0), found.rows_of(1))
     distributions = {

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cnpgen.loader import order, packed
+from cnpgen.loader import windows
 from cnpgen.loader.batches import Batches
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
@@ -25,8 +25,8 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 @pytest.fixture(autouse=True, params=["kept in memory", "read in every epoch"])
 def _small_windows(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
-    monkeypatch.setattr(order, "WINDOW_ROWS", 16)
-    monkeypatch.setattr(packed, "MAX_IN_MEMORY_BYTES", 1 << 20 if request.param == "kept in memory" else 0)
+    monkeypatch.setattr(windows, "WINDOW_ROWS", 16)
+    monkeypatch.setattr(windows, "MAX_IN_MEMORY_BYTES", 1 << 20 if request.param == "kept in memory" else 0)
 
 
 def remaining_ids(batches: Batches) -> list[list[int]]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cnpgen.make import repair
+from cnpgen.make import make_dataset as making
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.store.dataset_spec import load_dataset_spec, shards
 from cnpgen.store.layout import MANIFEST
@@ -171,14 +171,14 @@ def test_shards_are_compared_by_several_threads_and_an_interruption_cancels_the_
     spec = load_dataset_spec(folder)
     tasks = shards(spec) * 200
     compared = []
-    check = repair.check_committed
-    monkeypatch.setattr(repair, "check_committed", lambda *x: (compared.append(x), check(*x))[1])
+    check = making.check_committed
+    monkeypatch.setattr(making, "check_committed", lambda *x: (compared.append(x), check(*x))[1])
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        repair.find_damaged(folder, spec, tasks, progress=interrupt)
+        making.find_damaged(folder, spec, tasks, progress=interrupt)
     assert 1 <= len(compared) < len(tasks)
 
 

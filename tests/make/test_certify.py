@@ -16,7 +16,7 @@ from cnpgen.judges.rows.verify import PlanCheck, check_plans
 from cnpgen.make.certify import NO_PLAN, CertifiedPlan, certified
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.merge import _shipped_notes
-from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.planner.model_file import shipped_models
 from cnpgen.plans import load_plans, save_plans
 from cnpgen.plans.boundary_problems import load_boundary_problems, plans_of_rows

@@ -13,7 +13,7 @@ import cnpgen
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
 from cnpgen.make import extend as extend_module
-from cnpgen.make import recipe_file as load_module
+from cnpgen.make import recipe as load_module
 from cnpgen.make.extend import extend_dataset
 from cnpgen.store.dataset_spec import load_dataset_spec, shards
 from cnpgen.store.inspection import inspect_dataset

@@ -16,7 +16,7 @@ import pytest
 
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.make.make_dataset import make_dataset
-from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.sampling_statistics import SamplingStatistics
 from cnpgen.validate.validate_dataset import validate_dataset
@@ -64,7 +64,7 @@ def test_an_interrupted_dataset_is_finished_with_the_same_bytes(tiny, tmp_path, 
 CHILD = """
 import sys
 from dataclasses import replace
-from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.make.make_dataset import make_dataset
 if __name__ == "__main__":
     recipe = replace(load_dataset_recipe("airhockey-hit"), splits={"train": 600, "validation": 60})

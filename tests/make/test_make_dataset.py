@@ -17,7 +17,7 @@ from cnpgen.make import make_shards as make
 from cnpgen.make.make_dataset import _part as make_part
 from cnpgen.make.make_dataset import is_quick, make_dataset, runs
 from cnpgen.make.make_shards import Job, make_shards, shard_columns
-from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.make.resolve_spec import draw_up
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS

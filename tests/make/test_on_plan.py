@@ -9,13 +9,19 @@ from cnpgen.errors import RecipeError, UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.make.complete import complete
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
-from cnpgen.make.on_plan import GOAL, STATES_PER_REFINED_PLAN, GoalOfPlan, StartOnPlan, of_plan
-from cnpgen.make.recipe_file import load_dataset_recipe
-from cnpgen.make.stage_planner import load_stage_planner, model_sha256
+from cnpgen.make.on_plan import (
+    GOAL,
+    STATES_PER_REFINED_PLAN,
+    GoalOfPlan,
+    StartOnPlan,
+    load_stage_planner,
+    model_sha256,
+    of_plan,
+)
+from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.pipelines.completion import Completion
-from cnpgen.pipelines.context import load_context
 from cnpgen.pipelines.prepared import random_generator
-from cnpgen.pipelines.stages.stage import CandidateBatch
+from cnpgen.pipelines.stages.stage import CandidateBatch, load_context
 from cnpgen.planner.planner import Planner
 from cnpgen.schema.keys import Range
 from cnpgen.trajectory.boundary import Boundary

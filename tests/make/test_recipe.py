@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.make.recipe import DatasetRecipe, recipe_digest, split_rows
-from cnpgen.make.recipe_file import load_dataset_recipe, load_notes
+from cnpgen.make.recipe import DatasetRecipe, load_dataset_recipe, load_notes, recipe_digest, split_rows
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.problems.problem import Problem, resolved
 from cnpgen.problems.problem_file import load_problem

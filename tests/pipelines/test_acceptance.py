@@ -6,9 +6,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from cnpgen.pipelines.acceptance import acceptance
+from cnpgen.pipelines.acceptance import acceptance, unmet
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
-from cnpgen.pipelines.stages.narrow_phase import unmet
 from cnpgen.pipelines.stages.stage import CandidateBatch
 from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.robots.solid import place_obstacles

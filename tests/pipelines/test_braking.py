@@ -9,9 +9,9 @@ import pytest
 from scipy.optimize import linprog
 
 from cnpgen.kernels.tape import Loop
-from cnpgen.pipelines.pipeline_file import load_pipeline
+from cnpgen.pipelines.pipeline import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
-from cnpgen.pipelines.stages.braking import (
+from cnpgen.pipelines.stages.reach import (
     BRAKING_STEP_S,
     LOOKAHEAD_S,
     MAX_BRAKING_STEPS,

@@ -7,7 +7,7 @@ import pytest
 import scipy  # imports its statistics lazily, which takes a second
 
 from cnpgen.errors import RecipeError
-from cnpgen.pipelines.pipeline_file import load_pipeline
+from cnpgen.pipelines.pipeline import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.draw import DrawPositions
 from cnpgen.pipelines.stages.hit_angle import wrap

@@ -8,11 +8,10 @@ import pytest
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.make.make_dataset import make_dataset
-from cnpgen.make.recipe_file import load_dataset_recipe
-from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.pipeline_file import load_pipeline
-from cnpgen.pipelines.stages.behind_puck import BehindPuck
-from cnpgen.pipelines.stages.stage import CandidateBatch
+from cnpgen.make.recipe import load_dataset_recipe
+from cnpgen.pipelines.pipeline import load_pipeline
+from cnpgen.pipelines.stages.hit_angle import BehindPuck
+from cnpgen.pipelines.stages.stage import CandidateBatch, Context
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.store.dataset_spec import shards

@@ -10,7 +10,7 @@ from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.prepared import random_generator
 from cnpgen.pipelines.stages.draw import DrawGoal
 from cnpgen.pipelines.stages.hit_angle import HitAngleInCone
-from cnpgen.pipelines.stages.home import Home
+from cnpgen.pipelines.stages.ik import Home
 from cnpgen.pipelines.stages.stage import CandidateBatch, TaskBatch
 from cnpgen.schema import registry
 from cnpgen.schema.catalogue import read_kind

@@ -9,15 +9,12 @@ import pytest
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.tape import Loop
-from cnpgen.pipelines.context import Context, load_context
 from cnpgen.pipelines.families.resting_states import RestingStates
-from cnpgen.pipelines.pipeline import Pipeline
-from cnpgen.pipelines.pipeline_file import load_pipeline
+from cnpgen.pipelines.pipeline import Pipeline, load_pipeline
 from cnpgen.pipelines.stages.draw_scenes import TOO_MANY, base_depths
-from cnpgen.pipelines.stages.ik import MAX_POSE_IK_STEPS, POSE_TOLERANCE, pose_ik_step
 from cnpgen.pipelines.stages.scene_clearance import SceneClearance
-from cnpgen.pipelines.stages.scene_ends import NO_ENDS
-from cnpgen.pipelines.stages.stage import CandidateBatch
+from cnpgen.pipelines.stages.scene_ends import MAX_POSE_IK_STEPS, NO_ENDS, POSE_TOLERANCE, pose_ik_step
+from cnpgen.pipelines.stages.stage import CandidateBatch, Context, load_context
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.scene_capacity import with_capacity
 from cnpgen.robots.observation.primitives import KINDS, primitives_of

@@ -7,12 +7,11 @@ import pytest
 
 from cnpgen.judges.rows.verify import verify_rows
 from cnpgen.kernels.tape import tape_from_function
-from cnpgen.pipelines.context import Context, load_context
-from cnpgen.pipelines.pipeline_file import load_pipeline
+from cnpgen.pipelines.acceptance import narrow_phase, narrow_phase_of
+from cnpgen.pipelines.pipeline import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.collision import Collision, capsule_clearance
-from cnpgen.pipelines.stages.narrow_phase import narrow_phase, narrow_phase_of
-from cnpgen.pipelines.stages.stage import CandidateBatch
+from cnpgen.pipelines.stages.stage import CandidateBatch, Context, load_context
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem

@@ -3,9 +3,8 @@
 from dataclasses import replace
 
 from cnpgen.kernels.library import choose_backend, problem_kernels
-from cnpgen.pipelines.acceptance import boundary_unmet
+from cnpgen.pipelines.acceptance import boundary_unmet, narrow_phase
 from cnpgen.pipelines.stages.collision import capsule_axes_distance, capsule_clearance
-from cnpgen.pipelines.stages.narrow_phase import narrow_phase
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from tests.examples.shaped_robot import HELD_OBJECT, KINDS, SELF, write_problem

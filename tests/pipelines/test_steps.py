@@ -7,7 +7,7 @@ import pytest
 
 from cnpgen import plugins
 from cnpgen.errors import RecipeError
-from cnpgen.pipelines.pipeline_file import load_pipeline
+from cnpgen.pipelines.pipeline import load_pipeline
 from cnpgen.store.field import Field
 from tests.conftest import Prepare
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from cnpgen.errors import UsageError
-from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.planner.model_file import load_model, model_for, shipped_models
 from cnpgen.planner.plan_requests import read_rows
 from cnpgen.planner.planner import Planner

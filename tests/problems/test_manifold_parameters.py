@@ -13,8 +13,7 @@ from cnpgen.judges.rows.verify import verify_rows
 from cnpgen.kernels.library import choose_backend
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
-from cnpgen.make.recipe import DatasetRecipe
-from cnpgen.make.recipe_file import as_dataset_recipe
+from cnpgen.make.recipe import DatasetRecipe, as_dataset_recipe
 from cnpgen.pipelines.completion import Completion
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.pipelines.stages.collision import Collision

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from cnpgen.errors import RecipeError
-from cnpgen.pipelines.pipeline_file import load_pipeline
+from cnpgen.pipelines.pipeline import load_pipeline
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.schema.catalogue import find_recipe

@@ -13,7 +13,7 @@ from cnpgen import evaluate_plans, refine_plans, solve_plans
 from cnpgen.judges.rows.verify import verify_rows
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.make.make_dataset import make_dataset
-from cnpgen.pipelines.pipeline_file import load_pipeline
+from cnpgen.pipelines.pipeline import load_pipeline
 from cnpgen.planner.planner import Planner
 from cnpgen.plans import Plans
 from cnpgen.plans.boundary_problems import load_boundary_problems

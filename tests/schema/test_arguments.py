@@ -9,10 +9,9 @@ import pytest
 
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.make.make_dataset import make_dataset
-from cnpgen.make.recipe import DatasetRecipe
-from cnpgen.make.recipe_file import as_dataset_recipe
+from cnpgen.make.recipe import DatasetRecipe, as_dataset_recipe
 from cnpgen.make.resolve_spec import draw_up
-from cnpgen.pipelines.pipeline_file import load_pipeline
+from cnpgen.pipelines.pipeline import load_pipeline
 from cnpgen.schema.arguments import flag, integer, number, numbers
 from cnpgen.store.workspace import find_workspace
 from cnpgen.validate.validate_dataset import validate_dataset

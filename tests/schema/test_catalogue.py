@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 
 from cnpgen.errors import RecipeError
-from cnpgen.make.recipe import recipe_digest
-from cnpgen.make.recipe_file import load_dataset_recipe
-from cnpgen.pipelines.pipeline_file import load_pipeline
+from cnpgen.make.recipe import load_dataset_recipe, recipe_digest
+from cnpgen.pipelines.pipeline import load_pipeline
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.problem import resolved
 from cnpgen.problems.problem_file import load_problem

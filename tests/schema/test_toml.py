@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from cnpgen.errors import RecipeError
-from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.schema.toml import MAX_KEY_PARTS, MAX_RECIPE_BYTES, kind_of_file, read_table
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cnpgen.loader.order import Order
+from cnpgen.loader.windows import Order
 from cnpgen.planner.inference_pipeline import make_inference_pipeline
 from cnpgen.training import training_rows as rows_module
 from cnpgen.training.data import open_training_data

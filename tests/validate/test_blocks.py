@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 
 from cnpgen.store.dataset_spec import GENERATOR_REVISION, load_dataset_spec, shards
-from cnpgen.validate import blocks
-from cnpgen.validate.blocks import Regeneration, regenerate_blocks
+from cnpgen.validate import validate_dataset
+from cnpgen.validate.validate_dataset import Regeneration, regenerate_blocks
 
 
 @pytest.fixture
 def different(damaged: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A dataset that another version would compute differently."""
-    real = blocks.shard_columns
+    real = validate_dataset.shard_columns
 
     def shard_columns(*arguments):
         for columns, sampling, scenes in real(*arguments):
             yield {**columns, "start_q": columns["start_q"] + 1e-3}, sampling, scenes
 
-    monkeypatch.setattr(blocks, "shard_columns", shard_columns)
+    monkeypatch.setattr(validate_dataset, "shard_columns", shard_columns)
     return damaged
 
 
@@ -36,13 +36,13 @@ def test_the_field_and_the_size_of_a_difference_are_named(different):
 
 
 def test_another_revision_of_the_generator_is_an_explanation(different, monkeypatch):
-    monkeypatch.setattr(blocks, "GENERATOR_REVISION", GENERATOR_REVISION + 1)
+    monkeypatch.setattr(validate_dataset, "GENERATOR_REVISION", GENERATOR_REVISION + 1)
     expected = f"(made with other versions: revision of the generator {GENERATOR_REVISION} -> {GENERATOR_REVISION + 1})"
     assert problem_of(different).endswith(expected)
 
 
 def test_other_libraries_are_an_explanation(different, monkeypatch):
-    monkeypatch.setattr(blocks, "versions", lambda: {**load_dataset_spec(different).versions, "numpy": "0.1"})
+    monkeypatch.setattr(validate_dataset, "versions", lambda: {**load_dataset_spec(different).versions, "numpy": "0.1"})
     assert problem_of(different).endswith(f"numpy {np.__version__} -> 0.1)")
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from cnpgen.judges.rows.hits import highest_speed
 from cnpgen.make.make_dataset import make_dataset
-from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.store.dataset_spec import load_dataset_spec, shards

@@ -11,8 +11,7 @@ from torch.utils import data
 from cnpgen.errors import UsageError
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.batches import Batches
-from cnpgen.loader.columns import Columns
-from cnpgen.loader.normalization import Normalization
+from cnpgen.loader.row_format import Columns, Normalization
 
 MAX_WORKERS = 1024
 

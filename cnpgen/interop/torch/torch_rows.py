@@ -11,7 +11,7 @@ from numpy.typing import DTypeLike
 from torch.utils import data
 
 from cnpgen.loader.dataset import Dataset
-from cnpgen.loader.normalization import Normalization
+from cnpgen.loader.row_format import Normalization
 
 Tensors = dict[str, torch.Tensor]
 

@@ -51,11 +51,9 @@ class RestingStates:
         self._solids = list(solids)
 
     def are_clear(self, q: Array, *, margin: float = 0.0) -> NDArray[np.bool_]:
-        """Return whether nothing collides at each state, shape (K,).
+        """Return whether nothing collides at each state q [rad], shape (n, K).
 
-        Args:
-            q: Joint positions [rad], shape (n, K).
-            margin: Distance between links and obstacles in addition to the problem's clearance [m].
+        The margin [m] is added to the problem's distance of links from obstacles.
         """
         if not q.shape[1]:
             return np.zeros(0, bool)

@@ -1,4 +1,4 @@
-"""Planning problems in scenes of a family: obstacles, collision-free starts and goals, and lines that collide."""
+"""Families by name, and planning problems in their scenes: obstacles, collision-free ends, and lines that collide."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import UsageError
-from cnpgen.pipelines.families.catalog import load_family
+from cnpgen.errors import RecipeError, UsageError, nearest
 from cnpgen.pipelines.families.family import Grasp, Layout, SceneFamily
 from cnpgen.pipelines.families.resting_states import RestingStates, seeds_of
 from cnpgen.problems.load_robot import load_robot
@@ -25,12 +24,17 @@ from cnpgen.robots.shape.hull import frame_along
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
+from cnpgen.schema.keys import RecipeLocation
+from cnpgen.schema.parsing import parse
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.world.pose_ik import PoseKinematics, solve_pose_ik
 from cnpgen.world.world import World
 
-Array = NDArray[np.float64]
+FAMILIES: dict[str, type[SceneFamily]] = {
+    name: registry.load(registry.FAMILIES, name) for name in registry.BUILT_IN[registry.FAMILIES]
+}
 
+Array = NDArray[np.float64]
 POSES_PER_GRASP = 24  # random rotations about the approach
 MAX_GRASPS = 8  # of one scene that are tried
 MAX_PAIRS = 24  # of a start and a goal that are tried for one problem
@@ -39,6 +43,33 @@ END_MARGIN_M = 0.005  # clearance of starts and goals
 STRAIGHT_SHARE = 0.1  # of the problems that may be solvable by a straight line
 NEUTRAL_SPREAD_RAD = 0.1  # standard deviation of neutral starts around the base configuration
 _STARTS = {"neutral": 0.4, "grasp": 0.4, "random": 0.2}  # kind of start -> probability
+
+
+@checked_arguments
+def load_family(name: str, parameters: Mapping[str, Any] | None = None) -> SceneFamily:
+    """Return a family by its name.
+
+    Args:
+        name: Its name in ``FAMILIES``, or that of an installed package.
+        parameters: Values of its fields, as in recipes: ``{"tables": [1, 2], "height": "[0, 30] cm"}``.
+
+    Raises:
+        UsageError: The family or a parameter is unknown, or a value is invalid.
+    """
+    known = registry.names(registry.FAMILIES)
+    if name not in known:
+        text = f"unknown family {name!r}{nearest(name, known)}, expected one of {', '.join(known)}"
+        raise UsageError(text, concerns="name")
+    mistakes: list[str] = []
+    try:
+        kind = registry.load(registry.FAMILIES, name)
+    except RecipeError as error:
+        raise UsageError(str(error), concerns="family") from error
+    family = parse(kind, dict(parameters or {}), where=RecipeLocation(name), mistakes=mistakes)
+    if family is None or mistakes:
+        raise UsageError("; ".join(mistakes), concerns="parameters")
+    assert isinstance(family, SceneFamily)
+    return family
 
 
 @checked_arguments

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -9,8 +10,7 @@ import numpy as np
 from cnpgen.kernels.symbolic.dynamics import inverse_dynamics
 from cnpgen.kernels.symbolic.kinematics import bias_acceleration, forward_kinematics, tip_velocity
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, scale, subtract, symbols
-from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
+from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction, fraction
 from cnpgen.problems.constraints.table import Table
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
@@ -82,7 +82,7 @@ class TableVelocity(Stage):
     """Stage: random start velocity with ``J_z dq = 0``: a direction in the box of the limits, with uniform length."""
 
     inputs = ("start_q",)
-    at_rest: float = field("fraction of the starts at rest", low=0.0, high=1.0, default=0.0)
+    at_rest: float = fraction("fraction of the starts at rest", default=0.0)
 
     def describe(self) -> str:
         return (
@@ -132,7 +132,6 @@ class TableAcceleration(Stage):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Position and velocity of that end."""
         return f"{self.end}_q", f"{self.end}_dq"
 
     def describe(self) -> str:
@@ -202,10 +201,8 @@ def table_velocity(robot: Robot) -> Any:
     kin = forward_kinematics(robot.chain, q)
     limit = [float(x) for x in robot.velocity_limit]
     on_manifold = _project([x * bound for x, bound in zip(u, limit, strict=True)], [c[2] for c in kin.jacobian], limit)
-    largest: Scalar = ca.SX(0)
-    for x, bound in zip(on_manifold, limit, strict=True):
-        largest = ca.fmax(largest, ca.fabs(x) / bound)
-    dq = scale(on_manifold, s[0] / largest)
+    ratios = (ca.fabs(x) / bound for x, bound in zip(on_manifold, limit, strict=True))
+    dq = scale(on_manifold, s[0] / reduce(ca.fmax, ratios, ca.SX(0)))
     return ca.Function("table_velocity", [q_sx, u_sx, s_sx], [ca.vertcat(*dq), ca.vertcat(*tip_velocity(kin, dq))])
 
 

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import Array, CandidateBatch
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import table_frame_of
 from cnpgen.robots import table_frame

@@ -19,8 +19,7 @@ from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.obstacle_distances import symbolic_solids
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
-from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.obstacles import scene_of, table_frame_of
 from cnpgen.problems.problem import Problem
@@ -41,7 +40,6 @@ class Collision(Stage):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Configurations, and the tip positions above the obstacles."""
         return (*(f"{end}_q" for end in self._ends()), "start_xyz", "goal_xyz")
 
     def describe(self) -> str:
@@ -56,7 +54,6 @@ class Collision(Stage):
         return tuple(Field(f"{end}_clearance", "m", text.format(end), role="diagnostic") for end in self._ends())
 
     def prepare(self, context: Context) -> StageFunction:
-        """Load the kernel or build the geometry."""
         clearance = context.constraint(RobotClearance)
         if context.robot.shape is not None:
             return self._by_convex_parts(context, clearance.distance)

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.families.family import Layout, SceneFamily
-from cnpgen.pipelines.stages.batch_scenes import BatchScenes, batch_scenes
-from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
+from cnpgen.pipelines.stages.batch_scenes import batch_scenes
+from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.scenes.scene_problem import MAX_BASE_DEPTH_M
 from cnpgen.robots.scene_arrays import rotations_of, sample_obstacles
@@ -50,11 +49,9 @@ class DrawScenes(Stage):
         return f"draw scenes for {self.per_scene} candidates each ({', '.join(each)})"
 
     def writes(self, context: Context) -> tuple[str, ...]:
-        """List the index of the scene."""
         return ("scene",)
 
     def prepare(self, context: Context) -> StageFunction:
-        """Check the obstacles of the problem and return the stage function."""
         self._check(context)
         obstacles, capacity, shares = context.problem.obstacle, sum(self.capacity.values()), self._shares()
 
@@ -76,11 +73,7 @@ class DrawScenes(Stage):
         return work
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
-        """Refuse tasks: the obstacles of a task are those of its problem.
-
-        Raises:
-            UsageError: Always.
-        """
+        """Refuse tasks: their obstacles are those of the problem."""
         name = context.problem.name
         raise UsageError(
             f"tasks have no scenes: complete poses among the obstacles of the problem {name!r}, or use a scene file",
@@ -140,14 +133,3 @@ def base_depths(table: SceneTable) -> NDArray[np.float64]:
     ]
     depth = np.select([kind == code for code in range(len(depths))], depths, -np.inf)
     return np.asarray(depth.max(axis=1))
-
-
-def scenes_of(candidates: CandidateBatch) -> BatchScenes:
-    """Return the scenes of candidates.
-
-    Raises:
-        RecipeError: No stage has drawn scenes.
-    """
-    if candidates.scenes is None:
-        raise RecipeError(["needs scenes: expected a stage draw-scenes before it"])
-    return candidates.scenes

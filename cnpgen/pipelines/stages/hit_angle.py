@@ -1,12 +1,15 @@
-"""Stages: draw the direction of the hit in the table plane."""
+"""Stages: draw the direction of the hit in the table plane, and place the mallet behind the puck along it."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from cnpgen.pipelines.context import Context
+from cnpgen.errors import RecipeError
 from cnpgen.pipelines.stages.candidate_table import on_table
-from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
+from cnpgen.pipelines.stages.draw import position_field
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction
+from cnpgen.problems.constraints.puck_contact import PuckContact
+from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 
@@ -64,7 +67,6 @@ class HitAngleInCone(_HitAngle):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Positions of both ends of the line."""
         return f"{self.origin}_xyz", "goal_xyz"
 
     def describe(self) -> str:
@@ -79,3 +81,43 @@ class HitAngleInCone(_HitAngle):
             candidates["hit_angle"] = wrap(np.arctan2(y, x) + noise)
 
         return work
+
+
+@dataclass(frozen=True, kw_only=True)
+class BehindPuck(Stage):
+    """Stage: move the goal from the puck's centre to the mallet's centre at contact."""
+
+    inputs = ("goal_xyz", "hit_angle")
+    distance: float = field(
+        "distance of the centres of puck and mallet at contact: sum of the radii", unit="m", low=0.0, plausible=1.0
+    )
+
+    def describe(self) -> str:
+        return f"take the goal for the puck's centre: the tip meets it {1e3 * self.distance:g} mm behind, along the hit"
+
+    def outputs(self, context: Context) -> tuple[Field, ...]:
+        table = context.constraint(Table)
+        low, high = (table.x.low, table.y.low, table.z), (table.x.high, table.y.high, table.z)
+        return (position_field("goal", low, high),)
+
+    def prepare(self, context: Context) -> StageFunction:
+        contact = context.problem.first(PuckContact)
+        if contact is not None and contact.contact_distance != self.distance:
+            raise RecipeError(
+                [f"distance: expected {contact.contact_distance:g} m, as in puck-contact, got {self.distance:g} m"]
+            )
+
+        def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
+            candidates["goal_xyz"] = behind(candidates["goal_xyz"], candidates["hit_angle"], self.distance)
+
+        return work
+
+
+def behind(puck: Array, angle: Array, distance: float) -> Array:
+    """Return positions at a distance [m] behind pucks, shape (3, N), or (2, N) without height, along hit directions.
+
+    The directions are angles about world z [rad], shape (1, N).
+    """
+    along = np.concatenate([np.cos(angle), np.sin(angle), np.zeros(angle.shape)])
+    moved: Array = puck - distance * along[: len(puck)]
+    return moved

@@ -1,6 +1,6 @@
 """Stage: the hitting configuration, the joint positions at the puck that allow the fastest tip motion along the hit.
 
-``hitting_newton`` defines the objective and the Newton steps, ``hitting_limits`` the active set of joint limits.
+``hitting_newton`` defines the objective and its Newton steps. An active-set method moves optima within joint limits.
 """
 
 from dataclasses import dataclass
@@ -11,20 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
+from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, symbols
 from cnpgen.kernels.tape import Loop
-from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.candidate_table import hit_direction
-from cnpgen.pipelines.stages.hitting_limits import held_step, within_limits
 from cnpgen.pipelines.stages.hitting_newton import (
     MAX_NEWTON_STEPS,
     NEWTON_TOLERANCE_RAD,
     basic_joints,
+    held_step,
     newton_step,
     objective,
 )
 from cnpgen.pipelines.stages.ik import IK_TOLERANCE, MAX_IK_STEPS, ik_step
-from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
@@ -40,7 +40,6 @@ class HittingConfiguration(Stage):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Position and angle of the hit, and the home if goals are near it."""
         return ("goal_xyz", "hit_angle", "home_q") if self.near == "home" else ("goal_xyz", "hit_angle")
 
     def describe(self) -> str:
@@ -145,3 +144,37 @@ def _within(robot: Robot, q: Vec) -> Scalar:
 
     bounds = zip(q, robot.position_lower.tolist(), robot.position_upper.tolist(), strict=True)
     return reduce(ca.logic_and, (ca.logic_and(low <= x, x <= high) for x, low, high in bounds))
+
+
+def within_limits(robot: Robot, kernel: Kernel, q: Array, *parameters: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Move optima q [rad], shape (n, N), outside joint limits to nearby optima within, by an active-set method.
+
+    Joints outside their limits are set to the limit and held. Joints that leave their limits after a solve for the
+    others are held, too. Of the held joints with an inward gradient, the one with the largest is released. Positions,
+    directions and homes are further arguments of the kernel. Return configurations and the mask of optima, shape (N,).
+    """
+    low, high = robot.position_lower[:, None], robot.position_upper[:, None]
+    side = np.where(q > high, 1.0, np.where(q < low, -1.0, 0.0))  # sign of the limit on which a joint is held, else 0
+    q, left = np.clip(q, low, high), np.arange(q.shape[1])
+    for _ in range(2 * robot.n):
+        held = np.take(side, left, axis=1)
+        state = np.concatenate([np.take(q, left, axis=1), np.zeros_like(held)])
+        arguments = [np.take(values, left, axis=1) for values in parameters]
+        state, step = kernel(state, *arguments, np.abs(held))
+        moved, pull = np.split(state, 2)
+        q[:, left] = np.clip(moved, low, high)
+        change = _change(held, np.where(moved > high, 1.0, np.where(moved < low, -1.0, 0.0)), pull)
+        side[:, left] = held + change
+        left = left[(change != 0).any(0) | ~(step[0] < NEWTON_TOLERANCE_RAD)]
+        if len(left) == 0:
+            break
+    found = np.ones(q.shape[1], bool)
+    found[left] = False
+    return q, found
+
+
+def _change(held: Array, outside: Array, pull: Array) -> Array:
+    """Return the change of the held sides: the side of a new hold, minus the side of a released hold, otherwise 0."""
+    inwards = -held * pull
+    released = (inwards == inwards.max(axis=0)) & (inwards > 0) & ~outside.any(axis=0)
+    return np.where(released, -held, np.where(held == 0, outside, 0.0))

@@ -1,4 +1,4 @@
-"""Newton's method for the hitting configuration: one step as an SX function.
+"""Newton's method for the hitting configuration: steps as SX functions.
 
 Maximize ``f(q) = |J(q)^T d|^2 - |(q0 - q) / L|^2`` subject to ``FK(q) = p`` (reference 2, section on hitting): ``d``
 is the unit hitting direction in the table plane, ``J`` the translational Jacobian of the tip, ``q0`` the home
@@ -7,6 +7,11 @@ in closed form: ``d^2 p / dq_j dq_k = z_min(j,k) x J_max(j,k)``, hence gradient 
 ``A_jk = d . (z_min x J_max)``, and Hessian ``2 A A + 2 d . (dz_min x J_max + z_min x dJ_max)`` with ``dz``, ``dJ``
 the derivatives along ``a``. The constraint is eliminated through three basic joints, so that each step factorizes
 only a (n - 3) x (n - 3) matrix.
+
+These joints must be free to move. If joints are held on their limits, the step is computed in all joints. With ``J_F``
+the Jacobian without the columns of held joints, maximize ``g . s + s^T H s / 2`` subject to ``J_F s = p - FK(q)``.
+Adding a large multiple of ``J_F^T J_F`` to ``-H`` changes no solution and makes it positive definite near a solution.
+Two symmetric solves without pivoting then suffice.
 """
 
 from dataclasses import dataclass
@@ -23,8 +28,10 @@ from cnpgen.kernels.symbolic.linalg import (
     cross,
     dot,
     factorize,
+    gram,
     inverse3,
     scale,
+    solve,
     substitute,
     subtract,
     symbols,
@@ -35,6 +42,7 @@ MAX_NEWTON_STEP_RAD = 0.6  # Euclidean norm of one Newton step
 MIN_PIVOT = 1e-3  # minimum |pivot| of the reduced Hessian: every step is an ascent direction
 NEWTON_TOLERANCE_RAD = 1e-6  # length of the last step; convergence is quadratic
 MAX_NEWTON_STEPS = 40
+CONSTRAINT_WEIGHT = 1e3  # weight of J_F^T J_F relative to -H: both are in m^2/rad^2, and of order 1
 
 
 def objective(robot: Robot) -> Any:
@@ -55,8 +63,7 @@ def direction_symbols(robot: Robot) -> tuple[Any, Vec]:
 
 def along(direction: Vec, vector: Vec) -> Scalar:
     """Return the component of a vector along a direction of 2 or 3 components."""
-    first = direction[0] * vector[0] + direction[1] * vector[1]
-    return first if len(direction) == 2 else first + direction[2] * vector[2]
+    return dot(direction, vector[: len(direction)])
 
 
 @dataclass(frozen=True)
@@ -107,17 +114,12 @@ def expand(robot: Robot, q: Vec, d: Vec, home: Vec) -> Expansion:
     direction = [*d, 0.0] if len(d) == 2 else d
     weight = [1.0 / float(value) ** 2 for value in robot.rated_velocity]
     gain = [along(d, column) for column in kin.jacobian]
-    second = _second_derivatives(kin)
+    pairs = range(robot.n)
+    upper = {(j, k): cross(kin.axes[j], kin.jacobian[k]) for j in pairs for k in pairs if j <= k}  # z_min x J_max
+    second = [[upper[min(j, k), max(j, k)] for k in pairs] for j in pairs]
     gain_gradient = [[along(d, entry) for entry in row] for row in second]
     gradient = [2.0 * dot(gain_gradient[j], gain) + 2.0 * weight[j] * (home[j] - q[j]) for j in range(robot.n)]
     return Expansion(kin, gradient, direction, gain, second, gain_gradient, weight)
-
-
-def _second_derivatives(kin: Kinematics) -> list[list[Vec]]:
-    """Return ``d^2 p / dq_j dq_k = z_min x J_max``."""
-    n = len(kin.axes)
-    upper = {(j, k): cross(kin.axes[j], kin.jacobian[k]) for j in range(n) for k in range(j, n)}
-    return [[upper[min(j, k), max(j, k)] for k in range(n)] for j in range(n)]
 
 
 def _rates(kin: Kinematics, rate: Vec) -> tuple[list[Vec], list[Vec]]:
@@ -200,6 +202,53 @@ def _null_space(jacobian: list[Vec], inverse: list[Vec], basic: tuple[int, int, 
                 column[joint] = -dot(inverse[b], jacobian[j])
             columns.append(column)
     return columns
+
+
+def held_step(robot: Robot) -> Any:
+    """Build one Newton step in the joints that are not held: ``((q, pull), p, d, q0, held) -> (next, |step|)``.
+
+    ``held`` is 1 for joints that stay constant. ``pull`` is the gradient of the Lagrangian, an output that the step
+    does not use.
+    """
+    import casadi as ca
+
+    n = robot.n
+    widths = (("state", 2 * n), ("p", 3), ("q0", n), ("held", n))
+    (state_sx, state), (p_sx, p), (home_sx, home), (held_sx, held) = (symbols(*item) for item in widths)
+    d_sx, d = direction_symbols(robot)
+    q = state[:n]
+    here = expand(robot, q, d, home)
+    step, pull = _held_step(here, subtract(p, here.kin.tip), [1.0 - x for x in held])
+    moved, length = shortened(q, step)
+    following = ca.vertcat(moved, *pull)
+    return ca.Function("hitting_limits", [state_sx, p_sx, d_sx, home_sx, held_sx], [following, length])
+
+
+def _held_step(here: Expansion, miss: Vec, free: Vec) -> tuple[Vec, Vec]:
+    """Return the Newton step in the joints with ``free`` 1, 0 in the others, and the gradient of the Lagrangian."""
+    n, jacobian = here.n, here.kin.jacobian
+    rows = [[column[row] * x for column, x in zip(jacobian, free, strict=True)] for row in range(3)]
+    gradient = [g * x for g, x in zip(here.gradient, free, strict=True)]
+    multiplier = solve(gram(rows), [dot(row, gradient) for row in rows])
+    pull = [g - dot(column, multiplier) for g, column in zip(here.gradient, jacobian, strict=True)]
+    hessian = here.hessian(multiplier)
+
+    def stiff(i: int, j: int) -> Scalar:
+        value = (
+            CONSTRAINT_WEIGHT * dot([row[i] for row in rows], [row[j] for row in rows])
+            - free[i] * free[j] * hessian[i][j]
+        )
+        return value + (1.0 - free[i]) if i == j else value
+
+    factors = factorize([[stiff(i, j) for j in range(i + 1)] for i in range(n)], safeguard)
+    towards = [dot([row[j] for row in rows], miss) for j in range(n)]
+    step = substitute(*factors, add(gradient, scale(towards, CONSTRAINT_WEIGHT)))
+    spread = [substitute(*factors, row) for row in rows]
+    lower = [[dot(rows[i], spread[j]) for j in range(i + 1)] for i in range(3)]
+    force = solve(lower, [dot(row, step) - e for row, e in zip(rows, miss, strict=True)])
+    for amount, column in zip(force, spread, strict=True):
+        step = subtract(step, scale(column, amount))
+    return step, pull
 
 
 def basic_joints(robot: Robot) -> tuple[int, int, int]:

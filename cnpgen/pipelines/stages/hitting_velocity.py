@@ -20,10 +20,9 @@ import numpy as np
 from cnpgen.errors import UsageError
 from cnpgen.kernels.symbolic.kinematics import forward_kinematics
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, cross, dot, symbols
-from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.candidate_table import hit_direction, table_normal, velocity_factor
 from cnpgen.pipelines.stages.hitting_newton import along, direction_symbols
-from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction, fraction
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
@@ -38,7 +37,7 @@ class HittingVelocity(Stage):
     """Stage: joint velocities of the goal, exactly along the hit, at the maximum speed or scaled down."""
 
     inputs = ("goal_q", "hit_angle")
-    full_speed: float = field("fraction of the hits at the maximum speed; the others are scaled", low=0.0, high=1.0)
+    full_speed: float = fraction("fraction of the hits at the maximum speed; the others are scaled")
     min_speed: float = field("minimum of the maximum speed of a hit", unit="m/s", default=1e-3, low=1e-9)
 
     def describe(self) -> str:
@@ -48,7 +47,6 @@ class HittingVelocity(Stage):
         return f"solve the linear program for the fastest joint velocity along the hit{slower}"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the joint velocity and the speeds."""
         text = "highest possible speed along the hit at the goal configuration"
         return (
             context.joint_field("goal_dq", "rad/s", "joint velocities at the goal", "target"),
@@ -71,7 +69,6 @@ class HittingVelocity(Stage):
         return self.outputs(context)[1], share
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
-        """Load the kernel for the given speed or share."""
         if {"hit_speed", SPEED_SHARE_COLUMN} <= set(given):
             raise UsageError(f"hit_speed and {SPEED_SHARE_COLUMN} both define the speed of the hit: give one of them")
 
@@ -114,12 +111,9 @@ class HittingVelocity(Stage):
 def hitting_velocity(robot: Robot, *, min_speed: float) -> Any:
     """Build the linear program as an SX function ``(q, d) -> (dq, speed, found)``, or of (q, d, normal).
 
-    Hits are at least as fast as ``min_speed`` [m/s].
-
-    Returns:
-        A ``casadi.Function`` with arguments of width n, 2; dq [rad/s] maximizes the tip's speed [m/s] along d. If
-        samples tilt the table, the directions have width 3, and the normal of the table is the third argument.
-        ``found`` is 0 for slower hits, and if the Jacobian is singular and dq is not finite.
+    The joint velocity dq [rad/s] maximizes the tip's speed [m/s] along d, which has width 2. If samples tilt the table,
+    directions have width 3, and the normal of the table is the third argument. ``found`` is 0 for hits that are slower
+    than ``min_speed`` [m/s], and if the Jacobian is singular and dq is not finite.
     """
     import casadi as ca
 
@@ -190,16 +184,11 @@ def _smallest_ratio(b: list[Vec], limit: list[float], target: Vec) -> Vec:
     ratio = ca.fmax(ratio, 0.0)
     length = ca.sqrt(dot(pivot, pivot))
     parallel = [ca.fabs(dot(x, z)) <= PARALLEL_TOLERANCE * length * ca.sqrt(dot(x, x)) for x in b]
-    v = [
-        ca.if_else(same, 0.0, ratio * bound * ca.sign(dot(x, z)))
-        for same, bound, x in zip(parallel, limit, b, strict=True)
-    ]
+    joints = list(zip(parallel, limit, b, strict=True))
+    v = [ca.if_else(same, 0.0, ratio * bound * ca.sign(dot(x, z))) for same, bound, x in joints]
     left = [target[c] - dot([x[c] for x in b], v) for c in range(2)]
-    shares = [ca.if_else(same, bound * dot(x, pivot), 0.0) for same, bound, x in zip(parallel, limit, b, strict=True)]
+    shares = [ca.if_else(same, bound * dot(x, pivot), 0.0) for same, bound, x in joints]
     total = sum(map(ca.fabs, shares), 0.0)
     amount = dot(left, pivot) / ca.if_else(total > 0, total, 1.0)
-    along = [
-        ca.if_else(same, amount * bound * ca.sign(dot(x, pivot)), 0.0)
-        for same, bound, x in zip(parallel, limit, b, strict=True)
-    ]
+    along = [ca.if_else(same, amount * bound * ca.sign(dot(x, pivot)), 0.0) for same, bound, x in joints]
     return [x + w for x, w in zip(v, along, strict=True)]

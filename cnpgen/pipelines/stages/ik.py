@@ -1,19 +1,19 @@
-"""Inverse kinematics: stages for positions of start and goal, free or vertical, and a step for poses of the tip."""
+"""Inverse kinematics: stages for positions of start, home and goal, free or vertical, and their step."""
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import numpy as np
 
 from cnpgen.errors import RecipeError
-from cnpgen.kernels.symbolic.kinematics import Kinematics, forward_kinematics
+from cnpgen.kernels.symbolic.kinematics import Kinematics, forward_kinematics, tip_position
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, gram, scale, solve, subtract, symbols
 from cnpgen.kernels.tape import Loop
-from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.candidate_table import upright_axes
-from cnpgen.pipelines.stages.draw import uniform
-from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
+from cnpgen.pipelines.stages.draw import check_reach, uniform
+from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction, fraction
 from cnpgen.robots.plausible_values import find_implausible_value
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import Range, field
@@ -27,25 +27,36 @@ IK_DAMPING = 1e-9
 # The damping vanishes with the error e, so convergence stays quadratic.
 MAX_LIMIT_DAMPING = 1e-2
 LIMIT_DAMPING_RATE = 1e-1
-# Inverse kinematics of poses
-METERS_PER_RADIAN = 0.3  # weight of an angle against a distance
-POSE_TOLERANCE = 1e-9  # m and weighted rad, before the last step
-MAX_POSE_IK_STEPS = 30
-MAX_POSE_IK_STEP_RAD = 0.5  # of any joint
-POSE_DAMPING = 1e-3  # relative to the squared error (Sugihara 2011)
-MIN_DAMPING = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True)
-class _IK(Stage):
-    """Base class: Gauss-Newton inverse kinematics with clipped steps that saturate at the joint limits."""
+class GuessedIK(Stage):
+    """Base class: Gauss-Newton inverse kinematics from a random guess or from the base configuration.
+
+    Its steps are clipped and saturate at the joint limits.
+    """
 
     orientation: str = field("required orientation of the tip", choices=("free", "vertical"), default="free")
     max_step: float = field(
         "maximum change of a joint per iteration", unit="rad", default=0.4, low=1e-3, plausible=np.pi
     )
+    guess: tuple[Range, ...] = field("box of random guesses; default: the base configuration", unit="rad", default=())
+    at_limit: float = fraction(
+        "fraction of the guesses with one random joint held on one of its limits", default=0.0, since_version=2
+    )
 
-    def _solve(self, context: Context, end: str, initial: str, *, hold: bool = False) -> StageFunction:
+    def _how(self) -> str:
+        return " with the tip's z axis vertical" if self.orientation == "vertical" else ""
+
+    def _origin(self) -> str:
+        """Describe the initial guess."""
+        box = " x ".join(f"[{g.low:.4g}, {g.high:.4g}]" for g in self.guess)
+        held = f", with one joint held on a limit in {100 * self.at_limit:.4g} % of the cases" if self.at_limit else ""
+        return (f"a random guess in {box} rad" if self.guess else "the base configuration") + held
+
+    def _solve(self, context: Context, end: str, initial: str = "guess_q") -> StageFunction:
+        """Return the stage function that solves for the position of an end, from a column of initial positions."""
+        hold = initial == "guess_q" and self.at_limit > 0
         options = {"vertical": self.orientation == "vertical", "max_step": self.max_step, "hold": hold}
         kernel = context.kernels.load(ik_step, Loop(IK_TOLERANCE, MAX_IK_STEPS), **options)
         low, high = context.robot.position_lower[:, None], context.robot.position_upper[:, None]
@@ -61,31 +72,8 @@ class _IK(Stage):
 
         return work
 
-    def _how(self) -> str:
-        return " with the tip's z axis vertical" if self.orientation == "vertical" else ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class GuessedIK(_IK):
-    """Base class: inverse kinematics from a random guess or from the base configuration."""
-
-    guess: tuple[Range, ...] = field("box of random guesses; default: the base configuration", unit="rad", default=())
-    at_limit: float = field(
-        "fraction of the guesses with one random joint held on one of its limits",
-        low=0.0,
-        high=1.0,
-        default=0.0,
-        since_version=2,
-    )
-
-    def _origin(self) -> str:
-        """Describe the initial guess."""
-        box = " x ".join(f"[{g.low:.4g}, {g.high:.4g}]" for g in self.guess)
-        held = f", with one joint held on a limit in {100 * self.at_limit:.4g} % of the cases" if self.at_limit else ""
-        return (f"a random guess in {box} rad" if self.guess else "the base configuration") + held
-
     def _solve_guessed(self, context: Context, end: str) -> StageFunction:
-        guess, solve = self._guesses(context), self._solve_from_guess(context, end)
+        guess, solve = self._guesses(context), self._solve(context, end)
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             guess(candidates, random)
@@ -93,35 +81,28 @@ class GuessedIK(_IK):
 
         return work
 
-    def _solve_from_guess(self, context: Context, end: str) -> StageFunction:
-        return self._solve(context, end, "guess_q", hold=self.at_limit > 0)
-
     def _guesses(self, context: Context) -> StageFunction:
         """Return the stage function that draws initial guesses."""
-        n = context.robot.n
+        robot, n = context.robot, context.robot.n
         if self.guess and len(self.guess) != n:
             raise RecipeError([f"guess: needs {n} ranges, one per planned joint, got {len(self.guess)}"])
         for index, each in enumerate(() if context.problem.is_stored else self.guess):
-            ends = np.full((2, n), context.robot.base)
+            ends = np.full((2, n), robot.base)
             ends[:, index] = each.low, each.high
-            if wrong := find_implausible_value(context.robot, "guess_q", ends, context.robot.units("rad")):
-                raise RecipeError([f"guess: {context.robot.joint_names[index]}: {wrong}"])
-        guess = self.guess or tuple(Range(float(x), float(x)) for x in context.robot.base)
+            if wrong := find_implausible_value(robot, "guess_q", ends, robot.units("rad")):
+                raise RecipeError([f"guess: {robot.joint_names[index]}: {wrong}"])
+        guess = self.guess or tuple(Range(float(x), float(x)) for x in robot.base)
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             candidates["guess_q"] = uniform(candidates.draw(random, n), guess)
             if self.at_limit:
-                self._put_on_limits(candidates, random, context.robot)
+                choice, joint, side = candidates.draw(random, 3)
+                held = (np.arange(n)[:, None] == np.minimum((joint * n).astype(int), n - 1)) & (choice < self.at_limit)
+                limit = np.where(side < 0.5, robot.position_lower[:, None], robot.position_upper[:, None])
+                candidates["guess_q"] = np.where(held, limit, candidates["guess_q"])
+                candidates["held"] = held.astype(float)
 
         return work
-
-    def _put_on_limits(self, candidates: CandidateBatch, random: np.random.Generator, robot: Robot) -> None:
-        choice, joint, side = candidates.draw(random, 3)
-        which = np.minimum((joint * robot.n).astype(int), robot.n - 1)
-        held = (np.arange(robot.n)[:, None] == which) & (choice < self.at_limit)
-        limit = np.where(side < 0.5, robot.position_lower[:, None], robot.position_upper[:, None])
-        candidates["guess_q"] = np.where(held, limit, candidates["guess_q"])
-        candidates["held"] = held.astype(float)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,10 +129,8 @@ class GoalIK(GuessedIK):
     guess: tuple[Range, ...] = field(
         "box of random guesses; default: the start configuration", unit="rad", default=(), since_version=2
     )
-    from_start: float = field(
+    from_start: float = fraction(
         "fraction of the goals that start from the start configuration in spite of guesses",
-        low=0.0,
-        high=1.0,
         default=0.0,
         since_version=2,
     )
@@ -190,7 +169,7 @@ class GoalIK(GuessedIK):
     def _search(self, context: Context) -> StageFunction:
         if not self.guess:
             return self._solve(context, "goal", "start_q")
-        guess, solve = self._guesses(context), self._solve_from_guess(context, "goal")
+        guess, solve = self._guesses(context), self._solve(context, "goal")
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             guess(candidates, random)
@@ -238,11 +217,11 @@ def ik_step(robot: Robot, *, vertical: bool, max_step: float, hold: bool = False
         ca.logic_and(float(low) <= x, x <= float(high))
         for x, low, high in zip(target, robot.position_lower, robot.position_upper, strict=True)
     ]
-    moved = [ca.if_else(ok, 0.0, _clip(x, robot, i) - q[i]) for i, (ok, x) in enumerate(zip(free, target, strict=True))]
+    moved = [ca.if_else(ok, 0.0, x - at) for ok, x, at in zip(free, clip_to_limits(target, robot), q, strict=True)]
     rest = [factor * e - dot(row, moved) for e, row in zip(error, rows, strict=True)]
     left = [[x * ok for x, ok in zip(row, free, strict=True)] for row in rows]
     again, _ = clipped_step(left, rest, max_step, IK_DAMPING + ca.fmin(MAX_LIMIT_DAMPING, LIMIT_DAMPING_RATE * square))
-    following = [_clip(x, robot, i) for i, x in enumerate(add(add(q, moved), again))]
+    following = clip_to_limits(add(add(q, moved), again), robot)
     given = [q_sx, p_sx, *([held_sx] if hold else []), *([axes_sx] if turned else [])]
     return ca.Function("ik", given, [ca.vertcat(*following), ca.sqrt(square)])
 
@@ -271,42 +250,68 @@ def clipped_step(rows: list[Vec], error: Vec, max_step: float, damping: Scalar) 
     import casadi as ca
 
     weights = solve(gram(rows, damping), error)
-    columns = len(rows[0])
-    step = [dot([row[j] for row in rows], weights) for j in range(columns)]
-    largest: Scalar = ca.fabs(step[0])
-    for x in step[1:]:
-        largest = ca.fmax(largest, ca.fabs(x))
+    step = [dot(column, weights) for column in zip(*rows, strict=True)]
+    largest = reduce(ca.fmax, map(ca.fabs, step))
     factor = ca.fmin(1.0, max_step / ca.fmax(largest, 1e-9))
     return scale(step, factor), factor
 
 
-def _clip(x: Scalar, robot: Robot, i: int) -> Scalar:
+def clip_to_limits(q: Vec, robot: Robot) -> Vec:
+    """Move joint positions outside their limits to the limits."""
     import casadi as ca
 
-    return ca.fmin(ca.fmax(x, float(robot.position_lower[i])), float(robot.position_upper[i]))
+    bounds = zip(q, robot.position_lower.tolist(), robot.position_upper.tolist(), strict=True)
+    return [ca.fmin(ca.fmax(x, low), high) for x, low, high in bounds]
 
 
-def pose_ik_step(robot: Robot) -> Any:
-    """Build ``(q, position, rotation by rows) -> (next q, |error|)``; steps end at the joint limits.
+@dataclass(frozen=True, kw_only=True)
+class Home(GuessedIK):
+    """Stage: home is the start, the base, or a configuration for a random position, with given fractions."""
 
-    The error is the distance from the position, and the rotation vector to the rotation times ``METERS_PER_RADIAN``,
-    stretched to twice the tangent of half the angle, so that rotations by 180 degrees are no fixed point.
-    """
-    import casadi as ca
+    inputs = ("start_q", "start_xyz")
+    at_start: float = fraction("fraction of homes at the start configuration")
+    at_base: float = fraction("fraction of homes at the base configuration", default=0.0)
+    position: tuple[Range, Range, Range] = field("box of tip positions of the other homes: x, y, z", unit="m")
 
-    (q_sx, q), (p_sx, p), (r_sx, r) = symbols("q", robot.n), symbols("p", 3), symbols("r", 9)
-    kin = forward_kinematics(robot.chain, q)
-    target = [r[0:3], r[3:6], r[6:9]]
-    relative = [[dot(a, b) for b in kin.rotation] for a in target]  # target times the transposed rotation
-    trace = relative[0][0] + relative[1][1] + relative[2][2]
-    stretch = METERS_PER_RADIAN * 2.0 / ca.fmax(1.0 + trace, 1e-2)
-    turn = [relative[2][1] - relative[1][2], relative[0][2] - relative[2][0], relative[1][0] - relative[0][1]]
-    error = [*subtract(p, kin.tip), *scale(turn, stretch)]
-    axes = [axis if turns else [0.0] * 3 for axis, turns in zip(kin.axes, kin.turning, strict=True)]
-    rows = [[column[row] for column in kin.jacobian] for row in range(3)]
-    rows += [[METERS_PER_RADIAN * axis[row] for axis in axes] for row in range(3)]
-    square = dot(error, error)
-    step, _ = clipped_step(rows, error, MAX_POSE_IK_STEP_RAD, POSE_DAMPING * square + MIN_DAMPING)
-    moved = add(q, step)
-    following = [_clip(x, robot, i) for i, x in enumerate(moved)]
-    return ca.Function("pose_ik", [q_sx, p_sx, r_sx], [ca.vertcat(*following), ca.sqrt(square)])
+    def find_mistakes(self) -> Iterator[tuple[str, str]]:
+        if self.at_start + self.at_base > 1:
+            yield "at_base", f"the fractions must not be more than 1 together, got {self.at_start + self.at_base:g}"
+
+    def describe(self) -> str:
+        elsewhere = max(1 - self.at_start - self.at_base, 0.0)
+        return (
+            f"choose a home: the start configuration in {100 * self.at_start:.4g} % of the cases, the base in"
+            f" {100 * self.at_base:.4g} %, one for a random position{self._how()} from {self._origin()} in"
+            f" {100 * elsewhere:.4g} %"
+        )
+
+    def outputs(self, context: Context) -> tuple[Field, ...]:
+        text = "joint positions that those at the goal are chosen close to"
+        return (context.joint_field("home_q", "rad", text, "diagnostic"),)
+
+    def writes(self, context: Context) -> tuple[str, ...]:
+        return "home_q", "home_xyz"
+
+    def prepare(self, context: Context) -> StageFunction:
+        check_reach(context, (("position", self.position),))
+        guess_home, tip = self._solve_guessed(context, "home"), context.kernels.load(tip_position)
+        base = context.robot.base[:, None]
+
+        def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            candidates["home_xyz"] = uniform(candidates.draw(random, 3), self.position)
+            candidates["home_choice"] = candidates.draw(random, 1)
+            guess_home(candidates, random)
+            choice, elsewhere = candidates["home_choice"][0], candidates["home_q"]
+            home = np.where(choice < self.at_start + self.at_base, base, elsewhere)
+            candidates["home_q"] = np.where(choice < self.at_start, candidates["start_q"], home)
+            (candidates["home_xyz"],) = tip(candidates["home_q"])
+
+        return work
+
+    def complete(self, context: Context, given: Collection[str]) -> StageFunction:
+        """Use the start: goals of tasks are chosen near the start configuration."""
+
+        def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
+            candidates["home_q"], candidates["home_xyz"] = candidates["start_q"], candidates["start_xyz"]
+
+        return work

@@ -9,16 +9,15 @@ from numpy.typing import NDArray
 from cnpgen.kernels.collision.body_arrays import LANES, PADDING_DISTANCE_M, obstacle_bodies
 from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CollisionChecker, load_collision_library
 from cnpgen.kernels.compiled_kernel import address_of
-from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.families.resting_states import RestingStates
 from cnpgen.pipelines.stages.batch_scenes import BatchScenes
+from cnpgen.pipelines.stages.stage import Array, Context
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.solid import place_obstacles, solids_of
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 

@@ -2,21 +2,20 @@
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
-from cnpgen.kernels.symbolic.kinematics import tip_position
+from cnpgen.kernels.symbolic.kinematics import forward_kinematics, tip_position
+from cnpgen.kernels.symbolic.linalg import add, dot, scale, subtract, symbols
 from cnpgen.kernels.tape import Loop
-from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.batch_scenes import BatchScenes
 from cnpgen.pipelines.stages.draw import position_field
-from cnpgen.pipelines.stages.draw_scenes import scenes_of
-from cnpgen.pipelines.stages.ik import MAX_POSE_IK_STEPS, POSE_TOLERANCE, pose_ik_step
+from cnpgen.pipelines.stages.ik import clip_to_limits, clipped_step
 from cnpgen.pipelines.stages.scene_clearance import SceneClearance
-from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction, leave
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction, fraction, leave
 from cnpgen.pipelines.stages.torque import torque_ratio
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
@@ -31,6 +30,13 @@ FIRST_PHASES = (0.5, 0.25, 0.75)  # of a straight line, checked first
 OTHER_PHASES = tuple(k / 16 for k in range(1, 16, 2))
 NO_ENDS = "no collision-free start and goal in the scene"
 NUMBERS_PER_PAIR = 5  # random numbers: kind of start, and two for each of two states, less one
+# Inverse kinematics of poses
+METERS_PER_RADIAN = 0.3  # weight of an angle against a distance
+POSE_TOLERANCE = 1e-9  # m and weighted rad, before the last step
+MAX_POSE_IK_STEPS = 30
+MAX_POSE_IK_STEP_RAD = 0.5  # of any joint
+POSE_DAMPING = 1e-3  # relative to the squared error (Sugihara 2011)
+MIN_DAMPING = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,9 +44,9 @@ class SceneEnds(Stage):
     """Stage: goals at grasps of the scene, and starts at other grasps, near the base configuration or random."""
 
     inputs = ("scene",)
-    neutral: float = field("share of starts near the base configuration", default=0.4, low=0.0, high=1.0)
-    grasp: float = field("share of starts at another grasp", default=0.4, low=0.0, high=1.0)
-    random: float = field("share of random starts", default=0.2, low=0.0, high=1.0)
+    neutral: float = fraction("share of starts near the base configuration", default=0.4)
+    grasp: float = fraction("share of starts at another grasp", default=0.4)
+    random: float = fraction("share of random starts", default=0.2)
     spread: float = field(
         "standard deviation of starts around the base configuration", unit="rad", default=0.1, low=0.0, plausible=np.pi
     )
@@ -51,15 +57,13 @@ class SceneEnds(Stage):
         low=0.0,
         plausible=1.0,
     )
-    straight: float = field(
-        "share of the samples whose straight line may be free of collisions", default=0.1, low=0.0, high=1.0
-    )
+    straight: float = fraction("share of the samples whose straight line may be free of collisions", default=0.1)
     grasps: int = field("grasps of a scene that are tried", default=8, low=1, high=100)
     poses: int = field("random poses at each grasp", default=12, low=1, high=100)
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        if abs(self.neutral + self.grasp + self.random - 1) > 1e-9:
-            total = self.neutral + self.grasp + self.random
+        total = self.neutral + self.grasp + self.random
+        if abs(total - 1) > 1e-9:
             yield "random", f"the shares of starts must add up to 1, got {total:g}"
 
     def describe(self) -> str:
@@ -80,19 +84,17 @@ class SceneEnds(Stage):
         )
 
     def task_inputs(self, context: Context) -> tuple[Field, ...]:
-        """List the joint positions, which tasks give."""
         return self.outputs(context)[:2]
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
-        """Keep the joint positions of tasks."""
         return leave
 
     def prepare(self, context: Context) -> StageFunction:
-        """Load the kernels and the collision checks."""
         states, tip = _EndStates(context, self), context.kernels.load(tip_position)
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
-            scenes = scenes_of(candidates)
+            scenes = candidates.scenes
+            assert scenes is not None  # as a stage has written the column "scene"
             pools = states.pools(scenes, random)
             numbers = candidates.draw(random, 1 + NUMBERS_PER_PAIR * MAX_PAIRS_PER_CANDIDATE)
             start, goal = states.pairs(scenes, pools, candidates.scene, numbers)
@@ -212,8 +214,7 @@ class _EndStates:
         for attempt in range(MAX_PAIRS_PER_CANDIDATE):
             first = 1 + NUMBERS_PER_PAIR * attempt
             q, aim, key = self._pair(pools, scene[pending], numbers[first : first + NUMBERS_PER_PAIR, pending])
-            is_new = ~np.isin(key, used)
-            is_new[is_new] = _is_first(key[is_new])
+            is_new = _is_first(np.append(used, key))[len(used) :]
             exists = is_new & np.isfinite(q).all(axis=0)
             accepted = exists & may_be_straight[pending]
             lines = np.flatnonzero(exists & ~accepted)
@@ -285,3 +286,28 @@ def _across(axis: Array) -> tuple[Array, Array]:
     first = np.cross(helper, axis)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return first, np.cross(axis, first)
+
+
+def pose_ik_step(robot: Robot) -> Any:
+    """Build ``(q, position, rotation by rows) -> (next q, |error|)``; steps end at the joint limits.
+
+    The error is the distance from the position, and the rotation vector to the rotation times ``METERS_PER_RADIAN``,
+    stretched to twice the tangent of half the angle, so that rotations by 180 degrees are no fixed point.
+    """
+    import casadi as ca
+
+    (q_sx, q), (p_sx, p), (r_sx, r) = symbols("q", robot.n), symbols("p", 3), symbols("r", 9)
+    kin = forward_kinematics(robot.chain, q)
+    target = [r[0:3], r[3:6], r[6:9]]
+    relative = [[dot(a, b) for b in kin.rotation] for a in target]  # target times the transposed rotation
+    trace = relative[0][0] + relative[1][1] + relative[2][2]
+    stretch = METERS_PER_RADIAN * 2.0 / ca.fmax(1.0 + trace, 1e-2)
+    turn = [relative[2][1] - relative[1][2], relative[0][2] - relative[2][0], relative[1][0] - relative[0][1]]
+    error = [*subtract(p, kin.tip), *scale(turn, stretch)]
+    axes = [axis if turns else [0.0] * 3 for axis, turns in zip(kin.axes, kin.turning, strict=True)]
+    rows = [[column[row] for column in kin.jacobian] for row in range(3)]
+    rows += [[METERS_PER_RADIAN * axis[row] for axis in axes] for row in range(3)]
+    square = dot(error, error)
+    step, _ = clipped_step(rows, error, MAX_POSE_IK_STEP_RAD, POSE_DAMPING * square + MIN_DAMPING)
+    following = clip_to_limits(add(q, step), robot)
+    return ca.Function("pose_ik", [q_sx, p_sx, r_sx], [ca.vertcat(*following), ca.sqrt(square)])

@@ -1,25 +1,87 @@
-"""Base class of stages, and the batch of candidates that stages process."""
+"""Base class of stages, and the context and batch of candidates that they process."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import UsageError
+from cnpgen.errors import RecipeError, UsageError
+from cnpgen.kernels.library import Backend, KernelLibrary, problem_kernels
+from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
+from cnpgen.schema import registry
+from cnpgen.schema.keys import field as key
 from cnpgen.store.field import Field
 
 if TYPE_CHECKING:
-    from cnpgen.pipelines.context import Context
     from cnpgen.pipelines.stages.batch_scenes import BatchScenes
 
 Array = NDArray[np.float64]
+Kind = TypeVar("Kind", bound=Constraint)
 
 BLOCK_ROWS = 4096  # rows per block, unless a stage requires fewer
+
+
+@dataclass(frozen=True)
+class Context:
+    """Loaded problem of a stage.
+
+    Attributes:
+        problem: Definition of a valid motion.
+        robot: Robot with its planning limits.
+        kernels: Library of compiled kernels.
+        dtype: Float type of stored rows.
+    """
+
+    problem: Problem
+    robot: Robot
+    kernels: KernelLibrary
+    dtype: str = "float64"
+
+    def constraint(self, kind: type[Kind]) -> Kind:
+        """Return the problem's constraint of a kind.
+
+        Raises:
+            RecipeError: The problem has no constraint of this kind.
+        """
+        if (constraint := self.problem.first(kind)) is not None:
+            return constraint
+        name = registry.name_of(registry.CONSTRAINTS, kind)
+        raise RecipeError([f"needs a constraint {name!r}, which the problem {self.problem.path} does not have"])
+
+    def joint_field(self, name: str, unit: str, long_name: str, role: str = "input") -> Field:
+        """Describe a field with one column per planned joint, bounded by the planning limits of its unit.
+
+        Args:
+            name: Name of the field.
+            unit: Unit for revolute joints: "rad", "rad/s" or "rad/s^2".
+            long_name: Short description of the field.
+            role: Role of the field, see ``Field``.
+        """
+        robot = self.robot
+        bounds = {
+            "rad": (robot.position_lower, robot.position_upper),
+            "rad/s": (-robot.velocity_limit, robot.velocity_limit),
+            "rad/s^2": (-robot.acceleration_limit, robot.acceleration_limit),
+        }[unit]
+        low, high = (tuple(float(x) for x in bound) for bound in bounds)
+        return Field(
+            name, robot.units(unit), long_name, robot.n, robot.joint_names, role, valid_min=low, valid_max=high
+        )
+
+
+def load_context(problem: Problem, backend: Backend, cache_folder: Path, dtype: str = "float64") -> Context:
+    """Load the robot of a problem and open its kernel library."""
+    robot = load_robot(problem)
+    return Context(problem, robot, problem_kernels(problem, robot, backend, cache_folder), dtype)
 
 
 class CandidateBatch:
@@ -171,6 +233,11 @@ class Stage(ABC):
         if known and missing:
             raise UsageError(f"{', '.join(known)}: tasks that give this must also give {', '.join(missing)}")
         return leave if known else self.prepare(context)
+
+
+def fraction(doc: str, **options: Any) -> Any:
+    """Declare a key with a number from 0 to 1; see ``field``."""
+    return key(doc, low=0.0, high=1.0, **options)
 
 
 def leave(candidates: CandidateBatch, random: np.random.Generator) -> None:

@@ -1,14 +1,14 @@
 """Stage: the torque that holds the arm and its payload still, by inverse dynamics."""
 
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import numpy as np
 
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
-from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
+from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
@@ -22,7 +22,6 @@ class GravityTorque(Stage):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Joint positions of the end."""
         return (f"{self.end}_q",)
 
     def describe(self) -> str:
@@ -52,8 +51,7 @@ def torque_ratio(robot: Robot) -> Any:
 
     (q_sx, q), (parameters_sx, parameters) = symbols("q", robot.n), symbols("parameters", len(robot.parameters))
     zero = [0.0] * robot.n
-    largest = ca.SX(0)
-    state = SymbolicState(robot, q, zero, zero, parameters, (), None)
-    for torque, limit in zip(state.torque, robot.torque_limit, strict=True):
-        largest = ca.fmax(largest, ca.fabs(torque) / float(limit))
-    return ca.Function("torque_ratio", [q_sx, parameters_sx] if parameters else [q_sx], [largest])
+    torque = SymbolicState(robot, q, zero, zero, parameters, (), None).torque
+    ratios = (ca.fabs(value) / limit for value, limit in zip(torque, robot.torque_limit.tolist(), strict=True))
+    arguments = [q_sx, parameters_sx] if parameters else [q_sx]
+    return ca.Function("torque_ratio", arguments, [reduce(ca.fmax, ratios, ca.SX(0))])

@@ -9,10 +9,9 @@ import pytest
 import cnpgen
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
-from cnpgen.pipelines.families.catalog import FAMILIES
 from cnpgen.pipelines.families.family import Range
 from cnpgen.pipelines.families.resting_states import RestingStates
-from cnpgen.pipelines.families.scene_generator import grasp_rotations
+from cnpgen.pipelines.families.scene_generator import FAMILIES, grasp_rotations
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.observation.primitives import primitives_of
