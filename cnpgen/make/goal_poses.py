@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cnpgen.pipelines.families.resting_states import RestingStates, seeds_of
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
-from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.constraints.link_clearance import SelfClearance
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.scenes.scene_problem import GoalPose

@@ -14,8 +14,8 @@ from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.collision import candidate_poses
 from cnpgen.pipelines.stages.narrow_phase import narrow_phase_of, narrow_phase_of_scenes, unmet
 from cnpgen.pipelines.stages.stage import CandidateBatch, StageFunction
+from cnpgen.problems.conditions import symbolic_needs
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, End
-from cnpgen.problems.constraints.needs import symbolic_needs
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene_arrays import scene_capacity

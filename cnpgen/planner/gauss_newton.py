@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.symbolic.linalg import Vec, add, dot, solve
-from cnpgen.problems.equalities import equality_residuals
+from cnpgen.problems.conditions import equality_residuals
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.spline import basis, clamped_knots

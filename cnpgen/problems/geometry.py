@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 from cnpgen.errors import RecipeError
 from cnpgen.problems.checks import named_packages, tables
 from cnpgen.problems.constraints.constraint import Constraint
-from cnpgen.problems.constraints.object_clearance import ObjectClearance
+from cnpgen.problems.constraints.link_clearance import ObjectClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.shape.mesh_files import find_named_file, find_urdf
 from cnpgen.robots.urdf import read_urdf, urdf_tree

@@ -16,10 +16,9 @@ from cnpgen.errors import MachineError, UsageError
 from cnpgen.problems.constraints.axis import TipAxis
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import Constraint
-from cnpgen.problems.constraints.object_clearance import ObjectClearance
+from cnpgen.problems.constraints.link_clearance import ObjectClearance
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.objectives import Centrifugal, ObjectiveTerm
-from cnpgen.robots.locked_joints import with_locked_joints
 from cnpgen.robots.obstacle import Obstacle, invalid_obstacle
 from cnpgen.robots.parameter_ranges import (
     NO_PARAMETERS,
@@ -32,10 +31,15 @@ from cnpgen.robots.robot_spec import HeldObject, LimitSpec, Payload, RobotSpec
 from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.shape.inline import with_inline_meshes
 from cnpgen.robots.shape.mesh_files import find_urdf
-from cnpgen.robots.shape.payload_link import PAYLOAD, with_payload_link
-from cnpgen.robots.shape.srdf import with_disabled_pairs, with_ignored_pairs
 from cnpgen.robots.solid import pose_width
 from cnpgen.robots.urdf import read_urdf
+from cnpgen.robots.urdf_changes import (
+    PAYLOAD,
+    with_disabled_pairs,
+    with_ignored_pairs,
+    with_locked_joints,
+    with_payload_link,
+)
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.keys import NAME, Range, field, to_dict

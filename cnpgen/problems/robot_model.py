@@ -334,7 +334,7 @@ def constraint_values_of(robot: Robot, problem: Problem) -> Any:
     """Build ``(q, dq, ddq, obstacle poses) -> (g, dg/dq, dg/d(dq), dg/d(ddq), drift)``, Jacobians column by column."""
     import casadi as ca
 
-    from cnpgen.problems.constraints.needs import symbolic_needs
+    from cnpgen.problems.conditions import symbolic_needs
 
     state, pairs = _symbolic_conditions(robot, problem)
     inputs = [ca.vertcat(*values) for values in (state.q, state.dq, state.ddq, state.obstacle_poses)]

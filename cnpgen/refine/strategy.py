@@ -31,8 +31,7 @@ from numpy.typing import NDArray
 from cnpgen.judges.plans.judge import Judge
 from cnpgen.judges.plans.verdict import Reason, Verdict
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
-from cnpgen.problems.constraints.object_clearance import ObjectClearance
-from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.constraints.link_clearance import ObjectClearance, SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.grid_levels import MAX_INITIAL_VIOLATION
 from cnpgen.refine.obstacle_attempts import along_path, around_obstacles, ends_penetrate, is_deep, path_guesses

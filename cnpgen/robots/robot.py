@@ -1,18 +1,18 @@
-"""Robot: Pinocchio model, reduced to the planned joints, and planning limits of the problem."""
+"""Robot: Pinocchio model, reduced to the planned joints, with its attachments and planning limits of the problem."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import RecipeError, nearest
-from cnpgen.robots.attached import Attached, attach, bounded
+from cnpgen.errors import RecipeError, listed, nearest
 from cnpgen.robots.chain import Chain, frame_of, name_links_uniquely
 from cnpgen.robots.model_comparison import check_model
 from cnpgen.robots.parameter_ranges import NO_PARAMETERS, ParameterRanges
@@ -22,11 +22,43 @@ from cnpgen.robots.urdf_parameters import UrdfParameters, urdf_parameters
 from cnpgen.store.joint_units import units_of_joints
 
 if TYPE_CHECKING:
-    from xml.etree.ElementTree import Element
-
     import pinocchio as pin
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PayloadBody:
+    """Rigid body of the payload: mass [kg], center of mass [m] and inertia about it [kg m^2] along the tip frame."""
+
+    mass: float
+    com: Array
+    inertia: Array
+
+
+@dataclass(frozen=True)
+class Attached:
+    """Attachments to the robot of a URDF.
+
+    Attributes:
+        frame: URDF frame to which the tip frame is fixed.
+        rotation: Rotation of the tip frame in it, shape (3, 3).
+        translation: Origin of the tip frame in it [m], shape (3,).
+        payload: Body carried at the tip frame, or None.
+        ranges: Planned joint -> position limits [rad] that replace those of the URDF.
+    """
+
+    frame: str
+    rotation: Array = field(default_factory=lambda: np.eye(3))
+    translation: Array = field(default_factory=lambda: np.zeros(3))
+    payload: PayloadBody | None = None
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def tip(self) -> str:
+        """Name of the tip frame: the URDF's own, or that of a new one."""
+        moved = not np.array_equal(self.rotation, np.eye(3)) or self.translation.any()
+        return f"{self.frame} with offset" if moved else self.frame
 
 
 @dataclass(frozen=True)
@@ -162,14 +194,14 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
     return reduced
 
 
-def _check_mimic(tree: "Element", joints: Sequence[str]) -> None:
+def _check_mimic(tree: ElementTree.Element, joints: Sequence[str]) -> None:
     """Raise RecipeError if a mimic joint would have a wrong position: Pinocchio treats them as independent joints."""
     mistakes = [f"robot.joints: {text}" for joint in tree.iter("joint") for text in _mimic_mistakes(joint, joints)]
     if mistakes:
         raise RecipeError(mistakes)
 
 
-def _mimic_mistakes(joint: "Element", planned: Sequence[str]) -> Iterator[str]:
+def _mimic_mistakes(joint: ElementTree.Element, planned: Sequence[str]) -> Iterator[str]:
     mimic = joint.find("mimic")
     if mimic is None:
         return
@@ -182,7 +214,7 @@ def _mimic_mistakes(joint: "Element", planned: Sequence[str]) -> Iterator[str]:
         yield f"{name!r} mimics {other!r} with {offset}, but would stay at zero; mimic joints are not supported"
 
 
-def _mimic_offset(mimic: "Element") -> str:
+def _mimic_offset(mimic: ElementTree.Element) -> str:
     """Return an error message for a non-zero offset, otherwise an empty text."""
     try:
         return "an offset" if number_in(mimic, "offset", 0.0) else ""
@@ -241,3 +273,40 @@ def _capsule_axes(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:
         else:
             kept.append(point)
     return tuple((a, b) for a, b in pairwise(kept) if not (still(a) and still(b)))
+
+
+def attach(model: "pin.Model", attached: Attached) -> None:
+    """Add the attachments of a problem to a reduced model.
+
+    Raises:
+        RecipeError: The model has no such frame.
+    """
+    import pinocchio as pin
+
+    if not model.existFrame(attached.frame):
+        known = [frame.name for frame in model.frames]
+        text = f"{model.name} has no frame {attached.frame!r}{nearest(attached.frame, known)}"
+        raise RecipeError([f"robot.tip: {text}; its frames: {listed(known)}"])
+    index = frame_of(model, attached.frame)
+    frame = model.frames[index]
+    placement = frame.placement * pin.SE3(attached.rotation, attached.translation)
+    if attached.tip != attached.frame:
+        model.addFrame(pin.Frame(attached.tip, frame.parentJoint, index, placement, pin.FrameType.OP_FRAME), False)
+    if body := attached.payload:
+        model.appendBodyToJoint(frame.parentJoint, pin.Inertia(body.mass, body.com, body.inertia), placement)
+    for name, (low, high) in attached.ranges.items():
+        place = model.idx_qs[model.getJointId(name)]
+        model.lowerPositionLimit[place], model.upperPositionLimit[place] = low, high
+
+
+def bounded(urdf: str, tree: ElementTree.Element, attached: Attached) -> str:
+    """Return a URDF in which continuous joints with a given range are revolute; the tree is modified in place."""
+    turning = [joint for joint in tree.iter("joint") if joint.get("type") == "continuous"]
+    given = [joint for joint in turning if joint.get("name") in attached.ranges]
+    for joint in given:
+        joint.set("type", "revolute")
+        limit = joint.find("limit")
+        if limit is None:
+            limit = ElementTree.SubElement(joint, "limit", velocity="0", effort="0")
+        limit.attrib.update(lower="0", upper="0")
+    return ElementTree.tostring(tree, encoding="unicode") if given else urdf

@@ -12,8 +12,7 @@ from cnpgen.errors import UsageError
 from cnpgen.losses.metric import Metric, alpha_step, average_loss
 from cnpgen.losses.metric_settings import BOUNDED, PUBLISHED, MetricSettings, suggested_weights
 from cnpgen.problems.constraints.axis import Axis, Vertical
-from cnpgen.problems.constraints.line import Line
-from cnpgen.problems.constraints.plane import Plane
+from cnpgen.problems.constraints.plane import Line, Plane
 from cnpgen.problems.constraints.pose import Pose
 from cnpgen.problems.constraints.table import Table
 from tests.examples.constraints import TipSpeed

@@ -19,9 +19,8 @@ from cnpgen.pipelines.stages.scene_clearance import SceneClearance
 from cnpgen.pipelines.stages.scene_ends import NO_ENDS
 from cnpgen.pipelines.stages.stage import CandidateBatch
 from cnpgen.problems.load_robot import load_robot
-from cnpgen.problems.scene_capacity import with_capacity
-from cnpgen.robots.observation.primitives import KINDS, primitives_of
-from cnpgen.robots.observation.signed_distance import signed_distances
+from cnpgen.problems.obstacles import with_capacity
+from cnpgen.robots.observation.primitives import KINDS, primitives_of, signed_distances
 from cnpgen.robots.scene_arrays import make_scene_table, scene_capacity
 from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.store.scene_table import OBSTACLE_KINDS

@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.robots.observation.primitives import KINDS, Primitives, bodies_of
-from cnpgen.robots.observation.signed_distance import smallest_signed_distances
+from cnpgen.robots.observation.primitives import KINDS, Primitives, bodies_of, smallest_signed_distances
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.convex_part import ConvexPart
 from cnpgen.robots.shape.hull import ball_round, coal_hull

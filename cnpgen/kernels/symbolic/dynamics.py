@@ -18,8 +18,8 @@ from cnpgen.kernels.symbolic.linalg import (
     times,
     transposed_times,
 )
-from cnpgen.robots.attached import PayloadBody
 from cnpgen.robots.chain import Chain
+from cnpgen.robots.robot import PayloadBody
 
 
 @dataclass(frozen=True)

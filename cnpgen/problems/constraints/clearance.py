@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.robots.obstacle import Obstacle
-    from cnpgen.robots.shape.shape import Shape
     from cnpgen.world.path import PathWorld
     from cnpgen.world.world import World
 
@@ -40,23 +39,6 @@ class DistanceConstraint(Constraint):
         m = len(distances)
         lower, upper = np.full(m, least, float), np.full(m, np.inf)
         return (Condition(self.condition_name, "m", distances, lower, upper, "position", parts, sufficient),)
-
-
-@dataclass(frozen=True, kw_only=True)
-class LinkClearance(DistanceConstraint):
-    """Base class: bodies that the robot moves are further than ``distance`` from each other."""
-
-    uses_obstacles = False
-    distance: float
-
-    @property
-    def effective_tolerance(self) -> float:
-        """Tolerance up to a penetration of ``MAX_LINK_PENETRATION_M``."""
-        return min(self.tolerance, self.distance + MAX_LINK_PENETRATION_M)
-
-    def met(self, path: "PathWorld", tolerance: float) -> NDArray[np.bool_]:
-        """Return a mask of the states with sufficient distances between the bodies."""
-        return path.pairs(self.bodies).clear_states(self.distance - tolerance)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,12 +161,6 @@ class ObjectContact(DistanceConstraint):
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions on the solver's shapes of the obstacles."""
         return self._at_least([0.0] * len(world.obstacles), -self.depth, sufficient=_has_poses(world.obstacles))
-
-
-def names_of_pairs(shape: "Shape | None") -> tuple[str, ...]:
-    """Return the names of the checked pairs of convex parts."""
-    links = [part.link for part in shape.convex_parts] if shape else []
-    return tuple(f"{links[first]}, {links[second]}" for first, second in (shape.checked_pairs if shape else ()))
 
 
 def _is_cautious(state: "SymbolicState") -> bool:

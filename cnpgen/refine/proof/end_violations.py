@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.problems.conditions import measured_needs
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.joint import JointTorque
-from cnpgen.problems.constraints.needs import measured_needs
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.proof.reachable_positions import joint_limits
 from cnpgen.robots.robot import Robot

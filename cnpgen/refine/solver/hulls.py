@@ -19,8 +19,7 @@ from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CloseBodies, 
 from cnpgen.kernels.collision.row_kernels import DistanceColumns, RowKernels
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
-from cnpgen.problems.constraints.object_clearance import ObjectClearance
-from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.constraints.link_clearance import ObjectClearance, SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.grid import Grid
 from cnpgen.refine.solver.residuals import DISTANCE_SCALE_M

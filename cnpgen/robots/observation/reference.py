@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.robots.observation.camera import Camera, depth_image, depth_points
-from cnpgen.robots.observation.primitives import Primitives, bodies_of
-from cnpgen.robots.observation.signed_distance import smallest_signed_distances
+from cnpgen.robots.observation.primitives import Primitives, bodies_of, smallest_signed_distances
 from cnpgen.robots.observation.surface_points import Seeds, surface_points
 
 Array = NDArray[np.float64]

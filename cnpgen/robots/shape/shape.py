@@ -17,8 +17,8 @@ from cnpgen.robots.chain import frame_of
 from cnpgen.robots.shape.capsule import Capsule, covering_capsule, covers
 from cnpgen.robots.shape.convex_part import ConvexPart, link_convex_parts
 from cnpgen.robots.shape.link_pairs import LinkPair, find_pairs
-from cnpgen.robots.shape.srdf import disabled_pairs
 from cnpgen.robots.urdf import urdf_tree
+from cnpgen.robots.urdf_changes import disabled_pairs
 from cnpgen.store.files.atomic import write_file
 
 if TYPE_CHECKING:
