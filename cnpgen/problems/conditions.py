@@ -8,9 +8,8 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.constraint import Condition
+from cnpgen.problems.constraints.constraint import Array, Condition
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import place_obstacles
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.world.world import World
 
-Array = NDArray[np.float64]
 _SHARES = (0.1, 0.9, 10.0)  # fractions of the limits
 _MIXED = np.cos(np.arange(64.0))  # both signs and distinct magnitudes
 

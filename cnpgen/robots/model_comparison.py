@@ -4,16 +4,15 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
 from cnpgen.robots.chain import LINK_SUFFIX
+from cnpgen.robots.shape.hull import Array
 from cnpgen.robots.urdf_parameters import IDENTITY, LinkFrame, LinkInertia, UrdfJoint, UrdfParameters
 
 if TYPE_CHECKING:
     import pinocchio as pin
 
-Array = NDArray[np.float64]
 
 MAX_RELATIVE_DIFFERENCE = 1e-9  # of values from two parsers, which round differently
 WORLD = 0  # index of Pinocchio's joint of the root link

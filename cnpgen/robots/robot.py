@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError, listed, nearest
 from cnpgen.robots.chain import Chain, frame_of, name_links_uniquely
 from cnpgen.robots.model_comparison import check_model
 from cnpgen.robots.parameter_ranges import NO_PARAMETERS, ParameterRanges
+from cnpgen.robots.shape.hull import Array
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.urdf import number_in, urdf_tree
 from cnpgen.robots.urdf_parameters import UrdfParameters, urdf_parameters
@@ -23,8 +23,6 @@ from cnpgen.store.joint_units import units_of_joints
 
 if TYPE_CHECKING:
     import pinocchio as pin
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.shape.hull import MAX_COORDINATE_M
+from cnpgen.robots.shape.hull import MAX_COORDINATE_M, Array
 from cnpgen.robots.solid import Solid, pose_width, solids_of
 from cnpgen.schema.arguments import integer
-
-Array = NDArray[np.float64]
 
 PARKED_POSITION_M = (0.0, 0.0, -100.0)  # of obstacles that a sample with fewer obstacles does not have
 

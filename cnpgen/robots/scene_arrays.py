@@ -6,16 +6,14 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.shape.convex_part import PRISM_SIDES
+from cnpgen.robots.shape.hull import Array
 from cnpgen.robots.solid import number_slices, place_obstacles, pose_width
 from cnpgen.store.scene_table import NO_OBSTACLE, OBSTACLE_KINDS, SceneTable
-
-Array = NDArray[np.float64]
 
 
 def sample_obstacles(obstacles: Sequence[Obstacle]) -> dict[str, list[int]]:

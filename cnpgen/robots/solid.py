@@ -19,15 +19,12 @@ from dataclasses import dataclass
 from itertools import accumulate, pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import PRISM_SIDES, prism, turned
-from cnpgen.robots.shape.hull import CUBE, frame_along
+from cnpgen.robots.shape.hull import CUBE, Array, frame_along
 from cnpgen.robots.shape.inline import corners_of
 from cnpgen.schema.keys import Range
-
-Array = NDArray[np.float64]
 
 UNBOUNDED_OBSTACLE_HEIGHT_M = 10.0  # height of the box that represents an obstacle without a lower end
 _NOTHING = (0.0, 0.0, 0.0)

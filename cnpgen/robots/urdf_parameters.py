@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.shape.convex_part import turned
+from cnpgen.robots.shape.hull import Array
 from cnpgen.robots.urdf import number_in, numbers_in
-
-Array = NDArray[np.float64]
 
 _INERTIA_ENTRIES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _PARTS = {  # element -> the elements whose numbers are read

@@ -6,10 +6,7 @@ Tolerances of all but the position are fractions of the limit.
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-
-from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.constraint import Array, Condition, Constraint
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
@@ -30,7 +27,7 @@ class _RelativeLimit(Constraint):
 
     tolerance: float = field("violation that a valid motion may have, as a fraction of the limit", low=0.0)
 
-    def allowed(self, condition: Condition) -> NDArray[np.float64]:
+    def allowed(self, condition: Condition) -> Array:
         """Return the fraction of the limit, shape (m,)."""
         return self.tolerance * condition.upper
 

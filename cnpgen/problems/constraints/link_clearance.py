@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.problems.constraints.clearance import MAX_LINK_PENETRATION_M, DistanceConstraint
-from cnpgen.problems.constraints.constraint import Condition, End
+from cnpgen.problems.constraints.constraint import Array, Condition, End
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def _for_solvers(robot: "Robot") -> "list[LinkPair]":
     return [pair for pair in _looked_at(robot) if pair.for_solvers]
 
 
-def _radii(robot: "Robot", pairs: "Sequence[LinkPair]") -> NDArray[np.float64]:
+def _radii(robot: "Robot", pairs: "Sequence[LinkPair]") -> Array:
     """Return the sums of the capsule radii of pairs [m]."""
     radius = {capsule.link: capsule.radius for capsule in robot.shape.capsules} if robot.shape else {}
     return np.array([radius[pair.first] + radius[pair.second] for pair in pairs], float)

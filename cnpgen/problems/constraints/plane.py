@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.problems.constraints.constraint import Array
 from cnpgen.problems.constraints.tip_manifold import BOUND_KINKS, TipManifold, TipRegion, Vector, beside, unit
 from cnpgen.schema.keys import Range, field
 
@@ -46,7 +46,7 @@ class Plane(TipManifold):
         bounded = [axis.tolist() for axis, _ in given]
         return TipRegion(np.array(self.point), [normal.tolist()], bounded, tuple(each for _, each in given))
 
-    def _axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _axes(self) -> tuple[Array, Array]:
         """Return the normal and both directions in the plane, unit vectors."""
         normal = unit(self.normal, "normal")
         if self.along is None:

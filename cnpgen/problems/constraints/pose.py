@@ -6,17 +6,14 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.constraint import Condition, End
+from cnpgen.problems.constraints.constraint import Array, Condition, End
 from cnpgen.problems.constraints.tip_manifold import TipManifold, TipRegion
 from cnpgen.schema.keys import Range, field
 
 if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.world.world import World
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.constraint import Condition, Constraint, End
+from cnpgen.problems.constraints.constraint import Array, Condition, Constraint, End
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.world.world import World
 
-Array = NDArray[np.float64]
 
 ADDED_RADIUS_M = 1e-4  # so that motions do not touch the puck within a tolerance of this size
 ROUNDING = 0.02  # of the relaxation near the goal, relative to the overlap

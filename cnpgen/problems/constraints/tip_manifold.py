@@ -11,16 +11,14 @@ from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.constraint import Condition, Constraint, End
+from cnpgen.problems.constraints.constraint import Array, Condition, Constraint, End
 from cnpgen.schema.keys import Range
 
 if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.world.world import World
 
-Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 Vectors = Sequence[Sequence[float]]  # Python floats, used in scalar products
 BOUND_KINKS = (0.1, 0.3)  # phases between which a motion that starts off the manifold must reach it

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.constraint import Array, Condition, Constraint
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
@@ -23,7 +22,7 @@ class TipSpeed(Constraint):
     limit: float = field("maximum speed of the tip", unit="m/s", low=1e-6)
     tolerance: float = field("additional speed that a valid motion may have", unit="m/s", low=0.0, plausible=1.0)
 
-    def allowed(self, condition: Condition) -> NDArray[np.float64]:
+    def allowed(self, condition: Condition) -> Array:
         """Return the tolerance of the square of the speed [m^2/s^2]."""
         return np.full(len(condition.g), (self.limit + self.tolerance) ** 2 - self.limit**2)
 

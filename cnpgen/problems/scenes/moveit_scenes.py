@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.problems.scenes.quaternions import quaternion_mistake, quaternion_of, rotation_matrix
+from cnpgen.problems.scenes.quaternions import Array, quaternion_mistake, quaternion_of, rotation_matrix
 from cnpgen.problems.scenes.scene_problem import (
     GoalPose,
     SceneError,
@@ -29,7 +28,6 @@ from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.shape.hull import outward_triangles
 from cnpgen.robots.shape.inline import corners_of
 
-Array = NDArray[np.float64]
 Pose = tuple[Array, Array]  # position [m] and rotation matrix
 
 _PRIMITIVES = {"1": "box", "2": "sphere", "3": "cylinder"}  # codes of shape_msgs/SolidPrimitive

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from cnpgen.errors import UsageError
-from cnpgen.problems.scenes.quaternions import quaternion_mistake, roll_pitch_yaw, rotation_matrix
+from cnpgen.problems.scenes.quaternions import Array, quaternion_mistake, roll_pitch_yaw, rotation_matrix
 from cnpgen.robots.observation.primitives import KINDS, primitives_of, signed_distances
 from cnpgen.robots.obstacle import Obstacle, invalid_obstacle
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid, hull_corners
@@ -19,8 +19,6 @@ from cnpgen.robots.solid import place_obstacles
 from cnpgen.schema.argument_types import check_fields, checked_arguments
 from cnpgen.schema.arguments import numbers
 from cnpgen.schema.units import PLAUSIBLE_MAX
-
-Array = NDArray[np.float64]
 
 MAX_SCENE_OBSTACLES = 100  # as many as a problem may have
 MAX_SCENES = 100_000  # of one call

@@ -8,13 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.errors import requires_extra
+from cnpgen.problems.scenes.quaternions import Array
 from cnpgen.problems.scenes.scene_problem import SceneError
 from cnpgen.store.files.atomic import read_file
-
-Array = NDArray[np.float64]
 
 MAX_YAML_BYTES = 1 << 25
 MAX_YAML_DEPTH = 32  # nested mappings and lists

@@ -6,11 +6,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.robots.shape.hull import Array
 from cnpgen.robots.shape.inline import corners_of
-
-Array = NDArray[np.float64]
 
 PLANE_DECIMALS = 9  # to which the planes of triangles of one face agree
 MIN_AREA_M2 = 1e-12  # of a triangle; smaller ones have no normal in single precision

@@ -15,12 +15,11 @@ from cnpgen.robots.observation.convex_mesh import ConvexMesh, convex_mesh
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import PARKED_POSITION_M, Scene
 from cnpgen.robots.shape.convex_part import PRISM_SIDES
-from cnpgen.robots.shape.hull import frames_along
+from cnpgen.robots.shape.hull import Array, frames_along
 from cnpgen.robots.shape.inline import is_inline
 from cnpgen.robots.solid import UNBOUNDED_OBSTACLE_HEIGHT_M, number_slices, place_obstacles, pose_width
 from cnpgen.schema.keys import Range
 
-Array = NDArray[np.float64]
 KINDS = ("box", "sphere", "cylinder", "capsule")  # index: the code of a kind
 MESH = len(KINDS)  # the code of the first mesh, followed by those of the others
 NO_BODY = -1  # kind of the padding

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from cnpgen.robots.observation.camera import Camera, depth_image, depth_points
 from cnpgen.robots.observation.primitives import Primitives, bodies_of, smallest_signed_distances
 from cnpgen.robots.observation.surface_points import Seeds, surface_points
+from cnpgen.robots.shape.hull import Array
 
-Array = NDArray[np.float64]
 Values = NDArray[np.float32]
 
 

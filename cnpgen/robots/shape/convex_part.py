@@ -5,14 +5,11 @@ from dataclasses import dataclass
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
-from cnpgen.robots.shape.hull import CUBE, MAX_COORDINATE_M, check_solid
+from cnpgen.robots.shape.hull import CUBE, MAX_COORDINATE_M, Array, check_solid
 from cnpgen.robots.shape.inline import points_of
 from cnpgen.robots.urdf import urdf_tree
-
-Array = NDArray[np.float64]
 
 PRISM_SIDES = 64  # of the prism that contains a cylinder; its corners exceed the radius by 0.12 %
 _ANGLES = np.arange(PRISM_SIDES) * (2 * math.pi / PRISM_SIDES)

@@ -17,10 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import MachineError
-from cnpgen.robots.shape.hull import hull_corners
+from cnpgen.robots.shape.hull import Array, hull_corners
 from cnpgen.store.files.atomic import write_file
-
-Array = NDArray[np.float64]
 
 CUTS_PER_AXIS = 9  # planes between both ends of a part along each axis that are tried, and as many at faces
 FACE_TOLERANCE_M = 1e-4  # of the coordinates of points on a face

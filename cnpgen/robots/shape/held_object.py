@@ -5,20 +5,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.chain import Chain
 from cnpgen.robots.shape.capsule import Capsule, covering_capsule
 from cnpgen.robots.shape.convex_part import ConvexPart, link_convex_parts
-from cnpgen.robots.shape.hull import CUBE
+from cnpgen.robots.shape.hull import CUBE, Array
 from cnpgen.robots.shape.link_pairs import ALWAYS_FRACTION, LinkContact, LinkPair, body_of_part, sample_poses
 from cnpgen.robots.shape.shape import SHAPE_REVISION, Shape, cached_capsules, parts_of, place_convex_parts
 
 if TYPE_CHECKING:
     import pinocchio as pin
 
-Array = NDArray[np.float64]
 Size = tuple[float, float, float]
 
 HELD_OBJECT = "held object"  # takes the place of a link's name

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import RecipeError
 from cnpgen.robots.chain import frame_of
 from cnpgen.robots.shape.convex_part import ConvexPart, convex_part_of, origin_of
-from cnpgen.robots.shape.hull import ball_round, frame_along
+from cnpgen.robots.shape.hull import Array, ball_round, frame_along
 from cnpgen.robots.shape.inline import is_inline, read_mesh, scale_of, sides_of
 from cnpgen.robots.shape.link_pairs import ALWAYS_FRACTION, CollisionBody, LinkContact, body_of_part, sample_poses
 from cnpgen.robots.shape.mesh_files import find_named_file
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
     import pinocchio as pin
 
-Array = NDArray[np.float64]
 
 GAP_STATES = 3_000  # random states: a gap of 2 % has a standard error of 0.3 %
 

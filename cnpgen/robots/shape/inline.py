@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.shape.decomposition import convex_parts
-from cnpgen.robots.shape.hull import MAX_COORDINATE_M, MAX_CORNERS, MIN_THICKNESS_M, enclosing_hull, hull_corners
+from cnpgen.robots.shape.hull import MAX_COORDINATE_M, MAX_CORNERS, MIN_THICKNESS_M, Array, enclosing_hull, hull_corners
 from cnpgen.robots.shape.mesh_files import find_named_file
 from cnpgen.robots.urdf import urdf_tree
 
 if TYPE_CHECKING:
     import coal
 
-Array = NDArray[np.float64]
 
 _INLINE = "data:application/octet-stream;base64,"  # followed by corners x, y, z [m] as little-endian float64
 _MESHES = (".stl", ".dae", ".obj")

@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from cnpgen.robots.shape.capsule import Capsule
 from cnpgen.robots.shape.convex_part import ConvexPart
-from cnpgen.robots.shape.hull import ball_round, coal_hull
+from cnpgen.robots.shape.hull import Array, ball_round, coal_hull
 
 if TYPE_CHECKING:
     import pinocchio as pin
 
-Array = NDArray[np.float64]
 Names = frozenset[str]
 
 SAMPLED_STATES = 10_000  # ten times as many gave the same pairs for a Franka Panda
