@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from cnpgen.errors import PluginError, RecipeError
-from cnpgen.problems.checks import limit_mistakes, problem_mistakes, tables
+from cnpgen.problems.checks import ProblemTables, limit_mistakes, problem_mistakes, tables
 from cnpgen.problems.constraints.constraint import Constraint
-from cnpgen.problems.geometry import chosen_geometry, geometry_mistakes, with_object_clearance
 from cnpgen.problems.objectives import ObjectiveTerm
 from cnpgen.problems.problem import FILES, Problem
 from cnpgen.robots.obstacle import Obstacle
@@ -79,19 +78,16 @@ def read_problem(path: Path, mistakes: list[str]) -> Problem | None:
     table = read_table(path, ("problem",), mistakes)
     if table is None:
         return None
-    where = RecipeLocation(str(path))
+    raw = ProblemTables(table, where := RecipeLocation(str(path)), path.parent)
     problem = parse(Problem, table, where=where, mistakes=mistakes, readers=KIND_READERS)
     before = len(mistakes)
-    mistakes.extend(problem_mistakes(table, where, path.parent))
-    mistakes.extend(geometry_mistakes(table, where, path.parent))
+    mistakes.extend(problem_mistakes(raw))
     obstacles = () if problem is None else _with_meshes(problem, path, where, mistakes)
     if problem is None or len(mistakes) > before:
         return None
-    spec = replace(problem.robot, geometry=chosen_geometry(table, path.parent))
-    constraints = with_object_clearance(problem, table, path.parent)
-    problem = replace(problem, path=path.absolute())
-    mistakes.extend(limit_mistakes(problem, where))
-    return replace(problem, robot=spec, obstacle=obstacles, constraint=constraints)
+    mistakes.extend(limit_mistakes(problem, raw))
+    spec, constraints = replace(problem.robot, geometry=raw.geometry), raw.with_object_clearance(problem)
+    return replace(problem, path=path.absolute(), robot=spec, obstacle=obstacles, constraint=constraints)
 
 
 def _with_meshes(problem: Problem, path: Path, where: RecipeLocation, mistakes: list[str]) -> tuple[Obstacle, ...]:
