@@ -35,6 +35,11 @@ def _tilt(doc: str) -> Any:
     return _range(doc, "rad", low=-MAX_TILT_RAD, high=MAX_TILT_RAD)
 
 
+def _has_any(names: Sequence[str]) -> cached_property[bool]:
+    """Declare a property that is true if one of some parameters differs from sample to sample."""
+    return cached_property(lambda ranges: any(name in names for name in ranges.names))
+
+
 @dataclass(frozen=True, kw_only=True)
 class ParameterRanges:
     """Ranges of the parameters that samples of a problem have, in the order of their columns."""
@@ -89,25 +94,10 @@ class ParameterRanges:
         """Ranges of the parameters that samples have."""
         return tuple(getattr(self, name) for name in self.names)
 
-    @cached_property
-    def tilts_table(self) -> bool:
-        """Whether the table is raised or tilted."""
-        return any(name in TABLE_PARAMETERS for name in self.names)
-
-    @cached_property
-    def changes_rectangle(self) -> bool:
-        """Whether the rectangle of the table differs from sample to sample."""
-        return any(name in TABLE_BOUNDS for name in self.names)
-
-    @cached_property
-    def turns_upright(self) -> bool:
-        """Whether the direction of ``vertical`` or ``axis`` differs from sample to sample."""
-        return any(name in UPRIGHT_TURN for name in self.names)
-
-    @cached_property
-    def changes_payload(self) -> bool:
-        """Whether the payload differs from sample to sample."""
-        return any(name in PAYLOAD_PARAMETERS for name in self.names)
+    tilts_table = _has_any(TABLE_PARAMETERS)  # raised or tilted
+    changes_rectangle = _has_any(TABLE_BOUNDS)
+    turns_upright = _has_any(UPRIGHT_TURN)  # of the direction of "vertical" or "axis"
+    changes_payload = _has_any(PAYLOAD_PARAMETERS)
 
     def __len__(self) -> int:
         return len(self.names)

@@ -12,9 +12,8 @@ from cnpgen.errors import UsageError
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.observation.compiled_observations import observation_backend
-from cnpgen.robots.observation.observations import BasisPoints
+from cnpgen.robots.observation.observations import BasisPoints, ObservationBackend
 from cnpgen.robots.observation.primitives import Primitives, scene_primitives
-from cnpgen.robots.observation.reference import ObservationBackend
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.shape.capsule import Capsule
