@@ -187,11 +187,7 @@ def _tip_height(robot: Robot, q: Array) -> float:
 
 
 def check_plausible_sizes(robot: Robot, problem: Problem) -> None:
-    """Raise an error for lengths and masses that are probably in another unit.
-
-    Raises:
-        RecipeError: A value is far outside of its range; the error lists all of them.
-    """
+    """Raise an error that lists all lengths and masses that are probably in another unit."""
     mistakes = [f"{robot.urdf}: {mistake}" for mistake in _robot_mistakes(robot, problem)]
     if not mistakes:
         mistakes = [f"{problem.path}: {mistake}" for mistake in _problem_mistakes(robot, problem)]

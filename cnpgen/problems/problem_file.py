@@ -47,11 +47,7 @@ KIND_READERS: dict[type, Reader] = {
 
 
 def load_problem_behind(name_or_path: str | Path) -> Problem:
-    """Load the problem of a problem, pipeline or dataset recipe, by its name or path.
-
-    Raises:
-        RecipeError: There is no such recipe, or the problem file has mistakes.
-    """
+    """Load the problem of a problem, pipeline or dataset recipe, by name or path; RecipeError if it has mistakes."""
     return load_recipe(("problem", "pipeline", "dataset"), name_or_path, None, _read_behind)
 
 

@@ -191,11 +191,7 @@ def with_control_points(record: ProblemRecord, path: int | None, rate: int | Non
 
 
 def with_objective(record: ProblemRecord, objective: str) -> ProblemRecord:
-    """Return the record of a problem with another objective (``read_objective``); empty or "time" for its own.
-
-    Raises:
-        UsageError: The objective is invalid.
-    """
+    """Return the record of a problem with another objective (``read_objective``); empty or "time" for its own."""
     terms = read_objective(objective)
     if terms is None:
         return record
@@ -239,12 +235,7 @@ def as_problem(problem: object) -> Problem:
 
 
 def as_record(problem: object) -> ProblemRecord:
-    """Return the record of a problem from any argument of ``as_problem``.
-
-    Raises:
-        UsageError: The argument has another type.
-        RecipeError: There is no such recipe, or the problem file has mistakes.
-    """
+    """Return the record of a problem from any argument of ``as_problem``."""
     if isinstance(problem, ProblemRecord):
         return problem
     if isinstance(problem, StoredProblem):

@@ -74,11 +74,7 @@ class Chain:
 
 
 def chain_from_model(model: "pin.Model", tip: str) -> Chain:
-    """Read the chain that ends in frame ``tip`` from a reduced Pinocchio model.
-
-    Raises:
-        RecipeError: The model is not one serial chain of revolute and prismatic joints that carries the tip.
-    """
+    """Read the chain that ends in a tip frame; RecipeError if the model is not one serial chain that carries it."""
     data = model.createData()
     for index in range(1, model.njoints):
         name, joint = model.names[index], model.joints[index]

@@ -19,11 +19,7 @@ WORLD = 0  # index of Pinocchio's joint of the root link
 
 
 def check_model(model: "pin.Model", parameters: UrdfParameters) -> None:
-    """Raise an error if a Pinocchio model, all joints of a URDF or some with others at zero, differs from its XML.
-
-    Raises:
-        RecipeError: A link or a joint of the model differs from the XML; the error lists all of them.
-    """
+    """Raise an error that lists how a model, all joints of a URDF or some with others at zero, differs from its XML."""
     if mistakes := list(_Comparison(model, parameters).mistakes()):
         raise RecipeError(mistakes)
 

@@ -274,11 +274,7 @@ def _capsule_axes(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:
 
 
 def attach(model: "pin.Model", attached: Attached) -> None:
-    """Add the attachments of a problem to a reduced model.
-
-    Raises:
-        RecipeError: The model has no such frame.
-    """
+    """Add the attachments of a problem to a reduced model."""
     import pinocchio as pin
 
     if not model.existFrame(attached.frame):

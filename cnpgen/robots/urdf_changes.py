@@ -96,11 +96,7 @@ def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
 
 
 def with_disabled_pairs(urdf: str, srdf: Path) -> str:
-    """Return a URDF with the disabled link pairs of an SRDF file; URDF parsers ignore unknown elements.
-
-    Raises:
-        RecipeError: The SRDF cannot be read, is a URDF, or names links that the URDF does not have.
-    """
+    """Return a URDF with the disabled link pairs of an SRDF file; URDF parsers ignore unknown elements."""
     try:
         tree = urdf_tree(read_urdf(srdf))
     except ValueError as error:
@@ -111,11 +107,7 @@ def with_disabled_pairs(urdf: str, srdf: Path) -> str:
 
 
 def with_ignored_pairs(urdf: str, pairs: Iterable[tuple[str, str]]) -> str:
-    """Return a URDF with disabled link pairs of a problem.
-
-    Raises:
-        RecipeError: A pair names a link that the URDF does not have.
-    """
+    """Return a URDF with disabled link pairs of a problem."""
     entries = [{"link1": first, "link2": second, "reason": "User"} for first, second in pairs]
     return _with_entries(urdf, entries, "robot.ignored_pairs")
 

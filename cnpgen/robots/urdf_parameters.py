@@ -85,11 +85,7 @@ class UrdfParameters:
 
 
 def urdf_parameters(tree: Element) -> UrdfParameters:
-    """Read the numbers of all links and joints.
-
-    Raises:
-        RecipeError: A number is missing, is not finite or is not a plain decimal; the error lists all of them.
-    """
+    """Read the numbers of all links and joints; RecipeError lists missing ones and those not plain finite decimals."""
     mistakes: list[str] = []
     inertias: dict[str, LinkInertia | None] = {}
     joints: dict[str, UrdfJoint] = {}

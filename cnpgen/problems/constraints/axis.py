@@ -109,11 +109,7 @@ class Axis(TipAxis):
     tolerance: float = field("additional angle that a valid motion may have", unit="rad", low=1e-9, plausible=1.0)
 
     def __post_init__(self) -> None:
-        """Check both directions.
-
-        Raises:
-            ValueError: A direction is zero or not finite.
-        """
+        """Check both directions; ValueError if one is zero or not finite."""
         unit(self.axis, "axis")
         unit(self.direction, "direction")
 

@@ -29,11 +29,7 @@ class Plane(TipManifold):
     tolerance: float = field("violation that a valid motion may have", unit="m", low=1e-9, plausible=0.5)
 
     def __post_init__(self) -> None:
-        """Check the directions.
-
-        Raises:
-            ValueError: A direction is zero or not finite, or the range of u or v has no direction.
-        """
+        """Check the directions; ValueError if one is zero or not finite, or a range of u or v has none."""
         if self.along is None and (self.u or self.v):
             raise ValueError("u and v need a direction in the plane that u is measured along: along = [1, 0, 0]")
         self._axes()
@@ -73,11 +69,7 @@ class Line(TipManifold):
     tolerance: float = field("violation that a valid motion may have", unit="m", low=1e-9, plausible=0.5)
 
     def __post_init__(self) -> None:
-        """Check the direction.
-
-        Raises:
-            ValueError: It is zero or not finite.
-        """
+        """Check the direction; ValueError if it is zero or not finite."""
         unit(self.direction, "direction")
 
     @cached_property

@@ -79,10 +79,7 @@ class PuckContact(Constraint):
         return self.contact_range - self.contact_distance
 
     def scene_values(self, goal_xyz: Array, goal_velocity: Array) -> Array:
-        """Return the goal and the puck of N motions: x and y of both [m], shape (N, 4); out of reach if at rest.
-
-        See ``Constraint.scene_values``.
-        """
+        """Return the goal and the puck of N motions: x and y of both [m], shape (N, 4); out of reach if at rest."""
         goal, velocity = goal_xyz[:, :2], goal_velocity[:, :2]
         speed = np.hypot(velocity[:, :1], velocity[:, 1:])
         is_hit = speed > MIN_HIT_SPEED_M_S
@@ -165,10 +162,7 @@ class PuckContact(Constraint):
         return _at_least(self.contact_range + ADDED_RADIUS_M + margin, distance + relaxation)
 
     def initial_tip_paths(self, values: Array, start_xyz: Array) -> list[Array]:
-        """Return tip paths around the puck on either side, the shorter one first; none if it is not in the way.
-
-        See ``Constraint.initial_tip_paths``.
-        """
+        """Return tip paths around the puck on either side, the shorter one first; none if it is not in the way."""
         goal, puck, start = values[:2], values[2:], start_xyz[:2]
         hit = (puck - goal) / self.contact_distance
         entry = puck - (self.contact_range + self.overlap) * hit

@@ -163,11 +163,7 @@ def along(direction: Sequence[float], vector: Sequence[Any] | Array) -> Any:
 
 
 def unit(vector: Sequence[float] | Array, what: str) -> Array:
-    """Return a vector divided by its length.
-
-    Raises:
-        ValueError: The length is zero or not finite.
-    """
+    """Return a vector divided by its length; ValueError if that is zero or not finite."""
     given = np.array(vector, float)
     length = np.linalg.norm(given)
     if not (np.isfinite(length) and length > 1e-9):

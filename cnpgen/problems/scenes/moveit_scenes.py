@@ -220,11 +220,7 @@ def _rotation(xyzw: Any, where: str) -> Array:
 
 
 def moveit_texts(scene: SceneProblem, joints: Sequence[str]) -> tuple[str, str]:
-    """Return a scene and its request, with these names of joints, as YAML.
-
-    Raises:
-        SceneError: An obstacle, such as a capsule, has no primitive in MoveIt, or the scene has no goal state.
-    """
+    """Return a scene and its request, with these names of joints, as YAML; SceneError without a primitive or a goal."""
     lines = [f"name: {_text(scene.name)}", "world:", "  collision_objects:" + ("" if scene.obstacles else " []")]
     for obstacle in scene.obstacles:
         if obstacle.kind not in ("mesh", *_PRIMITIVES.values()) or obstacle.position is None:

@@ -39,12 +39,7 @@ def is_mpinets(path: Path) -> bool:
 
 
 def read_mpinets(path: Path, rows: slice) -> Iterator[SceneProblem]:
-    """Yield the problems of a file.
-
-    Raises:
-        DatasetError: The file is damaged or no HDF5 file.
-        SceneError: A dataset is missing or has a wrong shape, or a number of an obstacle is invalid.
-    """
+    """Yield the problems of a file; DatasetError if it is damaged, SceneError if a dataset or obstacle is invalid."""
     with opened_hdf5(path) as file:
         start, goal = _ends(file, rows)
         count = len(start)

@@ -91,11 +91,7 @@ class _Key:
 
 
 def part(document: Any, key: str, kind: type, where: str) -> Any:
-    """Return an entry of a mapping, or an empty mapping, list or text if it is missing; ``where`` is for messages.
-
-    Raises:
-        SceneError: The entry is no dict, list or str as required, or the document is not a mapping.
-    """
+    """Return an entry of a mapping, or an empty mapping, list or text if it is missing; ``where`` is for messages."""
     if not isinstance(document, dict):
         raise SceneError(f"{where} must be a mapping, got {document!r:.60}")
     value = document.get(key)
@@ -108,11 +104,7 @@ def part(document: Any, key: str, kind: type, where: str) -> Any:
 
 
 def vector(value: Any, keys: str, where: str) -> Array:
-    """Return the numbers of a list, or of a mapping by its keys in order, such as "xyz"; without keys, of any list.
-
-    Raises:
-        SceneError: There is another number of entries, or an entry is not a number.
-    """
+    """Return the numbers of a list, or of a mapping by its keys in order, such as "xyz"; without keys, of any list."""
     entries = [value.get(key) for key in keys] if isinstance(value, dict) and keys else value
     if not isinstance(entries, list) or (keys and len(entries) != len(keys)):
         expected = f"{len(keys)} numbers" if keys else "a list of numbers"
@@ -121,11 +113,7 @@ def vector(value: Any, keys: str, where: str) -> Array:
 
 
 def scalar(value: Any, where: str) -> float:
-    """Return a number.
-
-    Raises:
-        SceneError: The value is not a number.
-    """
+    """Return a number; ``where`` is for messages."""
     try:
         return float(value)
     except (TypeError, ValueError) as error:

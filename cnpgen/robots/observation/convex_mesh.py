@@ -55,12 +55,7 @@ class ConvexMesh:
         return smallest
 
     def entries(self, origin: Array, rays: Array) -> Array:
-        """Return where rays enter, in lengths of the rays, shape (P,); nan for rays that miss.
-
-        Args:
-            origin: Origin of the rays [m], shape (3,).
-            rays: Directions, shape (P, 3).
-        """
+        """Return where rays from an origin [m], shape (P, 3), enter, in ray lengths, shape (P,); nan for none."""
         enter, leave = np.full(len(rays), -np.inf), np.full(len(rays), np.inf)
         for plane in self.planes:
             speed = rays @ plane[:3]
@@ -79,11 +74,7 @@ def _squared_from_segment(offsets: Array, edge: Array) -> Array:
 
 @lru_cache(MAX_KEPT_MESHES)
 def convex_mesh(address: str) -> ConvexMesh:
-    """Return the mesh of an obstacle.
-
-    Args:
-        address: Its corners as a ``data:`` address (``cnpgen.robots.shape.inline``).
-    """
+    """Return the mesh of an obstacle from its corners, a ``data:`` address (``cnpgen.robots.shape.inline``)."""
     from scipy.spatial import ConvexHull
 
     corners = corners_of(address)

@@ -232,11 +232,7 @@ OBSERVATIONS: Mapping[str, type[Observation]] = {
 
 
 def as_observation(kind: str | Observation) -> Observation:
-    """Return an observation by its name, with default parameters; return observations unchanged.
-
-    Raises:
-        UsageError: There is no such observation.
-    """
+    """Return an observation by its name, with default parameters; return observations unchanged."""
     if isinstance(kind, Observation):
         return kind
     if kind not in OBSERVATIONS:

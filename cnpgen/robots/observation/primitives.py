@@ -119,11 +119,7 @@ def _fill(obstacle: Obstacle, numbers: Array, center: Array, rotation: Array, si
 
 
 def scene_primitives(scenes: Scene | Sequence[Sequence[Obstacle]]) -> Primitives:
-    """Return the bodies of N scenes, arrays with a first axis of length N; without obstacles parked below the robot.
-
-    Raises:
-        UsageError: An obstacle is a mesh file, not its corners.
-    """
+    """Return the bodies of N scenes, arrays with a first axis of length N; without obstacles parked below the robot."""
     if isinstance(scenes, Scene):
         bodies = primitives_of(scenes.obstacles, scenes.poses[:, : pose_width(scenes.obstacles)])
         bodies.kinds[bodies.centers[:, :, 2] <= PARKED_POSITION_M[2] / 2] = NO_BODY  # meshes have another center

@@ -57,11 +57,7 @@ def link_convex_parts(urdf: str) -> list[ConvexPart]:
 
 
 def convex_part_of(link: str, element: ElementTree.Element) -> ConvexPart:
-    """Read the geometry of an element of a link, in the frame of the link.
-
-    Raises:
-        ValueError: The element has no geometry, an invalid number, or a mesh that is not inline.
-    """
+    """Read the geometry of an element of a link, in the frame of the link; ValueError if invalid or not inline."""
     shape = element.find("geometry/*")
     if shape is None:
         raise ValueError("it has no <geometry>")

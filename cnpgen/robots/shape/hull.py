@@ -54,11 +54,7 @@ def hull_corners(points: Array) -> Array:
 
 
 def outward_triangles(points: Array) -> NDArray[np.int64]:
-    """Return the triangles of the convex hull of points as indices, counterclockwise seen from outside, shape (T, 3).
-
-    Args:
-        points: The points [m], shape (V, 3).
-    """
+    """Return the triangles of the hull of points, shape (V, 3), counterclockwise from outside: indices (T, 3)."""
     from scipy.spatial import ConvexHull
 
     hull = ConvexHull(points)
@@ -123,11 +119,7 @@ def ball_round(corners: Array, radius: float) -> tuple[Array, float]:
 
 
 def coal_hull(corners: Array) -> "coal.Convex":
-    """Return a convex hull of corners [m], shape (V, 3), as a Coal shape; three are a triangle, two a segment.
-
-    Raises:
-        UsageError: The corners are those of no body, for example of a damaged scene.
-    """
+    """Return a convex hull of corners [m], shape (V, 3), as a Coal shape; three are a triangle, two a segment."""
     import coal
     from scipy.spatial import ConvexHull, QhullError
 
