@@ -82,7 +82,7 @@ def load_robot(problem: Problem) -> Robot:
         model, robot = robot.model, replace(robot, shape=shape, held_shape=_held_shape(problem, robot))
     vars(robot)["model"] = model  # a cached property, expensive to build again
     if not problem.is_stored:
-        check_plausible_sizes(robot, problem)
+        _check_sizes(problem, robot)
     return robot
 
 
@@ -171,22 +171,13 @@ def _base_mistakes(problem: Problem, robot: Robot) -> Iterator[str]:
             f" limits [{low[worst]:g}, {high[worst]:g}]{hint}"
         )
     for table in (each for each in problem.constraint if isinstance(each, Table)):
-        height = _tip_height(robot, base)
+        height = float(robot.tip_positions(base[None])[0, 2])
         if height < table.z - max(table.band, table.tolerance):
             text = f"the tip is {table.z - height:.3g} m below the table, at z = {height:.4g} m, expected {table.z:g} m"
             yield f"{problem.path}: robot.base: {text} or more: is the tip the frame that you mean, and 'z' its height?"
 
 
-def _tip_height(robot: Robot, q: Array) -> float:
-    """Return the height of the tip at joint positions q [m]."""
-    import pinocchio as pin
-
-    data = robot.model.createData()
-    pin.forwardKinematics(robot.model, data, q)
-    return float(pin.updateFramePlacement(robot.model, data, robot.tip_frame).translation[2])
-
-
-def check_plausible_sizes(robot: Robot, problem: Problem) -> None:
+def _check_sizes(problem: Problem, robot: Robot) -> None:
     """Raise an error that lists all lengths and masses that are probably in another unit."""
     mistakes = [f"{robot.urdf}: {mistake}" for mistake in _robot_mistakes(robot, problem)]
     if not mistakes:

@@ -157,18 +157,10 @@ class ProblemRecord(StoredProblem):
         Returns:
             Tip positions in the world frame [m], shape (N, 3).
         """
-        import pinocchio as pin
-
-        _, robot = open_problem(self)
-        model, q = robot.model, numbers("q", q)
-        if q.ndim != 2 or q.shape[1] != model.nq:
-            raise UsageError(f"must have shape (N, {model.nq}), got {q.shape}", argument="q")
-        data, frame = model.createData(), robot.tip_frame
-        found = np.empty((len(q), 3))
-        for row, configuration in enumerate(q):
-            pin.forwardKinematics(model, data, configuration)
-            found[row] = pin.updateFramePlacement(model, data, frame).translation
-        return found
+        (_, robot), q = open_problem(self), numbers("q", q)
+        if q.ndim != 2 or q.shape[1] != robot.n:
+            raise UsageError(f"must have shape (N, {robot.n}), got {q.shape}", argument="q")
+        return robot.tip_positions(q)
 
 
 def with_control_points(record: ProblemRecord, path: int | None, rate: int | None) -> ProblemRecord:

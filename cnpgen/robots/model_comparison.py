@@ -1,6 +1,6 @@
 """Comparison of a Pinocchio model with the XML of its URDF: urdfdom drops elements that it cannot read, silently."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,21 +30,16 @@ class _Comparison:
     def __init__(self, model: "pin.Model", parameters: UrdfParameters) -> None:
         self.model, self.parameters = model, parameters
         self.joints = {name: index for index, name in enumerate(model.names) if index != WORLD}
-        self.bodies = dict(self._bodies())
+        self.bodies: dict[str, tuple[int, LinkFrame]] = {}  # link -> joint that moves it, and its placement in that
+        for link in parameters.inertias:
+            self.bodies[link] = self._body(link)
 
-    def _bodies(self) -> Iterator[tuple[str, tuple[int, LinkFrame]]]:
-        """Yield every link with the joint of the model that moves it and its placement in that joint."""
-        known: dict[str, tuple[int, LinkFrame]] = {}
-        for link in self.parameters.inertias:
-            known[link] = self._body(link, known)
-            yield link, known[link]
-
-    def _body(self, link: str, known: Mapping[str, tuple[int, LinkFrame]]) -> tuple[int, LinkFrame]:
-        """Follow fixed joints from a link towards the root until a joint of the model."""
+    def _body(self, link: str) -> tuple[int, LinkFrame]:
+        """Follow fixed joints from a link towards the root until a joint of the model or a known link."""
         inner = IDENTITY
         while link in self.parameters.joints:
-            if link in known:
-                index, outer = known[link]
+            if link in self.bodies:
+                index, outer = self.bodies[link]
                 return index, outer.of(inner)
             joint = self.parameters.joints[link]
             if joint.name in self.joints:

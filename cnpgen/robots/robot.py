@@ -145,6 +145,16 @@ class Robot:
         """Index of the tip frame in the model."""
         return frame_of(self.model, self.tip)
 
+    def tip_positions(self, q: Array) -> Array:
+        """Compute tip positions with Pinocchio [m], shape (N, 3), from joint positions [rad], shape (N, n)."""
+        import pinocchio as pin
+
+        data, positions = self.model.createData(), np.empty((len(q), 3))
+        for row, configuration in enumerate(q):
+            pin.forwardKinematics(self.model, data, configuration)
+            positions[row] = pin.updateFramePlacement(self.model, data, self.tip_frame).translation
+        return positions
+
     @cached_property
     def reach(self) -> float:
         """Length of the polyline from the world's origin over all joints to the tip [m]."""
@@ -164,7 +174,8 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
 
     try:
         tree = urdf_tree(text)
-        _check_mimic(tree, joints)
+        if mistakes := [f"robot.joints: {text}" for text in _mimic_mistakes(tree, joints)]:
+            raise RecipeError(mistakes)
         limited = bounded(text, tree, attached)
         with mistakes_in(urdf):
             parameters = urdf_parameters(tree)
@@ -192,24 +203,19 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
     return reduced
 
 
-def _check_mimic(tree: ElementTree.Element, joints: Sequence[str]) -> None:
-    """Raise RecipeError if a mimic joint would have a wrong position: Pinocchio treats them as independent joints."""
-    mistakes = [f"robot.joints: {text}" for joint in tree.iter("joint") for text in _mimic_mistakes(joint, joints)]
-    if mistakes:
-        raise RecipeError(mistakes)
-
-
-def _mimic_mistakes(joint: ElementTree.Element, planned: Sequence[str]) -> Iterator[str]:
-    mimic = joint.find("mimic")
-    if mimic is None:
-        return
-    name, other = joint.get("name", ""), mimic.get("joint", "")
-    if name in planned:
-        yield f"{name!r} mimics {other!r} and cannot be planned by itself; mimic joints are not supported"
-    elif other in planned:
-        yield f"{name!r} mimics the planned joint {other!r}, but would stay at zero; mimic joints are not supported"
-    elif offset := _mimic_offset(mimic):
-        yield f"{name!r} mimics {other!r} with {offset}, but would stay at zero; mimic joints are not supported"
+def _mimic_mistakes(tree: ElementTree.Element, planned: Sequence[str]) -> Iterator[str]:
+    """Yield error messages for mimic joints, which Pinocchio treats as independent, in a wrong position."""
+    for joint in tree.iter("joint"):
+        mimic = joint.find("mimic")
+        if mimic is None:
+            continue
+        name, other = joint.get("name", ""), mimic.get("joint", "")
+        if name in planned:
+            yield f"{name!r} mimics {other!r} and cannot be planned by itself; mimic joints are not supported"
+        elif other in planned:
+            yield f"{name!r} mimics the planned joint {other!r}, but would stay at zero; mimic joints are not supported"
+        elif offset := _mimic_offset(mimic):
+            yield f"{name!r} mimics {other!r} with {offset}, but would stay at zero; mimic joints are not supported"
 
 
 def _mimic_offset(mimic: ElementTree.Element) -> str:

@@ -63,7 +63,12 @@ def _quaternions(rotation: Array) -> Array:
 def rotations_of(table: SceneTable) -> Array:
     """Return the rotation matrices of the obstacles, whose columns are their axes, shape (S, O, 3, 3)."""
     quaternion = table.obstacle_quaternion.astype(np.float64)
-    w, x, y, z = np.moveaxis(quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True), -1, 0)
+    return rotation_matrices(quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True))
+
+
+def rotation_matrices(wxyz: Array) -> Array:
+    """Return the rotation matrices of unit quaternions (w, x, y, z), shape (..., 4) -> (..., 3, 3)."""
+    w, x, y, z = np.moveaxis(wxyz, -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],

@@ -11,6 +11,7 @@ from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.robot_spec import Payload, RobotSpec
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.urdf import number_in, numbers_in, numbers_text, read_urdf, urdf_tree
+from cnpgen.robots.urdf_parameters import placement_of
 
 _TURNING, _SLIDING = ("revolute", "continuous"), ("prismatic",)
 _MOTION = ("axis", "limit", "mimic", "calibration", "dynamics", "safety_controller")  # elements of a joint that moves
@@ -74,9 +75,8 @@ def _fix(joint: Element, position: float, is_stored: bool) -> list[str]:
     if not np.linalg.norm(axis):
         return [f"joint {name!r} has the axis 0 0 0"]
     axis /= np.linalg.norm(axis)
-    origin = joint.find("origin")
-    xyz = np.array(numbers_in(origin, "xyz", (0.0, 0.0, 0.0)))
-    rotation = turned(*numbers_in(origin, "rpy", (0.0, 0.0, 0.0)))
+    placement = placement_of(joint)
+    xyz, rotation = placement.translation, placement.rotation
     if kind in _SLIDING:
         xyz = xyz + rotation @ (position * axis)
     else:

@@ -144,17 +144,13 @@ def _inertia(link: Element) -> LinkInertia | None:
     mass, tensor = element.find("mass"), element.find("inertia")
     if mass is None or mass.get("value") is None:
         raise ValueError("its <inertial> has no <mass value=...>")
-    if tensor is None:
-        entries = dict.fromkeys(_INERTIA_ENTRIES, 0.0)
-    else:
-        if missing := [name for name in _INERTIA_ENTRIES if tensor.get(name) is None]:
-            raise ValueError(f"its <inertia> has no {', '.join(missing)}: all of its numbers would be ignored")
-        entries = {name: number_in(tensor, name, 0.0) for name in _INERTIA_ENTRIES}
+    if tensor is not None and (missing := [name for name in _INERTIA_ENTRIES if tensor.get(name) is None]):
+        raise ValueError(f"its <inertia> has no {', '.join(missing)}: all of its numbers would be ignored")
     rows = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
-    matrix = np.array([[entries[name] for name in row] for row in rows])
+    matrix = np.array([[number_in(tensor, name, 0.0) for name in row] for row in rows])
     if (value := number_in(mass, "value", 0.0)) < 0:
         raise ValueError(f"<mass value={mass.get('value')!r}> must not be negative: give the mass of the link in kg")
-    return LinkInertia(value, _placement(element), matrix)
+    return LinkInertia(value, placement_of(element), matrix)
 
 
 def _joint(element: Element) -> UrdfJoint:
@@ -174,13 +170,13 @@ def _joint(element: Element) -> UrdfJoint:
         kind=kind,
         parent=ends.get("parent", ""),
         child=ends.get("child", ""),
-        origin=_placement(element),
+        origin=placement_of(element),
         axis=axis / (length or 1.0),
         limits=limits if kind in _TURNING_OR_SLIDING else {},
     )
 
 
-def _placement(element: Element) -> LinkFrame:
+def placement_of(element: Element) -> LinkFrame:
     """Return the <origin> of an element."""
     origin = element.find("origin")
     if origin is not None and origin.get("quat_xyzw") is not None:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.problems.scenes.quaternions import Array, quaternion_mistake, quaternion_of, rotation_matrix
+from cnpgen.problems.scenes.quaternions import quaternion_mistake, quaternion_of, rotation_matrix
 from cnpgen.problems.scenes.scene_problem import (
     GoalPose,
     SceneError,
@@ -25,7 +25,7 @@ from cnpgen.problems.scenes.scene_problem import (
 from cnpgen.problems.scenes.yaml_document import part, scalar, vector
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import turned
-from cnpgen.robots.shape.hull import outward_triangles
+from cnpgen.robots.shape.hull import Array, outward_triangles
 from cnpgen.robots.shape.inline import corners_of
 
 Pose = tuple[Array, Array]  # position [m] and rotation matrix

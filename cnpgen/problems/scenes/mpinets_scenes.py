@@ -16,10 +16,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.problems.scenes.quaternions import Array, quaternion_of
+from cnpgen.problems.scenes.quaternions import quaternion_of
 from cnpgen.problems.scenes.scene_problem import MAX_SCENES, SceneError, SceneProblem, check_count, make_obstacle
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import turned
+from cnpgen.robots.shape.hull import Array
 from cnpgen.store.files.hdf5 import Hdf5, create_hdf5, opened_hdf5
 
 _ENDS = (("start_q", "goal_q"), ("start_configs", "target_configs"))

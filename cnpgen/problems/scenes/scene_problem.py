@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cnpgen.errors import UsageError
-from cnpgen.problems.scenes.quaternions import Array, quaternion_mistake, roll_pitch_yaw, rotation_matrix
+from cnpgen.problems.scenes.quaternions import quaternion_mistake, roll_pitch_yaw, rotation_matrix
 from cnpgen.robots.observation.primitives import KINDS, primitives_of, signed_distances
 from cnpgen.robots.obstacle import Obstacle, invalid_obstacle
-from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid, hull_corners
+from cnpgen.robots.shape.hull import MAX_COORDINATE_M, Array, check_solid, hull_corners
 from cnpgen.robots.shape.inline import address_of, is_inline
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.schema.argument_types import check_fields, checked_arguments

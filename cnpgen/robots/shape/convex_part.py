@@ -8,7 +8,7 @@ import numpy as np
 
 from cnpgen.errors import RecipeError
 from cnpgen.robots.shape.hull import CUBE, MAX_COORDINATE_M, Array, check_solid
-from cnpgen.robots.shape.inline import points_of
+from cnpgen.robots.shape.inline import corners_of, is_inline
 from cnpgen.robots.urdf import urdf_tree
 
 PRISM_SIDES = 64  # of the prism that contains a cylinder; its corners exceed the radius by 0.12 %
@@ -74,7 +74,10 @@ def convex_part_of(link: str, element: ElementTree.Element) -> ConvexPart:
 def _core(shape: ElementTree.Element) -> tuple[Array, float]:
     """Return the corners [m] and the thickness [m] of a geometry, in its own frame."""
     if shape.tag == "mesh":
-        return points_of(shape), 0.0
+        address = shape.get("filename", "")
+        if not is_inline(address):
+            raise ValueError(f"the mesh {address!r} is not in the text of the URDF")
+        return corners_of(address), 0.0
     if shape.tag == "box":
         return CUBE * [_positive(each) for each in _numbers(shape, "size", 3)], 0.0
     if shape.tag not in ("sphere", "cylinder", "capsule"):

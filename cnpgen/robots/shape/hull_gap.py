@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import RecipeError
 from cnpgen.robots.chain import frame_of
 from cnpgen.robots.shape.convex_part import ConvexPart, convex_part_of, origin_of
-from cnpgen.robots.shape.hull import Array, ball_round, frame_along
+from cnpgen.robots.shape.hull import Array, ball_round, coal_vectors, frame_along
 from cnpgen.robots.shape.inline import is_inline, read_mesh, scale_of, sides_of
 from cnpgen.robots.shape.link_pairs import ALWAYS_FRACTION, CollisionBody, LinkContact, body_of_part, sample_poses
 from cnpgen.robots.shape.mesh_files import find_named_file
@@ -158,12 +158,8 @@ def _triangles(points: Array, sides: NDArray[np.int64]) -> Any:
     """Return a triangle mesh as an object of Coal."""
     import coal
 
-    corners, triangles, mesh = coal.StdVec_Vec3s(), coal.StdVec_Triangle(), coal.BVHModelOBBRSS()
-    for point in points:
-        corners.append(point)
-    for side in sides:
-        triangles.append(coal.Triangle(*map(int, side)))
+    mesh = coal.BVHModelOBBRSS()
     mesh.beginModel(len(sides), len(points))
-    mesh.addSubModel(corners, triangles)
+    mesh.addSubModel(*coal_vectors(points, sides))
     mesh.endModel()
     return mesh

@@ -113,18 +113,6 @@ def mesh_links(urdf: str) -> frozenset[str]:
     )
 
 
-def points_of(mesh: ElementTree.Element) -> Array:
-    """Return the corners of an inline mesh [m], shape (V, 3).
-
-    Raises:
-        ValueError: The mesh is not inline.
-    """
-    name = mesh.get("filename", "")
-    if not is_inline(name):
-        raise ValueError(f"the mesh {name!r} is not in the text of the URDF")
-    return corners_of(name)
-
-
 def inline_mesh(path: Path, scale: Array) -> str:
     """Return the corners of the convex hull of a mesh file, scaled along x, y and z, as a ``data:`` address."""
     return address_of(*_parts_of_file(path, scale, 1, None))
