@@ -100,11 +100,7 @@ def goal_velocities(problem: Problem, robot: Robot, goal_q: Array, goal_dq: Arra
 
 
 def with_capacity(problem: Problem, capacity: Capacity) -> Problem:
-    """Return a problem with further obstacles, which stand far below the robot until a plan places them.
-
-    Raises:
-        UsageError: No constraint keeps the robot away from obstacles, or the problem has other values of each sample.
-    """
+    """Return a problem with further obstacles, which stand far below the robot until a plan places them."""
     if problem.first(RobotClearance) is None:
         raise UsageError(
             f"the problem {problem.name!r} has no constraint robot-clearance: obstacles would be ignored",

@@ -26,6 +26,7 @@ from cnpgen.robots.parameter_ranges import (
     PAYLOAD_PARAMETERS,
     UPRIGHT_TOLERANCE,
     ParameterRanges,
+    optional_key,
 )
 from cnpgen.robots.robot_spec import HeldObject, LimitSpec, Payload, RobotSpec
 from cnpgen.robots.scene import PARKED_POSITION_M
@@ -61,9 +62,7 @@ class Objective:
         default=0.0,
         low=0.0,
     )
-    term: tuple[ObjectiveTerm, ...] = field(
-        "further terms", default=(), form="[[objective.term]] tables", since_version=2
-    )
+    term: tuple[ObjectiveTerm, ...] = optional_key("further terms", default=(), form="[[objective.term]] tables")
 
     @property
     def terms(self) -> tuple[ObjectiveTerm, ...]:
@@ -85,9 +84,9 @@ class Problem:
     robot: RobotSpec = field("robot and its planned joints")
     limits: LimitSpec = field("planning limits, as fractions of the URDF's or in their place")
     object: HeldObject | None = field("upright cuboid that the tip holds", default=None)
-    payload: Payload | None = field("additional load at the tip", default=None, since_version=2)
-    parameters: ParameterRanges = field(
-        "ranges of the parameters that differ from sample to sample", default=NO_PARAMETERS, since_version=2
+    payload: Payload | None = optional_key("additional load at the tip")
+    parameters: ParameterRanges = optional_key(
+        "ranges of the parameters that differ from sample to sample", default=NO_PARAMETERS
     )
     obstacle: tuple[Obstacle, ...] = field("obstacles around the robot", default=(), form="[[obstacle]] tables")
     constraint: tuple[Constraint, ...] = field(

@@ -114,12 +114,7 @@ def without_defaults(value: Any) -> Any:
 
 
 def restore_problem(content: dict[str, Any], urdf: str, folder: Path) -> Problem:
-    """Rebuild a problem from its resolved form and the text of its URDF, for whose file there is a folder.
-
-    Raises:
-        RecipeError: This version of cnpgen does not support the content.
-        PluginError: A required package is not installed.
-    """
+    """Rebuild a problem from its resolved form and the text of its URDF, for whose file there is a folder."""
     if missing := missing_kinds_of_problem(content):
         raise PluginError(missing)
     path, mistakes = folder / "recipe.toml", list[str]()

@@ -164,11 +164,7 @@ class ProblemRecord(StoredProblem):
 
 
 def with_control_points(record: ProblemRecord, path: int | None, rate: int | None) -> ProblemRecord:
-    """Return the record of a problem with other numbers of control points of p(s) and r(s); None keeps a number.
-
-    Raises:
-        UsageError: A number does not suit the degree.
-    """
+    """Return the record of a problem with other numbers of control points of p(s) and r(s); None keeps a number."""
     counts = {"path_control_points": path, "rate_control_points": rate}
     changed = {key: count for key, count in counts.items() if count not in {None, record.content["trajectory"][key]}}
     if not changed:
@@ -243,11 +239,7 @@ def _rebuilt(record: ProblemRecord) -> Problem:
 
 @lru_cache(maxsize=8)
 def open_problem(record: ProblemRecord) -> tuple[Problem, Robot]:
-    """Rebuild a problem and its robot, which both contain the URDF; the files are deleted afterwards.
-
-    Raises:
-        RecipeError: The problem needs another version of cnpgen, or a plug-in that is not installed.
-    """
+    """Rebuild a problem and its robot, which both contain the URDF; the files are deleted afterwards."""
     from cnpgen.problems.load_robot import load_robot
 
     with record.restored() as problem:

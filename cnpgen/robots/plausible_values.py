@@ -67,9 +67,6 @@ def check_plausible(robot: Robot, columns: Mapping[str, NDArray[Any]], units: Ma
     """Raise an error for the first value of columns, shape (N, width), that is probably in another unit than theirs.
 
     The noun of a row is "task" or "plan".
-
-    Raises:
-        UnitError: A value is far outside of its range.
     """
     for name, values in columns.items():
         wrong = find_implausible_value(robot, name, values, units[name])

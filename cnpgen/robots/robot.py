@@ -166,9 +166,6 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
     """Build the Pinocchio model of a URDF, reduced to the planned joints, with the attachments of a problem.
 
     The path is for messages. Joints that are not planned are locked at zero.
-
-    Raises:
-        RecipeError: The text is not a URDF, it lacks the joints in this order, or Pinocchio reads other numbers.
     """
     import pinocchio as pin
 

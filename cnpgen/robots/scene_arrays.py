@@ -81,9 +81,6 @@ def scene_poses(obstacles: Sequence[Obstacle], table: SceneTable) -> Array:
     """Return the poses and sizes of a problem's obstacles in every scene (``cnpgen.robots.solid``), shape (S, width).
 
     The obstacles of a scene take the places of the parked obstacles of their kind, in order; the others stay parked.
-
-    Raises:
-        UsageError: A scene has more obstacles of a kind than the problem.
     """
     poses = np.tile(place_obstacles(obstacles), (len(table), 1))
     slices, rotations = number_slices(obstacles), rotations_of(table)

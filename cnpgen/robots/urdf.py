@@ -98,9 +98,6 @@ def numbers_in(element: ElementTree.Element | None, attribute: str, default: tup
     """Return the numbers in an attribute of an element; as many as the default ones of a missing attribute or element.
 
     The accepted notation is that of URDF parsers, which drop an element with other numbers without an error.
-
-    Raises:
-        ValueError: The attribute does not have as many finite decimal numbers.
     """
     text = None if element is None else element.get(attribute)
     if element is None or text is None:

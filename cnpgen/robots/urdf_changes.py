@@ -23,9 +23,6 @@ def with_locked_joints(urdf: str, positions: Mapping[str, float], *, is_stored: 
     """Return a URDF whose locked joints are fixed at their positions [rad or m], with those that mimic them.
 
     The joints of a stored problem are fixed already.
-
-    Raises:
-        RecipeError: A joint does not exist, does not move, or its position is outside of its limits.
     """
     if not positions:
         return urdf
@@ -140,9 +137,6 @@ def with_payload_link(urdf: str, spec: RobotSpec, payload: Payload | None, *, is
 
     The mass belongs to the robot's attachments. A payload with touch links is a body. A stored problem has the link
     already, which is replaced if it differs.
-
-    Raises:
-        RecipeError: A touch link or the tip does not exist, or the URDF has a link of this name.
     """
     is_body = payload is not None and bool(payload.touch_links)
     if not is_body and PAYLOAD not in urdf:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.robots.parameter_ranges import optional_key
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
@@ -59,13 +60,8 @@ class RobotClearance(DistanceConstraint):
         default=None,
         plausible=2.0,
     )
-    distance: float = field(
-        "minimum distance of the robot from obstacles",
-        unit="m",
-        low=0.0,
-        default=0.0,
-        since_version=2,
-        plausible=2.0,
+    distance: float = optional_key(
+        "minimum distance of the robot from obstacles", unit="m", low=0.0, default=0.0, plausible=2.0
     )
     tolerance: float = field(
         "violation that a valid motion may have; links may enter obstacles by 0.1 mm, the paper's capsules by all"

@@ -44,9 +44,6 @@ def read_moveit(documents: dict[Path, Any]) -> Iterator[SceneProblem]:
 
     A request belongs to the scene in its own document, or to the scene in the same folder whose name differs by
     "request" and "scene" only: ``request0001.yaml`` and ``scene0001.yaml``. A scene without a request is an error.
-
-    Raises:
-        SceneError: A document is invalid, or a scene has no request.
     """
     for path, document in documents.items():
         is_scene = "collision_objects" in document or "world" in document

@@ -146,11 +146,7 @@ def _obstacles(numbers: dict[str, Array], place: str) -> Iterator[Obstacle]:
 
 
 def mpinets_bytes(scenes: Sequence[SceneProblem]) -> bytes:
-    """Return scenes, with one goal state and equal numbers of joints, as an HDF5 file; equal scenes give equal bytes.
-
-    Raises:
-        SceneError: A scene has no goal state or several, or an obstacle of another kind.
-    """
+    """Return scenes, with one goal state and equal numbers of joints, as HDF5; equal scenes give equal bytes."""
     import h5py
 
     for scene in scenes:

@@ -109,9 +109,6 @@ def make_obstacle(
         position: Center in the frame of the robot's base [m], shape (3,).
         wxyz: Quaternion (w, x, y, z) of its axes, shape (4,).
         place: File and scene, for messages.
-
-    Raises:
-        SceneError: A number is not finite, a size is not positive, or the quaternion is not of unit length.
     """
     where = f"{place}: obstacle {name!r}"
     if kind not in _SIZES:
@@ -193,13 +190,7 @@ def check_count(count: int, place: str) -> None:
 
 
 def check_scenes(scenes: Sequence[SceneProblem]) -> None:
-    """Check the type of every scene, the numbers of its obstacles, and that there is one.
-
-    Raises:
-        UsageError: There are no scenes, or one is no ``SceneProblem``.
-        SceneError: An obstacle lacks a key, a number of it is not finite, too large or not positive, or joint
-            positions have another shape.
-    """
+    """Check the type of every scene, the numbers of its obstacles, and that there is one."""
     if not scenes:
         raise UsageError("there are no scenes", concerns="scenes")
     for index, scene in enumerate(scenes):
@@ -214,11 +205,7 @@ def check_scenes(scenes: Sequence[SceneProblem]) -> None:
 
 
 def checked_scene(scene: SceneProblem) -> SceneProblem:
-    """Check a scene and return it with unique names of obstacles.
-
-    Raises:
-        SceneError: There are too many obstacles, one contains the robot's base, or joint positions are invalid.
-    """
+    """Check a scene and return it with unique names of obstacles."""
     check_count(len(scene.obstacles), scene.place)
     pose = scene.goal_pose
     if pose is not None:

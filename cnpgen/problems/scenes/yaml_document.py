@@ -22,10 +22,6 @@ def read_yaml(path: Path, *, numbers: bool = False) -> list[Any]:
     """Read the documents of a YAML file; scalars stay texts, or with ``numbers`` become float, and plain nulls None.
 
     Anchors and aliases are refused, so the memory is proportional to the size of the file. Keys stay texts.
-
-    Raises:
-        SceneError: The file is not YAML, has anchors, or is nested too deeply.
-        MissingExtraError: PyYAML is missing.
     """
     with requires_extra("ros", "PyYAML"):
         import yaml

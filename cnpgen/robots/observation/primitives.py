@@ -62,9 +62,6 @@ def primitives_of(obstacles: Sequence[Obstacle], numbers: Array) -> Primitives:
 
     Poses and sizes (``cnpgen.robots.solid``) have shape (pose_width,), or of N samples (N, pose_width), which gives
     arrays with a first axis of length N.
-
-    Raises:
-        UsageError: An obstacle is a mesh file, not its corners.
     """
     shape, rows, count = numbers.shape[:-1], np.atleast_2d(numbers), len(obstacles)
     kinds, centers = np.empty((len(rows), count), np.int64), np.empty((len(rows), count, 3))

@@ -39,9 +39,6 @@ def link_convex_parts(urdf: str) -> list[ConvexPart]:
     """Read the collision geometry of a URDF whose meshes are inline, in the frames of its links and in its order.
 
     A cylinder becomes a prism of ``PRISM_SIDES`` sides that contains it; all other geometry is exact.
-
-    Raises:
-        RecipeError: A collision element is invalid.
     """
     found, mistakes = list[ConvexPart](), list[str]()
     for link in urdf_tree(urdf).iter("link"):

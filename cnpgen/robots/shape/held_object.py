@@ -40,9 +40,6 @@ def load_held_shape(urdf: str, model: "pin.Model", held: HeldBody, keep: Path | 
     Returns:
         The convex parts of all links that may not touch the object, then the object; a capsule and a pair for each of
         these links. Links that the joint of the tip moves do not move relative to the object and are omitted.
-
-    Raises:
-        RecipeError: The URDF has no such links or no collision geometry, or a link always overlaps the object.
     """
     convex_parts, joints = place_convex_parts(link_convex_parts(urdf), model)
     if not joints:

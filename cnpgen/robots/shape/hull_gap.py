@@ -80,9 +80,6 @@ def measure_hull_gap(urdf: str, path: Path, packages: Sequence[Path], *, model: 
 
     Relative mesh paths begin in the folder of the URDF's file, others in folders of packages. The model has the planned
     joints; states are sampled within its position limits.
-
-    Raises:
-        RecipeError: A mesh is missing or cannot be read.
     """
     poses = sample_poses(model, GAP_STATES)
     parts = LinkContact(poses, map(body_of_part, shape.convex_parts), shape.joints)

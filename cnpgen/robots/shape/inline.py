@@ -45,9 +45,6 @@ def with_inline_meshes(
 
     Relative mesh paths begin in the folder of the URDF's file, others in folders of packages. Meshes of all links, or
     of some, consist of at most so many convex parts, 1 for the hull, which a cache folder keeps.
-
-    Raises:
-        RecipeError: Links or meshes are missing or cannot be read; the error lists all of them.
     """
     try:
         tree = urdf_tree(urdf)

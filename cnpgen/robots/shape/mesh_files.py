@@ -17,11 +17,7 @@ _EXTRAS = {"example-robot-data": "robots"}  # Python packages of robots -> cnpge
 
 
 def find_urdf(name: str, problem: Path, packages: Sequence[Path] = ()) -> Path:
-    """Find the URDF of a problem, in a package (see ``find_named_file``) or relative to the problem file.
-
-    Raises:
-        PluginError: The package of the file is not installed; the message lists the searched folders.
-    """
+    """Find the URDF of a problem, in a package (see ``find_named_file``) or relative to the problem file."""
     if urlparse(name).scheme not in _PACKAGE:
         return problem.parent / name
     try:

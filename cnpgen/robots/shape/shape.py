@@ -65,9 +65,6 @@ def load_shape(urdf: str, model: "pin.Model", keep: Path | None) -> Shape:
     """Load the shape of a robot from a URDF with inline meshes (``cnpgen.robots.shape.inline``) and its reduced model.
 
     Capsules and pairs, which take some seconds to compute, are kept in a cache folder, if there is one.
-
-    Raises:
-        RecipeError: The URDF has no collision geometry, or some that cannot be read.
     """
     convex_parts, joints = place_convex_parts(link_convex_parts(urdf), model)
     if not any(joints.values()):
