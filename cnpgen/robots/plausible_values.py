@@ -25,16 +25,7 @@ class UnitError(UsageError):
 
 @dataclass(frozen=True)
 class ImplausibleValue:
-    """The first value of an array outside of its plausible range.
-
-    Attributes:
-        row: Index of its row.
-        column: Index of its column.
-        value: The value.
-        low: Lower end of the range.
-        high: Upper end of the range.
-        unit: Unit in which it is read.
-    """
+    """The first value of an array outside of its plausible range, which has the unit in which the value is read."""
 
     row: int
     column: int

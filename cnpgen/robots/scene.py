@@ -48,10 +48,8 @@ class Scene:
     def __getitem__(self, index: int | slice | Sequence[int] | NDArray[Any]) -> Scene:
         """Select samples; an integer selects one sample and keeps the first axis."""
         rows = slice(index, index + 1 or None) if isinstance(index, int) else index
-        if isinstance(index, int) and not -len(self) <= index < len(self):  # ends a loop over the samples, too
-            raise SampleIndexError(
-                f"there is no sample {index}: {len(self)} samples are numbered from 0", concerns="index"
-            )
+        if isinstance(index, int):  # ends a loop over the samples, too
+            self._check_sample(index, "index")
         try:
             return Scene(self.obstacles, self.poses[rows])
         except IndexError as error:
@@ -94,9 +92,10 @@ class Scene:
 
     def bodies(self, sample: int = 0) -> list[Solid]:
         """Return the obstacles of one sample as convex bodies in the world frame."""
-        sample = integer("sample", sample)
-        if not -len(self) <= sample < len(self):
-            raise SampleIndexError(
-                f"there is no sample {sample}: {len(self)} samples are numbered from 0", concerns="sample"
-            )
+        self._check_sample(sample := integer("sample", sample), "sample")
         return solids_of(self.obstacles, self.poses[sample])
+
+    def _check_sample(self, sample: int, argument: str) -> None:
+        if not -len(self) <= sample < len(self):
+            text = f"there is no sample {sample}: {len(self)} samples are numbered from 0"
+            raise SampleIndexError(text, concerns=argument)

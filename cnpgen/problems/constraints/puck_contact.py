@@ -147,7 +147,7 @@ class PuckContact(Constraint):
         l, permits contact in the disc of diameter l. The maximum is rounded, so that the verdict finds local maxima.
         """
         overlap = self.overlap + ADDED_RADIUS_M
-        relaxation = overlap * _positive_part(1 - from_goal / (overlap * self.last), ROUNDING)
+        relaxation = overlap * _positive_part(1 - from_goal / (overlap * self.last))
         return _at_least(self.contact_range + ADDED_RADIUS_M, distance + relaxation)
 
     def _cone(self, from_goal: Any, distance: Any, margin: float) -> tuple[Condition, ...]:
@@ -158,7 +158,7 @@ class PuckContact(Constraint):
         """
         overlap = self.overlap + ADDED_RADIUS_M + margin
         rho = (from_goal + MIN_SQUARED_PUCK_DISTANCE_M2) ** 0.5
-        relaxation = overlap * _positive_part(1 + (STRAIGHT_HIT_MARGIN_M - rho) / overlap, ROUNDING)
+        relaxation = overlap * _positive_part(1 + (STRAIGHT_HIT_MARGIN_M - rho) / overlap)
         return _at_least(self.contact_range + ADDED_RADIUS_M + margin, distance + relaxation)
 
     def initial_tip_paths(self, values: Array, start_xyz: Array) -> list[Array]:
@@ -186,9 +186,9 @@ class PuckContact(Constraint):
         return sorted(paths, key=lambda path: float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()))
 
 
-def _positive_part(value: Any, rounding: float) -> Any:
+def _positive_part(value: Any) -> Any:
     """Return ``max(value, 0)``, rounded."""
-    return (value + (value * value + rounding**2) ** 0.5) / 2
+    return (value + (value * value + ROUNDING**2) ** 0.5) / 2
 
 
 def _at_least(bound: float, distance: Any) -> tuple[Condition, ...]:

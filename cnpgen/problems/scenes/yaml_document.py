@@ -35,7 +35,7 @@ def read_yaml(path: Path, *, numbers: bool = False) -> list[Any]:
 
 def _documents(path: Path, yaml: Any, events: Any, numbers: bool) -> Iterator[Any]:
     """Build documents from the events of a parser, without recursion."""
-    stack: list[Any] = []  # open mappings and lists, and the keys that wait for their values
+    stack: list[Any] = []  # open mappings and lists, and the keys that wait for their values, each in a tuple
     for event in events:
         if getattr(event, "anchor", None) is not None:
             raise SceneError(f"{path} has the anchor {event.anchor!r:.60}, expected a file without anchors")
@@ -73,17 +73,10 @@ def _put(stack: list[Any], value: Any) -> Iterator[Any]:
     elif isinstance(stack[-1], list):
         stack[-1].append(value)
     elif isinstance(stack[-1], dict):
-        stack.append(_Key(value))
+        stack.append((value if isinstance(value, str) else repr(value),))
     else:
-        key = stack.pop().text
+        (key,) = stack.pop()
         stack[-1][key] = value
-
-
-class _Key:
-    """Key of a mapping that waits for its value."""
-
-    def __init__(self, value: Any) -> None:
-        self.text = value if isinstance(value, str) else repr(value)
 
 
 def part(document: Any, key: str, kind: type, where: str) -> Any:

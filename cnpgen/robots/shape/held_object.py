@@ -9,10 +9,18 @@ import numpy as np
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.chain import Chain
 from cnpgen.robots.shape.capsule import Capsule, covering_capsule
-from cnpgen.robots.shape.convex_part import ConvexPart, link_convex_parts
+from cnpgen.robots.shape.convex_part import ConvexPart
 from cnpgen.robots.shape.hull import CUBE, Array
 from cnpgen.robots.shape.link_pairs import ALWAYS_FRACTION, LinkContact, LinkPair, body_of_part, sample_poses
-from cnpgen.robots.shape.shape import SHAPE_REVISION, Shape, cached_capsules, parts_of, place_convex_parts
+from cnpgen.robots.shape.shape import (
+    SHAPE_REVISION,
+    Capsules,
+    Pairs,
+    Shape,
+    cached_capsules,
+    parts_of,
+    place_convex_parts,
+)
 
 if TYPE_CHECKING:
     import pinocchio as pin
@@ -41,7 +49,7 @@ def load_held_shape(urdf: str, model: "pin.Model", held: HeldBody, keep: Path | 
         The convex parts of all links that may not touch the object, then the object; a capsule and a pair for each of
         these links. Links that the joint of the tip moves do not move relative to the object and are omitted.
     """
-    convex_parts, joints = place_convex_parts(link_convex_parts(urdf), model)
+    convex_parts, joints = place_convex_parts(urdf, model)
     if not joints:
         raise RecipeError(
             ["no link has a <collision> element, so that contacts with the held object cannot be checked"]
@@ -56,7 +64,7 @@ def load_held_shape(urdf: str, model: "pin.Model", held: HeldBody, keep: Path | 
     parts = (*(part for part in convex_parts if part.link in checked), box)
     joints = {link: joints[link] for link in checked} | {HELD_OBJECT: carrier}
 
-    def compute() -> tuple[tuple[Capsule, ...], tuple[LinkPair, ...]]:
+    def compute() -> tuple[Capsules, Pairs]:
         capsules = tuple(covering_capsule(parts_of(link, parts)) for link in checked)
         return capsules, _compare(model, parts, capsules, joints)
 
@@ -88,23 +96,15 @@ def _box(size: Size, rotation: Array, translation: Array) -> ConvexPart:
 
 
 def _compare(
-    model: "pin.Model", parts: tuple[ConvexPart, ...], capsules: tuple[Capsule, ...], joints: dict[str, int]
+    model: "pin.Model", parts: tuple[ConvexPart, ...], capsules: Capsules, joints: dict[str, int]
 ) -> tuple[LinkPair, ...]:
     """Compare the object with all links and their capsules in random states."""
-    bodies = map(body_of_part, [*parts, *map(_part_of_capsule, capsules)])
-    all_joints = joints | {_capsule_name(capsule.link): joints[capsule.link] for capsule in capsules}
-    contact, pairs = LinkContact(sample_poses(model, SAMPLED_HELD_STATES), bodies, all_joints), []
-    for capsule in capsules:
-        overlap = contact.of(capsule.link, HELD_OBJECT)
-        near = contact.of(_capsule_name(capsule.link), HELD_OBJECT)
-        mistaken = float(near[~overlap].mean()) if not overlap.all() else 1.0
-        pairs.append(LinkPair(capsule.link, HELD_OBJECT, "", float(overlap.mean()), mistaken))
-    return tuple(pairs)
-
-
-def _capsule_name(link: str) -> str:
-    return f"capsule of {link}"
-
-
-def _part_of_capsule(capsule: Capsule) -> ConvexPart:
-    return ConvexPart(_capsule_name(capsule.link), np.array([capsule.first, capsule.second]), capsule.radius)
+    names = {capsule.link: f"capsule of {capsule.link}" for capsule in capsules}
+    covers = [ConvexPart(names[each.link], np.array([each.first, each.second]), each.radius) for each in capsules]
+    all_joints = joints | {name: joints[link] for link, name in names.items()}
+    poses = sample_poses(model, SAMPLED_HELD_STATES)
+    contact = LinkContact(poses, map(body_of_part, [*parts, *covers]), all_joints)
+    return tuple(
+        LinkPair.from_samples(link, HELD_OBJECT, "", contact.of(link, HELD_OBJECT), contact.of(name, HELD_OBJECT))
+        for link, name in names.items()
+    )

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import pinocchio as pin
 
 Names = frozenset[str]
+Mask = NDArray[np.bool_]
 
 SAMPLED_STATES = 10_000  # ten times as many gave the same pairs for a Franka Panda
 ALWAYS_FRACTION = 0.95  # links that overlap in a larger fraction of the states are treated as connected
@@ -41,6 +42,12 @@ class LinkPair:
     left_out: str
     colliding: float
     mistaken: float
+
+    @classmethod
+    def from_samples(cls, first: str, second: str, left_out: str, hit: Mask, near: Mask) -> "LinkPair":
+        """Return a pair from masks of the sampled states in which the links, and their capsules, overlap."""
+        mistaken = float(near[~hit].mean()) if not hit.all() else 1.0
+        return cls(first, second, left_out, float(hit.mean()), mistaken)
 
     @property
     def for_solvers(self) -> bool:
@@ -80,10 +87,9 @@ def find_pairs(
         hit = contact.of(first, second)
         ends = [_ends(capsules[link], rotations[joints[link]], positions[joints[link]]) for link in (first, second)]
         near = segment_distances(*ends[0], *ends[1]) < capsules[first].radius + capsules[second].radius
-        colliding = float(hit.mean())
-        left_out = "disabled" if disabled and names in disabled else "always" if colliding > ALWAYS_FRACTION else ""
-        mistaken = float(near[~hit].mean()) if not hit.all() else 1.0
-        found.append(LinkPair(first, second, left_out, colliding, mistaken))
+        is_always = hit.mean() > ALWAYS_FRACTION
+        left_out = "disabled" if disabled and names in disabled else "always" if is_always else ""
+        found.append(LinkPair.from_samples(first, second, left_out, hit, near))
     return tuple(found)
 
 
@@ -152,7 +158,7 @@ class LinkContact:
             self._of_link.setdefault(link, []).append(body)
         self._request, self._places = coal.CollisionRequest(), (coal.Transform3s(), coal.Transform3s())
 
-    def of(self, first: str, second: str, *, among: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
+    def of(self, first: str, second: str, *, among: Mask | None = None) -> Mask:
         """Return a mask of the states, among all or those of a mask, in which two links overlap, shape (K,)."""
         hit = np.zeros(self._positions.shape[1], bool)
         for one, other in product(self._of_link[first], self._of_link[second]):

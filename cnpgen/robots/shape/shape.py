@@ -24,6 +24,9 @@ from cnpgen.store.files.atomic import write_file
 if TYPE_CHECKING:
     import pinocchio as pin
 
+Capsules = tuple[Capsule, ...]
+Pairs = tuple[LinkPair, ...]
+
 SHAPE_REVISION = 1  # of the computation of capsules and pairs; cached results of another revision are ignored
 
 
@@ -40,8 +43,8 @@ class Shape:
 
     convex_parts: tuple[ConvexPart, ...]
     joints: Mapping[str, int]
-    capsules: tuple[Capsule, ...]
-    pairs: tuple[LinkPair, ...]
+    capsules: Capsules
+    pairs: Pairs
 
     @property
     def moving_convex_parts(self) -> tuple[ConvexPart, ...]:
@@ -56,7 +59,7 @@ class Shape:
         return tuple(both for pair in kept for both in product(of_link[pair.first], of_link[pair.second]))
 
     @property
-    def moving_capsules(self) -> tuple[Capsule, ...]:
+    def moving_capsules(self) -> Capsules:
         """Capsules of moving links."""
         return tuple(capsule for capsule in self.capsules if self.joints[capsule.link])
 
@@ -66,11 +69,11 @@ def load_shape(urdf: str, model: "pin.Model", keep: Path | None) -> Shape:
 
     Capsules and pairs, which take some seconds to compute, are kept in a cache folder, if there is one.
     """
-    convex_parts, joints = place_convex_parts(link_convex_parts(urdf), model)
+    convex_parts, joints = place_convex_parts(urdf, model)
     if not any(joints.values()):
         raise RecipeError(["no link that moves has a <collision> element, so that the robot has no shape"])
 
-    def compute() -> tuple[tuple[Capsule, ...], tuple[LinkPair, ...]]:
+    def compute() -> tuple[Capsules, Pairs]:
         capsules = tuple(covering_capsule(parts_of(link, convex_parts)) for link in joints)
         by_link = {capsule.link: capsule for capsule in capsules}
         adjacent, disabled = _adjacent(urdf, set(joints)), disabled_pairs(urdf)
@@ -84,8 +87,8 @@ def cached_capsules(
     keep: Path | None,
     numbers: list[Any],
     convex_parts: tuple[ConvexPart, ...],
-    compute: Callable[[], tuple[tuple[Capsule, ...], tuple[LinkPair, ...]]],
-) -> tuple[tuple[Capsule, ...], tuple[LinkPair, ...]]:
+    compute: Callable[[], tuple[Capsules, Pairs]],
+) -> tuple[Capsules, Pairs]:
     """Return capsules and link pairs from the cache folder, or compute and store them; without a folder, compute them.
 
     JSON values determine the result. Capsules must cover the convex parts.
@@ -106,15 +109,10 @@ def parts_of(link: str, convex_parts: tuple[ConvexPart, ...]) -> list[ConvexPart
     return [part for part in convex_parts if part.link == link]
 
 
-def place_convex_parts(
-    convex_parts: list[ConvexPart], model: "pin.Model"
-) -> tuple[tuple[ConvexPart, ...], dict[str, int]]:
-    """Transform convex parts from the frames of their links to those of the joints that move them.
-
-    Also return link -> index of the joint that moves it; 0 for fixed links.
-    """
+def place_convex_parts(urdf: str, model: "pin.Model") -> tuple[tuple[ConvexPart, ...], dict[str, int]]:
+    """Return the convex parts of links in the frames of the joints that move them, and link -> index of this joint."""
     placed, joints = [], {}
-    for part in convex_parts:
+    for part in link_convex_parts(urdf):
         frame = model.frames[frame_of(model, part.link)]
         placed.append(part.moved(np.array(frame.placement.rotation), np.array(frame.placement.translation)))
         joints[part.link] = int(frame.parentJoint)
@@ -138,14 +136,12 @@ def _adjacent(urdf: str, shaped: set[str]) -> frozenset[frozenset[str]]:
     return frozenset(found)
 
 
-def _written(capsules: tuple[Capsule, ...], pairs: tuple[LinkPair, ...]) -> dict[str, Any]:
+def _written(capsules: Capsules, pairs: Pairs) -> dict[str, Any]:
     entries = [asdict(each) | {"first": each.first.tolist(), "second": each.second.tolist()} for each in capsules]
     return {"capsules": entries, "pairs": [asdict(pair) for pair in pairs]}
 
 
-def _read(
-    content: dict[str, Any], convex_parts: tuple[ConvexPart, ...]
-) -> tuple[tuple[Capsule, ...], tuple[LinkPair, ...]]:
+def _read(content: dict[str, Any], convex_parts: tuple[ConvexPart, ...]) -> tuple[Capsules, Pairs]:
     """Return cached capsules and pairs; raise ValueError if a capsule does not cover its link."""
     capsules = tuple(
         Capsule(**each | {"first": np.array(each["first"]), "second": np.array(each["second"])})
