@@ -18,7 +18,7 @@ from cnpgen.problems.conditions import symbolic_needs
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, End
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
-from cnpgen.robots.scene_arrays import scene_capacity
+from cnpgen.robots.scene import scene_capacity
 from cnpgen.store.field import Field
 from cnpgen.store.scene_table import SCENE_ID
 

@@ -17,7 +17,7 @@ from cnpgen.plans.plan_file import agreed_problem
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
-from cnpgen.robots.scene_arrays import scene_poses
+from cnpgen.robots.scene import scene_poses
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.store.dataset_spec import DatasetSpec, StoredProblem

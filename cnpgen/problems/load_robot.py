@@ -13,10 +13,10 @@ from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem, kept_folder
 from cnpgen.robots.chain import chain_from_model
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.robot import Attached, PayloadBody, Robot, mistakes_in, reduced_model
+from cnpgen.robots.robot import Attached, Robot, mistakes_in, reduced_model
 from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.shape.convex_part import turned
-from cnpgen.robots.shape.held_object import HeldBody, load_held_shape
+from cnpgen.robots.shape.held_object import load_held_shape
 from cnpgen.robots.shape.shape import Shape, load_shape
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.keys import PerJoint
@@ -88,7 +88,7 @@ def load_robot(problem: Problem) -> Robot:
 
 def _attached(problem: Problem) -> Attached:
     """Return the attachments of the problem."""
-    spec, ranges, payload = problem.robot, problem.limits.position or (), problem.payload
+    spec, ranges = problem.robot, problem.limits.position or ()
     if ranges and len(ranges) != len(spec.joints):
         raise RecipeError(
             [f"limits.position: needs {len(spec.joints)} ranges, one per planned joint, got {len(ranges)}"]
@@ -97,7 +97,7 @@ def _attached(problem: Problem) -> Attached:
         spec.tip,
         rotation=turned(*spec.tip_rotation),
         translation=np.array(spec.tip_offset),
-        payload=PayloadBody(payload.mass, np.array(payload.centre), payload.inertia_matrix) if payload else None,
+        payload=problem.payload,
         ranges={name: (each.low, each.high) for name, each in zip(spec.joints, ranges, strict=False)},
     )
 
@@ -116,8 +116,7 @@ def _held_shape(problem: Problem, robot: Robot) -> Shape | None:
     """Load the geometry for collisions of the held object with the robot, if a constraint needs it."""
     if problem.object is None or problem.first(ObjectClearance) is None:
         return None
-    held = HeldBody(problem.object.size, problem.object.touch_links, robot.tip_frame)
-    return load_held_shape(robot.urdf_text, robot.model, held, kept_folder())
+    return load_held_shape(robot.urdf_text, robot.model, problem.object, robot.tip_frame, kept_folder())
 
 
 def _mistakes(problem: Problem, robot: Robot) -> Iterator[str]:

@@ -13,25 +13,16 @@ import numpy as np
 
 from cnpgen.errors import RecipeError, listed, nearest
 from cnpgen.robots.chain import Chain, frame_of, name_links_uniquely
-from cnpgen.robots.model_comparison import check_model
 from cnpgen.robots.parameter_ranges import NO_PARAMETERS, ParameterRanges
+from cnpgen.robots.robot_spec import Payload
 from cnpgen.robots.shape.hull import Array
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.urdf import number_in, urdf_tree
-from cnpgen.robots.urdf_parameters import UrdfParameters, urdf_parameters
+from cnpgen.robots.urdf_parameters import UrdfParameters, check_model, urdf_parameters
 from cnpgen.store.joint_units import units_of_joints
 
 if TYPE_CHECKING:
     import pinocchio as pin
-
-
-@dataclass(frozen=True)
-class PayloadBody:
-    """Rigid body of the payload: mass [kg], center of mass [m] and inertia about it [kg m^2] along the tip frame."""
-
-    mass: float
-    com: Array
-    inertia: Array
 
 
 @dataclass(frozen=True)
@@ -49,7 +40,7 @@ class Attached:
     frame: str
     rotation: Array = field(default_factory=lambda: np.eye(3))
     translation: Array = field(default_factory=lambda: np.zeros(3))
-    payload: PayloadBody | None = None
+    payload: Payload | None = None
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
@@ -290,7 +281,8 @@ def attach(model: "pin.Model", attached: Attached) -> None:
     if attached.tip != attached.frame:
         model.addFrame(pin.Frame(attached.tip, frame.parentJoint, index, placement, pin.FrameType.OP_FRAME), False)
     if body := attached.payload:
-        model.appendBodyToJoint(frame.parentJoint, pin.Inertia(body.mass, body.com, body.inertia), placement)
+        inertia = pin.Inertia(body.mass, np.array(body.centre), body.inertia_matrix)
+        model.appendBodyToJoint(frame.parentJoint, inertia, placement)
     for name, (low, high) in attached.ranges.items():
         place = model.idx_qs[model.getJointId(name)]
         model.lowerPositionLimit[place], model.upperPositionLimit[place] = low, high

@@ -69,7 +69,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "vertical": "cnpgen.problems.constraints.axis:Vertical",
         "axis": "cnpgen.problems.constraints.axis:Axis",
         "pose": "cnpgen.problems.constraints.pose:Pose",
-        "tip-speed": "cnpgen.problems.constraints.tip_speed:TipSpeed",
+        "tip-speed": "cnpgen.problems.constraints.joint:TipSpeed",
         "robot-clearance": "cnpgen.problems.constraints.clearance:RobotClearance",
         "self-clearance": "cnpgen.problems.constraints.link_clearance:SelfClearance",
         "object-clearance": "cnpgen.problems.constraints.link_clearance:ObjectClearance",

@@ -21,7 +21,7 @@ from cnpgen.pipelines.stages.stage import CandidateBatch
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.obstacles import with_capacity
 from cnpgen.robots.observation.primitives import KINDS, primitives_of, signed_distances
-from cnpgen.robots.scene_arrays import make_scene_table, scene_capacity
+from cnpgen.robots.scene import make_scene_table, scene_capacity
 from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.store.scene_table import OBSTACLE_KINDS
 from cnpgen.world.pose_ik import PoseKinematics

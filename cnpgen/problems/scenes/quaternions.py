@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from cnpgen.robots.scene_arrays import rotation_matrices
+from cnpgen.robots.scene import rotation_matrices
 from cnpgen.robots.shape.hull import Array
 
 MAX_NORM_ERROR = 0.01  # of a quaternion that is accepted and normalized

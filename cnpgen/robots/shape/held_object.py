@@ -1,6 +1,5 @@
 """Link geometry of a robot together with the held object, for collisions between the two."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,6 +7,7 @@ import numpy as np
 
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.chain import Chain
+from cnpgen.robots.robot_spec import HeldObject
 from cnpgen.robots.shape.capsule import Capsule, covering_capsule
 from cnpgen.robots.shape.convex_part import ConvexPart
 from cnpgen.robots.shape.hull import CUBE, Array
@@ -31,16 +31,7 @@ HELD_OBJECT = "held object"  # takes the place of a link's name
 SAMPLED_HELD_STATES = 2000  # states in which the object and the links are compared
 
 
-@dataclass(frozen=True)
-class HeldBody:
-    """The held cuboid: edge lengths along the tip frame [m], links that may touch it, and the frame, its center."""
-
-    size: Size
-    touch_links: tuple[str, ...]
-    tip_frame: int
-
-
-def load_held_shape(urdf: str, model: "pin.Model", held: HeldBody, keep: Path | None) -> Shape:
+def load_held_shape(urdf: str, model: "pin.Model", held: HeldObject, tip_frame: int, keep: Path | None) -> Shape:
     """Load the link geometry for collisions with the held object, for a URDF with inline meshes and its reduced model.
 
     A cache folder keeps capsules and pairs; None for no cache.
@@ -57,7 +48,7 @@ def load_held_shape(urdf: str, model: "pin.Model", held: HeldBody, keep: Path | 
     for link in held.touch_links:
         if link not in joints:
             raise RecipeError([f"object.touch_links: no link {link!r} has collision geometry{nearest(link, joints)}"])
-    tip = model.frames[held.tip_frame]
+    tip = model.frames[tip_frame]
     carrier = int(tip.parentJoint)
     checked = [link for link in joints if link not in held.touch_links and joints[link] != carrier]
     box = _box(held.size, np.array(tip.placement.rotation), np.array(tip.placement.translation))
