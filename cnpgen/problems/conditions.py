@@ -23,11 +23,7 @@ _MIXED = np.cos(np.arange(64.0))  # both signs and distinct magnitudes
 
 
 def symbolic_needs(condition: Condition, *derivatives: Any) -> int:
-    """Return the derivative order of a condition with SX expressions.
-
-    The derivatives are SX columns of the symbols of the velocities, of those in the accelerations alone and, for states
-    with jerks, of those in the jerks alone.
-    """
+    """Return the derivative order of a condition, from SX columns of velocities, accelerations and maybe jerks."""
     import casadi as ca
 
     g = ca.SX(ca.vertcat(*condition.g))
@@ -41,12 +37,7 @@ def measured_needs(
     """Return the derivative orders of conditions in measured form: which of dq, ddq and the jerk change their values.
 
     The conditions are evaluated with one of these nan and, since a form may ignore nan, far below, near and far above
-    its limit.
-
-    Args:
-        forms: Functions that evaluate them: ``measured`` of every constraint, or ``measured_at`` for an end.
-        world: World for the evaluation; it is left at rest in the base configuration.
-        jerk: Whether states have jerks, as those of motions, unlike boundary states.
+    its limit. The world is left at rest in the base configuration. Boundary states have no jerk.
     """
     robot, forms = world.robot, list(forms)
     limits = [robot.velocity_limit, robot.acceleration_limit, *([robot.jerk_limit] if jerk else [])]

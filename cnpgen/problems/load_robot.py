@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
 from cnpgen.problems.constraints.joint import JointTorque
@@ -17,13 +16,13 @@ from cnpgen.robots.robot import Attached, Robot, mistakes_in, reduced_model
 from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.shape.held_object import load_held_shape
+from cnpgen.robots.shape.hull import Array
 from cnpgen.robots.shape.shape import Shape, load_shape
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.keys import PerJoint
 from cnpgen.schema.units import PLAUSIBLE_MAX, suggested_unit
 from cnpgen.store.joint_units import unit_of
 
-Array = NDArray[np.float64]
 JERK_RATE = 5.0  # 1/s: jerk limit / acceleration limit in the authors' code
 MIN_REACH_M, MAX_REACH_M = 0.01, 100.0  # of an arm, along its joints
 MAX_LINK_RATIO = 20.0  # size of a link / reach; pedestals and mobile bases may be larger than arms

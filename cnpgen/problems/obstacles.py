@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.problems.constraints.clearance import RobotClearance
@@ -16,13 +15,13 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.observation.primitives import KINDS
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import PARKED_POSITION_M, Scene
+from cnpgen.robots.shape.hull import Array
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.robots.table_frame import TableFrame, table_frame
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
-Array = NDArray[np.float64]
 Capacity = Mapping[str, int]  # kind, or corners of a mesh -> number of obstacles
 _PARKED_ROTATION = (0.1, 0.1, 0.1)  # any rotation: boxes of scenes have rotation matrices
 
@@ -47,9 +46,6 @@ def scene_of(
         goal_velocity: Tip velocities at the goal [m/s], shape (N, 3), for problems with a ``scene_constraint``.
         parameters: Parameters of the samples, shape (N, width), for problems with parameters; nominal by default.
         obstacle_poses: Poses and sizes of the obstacles of each sample, shape (N, width), in place of the problem's.
-
-    Raises:
-        UsageError: The problem needs the velocities, and they are missing, or the poses do not fit the problem.
     """
     half = 0.0 if problem.object is None else problem.object.size[2] / 2
     parts, constraint = [], problem.scene_constraint

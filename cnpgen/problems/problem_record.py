@@ -13,14 +13,12 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.problems.objectives import read_objective
 from cnpgen.problems.problem import FILES, Objective, Problem, resolved
 from cnpgen.problems.problem_file import load_problem_behind, restore_problem
 from cnpgen.robots.parameter_ranges import NO_PARAMETERS, ParameterRanges
+from cnpgen.robots.shape.hull import Array
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning, numbers
@@ -35,7 +33,6 @@ from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 
 _MOVING = ("revolute", "continuous", "prismatic")
@@ -202,15 +199,7 @@ def record_problem(problem: Problem) -> ProblemRecord:
 
 
 def as_problem(problem: object) -> Problem:
-    """Return a problem from a problem, a record, a name or a path.
-
-    Args:
-        problem: A problem, its record, or the name or the file of a problem, a pipeline or a dataset.
-
-    Raises:
-        UsageError: The argument has another type.
-        RecipeError: There is no such recipe, or the problem file has mistakes.
-    """
+    """Return a problem from a problem, its record, or the name or the file of a problem, a pipeline or a dataset."""
     if isinstance(problem, Problem):
         return problem
     if isinstance(problem, StoredProblem):

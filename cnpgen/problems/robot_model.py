@@ -14,6 +14,7 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
 from cnpgen.robots.scene import Scene
+from cnpgen.robots.shape.hull import Array
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import numbers
 from cnpgen.store.dataset_spec import StoredProblem
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
     from cnpgen.problems.constraints.constraint import Condition, Constraint
     from cnpgen.robots.robot import Robot
     from cnpgen.world.world import World
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,14 +4,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
+from cnpgen.robots.shape.hull import Array
 
 if TYPE_CHECKING:
     import pinocchio as pin
-
-Array = NDArray[np.float64]
 
 
 SNAP_TOLERANCE = 1e-12  # maximum deviation of entries that are rounded to -1, 0 or 1

@@ -119,12 +119,9 @@ def scene_capacity(obstacles: Sequence[Obstacle]) -> int:
 
 
 def make_scene_table(layouts: Sequence[Sequence[Obstacle]], families: Sequence[int], obstacles: int) -> SceneTable:
-    """Return the obstacles of S scenes as arrays; scene IDs are the indices of the scenes.
+    """Return the obstacles of S scenes, at most O each, as arrays; scene IDs are the indices of the scenes.
 
-    Args:
-        layouts: Obstacles of each scene, none upright, below an object, or a mesh.
-        families: Family of each scene.
-        obstacles: Largest number of obstacles O, at least that of every scene.
+    No obstacle is upright, below an object, or a mesh.
     """
     count = np.array([len(layout) for layout in layouts], np.int64)
     real = np.arange(obstacles) < count[:, None]

@@ -100,15 +100,10 @@ class SceneProblem:
 def make_obstacle(
     name: str, kind: str, sizes: Sequence[float] | Array, position: Array, wxyz: Array, *, place: str
 ) -> Obstacle:
-    """Build an obstacle from the numbers of a file.
+    """Build an obstacle from the numbers of a file; ``place`` is the file and scene, for messages.
 
-    Args:
-        name: Name of the obstacle.
-        kind: "box", "sphere", "cylinder" or "capsule".
-        sizes: Edge lengths of a box [m]; radius; or radius and length along z (of a capsule without its round ends).
-        position: Center in the frame of the robot's base [m], shape (3,).
-        wxyz: Quaternion (w, x, y, z) of its axes, shape (4,).
-        place: File and scene, for messages.
+    Sizes [m] are edge lengths, a radius, or a radius and a length along z (of a capsule without its round ends). The
+    center [m], shape (3,), and the quaternion (w, x, y, z) are in the frame of the robot's base.
     """
     where = f"{place}: obstacle {name!r}"
     if kind not in _SIZES:

@@ -68,16 +68,7 @@ class Observation(ABC):
 
     @abstractmethod
     def observe(self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend) -> dict[str, Array]:
-        """Observe N scenes.
-
-        Args:
-            bodies: The bodies, arrays with a first axis of length N.
-            seeds: Seeds of the scenes, shape (N,).
-            backend: Compiled functions or their NumPy reference.
-
-        Returns:
-            Name -> array with a first axis of length N.
-        """
+        """Observe N scenes from their bodies and seeds, shape (N,): name -> array with a first axis of length N."""
 
 
 @dataclass(frozen=True, kw_only=True)

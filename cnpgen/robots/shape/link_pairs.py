@@ -64,15 +64,10 @@ def find_pairs(
     adjacent: frozenset[Names],
     disabled: frozenset[Names] | None,
 ) -> tuple[LinkPair, ...]:
-    """Determine the link pairs that can collide.
+    """Determine the link pairs that can collide, at random states within the position limits of a reduced model.
 
-    Args:
-        model: Pinocchio model, reduced to the planned joints; states are sampled within its position limits.
-        convex_parts: Convex parts of the links, in the frames of the joints that move them.
-        capsules: Link -> covering capsule, in the same frames.
-        joints: Link -> index in the model of the joint that moves it; 0 for fixed links.
-        adjacent: Pairs of links with only links without a shape between them.
-        disabled: Disabled pairs of an SRDF, None without an SRDF.
+    Convex parts and covering capsules are in the frames of the joints that move the links; ``joints`` are their indices,
+    0 for fixed links. Adjacent links have only links without a shape between them. An SRDF may disable pairs.
     """
     rotations, positions = sample_poses(model, SAMPLED_STATES)
     contact = LinkContact((rotations, positions), map(body_of_part, convex_parts), joints)
