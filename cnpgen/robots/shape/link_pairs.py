@@ -66,7 +66,7 @@ def find_pairs(
 ) -> tuple[LinkPair, ...]:
     """Determine the link pairs that can collide, at random states within the position limits of a reduced model.
 
-    Convex parts and covering capsules are in the frames of the joints that move the links; ``joints`` are their indices,
+    Convex parts and covering capsules are in the frames of the joints that move the links; ``joints`` are indices,
     0 for fixed links. Adjacent links have only links without a shape between them. An SRDF may disable pairs.
     """
     rotations, positions = sample_poses(model, SAMPLED_STATES)
