@@ -15,9 +15,8 @@ from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Attached, Robot, mistakes_in, reduced_model
 from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.shape.convex_part import turned
-from cnpgen.robots.shape.held_object import load_held_shape
 from cnpgen.robots.shape.hull import Array
-from cnpgen.robots.shape.shape import Shape, load_shape
+from cnpgen.robots.shape.shape import Shape, load_held_shape, load_shape
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.keys import PerJoint
 from cnpgen.schema.units import PLAUSIBLE_MAX, suggested_unit

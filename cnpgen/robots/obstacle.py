@@ -64,10 +64,7 @@ class Obstacle:
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
         """Yield (key, mistake) pairs."""
-        if self.upright:
-            yield from self._mistakes_upright()
-        else:
-            yield from self._mistakes_posed()
+        yield from self._mistakes_upright() if self.upright else self._mistakes_posed()
 
     def value_mistakes(self) -> Iterator[tuple[str, str]]:
         """Yield (key, mistake) pairs of an obstacle that Python has built: its kind, missing keys, and numbers."""

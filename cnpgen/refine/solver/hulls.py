@@ -25,7 +25,7 @@ from cnpgen.refine.solver.grid import Grid
 from cnpgen.refine.solver.residuals import DISTANCE_SCALE_M
 from cnpgen.refine.solver.transcription import Linearization, ResidualKernels, Transcription, cache_last
 from cnpgen.robots.robot import Robot
-from cnpgen.robots.shape.held_object import HELD_OBJECT, with_held_object
+from cnpgen.robots.shape.shape import HELD_OBJECT, with_held_object
 from cnpgen.robots.solid import solids_of
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.forward_kinematics import ForwardKinematics

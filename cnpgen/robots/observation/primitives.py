@@ -138,9 +138,8 @@ def primitives_of(obstacles: Sequence[Obstacle], numbers: Array) -> Primitives:
     Poses and sizes (``cnpgen.robots.solid``) have shape (pose_width,), or of N samples (N, pose_width), which gives
     arrays with a first axis of length N.
     """
-    shape, rows, count = numbers.shape[:-1], np.atleast_2d(numbers), len(obstacles)
-    kinds, centers = np.empty((len(rows), count), np.int64), np.empty((len(rows), count, 3))
-    rotations, sizes = np.tile(np.eye(3), (len(rows), count, 1, 1)), np.zeros((len(rows), count, 3))
+    shape, rows = numbers.shape[:-1], np.atleast_2d(numbers)
+    kinds, centers, rotations, sizes = _padding(len(rows), len(obstacles))
     meshes: list[ConvexMesh] = []
     for index, (obstacle, part) in enumerate(zip(obstacles, number_slices(obstacles), strict=True)):
         of_body = centers[:, index], rotations[:, index], sizes[:, index]
@@ -149,22 +148,19 @@ def primitives_of(obstacles: Sequence[Obstacle], numbers: Array) -> Primitives:
             _fill(obstacle, rows[:, part], *of_body)
         else:
             kinds[:, index] = MESH + len(meshes)
-            meshes.append(_mesh_of(obstacle))
-            _fill_mesh(meshes[-1], rows[:, part], *of_body)
+            meshes.append(_fill_mesh(obstacle, rows[:, part], *of_body))
     arrays = (array.reshape(*shape, *array.shape[1:]) for array in (kinds, centers, rotations, sizes))
     return Primitives(*arrays, meshes=tuple(meshes))  # type: ignore[misc,arg-type]
 
 
-def _mesh_of(obstacle: Obstacle) -> ConvexMesh:
+def _fill_mesh(obstacle: Obstacle, numbers: Array, center: Array, rotation: Array, size: Array) -> ConvexMesh:
+    """Fill in the arrays of a mesh as ``_fill`` does, and return the mesh."""
     if not is_inline(obstacle.mesh):
         raise UsageError(f"obstacle {obstacle.name!r} is a mesh file, expected its corners: see make_mesh")
-    return convex_mesh(obstacle.mesh)
-
-
-def _fill_mesh(mesh: ConvexMesh, numbers: Array, center: Array, rotation: Array, size: Array) -> None:
-    """Fill in the arrays of a mesh as ``_fill`` does."""
+    mesh = convex_mesh(obstacle.mesh)
     rotation[:] = numbers[:, 3:].reshape(-1, 3, 3)
     center[:], size[:] = numbers[:, :3] + rotation @ mesh.center, mesh.half
+    return mesh
 
 
 def _fill(obstacle: Obstacle, numbers: Array, center: Array, rotation: Array, size: Array) -> None:
@@ -205,9 +201,7 @@ def scene_primitives(scenes: Scene | Sequence[Sequence[Obstacle]]) -> Primitives
 
 def padded(scenes: Sequence[Primitives]) -> Primitives:
     """Return the bodies of N scenes as arrays with a first axis of length N, padded with bodies of kind -1."""
-    shape = len(scenes), max(map(len, scenes), default=0)
-    kinds, centers = np.full(shape, NO_BODY, np.int64), np.zeros((*shape, 3))
-    rotations, sizes = np.tile(np.eye(3), (*shape, 1, 1)), np.zeros((*shape, 3))
+    kinds, centers, rotations, sizes = _padding(len(scenes), max(map(len, scenes), default=0))
     meshes: dict[ConvexMesh, int] = {}  # mesh -> index
     for index, scene in enumerate(scenes):
         count = len(scene)
@@ -216,6 +210,12 @@ def padded(scenes: Sequence[Primitives]) -> Primitives:
         centers[index, :count] = scene.centers
         rotations[index, :count], sizes[index, :count] = scene.rotations, scene.sizes
     return Primitives(kinds, centers, rotations, sizes, tuple(meshes))
+
+
+def _padding(*shape: int) -> tuple[NDArray[np.int64], Array, Array, Array]:
+    """Return kinds, centers, rotations and sizes of rows of no bodies."""
+    centers, sizes = np.zeros((2, *shape, 3))
+    return np.full(shape, NO_BODY, np.int64), centers, np.tile(np.eye(3), (*shape, 1, 1)), sizes
 
 
 def bodies_of(scenes: Primitives, index: int) -> Primitives:
