@@ -93,10 +93,8 @@ class TipManifold(Constraint):
     def measured_at(self, world: "World", end: End) -> tuple[Condition, ...]:
         """Evaluate position, velocity and acceleration with Pinocchio."""
         position = self._position(self._measured_tip(world), self._band_at(end), world.parameters.values)
-        velocity, acceleration = world.tip_velocity, world.tip_acceleration
-        if self.moves_with_table:
-            velocity, acceleration = map(world.parameters.along_table, (velocity, acceleration))
-        return (*position, *self._moving(list(velocity), list(acceleration)))
+        rates, turned = (world.tip_velocity, world.tip_acceleration), world.parameters.along_table
+        return (*position, *self._moving(*(map(turned, rates) if self.moves_with_table else rates)))
 
     def _symbolic_tip(self, state: "SymbolicState") -> Sequence[Any]:
         tip = state.kinematics.tip
