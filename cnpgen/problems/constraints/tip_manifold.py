@@ -137,7 +137,7 @@ class TipManifold(Constraint):
     def _band_at(self, end: End) -> float:
         return self.band if end == "start" else 0.0
 
-    def _moving(self, velocity: Sequence[Any], acceleration: Sequence[Any]) -> tuple[Condition, ...]:
+    def _moving(self, velocity: Sequence[Any] | Array, acceleration: Sequence[Any] | Array) -> tuple[Condition, ...]:
         """State that the tip moves along the manifold only."""
         held, parts = self.place.held, self.parts[1]
         if not held:
