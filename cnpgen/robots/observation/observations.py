@@ -19,8 +19,8 @@ from cnpgen.schema.arguments import integer
 
 Values = NDArray[np.float32]
 Array = NDArray[Any]
-FloatArray = NDArray[np.float64]
 Corner = tuple[float, float, float]
+
 MAX_OBSERVED_POINTS = 10_000_000  # of one observation of one scene
 MIN_GRID_EXTENT_M = 1e-6
 WORKSPACE = (-0.9, -0.9, -0.1), (0.9, 0.9, 1.1)  # corners of the default grids, around an arm like the Panda [m]
@@ -32,7 +32,7 @@ class ObservationBackend:
     Compiled code overrides each of them.
     """
 
-    def distances(self, scenes: Primitives, points: FloatArray) -> Values:
+    def distances(self, scenes: Primitives, points: Array) -> Values:
         """Return the smallest signed distance of points from the bodies of each scene [m], shape (N, P).
 
         Points in the world frame [m] have shape (P, 3) for all scenes or (N, P, 3). Without bodies distances are inf.
@@ -57,7 +57,7 @@ class ObservationBackend:
         return _stacked(parts, (count, 3))
 
 
-def _stacked(parts: list[FloatArray], shape: tuple[int, ...]) -> Values:
+def _stacked(parts: list[Array], shape: tuple[int, ...]) -> Values:
     return np.array(parts, np.float32).reshape(len(parts), *shape)
 
 

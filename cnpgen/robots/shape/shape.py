@@ -36,8 +36,9 @@ if TYPE_CHECKING:
 Capsules = tuple[Capsule, ...]
 Pairs = tuple[LinkPair, ...]
 Parts = tuple[ConvexPart, ...]
-SHAPE_REVISION = 1  # of the computation of capsules and pairs; cached results of another revision are ignored
 Size = tuple[float, float, float]
+
+SHAPE_REVISION = 1  # of the computation of capsules and pairs; cached results of another revision are ignored
 HELD_OBJECT = "held object"  # takes the place of a link's name
 SAMPLED_HELD_STATES = 2000  # states in which the object and the links are compared
 
