@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,9 +11,8 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.shape.convex_part import PRISM_SIDES
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, Array
-from cnpgen.robots.solid import Solid, number_slices, place_obstacles, pose_width, solids_of
+from cnpgen.robots.solid import Solid, number_slices, place_obstacles, pose_width, posed_numbers, solids_of
 from cnpgen.schema.arguments import integer
 from cnpgen.store.scene_table import NO_OBSTACLE, OBSTACLE_KINDS, SceneTable
 
@@ -177,19 +175,8 @@ def scene_poses(obstacles: Sequence[Obstacle], table: SceneTable) -> Array:
             raise UsageError(f"a scene has {rank.max() + 1} obstacles of the kind {kind}, expected {len(places)}")
         if not len(rank):
             continue
-        numbers = _numbers(kind, position[scenes, entries], size[scenes, entries], rotations[scenes, entries])
+        numbers = posed_numbers(kind, position[scenes, entries], size[scenes, entries], rotations[scenes, entries])
         first = np.array([slices[place].start for place in places])[rank]
         poses[scenes[:, None], first[:, None] + np.arange(numbers.shape[1])] = numbers
     assert poses.shape[1] == pose_width(obstacles)
     return poses
-
-
-def _numbers(kind: str, position: Array, size: Array, rotation: Array) -> Array:
-    """Return the poses and sizes of M obstacles of one kind, shape (M, width)."""
-    if kind == "box":
-        return np.concatenate([position, size / 2, rotation.reshape(-1, 9)], axis=1)
-    radius = size[:, :1]
-    if kind == "sphere":
-        return np.concatenate([position, radius], axis=1)
-    outer = radius / math.cos(math.pi / PRISM_SIDES) if kind == "cylinder" else radius
-    return np.concatenate([position, size[:, 1:2] / 2 * rotation[..., 2], outer], axis=1)
