@@ -45,7 +45,7 @@ from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.refine.task import Attempt
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
-from cnpgen.robots.shape.held_object import with_held_object
+from cnpgen.robots.shape.shape import with_held_object
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.schema import registry
 from cnpgen.schema.catalogue import list_recipes

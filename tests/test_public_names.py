@@ -31,7 +31,7 @@ INNER = {  # classes in public signatures that users neither construct nor annot
     "ShardReader": "constructed by load_dataset",
     "SplitShards": "constructed by load_dataset",
     "Missing": "stands for an omitted argument",
-    "SceneBatch": "argument of observations, constructed by observe",
+    "ObservationBackend": "argument of observations, constructed by observe",
     "Primitives": "bodies of scenes, returned by scene_bodies and passed to observe",
     "Observation": "base class of the observations in cnpgen.scenes",
     "Robot": "argument of kernels and worlds of plug-ins; RobotModel is the public robot",

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.scene_arrays import scene_poses
+from cnpgen.robots.scene import scene_poses
 from cnpgen.robots.solid import pose_width
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import parse, stored_values

@@ -17,7 +17,7 @@ from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage,
 from cnpgen.plans.format import BOUNDARY, OBSTACLE_POSES
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.refine_engine import Solver, load_solver
-from cnpgen.robots.scene_arrays import sample_obstacles, scene_poses
+from cnpgen.robots.scene import sample_obstacles, scene_poses
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 from cnpgen.store.scene_table import OBSTACLE_KINDS, SceneTable

@@ -8,7 +8,7 @@ from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import record_problem
-from cnpgen.robots.scene_arrays import scene_poses
+from cnpgen.robots.scene import scene_poses
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import check_memory, integer
 from cnpgen.store.scene_table import SCENE_ID, concatenate_scenes

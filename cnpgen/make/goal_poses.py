@@ -15,7 +15,7 @@ from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.format import GOAL_OPTION
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
-from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.constraints.link_clearance import SelfClearance
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem

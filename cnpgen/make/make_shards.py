@@ -18,7 +18,7 @@ from cnpgen.machine.versions import versions
 from cnpgen.make.recipe import makes_its_rows, restored
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.prepared import Block, PreparedPipeline
-from cnpgen.robots.scene_arrays import scene_poses
+from cnpgen.robots.scene import scene_poses
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask
 from cnpgen.store.field import Field
 from cnpgen.store.manifest import source_date

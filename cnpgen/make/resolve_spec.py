@@ -13,7 +13,7 @@ from cnpgen.make.make_shards import Job
 from cnpgen.make.recipe import MAX_SEED, DatasetRecipe, recipe_digest, split_rows
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.problems.problem import resolved
-from cnpgen.robots.scene_arrays import scene_capacity
+from cnpgen.robots.scene import scene_capacity
 from cnpgen.schema.arguments import check_memory, integer
 from cnpgen.store.dataset_spec import DatasetSpec, default_shard_size
 from cnpgen.store.workspace import Workspace

@@ -25,9 +25,9 @@ from cnpgen.plans.join import concatenate
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.scene_plans import capacity_of, goal_states, joint_order, scene_plans, with_wider_capacity
 from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.obstacles import Capacity
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem, open_problem
-from cnpgen.problems.scene_capacity import Capacity
 from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError, SceneProblem, check_scenes, checked_scene
 from cnpgen.refine.goal_options import Progress
 from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions

@@ -16,13 +16,13 @@ from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.pipelines.stages.collision import candidate_poses
 from cnpgen.pipelines.stages.scene_clearance import SceneClearance
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, StageFunction
+from cnpgen.problems.conditions import symbolic_needs
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, Condition, Constraint, End
-from cnpgen.problems.constraints.needs import symbolic_needs
-from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.constraints.link_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
-from cnpgen.robots.scene_arrays import scene_capacity
+from cnpgen.robots.scene import scene_capacity
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
 

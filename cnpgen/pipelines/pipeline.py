@@ -9,9 +9,9 @@ from typing import Any
 from cnpgen.errors import PluginError, RecipeError, UsageError
 from cnpgen.pipelines.stages.draw_scenes import DrawScenes
 from cnpgen.pipelines.stages.stage import Context, Stage, StageFunction
+from cnpgen.problems.obstacles import with_capacity
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import missing_kinds, read_problem, without_defaults
-from cnpgen.problems.scene_capacity import with_capacity
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference

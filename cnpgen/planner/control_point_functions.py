@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.symbolic.kinematics import forward_kinematics, tip_velocity
 from cnpgen.kernels.symbolic.linalg import Vec, add, dot, solve, symbols
-from cnpgen.problems.equalities import equality_residuals
+from cnpgen.problems.conditions import equality_residuals
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.spline import basis, clamped_knots, end_derivatives

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.symbolic.linalg import Vec, symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState, time_derivatives
+from cnpgen.problems.conditions import conditions_with_needs, equality_residuals, state_of_symbols
 from cnpgen.problems.constraints.constraint import MIN_TOLERANCE, Condition
-from cnpgen.problems.equalities import conditions_with_needs, equality_residuals, state_of_symbols
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 

@@ -26,7 +26,7 @@ from cnpgen.plans.plausible import check_boundary_units
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
 from cnpgen.robots.robot import Robot
-from cnpgen.robots.scene_arrays import scene_poses
+from cnpgen.robots.scene import scene_poses
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.store.checked_shard import Shard, read_rows

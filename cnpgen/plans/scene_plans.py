@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError
 from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans, make_plans
+from cnpgen.problems.obstacles import Capacity, with_capacity
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import open_problem, record_problem
-from cnpgen.problems.scene_capacity import Capacity, with_capacity
 from cnpgen.problems.scenes.scene_problem import SceneError, SceneProblem, check_scenes
 from cnpgen.robots.observation.primitives import KINDS, primitives_of
 from cnpgen.robots.obstacle import Obstacle

@@ -1,17 +1,21 @@
-"""Checks of a problem file across several tables, or against its URDF."""
+"""Checks of a problem file across several tables, or against its URDF, and the choice of the robot geometry."""
 
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 from cnpgen.errors import PluginError, RecipeError, listed, nearest
+from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.constraints.link_clearance import ObjectClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.plausible_values import MAX_LIMIT_RATIO, MAX_RANGE_RATIO, ImplausibleValue
 from cnpgen.robots.robot_spec import LimitSpec
-from cnpgen.robots.shape.mesh_files import find_urdf
+from cnpgen.robots.shape.mesh_files import find_named_file, find_urdf
 from cnpgen.robots.urdf import number_in, read_urdf, urdf_tree
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.registry import BUILT_IN, CONSTRAINTS
@@ -20,15 +24,75 @@ from cnpgen.store.joint_units import units_of_joints
 
 _LIMIT_UNITS = {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s^2"}
 _XACRO = "{http://www.ros.org/wiki/xacro}"
+_NAME_IT = 'name geometry = "paper-capsules" in [robot] for a robot that is a line through its joints\' origins'
 
 
-def problem_mistakes(table: dict[str, Any], where: RecipeLocation, folder: Path) -> Iterator[str]:
+@dataclass(frozen=True)
+class ProblemTables:
+    """Raw tables of a problem file, its location and its folder; the URDF is read once."""
+
+    table: dict[str, Any]
+    where: RecipeLocation
+    folder: Path
+
+    @cached_property
+    def robot(self) -> dict[str, Any]:
+        """The table [robot]; empty if there is none."""
+        robot = self.table.get("robot")
+        return robot if isinstance(robot, dict) else {}
+
+    @cached_property
+    def packages(self) -> list[Path]:
+        """Folders in ``packages`` of the table [robot]."""
+        named = self.robot.get("packages", [])
+        return [self.folder / each for each in named if isinstance(each, str)] if isinstance(named, list) else []
+
+    @cached_property
+    def urdf_path(self) -> Path | None:
+        """The URDF; None if it is not named, or in a package that is not installed, which loading the robot reports."""
+        urdf = self.robot.get("urdf")
+        with suppress(PluginError):
+            return find_urdf(urdf, self.folder / "problem.toml", self.packages) if isinstance(urdf, str) else None
+        return None
+
+    @cached_property
+    def urdf(self) -> ElementTree.Element | None:
+        """The tree of the URDF; None if it cannot be read, which is reported elsewhere."""
+        with suppress(RecipeError, ValueError):
+            return None if self.urdf_path is None else urdf_tree(read_urdf(self.urdf_path))
+        return None
+
+    @cached_property
+    def collision_elements(self) -> list[ElementTree.Element] | None:
+        """The collision elements of the URDF; None if it cannot be read."""
+        return None if self.urdf is None else list(self.urdf.iterfind("link/collision"))
+
+    @cached_property
+    def geometry(self) -> str:
+        """Geometry of the robot: the named one, or the URDF's if there is an obstacle."""
+        named = self.robot.get("geometry")
+        if isinstance(named, str):
+            return named
+        something_to_hit = bool(tables(self.table, "obstacle") or self.constraints("self-clearance"))
+        return "urdf" if something_to_hit and self.collision_elements else "paper-capsules"
+
+    def constraints(self, use: str) -> list[tuple[int, dict[str, Any]]]:
+        """Return the tables of the constraints of a kind, with their indices."""
+        return [(place, each) for place, each in tables(self.table, "constraint") if each.get("use") == use]
+
+    def with_object_clearance(self, problem: Problem) -> tuple[Constraint, ...]:
+        """Return all constraints; by default, a held object stays clear of links that have geometry."""
+        if problem.object is None or problem.first(ObjectClearance) or not self.collision_elements:
+            return problem.constraint
+        return (*problem.constraint, ObjectClearance())
+
+
+def problem_mistakes(raw: ProblemTables) -> Iterator[str]:
     """Check conditions across tables, on the raw tables, so that all mistakes are reported together."""
-    robot = table.get("robot")
-    if isinstance(robot, dict):
-        yield from _robot_mistakes(robot, where / "robot", folder)
-    yield from _repeated(table, where, "constraint", "use")
-    yield from _repeated(table, where, "obstacle", "name")
+    table, where = raw.table, raw.where
+    yield from _robot_mistakes(raw)
+    yield from _repeated(raw, "constraint", "use")
+    yield from _repeated(raw, "obstacle", "name")
     uses = {str(each.get("use")) for _, each in tables(table, "constraint")}
     using = {"robot-clearance", "object-contact"} if "object" in table else {"robot-clearance"}
     for index, obstacle in tables(table, "obstacle"):
@@ -37,52 +101,103 @@ def problem_mistakes(table: dict[str, Any], where: RecipeLocation, folder: Path)
             yield (where / "obstacle" / index).message(text)
         if obstacle.get("below") and "object" not in table:
             yield (where / "obstacle" / index / "below").message("nothing stands on the obstacle: there is no [object]")
+    for place, _ in raw.constraints("object-clearance"):
+        if "object" not in table:
+            yield (where / "constraint" / place).message("object-clearance needs [object], the held object")
+        elif raw.collision_elements == []:
+            yield (where / "constraint" / place).message("object-clearance needs <collision> elements in the URDF")
+    if raw.geometry != "urdf":
+        yield from _paper_mistakes(raw)
+    elif raw.collision_elements is not None:
+        yield from _shape_mistakes(raw, raw.collision_elements)
 
 
-def _robot_mistakes(robot: dict[str, Any], where: RecipeLocation, folder: Path) -> Iterator[str]:
+def _robot_mistakes(raw: ProblemTables) -> Iterator[str]:
     """Check that the URDF exists and has the joints and the tip; Pinocchio checks the rest."""
-    urdf, joints, tip = robot.get("urdf"), robot.get("joints"), robot.get("tip")
-    if not isinstance(urdf, str):
-        return
-    try:
-        path = find_urdf(urdf, folder / "problem.toml", named_packages(robot, folder))
-    except PluginError:  # a problem can be listed without its robot; loading the robot raises the error
+    joints, tip, where = raw.robot.get("joints"), raw.robot.get("tip"), raw.where / "robot"
+    planned: list[Any] = joints if isinstance(joints, list) else []
+    path = raw.urdf_path
+    if path is None:
         return
     if not os.path.isfile(path):  # noqa: PTH113 - Path.is_file raises where a name is too long
-        hint = nearest(urdf, [file.name for file in folder.glob("*.urdf")])
+        hint = nearest(raw.robot["urdf"], [file.name for file in raw.folder.glob("*.urdf")])
         there = os.path.exists(path)  # noqa: PTH110 - os.path does not raise for odd names
         yield (where / "urdf").message(f"not a file: {path}" if there else f"no such file: {path}{hint}")
         return
-    try:
-        tree = urdf_tree(read_urdf(path))
-    except (RecipeError, ValueError):  # loading the robot raises the error
+    if raw.urdf is None:  # loading the robot raises the error
         return
-    if text := unread_xacro(tree, path):
+    if text := unread_xacro(raw.urdf, path):
         yield (where / "urdf").message(text)
         return
-    moving = [joint.get("name", "") for joint in tree.iter("joint") if joint.get("type", "fixed") != "fixed"]
-    for name in joints if isinstance(joints, list) else ():
+    moving = [joint.get("name", "") for joint in raw.urdf.iter("joint") if joint.get("type", "fixed") != "fixed"]
+    for name in planned:
         if isinstance(name, str) and name not in moving:
             yield (where / "joints").message(f"{path.name} has no joint {name!r} that moves{nearest(name, moving)}")
-    if isinstance(tip, str) and (text := missing_frame(tree, path, tip)):
+    if isinstance(tip, str) and (text := missing_frame(raw.urdf, path, tip)):
         yield (where / "tip").message(text)
-    for name, low, high in _locked_outside(tree.iter("joint"), joints if isinstance(joints, list) else []):
+    for name, low, high in _locked_outside(raw.urdf.iter("joint"), planned):
         text = f"{name!r} is not planned and stays at zero, which is outside of its limits [{low:g}, {high:g}]"
         yield (where / "joints").message(text)
 
 
-def limit_mistakes(problem: Problem, where: RecipeLocation) -> Iterator[str]:
+def _shape_mistakes(raw: ProblemTables, elements: list[ElementTree.Element]) -> Iterator[str]:
+    """Check a robot whose shape is that of the collision elements of its URDF."""
+    robot, where = raw.robot, raw.where / "robot"
+    if not elements:
+        text = "its links have no <collision> elements, so that it has no shape"
+        yield (where / "geometry").message(f"the URDF gives no shape: {text}; {_NAME_IT}")
+    for place, constraint in raw.constraints("robot-clearance"):
+        if "radius" in constraint:
+            text = f"the robot has the shape that its URDF gives it, and no radius: leave it out, or {_NAME_IT}"
+            yield (raw.where / "constraint" / place / "radius").message(text)
+    for package in raw.packages:
+        if not package.is_dir():
+            yield (where / "packages").message(f"no such folder: {package}")
+    meshes = dict.fromkeys(mesh.get("filename", "") for each in elements for mesh in each.iter("mesh"))
+    for name in (each for each in meshes if not each.startswith("data:")):
+        try:
+            find_named_file(name, raw.urdf_path or raw.folder, raw.packages)
+        except RecipeError as error:
+            yield (where / "urdf").message(str(error))
+    srdf = robot.get("srdf")
+    if isinstance(srdf, str) and srdf and not (raw.folder / srdf).is_file():
+        yield (where / "srdf").message(f"no such file: {raw.folder / srdf}")
+
+
+def _paper_mistakes(raw: ProblemTables) -> Iterator[str]:
+    """Check a robot with the geometry of the paper."""
+    robot, where = raw.robot, raw.where
+    for place, constraint in raw.constraints("robot-clearance"):
+        if "radius" not in constraint:
+            text = 'missing key, expected a length [m]: with geometry = "paper-capsules" the arm is so thick'
+            yield (where / "constraint" / place / "radius").message(text)
+    for place, _ in raw.constraints("self-clearance"):
+        text = 'self-clearance needs geometry = "urdf" in [robot], and <collision> elements'
+        yield (where / "constraint" / place).message(text)
+    if robot.get("convex_parts", 1) != 1:
+        yield (where / "robot" / "convex_parts").message('meshes matter with geometry = "urdf" only')
+    payload = raw.table.get("payload")
+    if isinstance(payload, dict) and payload.get("touch_links"):
+        text = 'a payload is a body with geometry = "urdf" in [robot] only'
+        yield (where / "payload" / "touch_links").message(text)
+    for key in ("srdf", "ignored_pairs"):
+        if robot.get(key):
+            yield (where / "robot" / key).message('pairs of links matter with geometry = "urdf" only')
+
+
+def limit_mistakes(problem: Problem, raw: ProblemTables) -> Iterator[str]:
     """Check that no limit exceeds that of the URDF so far that it must be in another unit or in percent."""
     spec, limits = problem.robot, problem.limits
     per_joint = {"velocity": limits.velocity, "acceleration": limits.acceleration}  # effort is often a placeholder
     given: dict[str, list[tuple[float, ...]]] = {}
     given |= {key: [(value,) for value in limit.values] for key, limit in per_joint.items() if limit is not None}
     given |= {"position": [(span.low, span.high) for span in limits.position]} if limits.position else {}
+    if raw.urdf is None:  # loading the robot raises the error
+        return
+    joints = {joint.get("name"): joint for joint in raw.urdf.iter("joint")}
     try:
-        urdf = urdf_tree(read_urdf(problem.urdf_path)).iter("joint") if given else ()
-        joints = {joint.get("name"): joint for joint in urdf}
         plausible = {key: [_plausible_limit(joints[name], key) for name in spec.joints] for key in given}
-    except (PluginError, RecipeError, ValueError, KeyError):  # loading the robot raises the error
+    except (ValueError, KeyError):  # loading the robot raises the error
         return
     for key, rows in given.items():
         per_row = rows * (len(spec.joints) if len(rows) == 1 else 1)
@@ -91,7 +206,7 @@ def limit_mistakes(problem: Problem, where: RecipeLocation) -> Iterator[str]:
             if wrong is not None:
                 text = f"{name}: {ImplausibleValue(0, 0, wrong, low, high, unit)}"
                 hint = "" if key == "acceleration" else f" ('{key}_scale' is a fraction of the URDF's limit)"
-                yield (where / "limits" / key).message(text + hint)
+                yield (raw.where / "limits" / key).message(text + hint)
                 break
 
 
@@ -104,12 +219,6 @@ def _plausible_limit(joint: ElementTree.Element, key: str) -> tuple[float, float
         return center - half, center + half, unit
     rate = LimitSpec.acceleration_rate if key == "acceleration" else 1.0
     return 0.0, MAX_LIMIT_RATIO * rate * number_in(limit, "velocity", 0.0), unit
-
-
-def named_packages(robot: dict[str, Any], folder: Path) -> list[Path]:
-    """Return the folders in ``packages`` of the table [robot] of a problem in ``folder``."""
-    named = robot.get("packages", [])
-    return [folder / each for each in named if isinstance(each, str)] if isinstance(named, list) else []
 
 
 def unread_xacro(tree: ElementTree.Element, path: Path) -> str:
@@ -127,11 +236,9 @@ def frames_of(tree: ElementTree.Element) -> list[str]:
 def missing_frame(tree: ElementTree.Element, path: Path, name: str) -> str:
     """Return an error message for a missing frame, with the known names; empty if the frame exists."""
     frames = frames_of(tree)
-    return (
-        ""
-        if name in frames
-        else f"{path.name} has no frame {name!r}{nearest(name, frames)}; its frames: {listed(frames)}"
-    )
+    if name in frames:
+        return ""
+    return f"{path.name} has no frame {name!r}{nearest(name, frames)}; its frames: {listed(frames)}"
 
 
 def _locked_outside(joints: Iterable[ElementTree.Element], planned: list[Any]) -> Iterator[tuple[str, float, float]]:
@@ -147,13 +254,13 @@ def _locked_outside(joints: Iterable[ElementTree.Element], planned: list[Any]) -
                 yield name, low, high
 
 
-def _repeated(table: dict[str, Any], where: RecipeLocation, array: str, key: str) -> Iterator[str]:
+def _repeated(raw: ProblemTables, array: str, key: str) -> Iterator[str]:
     seen: list[Any] = []
-    for index, entry in tables(table, array):
+    for index, entry in tables(raw.table, array):
         if key in entry and entry[key] in seen:
             article = "an" if array[0] in "aeiou" else "a"
             text = f"there is {article} {array} {show(entry[key])} already: edit that one, or remove one of them"
-            yield (where / array / index / key).message(text)
+            yield (raw.where / array / index / key).message(text)
         seen.append(entry.get(key))
 
 

@@ -1,30 +1,37 @@
-"""Loading of the robot of a problem, with scaled limits and consistency checks."""
+"""Loading of the robot of a problem, with scaled limits and checks of consistency and of units."""
 
 from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
 from cnpgen.problems.constraints.joint import JointTorque
-from cnpgen.problems.constraints.object_clearance import ObjectClearance
+from cnpgen.problems.constraints.link_clearance import ObjectClearance
 from cnpgen.problems.constraints.table import Table
-from cnpgen.problems.plausible_sizes import check_plausible_sizes
 from cnpgen.problems.problem import Problem, kept_folder
-from cnpgen.robots.attached import Attached, PayloadBody
 from cnpgen.robots.chain import chain_from_model
-from cnpgen.robots.robot import Robot, mistakes_in, reduced_model
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.robot import Attached, Robot, mistakes_in, reduced_model
+from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.shape.convex_part import turned
-from cnpgen.robots.shape.held_object import HeldBody, load_held_shape
-from cnpgen.robots.shape.shape import Shape, load_shape
+from cnpgen.robots.shape.hull import Array
+from cnpgen.robots.shape.shape import Shape, load_held_shape, load_shape
+from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.keys import PerJoint
 from cnpgen.schema.units import PLAUSIBLE_MAX, suggested_unit
 from cnpgen.store.joint_units import unit_of
 
-Array = NDArray[np.float64]
-
 JERK_RATE = 5.0  # 1/s: jerk limit / acceleration limit in the authors' code
+MIN_REACH_M, MAX_REACH_M = 0.01, 100.0  # of an arm, along its joints
+MAX_LINK_RATIO = 20.0  # size of a link / reach; pedestals and mobile bases may be larger than arms
+MIN_LINK_RATIO = 0.02  # size of the largest moving link / reach
+MIN_MESH_M = 1e-3  # size of a link with a mesh
+MIN_MASS_KG = 0.01  # of bodies whose inertia is checked; lighter ones have placeholders
+MIN_ARM_KG = 0.1  # that a payload is compared with
+MAX_CENTER_RATIO = 3.0  # distance of a center of mass from its joint, and radius of gyration / reach
+MAX_PAYLOAD_RATIO = 10.0  # mass of a payload / mass of the arm
+MAX_OBSTACLE_RATIO = 10.0  # distance of an obstacle / reach
 
 
 def load_robot(problem: Problem) -> Robot:
@@ -73,13 +80,13 @@ def load_robot(problem: Problem) -> Robot:
         model, robot = robot.model, replace(robot, shape=shape, held_shape=_held_shape(problem, robot))
     vars(robot)["model"] = model  # a cached property, expensive to build again
     if not problem.is_stored:
-        check_plausible_sizes(robot, problem)
+        _check_sizes(problem, robot)
     return robot
 
 
 def _attached(problem: Problem) -> Attached:
     """Return the attachments of the problem."""
-    spec, ranges, payload = problem.robot, problem.limits.position or (), problem.payload
+    spec, ranges = problem.robot, problem.limits.position or ()
     if ranges and len(ranges) != len(spec.joints):
         raise RecipeError(
             [f"limits.position: needs {len(spec.joints)} ranges, one per planned joint, got {len(ranges)}"]
@@ -88,7 +95,7 @@ def _attached(problem: Problem) -> Attached:
         spec.tip,
         rotation=turned(*spec.tip_rotation),
         translation=np.array(spec.tip_offset),
-        payload=PayloadBody(payload.mass, np.array(payload.centre), payload.inertia_matrix) if payload else None,
+        payload=problem.payload,
         ranges={name: (each.low, each.high) for name, each in zip(spec.joints, ranges, strict=False)},
     )
 
@@ -107,8 +114,7 @@ def _held_shape(problem: Problem, robot: Robot) -> Shape | None:
     """Load the geometry for collisions of the held object with the robot, if a constraint needs it."""
     if problem.object is None or problem.first(ObjectClearance) is None:
         return None
-    held = HeldBody(problem.object.size, problem.object.touch_links, robot.tip_frame)
-    return load_held_shape(robot.urdf_text, robot.model, held, kept_folder())
+    return load_held_shape(robot.urdf_text, robot.model, problem.object, robot.tip_frame, kept_folder())
 
 
 def _mistakes(problem: Problem, robot: Robot) -> Iterator[str]:
@@ -162,16 +168,90 @@ def _base_mistakes(problem: Problem, robot: Robot) -> Iterator[str]:
             f" limits [{low[worst]:g}, {high[worst]:g}]{hint}"
         )
     for table in (each for each in problem.constraint if isinstance(each, Table)):
-        height = _tip_height(robot, base)
+        height = float(robot.tip_positions(base[None])[0, 2])
         if height < table.z - max(table.band, table.tolerance):
             text = f"the tip is {table.z - height:.3g} m below the table, at z = {height:.4g} m, expected {table.z:g} m"
             yield f"{problem.path}: robot.base: {text} or more: is the tip the frame that you mean, and 'z' its height?"
 
 
-def _tip_height(robot: Robot, q: Array) -> float:
-    """Return the height of the tip at joint positions q [m]."""
-    import pinocchio as pin
+def _check_sizes(problem: Problem, robot: Robot) -> None:
+    """Raise an error that lists all lengths and masses that are probably in another unit."""
+    mistakes = [f"{robot.urdf}: {mistake}" for mistake in _robot_mistakes(robot, problem)]
+    if not mistakes:
+        mistakes = [f"{problem.path}: {mistake}" for mistake in _problem_mistakes(robot, problem)]
+    if mistakes:
+        raise RecipeError(mistakes)
 
-    data = robot.model.createData()
-    pin.forwardKinematics(robot.model, data, q)
-    return float(pin.updateFramePlacement(robot.model, data, robot.tip_frame).translation[2])
+
+def _robot_mistakes(robot: Robot, problem: Problem) -> Iterator[str]:
+    """Yield error messages for lengths of the URDF."""
+    reach = robot.reach
+    if not MIN_REACH_M <= reach <= MAX_REACH_M:
+        remedy = "lengths of a URDF are in m, not in mm: convert the <origin xyz> of its joints"
+        yield f"the arm is {reach:.3g} m long, expected {MIN_REACH_M:g} to {MAX_REACH_M:g} m; {remedy}"
+        return
+    joints = robot.chain.joints if problem.payload is None else robot.chain.joints[:-1]
+    for name, joint in zip(robot.joint_names, joints, strict=False):
+        if joint.mass < MIN_MASS_KG:
+            continue
+        center, gyration = np.linalg.norm(joint.com), np.sqrt(max(np.trace(joint.inertia), 0.0) / (2 * joint.mass))
+        if max(center, gyration) > MAX_CENTER_RATIO * reach:
+            text = f"the center of mass is {center:.3g} m away, the radius of gyration {gyration:.3g} m"
+            yield f"{name}: {text}, the arm {reach:.3g} m long; an <inertial> is in kg, m and kg m^2, not in mm or g"
+    yield from _link_mistakes(robot, reach)
+
+
+def _link_mistakes(robot: Robot, reach: float) -> Iterator[str]:
+    """Yield error messages for sizes of links."""
+    if robot.shape is None:
+        return
+    sizes: dict[str, float] = {}
+    for part in robot.shape.convex_parts:
+        size = float(np.ptp(part.vertices, axis=0).max()) + 2 * part.radius
+        sizes[part.link] = max(size, sizes.get(part.link, 0.0))
+    large = {link: size for link, size in sizes.items() if size > MAX_LINK_RATIO * reach}
+    small = {link: size for link, size in sizes.items() if size < MIN_MESH_M}
+    for link, size in large.items():
+        remedy = 'write scale="0.001 0.001 0.001" in the <mesh> of a file in mm'
+        yield f"link {link!r}: its collision geometry is {size:.3g} m large, the arm {reach:.3g} m; {remedy}"
+    remedy = "remove the scale of its <mesh> elements, or correct it"
+    for link in _mesh_links(robot.urdf_text) & small.keys() if small else ():  # spheres and boxes may be placeholders
+        text = f"its collision geometry is {small[link]:.3g} m large, expected {MIN_MESH_M:g} m or more"
+        yield f"link {link!r}: {text}; {remedy}"
+    largest = max(size for link, size in sizes.items() if robot.shape.joints[link])
+    if largest < MIN_LINK_RATIO * reach:
+        yield f"no moving link is larger than {largest:.3g} m, where the arm is {reach:.3g} m long; {remedy}"
+
+
+def _mesh_links(urdf: str) -> set[str]:
+    links = urdf_tree(urdf).findall("link")
+    return {link.get("name", "") for link in links if link.find("collision/geometry/mesh") is not None}
+
+
+def _problem_mistakes(robot: Robot, problem: Problem) -> Iterator[str]:
+    """Yield error messages for lengths and masses of the problem."""
+    reach, payload = robot.reach, problem.payload
+    mass = sum(joint.mass for joint in robot.chain.joints)
+    if payload is not None:
+        arm, distance = mass - payload.mass, float(np.linalg.norm(payload.centre))
+        gyration = float(np.sqrt(np.trace(payload.inertia_matrix) / (2 * payload.mass)))
+        if arm > MIN_ARM_KG and payload.mass > MAX_PAYLOAD_RATIO * arm:
+            yield f"payload.mass: is {payload.mass:g} kg, where the arm has {arm:.3g} kg: masses are in kg, not in g"
+        for key, length in {"centre": distance, "inertia": gyration}.items():
+            if length > MAX_CENTER_RATIO * reach:
+                text = f"a length of {length:.3g} m from it, where the arm is {reach:.3g} m long"
+                yield f"payload.{key}: {text}; lengths are in m and inertias in kg m^2"
+    for index, obstacle in enumerate(problem.obstacle, 1):
+        distance = _distance(obstacle)
+        if distance > MAX_OBSTACLE_RATIO * reach and obstacle.position != PARKED_POSITION_M:
+            text = f"{obstacle.name!r} is {distance:.3g} m away, where the arm is {reach:.3g} m long"
+            yield f"obstacle {index}: {text}: check its unit"
+
+
+def _distance(obstacle: Obstacle) -> float:
+    """Return a lower bound of the distance of an obstacle from the origin of the world [m]."""
+    if obstacle.position is not None and not obstacle.mesh:
+        lengths = [*(obstacle.size or ()), obstacle.radius or 0.0, obstacle.radius or 0.0, obstacle.length or 0.0]
+        return float(np.linalg.norm(obstacle.position) - sum(lengths))
+    sides = [max(each.low, -each.high, 0.0) for each in (obstacle.x, obstacle.y) if each is not None]
+    return float(np.linalg.norm(sides))

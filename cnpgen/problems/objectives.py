@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from cnpgen.errors import RecipeError, UsageError, nearest
 from cnpgen.schema import registry
+from cnpgen.schema.arguments import concerning
 from cnpgen.schema.keys import RecipeLocation, field
 from cnpgen.schema.parsing import parse
 
@@ -173,15 +174,14 @@ def read_objective(text: str) -> tuple[ObjectiveTerm, ...] | None:
     if text.strip() in {"", OWN_OBJECTIVE}:
         return None
     weights: dict[str, float] = {}
-    for part in text.split(","):
-        name, _, value = (word.strip() for word in part.partition("="))
-        weights[name] = _weight(name, value) if "=" in part else 1.0
-    time = weights.pop(OWN_OBJECTIVE, 1.0)
-    if time == 0:
-        raise UsageError(
-            "the weight of time must be above 0: without it motions may be arbitrarily slow", concerns="objective"
-        )
-    return tuple(_term(name, weight / time) for name, weight in weights.items())
+    with concerning("objective"):
+        for part in text.split(","):
+            name, _, value = (word.strip() for word in part.partition("="))
+            weights[name] = _weight(name, value) if "=" in part else 1.0
+        time = weights.pop(OWN_OBJECTIVE, 1.0)
+        if time == 0:
+            raise UsageError("the weight of time must be above 0: without it motions may be arbitrarily slow")
+        return tuple(_term(name, weight / time) for name, weight in weights.items())
 
 
 def _weight(name: str, text: str) -> float:
@@ -190,9 +190,7 @@ def _weight(name: str, text: str) -> float:
     except ValueError:
         weight = -1.0
     if not 0 <= weight < float("inf"):
-        raise UsageError(
-            f"the weight of {name!r} must be a number that is not negative, got {text!r}", concerns="objective"
-        )
+        raise UsageError(f"the weight of {name!r} must be a number that is not negative, got {text!r}")
     return weight
 
 
@@ -200,17 +198,15 @@ def _term(name: str, weight: float) -> ObjectiveTerm:
     known = (OWN_OBJECTIVE, *registry.names(registry.OBJECTIVES))
     if name not in known:
         expected = f"expected one of {', '.join(known)}{nearest(name, known)}"
-        raise UsageError(f"objective {name!r} does not exist: {expected}", concerns="objective")
+        raise UsageError(f"objective {name!r} does not exist: {expected}")
     mistakes: list[str] = []
     try:
         term: Any = parse(
             registry.load(registry.OBJECTIVES, name), {"weight": weight}, where=RecipeLocation(name), mistakes=mistakes
         )
     except RecipeError as error:
-        raise UsageError(str(error), concerns="objective") from error
+        raise UsageError(str(error)) from error
     if term is None:
-        raise UsageError(
-            f"{'; '.join(mistakes)}: write the term as [[objective.term]] in the problem file", concerns="objective"
-        )
+        raise UsageError(f"{'; '.join(mistakes)}: write the term as [[objective.term]] in the problem file")
     found: ObjectiveTerm = term
     return found

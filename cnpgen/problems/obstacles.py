@@ -1,22 +1,29 @@
-"""Scenes of samples: obstacles below the object at the start or at the goal, and values that depend on the goal."""
+"""Scenes of samples: obstacles at the ends of motions, values that depend on the goal, and capacities."""
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.scene import Scene
+from cnpgen.robots.observation.primitives import KINDS
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.scene import PARKED_POSITION_M, Scene
+from cnpgen.robots.shape.hull import Array
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.robots.table_frame import TableFrame, table_frame
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
-Array = NDArray[np.float64]
+Capacity = Mapping[str, int]  # kind, or corners of a mesh -> number of obstacles
+_PARKED_ROTATION = (0.1, 0.1, 0.1)  # any rotation: boxes of scenes have rotation matrices
 
 
 def scene_of(
@@ -39,9 +46,6 @@ def scene_of(
         goal_velocity: Tip velocities at the goal [m/s], shape (N, 3), for problems with a ``scene_constraint``.
         parameters: Parameters of the samples, shape (N, width), for problems with parameters; nominal by default.
         obstacle_poses: Poses and sizes of the obstacles of each sample, shape (N, width), in place of the problem's.
-
-    Raises:
-        UsageError: The problem needs the velocities, and they are missing, or the poses do not fit the problem.
     """
     half = 0.0 if problem.object is None else problem.object.size[2] / 2
     parts, constraint = [], problem.scene_constraint
@@ -89,3 +93,33 @@ def goal_velocities(problem: Problem, robot: Robot, goal_q: Array, goal_dq: Arra
     world = PathWorld(robot)
     world.set_path(goal_q.T, goal_dq.T, np.zeros(goal_q.T.shape), np.empty(0))
     return world.tip_velocity.T
+
+
+def with_capacity(problem: Problem, capacity: Capacity) -> Problem:
+    """Return a problem with further obstacles, which stand far below the robot until a plan places them."""
+    mistake = ""
+    if problem.first(RobotClearance) is None:
+        mistake = "has no constraint robot-clearance: obstacles would be ignored"
+    elif problem.parameters or problem.scene_constraint is not None:
+        values = "values of each sample (parameters or a puck)"
+        mistake = f"has {values}, which are not supported among obstacles that samples place"
+    if mistake:
+        raise UsageError(f"the problem {problem.name!r} {mistake}", concerns="problem")
+    shapes = [*KINDS, *sorted(capacity.keys() - set(KINDS))]
+    parked = [_parked(shape, index) for shape in shapes for index in range(1, capacity.get(shape, 0) + 1)]
+    full = replace(problem, obstacle=(*problem.obstacle, *parked))
+    if "urdf_text" in vars(problem):  # a cached property, expensive to read again
+        vars(full)["urdf_text"] = problem.urdf_text
+    return full
+
+
+def _parked(kind: str, index: int) -> Obstacle:
+    if kind not in KINDS:
+        name = f"mesh {hashlib.sha256(kind.encode()).hexdigest()[:8]} {index}"
+        return Obstacle(name=name, kind="mesh", mesh=kind, position=PARKED_POSITION_M, rotation=_PARKED_ROTATION)
+    name, small = f"{kind} {index}", 0.01
+    if kind == "box":
+        return Obstacle(name=name, kind=kind, position=PARKED_POSITION_M, size=(small,) * 3, rotation=_PARKED_ROTATION)
+    if kind == "sphere":
+        return Obstacle(name=name, kind=kind, position=PARKED_POSITION_M, radius=small)
+    return Obstacle(name=name, kind=kind, position=PARKED_POSITION_M, radius=small, length=small)

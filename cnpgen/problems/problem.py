@@ -16,10 +16,9 @@ from cnpgen.errors import MachineError, UsageError
 from cnpgen.problems.constraints.axis import TipAxis
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import Constraint
-from cnpgen.problems.constraints.object_clearance import ObjectClearance
+from cnpgen.problems.constraints.link_clearance import ObjectClearance
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.objectives import Centrifugal, ObjectiveTerm
-from cnpgen.robots.locked_joints import with_locked_joints
 from cnpgen.robots.obstacle import Obstacle, invalid_obstacle
 from cnpgen.robots.parameter_ranges import (
     NO_PARAMETERS,
@@ -27,15 +26,21 @@ from cnpgen.robots.parameter_ranges import (
     PAYLOAD_PARAMETERS,
     UPRIGHT_TOLERANCE,
     ParameterRanges,
+    optional_key,
 )
 from cnpgen.robots.robot_spec import HeldObject, LimitSpec, Payload, RobotSpec
 from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.shape.inline import with_inline_meshes
 from cnpgen.robots.shape.mesh_files import find_urdf
-from cnpgen.robots.shape.payload_link import PAYLOAD, with_payload_link
-from cnpgen.robots.shape.srdf import with_disabled_pairs, with_ignored_pairs
 from cnpgen.robots.solid import pose_width
 from cnpgen.robots.urdf import read_urdf
+from cnpgen.robots.urdf_changes import (
+    PAYLOAD,
+    with_disabled_pairs,
+    with_ignored_pairs,
+    with_locked_joints,
+    with_payload_link,
+)
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.keys import NAME, Range, field, to_dict
@@ -57,9 +62,7 @@ class Objective:
         default=0.0,
         low=0.0,
     )
-    term: tuple[ObjectiveTerm, ...] = field(
-        "further terms", default=(), form="[[objective.term]] tables", since_version=2
-    )
+    term: tuple[ObjectiveTerm, ...] = optional_key("further terms", default=(), form="[[objective.term]] tables")
 
     @property
     def terms(self) -> tuple[ObjectiveTerm, ...]:
@@ -81,9 +84,9 @@ class Problem:
     robot: RobotSpec = field("robot and its planned joints")
     limits: LimitSpec = field("planning limits, as fractions of the URDF's or in their place")
     object: HeldObject | None = field("upright cuboid that the tip holds", default=None)
-    payload: Payload | None = field("additional load at the tip", default=None, since_version=2)
-    parameters: ParameterRanges = field(
-        "ranges of the parameters that differ from sample to sample", default=NO_PARAMETERS, since_version=2
+    payload: Payload | None = optional_key("additional load at the tip")
+    parameters: ParameterRanges = optional_key(
+        "ranges of the parameters that differ from sample to sample", default=NO_PARAMETERS
     )
     obstacle: tuple[Obstacle, ...] = field("obstacles around the robot", default=(), form="[[obstacle]] tables")
     constraint: tuple[Constraint, ...] = field(

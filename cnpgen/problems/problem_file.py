@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from cnpgen.errors import PluginError, RecipeError
-from cnpgen.problems.checks import limit_mistakes, problem_mistakes, tables
+from cnpgen.problems.checks import ProblemTables, limit_mistakes, problem_mistakes, tables
 from cnpgen.problems.constraints.constraint import Constraint
-from cnpgen.problems.geometry import chosen_geometry, geometry_mistakes, with_object_clearance
 from cnpgen.problems.objectives import ObjectiveTerm
 from cnpgen.problems.problem import FILES, Problem
 from cnpgen.robots.obstacle import Obstacle
@@ -48,11 +47,7 @@ KIND_READERS: dict[type, Reader] = {
 
 
 def load_problem_behind(name_or_path: str | Path) -> Problem:
-    """Load the problem of a problem, pipeline or dataset recipe, by its name or path.
-
-    Raises:
-        RecipeError: There is no such recipe, or the problem file has mistakes.
-    """
+    """Load the problem of a problem, pipeline or dataset recipe, by name or path; RecipeError if it has mistakes."""
     return load_recipe(("problem", "pipeline", "dataset"), name_or_path, None, _read_behind)
 
 
@@ -79,19 +74,16 @@ def read_problem(path: Path, mistakes: list[str]) -> Problem | None:
     table = read_table(path, ("problem",), mistakes)
     if table is None:
         return None
-    where = RecipeLocation(str(path))
+    raw = ProblemTables(table, where := RecipeLocation(str(path)), path.parent)
     problem = parse(Problem, table, where=where, mistakes=mistakes, readers=KIND_READERS)
     before = len(mistakes)
-    mistakes.extend(problem_mistakes(table, where, path.parent))
-    mistakes.extend(geometry_mistakes(table, where, path.parent))
+    mistakes.extend(problem_mistakes(raw))
     obstacles = () if problem is None else _with_meshes(problem, path, where, mistakes)
     if problem is None or len(mistakes) > before:
         return None
-    spec = replace(problem.robot, geometry=chosen_geometry(table, path.parent))
-    constraints = with_object_clearance(problem, table, path.parent)
-    problem = replace(problem, path=path.absolute())
-    mistakes.extend(limit_mistakes(problem, where))
-    return replace(problem, robot=spec, obstacle=obstacles, constraint=constraints)
+    mistakes.extend(limit_mistakes(problem, raw))
+    spec, constraints = replace(problem.robot, geometry=raw.geometry), raw.with_object_clearance(problem)
+    return replace(problem, path=path.absolute(), robot=spec, obstacle=obstacles, constraint=constraints)
 
 
 def _with_meshes(problem: Problem, path: Path, where: RecipeLocation, mistakes: list[str]) -> tuple[Obstacle, ...]:
@@ -122,12 +114,7 @@ def without_defaults(value: Any) -> Any:
 
 
 def restore_problem(content: dict[str, Any], urdf: str, folder: Path) -> Problem:
-    """Rebuild a problem from its resolved form and the text of its URDF, for whose file there is a folder.
-
-    Raises:
-        RecipeError: This version of cnpgen does not support the content.
-        PluginError: A required package is not installed.
-    """
+    """Rebuild a problem from its resolved form and the text of its URDF, for whose file there is a folder."""
     if missing := missing_kinds_of_problem(content):
         raise PluginError(missing)
     path, mistakes = folder / "recipe.toml", list[str]()

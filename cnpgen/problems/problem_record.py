@@ -13,14 +13,12 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.problems.objectives import read_objective
 from cnpgen.problems.problem import FILES, Objective, Problem, resolved
 from cnpgen.problems.problem_file import load_problem_behind, restore_problem
 from cnpgen.robots.parameter_ranges import NO_PARAMETERS, ParameterRanges
+from cnpgen.robots.shape.hull import Array
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning, numbers
@@ -35,7 +33,6 @@ from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 
 _MOVING = ("revolute", "continuous", "prismatic")
@@ -157,26 +154,14 @@ class ProblemRecord(StoredProblem):
         Returns:
             Tip positions in the world frame [m], shape (N, 3).
         """
-        import pinocchio as pin
-
-        _, robot = open_problem(self)
-        model, q = robot.model, numbers("q", q)
-        if q.ndim != 2 or q.shape[1] != model.nq:
-            raise UsageError(f"must have shape (N, {model.nq}), got {q.shape}", argument="q")
-        data, frame = model.createData(), robot.tip_frame
-        found = np.empty((len(q), 3))
-        for row, configuration in enumerate(q):
-            pin.forwardKinematics(model, data, configuration)
-            found[row] = pin.updateFramePlacement(model, data, frame).translation
-        return found
+        (_, robot), q = open_problem(self), numbers("q", q)
+        if q.ndim != 2 or q.shape[1] != robot.n:
+            raise UsageError(f"must have shape (N, {robot.n}), got {q.shape}", argument="q")
+        return robot.tip_positions(q)
 
 
 def with_control_points(record: ProblemRecord, path: int | None, rate: int | None) -> ProblemRecord:
-    """Return the record of a problem with other numbers of control points of p(s) and r(s); None keeps a number.
-
-    Raises:
-        UsageError: A number does not suit the degree.
-    """
+    """Return the record of a problem with other numbers of control points of p(s) and r(s); None keeps a number."""
     counts = {"path_control_points": path, "rate_control_points": rate}
     changed = {key: count for key, count in counts.items() if count not in {None, record.content["trajectory"][key]}}
     if not changed:
@@ -191,11 +176,7 @@ def with_control_points(record: ProblemRecord, path: int | None, rate: int | Non
 
 
 def with_objective(record: ProblemRecord, objective: str) -> ProblemRecord:
-    """Return the record of a problem with another objective (``read_objective``); empty or "time" for its own.
-
-    Raises:
-        UsageError: The objective is invalid.
-    """
+    """Return the record of a problem with another objective (``read_objective``); empty or "time" for its own."""
     terms = read_objective(objective)
     if terms is None:
         return record
@@ -218,15 +199,7 @@ def record_problem(problem: Problem) -> ProblemRecord:
 
 
 def as_problem(problem: object) -> Problem:
-    """Return a problem from a problem, a record, a name or a path.
-
-    Args:
-        problem: A problem, its record, or the name or the file of a problem, a pipeline or a dataset.
-
-    Raises:
-        UsageError: The argument has another type.
-        RecipeError: There is no such recipe, or the problem file has mistakes.
-    """
+    """Return a problem from a problem, its record, or the name or the file of a problem, a pipeline or a dataset."""
     if isinstance(problem, Problem):
         return problem
     if isinstance(problem, StoredProblem):
@@ -239,12 +212,7 @@ def as_problem(problem: object) -> Problem:
 
 
 def as_record(problem: object) -> ProblemRecord:
-    """Return the record of a problem from any argument of ``as_problem``.
-
-    Raises:
-        UsageError: The argument has another type.
-        RecipeError: There is no such recipe, or the problem file has mistakes.
-    """
+    """Return the record of a problem from any argument of ``as_problem``."""
     if isinstance(problem, ProblemRecord):
         return problem
     if isinstance(problem, StoredProblem):
@@ -260,11 +228,7 @@ def _rebuilt(record: ProblemRecord) -> Problem:
 
 @lru_cache(maxsize=8)
 def open_problem(record: ProblemRecord) -> tuple[Problem, Robot]:
-    """Rebuild a problem and its robot, which both contain the URDF; the files are deleted afterwards.
-
-    Raises:
-        RecipeError: The problem needs another version of cnpgen, or a plug-in that is not installed.
-    """
+    """Rebuild a problem and its robot, which both contain the URDF; the files are deleted afterwards."""
     from cnpgen.problems.load_robot import load_robot
 
     with record.restored() as problem:

@@ -14,6 +14,7 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
 from cnpgen.robots.scene import Scene
+from cnpgen.robots.shape.hull import Array
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import numbers
 from cnpgen.store.dataset_spec import StoredProblem
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
     from cnpgen.problems.constraints.constraint import Condition, Constraint
     from cnpgen.robots.robot import Robot
     from cnpgen.world.world import World
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,7 +333,7 @@ def constraint_values_of(robot: Robot, problem: Problem) -> Any:
     """Build ``(q, dq, ddq, obstacle poses) -> (g, dg/dq, dg/d(dq), dg/d(ddq), drift)``, Jacobians column by column."""
     import casadi as ca
 
-    from cnpgen.problems.constraints.needs import symbolic_needs
+    from cnpgen.problems.conditions import symbolic_needs
 
     state, pairs = _symbolic_conditions(robot, problem)
     inputs = [ca.vertcat(*values) for values in (state.q, state.dq, state.ddq, state.obstacle_poses)]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cnpgen.kernels.collision.collision_checker import load_collision_library
 from cnpgen.kernels.collision.tree_search import EqualityKernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
-from cnpgen.problems.equalities import equality_residuals
+from cnpgen.problems.conditions import equality_residuals
 from cnpgen.problems.obstacles import table_frame_of
 from cnpgen.problems.problem import Problem
 from cnpgen.refine import initial_guesses

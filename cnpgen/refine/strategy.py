@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from cnpgen.judges.plans.judge import Judge
 from cnpgen.judges.plans.verdict import Reason, Verdict
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
-from cnpgen.problems.constraints.object_clearance import ObjectClearance
-from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.constraints.link_clearance import ObjectClearance, SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.attempts import make_attempts
 from cnpgen.refine.proof.explain import end_violations

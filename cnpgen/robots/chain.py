@@ -4,14 +4,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
+from cnpgen.robots.shape.hull import Array
 
 if TYPE_CHECKING:
     import pinocchio as pin
-
-Array = NDArray[np.float64]
 
 
 SNAP_TOLERANCE = 1e-12  # maximum deviation of entries that are rounded to -1, 0 or 1
@@ -74,11 +72,7 @@ class Chain:
 
 
 def chain_from_model(model: "pin.Model", tip: str) -> Chain:
-    """Read the chain that ends in frame ``tip`` from a reduced Pinocchio model.
-
-    Raises:
-        RecipeError: The model is not one serial chain of revolute and prismatic joints that carries the tip.
-    """
+    """Read the chain that ends in a tip frame; RecipeError if the model is not one serial chain that carries it."""
     data = model.createData()
     for index in range(1, model.njoints):
         name, joint = model.names[index], model.joints[index]

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
+from cnpgen.robots.parameter_ranges import optional_key
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid
 from cnpgen.robots.shape.inline import corners_of, is_inline
 from cnpgen.schema.keys import Range, field, keys
@@ -39,45 +40,31 @@ class Obstacle:
     )
     top: float | None = field("height of the upper face", unit="m", default=None)
     below: str = field("end whose object stands on this obstacle", choices=("", "start", "goal"), default="")
-    kind: str = field("kind of the obstacle", choices=tuple(_KEYS), default="box", since_version=2)
-    position: tuple[float, float, float] | None = field(
-        "position of the centre, for a mesh of the origin of its file: x, y, z", unit="m", default=None, since_version=2
+    kind: str = optional_key("kind of the obstacle", choices=tuple(_KEYS), default="box")
+    position: tuple[float, float, float] | None = optional_key(
+        "position of the centre, for a mesh of the origin of its file: x, y, z", unit="m"
     )
-    rotation: tuple[float, float, float] = field(
+    rotation: tuple[float, float, float] = optional_key(
         "rotation: roll, pitch and yaw about the world's axes, as <origin rpy> of a URDF",
         unit="rad",
         default=_OPTIONAL["rotation"],
         plausible=2 * math.pi,
-        since_version=2,
     )
-    size: tuple[float, float, float] | None = field(
-        "edge lengths of a box", unit="m", default=None, low=1e-6, since_version=2
+    size: tuple[float, float, float] | None = optional_key("edge lengths of a box", unit="m", low=1e-6)
+    radius: float | None = optional_key("radius of a sphere, a cylinder, a capsule", unit="m", low=1e-6)
+    length: float | None = optional_key(
+        "length of a cylinder, or of a capsule without its round ends, along its z axis", unit="m", low=1e-6
     )
-    radius: float | None = field(
-        "radius of a sphere, a cylinder, a capsule", unit="m", default=None, low=1e-6, since_version=2
+    mesh: str = optional_key(
+        "mesh file (STL, DAE, OBJ), relative to the problem file; its convex hull is used", default=""
     )
-    length: float | None = field(
-        "length of a cylinder, or of a capsule without its round ends, along its z axis",
-        unit="m",
-        default=None,
-        low=1e-6,
-        since_version=2,
-    )
-    mesh: str = field(
-        "mesh file (STL, DAE, OBJ), relative to the problem file; its convex hull is used",
-        default="",
-        since_version=2,
-    )
-    scale: tuple[float, float, float] = field(
-        "scale factors of the mesh along x, y and z", default=_OPTIONAL["scale"], since_version=2
+    scale: tuple[float, float, float] = optional_key(
+        "scale factors of the mesh along x, y and z", default=_OPTIONAL["scale"]
     )
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
         """Yield (key, mistake) pairs."""
-        if self.upright:
-            yield from self._mistakes_upright()
-        else:
-            yield from self._mistakes_posed()
+        yield from self._mistakes_upright() if self.upright else self._mistakes_posed()
 
     def value_mistakes(self) -> Iterator[tuple[str, str]]:
         """Yield (key, mistake) pairs of an obstacle that Python has built: its kind, missing keys, and numbers."""

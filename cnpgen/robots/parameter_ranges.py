@@ -25,46 +25,53 @@ MAX_TILT_RAD = 0.5  # of a table or an upright direction about each axis
 RANGE_ROUNDING = 1e-12  # of values at the ends of a range
 
 
-def _range(doc: str, unit: str = "1", **bounds: Any) -> Any:
-    """Declare the optional range of a parameter."""
-    return field(doc, unit=unit, default=None, since_version=2, **bounds)
+def optional_key(doc: str, unit: str = "1", default: Any = None, **bounds: Any) -> Any:
+    """Declare a key that may be absent and exists since version 2 of the recipe schema; see ``field``."""
+    return field(doc, unit=unit, default=default, since_version=2, **bounds)
 
 
 def _tilt(doc: str) -> Any:
     """Declare the optional range of an angle of a tilt."""
-    return _range(doc, "rad", low=-MAX_TILT_RAD, high=MAX_TILT_RAD)
+    return optional_key(doc, "rad", low=-MAX_TILT_RAD, high=MAX_TILT_RAD)
+
+
+def _has_any(names: Sequence[str]) -> cached_property[bool]:
+    """Declare a property that is true if one of some parameters differs from sample to sample."""
+    return cached_property(lambda ranges: any(name in names for name in ranges.names))
 
 
 @dataclass(frozen=True, kw_only=True)
 class ParameterRanges:
     """Ranges of the parameters that samples of a problem have, in the order of their columns."""
 
-    table_height: Range | None = _range("height of the table above that of the constraint 'table'", "m")
+    table_height: Range | None = optional_key("height of the table above that of the constraint 'table'", "m")
     table_roll: Range | None = _tilt("turn of the table about its x axis")
     table_pitch: Range | None = _tilt("turn of the table about world y, after the roll")
-    table_x_low: Range | None = _range("lower bound of the table's rectangle along its x axis", "m")
-    table_x_high: Range | None = _range("upper bound along x", "m")
-    table_y_low: Range | None = _range("lower bound along y", "m")
-    table_y_high: Range | None = _range("upper bound along y", "m")
+    table_x_low: Range | None = optional_key("lower bound of the table's rectangle along its x axis", "m")
+    table_x_high: Range | None = optional_key("upper bound along x", "m")
+    table_y_low: Range | None = optional_key("lower bound along y", "m")
+    table_y_high: Range | None = optional_key("upper bound along y", "m")
     upright_roll: Range | None = _tilt("turn about world x of the direction of the constraint 'vertical' or 'axis'")
     upright_pitch: Range | None = _tilt("its turn about world y, after the roll")
-    upright_tolerance: Range | None = _range(
+    upright_tolerance: Range | None = optional_key(
         "'angle' of the constraint 'axis', or 'tolerance' of an aligned axis and of 'vertical'",
         "rad",
         low=1e-4,
         high=1.5,
     )
-    velocity_factor: Range | None = _range(
+    velocity_factor: Range | None = optional_key(
         "joint velocity limit, as a fraction of that of [limits]", low=1e-3, high=1.0
     )
-    acceleration_factor: Range | None = _range(
+    acceleration_factor: Range | None = optional_key(
         "joint acceleration limit, as a fraction of that of [limits]", low=1e-3, high=1.0
     )
-    payload_mass: Range | None = _range("mass of the payload, whose inertia is proportional to it", "kg", low=1e-9)
-    payload_x: Range | None = _range("centre of mass of the payload along the tip's x axis", "m", plausible=5.0)
-    payload_y: Range | None = _range("the same along its y axis", "m", plausible=5.0)
-    payload_z: Range | None = _range("the same along its z axis", "m", plausible=5.0)
-    payload_inertia: Range | None = _range(
+    payload_mass: Range | None = optional_key(
+        "mass of the payload, whose inertia is proportional to it", "kg", low=1e-9
+    )
+    payload_x: Range | None = optional_key("centre of mass of the payload along the tip's x axis", "m", plausible=5.0)
+    payload_y: Range | None = optional_key("the same along its y axis", "m", plausible=5.0)
+    payload_z: Range | None = optional_key("the same along its z axis", "m", plausible=5.0)
+    payload_inertia: Range | None = optional_key(
         "inertia of the payload about its centre, as a fraction of that of [payload] at equal mass", low=0.0
     )
 
@@ -89,25 +96,10 @@ class ParameterRanges:
         """Ranges of the parameters that samples have."""
         return tuple(getattr(self, name) for name in self.names)
 
-    @cached_property
-    def tilts_table(self) -> bool:
-        """Whether the table is raised or tilted."""
-        return any(name in TABLE_PARAMETERS for name in self.names)
-
-    @cached_property
-    def changes_rectangle(self) -> bool:
-        """Whether the rectangle of the table differs from sample to sample."""
-        return any(name in TABLE_BOUNDS for name in self.names)
-
-    @cached_property
-    def turns_upright(self) -> bool:
-        """Whether the direction of ``vertical`` or ``axis`` differs from sample to sample."""
-        return any(name in UPRIGHT_TURN for name in self.names)
-
-    @cached_property
-    def changes_payload(self) -> bool:
-        """Whether the payload differs from sample to sample."""
-        return any(name in PAYLOAD_PARAMETERS for name in self.names)
+    tilts_table = _has_any(TABLE_PARAMETERS)  # raised or tilted
+    changes_rectangle = _has_any(TABLE_BOUNDS)
+    turns_upright = _has_any(UPRIGHT_TURN)  # of the direction of "vertical" or "axis"
+    changes_payload = _has_any(PAYLOAD_PARAMETERS)
 
     def __len__(self) -> int:
         return len(self.names)

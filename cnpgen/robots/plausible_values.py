@@ -25,16 +25,7 @@ class UnitError(UsageError):
 
 @dataclass(frozen=True)
 class ImplausibleValue:
-    """The first value of an array outside of its plausible range.
-
-    Attributes:
-        row: Index of its row.
-        column: Index of its column.
-        value: The value.
-        low: Lower end of the range.
-        high: Upper end of the range.
-        unit: Unit in which it is read.
-    """
+    """The first value of an array outside of its plausible range, which has the unit in which the value is read."""
 
     row: int
     column: int
@@ -67,9 +58,6 @@ def check_plausible(robot: Robot, columns: Mapping[str, NDArray[Any]], units: Ma
     """Raise an error for the first value of columns, shape (N, width), that is probably in another unit than theirs.
 
     The noun of a row is "task" or "plan".
-
-    Raises:
-        UnitError: A value is far outside of its range.
     """
     for name, values in columns.items():
         wrong = find_implausible_value(robot, name, values, units[name])

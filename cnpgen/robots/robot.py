@@ -1,32 +1,53 @@
-"""Robot: Pinocchio model, reduced to the planned joints, and planning limits of the problem."""
+"""Robot: Pinocchio model, reduced to the planned joints, with its attachments and planning limits of the problem."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
+from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.errors import RecipeError, nearest
-from cnpgen.robots.attached import Attached, attach, bounded
+from cnpgen.errors import RecipeError, listed, nearest
 from cnpgen.robots.chain import Chain, frame_of, name_links_uniquely
-from cnpgen.robots.model_comparison import check_model
 from cnpgen.robots.parameter_ranges import NO_PARAMETERS, ParameterRanges
+from cnpgen.robots.robot_spec import Payload
+from cnpgen.robots.shape.hull import Array
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.urdf import number_in, urdf_tree
-from cnpgen.robots.urdf_parameters import UrdfParameters, urdf_parameters
+from cnpgen.robots.urdf_parameters import UrdfParameters, check_model, urdf_parameters
 from cnpgen.store.joint_units import units_of_joints
 
 if TYPE_CHECKING:
-    from xml.etree.ElementTree import Element
-
     import pinocchio as pin
 
-Array = NDArray[np.float64]
+
+@dataclass(frozen=True)
+class Attached:
+    """Attachments to the robot of a URDF.
+
+    Attributes:
+        frame: URDF frame to which the tip frame is fixed.
+        rotation: Rotation of the tip frame in it, shape (3, 3).
+        translation: Origin of the tip frame in it [m], shape (3,).
+        payload: Body carried at the tip frame, or None.
+        ranges: Planned joint -> position limits [rad] that replace those of the URDF.
+    """
+
+    frame: str
+    rotation: Array = field(default_factory=lambda: np.eye(3))
+    translation: Array = field(default_factory=lambda: np.zeros(3))
+    payload: Payload | None = None
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def tip(self) -> str:
+        """Name of the tip frame: the URDF's own, or that of a new one."""
+        moved = not np.array_equal(self.rotation, np.eye(3)) or self.translation.any()
+        return f"{self.frame} with offset" if moved else self.frame
 
 
 @dataclass(frozen=True)
@@ -115,6 +136,16 @@ class Robot:
         """Index of the tip frame in the model."""
         return frame_of(self.model, self.tip)
 
+    def tip_positions(self, q: Array) -> Array:
+        """Compute tip positions with Pinocchio [m], shape (N, 3), from joint positions [rad], shape (N, n)."""
+        import pinocchio as pin
+
+        data, positions = self.model.createData(), np.empty((len(q), 3))
+        for row, configuration in enumerate(q):
+            pin.forwardKinematics(self.model, data, configuration)
+            positions[row] = pin.updateFramePlacement(self.model, data, self.tip_frame).translation
+        return positions
+
     @cached_property
     def reach(self) -> float:
         """Length of the polyline from the world's origin over all joints to the tip [m]."""
@@ -126,15 +157,13 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
     """Build the Pinocchio model of a URDF, reduced to the planned joints, with the attachments of a problem.
 
     The path is for messages. Joints that are not planned are locked at zero.
-
-    Raises:
-        RecipeError: The text is not a URDF, it lacks the joints in this order, or Pinocchio reads other numbers.
     """
     import pinocchio as pin
 
     try:
         tree = urdf_tree(text)
-        _check_mimic(tree, joints)
+        if mistakes := [f"robot.joints: {text}" for text in _mimic_mistakes(tree, joints)]:
+            raise RecipeError(mistakes)
         limited = bounded(text, tree, attached)
         with mistakes_in(urdf):
             parameters = urdf_parameters(tree)
@@ -162,27 +191,22 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
     return reduced
 
 
-def _check_mimic(tree: "Element", joints: Sequence[str]) -> None:
-    """Raise RecipeError if a mimic joint would have a wrong position: Pinocchio treats them as independent joints."""
-    mistakes = [f"robot.joints: {text}" for joint in tree.iter("joint") for text in _mimic_mistakes(joint, joints)]
-    if mistakes:
-        raise RecipeError(mistakes)
+def _mimic_mistakes(tree: ElementTree.Element, planned: Sequence[str]) -> Iterator[str]:
+    """Yield error messages for mimic joints, which Pinocchio treats as independent, in a wrong position."""
+    for joint in tree.iter("joint"):
+        mimic = joint.find("mimic")
+        if mimic is None:
+            continue
+        name, other = joint.get("name", ""), mimic.get("joint", "")
+        if name in planned:
+            yield f"{name!r} mimics {other!r} and cannot be planned by itself; mimic joints are not supported"
+        elif other in planned:
+            yield f"{name!r} mimics the planned joint {other!r}, but would stay at zero; mimic joints are not supported"
+        elif offset := _mimic_offset(mimic):
+            yield f"{name!r} mimics {other!r} with {offset}, but would stay at zero; mimic joints are not supported"
 
 
-def _mimic_mistakes(joint: "Element", planned: Sequence[str]) -> Iterator[str]:
-    mimic = joint.find("mimic")
-    if mimic is None:
-        return
-    name, other = joint.get("name", ""), mimic.get("joint", "")
-    if name in planned:
-        yield f"{name!r} mimics {other!r} and cannot be planned by itself; mimic joints are not supported"
-    elif other in planned:
-        yield f"{name!r} mimics the planned joint {other!r}, but would stay at zero; mimic joints are not supported"
-    elif offset := _mimic_offset(mimic):
-        yield f"{name!r} mimics {other!r} with {offset}, but would stay at zero; mimic joints are not supported"
-
-
-def _mimic_offset(mimic: "Element") -> str:
+def _mimic_offset(mimic: ElementTree.Element) -> str:
     """Return an error message for a non-zero offset, otherwise an empty text."""
     try:
         return "an offset" if number_in(mimic, "offset", 0.0) else ""
@@ -241,3 +265,37 @@ def _capsule_axes(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:
         else:
             kept.append(point)
     return tuple((a, b) for a, b in pairwise(kept) if not (still(a) and still(b)))
+
+
+def attach(model: "pin.Model", attached: Attached) -> None:
+    """Add the attachments of a problem to a reduced model."""
+    import pinocchio as pin
+
+    if not model.existFrame(attached.frame):
+        known = [frame.name for frame in model.frames]
+        text = f"{model.name} has no frame {attached.frame!r}{nearest(attached.frame, known)}"
+        raise RecipeError([f"robot.tip: {text}; its frames: {listed(known)}"])
+    index = frame_of(model, attached.frame)
+    frame = model.frames[index]
+    placement = frame.placement * pin.SE3(attached.rotation, attached.translation)
+    if attached.tip != attached.frame:
+        model.addFrame(pin.Frame(attached.tip, frame.parentJoint, index, placement, pin.FrameType.OP_FRAME), False)
+    if body := attached.payload:
+        inertia = pin.Inertia(body.mass, np.array(body.centre), body.inertia_matrix)
+        model.appendBodyToJoint(frame.parentJoint, inertia, placement)
+    for name, (low, high) in attached.ranges.items():
+        place = model.idx_qs[model.getJointId(name)]
+        model.lowerPositionLimit[place], model.upperPositionLimit[place] = low, high
+
+
+def bounded(urdf: str, tree: ElementTree.Element, attached: Attached) -> str:
+    """Return a URDF in which continuous joints with a given range are revolute; the tree is modified in place."""
+    turning = [joint for joint in tree.iter("joint") if joint.get("type") == "continuous"]
+    given = [joint for joint in turning if joint.get("name") in attached.ranges]
+    for joint in given:
+        joint.set("type", "revolute")
+        limit = joint.find("limit")
+        if limit is None:
+            limit = ElementTree.SubElement(joint, "limit", velocity="0", effort="0")
+        limit.attrib.update(lower="0", upper="0")
+    return ElementTree.tostring(tree, encoding="unicode") if given else urdf

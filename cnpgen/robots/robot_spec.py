@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cnpgen.robots.parameter_ranges import PAYLOAD_CENTRE
+from cnpgen.robots.parameter_ranges import PAYLOAD_CENTRE, optional_key
 from cnpgen.schema.keys import PerJoint, Range, field
 
 GEOMETRIES = ("urdf", "paper-capsules")
@@ -23,66 +23,50 @@ class RobotSpec:
     )
     tip: str = field("name of the tip frame (URDF link)")
     base: tuple[float, ...] = field("base configuration of the planned joints", unit="rad", plausible=100.0)
-    tip_offset: tuple[float, float, float] = field(
-        "offset of the tip in the frame 'tip': x, y, z",
-        unit="m",
-        default=(0.0, 0.0, 0.0),
-        since_version=2,
-        plausible=5.0,
+    tip_offset: tuple[float, float, float] = optional_key(
+        "offset of the tip in the frame 'tip': x, y, z", unit="m", default=(0.0, 0.0, 0.0), plausible=5.0
     )
-    tip_rotation: tuple[float, float, float] = field(
+    tip_rotation: tuple[float, float, float] = optional_key(
         "rotation of the tip in the frame 'tip': roll, pitch and yaw about fixed axes",
         unit="rad",
         default=(0.0, 0.0, 0.0),
         plausible=2 * np.pi,
-        since_version=2,
     )
-    geometry: str = field(
+    geometry: str = optional_key(
         'its shape: "urdf", the URDF\'s <collision> elements, or "paper-capsules", a line through the joints\' origins'
         ' that is one radius thick; by default "urdf" where there are obstacles and such elements',
         choices=GEOMETRIES,
         default="paper-capsules",
-        since_version=2,
     )
-    locked_joints: tuple[str, ...] = field(
+    locked_joints: tuple[str, ...] = optional_key(
         "joints that are not planned and stay at other positions than zero, such as those of an open gripper",
         default=(),
-        since_version=2,
     )
-    locked_positions: tuple[float, ...] = field(
-        "their positions, one per joint", unit="rad", default=(), plausible=100.0, since_version=2
+    locked_positions: tuple[float, ...] = optional_key(
+        "their positions, one per joint", unit="rad", default=(), plausible=100.0
     )
-    packages: tuple[str, ...] = field(
-        "folders, relative to the problem file, that are searched for package:// of the URDF",
-        default=(),
-        since_version=2,
+    packages: tuple[str, ...] = optional_key(
+        "folders, relative to the problem file, that are searched for package:// of the URDF", default=()
     )
-    convex_parts: int = field(
-        "maximum number of convex parts of a collision mesh; 1 for its convex hull",
-        default=1,
-        low=1,
-        high=64,
-        since_version=2,
+    convex_parts: int = optional_key(
+        "maximum number of convex parts of a collision mesh; 1 for its convex hull", default=1, low=1, high=64
     )
-    decomposed: tuple[str, ...] = field(
-        "links whose collision meshes are decomposed into convex parts; by default all", default=(), since_version=2
+    decomposed: tuple[str, ...] = optional_key(
+        "links whose collision meshes are decomposed into convex parts; by default all", default=()
     )
-    hull_gap: float | None = field(
+    hull_gap: float | None = optional_key(
         "fraction of the random states without overlap of the links' triangle meshes in which their convex parts"
         " overlap, as 'cnpgen init' measured it",
-        default=None,
         low=0.0,
         high=1.0,
-        since_version=2,
     )
-    srdf: str = field(
+    srdf: str = optional_key(
         "SRDF file, relative to the problem file, whose disabled pairs of links are not checked; without it they are"
         " found by sampling",
         default="",
-        since_version=2,
     )
-    ignored_pairs: tuple[tuple[str, str], ...] = field(
-        "pairs of links whose collisions are not checked, besides those of the SRDF", default=(), since_version=2
+    ignored_pairs: tuple[tuple[str, str], ...] = optional_key(
+        "pairs of links whose collisions are not checked, besides those of the SRDF", default=()
     )
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
@@ -117,34 +101,24 @@ class LimitSpec:
         "maximum of the acceleration limits", unit="rad/s^2", default=20.0, low=1e-3, plausible=1000.0
     )
     torque_scale: float = field("planning limit / URDF limit of joint torques", default=1.0, low=1e-3, high=1.0)
-    position: tuple[Range, ...] | None = field(
+    position: tuple[Range, ...] | None = optional_key(
         "limits of joint positions in place of the URDF's, one range per planned joint; required for continuous joints",
         unit="rad",
         plausible=100.0,
-        default=None,
-        since_version=2,
     )
-    velocity: PerJoint | None = field(
-        "limits of joint velocities in place of the URDF's", unit="rad/s", default=None, low=1e-6, since_version=2
+    velocity: PerJoint | None = optional_key(
+        "limits of joint velocities in place of the URDF's", unit="rad/s", low=1e-6
     )
-    acceleration: PerJoint | None = field(
-        "planning limits of joint accelerations in place of rate and cap",
-        unit="rad/s^2",
-        default=None,
-        low=1e-6,
-        since_version=2,
+    acceleration: PerJoint | None = optional_key(
+        "planning limits of joint accelerations in place of rate and cap", unit="rad/s^2", low=1e-6
     )
-    jerk: PerJoint | None = field(
+    jerk: PerJoint | None = optional_key(
         "planning limits of joint jerks; default 5/s times those of the accelerations",
         unit="rad/s^3",
-        default=None,
         low=1e-6,
-        since_version=2,
         plausible=1e5,
     )
-    torque: PerJoint | None = field(
-        "limits of joint torques in place of the URDF's", unit="N m", default=None, low=1e-6, since_version=2
-    )
+    torque: PerJoint | None = optional_key("limits of joint torques in place of the URDF's", unit="N m", low=1e-6)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,10 +145,9 @@ class Payload:
         plausible=10.0,
     )
 
-    touch_links: tuple[str, ...] = field(
+    touch_links: tuple[str, ...] = optional_key(
         "links that carry the payload and may touch it; its box of 'size' is then a body that touches nothing else",
         default=(),
-        since_version=2,
     )
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
@@ -223,6 +196,6 @@ class HeldObject:
     size: tuple[float, float, float] = field(
         "edge lengths along the tip frame's x, y, z", unit="m", low=1e-6, plausible=10.0
     )
-    touch_links: tuple[str, ...] = field(
-        "links that carry the object and may touch it (constraint 'object-clearance')", default=(), since_version=2
+    touch_links: tuple[str, ...] = optional_key(
+        "links that carry the object and may touch it (constraint 'object-clearance')", default=()
     )

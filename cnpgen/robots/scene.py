@@ -1,4 +1,4 @@
-"""The scene of samples: their obstacles with poses and sizes."""
+"""The scene of samples: their obstacles with poses and sizes; scene tables of datasets in the same layout."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.shape.hull import MAX_COORDINATE_M
-from cnpgen.robots.solid import Solid, pose_width, solids_of
+from cnpgen.robots.shape.hull import MAX_COORDINATE_M, Array
+from cnpgen.robots.solid import Solid, number_slices, place_obstacles, pose_width, posed_numbers, solids_of
 from cnpgen.schema.arguments import integer
-
-Array = NDArray[np.float64]
+from cnpgen.store.scene_table import NO_OBSTACLE, OBSTACLE_KINDS, SceneTable
 
 PARKED_POSITION_M = (0.0, 0.0, -100.0)  # of obstacles that a sample with fewer obstacles does not have
 
@@ -50,10 +49,8 @@ class Scene:
     def __getitem__(self, index: int | slice | Sequence[int] | NDArray[Any]) -> Scene:
         """Select samples; an integer selects one sample and keeps the first axis."""
         rows = slice(index, index + 1 or None) if isinstance(index, int) else index
-        if isinstance(index, int) and not -len(self) <= index < len(self):  # ends a loop over the samples, too
-            raise SampleIndexError(
-                f"there is no sample {index}: {len(self)} samples are numbered from 0", concerns="index"
-            )
+        if isinstance(index, int):  # ends a loop over the samples, too
+            self._check_sample(index, "index")
         try:
             return Scene(self.obstacles, self.poses[rows])
         except IndexError as error:
@@ -96,9 +93,90 @@ class Scene:
 
     def bodies(self, sample: int = 0) -> list[Solid]:
         """Return the obstacles of one sample as convex bodies in the world frame."""
-        sample = integer("sample", sample)
-        if not -len(self) <= sample < len(self):
-            raise SampleIndexError(
-                f"there is no sample {sample}: {len(self)} samples are numbered from 0", concerns="sample"
-            )
+        self._check_sample(sample := integer("sample", sample), "sample")
         return solids_of(self.obstacles, self.poses[sample])
+
+    def _check_sample(self, sample: int, argument: str) -> None:
+        if not -len(self) <= sample < len(self):
+            text = f"there is no sample {sample}: {len(self)} samples are numbered from 0"
+            raise SampleIndexError(text, concerns=argument)
+
+
+def sample_obstacles(obstacles: Sequence[Obstacle]) -> dict[str, list[int]]:
+    """Return the obstacles that samples place: kind -> indices; they are parked far below the robot."""
+    parked: dict[str, list[int]] = {kind: [] for kind in OBSTACLE_KINDS}
+    for index, obstacle in enumerate(obstacles):
+        if obstacle.position == PARKED_POSITION_M and obstacle.kind in parked:
+            parked[obstacle.kind].append(index)
+    return parked
+
+
+def scene_capacity(obstacles: Sequence[Obstacle]) -> int:
+    """Return the number of obstacles that samples place."""
+    return sum(map(len, sample_obstacles(obstacles).values()))
+
+
+def make_scene_table(layouts: Sequence[Sequence[Obstacle]], families: Sequence[int], obstacles: int) -> SceneTable:
+    """Return the obstacles of S scenes, at most O each, as arrays; scene IDs are the indices of the scenes.
+
+    No obstacle is upright, below an object, or a mesh.
+    """
+    count = np.array([len(layout) for layout in layouts], np.int64)
+    real = np.arange(obstacles) < count[:, None]
+    flat = [obstacle for layout in layouts for obstacle in layout]
+    kind = np.full(real.shape, NO_OBSTACLE, np.int64)
+    size, position, quaternion = (np.zeros((*real.shape, width)) for width in (3, 3, 4))
+    quaternion[..., 0] = 1.0
+    kind[real] = [OBSTACLE_KINDS.index(obstacle.kind) for obstacle in flat]
+    if flat:
+        size[real] = [obstacle.size or (obstacle.radius, obstacle.length or 0.0, 0.0) for obstacle in flat]
+        position[real] = [obstacle.position for obstacle in flat]
+        quaternion[real] = _quaternions(np.array([obstacle.rotation for obstacle in flat]))
+    return SceneTable(np.arange(len(layouts)), np.array(families, np.int64), count, kind, size, position, quaternion)
+
+
+def _quaternions(rotation: Array) -> Array:
+    """Return the quaternions (w, x, y, z) of roll, pitch and yaw about fixed axes [rad], shape (M, 3) -> (M, 4)."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rotation.T / 2), np.sin(rotation.T / 2)
+    w, x = cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy
+    y, z = cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy
+    return np.stack([w, x, y, z], axis=1)
+
+
+def rotations_of(table: SceneTable) -> Array:
+    """Return the rotation matrices of the obstacles, whose columns are their axes, shape (S, O, 3, 3)."""
+    quaternion = table.obstacle_quaternion.astype(np.float64)
+    return rotation_matrices(quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True))
+
+
+def rotation_matrices(wxyz: Array) -> Array:
+    """Return the rotation matrices of unit quaternions (w, x, y, z), shape (..., 4) -> (..., 3, 3)."""
+    w, x, y, z = np.moveaxis(wxyz, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
+def scene_poses(obstacles: Sequence[Obstacle], table: SceneTable) -> Array:
+    """Return the poses and sizes of a problem's obstacles in every scene (``cnpgen.robots.solid``), shape (S, width).
+
+    The obstacles of a scene take the places of the parked obstacles of their kind, in order; the others stay parked.
+    """
+    poses = np.tile(place_obstacles(obstacles), (len(table), 1))
+    slices, rotations = number_slices(obstacles), rotations_of(table)
+    position, size = table.obstacle_position.astype(np.float64), table.obstacle_size.astype(np.float64)
+    for code, (kind, places) in enumerate(sample_obstacles(obstacles).items()):
+        scenes, entries = np.nonzero(table.obstacle_kind == code)
+        rank = np.cumsum(table.obstacle_kind == code, axis=1)[scenes, entries] - 1
+        if len(rank) and rank.max() >= len(places):
+            raise UsageError(f"a scene has {rank.max() + 1} obstacles of the kind {kind}, expected {len(places)}")
+        if not len(rank):
+            continue
+        numbers = posed_numbers(kind, position[scenes, entries], size[scenes, entries], rotations[scenes, entries])
+        first = np.array([slices[place].start for place in places])[rank]
+        poses[scenes[:, None], first[:, None] + np.arange(numbers.shape[1])] = numbers
+    assert poses.shape[1] == pose_width(obstacles)
+    return poses

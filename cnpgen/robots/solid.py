@@ -19,15 +19,12 @@ from dataclasses import dataclass
 from itertools import accumulate, pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import PRISM_SIDES, prism, turned
-from cnpgen.robots.shape.hull import CUBE, frame_along
+from cnpgen.robots.shape.hull import CUBE, Array, frame_along
 from cnpgen.robots.shape.inline import corners_of
 from cnpgen.schema.keys import Range
-
-Array = NDArray[np.float64]
 
 UNBOUNDED_OBSTACLE_HEIGHT_M = 10.0  # height of the box that represents an obstacle without a lower end
 _NOTHING = (0.0, 0.0, 0.0)
@@ -113,16 +110,25 @@ def place_obstacles(obstacles: Sequence[Obstacle], bottoms: Mapping[str, Array] 
 
 def _posed_numbers(obstacle: Obstacle) -> Array:
     """Return the pose and size entries of an obstacle with a pose."""
-    turn, radius, half = turned(*obstacle.rotation), obstacle.radius or 0.0, (obstacle.length or 0.0) / 2
-    edges = np.array(obstacle.size or _NOTHING) / 2
-    by_kind: dict[str, Sequence[float]] = {
-        "box": [*edges, *(turn.ravel() if obstacle.is_turned else ())],
-        "sphere": [radius],
-        "capsule": [*(half * turn[:, 2]), radius],
-        "cylinder": [*(half * turn[:, 2]), radius / math.cos(math.pi / PRISM_SIDES)],
-        "mesh": [*turn.ravel()],
-    }
-    return np.array([*(obstacle.position or _NOTHING), *by_kind[obstacle.kind]])
+    size = obstacle.size or (obstacle.radius or 0.0, obstacle.length or 0.0, 0.0)
+    poses = (np.array([values]) for values in (obstacle.position or _NOTHING, size, turned(*obstacle.rotation)))
+    return posed_numbers(obstacle.kind, *poses)[0, : _count(obstacle)]  # without the rotation of a box that has none
+
+
+def posed_numbers(kind: str, position: Array, size: Array, rotation: Array) -> Array:
+    """Return the pose and size entries of M rotated obstacles of a kind, shape (M, width).
+
+    Positions and sizes (edge lengths, or radius and length) [m] have shape (M, 3), rotations (M, 3, 3).
+    """
+    turn, radius = rotation.reshape(-1, 9), size[:, :1]
+    if kind == "box":
+        return np.concatenate([position, size / 2, turn], axis=1)
+    if kind == "mesh":
+        return np.concatenate([position, turn], axis=1)
+    if kind == "sphere":
+        return np.concatenate([position, radius], axis=1)
+    outer = radius / math.cos(math.pi / PRISM_SIDES) if kind == "cylinder" else radius
+    return np.concatenate([position, size[:, 1:2] / 2 * rotation[..., 2], outer], axis=1)
 
 
 def solids_of(obstacles: Sequence[Obstacle], numbers: Array) -> list[Solid]:

@@ -6,11 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.robots.parameter_ranges import UPRIGHT_TURN, ParameterRanges
-
-Array = NDArray[np.float64]
+from cnpgen.robots.shape.hull import Array
 
 
 @dataclass(frozen=True)

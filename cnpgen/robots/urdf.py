@@ -45,11 +45,7 @@ class _Builder(ElementTree.TreeBuilder):
 
 
 def read_urdf(path: Path) -> str:
-    """Read the text of a URDF file.
-
-    Raises:
-        RecipeError: The file cannot be read, is too large or is not UTF-8.
-    """
+    """Read the text of a URDF file; RecipeError if it cannot be read, is too large or is not UTF-8."""
     try:
         return utf8_text(read_at_most(path, MAX_URDF_BYTES, "a URDF"), "utf-8", hint="; save the URDF as UTF-8")
     except OSError as error:
@@ -59,11 +55,7 @@ def read_urdf(path: Path) -> str:
 
 
 def urdf_tree(text: str) -> ElementTree.Element:
-    """Parse the text of a URDF.
-
-    Raises:
-        ValueError: The text is not XML, too deep or too large, or it defines entities.
-    """
+    """Parse the text of a URDF; ValueError if it is not XML, too deep or too large, or defines entities."""
     if len(text) > MAX_URDF_BYTES:
         raise ValueError(f"it has {len(text):,} characters, expected at most {MAX_URDF_BYTES:,}")
     parser = ElementTree.XMLParser(target=_Builder(), encoding="utf-8")  # noqa: S314 - the builder allows no entities
@@ -98,11 +90,7 @@ def numbers_text(values: Iterable[float]) -> str:
 
 
 def number_in(element: ElementTree.Element | None, attribute: str, default: float) -> float:
-    """Return a numeric attribute of an element.
-
-    Raises:
-        ValueError: The attribute is not a number.
-    """
+    """Return a numeric attribute of an element; ValueError if it is not a number."""
     return numbers_in(element, attribute, (default,))[0]
 
 
@@ -110,9 +98,6 @@ def numbers_in(element: ElementTree.Element | None, attribute: str, default: tup
     """Return the numbers in an attribute of an element; as many as the default ones of a missing attribute or element.
 
     The accepted notation is that of URDF parsers, which drop an element with other numbers without an error.
-
-    Raises:
-        ValueError: The attribute does not have as many finite decimal numbers.
     """
     text = None if element is None else element.get(attribute)
     if element is None or text is None:

@@ -18,7 +18,7 @@ from cnpgen.machine.engine import Engine, assembled
 from cnpgen.make.recipe import restored
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES
 from cnpgen.problems.load_robot import load_robot
-from cnpgen.robots.scene_arrays import scene_poses
+from cnpgen.robots.scene import scene_poses
 from cnpgen.store.check import DELETE_HINT, Finding
 from cnpgen.store.checked_shard import Shard, read_checked, read_scenes
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask

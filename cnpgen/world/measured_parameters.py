@@ -94,8 +94,8 @@ class MeasuredParameters:
         assert payload is not None
         joint, bare, placement = self._load
         mass = self.values.get("payload_mass", payload.mass)
-        centre = [self.values.get(name, value) for name, value in zip(PAYLOAD_CENTRE, payload.com, strict=True)]
-        shape = payload.inertia * self.values.get("payload_inertia", 1.0)
+        centre = [self.values.get(name, value) for name, value in zip(PAYLOAD_CENTRE, payload.centre, strict=True)]
+        shape = payload.inertia_matrix * self.values.get("payload_inertia", 1.0)
         body = pin.Inertia(mass, np.array(centre), shape * (mass / payload.mass))
         self.model.inertias[joint] = bare + placement.act(body)
 

@@ -7,10 +7,9 @@ from scipy.optimize import least_squares
 
 from cnpgen.problems.constraints.axis import Axis
 from cnpgen.problems.constraints.constraint import Constraint
-from cnpgen.problems.constraints.line import Line
-from cnpgen.problems.constraints.plane import Plane
+from cnpgen.problems.constraints.joint import TipSpeed
+from cnpgen.problems.constraints.plane import Line, Plane
 from cnpgen.problems.constraints.pose import Pose
-from cnpgen.problems.constraints.tip_speed import TipSpeed
 from cnpgen.problems.problem import Problem
 from cnpgen.schema.keys import Range
 from cnpgen.world.world import World

@@ -11,8 +11,7 @@ import pytest
 from cnpgen.errors import UsageError
 from cnpgen.losses.metric import BOUNDED, PUBLISHED, Metric, MetricSettings, alpha_step, average_loss, suggested_weights
 from cnpgen.problems.constraints.axis import Axis, Vertical
-from cnpgen.problems.constraints.line import Line
-from cnpgen.problems.constraints.plane import Plane
+from cnpgen.problems.constraints.plane import Line, Plane
 from cnpgen.problems.constraints.pose import Pose
 from cnpgen.problems.constraints.table import Table
 from tests.examples.constraints import TipSpeed

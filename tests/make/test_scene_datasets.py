@@ -15,8 +15,8 @@ from cnpgen.errors import DatasetError, UsageError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.make.publish import write_repository
 from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.obstacles import with_capacity
 from cnpgen.problems.problem_record import as_record, open_problem
-from cnpgen.problems.scene_capacity import with_capacity
 from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.scenes import BasisPoints, observe
 from cnpgen.store.reader import open_dataset

@@ -10,7 +10,7 @@ from cnpgen.errors import RecipeError
 from cnpgen.pipelines.prepared import Block, PreparedPipeline, as_stored, random_generator
 from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS, CandidateBatch
-from cnpgen.problems.constraints.object_clearance import ObjectClearance
+from cnpgen.problems.constraints.link_clearance import ObjectClearance
 from cnpgen.store.field import Field
 from cnpgen.store.sampling_statistics import SamplingStatistics, merge_sampling
 from tests.conftest import SHIPPED, Prepare, needs_compiler, some

@@ -16,10 +16,9 @@ from cnpgen.pipelines.stages.scene_clearance import SceneClearance
 from cnpgen.pipelines.stages.scene_ends import MAX_POSE_IK_STEPS, NO_ENDS, POSE_TOLERANCE, pose_ik_step
 from cnpgen.pipelines.stages.stage import CandidateBatch, Context, load_context
 from cnpgen.problems.load_robot import load_robot
-from cnpgen.problems.scene_capacity import with_capacity
-from cnpgen.robots.observation.primitives import KINDS, primitives_of
-from cnpgen.robots.observation.signed_distance import signed_distances
-from cnpgen.robots.scene_arrays import make_scene_table, scene_capacity
+from cnpgen.problems.obstacles import with_capacity
+from cnpgen.robots.observation.primitives import KINDS, primitives_of, signed_distances
+from cnpgen.robots.scene import make_scene_table, scene_capacity
 from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.store.scene_table import OBSTACLE_KINDS
 from cnpgen.world.pose_ik import PoseKinematics

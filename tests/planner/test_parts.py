@@ -13,7 +13,7 @@ from cnpgen.planner.inference_pipeline import make_inference_pipeline
 from cnpgen.planner.time_scaling import MAX_TIME_SCALE, SCALING_INTERVALS, make_time_scaling
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import make_plans
-from cnpgen.problems.equalities import equality_residuals
+from cnpgen.problems.conditions import equality_residuals
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem_record import as_problem
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble

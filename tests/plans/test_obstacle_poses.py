@@ -11,7 +11,7 @@ from cnpgen.errors import UsageError
 from cnpgen.plans.plans import make_plans
 from cnpgen.problems.constraints.axis import Vertical
 from cnpgen.problems.constraints.clearance import ObjectContact
-from cnpgen.problems.constraints.object_clearance import ObjectClearance
+from cnpgen.problems.constraints.link_clearance import ObjectClearance
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.solid import place_obstacles

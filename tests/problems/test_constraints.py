@@ -13,19 +13,23 @@ import pytest
 
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
+from cnpgen.problems.conditions import measured_needs, symbolic_needs
 from cnpgen.problems.constraints.axis import Axis, Vertical
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, Condition, Constraint
-from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, JointPosition, JointTorque, JointVelocity
-from cnpgen.problems.constraints.line import Line
-from cnpgen.problems.constraints.needs import measured_needs, symbolic_needs
-from cnpgen.problems.constraints.object_clearance import ObjectClearance
-from cnpgen.problems.constraints.plane import Plane
+from cnpgen.problems.constraints.joint import (
+    JointAcceleration,
+    JointJerk,
+    JointPosition,
+    JointTorque,
+    JointVelocity,
+    TipSpeed,
+)
+from cnpgen.problems.constraints.link_clearance import ObjectClearance, SelfClearance
+from cnpgen.problems.constraints.plane import Line, Plane
 from cnpgen.problems.constraints.pose import Pose
 from cnpgen.problems.constraints.puck_contact import PuckContact
-from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.constraints.table import Table
-from cnpgen.problems.constraints.tip_speed import TipSpeed
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem

@@ -11,8 +11,8 @@ from scipy.interpolate import BSpline
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState, time_derivatives
+from cnpgen.problems.conditions import measured_needs, symbolic_needs
 from cnpgen.problems.constraints.joint import JointJerk
-from cnpgen.problems.constraints.needs import measured_needs, symbolic_needs
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem

@@ -12,7 +12,7 @@ import pytest
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
-from cnpgen.problems.constraints.object_clearance import ObjectClearance
+from cnpgen.problems.constraints.link_clearance import ObjectClearance
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem

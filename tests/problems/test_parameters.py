@@ -15,7 +15,7 @@ from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.plans.plans import make_plans
 from cnpgen.problems.constraints.clearance import ObjectContact
-from cnpgen.problems.constraints.object_clearance import ObjectClearance
+from cnpgen.problems.constraints.link_clearance import ObjectClearance
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem, resolved

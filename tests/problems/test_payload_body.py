@@ -14,7 +14,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import as_problem, open_problem, record_problem, with_payload_of
 from cnpgen.robots.robot_spec import Payload
-from cnpgen.robots.shape.payload_link import PAYLOAD
+from cnpgen.robots.urdf_changes import PAYLOAD
 from tests.examples.shaped_robot import write_problem
 
 BODY = """

@@ -13,7 +13,7 @@ from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint
-from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.constraints.link_clearance import SelfClearance
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.shape.link_pairs import segment_distances
 from cnpgen.robots.solid import place_obstacles

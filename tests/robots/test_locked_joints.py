@@ -10,7 +10,7 @@ from cnpgen.errors import RecipeError
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import open_problem, record_problem
-from cnpgen.robots.locked_joints import with_locked_joints
+from cnpgen.robots.urdf_changes import with_locked_joints
 from tests.examples.shaped_robot import urdf, write_problem
 
 LIFT, GRIP = 0.7, -0.4  # rad and m

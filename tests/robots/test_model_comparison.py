@@ -12,10 +12,9 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import ProblemRecord, record_problem
 from cnpgen.robots.chain import name_links_uniquely
-from cnpgen.robots.model_comparison import check_model
 from cnpgen.robots.robot import reduced_model
 from cnpgen.robots.urdf import urdf_tree
-from cnpgen.robots.urdf_parameters import urdf_parameters
+from cnpgen.robots.urdf_parameters import check_model, urdf_parameters
 from tests.examples.urdf_reading import bodies_in, differences
 from tests.faults.mutations import changed_number
 

@@ -13,8 +13,7 @@ from scipy.spatial import ConvexHull, KDTree
 from cnpgen.errors import RecipeError
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
-from cnpgen.robots.attached import Attached
-from cnpgen.robots.robot import reduced_model
+from cnpgen.robots.robot import Attached, reduced_model
 from cnpgen.robots.shape import link_pairs as pairs
 from cnpgen.robots.shape import shape as module
 from cnpgen.robots.shape.capsule import covering_capsule
@@ -23,7 +22,7 @@ from cnpgen.robots.shape.hull import coal_hull, enclosing_hull, hull_corners
 from cnpgen.robots.shape.inline import corners_of, inline_mesh, with_inline_meshes
 from cnpgen.robots.shape.mesh_files import find_named_file
 from cnpgen.robots.shape.shape import Shape, load_shape
-from cnpgen.robots.shape.srdf import disabled_pairs, with_disabled_pairs
+from cnpgen.robots.urdf_changes import disabled_pairs, with_disabled_pairs
 from tests.examples.shaped_robot import CLAW, LINKS, PLANNED, WEDGE, stl, urdf, write_crane, write_problem
 
 DAE = """<?xml version="1.0"?>

@@ -27,11 +27,10 @@ from cnpgen.planner.tasks import ends_of
 from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plan_file import load_plans
 from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.obstacles import with_capacity
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import record_problem
-from cnpgen.problems.scene_capacity import with_capacity
-from cnpgen.robots.observation.primitives import primitives_of
-from cnpgen.robots.observation.signed_distance import signed_distances
+from cnpgen.robots.observation.primitives import primitives_of, signed_distances
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.shape.hull import hull_corners

@@ -22,7 +22,7 @@ from cnpgen.pipelines.stages.torque import GravityTorque
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, JointPosition, JointTorque, JointVelocity
-from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.constraints.link_clearance import SelfClearance
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot

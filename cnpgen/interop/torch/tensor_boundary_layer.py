@@ -11,7 +11,7 @@ from cnpgen.planner.control_point_functions import MAX_STEP_RAD, PROJECTION_DAMP
 from cnpgen.planner.control_points import along_line
 from cnpgen.planner.expressions import effective_steps
 from cnpgen.planner.tasks import Tasks
-from cnpgen.problems.equalities import equality_residuals
+from cnpgen.problems.conditions import equality_residuals
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.schema.argument_types import checked_arguments
 

@@ -17,9 +17,9 @@ from cnpgen.errors import UsageError
 from cnpgen.judges.plans.continuous_collision import is_contact
 from cnpgen.judges.plans.joint_limits import ProvenJointLimits
 from cnpgen.judges.plans.measure import EvaluationContext, MeasuredCondition, measure
+from cnpgen.problems.conditions import measured_needs
 from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.joint import JointPosition
-from cnpgen.problems.constraints.needs import measured_needs
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.arguments import check_range

@@ -15,8 +15,8 @@ from cnpgen.errors import DatasetError
 from cnpgen.judges.plans.judge import judge
 from cnpgen.judges.rows.hits import HitRule, highest_speed, judge_goals, velocity_factors
 from cnpgen.judges.rows.row_report import ENDS, Array, Check, Index, RowReport, compare, merge
+from cnpgen.problems.conditions import measured_needs
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, Condition
-from cnpgen.problems.constraints.needs import measured_needs
 from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot

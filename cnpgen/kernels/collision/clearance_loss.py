@@ -16,8 +16,7 @@ from cnpgen.kernels.collision.body_arrays import primitive_bodies
 from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CollisionChecker, load_collision_library
 from cnpgen.kernels.compiled_kernel import address_of
 from cnpgen.kernels.library import KernelLibrary
-from cnpgen.robots.observation.primitives import KINDS, Primitives, bodies_of
-from cnpgen.robots.observation.signed_distance import smallest_signed_distances
+from cnpgen.robots.observation.primitives import KINDS, Primitives, bodies_of, smallest_signed_distances
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.convex_part import ConvexPart
 from cnpgen.robots.shape.hull import ball_round, coal_hull

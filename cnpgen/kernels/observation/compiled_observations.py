@@ -1,4 +1,4 @@
-"""Observations of scenes in compiled code, for ``observe.c``; ``reference.py`` is the same in NumPy."""
+"""Observations of scenes in compiled code, for ``observe.c``; ``ObservationBackend`` is the same in NumPy."""
 
 import ctypes
 from ctypes import c_int, c_long, c_void_p
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from cnpgen.kernels.compiled_kernel import address_of
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.robots.observation.camera import Camera
+from cnpgen.robots.observation.observations import ObservationBackend
 from cnpgen.robots.observation.primitives import Primitives
-from cnpgen.robots.observation.reference import NumpyObservations, ObservationBackend
 from cnpgen.robots.observation.surface_points import Seeds
 
 Array = NDArray[np.float64]
@@ -43,7 +43,7 @@ class _SceneArrays(ctypes.Structure):
         super().__init__(*scenes.kinds.shape, *map(address_of, self._keep))
 
 
-class CompiledObservations:
+class CompiledObservations(ObservationBackend):
     """``ObservationBackend`` in compiled code: the library of observe.c."""
 
     def __init__(self, library: ctypes.CDLL) -> None:
@@ -96,4 +96,4 @@ def _view(camera: Camera) -> Array:
 def observation_backend(backend: str | None = None) -> ObservationBackend:
     """Return the functions of a backend of kernels: compiled ones, or their NumPy reference."""
     library = KernelLibrary(*choose_backend(backend), "").load_source(SOURCE)
-    return NumpyObservations() if library is None else CompiledObservations(library)
+    return ObservationBackend() if library is None else CompiledObservations(library)

@@ -18,8 +18,8 @@ from cnpgen.kernels.symbolic.linalg import (
     times,
     transposed_times,
 )
-from cnpgen.robots.attached import PayloadBody
 from cnpgen.robots.chain import Chain
+from cnpgen.robots.robot_spec import Payload
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def inverse_dynamics(
     dq: Vec,
     ddq: Vec,
     *,
-    payload: PayloadBody | None = None,
+    payload: Payload | None = None,
     loads: Sequence[Load] = (),
 ) -> Vec:
     """Return joint torques [N m] by recursive Newton-Euler in joint frames, at q [rad], dq and ddq of n scalars.
@@ -124,9 +124,9 @@ def _body_wrench(mass: float, com: Vec, inertia: list[Vec], motion: BodyMotion) 
     return force, add(spin, cross(com, force))
 
 
-def _load_wrench(chain: Chain, payload: PayloadBody, load: Load, motion: BodyMotion) -> tuple[Vec, Vec]:
+def _load_wrench(chain: Chain, payload: Payload, load: Load, motion: BodyMotion) -> tuple[Vec, Vec]:
     """Return the wrench of a load of the payload's mass in the last joint frame; see ``_body_wrench``."""
     turn = chain.tip_rotation
     com = add(constants(chain.tip_translation), times(rows_of(turn), load.centre))
-    inertia = [scale(row, load.shape) for row in rows_of(turn @ payload.inertia @ turn.T)]
+    inertia = [scale(row, load.shape) for row in rows_of(turn @ payload.inertia_matrix @ turn.T)]
     return _body_wrench(payload.mass, com, inertia, motion)

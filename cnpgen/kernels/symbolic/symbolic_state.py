@@ -119,7 +119,7 @@ class SymbolicState:
         chain, payload, values = self.robot.chain, self.robot.attached.payload, self.parameters
         if payload is None or not self.robot.parameters.changes_payload:
             return inverse_dynamics(chain, self.q, self.dq, ddq)
-        mass, nominal = values.get("payload_mass", payload.mass), constants(payload.com)
+        mass, nominal = values.get("payload_mass", payload.mass), list(payload.centre)
         if values.keys().isdisjoint(PAYLOAD_PARAMETERS[1:]):
             loads = [Load((mass - payload.mass) / payload.mass, nominal, 1.0)]
         else:  # the load in place of the nominal one

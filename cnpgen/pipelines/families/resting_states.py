@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.problems.constraints.clearance import RobotClearance
-from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.constraints.link_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot

@@ -15,7 +15,7 @@ from cnpgen.pipelines.stages.batch_scenes import batch_scenes
 from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.scenes.scene_problem import MAX_BASE_DEPTH_M
-from cnpgen.robots.scene_arrays import rotations_of, sample_obstacles
+from cnpgen.robots.scene import rotations_of, sample_obstacles
 from cnpgen.schema import registry
 from cnpgen.schema.keys import field
 from cnpgen.store.scene_table import OBSTACLE_KINDS, SceneTable

@@ -13,7 +13,7 @@ from cnpgen.pipelines.families.resting_states import RestingStates
 from cnpgen.pipelines.stages.batch_scenes import BatchScenes
 from cnpgen.pipelines.stages.stage import Array, Context
 from cnpgen.problems.constraints.clearance import RobotClearance
-from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.constraints.link_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.solid import place_obstacles, solids_of

@@ -17,9 +17,8 @@ from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.observation.compiled_observations import observation_backend
 from cnpgen.planner.tasks import Tasks
-from cnpgen.robots.observation.observations import BasisPoints
+from cnpgen.robots.observation.observations import BasisPoints, ObservationBackend
 from cnpgen.robots.observation.primitives import Primitives, scene_primitives
-from cnpgen.robots.observation.reference import ObservationBackend
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.shape.capsule import Capsule

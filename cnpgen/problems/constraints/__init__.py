@@ -1,1 +1,1 @@
-"""Constraints: one file per kind, each in a symbolic and a measured form."""
+"""Constraints: one file per kind or family of kinds, each kind in a symbolic and a measured form."""

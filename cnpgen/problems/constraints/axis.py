@@ -7,9 +7,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.constraint import Condition, Constraint, End
+from cnpgen.problems.constraints.constraint import Array, Condition, Constraint, End
 from cnpgen.problems.constraints.tip_manifold import Vector, along, beside, unit
 from cnpgen.robots.parameter_ranges import UPRIGHT_TOLERANCE
 from cnpgen.schema.keys import field
@@ -17,8 +16,6 @@ from cnpgen.schema.keys import field
 if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.world.world import World
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,11 +109,7 @@ class Axis(TipAxis):
     tolerance: float = field("additional angle that a valid motion may have", unit="rad", low=1e-9, plausible=1.0)
 
     def __post_init__(self) -> None:
-        """Check both directions.
-
-        Raises:
-            ValueError: A direction is zero or not finite.
-        """
+        """Check both directions; ValueError if one is zero or not finite."""
         unit(self.axis, "axis")
         unit(self.direction, "direction")
 

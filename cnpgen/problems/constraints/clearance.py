@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.robots.parameter_ranges import optional_key
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
@@ -14,7 +15,6 @@ if TYPE_CHECKING:
 
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.robots.obstacle import Obstacle
-    from cnpgen.robots.shape.shape import Shape
     from cnpgen.world.path import PathWorld
     from cnpgen.world.world import World
 
@@ -43,23 +43,6 @@ class DistanceConstraint(Constraint):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LinkClearance(DistanceConstraint):
-    """Base class: bodies that the robot moves are further than ``distance`` from each other."""
-
-    uses_obstacles = False
-    distance: float
-
-    @property
-    def effective_tolerance(self) -> float:
-        """Tolerance up to a penetration of ``MAX_LINK_PENETRATION_M``."""
-        return min(self.tolerance, self.distance + MAX_LINK_PENETRATION_M)
-
-    def met(self, path: "PathWorld", tolerance: float) -> NDArray[np.bool_]:
-        """Return a mask of the states with sufficient distances between the bodies."""
-        return path.pairs(self.bodies).clear_states(self.distance - tolerance)
-
-
-@dataclass(frozen=True, kw_only=True)
 class RobotClearance(DistanceConstraint):
     """Constraint: the robot is further than ``distance`` from every obstacle.
 
@@ -77,13 +60,8 @@ class RobotClearance(DistanceConstraint):
         default=None,
         plausible=2.0,
     )
-    distance: float = field(
-        "minimum distance of the robot from obstacles",
-        unit="m",
-        low=0.0,
-        default=0.0,
-        since_version=2,
-        plausible=2.0,
+    distance: float = optional_key(
+        "minimum distance of the robot from obstacles", unit="m", low=0.0, default=0.0, plausible=2.0
     )
     tolerance: float = field(
         "violation that a valid motion may have; links may enter obstacles by 0.1 mm, the paper's capsules by all"
@@ -179,12 +157,6 @@ class ObjectContact(DistanceConstraint):
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions on the solver's shapes of the obstacles."""
         return self._at_least([0.0] * len(world.obstacles), -self.depth, sufficient=_has_poses(world.obstacles))
-
-
-def names_of_pairs(shape: "Shape | None") -> tuple[str, ...]:
-    """Return the names of the checked pairs of convex parts."""
-    links = [part.link for part in shape.convex_parts] if shape else []
-    return tuple(f"{links[first]}, {links[second]}" for first, second in (shape.checked_pairs if shape else ()))
 
 
 def _is_cautious(state: "SymbolicState") -> bool:

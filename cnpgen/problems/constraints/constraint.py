@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from cnpgen.world.path import PathWorld
     from cnpgen.world.world import World
 
+Array = NDArray[np.float64]
 End = Literal["start", "goal"]
 
 MIN_TOLERANCE = 1e-9  # replaces a tolerance of zero in solvers and planners
@@ -60,19 +61,19 @@ class Condition:
     name: str
     unit: str
     g: list[Any]
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
+    lower: Array
+    upper: Array
     tolerance_kind: str
     parts: tuple[str, ...] = ()
     sufficient: bool = False
-    accepted: NDArray[np.float64] | None = None
+    accepted: Array | None = None
 
     @property
     def is_equality(self) -> bool:
         """Whether it is an equality."""
         return bool(np.array_equal(self.lower, self.upper))
 
-    def tolerance(self, dtype: str) -> NDArray[np.float64]:
+    def tolerance(self, dtype: str) -> Array:
         """Return the tolerance of g on a boundary state stored as ``dtype``, in the unit of g, shape (m,)."""
         exact = BOUNDARY_TOLERANCES[dtype][self.tolerance_kind]
         if self.tolerance_kind != "limit":
@@ -130,7 +131,7 @@ class Constraint(ABC):
     budget: float = field("accepted violation during training (the paper's C-bar^2)", low=0.0, default=0.0)
     weight: float = field("initial weight during training (the paper's e^alpha)", low=1e-12, default=1.0)
 
-    def allowed(self, condition: Condition) -> NDArray[np.float64]:
+    def allowed(self, condition: Condition) -> Array:
         """Return the tolerance of a condition for valid motions, in its unit, shape (m,)."""
         return np.full(len(condition.g), self.effective_tolerance)
 
@@ -139,9 +140,7 @@ class Constraint(ABC):
         """Violation that a valid motion may have: ``tolerance``, or less where it would permit penetration."""
         return self.tolerance
 
-    def bound_relaxation(
-        self, condition: Condition, s: NDArray[np.float64], start_tip: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def bound_relaxation(self, condition: Condition, s: Array, start_tip: Array) -> Array:
         """Return the relaxation of a condition's bounds at phases s of motions, in its unit, shape (..., K).
 
         By default zero; constraints that motions may violate at the start override it.
@@ -154,7 +153,7 @@ class Constraint(ABC):
         del condition
         return np.zeros((*start_tip.shape[:-1], len(s)))
 
-    def scene_values(self, goal_xyz: NDArray[np.float64], goal_velocity: NDArray[np.float64]) -> NDArray[np.float64]:  # noqa: ARG002
+    def scene_values(self, goal_xyz: Array, goal_velocity: Array) -> Array:  # noqa: ARG002
         """Return the values of N motions that the constraint depends on, shape (N, scene_width).
 
         The forms read them as ``scene_values`` of states and worlds. One constraint of a problem may have them.
@@ -165,9 +164,7 @@ class Constraint(ABC):
         """
         return np.empty((len(goal_xyz), 0))
 
-    def initial_tip_paths(
-        self, values: NDArray[np.float64], start_xyz: NDArray[np.float64]
-    ) -> list[NDArray[np.float64]]:
+    def initial_tip_paths(self, values: Array, start_xyz: Array) -> list[Array]:
         """Return tip paths for initial guesses where the straight line violates the constraint, by default none.
 
         Args:

@@ -1,15 +1,15 @@
-"""Joint limits: position, velocity, acceleration, jerk and torque, each within the planning limits of the robot.
+"""Limits of joints: position, velocity, acceleration, jerk and torque; limit of the speed of the tip.
 
-Tolerances of all but the position are fractions of the limit.
+Tolerances of all joint limits but the position are fractions of the limit.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.constraint import Array, Condition, Constraint
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ class _RelativeLimit(Constraint):
 
     tolerance: float = field("violation that a valid motion may have, as a fraction of the limit", low=0.0)
 
-    def allowed(self, condition: Condition) -> NDArray[np.float64]:
+    def allowed(self, condition: Condition) -> Array:
         """Return the fraction of the limit, shape (m,)."""
         return self.tolerance * condition.upper
 
@@ -113,3 +113,30 @@ class JointTorque(_RelativeLimit):
     reason = "joint torque limit"
     training_weight, training_factor = 1.5, 0.97
     condition_name, unit, rates, limit = "joint torque", "N m", "torque", "torque_limit"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TipSpeed(Constraint):
+    """Constraint: tip speed within a limit, ``|v| <= limit``, stated for the square, a smooth function."""
+
+    reason = "tip too fast"
+    limit: float = field("maximum speed of the tip", unit="m/s", low=1e-6)
+    tolerance: float = field("additional speed that a valid motion may have", unit="m/s", low=0.0, plausible=1.0)
+
+    def allowed(self, condition: Condition) -> Array:
+        """Return the tolerance of the square of the speed [m^2/s^2]."""
+        return np.full(len(condition.g), (self.limit + self.tolerance) ** 2 - self.limit**2)
+
+    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+        """State the square of the tip's speed [m^2/s^2]."""
+        return self._slow(state.tip_velocity)
+
+    def measured(self, world: "World") -> tuple[Condition, ...]:
+        """Evaluate Pinocchio's velocity of the tip."""
+        return self._slow(list(world.tip_velocity))
+
+    def _slow(self, velocity: Sequence[Any]) -> tuple[Condition, ...]:
+        square = velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2
+        return (
+            Condition("tip speed", "m^2/s^2", [square], np.array([-np.inf]), np.array([self.limit**2]), "velocity"),
+        )

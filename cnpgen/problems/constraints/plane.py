@@ -1,11 +1,11 @@
-"""Constraint: the tip in a plane of any direction, or in a rectangle of it."""
+"""Constraints: the tip in a plane or on a line of any direction, or in a part of it."""
 
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.problems.constraints.constraint import Array
 from cnpgen.problems.constraints.tip_manifold import BOUND_KINKS, TipManifold, TipRegion, Vector, beside, unit
 from cnpgen.schema.keys import Range, field
 
@@ -29,11 +29,7 @@ class Plane(TipManifold):
     tolerance: float = field("violation that a valid motion may have", unit="m", low=1e-9, plausible=0.5)
 
     def __post_init__(self) -> None:
-        """Check the directions.
-
-        Raises:
-            ValueError: A direction is zero or not finite, or the range of u or v has no direction.
-        """
+        """Check the directions; ValueError if one is zero or not finite, or a range of u or v has none."""
         if self.along is None and (self.u or self.v):
             raise ValueError("u and v need a direction in the plane that u is measured along: along = [1, 0, 0]")
         self._axes()
@@ -46,7 +42,7 @@ class Plane(TipManifold):
         bounded = [axis.tolist() for axis, _ in given]
         return TipRegion(np.array(self.point), [normal.tolist()], bounded, tuple(each for _, each in given))
 
-    def _axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _axes(self) -> tuple[Array, Array]:
         """Return the normal and both directions in the plane, unit vectors."""
         normal = unit(self.normal, "normal")
         if self.along is None:
@@ -54,3 +50,31 @@ class Plane(TipManifold):
         given = unit(self.along, "along")
         first = unit(given - normal * (normal @ given), "along, seen in the plane,")
         return normal, np.stack([first, np.cross(normal, first)])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line(TipManifold):
+    """Constraint: the tip is on a line through ``point`` along ``direction``; its end derivatives are along it."""
+
+    reason = "off the line"
+    kinks = BOUND_KINKS
+    inside_name, held_name = "line piece", "line distance"
+    velocity_name, acceleration_name = "velocity across the line", "acceleration across the line"
+    point: Vector = field("point of the line", unit="m")
+    direction: Vector = field("direction of the line, of any length")
+    piece: Range | None = field("range of the tip along the line, from the point", unit="m", default=None)
+    start_band: float = field(
+        "violation that the start of a motion may have", unit="m", default=0.0, low=0.0, plausible=0.5
+    )
+    tolerance: float = field("violation that a valid motion may have", unit="m", low=1e-9, plausible=0.5)
+
+    def __post_init__(self) -> None:
+        """Check the direction; ValueError if it is zero or not finite."""
+        unit(self.direction, "direction")
+
+    @cached_property
+    def place(self) -> TipRegion:
+        """Region of the tip: the line."""
+        direction = unit(self.direction, "direction")
+        bounded, ranges = ([direction.tolist()], (self.piece,)) if self.piece else ((), ())
+        return TipRegion(np.array(self.point), beside(direction).tolist(), bounded, ranges)

@@ -6,17 +6,14 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.constraint import Condition, End
+from cnpgen.problems.constraints.constraint import Array, Condition, End
 from cnpgen.problems.constraints.tip_manifold import TipManifold, TipRegion
 from cnpgen.schema.keys import Range, field
 
 if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.world.world import World
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,15 +78,21 @@ class Pose(TipManifold):
 
     def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
         """State position, orientation and their rates."""
-        moving = self._moving(state.tip_velocity, state.tip_acceleration)
-        turning = _turning(state.tip_angular_velocity, state.tip_angular_acceleration)
-        return (*self.symbolic(state), *moving, *turning)
+        return (*self.symbolic(state), *self._resting(state))
 
     def measured_at(self, world: "World", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
         """Evaluate position, orientation and their rates with Pinocchio."""
-        moving = self._moving(list(world.tip_velocity), list(world.tip_acceleration))
-        turning = _turning(list(world.tip_angular_velocity), list(world.tip_angular_acceleration))
-        return (*self.measured(world), *moving, *turning)
+        return (*self.measured(world), *self._resting(world))
+
+    def _resting(self, state: "SymbolicState | World") -> tuple[Condition, ...]:
+        """State that the tip moves along its free directions only and does not turn."""
+        zero, axes = np.zeros(3), ("x", "y", "z")
+        omega, alpha = list(state.tip_angular_velocity), list(state.tip_angular_acceleration)
+        return (
+            *self._moving(state.tip_velocity, state.tip_acceleration),
+            Condition("turning", "rad/s", omega, zero, zero, "velocity", axes),
+            Condition("turning acceleration", "rad/s^2", alpha, zero, zero, "acceleration", axes),
+        )
 
     def _turned(self, rotation: Sequence[Any]) -> tuple[Condition, ...]:
         wanted = self.rotation
@@ -100,12 +103,3 @@ class Pose(TipManifold):
             Condition("orientation", "rad", sine, np.zeros(3), np.zeros(3), "angle", ("x", "y", "z")),
             Condition("less than a quarter turn", "1", [cosine], np.zeros(1), np.full(1, np.inf), "angle"),
         )
-
-
-def _turning(omega: Sequence[Any], alpha: Sequence[Any]) -> tuple[Condition, ...]:
-    """State that the angular velocity and acceleration of the tip are zero."""
-    zero = np.zeros(3)
-    return (
-        Condition("turning", "rad/s", list(omega), zero, zero, "velocity", ("x", "y", "z")),
-        Condition("turning acceleration", "rad/s^2", list(alpha), zero, zero, "acceleration", ("x", "y", "z")),
-    )

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.constraint import Condition, Constraint, End
+from cnpgen.problems.constraints.constraint import Array, Condition, Constraint, End
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.world.world import World
 
-Array = NDArray[np.float64]
 
 ADDED_RADIUS_M = 1e-4  # so that motions do not touch the puck within a tolerance of this size
 ROUNDING = 0.02  # of the relaxation near the goal, relative to the overlap
@@ -80,10 +79,7 @@ class PuckContact(Constraint):
         return self.contact_range - self.contact_distance
 
     def scene_values(self, goal_xyz: Array, goal_velocity: Array) -> Array:
-        """Return the goal and the puck of N motions: x and y of both [m], shape (N, 4); out of reach if at rest.
-
-        See ``Constraint.scene_values``.
-        """
+        """Return the goal and the puck of N motions: x and y of both [m], shape (N, 4); out of reach if at rest."""
         goal, velocity = goal_xyz[:, :2], goal_velocity[:, :2]
         speed = np.hypot(velocity[:, :1], velocity[:, 1:])
         is_hit = speed > MIN_HIT_SPEED_M_S
@@ -151,7 +147,7 @@ class PuckContact(Constraint):
         l, permits contact in the disc of diameter l. The maximum is rounded, so that the verdict finds local maxima.
         """
         overlap = self.overlap + ADDED_RADIUS_M
-        relaxation = overlap * _positive_part(1 - from_goal / (overlap * self.last), ROUNDING)
+        relaxation = overlap * _positive_part(1 - from_goal / (overlap * self.last))
         return _at_least(self.contact_range + ADDED_RADIUS_M, distance + relaxation)
 
     def _cone(self, from_goal: Any, distance: Any, margin: float) -> tuple[Condition, ...]:
@@ -162,14 +158,11 @@ class PuckContact(Constraint):
         """
         overlap = self.overlap + ADDED_RADIUS_M + margin
         rho = (from_goal + MIN_SQUARED_PUCK_DISTANCE_M2) ** 0.5
-        relaxation = overlap * _positive_part(1 + (STRAIGHT_HIT_MARGIN_M - rho) / overlap, ROUNDING)
+        relaxation = overlap * _positive_part(1 + (STRAIGHT_HIT_MARGIN_M - rho) / overlap)
         return _at_least(self.contact_range + ADDED_RADIUS_M + margin, distance + relaxation)
 
     def initial_tip_paths(self, values: Array, start_xyz: Array) -> list[Array]:
-        """Return tip paths around the puck on either side, the shorter one first; none if it is not in the way.
-
-        See ``Constraint.initial_tip_paths``.
-        """
+        """Return tip paths around the puck on either side, the shorter one first; none if it is not in the way."""
         goal, puck, start = values[:2], values[2:], start_xyz[:2]
         hit = (puck - goal) / self.contact_distance
         entry = puck - (self.contact_range + self.overlap) * hit
@@ -193,9 +186,9 @@ class PuckContact(Constraint):
         return sorted(paths, key=lambda path: float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()))
 
 
-def _positive_part(value: Any, rounding: float) -> Any:
+def _positive_part(value: Any) -> Any:
     """Return ``max(value, 0)``, rounded."""
-    return (value + (value * value + rounding**2) ** 0.5) / 2
+    return (value + (value * value + ROUNDING**2) ** 0.5) / 2
 
 
 def _at_least(bound: float, distance: Any) -> tuple[Condition, ...]:

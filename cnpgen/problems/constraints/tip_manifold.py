@@ -11,16 +11,14 @@ from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.constraint import Condition, Constraint, End
+from cnpgen.problems.constraints.constraint import Array, Condition, Constraint, End
 from cnpgen.schema.keys import Range
 
 if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.world.world import World
 
-Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 Vectors = Sequence[Sequence[float]]  # Python floats, used in scalar products
 BOUND_KINKS = (0.1, 0.3)  # phases between which a motion that starts off the manifold must reach it
@@ -95,10 +93,8 @@ class TipManifold(Constraint):
     def measured_at(self, world: "World", end: End) -> tuple[Condition, ...]:
         """Evaluate position, velocity and acceleration with Pinocchio."""
         position = self._position(self._measured_tip(world), self._band_at(end), world.parameters.values)
-        velocity, acceleration = world.tip_velocity, world.tip_acceleration
-        if self.moves_with_table:
-            velocity, acceleration = map(world.parameters.along_table, (velocity, acceleration))
-        return (*position, *self._moving(list(velocity), list(acceleration)))
+        rates, turned = (world.tip_velocity, world.tip_acceleration), world.parameters.along_table
+        return (*position, *self._moving(*(map(turned, rates) if self.moves_with_table else rates)))
 
     def _symbolic_tip(self, state: "SymbolicState") -> Sequence[Any]:
         tip = state.kinematics.tip
@@ -141,7 +137,7 @@ class TipManifold(Constraint):
     def _band_at(self, end: End) -> float:
         return self.band if end == "start" else 0.0
 
-    def _moving(self, velocity: Sequence[Any], acceleration: Sequence[Any]) -> tuple[Condition, ...]:
+    def _moving(self, velocity: Sequence[Any] | Array, acceleration: Sequence[Any] | Array) -> tuple[Condition, ...]:
         """State that the tip moves along the manifold only."""
         held, parts = self.place.held, self.parts[1]
         if not held:
@@ -165,11 +161,7 @@ def along(direction: Sequence[float], vector: Sequence[Any] | Array) -> Any:
 
 
 def unit(vector: Sequence[float] | Array, what: str) -> Array:
-    """Return a vector divided by its length.
-
-    Raises:
-        ValueError: The length is zero or not finite.
-    """
+    """Return a vector divided by its length; ValueError if that is zero or not finite."""
     given = np.array(vector, float)
     length = np.linalg.norm(given)
     if not (np.isfinite(length) and length > 1e-9):

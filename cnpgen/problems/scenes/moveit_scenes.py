@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.problems.scenes.quaternions import quaternion_mistake, quaternion_of, rotation_matrix
 from cnpgen.problems.scenes.scene_problem import (
@@ -26,10 +25,9 @@ from cnpgen.problems.scenes.scene_problem import (
 from cnpgen.problems.scenes.yaml_document import part, scalar, vector
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import turned
-from cnpgen.robots.shape.hull import outward_triangles
+from cnpgen.robots.shape.hull import Array, outward_triangles
 from cnpgen.robots.shape.inline import corners_of
 
-Array = NDArray[np.float64]
 Pose = tuple[Array, Array]  # position [m] and rotation matrix
 
 _PRIMITIVES = {"1": "box", "2": "sphere", "3": "cylinder"}  # codes of shape_msgs/SolidPrimitive
@@ -46,9 +44,6 @@ def read_moveit(documents: dict[Path, Any]) -> Iterator[SceneProblem]:
 
     A request belongs to the scene in its own document, or to the scene in the same folder whose name differs by
     "request" and "scene" only: ``request0001.yaml`` and ``scene0001.yaml``. A scene without a request is an error.
-
-    Raises:
-        SceneError: A document is invalid, or a scene has no request.
     """
     for path, document in documents.items():
         is_scene = "collision_objects" in document or "world" in document
@@ -222,11 +217,7 @@ def _rotation(xyzw: Any, where: str) -> Array:
 
 
 def moveit_texts(scene: SceneProblem, joints: Sequence[str]) -> tuple[str, str]:
-    """Return a scene and its request, with these names of joints, as YAML.
-
-    Raises:
-        SceneError: An obstacle, such as a capsule, has no primitive in MoveIt, or the scene has no goal state.
-    """
+    """Return a scene and its request, with these names of joints, as YAML; SceneError without a primitive or a goal."""
     lines = [f"name: {_text(scene.name)}", "world:", "  collision_objects:" + ("" if scene.obstacles else " []")]
     for obstacle in scene.obstacles:
         if obstacle.kind not in ("mesh", *_PRIMITIVES.values()) or obstacle.position is None:

@@ -20,9 +20,8 @@ from cnpgen.problems.scenes.quaternions import quaternion_of
 from cnpgen.problems.scenes.scene_problem import MAX_SCENES, SceneError, SceneProblem, check_count, make_obstacle
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import turned
+from cnpgen.robots.shape.hull import Array
 from cnpgen.store.files.hdf5 import Hdf5, create_hdf5, opened_hdf5
-
-Array = NDArray[np.float64]
 
 _ENDS = (("start_q", "goal_q"), ("start_configs", "target_configs"))
 _TRAJECTORIES = ("global_solutions", "hybrid_solutions", "solutions")  # shape (N, T, n)
@@ -41,12 +40,7 @@ def is_mpinets(path: Path) -> bool:
 
 
 def read_mpinets(path: Path, rows: slice) -> Iterator[SceneProblem]:
-    """Yield the problems of a file.
-
-    Raises:
-        DatasetError: The file is damaged or no HDF5 file.
-        SceneError: A dataset is missing or has a wrong shape, or a number of an obstacle is invalid.
-    """
+    """Yield the problems of a file; DatasetError if it is damaged, SceneError if a dataset or obstacle is invalid."""
     with opened_hdf5(path) as file:
         start, goal = _ends(file, rows)
         count = len(start)
@@ -152,11 +146,7 @@ def _obstacles(numbers: dict[str, Array], place: str) -> Iterator[Obstacle]:
 
 
 def mpinets_bytes(scenes: Sequence[SceneProblem]) -> bytes:
-    """Return scenes, with one goal state and equal numbers of joints, as an HDF5 file; equal scenes give equal bytes.
-
-    Raises:
-        SceneError: A scene has no goal state or several, or an obstacle of another kind.
-    """
+    """Return scenes, with one goal state and equal numbers of joints, as HDF5; equal scenes give equal bytes."""
     import h5py
 
     for scene in scenes:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.problems.scenes.scene_problem import SceneProblem
-from cnpgen.robots.observation.observations import Observation, SceneBatch, as_observation
+from cnpgen.robots.observation.observations import Observation, as_observation
 from cnpgen.robots.observation.primitives import Primitives, scene_primitives
 from cnpgen.robots.observation.surface_points import scene_seeds
 from cnpgen.robots.obstacle import Obstacle, invalid_obstacle
@@ -47,7 +47,7 @@ def observe(
 
     observation, seed = as_observation(kind), integer("seed", seed, least=0, most=MAX_SEED)
     bodies = scene_bodies(scenes)
-    return observation.observe(SceneBatch(bodies, scene_seeds(seed, len(bodies)), observation_backend(backend)))
+    return observation.observe(bodies, scene_seeds(seed, len(bodies)), observation_backend(backend))
 
 
 def scene_bodies(scenes: Scenes) -> Primitives:

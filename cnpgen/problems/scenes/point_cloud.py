@@ -8,11 +8,11 @@ from numpy.typing import ArrayLike, NDArray
 from cnpgen.errors import UsageError, counted
 from cnpgen.problems.scenes.scene_problem import MAX_SCENE_OBSTACLES
 from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.shape.hull import Array
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import check_range, integer, number, numbers
 from cnpgen.schema.units import PLAUSIBLE_MAX, suggested_unit
 
-Array = NDArray[np.float64]
 Voxels = NDArray[np.int64]
 
 MAX_POINTS = 1_000_000

@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from cnpgen.robots.scene import rotation_matrices
+from cnpgen.robots.shape.hull import Array
 
 MAX_NORM_ERROR = 0.01  # of a quaternion that is accepted and normalized
 
@@ -21,14 +21,7 @@ def quaternion_mistake(quaternion: Array) -> str:
 
 def rotation_matrix(wxyz: Array) -> Array:
     """Return the rotation matrix of a quaternion (w, x, y, z), which is normalized first, shape (3, 3)."""
-    w, x, y, z = np.asarray(wxyz, float) / np.linalg.norm(wxyz)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return rotation_matrices(np.asarray(wxyz, float) / np.linalg.norm(wxyz))
 
 
 def quaternion_of(rotation: Array) -> Array:

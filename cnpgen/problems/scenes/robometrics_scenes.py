@@ -30,11 +30,7 @@ def is_robometrics(document: Any) -> bool:
 
 
 def read_robometrics(path: Path, document: Any) -> Iterator[SceneProblem]:
-    """Yield the problems of a document.
-
-    Raises:
-        SceneError: A problem is invalid.
-    """
+    """Yield the problems of a document."""
     for family in document:
         for index, entry in enumerate(part(document, family, list, str(path))):
             name = f"{family} {index}"

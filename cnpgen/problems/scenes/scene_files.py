@@ -19,6 +19,7 @@ from cnpgen.store.files.atomic import write_file
 from cnpgen.store.files.kind import HDF5_SUFFIXES, is_hdf5
 
 YAML_SUFFIXES = (".yaml", ".yml")
+SCENE_SUFFIXES = (*YAML_SUFFIXES, *HDF5_SUFFIXES)
 MAX_SCENE_FILES = 20_000  # of a folder
 
 
@@ -73,14 +74,13 @@ def _files(path: Path) -> list[Path]:
     if not path.exists():
         raise UsageError(f"no such file or folder: {path}", concerns="path")
     if not path.is_dir():
-        if path.suffix.lower() not in (*YAML_SUFFIXES, *HDF5_SUFFIXES):
-            expected = ", ".join((*YAML_SUFFIXES, *HDF5_SUFFIXES))
-            raise UsageError(f"{path} must end in one of {expected}", concerns="path")
+        if path.suffix.lower() not in SCENE_SUFFIXES:
+            raise UsageError(f"{path} must end in one of {', '.join(SCENE_SUFFIXES)}", concerns="path")
         return [path]
     files = list(itertools.islice(path.iterdir(), MAX_SCENE_FILES + 1))
     if len(files) > MAX_SCENE_FILES:
         raise UsageError(f"{path} has more than {MAX_SCENE_FILES:,} files", concerns="path")
-    known = [file for file in sorted(files) if file.suffix.lower() in (*YAML_SUFFIXES, *HDF5_SUFFIXES)]
+    known = [file for file in sorted(files) if file.suffix.lower() in SCENE_SUFFIXES]
     if not known:
         raise UsageError(f"{path} contains no scenes in YAML or HDF5 files", concerns="path")
     return known

@@ -7,21 +7,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from cnpgen.errors import UsageError
 from cnpgen.problems.scenes.quaternions import quaternion_mistake, roll_pitch_yaw, rotation_matrix
-from cnpgen.robots.observation.primitives import KINDS, primitives_of
-from cnpgen.robots.observation.signed_distance import signed_distances
+from cnpgen.robots.observation.primitives import KINDS, primitives_of, signed_distances
 from cnpgen.robots.obstacle import Obstacle, invalid_obstacle
-from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid, hull_corners
+from cnpgen.robots.shape.hull import MAX_COORDINATE_M, Array, check_solid, hull_corners
 from cnpgen.robots.shape.inline import address_of, is_inline
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.schema.argument_types import check_fields, checked_arguments
 from cnpgen.schema.arguments import numbers
 from cnpgen.schema.units import PLAUSIBLE_MAX
-
-Array = NDArray[np.float64]
 
 MAX_SCENE_OBSTACLES = 100  # as many as a problem may have
 MAX_SCENES = 100_000  # of one call
@@ -103,18 +100,10 @@ class SceneProblem:
 def make_obstacle(
     name: str, kind: str, sizes: Sequence[float] | Array, position: Array, wxyz: Array, *, place: str
 ) -> Obstacle:
-    """Build an obstacle from the numbers of a file.
+    """Build an obstacle from the numbers of a file; ``place`` is the file and scene, for messages.
 
-    Args:
-        name: Name of the obstacle.
-        kind: "box", "sphere", "cylinder" or "capsule".
-        sizes: Edge lengths of a box [m]; radius; or radius and length along z (of a capsule without its round ends).
-        position: Center in the frame of the robot's base [m], shape (3,).
-        wxyz: Quaternion (w, x, y, z) of its axes, shape (4,).
-        place: File and scene, for messages.
-
-    Raises:
-        SceneError: A number is not finite, a size is not positive, or the quaternion is not of unit length.
+    Sizes [m] are edge lengths, a radius, or a radius and a length along z (of a capsule without its round ends). The
+    center [m], shape (3,), and the quaternion (w, x, y, z) are in the frame of the robot's base.
     """
     where = f"{place}: obstacle {name!r}"
     if kind not in _SIZES:
@@ -196,13 +185,7 @@ def check_count(count: int, place: str) -> None:
 
 
 def check_scenes(scenes: Sequence[SceneProblem]) -> None:
-    """Check the type of every scene, the numbers of its obstacles, and that there is one.
-
-    Raises:
-        UsageError: There are no scenes, or one is no ``SceneProblem``.
-        SceneError: An obstacle lacks a key, a number of it is not finite, too large or not positive, or joint
-            positions have another shape.
-    """
+    """Check the type of every scene, the numbers of its obstacles, and that there is one."""
     if not scenes:
         raise UsageError("there are no scenes", concerns="scenes")
     for index, scene in enumerate(scenes):
@@ -217,11 +200,7 @@ def check_scenes(scenes: Sequence[SceneProblem]) -> None:
 
 
 def checked_scene(scene: SceneProblem) -> SceneProblem:
-    """Check a scene and return it with unique names of obstacles.
-
-    Raises:
-        SceneError: There are too many obstacles, one contains the robot's base, or joint positions are invalid.
-    """
+    """Check a scene and return it with unique names of obstacles."""
     check_count(len(scene.obstacles), scene.place)
     pose = scene.goal_pose
     if pose is not None:

@@ -8,13 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.errors import requires_extra
 from cnpgen.problems.scenes.scene_problem import SceneError
+from cnpgen.robots.shape.hull import Array
 from cnpgen.store.files.atomic import read_file
-
-Array = NDArray[np.float64]
 
 MAX_YAML_BYTES = 1 << 25
 MAX_YAML_DEPTH = 32  # nested mappings and lists
@@ -24,10 +22,6 @@ def read_yaml(path: Path, *, numbers: bool = False) -> list[Any]:
     """Read the documents of a YAML file; scalars stay texts, or with ``numbers`` become float, and plain nulls None.
 
     Anchors and aliases are refused, so the memory is proportional to the size of the file. Keys stay texts.
-
-    Raises:
-        SceneError: The file is not YAML, has anchors, or is nested too deeply.
-        MissingExtraError: PyYAML is missing.
     """
     with requires_extra("ros", "PyYAML"):
         import yaml
@@ -41,7 +35,7 @@ def read_yaml(path: Path, *, numbers: bool = False) -> list[Any]:
 
 def _documents(path: Path, yaml: Any, events: Any, numbers: bool) -> Iterator[Any]:
     """Build documents from the events of a parser, without recursion."""
-    stack: list[Any] = []  # open mappings and lists, and the keys that wait for their values
+    stack: list[Any] = []  # open mappings and lists, and the keys that wait for their values, each in a tuple
     for event in events:
         if getattr(event, "anchor", None) is not None:
             raise SceneError(f"{path} has the anchor {event.anchor!r:.60}, expected a file without anchors")
@@ -79,25 +73,14 @@ def _put(stack: list[Any], value: Any) -> Iterator[Any]:
     elif isinstance(stack[-1], list):
         stack[-1].append(value)
     elif isinstance(stack[-1], dict):
-        stack.append(_Key(value))
+        stack.append((value if isinstance(value, str) else repr(value),))
     else:
-        key = stack.pop().text
+        (key,) = stack.pop()
         stack[-1][key] = value
 
 
-class _Key:
-    """Key of a mapping that waits for its value."""
-
-    def __init__(self, value: Any) -> None:
-        self.text = value if isinstance(value, str) else repr(value)
-
-
 def part(document: Any, key: str, kind: type, where: str) -> Any:
-    """Return an entry of a mapping, or an empty mapping, list or text if it is missing; ``where`` is for messages.
-
-    Raises:
-        SceneError: The entry is no dict, list or str as required, or the document is not a mapping.
-    """
+    """Return an entry of a mapping, or an empty mapping, list or text if it is missing; ``where`` is for messages."""
     if not isinstance(document, dict):
         raise SceneError(f"{where} must be a mapping, got {document!r:.60}")
     value = document.get(key)
@@ -110,11 +93,7 @@ def part(document: Any, key: str, kind: type, where: str) -> Any:
 
 
 def vector(value: Any, keys: str, where: str) -> Array:
-    """Return the numbers of a list, or of a mapping by its keys in order, such as "xyz"; without keys, of any list.
-
-    Raises:
-        SceneError: There is another number of entries, or an entry is not a number.
-    """
+    """Return the numbers of a list, or of a mapping by its keys in order, such as "xyz"; without keys, of any list."""
     entries = [value.get(key) for key in keys] if isinstance(value, dict) and keys else value
     if not isinstance(entries, list) or (keys and len(entries) != len(keys)):
         expected = f"{len(keys)} numbers" if keys else "a list of numbers"
@@ -123,11 +102,7 @@ def vector(value: Any, keys: str, where: str) -> Array:
 
 
 def scalar(value: Any, where: str) -> float:
-    """Return a number.
-
-    Raises:
-        SceneError: The value is not a number.
-    """
+    """Return a number; ``where`` is for messages."""
     try:
         return float(value)
     except (TypeError, ValueError) as error:

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.problems.conditions import measured_needs
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.joint import JointTorque
-from cnpgen.problems.constraints.needs import measured_needs
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.proof.reachable_positions import end_states, joint_limits, sample_times
 from cnpgen.refine.proof.table_proof import find_table_exit

@@ -6,12 +6,11 @@ from itertools import accumulate
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.problems.conditions import measured_needs
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.joint import JointPosition
-from cnpgen.problems.constraints.needs import measured_needs
-from cnpgen.problems.constraints.object_clearance import ObjectClearance
-from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.constraints.link_clearance import ObjectClearance, SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.residuals import DISTANCE_SCALE_M, residual_scale
 from cnpgen.robots.solid import place_obstacles

@@ -18,14 +18,13 @@ from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CollisionChec
 from cnpgen.kernels.collision.row_kernels import DistanceColumns, RowKernels
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
-from cnpgen.problems.constraints.object_clearance import ObjectClearance
-from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.constraints.link_clearance import ObjectClearance, SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.residuals import DISTANCE_SCALE_M
 from cnpgen.refine.solver.transcription import ResidualKernels
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.convex_part import Contacts
-from cnpgen.robots.shape.held_object import HELD_OBJECT, with_held_object
+from cnpgen.robots.shape.shape import HELD_OBJECT, with_held_object
 from cnpgen.robots.solid import solids_of
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.rigid_bodies import RigidBodies

@@ -6,16 +6,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.robots.observation.primitives import KINDS, Primitives
 from cnpgen.robots.observation.surface_points import unit_offset
+from cnpgen.robots.shape.hull import Array
 from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.arguments import integer
 from cnpgen.schema.units import suggested_unit
-
-Array = NDArray[np.float64]
 
 MAX_PIXELS = 4096  # of one side of an image
 MIN_VIEW_DISTANCE_M = 1e-6

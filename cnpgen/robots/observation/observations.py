@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError, nearest
-from cnpgen.robots.observation.camera import Camera
-from cnpgen.robots.observation.primitives import KINDS, MESH, Primitives
-from cnpgen.robots.observation.reference import ObservationBackend
-from cnpgen.robots.observation.surface_points import Seeds
+from cnpgen.robots.observation.camera import Camera, depth_image, depth_points
+from cnpgen.robots.observation.primitives import KINDS, MESH, Primitives, bodies_of, smallest_signed_distances
+from cnpgen.robots.observation.surface_points import Seeds, surface_points
 from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.arguments import integer
 
+Values = NDArray[np.float32]
 Array = NDArray[Any]
 Corner = tuple[float, float, float]
 
@@ -26,19 +26,39 @@ MIN_GRID_EXTENT_M = 1e-6
 WORKSPACE = (-0.9, -0.9, -0.1), (0.9, 0.9, 1.1)  # corners of the default grids, around an arm like the Panda [m]
 
 
-@dataclass(frozen=True, eq=False)
-class SceneBatch:
-    """N scenes to observe.
+class ObservationBackend:
+    """Functions of N scenes, which are primitives with a first axis of length N: the NumPy reference.
 
-    Attributes:
-        bodies: The bodies, arrays with a first axis of length N.
-        seeds: Seeds of the scenes, shape (N,).
-        backend: Compiled functions or their NumPy reference.
+    Compiled code overrides each of them.
     """
 
-    bodies: Primitives
-    seeds: Seeds
-    backend: ObservationBackend
+    def distances(self, scenes: Primitives, points: Array) -> Values:
+        """Return the smallest signed distance of points from the bodies of each scene [m], shape (N, P).
+
+        Points in the world frame [m] have shape (P, 3) for all scenes or (N, P, 3). Without bodies distances are inf.
+        """
+        points = np.broadcast_to(points, (len(scenes), *points.shape[-2:]))
+        parts = [smallest_signed_distances(bodies_of(scenes, i), points[i]) for i in range(len(scenes))]
+        return _stacked(parts, points.shape[1:2])
+
+    def surface_points(self, scenes: Primitives, count: int, seeds: Seeds) -> Values:
+        """Return points on the surfaces of each scene [m], shape (N, count, 3); see ``surface_points``."""
+        parts = [surface_points(bodies_of(scenes, i), count, seeds[i]) for i in range(len(scenes))]
+        return _stacked(parts, (count, 3))
+
+    def depth_images(self, scenes: Primitives, camera: Camera) -> Values:
+        """Return depth images [m], shape (N, height, width); see ``depth_image``."""
+        parts = [depth_image(bodies_of(scenes, i), camera) for i in range(len(scenes))]
+        return _stacked(parts, (camera.height, camera.width))
+
+    def depth_points(self, depth: Values, camera: Camera, count: int, seeds: Seeds) -> Values:
+        """Return points of depth images [m], shape (N, count, 3); see ``depth_points``."""
+        parts = [depth_points(image, camera, count, seed) for image, seed in zip(depth, seeds, strict=True)]
+        return _stacked(parts, (count, 3))
+
+
+def _stacked(parts: list[Array], shape: tuple[int, ...]) -> Values:
+    return np.array(parts, np.float32).reshape(len(parts), *shape)
 
 
 class Observation(ABC):
@@ -47,15 +67,8 @@ class Observation(ABC):
     name: ClassVar[str]
 
     @abstractmethod
-    def observe(self, scenes: SceneBatch) -> dict[str, Array]:
-        """Observe N scenes.
-
-        Args:
-            scenes: The scenes.
-
-        Returns:
-            Name -> array with a first axis of length N.
-        """
+    def observe(self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend) -> dict[str, Array]:
+        """Observe N scenes from their bodies and seeds, shape (N,): name -> array with a first axis of length N."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,9 +86,9 @@ class SurfaceCloud(Observation):
         check_fields(self)
         integer("points", self.points, least=1, most=MAX_OBSERVED_POINTS)
 
-    def observe(self, scenes: SceneBatch) -> dict[str, Array]:
+    def observe(self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend) -> dict[str, Array]:
         """See ``Observation``."""
-        return {"cloud": scenes.backend.surface_points(scenes.bodies, self.points, scenes.seeds)}
+        return {"cloud": backend.surface_points(bodies, self.points, seeds)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,10 +108,10 @@ class CameraCloud(Observation):
         check_fields(self)
         integer("points", self.points, least=1, most=MAX_OBSERVED_POINTS)
 
-    def observe(self, scenes: SceneBatch) -> dict[str, Array]:
+    def observe(self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend) -> dict[str, Array]:
         """See ``Observation``."""
-        depth = scenes.backend.depth_images(scenes.bodies, self.camera)
-        return {"camera_cloud": scenes.backend.depth_points(depth, self.camera, self.points, scenes.seeds)}
+        depth = backend.depth_images(bodies, self.camera)
+        return {"camera_cloud": backend.depth_points(depth, self.camera, self.points, seeds)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,11 +137,11 @@ class DistanceGrid(Observation):
                 f"must be positive with at most {MAX_OBSERVED_POINTS:,} points, got {self.shape}", argument="shape"
             )
 
-    def observe(self, scenes: SceneBatch) -> dict[str, Array]:
+    def observe(self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend) -> dict[str, Array]:  # noqa: ARG002
         """See ``Observation``."""
         axes = [np.linspace(*ends) for ends in zip(self.low, self.high, self.shape, strict=True)]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        return {"distances": scenes.backend.distances(scenes.bodies, points).reshape(-1, *self.shape)}
+        return {"distances": backend.distances(bodies, points).reshape(-1, *self.shape)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,9 +171,9 @@ class BasisPoints(Observation):
         steps = np.arange(1, self.points + 1)[:, None] / root ** np.arange(1, 4)
         return np.asarray(np.array(self.low) + (steps + 0.5) % 1.0 * np.subtract(self.high, self.low))
 
-    def observe(self, scenes: SceneBatch) -> dict[str, Array]:
+    def observe(self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend) -> dict[str, Array]:  # noqa: ARG002
         """See ``Observation``."""
-        return {"basis": scenes.backend.distances(scenes.bodies, self.positions)}
+        return {"basis": backend.distances(bodies, self.positions)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,9 +196,8 @@ class ObjectTokens(Observation):
         if self.capacity is not None:
             integer("capacity", self.capacity, least=1)
 
-    def observe(self, scenes: SceneBatch) -> dict[str, Array]:
+    def observe(self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend) -> dict[str, Array]:  # noqa: ARG002
         """See ``Observation``."""
-        bodies = scenes.bodies
         real = bodies.kinds >= 0
         order = np.argsort(~real, axis=1, kind="stable")  # bodies first
         most = int(real.sum(axis=1).max(initial=0))
@@ -211,11 +223,7 @@ OBSERVATIONS: Mapping[str, type[Observation]] = {
 
 
 def as_observation(kind: str | Observation) -> Observation:
-    """Return an observation by its name, with default parameters; return observations unchanged.
-
-    Raises:
-        UsageError: There is no such observation.
-    """
+    """Return an observation by its name, with default parameters; return observations unchanged."""
     if isinstance(kind, Observation):
         return kind
     if kind not in OBSERVATIONS:

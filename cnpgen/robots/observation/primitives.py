@@ -5,26 +5,100 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.robots.observation.convex_mesh import ConvexMesh, convex_mesh
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import PARKED_POSITION_M, Scene
 from cnpgen.robots.shape.convex_part import PRISM_SIDES
-from cnpgen.robots.shape.hull import frames_along
-from cnpgen.robots.shape.inline import is_inline
+from cnpgen.robots.shape.hull import Array, frames_along
+from cnpgen.robots.shape.inline import corners_of, is_inline
 from cnpgen.robots.solid import UNBOUNDED_OBSTACLE_HEIGHT_M, number_slices, place_obstacles, pose_width
 from cnpgen.schema.keys import Range
 
-Array = NDArray[np.float64]
-
+PLANE_DECIMALS = 9  # to which the planes of triangles of one face agree
+MIN_AREA_M2 = 1e-12  # of a triangle; smaller ones have no normal in single precision
+MAX_KEPT_MESHES = 256
 KINDS = ("box", "sphere", "cylinder", "capsule")  # index: the code of a kind
 MESH = len(KINDS)  # the code of the first mesh, followed by those of the others
 NO_BODY = -1  # kind of the padding
+POINTS_PER_CHUNK = 65_536  # keeps the temporary arrays of one primitive in the cache
+
+
+@dataclass(frozen=True, eq=False)
+class ConvexMesh:
+    """The convex hull of corners, relative to the center of its bounding box.
+
+    Attributes:
+        center: Center of the bounding box in the frame of the mesh [m], shape (3,).
+        half: Half the edge lengths of the bounding box [m], shape (3,).
+        corners: The corners [m], shape (V, 3).
+        triangles: Triangles of the surface: a corner and the edges to the two others [m], shape (T, 3, 3).
+        planes: Outer unit normals n and offsets c of the faces, shape (F, 4): ``n @ x + c <= 0`` inside.
+    """
+
+    center: Array
+    half: Array
+    corners: Array
+    triangles: Array
+    planes: Array
+
+    def distances(self, points: Array) -> Array:
+        """Return the signed distances of points [m], shape (P, 3), negative inside, shape (P,)."""
+        distances: Array = (points @ self.planes[:, :3].T + self.planes[:, 3]).max(axis=1)
+        outside = distances > 0
+        distances[outside] = np.sqrt(self._squared_distances(points[outside]))
+        return distances
+
+    def _squared_distances(self, points: Array) -> Array:
+        """Return squared distances from the nearest triangle."""
+        smallest = np.full(len(points), np.inf)
+        for corner, first, second in self.triangles:
+            normal = np.cross(first, second)
+            ends = (corner, first), (corner + first, second - first), (corner + second, -second)
+            offsets = [points - start for start, _ in ends]
+            above = [offset @ np.cross(normal, edge) >= 0 for offset, (_, edge) in zip(offsets, ends, strict=True)]
+            to_plane = (offsets[0] @ normal) ** 2 / (normal @ normal)
+            to_edges = [_squared_from_segment(offset, edge) for offset, (_, edge) in zip(offsets, ends, strict=True)]
+            squared = np.where(np.all(above, axis=0), to_plane, np.min(to_edges, axis=0))
+            np.minimum(smallest, squared, out=smallest)
+        return smallest
+
+    def entries(self, origin: Array, rays: Array) -> Array:
+        """Return where rays from an origin [m], shape (P, 3), enter, in ray lengths, shape (P,); nan for none."""
+        enter, leave = np.full(len(rays), -np.inf), np.full(len(rays), np.inf)
+        for plane in self.planes:
+            speed = rays @ plane[:3]
+            with np.errstate(all="ignore"):
+                crossing = -(plane[:3] @ origin + plane[3]) / speed
+            enter = np.where(speed < 0, np.fmax(enter, crossing), enter)
+            leave = np.where(speed < 0, leave, np.fmin(leave, crossing))  # -inf for rays along a face, outside of it
+        return np.where(enter <= leave, enter, np.nan)
+
+
+def _squared_from_segment(offsets: Array, edge: Array) -> Array:
+    """Return squared distances from a segment of points relative to its start, shape (P,)."""
+    along = np.clip(offsets @ edge / (edge @ edge), 0, 1)
+    return np.asarray(((offsets - along[:, None] * edge) ** 2).sum(axis=1))
+
+
+@lru_cache(MAX_KEPT_MESHES)
+def convex_mesh(address: str) -> ConvexMesh:
+    """Return the mesh of an obstacle from its corners, a ``data:`` address (``cnpgen.robots.shape.inline``)."""
+    from scipy.spatial import ConvexHull
+
+    corners = corners_of(address)
+    center, half = (corners.max(axis=0) + corners.min(axis=0)) / 2, np.ptp(corners, axis=0) / 2
+    hull = ConvexHull(corners - center)
+    first, second, third = (hull.points[index] for index in hull.simplices.T)
+    planes = hull.equations[np.sort(np.unique(hull.equations.round(PLANE_DECIMALS), axis=0, return_index=True)[1])]
+    triangles = np.stack([first, second - first, third - first], axis=1)
+    areas = np.linalg.norm(np.cross(triangles[:, 1], triangles[:, 2]), axis=1) / 2
+    return ConvexMesh(center, half, hull.points, triangles[areas > MIN_AREA_M2], planes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,13 +137,9 @@ def primitives_of(obstacles: Sequence[Obstacle], numbers: Array) -> Primitives:
 
     Poses and sizes (``cnpgen.robots.solid``) have shape (pose_width,), or of N samples (N, pose_width), which gives
     arrays with a first axis of length N.
-
-    Raises:
-        UsageError: An obstacle is a mesh file, not its corners.
     """
-    shape, rows, count = numbers.shape[:-1], np.atleast_2d(numbers), len(obstacles)
-    kinds, centers = np.empty((len(rows), count), np.int64), np.empty((len(rows), count, 3))
-    rotations, sizes = np.tile(np.eye(3), (len(rows), count, 1, 1)), np.zeros((len(rows), count, 3))
+    shape, rows = numbers.shape[:-1], np.atleast_2d(numbers)
+    kinds, centers, rotations, sizes = _padding(len(rows), len(obstacles))
     meshes: list[ConvexMesh] = []
     for index, (obstacle, part) in enumerate(zip(obstacles, number_slices(obstacles), strict=True)):
         of_body = centers[:, index], rotations[:, index], sizes[:, index]
@@ -78,22 +148,19 @@ def primitives_of(obstacles: Sequence[Obstacle], numbers: Array) -> Primitives:
             _fill(obstacle, rows[:, part], *of_body)
         else:
             kinds[:, index] = MESH + len(meshes)
-            meshes.append(_mesh_of(obstacle))
-            _fill_mesh(meshes[-1], rows[:, part], *of_body)
+            meshes.append(_fill_mesh(obstacle, rows[:, part], *of_body))
     arrays = (array.reshape(*shape, *array.shape[1:]) for array in (kinds, centers, rotations, sizes))
     return Primitives(*arrays, meshes=tuple(meshes))  # type: ignore[misc,arg-type]
 
 
-def _mesh_of(obstacle: Obstacle) -> ConvexMesh:
+def _fill_mesh(obstacle: Obstacle, numbers: Array, center: Array, rotation: Array, size: Array) -> ConvexMesh:
+    """Fill in the arrays of a mesh as ``_fill`` does, and return the mesh."""
     if not is_inline(obstacle.mesh):
         raise UsageError(f"obstacle {obstacle.name!r} is a mesh file, expected its corners: see make_mesh")
-    return convex_mesh(obstacle.mesh)
-
-
-def _fill_mesh(mesh: ConvexMesh, numbers: Array, center: Array, rotation: Array, size: Array) -> None:
-    """Fill in the arrays of a mesh as ``_fill`` does."""
+    mesh = convex_mesh(obstacle.mesh)
     rotation[:] = numbers[:, 3:].reshape(-1, 3, 3)
     center[:], size[:] = numbers[:, :3] + rotation @ mesh.center, mesh.half
+    return mesh
 
 
 def _fill(obstacle: Obstacle, numbers: Array, center: Array, rotation: Array, size: Array) -> None:
@@ -120,11 +187,7 @@ def _fill(obstacle: Obstacle, numbers: Array, center: Array, rotation: Array, si
 
 
 def scene_primitives(scenes: Scene | Sequence[Sequence[Obstacle]]) -> Primitives:
-    """Return the bodies of N scenes, arrays with a first axis of length N; without obstacles parked below the robot.
-
-    Raises:
-        UsageError: An obstacle is a mesh file, not its corners.
-    """
+    """Return the bodies of N scenes, arrays with a first axis of length N; without obstacles parked below the robot."""
     if isinstance(scenes, Scene):
         bodies = primitives_of(scenes.obstacles, scenes.poses[:, : pose_width(scenes.obstacles)])
         bodies.kinds[bodies.centers[:, :, 2] <= PARKED_POSITION_M[2] / 2] = NO_BODY  # meshes have another center
@@ -138,9 +201,7 @@ def scene_primitives(scenes: Scene | Sequence[Sequence[Obstacle]]) -> Primitives
 
 def padded(scenes: Sequence[Primitives]) -> Primitives:
     """Return the bodies of N scenes as arrays with a first axis of length N, padded with bodies of kind -1."""
-    shape = len(scenes), max(map(len, scenes), default=0)
-    kinds, centers = np.full(shape, NO_BODY, np.int64), np.zeros((*shape, 3))
-    rotations, sizes = np.tile(np.eye(3), (*shape, 1, 1)), np.zeros((*shape, 3))
+    kinds, centers, rotations, sizes = _padding(len(scenes), max(map(len, scenes), default=0))
     meshes: dict[ConvexMesh, int] = {}  # mesh -> index
     for index, scene in enumerate(scenes):
         count = len(scene)
@@ -151,7 +212,51 @@ def padded(scenes: Sequence[Primitives]) -> Primitives:
     return Primitives(kinds, centers, rotations, sizes, tuple(meshes))
 
 
+def _padding(*shape: int) -> tuple[NDArray[np.int64], Array, Array, Array]:
+    """Return kinds, centers, rotations and sizes of rows of no bodies."""
+    centers, sizes = np.zeros((2, *shape, 3))
+    return np.full(shape, NO_BODY, np.int64), centers, np.tile(np.eye(3), (*shape, 1, 1)), sizes
+
+
 def bodies_of(scenes: Primitives, index: int) -> Primitives:
     """Return the bodies of one of N scenes, without padding."""
     scene = scenes[index]
     return scene[scene.kinds >= 0]
+
+
+def signed_distances(primitives: Primitives, points: Array) -> Array:
+    """Compute the signed distances of P world points from M primitives [m], negative inside, shape (M, P)."""
+    distances = np.empty((len(primitives), len(points)))
+    for index in range(len(primitives)):
+        mesh, kind, size = primitives.mesh(index), int(primitives.kinds[index]), primitives.sizes[index]
+        for first in range(0, len(points), POINTS_PER_CHUNK):
+            part = slice(first, first + POINTS_PER_CHUNK)
+            local = (points[part] - primitives.centers[index]) @ primitives.rotations[index]
+            distances[index, part] = mesh.distances(local) if mesh else _distance(kind, size, local)
+    return distances
+
+
+def smallest_signed_distances(primitives: Primitives, points: Array) -> Array:
+    """Compute the smallest signed distance of points from any primitive [m], shape (P,); inf without primitives."""
+    smallest = np.full(len(points), np.inf)
+    for index in range(len(primitives)):
+        np.minimum(smallest, signed_distances(primitives[np.array([index])], points)[0], out=smallest)
+    return smallest
+
+
+def _distance(kind: int, size: Array, local: Array) -> Array:
+    """Return the signed distances of points in the frame of a primitive, shape (P,)."""
+    if kind == 0:
+        return _outside_or_inside(np.abs(local) - size)
+    radius, half = size[0], size[1]
+    if kind == 2:
+        radial = np.hypot(local[:, 0], local[:, 1]) - radius
+        return _outside_or_inside(np.stack([radial, np.abs(local[:, 2]) - half], axis=1))
+    along = np.clip(local[:, 2], -half, half)  # half is 0 for a sphere
+    return np.asarray(np.sqrt(local[:, 0] ** 2 + local[:, 1] ** 2 + (local[:, 2] - along) ** 2) - radius)
+
+
+def _outside_or_inside(gaps: Array) -> Array:
+    """Return the distance from a product of intervals, or of a disc and an interval, from the gap along each."""
+    outside = np.linalg.norm(np.maximum(gaps, 0), axis=1)
+    return np.asarray(np.where(outside > 0, outside, gaps.max(axis=1)))

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.robots.observation.primitives import KINDS, Primitives
+from cnpgen.robots.shape.hull import Array
 
-Array = NDArray[np.float64]
 Seeds = NDArray[np.uint64]
 
 STEPS = np.array([3242174889, 2447445414], np.uint32)  # 2^32 / g and 2^32 / g^2 with g^3 = g + 1: low discrepancy

@@ -9,12 +9,9 @@ from dataclasses import dataclass
 from operator import attrgetter
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.robots.shape.convex_part import ConvexPart
-from cnpgen.robots.shape.hull import half_sphere, hull_corners
-
-Array = NDArray[np.float64]
+from cnpgen.robots.shape.hull import Array, half_sphere, hull_corners
 
 SEARCH_DIRECTIONS = 3  # initial directions of the search
 POINTS_PER_ROUND = 25  # corners and facets with the largest violations that are added per round

@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
-from cnpgen.robots.shape.hull import CUBE, MAX_COORDINATE_M, check_solid
-from cnpgen.robots.shape.inline import points_of
+from cnpgen.robots.shape.hull import CUBE, MAX_COORDINATE_M, Array, check_solid
+from cnpgen.robots.shape.inline import corners_of, is_inline
 from cnpgen.robots.urdf import urdf_tree
-
-Array = NDArray[np.float64]
 
 PRISM_SIDES = 64  # of the prism that contains a cylinder; its corners exceed the radius by 0.12 %
 _ANGLES = np.arange(PRISM_SIDES) * (2 * math.pi / PRISM_SIDES)
@@ -61,9 +59,6 @@ def link_convex_parts(urdf: str) -> list[ConvexPart]:
     """Read the collision geometry of a URDF whose meshes are inline, in the frames of its links and in its order.
 
     A cylinder becomes a prism of ``PRISM_SIDES`` sides that contains it; all other geometry is exact.
-
-    Raises:
-        RecipeError: A collision element is invalid.
     """
     found, mistakes = list[ConvexPart](), list[str]()
     for link in urdf_tree(urdf).iter("link"):
@@ -79,11 +74,7 @@ def link_convex_parts(urdf: str) -> list[ConvexPart]:
 
 
 def convex_part_of(link: str, element: ElementTree.Element) -> ConvexPart:
-    """Read the geometry of an element of a link, in the frame of the link.
-
-    Raises:
-        ValueError: The element has no geometry, an invalid number, or a mesh that is not inline.
-    """
+    """Read the geometry of an element of a link, in the frame of the link; ValueError if invalid or not inline."""
     shape = element.find("geometry/*")
     if shape is None:
         raise ValueError("it has no <geometry>")
@@ -100,7 +91,10 @@ def convex_part_of(link: str, element: ElementTree.Element) -> ConvexPart:
 def _core(shape: ElementTree.Element) -> tuple[Array, float]:
     """Return the corners [m] and the thickness [m] of a geometry, in its own frame."""
     if shape.tag == "mesh":
-        return points_of(shape), 0.0
+        address = shape.get("filename", "")
+        if not is_inline(address):
+            raise ValueError(f"the mesh {address!r} is not in the text of the URDF")
+        return corners_of(address), 0.0
     if shape.tag == "box":
         return CUBE * [_positive(each) for each in _numbers(shape, "size", 3)], 0.0
     if shape.tag not in ("sphere", "cylinder", "capsule"):

@@ -17,10 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import MachineError
-from cnpgen.robots.shape.hull import hull_corners
+from cnpgen.robots.shape.hull import Array, hull_corners
 from cnpgen.store.files.atomic import write_file
-
-Array = NDArray[np.float64]
 
 CUTS_PER_AXIS = 9  # planes between both ends of a part along each axis that are tried, and as many at faces
 FACE_TOLERANCE_M = 1e-4  # of the coordinates of points on a face
@@ -63,13 +61,10 @@ class _Cut:
 
 
 def convex_parts(points: Array, triangles: NDArray[np.int64], most: int, keep: Path | None) -> list[Array]:
-    """Decompose a mesh into at most so many convex parts that together cover its surface.
+    """Return the corners [m], shape (V, 3), of at most so many convex parts that together cover the surface of a mesh.
 
     Points [m] have shape (N, 3), triangles are indices of points, shape (T, 3). A cache folder keeps the result, which
     takes seconds; None for no cache.
-
-    Returns:
-        Corners of each part [m], shape (V, 3); those of the hull if no cut reduces its volume.
     """
     kept = None if keep is None else keep / f"parts-{_identity(points, triangles, most)}.npz"
     if kept is not None:

@@ -1,9 +1,9 @@
 """Convex hulls: corners, bounding planes and balls, and shapes of Coal."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,11 +54,7 @@ def hull_corners(points: Array) -> Array:
 
 
 def outward_triangles(points: Array) -> NDArray[np.int64]:
-    """Return the triangles of the convex hull of points as indices, counterclockwise seen from outside, shape (T, 3).
-
-    Args:
-        points: The points [m], shape (V, 3).
-    """
+    """Return the triangles of the hull of points, shape (V, 3), counterclockwise from outside: indices (T, 3)."""
     from scipy.spatial import ConvexHull
 
     hull = ConvexHull(points)
@@ -123,11 +119,7 @@ def ball_round(corners: Array, radius: float) -> tuple[Array, float]:
 
 
 def coal_hull(corners: Array) -> "coal.Convex":
-    """Return a convex hull of corners [m], shape (V, 3), as a Coal shape; three are a triangle, two a segment.
-
-    Raises:
-        UsageError: The corners are those of no body, for example of a damaged scene.
-    """
+    """Return a convex hull of corners [m], shape (V, 3), as a Coal shape; three are a triangle, two a segment."""
     import coal
     from scipy.spatial import ConvexHull, QhullError
 
@@ -137,12 +129,19 @@ def coal_hull(corners: Array) -> "coal.Convex":
         raise UsageError(
             f"corners from {corners.min(axis=0)} to {corners.max(axis=0)} m have no convex hull"
         ) from error
-    points, faces = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
-    for corner in corners:
-        points.append(corner)
+    return coal.Convex(*coal_vectors(corners, triangles))
+
+
+def coal_vectors(points: Array, triangles: Iterable[Any]) -> tuple[Any, Any]:
+    """Return points [m], shape (V, 3), and triangles, indices of points, as vectors of Coal."""
+    import coal
+
+    corners, sides = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+    for point in points:
+        corners.append(point)
     for triangle in triangles:
-        faces.append(coal.Triangle(*map(int, triangle)))
-    return coal.Convex(points, faces)
+        sides.append(coal.Triangle(*map(int, triangle)))
+    return corners, sides
 
 
 def frame_along(vector: Sequence[float], length: float) -> Array:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import RecipeError
 from cnpgen.robots.chain import frame_of
 from cnpgen.robots.shape.convex_part import ConvexPart, convex_part_of, origin_of
-from cnpgen.robots.shape.hull import ball_round, frame_along
+from cnpgen.robots.shape.hull import Array, ball_round, coal_vectors, frame_along
 from cnpgen.robots.shape.inline import is_inline, read_mesh, scale_of, sides_of
 from cnpgen.robots.shape.link_pairs import ALWAYS_FRACTION, CollisionBody, LinkContact, body_of_part, sample_poses
 from cnpgen.robots.shape.mesh_files import find_named_file
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
     import pinocchio as pin
 
-Array = NDArray[np.float64]
 
 GAP_STATES = 3_000  # random states: a gap of 2 % has a standard error of 0.3 %
 
@@ -81,9 +80,6 @@ def measure_hull_gap(urdf: str, path: Path, packages: Sequence[Path], *, model: 
 
     Relative mesh paths begin in the folder of the URDF's file, others in folders of packages. The model has the planned
     joints; states are sampled within its position limits.
-
-    Raises:
-        RecipeError: A mesh is missing or cannot be read.
     """
     poses = sample_poses(model, GAP_STATES)
     parts = LinkContact(poses, map(body_of_part, shape.convex_parts), shape.joints)
@@ -159,12 +155,8 @@ def _triangles(points: Array, sides: NDArray[np.int64]) -> Any:
     """Return a triangle mesh as an object of Coal."""
     import coal
 
-    corners, triangles, mesh = coal.StdVec_Vec3s(), coal.StdVec_Triangle(), coal.BVHModelOBBRSS()
-    for point in points:
-        corners.append(point)
-    for side in sides:
-        triangles.append(coal.Triangle(*map(int, side)))
+    mesh = coal.BVHModelOBBRSS()
     mesh.beginModel(len(sides), len(points))
-    mesh.addSubModel(corners, triangles)
+    mesh.addSubModel(*coal_vectors(points, sides))
     mesh.endModel()
     return mesh

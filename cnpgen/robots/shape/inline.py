@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.shape.decomposition import convex_parts
-from cnpgen.robots.shape.hull import MAX_COORDINATE_M, MAX_CORNERS, MIN_THICKNESS_M, enclosing_hull, hull_corners
+from cnpgen.robots.shape.hull import MAX_COORDINATE_M, MAX_CORNERS, MIN_THICKNESS_M, Array, enclosing_hull, hull_corners
 from cnpgen.robots.shape.mesh_files import find_named_file
 from cnpgen.robots.urdf import urdf_tree
 
 if TYPE_CHECKING:
     import coal
 
-Array = NDArray[np.float64]
 
 _INLINE = "data:application/octet-stream;base64,"  # followed by corners x, y, z [m] as little-endian float64
 _MESHES = (".stl", ".dae", ".obj")
@@ -46,9 +45,6 @@ def with_inline_meshes(
 
     Relative mesh paths begin in the folder of the URDF's file, others in folders of packages. Meshes of all links, or
     of some, consist of at most so many convex parts, 1 for the hull, which a cache folder keeps.
-
-    Raises:
-        RecipeError: Links or meshes are missing or cannot be read; the error lists all of them.
     """
     try:
         tree = urdf_tree(urdf)
@@ -100,46 +96,22 @@ def _replace(
 
 
 def mesh_files(urdf: str) -> list[str]:
-    """List the mesh files in the collision geometry of a URDF, without inline meshes.
-
-    Raises:
-        ValueError: The text is not a URDF.
-    """
+    """List the mesh files in the collision geometry of a URDF, without inline meshes."""
     meshes = urdf_tree(urdf).iterfind(".//collision/geometry/mesh")
     names = dict.fromkeys(mesh.get("filename", "") for mesh in meshes)
     return [name for name in names if not name.startswith(_INLINE)]
 
 
 def mesh_links(urdf: str) -> frozenset[str]:
-    """Return the links with mesh files in their collision geometry.
-
-    Raises:
-        ValueError: The text is not a URDF.
-    """
+    """Return the links with mesh files in their collision geometry."""
     links = urdf_tree(urdf).iter("link")
     return frozenset(
         link.get("name", "") for link in links if any(_mesh_file(each) is not None for each in link.iter("collision"))
     )
 
 
-def points_of(mesh: ElementTree.Element) -> Array:
-    """Return the corners of an inline mesh [m], shape (V, 3).
-
-    Raises:
-        ValueError: The mesh is not inline.
-    """
-    name = mesh.get("filename", "")
-    if not is_inline(name):
-        raise ValueError(f"the mesh {name!r} is not in the text of the URDF")
-    return corners_of(name)
-
-
 def inline_mesh(path: Path, scale: Array) -> str:
-    """Return the corners of the convex hull of a mesh file, scaled along x, y and z, as a ``data:`` address.
-
-    Raises:
-        RecipeError: The file cannot be read.
-    """
+    """Return the corners of the convex hull of a mesh file, scaled along x, y and z, as a ``data:`` address."""
     return address_of(*_parts_of_file(path, scale, 1, None))
 
 
@@ -154,11 +126,7 @@ def is_inline(address: str) -> bool:
 
 
 def corners_of(address: str) -> Array:
-    """Return the corners of an inline mesh [m], shape (V, 3).
-
-    Raises:
-        ValueError: The corners are not triples of finite numbers.
-    """
+    """Return the corners of an inline mesh [m], shape (V, 3); ValueError if they are not triples of finite numbers."""
     corners = np.frombuffer(base64.b64decode(address.removeprefix(_INLINE)), "<f8").reshape(-1, 3).astype(float)
     if not len(corners) or not np.isfinite(corners).all():
         raise ValueError("a mesh has no corners, or some that are not finite")
@@ -166,11 +134,7 @@ def corners_of(address: str) -> Array:
 
 
 def scale_of(mesh: ElementTree.Element) -> Array:
-    """Return the scale factors of x, y and z of a mesh, shape (3,).
-
-    Raises:
-        RecipeError: The scale is invalid.
-    """
+    """Return the scale factors of x, y and z of a mesh, shape (3,)."""
     try:
         scale = np.array([float(factor) for factor in mesh.get("scale", "1 1 1").split()])
     except ValueError:
@@ -238,14 +202,7 @@ def sides_of(mesh: "coal.BVHModelBase") -> NDArray[np.int64]:
 
 
 def read_mesh(path: Path, scale: Array) -> tuple[Array, "coal.BVHModelBase"]:
-    """Read a mesh, scaled along x, y and z: STL, DAE or OBJ.
-
-    Returns:
-        Points of the mesh [m], shape (N, 3), and the mesh as an object of Coal.
-
-    Raises:
-        RecipeError: The file cannot be read.
-    """
+    """Read an STL, DAE or OBJ file, scaled along x, y and z: points [m], shape (N, 3), and mesh of Coal."""
     import coal
 
     if path.suffix.lower() not in _MESHES:

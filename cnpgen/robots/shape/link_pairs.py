@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from cnpgen.robots.shape.capsule import Capsule
 from cnpgen.robots.shape.convex_part import ConvexPart
-from cnpgen.robots.shape.hull import ball_round, coal_hull
+from cnpgen.robots.shape.hull import Array, ball_round, coal_hull
 
 if TYPE_CHECKING:
     import pinocchio as pin
 
-Array = NDArray[np.float64]
 Names = frozenset[str]
+Mask = NDArray[np.bool_]
 
 SAMPLED_STATES = 10_000  # ten times as many gave the same pairs for a Franka Panda
 ALWAYS_FRACTION = 0.95  # links that overlap in a larger fraction of the states are treated as connected
@@ -43,6 +43,12 @@ class LinkPair:
     colliding: float
     mistaken: float
 
+    @classmethod
+    def from_samples(cls, first: str, second: str, left_out: str, hit: Mask, near: Mask) -> "LinkPair":
+        """Return a pair from masks of the sampled states in which the links, and their capsules, overlap."""
+        mistaken = float(near[~hit].mean()) if not hit.all() else 1.0
+        return cls(first, second, left_out, float(hit.mean()), mistaken)
+
     @property
     def for_solvers(self) -> bool:
         """Whether solvers use the capsules of the pair; judges check every pair that is not left out."""
@@ -58,15 +64,10 @@ def find_pairs(
     adjacent: frozenset[Names],
     disabled: frozenset[Names] | None,
 ) -> tuple[LinkPair, ...]:
-    """Determine the link pairs that can collide.
+    """Determine the link pairs that can collide, at random states within the position limits of a reduced model.
 
-    Args:
-        model: Pinocchio model, reduced to the planned joints; states are sampled within its position limits.
-        convex_parts: Convex parts of the links, in the frames of the joints that move them.
-        capsules: Link -> covering capsule, in the same frames.
-        joints: Link -> index in the model of the joint that moves it; 0 for fixed links.
-        adjacent: Pairs of links with only links without a shape between them.
-        disabled: Disabled pairs of an SRDF, None without an SRDF.
+    Convex parts and covering capsules are in the frames of the joints that move the links; ``joints`` are indices,
+    0 for fixed links. Adjacent links have only links without a shape between them. An SRDF may disable pairs.
     """
     rotations, positions = sample_poses(model, SAMPLED_STATES)
     contact = LinkContact((rotations, positions), map(body_of_part, convex_parts), joints)
@@ -81,10 +82,9 @@ def find_pairs(
         hit = contact.of(first, second)
         ends = [_ends(capsules[link], rotations[joints[link]], positions[joints[link]]) for link in (first, second)]
         near = segment_distances(*ends[0], *ends[1]) < capsules[first].radius + capsules[second].radius
-        colliding = float(hit.mean())
-        left_out = "disabled" if disabled and names in disabled else "always" if colliding > ALWAYS_FRACTION else ""
-        mistaken = float(near[~hit].mean()) if not hit.all() else 1.0
-        found.append(LinkPair(first, second, left_out, colliding, mistaken))
+        is_always = hit.mean() > ALWAYS_FRACTION
+        left_out = "disabled" if disabled and names in disabled else "always" if is_always else ""
+        found.append(LinkPair.from_samples(first, second, left_out, hit, near))
     return tuple(found)
 
 
@@ -153,7 +153,7 @@ class LinkContact:
             self._of_link.setdefault(link, []).append(body)
         self._request, self._places = coal.CollisionRequest(), (coal.Transform3s(), coal.Transform3s())
 
-    def of(self, first: str, second: str, *, among: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
+    def of(self, first: str, second: str, *, among: Mask | None = None) -> Mask:
         """Return a mask of the states, among all or those of a mask, in which two links overlap, shape (K,)."""
         hit = np.zeros(self._positions.shape[1], bool)
         for one, other in product(self._of_link[first], self._of_link[second]):

@@ -17,11 +17,7 @@ _EXTRAS = {"example-robot-data": "robots"}  # Python packages of robots -> cnpge
 
 
 def find_urdf(name: str, problem: Path, packages: Sequence[Path] = ()) -> Path:
-    """Find the URDF of a problem, in a package (see ``find_named_file``) or relative to the problem file.
-
-    Raises:
-        PluginError: The package of the file is not installed; the message lists the searched folders.
-    """
+    """Find the URDF of a problem, in a package (see ``find_named_file``) or relative to the problem file."""
     if urlparse(name).scheme not in _PACKAGE:
         return problem.parent / name
     try:
@@ -37,9 +33,6 @@ def find_named_file(name: str, urdf: Path, packages: Sequence[Path] = ()) -> Pat
     ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH``, in the URDF's own folder and all above it, and where pip installs a
     package of this name; each may hold the package or be it. Finally the folders around the URDF are taken for the
     package, whose folder may have another name. What is no URI is relative to the URDF's folder.
-
-    Raises:
-        RecipeError: It is in none of these places; with every one of them.
     """
     try:
         return _find(name, urdf, packages)

@@ -1,4 +1,4 @@
-"""Shape of a robot for judges and solvers: convex parts, covering capsules, link pairs."""
+"""Shape of a robot for judges and solvers: convex parts, covering capsules and link pairs; the held object."""
 
 import hashlib
 import json
@@ -12,19 +12,35 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.errors import MachineError, RecipeError
-from cnpgen.robots.chain import frame_of
+from cnpgen.errors import MachineError, RecipeError, nearest
+from cnpgen.robots.chain import Chain, frame_of
+from cnpgen.robots.robot_spec import HeldObject
 from cnpgen.robots.shape.capsule import Capsule, covering_capsule, covers
 from cnpgen.robots.shape.convex_part import ConvexPart, link_convex_parts
-from cnpgen.robots.shape.link_pairs import LinkPair, find_pairs
-from cnpgen.robots.shape.srdf import disabled_pairs
+from cnpgen.robots.shape.hull import CUBE, Array
+from cnpgen.robots.shape.link_pairs import (
+    ALWAYS_FRACTION,
+    LinkContact,
+    LinkPair,
+    body_of_part,
+    find_pairs,
+    sample_poses,
+)
 from cnpgen.robots.urdf import urdf_tree
+from cnpgen.robots.urdf_changes import disabled_pairs
 from cnpgen.store.files.atomic import write_file
 
 if TYPE_CHECKING:
     import pinocchio as pin
 
+Capsules = tuple[Capsule, ...]
+Pairs = tuple[LinkPair, ...]
+Parts = tuple[ConvexPart, ...]
+Size = tuple[float, float, float]
+
 SHAPE_REVISION = 1  # of the computation of capsules and pairs; cached results of another revision are ignored
+HELD_OBJECT = "held object"  # takes the place of a link's name
+SAMPLED_HELD_STATES = 2000  # states in which the object and the links are compared
 
 
 @dataclass(frozen=True)
@@ -38,13 +54,13 @@ class Shape:
         pairs: Pairs of links that move relative to each other.
     """
 
-    convex_parts: tuple[ConvexPart, ...]
+    convex_parts: Parts
     joints: Mapping[str, int]
-    capsules: tuple[Capsule, ...]
-    pairs: tuple[LinkPair, ...]
+    capsules: Capsules
+    pairs: Pairs
 
     @property
-    def moving_convex_parts(self) -> tuple[ConvexPart, ...]:
+    def moving_convex_parts(self) -> Parts:
         """Convex parts of moving links, the only ones that can avoid obstacles."""
         return tuple(part for part in self.convex_parts if self.joints[part.link])
 
@@ -56,7 +72,7 @@ class Shape:
         return tuple(both for pair in kept for both in product(of_link[pair.first], of_link[pair.second]))
 
     @property
-    def moving_capsules(self) -> tuple[Capsule, ...]:
+    def moving_capsules(self) -> Capsules:
         """Capsules of moving links."""
         return tuple(capsule for capsule in self.capsules if self.joints[capsule.link])
 
@@ -65,35 +81,33 @@ def load_shape(urdf: str, model: "pin.Model", keep: Path | None) -> Shape:
     """Load the shape of a robot from a URDF with inline meshes (``cnpgen.robots.shape.inline``) and its reduced model.
 
     Capsules and pairs, which take some seconds to compute, are kept in a cache folder, if there is one.
-
-    Raises:
-        RecipeError: The URDF has no collision geometry, or some that cannot be read.
     """
-    convex_parts, joints = place_convex_parts(link_convex_parts(urdf), model)
+    convex_parts, joints = place_convex_parts(urdf, model)
     if not any(joints.values()):
         raise RecipeError(["no link that moves has a <collision> element, so that the robot has no shape"])
 
-    def compute() -> tuple[tuple[Capsule, ...], tuple[LinkPair, ...]]:
-        capsules = tuple(covering_capsule(parts_of(link, convex_parts)) for link in joints)
+    def compute() -> tuple[Capsules, Pairs]:
+        capsules = tuple(covering_capsule(_parts_of(link, convex_parts)) for link in joints)
         by_link = {capsule.link: capsule for capsule in capsules}
         adjacent, disabled = _adjacent(urdf, set(joints)), disabled_pairs(urdf)
         return capsules, find_pairs(model, convex_parts, by_link, joints=joints, adjacent=adjacent, disabled=disabled)
 
-    numbers = [SHAPE_REVISION, urdf, list(model.names), list(model.lowerPositionLimit), list(model.upperPositionLimit)]
-    return Shape(convex_parts, joints, *cached_capsules(keep, numbers, convex_parts, compute))
+    return Shape(convex_parts, joints, *_cached(keep, [urdf, *_joints_of(model)], convex_parts, compute))
 
 
-def cached_capsules(
-    keep: Path | None,
-    numbers: list[Any],
-    convex_parts: tuple[ConvexPart, ...],
-    compute: Callable[[], tuple[tuple[Capsule, ...], tuple[LinkPair, ...]]],
-) -> tuple[tuple[Capsule, ...], tuple[LinkPair, ...]]:
-    """Return capsules and link pairs from the cache folder, or compute and store them; without a folder, compute them.
+def _joints_of(model: "pin.Model") -> list[list[Any]]:
+    """Return the names and the position limits of joints, on which capsules and pairs depend."""
+    return [list(model.names), list(model.lowerPositionLimit), list(model.upperPositionLimit)]
 
-    JSON values determine the result. Capsules must cover the convex parts.
+
+def _cached(
+    keep: Path | None, numbers: list[Any], convex_parts: Parts, compute: Callable[[], tuple[Capsules, Pairs]]
+) -> tuple[Capsules, Pairs]:
+    """Return capsules, which must cover the parts, and pairs from a cache folder, or compute and store them.
+
+    The JSON values determine the result. Without a folder, it is computed.
     """
-    name = f"shape-{hashlib.sha256(json.dumps(numbers).encode()).hexdigest()[:32]}.json"
+    name = f"shape-{hashlib.sha256(json.dumps([SHAPE_REVISION, *numbers]).encode()).hexdigest()[:32]}.json"
     if keep is not None:
         with suppress(OSError, ValueError, KeyError, TypeError):
             return _read(json.loads((keep / name).read_text(encoding="utf-8")), convex_parts)
@@ -104,20 +118,15 @@ def cached_capsules(
     return capsules, pairs
 
 
-def parts_of(link: str, convex_parts: tuple[ConvexPart, ...]) -> list[ConvexPart]:
+def _parts_of(link: str, convex_parts: Parts) -> list[ConvexPart]:
     """Return the convex parts of a link."""
     return [part for part in convex_parts if part.link == link]
 
 
-def place_convex_parts(
-    convex_parts: list[ConvexPart], model: "pin.Model"
-) -> tuple[tuple[ConvexPart, ...], dict[str, int]]:
-    """Transform convex parts from the frames of their links to those of the joints that move them.
-
-    Also return link -> index of the joint that moves it; 0 for fixed links.
-    """
+def place_convex_parts(urdf: str, model: "pin.Model") -> tuple[Parts, dict[str, int]]:
+    """Return the convex parts of links in the frames of the joints that move them, and link -> index of this joint."""
     placed, joints = [], {}
-    for part in convex_parts:
+    for part in link_convex_parts(urdf):
         frame = model.frames[frame_of(model, part.link)]
         placed.append(part.moved(np.array(frame.placement.rotation), np.array(frame.placement.translation)))
         joints[part.link] = int(frame.parentJoint)
@@ -141,19 +150,84 @@ def _adjacent(urdf: str, shaped: set[str]) -> frozenset[frozenset[str]]:
     return frozenset(found)
 
 
-def _written(capsules: tuple[Capsule, ...], pairs: tuple[LinkPair, ...]) -> dict[str, Any]:
+def _written(capsules: Capsules, pairs: Pairs) -> dict[str, Any]:
     entries = [asdict(each) | {"first": each.first.tolist(), "second": each.second.tolist()} for each in capsules]
     return {"capsules": entries, "pairs": [asdict(pair) for pair in pairs]}
 
 
-def _read(
-    content: dict[str, Any], convex_parts: tuple[ConvexPart, ...]
-) -> tuple[tuple[Capsule, ...], tuple[LinkPair, ...]]:
+def _read(content: dict[str, Any], convex_parts: Parts) -> tuple[Capsules, Pairs]:
     """Return cached capsules and pairs; raise ValueError if a capsule does not cover its link."""
     capsules = tuple(
         Capsule(**each | {"first": np.array(each["first"]), "second": np.array(each["second"])})
         for each in content["capsules"]
     )
-    if not all(covers(capsule, parts_of(capsule.link, convex_parts)) for capsule in capsules):
+    if not all(covers(capsule, _parts_of(capsule.link, convex_parts)) for capsule in capsules):
         raise ValueError("a capsule does not cover its link")
     return capsules, tuple(LinkPair(**pair) for pair in content["pairs"])
+
+
+def load_held_shape(urdf: str, model: "pin.Model", held: HeldObject, tip_frame: int, keep: Path | None) -> Shape:
+    """Load the link geometry for collisions with the held object, for a URDF with inline meshes and its reduced model.
+
+    A cache folder keeps capsules and pairs; None for no cache.
+
+    Returns:
+        The convex parts of all links that may not touch the object, then the object; a capsule and a pair for each of
+        these links. Links that the joint of the tip moves do not move relative to the object and are omitted.
+    """
+    convex_parts, joints = place_convex_parts(urdf, model)
+    if not joints:
+        raise RecipeError(
+            ["no link has a <collision> element, so that contacts with the held object cannot be checked"]
+        )
+    for link in held.touch_links:
+        if link not in joints:
+            raise RecipeError([f"object.touch_links: no link {link!r} has collision geometry{nearest(link, joints)}"])
+    tip = model.frames[tip_frame]
+    carrier = int(tip.parentJoint)
+    checked = [link for link in joints if link not in held.touch_links and joints[link] != carrier]
+    box = _box(held.size, np.array(tip.placement.rotation), np.array(tip.placement.translation))
+    parts = (*(part for part in convex_parts if part.link in checked), box)
+    joints = {link: joints[link] for link in checked} | {HELD_OBJECT: carrier}
+
+    def compute() -> tuple[Capsules, Pairs]:
+        capsules = tuple(covering_capsule(_parts_of(link, parts)) for link in checked)
+        return capsules, _compare(model, parts, capsules, joints)
+
+    about = [HELD_OBJECT, list(held.size), list(held.touch_links), tip.placement.homogeneous.tolist()]
+    capsules, pairs = _cached(keep, [urdf, *_joints_of(model), *about], parts, compute)
+    if fixed := [pair.first for pair in pairs if pair.colliding > ALWAYS_FRACTION]:
+        text = f"the held object overlaps {', '.join(fixed)} in nearly all of {SAMPLED_HELD_STATES:,} random states"
+        raise RecipeError([f"object.touch_links: {text}: name the links that may touch it"])
+    return Shape(parts, joints, capsules, pairs)
+
+
+def with_held_object(shape: Shape, held: Shape | None, chain: Chain, size: Size) -> Shape:
+    """Return the link geometry of a robot with the held object, of these edge lengths [m], as a further link.
+
+    The tip of the chain is its center. Pairs of the held shape are added; None for no pairs with the object.
+    """
+    box, half = _box(size, chain.tip_rotation, chain.tip_translation), np.array(size) / 2
+    widest = int(np.argmax(half))
+    axis, radius = half[widest] * chain.tip_rotation[:, widest], float(np.linalg.norm(np.delete(half, widest)))
+    capsule = Capsule(HELD_OBJECT, chain.tip_translation - axis, chain.tip_translation + axis, radius, overhang=radius)
+    joints = {**shape.joints, HELD_OBJECT: len(chain.joints)}
+    pairs = () if held is None else held.pairs
+    return Shape((*shape.convex_parts, box), joints, (*shape.capsules, capsule), (*shape.pairs, *pairs))
+
+
+def _box(size: Size, rotation: Array, translation: Array) -> ConvexPart:
+    return ConvexPart(HELD_OBJECT, CUBE * np.array(size)).moved(rotation, translation)
+
+
+def _compare(model: "pin.Model", parts: Parts, capsules: Capsules, joints: dict[str, int]) -> tuple[LinkPair, ...]:
+    """Compare the object with all links and their capsules in random states."""
+    names = {capsule.link: f"capsule of {capsule.link}" for capsule in capsules}
+    covers = [ConvexPart(names[each.link], np.array([each.first, each.second]), each.radius) for each in capsules]
+    all_joints = joints | {name: joints[link] for link, name in names.items()}
+    poses = sample_poses(model, SAMPLED_HELD_STATES)
+    contact = LinkContact(poses, map(body_of_part, [*parts, *covers]), all_joints)
+    return tuple(
+        LinkPair.from_samples(link, HELD_OBJECT, "", contact.of(link, HELD_OBJECT), contact.of(name, HELD_OBJECT))
+        for link, name in names.items()
+    )

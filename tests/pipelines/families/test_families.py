@@ -14,8 +14,7 @@ from cnpgen.pipelines.families.resting_states import RestingStates
 from cnpgen.pipelines.families.scene_generator import FAMILIES, grasp_rotations
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.observation.primitives import primitives_of
-from cnpgen.robots.observation.signed_distance import signed_distances
+from cnpgen.robots.observation.primitives import primitives_of, signed_distances
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import place_obstacles, solids_of

@@ -13,8 +13,7 @@ from cnpgen.problems.scenes.scene_problem import make_mesh
 from cnpgen.recipes import Obstacle
 from cnpgen.robots.observation.camera import depth_image
 from cnpgen.robots.observation.observations import OBSERVATIONS, Observation
-from cnpgen.robots.observation.primitives import KINDS, bodies_of
-from cnpgen.robots.observation.signed_distance import signed_distances
+from cnpgen.robots.observation.primitives import KINDS, bodies_of, signed_distances
 from cnpgen.robots.scene import PARKED_POSITION_M, Scene
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.shape.hull import CUBE, coal_hull

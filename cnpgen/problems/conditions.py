@@ -1,32 +1,29 @@
-"""Derivative order of conditions: the highest derivative of q that a condition depends on, derived from its forms.
+"""Conditions of a problem at a state, their derivative orders, and the residuals of its equalities.
 
-The order is 0 for positions, 1 for velocities, 2 for accelerations and 3 for jerks.
+The derivative order is the highest derivative of q that a condition depends on, derived from its forms. It is 0 for
+positions, 1 for velocities, 2 for accelerations and 3 for jerks.
 """
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.constraint import Condition
+from cnpgen.problems.constraints.constraint import Array, Condition
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import place_obstacles
 
 if TYPE_CHECKING:
+    from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.world.world import World
-
-Array = NDArray[np.float64]
 
 _SHARES = (0.1, 0.9, 10.0)  # fractions of the limits
 _MIXED = np.cos(np.arange(64.0))  # both signs and distinct magnitudes
 
 
 def symbolic_needs(condition: Condition, *derivatives: Any) -> int:
-    """Return the derivative order of a condition with SX expressions.
-
-    The derivatives are SX columns of the symbols of the velocities, of those in the accelerations alone and, for states
-    with jerks, of those in the jerks alone.
-    """
+    """Return the derivative order of a condition, from SX columns of velocities, accelerations and maybe jerks."""
     import casadi as ca
 
     g = ca.SX(ca.vertcat(*condition.g))
@@ -40,12 +37,7 @@ def measured_needs(
     """Return the derivative orders of conditions in measured form: which of dq, ddq and the jerk change their values.
 
     The conditions are evaluated with one of these nan and, since a form may ignore nan, far below, near and far above
-    its limit.
-
-    Args:
-        forms: Functions that evaluate them: ``measured`` of every constraint, or ``measured_at`` for an end.
-        world: World for the evaluation; it is left at rest in the base configuration.
-        jerk: Whether states have jerks, as those of motions, unlike boundary states.
+    its limit. The world is left at rest in the base configuration. Boundary states have no jerk.
     """
     robot, forms = world.robot, list(forms)
     limits = [robot.velocity_limit, robot.acceleration_limit, *([robot.jerk_limit] if jerk else [])]
@@ -73,3 +65,35 @@ def _changed(
         any(not np.array_equal(one[index], known, equal_nan=True) for one in moving)
         for index, known in enumerate(still)
     ]
+
+
+def equality_residuals(robot: Robot, problem: Problem) -> Any:
+    """Build ``(q, obstacle_poses) -> (r, dr/dq)``: residuals of the equalities, Jacobian column by column."""
+    import casadi as ca
+
+    columns, state = state_of_symbols(robot, problem)
+    rows = [
+        value - float(target)
+        for condition, needs in conditions_with_needs(problem, state, columns[1:-1])
+        if needs == 0 and condition.is_equality
+        for value, target in zip(condition.g, condition.lower, strict=True)
+    ]
+    residual = ca.vertcat(*rows) if rows else ca.SX(0, 1)
+    jacobian = ca.densify(ca.jacobian(residual, columns[0]))
+    return ca.Function("equality_residuals", [columns[0], columns[-1]], ca.cse([residual, ca.vec(jacobian)]))
+
+
+def state_of_symbols(robot: Robot, problem: Problem) -> tuple[list[Any], "SymbolicState"]:
+    """Return the columns q, dq, ddq, the jerk if it is constrained, and obstacle poses, and their state."""
+    from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
+
+    scene = problem.obstacle, problem.object_size, problem.scene_width
+    return SymbolicState.of_symbols(robot, *scene, uses_jerk=problem.uses_jerk)
+
+
+def conditions_with_needs(
+    problem: Problem, state: "SymbolicState", moving: Sequence[Any]
+) -> list[tuple[Condition, int]]:
+    """Return all constraints at a state, each with the highest derivative of q, of ``moving``, that it depends on."""
+    conditions = [condition for constraint in problem.constraint for condition in constraint.symbolic(state)]
+    return [(condition, symbolic_needs(condition, *moving)) for condition in conditions]
