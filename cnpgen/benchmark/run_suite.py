@@ -190,7 +190,7 @@ def _checked_numbers(time_limit: float, plane_tolerance: float, seed: int, repea
     limit = number("time_limit", time_limit)
     if limit <= 0:
         raise UsageError(f"must be above 0 s, got {time_limit:g} s", argument="time_limit")
-    if not 0 <= plane_tolerance < np.inf:
+    if number("plane_tolerance", plane_tolerance) < 0:
         raise UsageError(f"must not be negative, got {plane_tolerance:g} m", argument="plane_tolerance")
     return limit, integer("seed", seed, least=0), integer("repeat", repeat, least=1, most=MAX_REPETITIONS)
 

@@ -28,8 +28,6 @@ def run(arguments: argparse.Namespace) -> int:
 
     report = check_machine()
     print(json.dumps(report.to_dict(), indent=2) if arguments.json else machine_text(report))
-    for note in report.notes:
-        print(f"cnpgen: warning: {note}", file=sys.stderr)
     for problem in report.problems:
         print(f"cnpgen: error: {problem}", file=sys.stderr)
     return 0 if report.ok else MachineError.exit_code
@@ -54,7 +52,8 @@ def machine_text(report: "MachineReport") -> str:
         "free disk": f"{report.free_bytes / 1e9:,.1f} GB here",
         "verdict": _verdict(report),
     }
-    return "\n".join(table(list(facts.items())))
+    findings = [("problem", problem) for problem in report.problems] + [("warning", note) for note in report.notes]
+    return "\n".join(table([*facts.items(), *findings]))
 
 
 def _cache(report: "MachineReport") -> str:

@@ -154,7 +154,7 @@ class GoalOfPlan(Stage):
     """Stage: keep the goal of the motion that contains the start, in a fraction of the cases."""
 
     inputs = tuple(f"planned_{name}" for name in GOAL)
-    share: float = fraction("fraction of the plans that are refined")
+    share: float = fraction("fraction of the samples with the goal of the motion that they start on")
 
     def describe(self) -> str:
         return f"in {100 * self.share:.4g} % of the cases take the goal of the motion that the start is on"

@@ -194,7 +194,7 @@ def limit_mistakes(problem: Problem, raw: ProblemTables) -> Iterator[str]:
     given |= {"position": [(span.low, span.high) for span in limits.position]} if limits.position else {}
     if raw.urdf is None:  # loading the robot raises the error
         return
-    joints = {joint.get("name"): joint for joint in raw.urdf.iter("joint")}
+    joints = {joint.get("name"): joint for joint in raw.urdf.findall("joint")}  # others are of transmissions
     try:
         plausible = {key: [_plausible_limit(joints[name], key) for name in spec.joints] for key in given}
     except (ValueError, KeyError):  # loading the robot raises the error

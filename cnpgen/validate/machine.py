@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from cnpgen.errors import PluginError
+from cnpgen.errors import PluginError, counted
 from cnpgen.machine.threads import users_environment
 from cnpgen.machine.versions import installed_version, processor_entry
 
@@ -192,7 +192,8 @@ def _check_cores(findings: _Findings) -> tuple[int, int]:
     except Exception:  # noqa: BLE001 - reported by _check_libraries
         granted = available
     if granted < available:
-        findings.notes.append(f"this container may use {granted} of {available} cores: use at most {granted} workers")
+        workers = counted(granted, "worker")
+        findings.notes.append(f"this container may use {granted} of {available} cores: use at most {workers}")
     return min(granted, available), present
 
 

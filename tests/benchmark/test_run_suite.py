@@ -260,6 +260,9 @@ def test_mistakes_are_reported_before_any_work(tmp_path: Path) -> None:
         run_benchmark("hits-81", tmp_path, planners=["cnpgen"], plants=["lighter"])
     with pytest.raises(UsageError, match="time_limit must be above 0"):
         run_benchmark("hits-81", tmp_path, planners=["cnpgen"], time_limit=0)
+    for tolerance in (-1e-3, float("inf"), True):
+        with pytest.raises(UsageError, match="plane_tolerance must"):
+            run_benchmark("hits-81", tmp_path, planners=["cnpgen"], plane_tolerance=tolerance)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -465,7 +468,7 @@ def test_figures_have_success_over_planning_time_and_suitable_axes(random: str, 
     scales = {axes.get_title(): axes.get_yscale() for axes in distribution_figure(values).axes}
     assert scales["planning time, CPU [ms]"] == "log"
     assert scales["motion time [s]"] == "linear"
-    paths = save_benchmark_figures(benchmark, tmp_path)
+    paths = save_benchmark_figures(benchmark, tmp_path / "new" / "figures")
     assert [path.name for path in paths] == ["success-planned.pdf", "distributions-planned.pdf"]
     assert all(path.read_bytes().startswith(b"%PDF") for path in paths)
 

@@ -615,6 +615,18 @@ def test_doctor_finds_this_machine_well(run):
     code, out, _ = run("doctor")
     assert code == 0
     assert "all requirements are met" in out
+
+
+def test_the_report_of_doctor_has_all_findings(run, monkeypatch):
+    """``cnpgen doctor > machine.txt`` loses none of them."""
+    monkeypatch.setenv("LOKY_MAX_CPU_COUNT", "1")
+    monkeypatch.setitem(sys.modules, "pinocchio", types.ModuleType("pinocchio"))
+    _, out, _ = run("doctor")
+    assert "another project" in " ".join(out.split())
+    assert re.search(r"^warning .*container may use 1 of", out, re.MULTILINE)
+
+
+def test_doctor_writes_json(run):
     assert json.loads(run("doctor", "--json")[1])["ok"] is True
 
 

@@ -16,6 +16,7 @@ from cnpgen.judges.trajectories.smooth_curve import AccelerationLimits, smooth_c
 from cnpgen.plans import Plans
 from cnpgen.plans.export import export_plans
 from cnpgen.plans.exporter import sample_plan
+from cnpgen.problems.scenes.yaml_document import MAX_YAML_DEPTH, read_yaml
 from cnpgen.trajectories import Decision, Trajectory, load_trajectories
 from tests.examples.plan_files import plans_of
 from tests.examples.plans import load, perturbed
@@ -374,6 +375,21 @@ def test_yaml_with_anchors_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "anchors.yaml").write_text(text)
     with pytest.raises(UsageError, match="expected a file without anchors"):
         load_trajectories(tmp_path / "anchors.yaml", "airhockey")
+
+
+@pytest.mark.parametrize("opening", ["[", "{a: "])
+def test_yaml_is_nested_to_the_stated_depth(tmp_path: Path, opening: str) -> None:
+    """A list and a mapping count as one level each."""
+    pytest.importorskip("yaml")
+    closing = "]" if opening == "[" else "}"
+
+    def nested(levels: int) -> list[object]:
+        (tmp_path / "deep.yaml").write_text(opening * levels + "1" + closing * levels)
+        return read_yaml(tmp_path / "deep.yaml")
+
+    assert len(nested(MAX_YAML_DEPTH)) == 1
+    with pytest.raises(UsageError, match=f"at most {MAX_YAML_DEPTH} levels"):
+        nested(MAX_YAML_DEPTH + 1)
 
 
 def test_a_damaged_header_of_a_parquet_file_in_a_dataset_of_lerobot_is_an_error(tmp_path: Path) -> None:

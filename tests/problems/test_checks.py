@@ -92,6 +92,15 @@ def test_limits_far_above_those_of_the_urdf_are_in_another_unit(tmp_path, limit,
     assert ("'velocity_scale' is a fraction of the URDF's limit" in found) == limit.startswith("velocity")
 
 
+def test_joints_of_transmissions_have_no_limits(tmp_path):
+    """They repeat names of joints; implausible limits are found in such URDFs, too."""
+    file = limited(tmp_path, "velocity = 80")
+    (urdf,) = tmp_path.rglob("*.urdf")
+    transmission = '<transmission name="t"><joint name="swing"/></transmission></robot>'
+    urdf.write_text(urdf.read_text(encoding="utf-8").replace("</robot>", transmission), encoding="utf-8")
+    assert "limits.velocity: swing: must be from 0 to 20 rad/s" in mistakes(file)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "text"),
     [

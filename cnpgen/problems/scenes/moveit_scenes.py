@@ -163,7 +163,17 @@ def _obstacles(scene: Any, place: str) -> Iterator[Obstacle]:
             vertices = part(mesh, "vertices", list, where)
             points = np.array([vector(each, "xyz", f"{where}: vertex") for each in vertices]).reshape(-1, 3)
             inner = _pose(pose, where)
-            yield make_mesh(name, points, outer[0] + outer[1] @ inner[0], outer[1] @ inner[1], place=place)
+            obstacle = make_mesh(name, points, outer[0] + outer[1] @ inner[0], outer[1] @ inner[1], place=place)
+            _check_triangles(mesh, len(points), where)
+            yield obstacle
+
+
+def _check_triangles(mesh: Any, vertices: int, where: str) -> None:
+    """Check that the triangles of a mesh, whose hull counts, refer to its vertices."""
+    for triangle in part(mesh, "triangles", list, where):
+        for index in vector(part(triangle, "vertex_indices", list, where), "", f"{where}: vertex_indices"):
+            if index not in range(vertices):
+                raise SceneError(f"{where}: a triangle has the vertex {index:g}, expected 0 to {vertices - 1}")
 
 
 def _with_poses(entry: Any, what: str, where: str) -> list[tuple[Any, Any]]:

@@ -41,7 +41,7 @@ def _documents(path: Path, yaml: Any, events: Any, numbers: bool) -> Iterator[An
             raise SceneError(f"{path} has the anchor {event.anchor!r:.60}, expected a file without anchors")
         if isinstance(event, yaml.MappingStartEvent | yaml.SequenceStartEvent):
             stack.append({} if isinstance(event, yaml.MappingStartEvent) else [])
-            if len(stack) > 2 * MAX_YAML_DEPTH:
+            if sum(isinstance(part, dict | list) for part in stack) > MAX_YAML_DEPTH:
                 raise SceneError(f"{path} is nested too deeply, expected at most {MAX_YAML_DEPTH} levels")
             continue
         if isinstance(event, yaml.MappingEndEvent | yaml.SequenceEndEvent):

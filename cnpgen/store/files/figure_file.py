@@ -18,6 +18,7 @@ def new_figure(width: float, height: float, dpi: int = 110) -> "Figure":
 
 
 def save_figure(figure: "Figure", path: Path) -> None:
-    """Write a figure in the format of the suffix."""
+    """Write a figure in the format of the suffix; create its folder if it does not exist."""
     with machine_errors("write", path):
+        path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path)

@@ -192,6 +192,9 @@ BAD_SCENES = {  # damage of the text of a scene -> part of the message
     "primitives:|meshes: [{}]\n      primitives:": "obstacle 'Can1' has 1 meshes and 0 poses, expected equal numbers",
     "primitives:|meshes: [{vertices: []}]\n      mesh_poses: [{position: [0, 0, 0], orientation:"
     " [0, 0, 0, 1]}]\n      primitives:": "obstacle 'Can1' is a mesh without vertices",
+    "primitives:|meshes: [{vertices: [{x: 0, y: 0, z: 0}, {x: 1, y: 0, z: 0}, {x: 0, y: 1, z: 0}, {x: 0, y: 0, z: 1}],"
+    " triangles: [{vertex_indices: [1, 2, 4]}]}]\n      mesh_poses: [{position: [2, 2, 2], orientation: [0, 0, 0, 1]}]"
+    "\n      primitives:": "obstacle 'Can1': a triangle has the vertex 4, expected 0 to 3",
 }
 
 
