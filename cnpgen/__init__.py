@@ -34,7 +34,7 @@ public names are in these modules:
 * ``cnpgen.trajectories``: sampled trajectories of other planners: load, import, fit, and their verdicts.
 * ``cnpgen.scenes``: planning problems in scene files, families of scenes, and plans for them.
 * ``cnpgen.errors``: the exceptions.
-* ``cnpgen.plugins``: contracts of stages, constraints and exporters.
+* ``cnpgen.plugins``: contracts of stages, constraints, objectives and exporters.
 * ``cnpgen.benchmark``: comparison of planners, and simulation of plans.
 
 Names load on first use, so that importing the package is cheap. ``__init__.pyi`` lists them for type checkers (SPEC 1).

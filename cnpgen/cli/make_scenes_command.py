@@ -16,7 +16,7 @@ from typing import Any
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, add_json
 from cnpgen.cli.terminal import Meter
-from cnpgen.errors import UsageError
+from cnpgen.errors import UsageError, counted
 
 
 def add_options(parser: Parser) -> None:
@@ -71,9 +71,11 @@ def run(arguments: argparse.Namespace) -> None:
         )
     save_scenes(out, scenes)
     obstacles = [len(scene.obstacles) for scene in scenes]
-    facts = {"file": str(out), "problems": len(scenes), "scenes": len({id(scene.obstacles) for scene in scenes})}
+    groups = len({id(scene.obstacles) for scene in scenes})
+    facts = {"file": str(out), "problems": len(scenes), "scenes": groups}
     if not arguments.quiet:
-        text = f"{len(scenes)} problems in {facts['scenes']} scenes with {min(obstacles)} to {max(obstacles)} obstacles"
+        text = f"{counted(len(scenes), 'problem')} in {counted(groups, 'scene')}"
+        text += f" with {min(obstacles)} to {max(obstacles)} obstacles"
         print(text, file=sys.stderr)
     print(json.dumps(facts, indent=2) if arguments.json else out)
 

@@ -19,6 +19,7 @@ from cnpgen.make.recipe import makes_its_rows, restored
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.prepared import Block, PreparedPipeline
 from cnpgen.robots.scene import scene_poses
+from cnpgen.schema.registry import group_of, package_of
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask
 from cnpgen.store.field import Field
 from cnpgen.store.manifest import source_date
@@ -165,10 +166,13 @@ def spot_check(
     report = verify_rows(prepared.context.problem, prepared.context.robot, some, dtype=spec.dtype)
     if len(report.failed_rows):
         wrong = ", ".join(f"{check.name} {check.worst:.3g} {check.unit}" for check in report.failed)
+        kinds = (*prepared.context.problem.constraint, *prepared.pipeline.stage)
+        packages = sorted({package_of(group_of(type(kind)), type(kind)) for kind in kinds} - {""})
+        plug_ins = f"what {', '.join(packages)} samples or solves is not what it measures, or " if packages else ""
         raise MachineError(
             f"row {task.first_row + rows[report.failed_rows[0]]} of split {task.split!r} fails Pinocchio's check"
-            f" ({wrong}):"
-            f" the {spec.backend!r} backend computes wrong numbers on this machine; try another {{backend}}",
+            f" ({wrong}): {plug_ins}"
+            f"the {spec.backend!r} backend computes wrong numbers on this machine; try another {{backend}}",
             remedies={"backend": None},
         )
     return {check.name: check.worst for check in report.checks}

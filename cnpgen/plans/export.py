@@ -18,7 +18,7 @@ from cnpgen.plans.plans import Plans, screen
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
-from cnpgen.store.files.atomic import write_file
+from cnpgen.store.files.atomic import machine_errors, write_file
 
 MAX_SAMPLES = 1_000_000  # per plan
 MAX_RATE_HZ = 1e6  # steps of 1 us; ROS stamps resolve 1 ns
@@ -105,6 +105,9 @@ def export_plans(
         parameters=problem.parameters.names,
     )
     held = None
+    folder = out.parent if exporter.single_file else out
+    with machine_errors("write", folder):
+        folder.mkdir(parents=True, exist_ok=True)
     if exporter.single_file:
         files = [out / f"plans{exporter.suffix}" if out.is_dir() and not exporter.is_folder else out]
         exporter.write(files[0], sampled, exported)

@@ -304,6 +304,7 @@ class _Reader:
         naming = [list(joints)]
         if not any(joint.isdecimal() for joint in joints):
             naming += [[str(k + first) for k in range(len(joints))] for first in (0, 1)]
+        most = 0  # columns of a numbering that is not complete
         for names in naming:
             found = [_column_of(plain, name.lower(), kind) for name in names]
             if all(found):
@@ -311,6 +312,9 @@ class _Reader:
             if any(found) and names is naming[0]:
                 missing = names[found.index(None)]
                 raise self._error(f"no column with the {KIND_NAMES[kind][1]} of {missing!r}")
+            most = max(most, len(joints) - found.count(None))
+        if kind == "q" and most > 1:
+            raise self._error(f"{most} columns with joint positions, the problem plans {len(joints)} joints")
         return None
 
     def _numbers(self, name: str, *, ndim: int) -> Array:

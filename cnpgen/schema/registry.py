@@ -8,6 +8,7 @@ import importlib.metadata
 import inspect
 import pkgutil
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -219,6 +220,17 @@ def package_of(group: str, kind: type) -> str:
     """Return the name of the installed package that registers a class; empty for built-in and unregistered ones."""
     name = name_of(group, kind)
     return next((entry.dist.name for entry in installed(group) if entry.name == name and entry.dist), "")
+
+
+def package_in(error: BaseException) -> str:
+    """Return the installed package of plug-ins in whose code an error was raised; empty if there is none."""
+    packages = {
+        entry.module.partition(".")[0]: entry.dist.name if entry.dist else entry.module
+        for group in CONTRACTS
+        for entry in installed(group)
+    }
+    modules = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return next((packages[top] for top in (name.partition(".")[0] for name in modules[::-1]) if top in packages), "")
 
 
 def why_missing(group: str, use: str, package: str) -> str:

@@ -11,6 +11,7 @@ import pytest
 from cnpgen.cli.docs_command import KINDS, list_pages
 from cnpgen.cli.main import build_parser
 from cnpgen.errors import CnpgenError
+from cnpgen.refine.task import Outcome
 from tests.docs.test_blocks import blocks
 from tests.test_public_names import MODULES
 
@@ -156,3 +157,9 @@ def test_the_pictures_of_the_concepts_are_drawn_from_computed_plans(
         assert f"../images/{name}" in text
         assert (DOCS / "images" / name).is_file()
         assert (tmp_path / name).stat().st_size > 5_000
+
+
+def test_the_plan_format_lists_every_outcome_of_refining() -> None:
+    page = (DOCS / "reference" / "plan-format.md").read_text(encoding="utf-8")
+    table = page.split("| outcome | definition |")[1].split("\n\n")[0]
+    assert re.findall(r"^\| (\d+) \|", table, re.MULTILINE) == [str(int(outcome)) for outcome in Outcome]

@@ -20,6 +20,7 @@ from cnpgen.make.make_shards import Job, make_shards, shard_columns
 from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.make.resolve_spec import draw_up
 from cnpgen.pipelines.prepared import PreparedPipeline
+from cnpgen.pipelines.stages.ik import StartIK
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS
 from cnpgen.schema.catalogue import list_recipes
 from cnpgen.store.dataset_spec import load_dataset_spec, shards
@@ -200,6 +201,9 @@ def test_a_shard_that_pinocchio_disagrees_with_is_not_written(tmp_path, monkeypa
     with pytest.raises(MachineError, match=r"row 249 of split 'train' fails Pinocchio's check .*try another backend="):
         make_tiny(tmp_path / "out")
     assert not digests(tmp_path / "out")
+    monkeypatch.setattr(make, "package_of", lambda _group, kind: "my-hits" if kind is StartIK else "")
+    with pytest.raises(MachineError, match="what my-hits samples or solves is not what it measures, or the"):
+        make_tiny(tmp_path / "out")
 
 
 def test_the_worst_violation_of_every_check_is_recorded(tiny):

@@ -12,8 +12,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from cnpgen.cli.main import main
 from cnpgen.errors import DatasetError, MachineError, UsageError
-from cnpgen.plans import Plans
+from cnpgen.plans import Plans, save_plans
 from cnpgen.plans.export import Exported, export_plans
 from cnpgen.plans.exporter import sample_plan
 from cnpgen.problems.problem_file import load_problem
@@ -278,6 +279,27 @@ def test_a_package_adds_a_format(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
             export_plans(plans, tmp_path, to="duration")
     assert exported.files == (tmp_path / "plans.txt",)
     assert exported.files[0].read_text() == f"0 {plans.duration[0]}\n1 {plans.duration[1]}\n"
+
+
+def test_a_format_with_a_file_per_plan_finds_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "separate.py").write_text(EXPORTER.replace("single_file = True", ""))
+    with installed_kind(tmp_path, "separate", "separate:Durations", monkeypatch, group=registry.EXPORTERS):
+        exported = export_plans(draw_plans(), tmp_path / "new" / "texts", to="separate", only=[0, 1])
+    assert [path.name for path in exported.files] == ["plan_00000.txt", "plan_00001.txt"]
+    assert all(path.is_file() for path in exported.files)
+
+
+def test_an_error_in_a_package_names_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_plans(tmp_path / "plans.h5", draw_plans())
+    (tmp_path / "failing.py").write_text(EXPORTER.replace("plan.t[-1]", "plan.time[-1]"))
+    with installed_kind(tmp_path, "failing", "failing:Durations", monkeypatch, group=registry.EXPORTERS):
+        words = ["export", str(tmp_path / "plans.h5"), "--to", "failing", "-o", str(tmp_path / "out.txt")]
+        assert main(words) == MachineError.exit_code
+    message = capsys.readouterr().err
+    assert "error in the package 'failing': AttributeError: 'SampledPlan' object has no attribute 'time'" in message
+    assert "please report it" not in message
 
 
 @pytest.mark.parametrize(

@@ -377,6 +377,12 @@ def test_yaml_with_anchors_is_refused(tmp_path: Path, text: str) -> None:
         load_trajectories(tmp_path / "anchors.yaml", "airhockey")
 
 
+def test_numbered_columns_of_fewer_joints_are_counted(tmp_path: Path) -> None:
+    (tmp_path / "five.csv").write_text("t,q1,q2,q3,q4,q5\n0,0,0,0,0,0\n1,0,0,0,0,0\n")
+    with pytest.raises(UsageError, match="5 columns with joint positions, the problem plans 6 joints"):
+        load_trajectories(tmp_path / "five.csv", "airhockey")
+
+
 @pytest.mark.parametrize("opening", ["[", "{a: "])
 def test_yaml_is_nested_to_the_stated_depth(tmp_path: Path, opening: str) -> None:
     """A list and a mapping count as one level each."""
