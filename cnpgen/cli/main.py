@@ -208,14 +208,17 @@ def _explain(error: BaseException, options: Container[str]) -> tuple[Sequence[st
         return ["out of memory; fewer --workers need less"], code
     if isinstance(error, OSError) and error.strerror:
         return [f"{error.filename}: {error.strerror}" if error.filename else error.strerror], code
+    return [_describe_bug(error)], code
+
+
+def _describe_bug(error: BaseException) -> str:
+    """Describe an error that no module expects, with the package of a plug-in whose code raised it."""
     from cnpgen.schema.registry import package_in
 
     text = " ".join(f"{type(error).__name__}: {error}".split())
     if package := package_in(error):
-        return [f"error in the package {package!r}: {text}; --debug shows the traceback"], code
-    return [
-        f"internal error: {text}; please report it (--debug shows the traceback, 'cnpgen doctor' the machine)"
-    ], code
+        return f"error in the package {package!r}: {text}; --debug shows the traceback"
+    return f"internal error: {text}; please report it (--debug shows the traceback, 'cnpgen doctor' the machine)"
 
 
 def shell_spelling(options: Container[str]) -> Spelling:
