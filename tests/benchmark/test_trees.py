@@ -22,16 +22,8 @@ from cnpgen.benchmark.planners.proposals import (
     shipped_proposals,
     train_proposals,
 )
-from cnpgen.benchmark.planners.sst import (
-    CONTROL_STEP_S,
-    MAX_TIP_HEIGHT_ERROR_M,
-    MAX_UPRIGHT_ERROR,
-    SST,
-    Radii,
-    StateCheck,
-    Tree,
-    radii_of,
-)
+from cnpgen.benchmark.planners.sst import CONTROL_STEP_S, SST, Radii, Tree, radii_of
+from cnpgen.benchmark.planners.state_check import MAX_TIP_HEIGHT_ERROR_M, MAX_UPRIGHT_ERROR, StateCheck
 from cnpgen.benchmark.suite import load_suite
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.planner.network.architecture import Architecture, forward, initial_parameters

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
 from cnpgen.benchmark.planners.proposals import Proposals, load_proposals, shipped_proposals
-from cnpgen.benchmark.planners.sst import StateCheck, Tree, radii_of
+from cnpgen.benchmark.planners.sst import Tree, radii_of
+from cnpgen.benchmark.planners.state_check import StateCheck
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem
