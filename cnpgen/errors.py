@@ -122,7 +122,12 @@ class MissingExtraError(MachineError, ImportError):
 
 @contextmanager
 def requires_extra(extra: str, package: str) -> Iterator[None]:
-    """Raise MissingExtraError if an import of a package in the block fails, with the extra that installs it."""
+    """Raise MissingExtraError if an import in the block fails.
+
+    Args:
+        extra: Name of the extra in pyproject.toml.
+        package: Name of the package, for the message.
+    """
     try:
         yield
     except (ImportError, OSError, AttributeError) as error:  # broken installations raise any of them

@@ -1,4 +1,4 @@
-"""Output of ``cnpgen evaluate``: counts, reasons, statistics, margins; and the plans one by one."""
+"""Output of ``cnpgen evaluate``: counts, reasons, statistics, margins, checksums; and the plans one by one."""
 
 import math
 import sys

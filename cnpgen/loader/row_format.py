@@ -68,7 +68,11 @@ class Normalization:
         return _with_type_of(values, values * std + mean)
 
     def side_by_side(self, fields: Sequence[Field]) -> tuple[Floats, Floats]:
-        """Return mean and scale of the columns of fields in the packed table, shape (columns,) each."""
+        """Return mean and scale of the columns of fields in the packed table, shape (columns,) each.
+
+        Raises:
+            DatasetError: A field has no statistics here.
+        """
         of_scenes = {OBSTACLE_POSES, *(item.name for item in SCENE_ARRAYS)}  # never normalized
         missing = [field.name for field in fields if field.name not in {*self.mean, *of_scenes}]
         if missing:

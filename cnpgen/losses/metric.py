@@ -100,7 +100,8 @@ def alpha_step(
 ) -> Array:
     """Take one step of the metric, ``alpha_i + gamma log(L_i / C_i)`` (paper, update rule of alpha), shape (m,).
 
-    The logarithm is at most ``largest_log`` in absolute value. A mean that is not finite, or a budget (the paper's
+    ``alpha`` are the logarithms of the weights, ``losses`` the mean of every term, and ``gamma`` is the step size. The
+    logarithm is at most ``largest_log`` in absolute value. A mean that is not finite, or a budget (the paper's
     C-bar^2) of 0, leaves its weight unchanged.
     """
     before, mean, budget = (np.asarray(x, float) for x in (alpha, losses, budgets))

@@ -50,6 +50,15 @@ def load_completion(model: Model, backend: str | None) -> Completion:
         return Completion(restore_pipeline(name, drawing_stages(stages), loaded.problem), context, given)
 
 
+def state_lanes(state: State, n: int) -> list[Array]:
+    """Return positions, velocities and accelerations of n joints, shape (n, N) or (n, 1) each."""
+    if len(state) != 3 or np.ndim(state[0]) == 0:
+        raise UsageError(
+            f"must be positions, velocities and accelerations, got {len(state)} values or arrays", argument="state"
+        )
+    return [lanes("state", values, {n}) for values in state]
+
+
 def hit_tasks(
     completion: Completion,
     state: State,
@@ -63,11 +72,7 @@ def hit_tasks(
 ) -> TaskBatch:
     """Complete the tasks of N hits; see ``plan_hits``. Their angles [rad], shape (N,), are by default to the target."""
     n = completion.context.robot.n
-    if len(state) != 3 or np.ndim(state[0]) == 0:
-        raise UsageError(
-            f"must be positions, velocities and accelerations, got {len(state)} values or arrays", argument="state"
-        )
-    parts = [lanes("state", values, {n}) for values in state]
+    parts = state_lanes(state, n)
     with concerning("state"):
         states = {name: values.T for name, values in zip(HIT_COLUMNS[:3], parts, strict=True)}
         check_units_of_states(completion.context.robot, states, noun="hit")

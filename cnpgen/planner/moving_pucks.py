@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.pipelines.completion import Completion
-from cnpgen.planner.hit_tasks import State, boundary_of_tasks, hit_tasks, lanes
+from cnpgen.planner.hit_tasks import State, boundary_of_tasks, hit_tasks, lanes, state_lanes
 from cnpgen.planner.planner import Planner, plan_tasks
 from cnpgen.plans.boundary_problems import CONTEXT
 from cnpgen.plans.plans import Plans
@@ -161,7 +161,7 @@ class MovingHits:
         parts |= {
             name: lanes(name, np.reshape(numbers(name, values), (-1, 1)), {1}).T for name, values in scalars.items()
         }
-        parts |= {f"state {index}": lanes("state", values, {n}).T for index, values in enumerate(state)}
+        parts |= {f"state {index}": values.T for index, values in enumerate(state_lanes(state, n))}
         check_range("meeting_time", parts["meeting_time"], 0.0, MAX_MEETING_TIME_S, "s")
         check_range("puck_velocity", parts["puck_velocity"], -MAX_PUCK_SPEED_M_S, MAX_PUCK_SPEED_M_S, "m/s")
         size = max(len(values) for values in parts.values())

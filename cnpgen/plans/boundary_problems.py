@@ -275,8 +275,8 @@ def plans_of_rows(problem: ProblemRecord, columns: Mapping[str, NDArray[Any]], *
     return make_plans(
         problem,
         Boundary.from_batch(columns, None),
-        path_control_points=np.broadcast_to(path, (rows, points * n)).reshape(rows, points, n),
-        rate_control_points=np.broadcast_to(rate, (rows, rates)),
+        path_control_points=np.array(np.broadcast_to(path, (rows, points * n))).reshape(rows, points, n),
+        rate_control_points=np.array(np.broadcast_to(rate, (rows, rates))),
         columns={name: columns[name] for name in kept if name in columns},
         sample_id=columns.get("sample_id"),
         source=source,

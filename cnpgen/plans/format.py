@@ -1,4 +1,4 @@
-"""Plan file format: names, units and definitions of its datasets ('cnpgen docs plan-format')."""
+"""Plan file format: names, units and definitions of its datasets ('cnpgen docs plan-format'), and status of plans."""
 
 import difflib
 from collections.abc import Collection

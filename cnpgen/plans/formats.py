@@ -29,7 +29,10 @@ _WITHOUT_POINT = re.compile(r"(?<![\d.])(\d+)(?=e[+-])")
 
 @dataclass(frozen=True)
 class NumpyArchive(Exporter):
-    """One NumPy archive with the arrays of all plans, numbered by their indices ('cnpgen docs plan-format')."""
+    """One NumPy archive with all plans.
+
+    Its arrays are numbered by the indices of the plans ('cnpgen docs plan-format').
+    """
 
     suffix = ".npz"
     single_file = True
@@ -58,7 +61,10 @@ class NumpyArchive(Exporter):
 
 @dataclass(frozen=True)
 class CsvTables(Exporter):
-    """A folder with one CSV table per plan; numbers read back as the same float64 ('cnpgen docs plan-format')."""
+    """A folder with one CSV table per plan; numbers read back as the same float64.
+
+    'cnpgen docs plan-format' lists its columns.
+    """
 
     suffix = ".csv"
 
@@ -80,9 +86,9 @@ class CsvTables(Exporter):
 
 @dataclass(frozen=True)
 class ParquetTable(Exporter):
-    """One Parquet file with all plans, one row per sample ('cnpgen docs plan-format'); every plan is a row group.
+    """One Parquet file with all plans, one row per sample.
 
-    The metadata have the names of the joints and the units.
+    Every plan is a row group ('cnpgen docs plan-format'). The metadata have the names of the joints and the units.
     """
 
     suffix = ".parquet"
@@ -135,7 +141,10 @@ class JointTrajectory(Exporter):
 
 @dataclass(frozen=True)
 class TrajectoryControllerGoal(Exporter):
-    """A folder with one YAML file per plan: a goal of ``FollowJointTrajectory`` for ``ros2 action send_goal``."""
+    """A folder with one goal of ``control_msgs/action/FollowJointTrajectory`` per plan, as YAML.
+
+    ``ros2 action send_goal`` takes the content as its goal.
+    """
 
     suffix = ".yaml"
 

@@ -1,4 +1,7 @@
-"""Plans fitted to sampled trajectories of any planner, as initial guesses of the refiner."""
+"""Plans fitted to sampled trajectories of any planner, as initial guesses of the refiner.
+
+The ends of the fitted motions are moved onto the constraints.
+"""
 
 from __future__ import annotations
 

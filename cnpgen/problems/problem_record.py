@@ -228,7 +228,11 @@ def _rebuilt(record: ProblemRecord) -> Problem:
 
 @lru_cache(maxsize=8)
 def open_problem(record: ProblemRecord) -> tuple[Problem, Robot]:
-    """Rebuild a problem and its robot, which both contain the URDF; the files are deleted afterwards."""
+    """Rebuild a problem and its robot, which both contain the URDF; the files are deleted afterwards.
+
+    Raises:
+        RecipeError: The problem needs another version of cnpgen, or a plug-in that is not installed.
+    """
     from cnpgen.problems.load_robot import load_robot
 
     with record.restored() as problem:

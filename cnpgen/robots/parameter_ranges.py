@@ -35,9 +35,11 @@ def _tilt(doc: str) -> Any:
     return optional_key(doc, "rad", low=-MAX_TILT_RAD, high=MAX_TILT_RAD)
 
 
-def _has_any(names: Sequence[str]) -> cached_property[bool]:
+def _has_any(names: Sequence[str], doc: str) -> cached_property[bool]:
     """Declare a property that is true if one of some parameters differs from sample to sample."""
-    return cached_property(lambda ranges: any(name in names for name in ranges.names))
+    declared = cached_property[bool](lambda ranges: any(name in names for name in ranges.names))
+    declared.__doc__ = doc
+    return declared
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,10 +98,10 @@ class ParameterRanges:
         """Ranges of the parameters that samples have."""
         return tuple(getattr(self, name) for name in self.names)
 
-    tilts_table = _has_any(TABLE_PARAMETERS)  # raised or tilted
-    changes_rectangle = _has_any(TABLE_BOUNDS)
-    turns_upright = _has_any(UPRIGHT_TURN)  # of the direction of "vertical" or "axis"
-    changes_payload = _has_any(PAYLOAD_PARAMETERS)
+    tilts_table = _has_any(TABLE_PARAMETERS, "Whether the table is raised or tilted.")
+    changes_rectangle = _has_any(TABLE_BOUNDS, "Whether the rectangle of the table differs from sample to sample.")
+    turns_upright = _has_any(UPRIGHT_TURN, "Whether the direction of ``vertical`` or ``axis`` differs.")
+    changes_payload = _has_any(PAYLOAD_PARAMETERS, "Whether the payload differs from sample to sample.")
 
     def __len__(self) -> int:
         return len(self.names)

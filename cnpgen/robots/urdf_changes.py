@@ -72,7 +72,10 @@ def _fix(joint: Element, position: float, is_stored: bool) -> list[str]:
     if not np.linalg.norm(axis):
         return [f"joint {name!r} has the axis 0 0 0"]
     axis /= np.linalg.norm(axis)
-    placement = placement_of(joint)
+    try:
+        placement = placement_of(joint)
+    except ValueError as error:
+        return [f"joint {name!r}: {error}"]
     xyz, rotation = placement.translation, placement.rotation
     if kind in _SLIDING:
         xyz = xyz + rotation @ (position * axis)

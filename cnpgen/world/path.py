@@ -24,7 +24,7 @@ _CACHED = ("tip_rotation", "torque", "_tip_motion")  # of one path
 _AT_ORIGIN = np.eye(3), np.zeros(3)
 
 
-class PathWorld(RobotWorld):
+class PathWorld(RobotWorld[Array]):
     """A robot along a path, among the obstacles.
 
     It has the interface of ``cnpgen.world.world.World`` with a trailing axis of K states, so that a constraint's

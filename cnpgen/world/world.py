@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,10 @@ from cnpgen.world.pair_distances import PairDistances
 from cnpgen.world.rigid_bodies import NO_HELD_SHAPE, NO_SHAPE, RigidBodies
 
 Array = NDArray[np.float64]
+Value = TypeVar("Value", float, Array)  # of one state, or of K states
 
 
-class RobotWorld(ABC):
+class RobotWorld(ABC, Generic[Value]):
     """A robot among its obstacles, at one or at many states: the parts that ``World`` and ``PathWorld`` share.
 
     Vectors are in the world frame. The memory of Pinocchio and Coal is reused: use a world in one process and one
@@ -66,7 +67,7 @@ class RobotWorld(ABC):
         """Values for a constraint (``Constraint.scene_values``); empty if none were given."""
         return self.parameters.scene_values
 
-    def segment_distances(self, sufficient: float = np.inf) -> list[Any]:
+    def segment_distances(self, sufficient: float = np.inf) -> list[Value]:
         """Measure the signed distance of every segment of the robot from every obstacle, segment by segment [m].
 
         A path that is not exact returns lower bounds without measuring if these are sufficient.
@@ -76,7 +77,7 @@ class RobotWorld(ABC):
         """
         return self._smallest("segments", sufficient)
 
-    def shape_distances(self, sufficient: float = np.inf) -> list[Any]:
+    def shape_distances(self, sufficient: float = np.inf) -> list[Value]:
         """Measure the signed distance of every moving part of the robot's links from every obstacle, part by part [m].
 
         The smallest is exact, the others are lower bounds above it (``cnpgen.world.pair_distances``).
@@ -86,11 +87,11 @@ class RobotWorld(ABC):
         """
         return self._smallest("links", sufficient)
 
-    def self_distances(self, sufficient: float = np.inf) -> list[Any]:
+    def self_distances(self, sufficient: float = np.inf) -> list[Value]:
         """Measure the signed distance of every two parts of links that must not touch [m]; see ``shape_distances``."""
         return self._smallest("self", sufficient)
 
-    def held_object_distances(self, sufficient: float = np.inf) -> list[Any]:
+    def held_object_distances(self, sufficient: float = np.inf) -> list[Value]:
         """Measure the signed distance of the held object from parts of links [m]; see ``shape_distances``.
 
         Raises:
@@ -98,7 +99,7 @@ class RobotWorld(ABC):
         """
         return self._smallest("held object", sufficient)
 
-    def object_distances(self, sufficient: float = np.inf) -> list[Any]:
+    def object_distances(self, sufficient: float = np.inf) -> list[Value]:
         """Measure the signed distance of the held object from every obstacle [m], negative if they overlap.
 
         At K states, the smallest value of each array is exact.
@@ -109,7 +110,7 @@ class RobotWorld(ABC):
         return self._smallest("object", sufficient)
 
     @abstractmethod
-    def _smallest(self, bodies: str, sufficient: float) -> list[Any]:
+    def _smallest(self, bodies: str, sufficient: float) -> list[Value]:
         """Measure distances, or return their bounds if these are sufficient and need not be exact."""
 
     def _require_object(self) -> Array:
@@ -143,7 +144,7 @@ class RobotWorld(ABC):
         """Return the distances of parts of links from obstacles, from each other, or from the held object."""
         if bodies != "held object":
             placed = self._placed_bodies()
-            return placed.pair_distances(placed.link_pairs if bodies == "self" else placed.obstacle_pairs)
+            return placed.pair_distances({"self": placed.link_pairs, "links": placed.obstacle_pairs}[bodies])
         if self._held is None:
             raise RecipeError([NO_HELD_SHAPE])
         self._held.place(*self._joint_poses(), [])
@@ -159,13 +160,22 @@ class RobotWorld(ABC):
         return self._bodies
 
 
-class World(RobotWorld):
+class World(RobotWorld[float]):
     """A robot at one state, among the obstacles.
 
     Constraints evaluate their ``measured`` forms on it. ``set_state`` runs the forward kinematics; every other quantity
-    is computed when it is read. For arguments and further attributes see ``RobotWorld``.
+    is computed when it is read. Vectors are in the world frame. The memory of Pinocchio and Coal is reused: use a world
+    in one process and one thread only.
+
+    Args:
+        robot: The robot.
+        obstacles: The obstacles.
+        object_size: Edge lengths of the held object [m], or None.
 
     Attributes:
+        robot: The robot.
+        obstacles: The obstacles.
+        parameters: Parameters of the sample.
         q: Joint positions [rad], shape (n,).
         dq: Joint velocities [rad/s], shape (n,).
         ddq: Joint accelerations [rad/s^2], shape (n,).

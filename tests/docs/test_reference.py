@@ -163,3 +163,12 @@ def test_the_plan_format_lists_every_outcome_of_refining() -> None:
     page = (DOCS / "reference" / "plan-format.md").read_text(encoding="utf-8")
     table = page.split("| outcome | definition |")[1].split("\n\n")[0]
     assert re.findall(r"^\| (\d+) \|", table, re.MULTILINE) == [str(int(outcome)) for outcome in Outcome]
+
+
+def test_the_new_names_of_modules_in_the_change_log_exist() -> None:
+    table = (
+        (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").split("| `benchmarks/loader_ways.py` |")[1].split("\n\n")[0]
+    )
+    names = re.findall(r"\| `([\w/.-]+)` \|$", table, re.MULTILINE)
+    assert len(names) > 100
+    assert [name for name in names if not (ROOT / name).exists() and not (ROOT / "cnpgen" / name).exists()] == []

@@ -18,7 +18,7 @@ from cnpgen.problems.problem_file import load_problem
 WITHOUT_EFFECT = {
     "cnpgen.errors": "the words of exceptions",
     "cnpgen.schema": "how recipes are read: what was read is in the problem's identity",
-    "cnpgen.machine": "the processor, which is in no tape",
+    "cnpgen.machine.versions": "the processor, which is in no tape",
     "cnpgen.world": "what Pinocchio and Coal measure, which is in no tape",
     "cnpgen.store": "how columns are described and files are written",
 }
@@ -111,7 +111,7 @@ def test_a_change_in_a_subfolder_of_a_package_changes_the_key_of_a_tape(
 def test_a_change_that_no_builder_imports_changes_no_key(copy: Path, tmp_path: Path) -> None:
     before = tapes(tmp_path)
     (copy / "cli" / "main.py").write_text("")
-    (copy / "losses" / "terms.py").write_text("")
+    (copy / "losses" / "metric.py").write_text("")
     assert tapes(tmp_path) == before
 
 

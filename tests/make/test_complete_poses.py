@@ -179,6 +179,12 @@ def test_tasks_with_goal_poses_are_solved(problem: Problem) -> None:
         assert solved.plans.duration[row] == pytest.approx(cnpgen.solve_plans(single, workers=1).plans.duration.min())
 
 
+def test_unplanned_tasks_can_be_filled_in_place(problem: Problem) -> None:
+    plans = cnpgen.complete(problem, goal_xyz=GOALS[0]).plans
+    assert plans.path_control_points.flags.writeable
+    assert plans.rate_control_points.flags.writeable
+
+
 def test_tasks_with_one_number_are_refused_instead_of_merged(problem: Problem) -> None:
     first, second = (cnpgen.complete(problem, goal_xyz=goal).plans for goal in (GOALS[0], [0.4, 0.3, 0.5]))
     with pytest.raises(UsageError, match=r"plans have several tasks with the sample_id 0"):

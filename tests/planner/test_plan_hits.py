@@ -99,6 +99,11 @@ def test_invalid_arguments_raise_errors_with_their_name(planner, arguments, mess
         plan_hits(planner, *arguments)
 
 
+def test_the_state_for_a_moving_puck_has_three_parts(planner):
+    with pytest.raises(UsageError, match="state must be positions, velocities and accelerations, got 2 values"):
+        plan_hits(planner, (np.zeros(6),) * 2, [1.0, 0.0], TARGET, puck_velocity=[-0.5, 0.0])
+
+
 def test_a_model_of_certified_rows_plans_hits_without_certifying(planner, state):
     stages = [*planner.model.training["stages"], {"use": "certified-plan"}]
     certified = Planner(replace(planner.model, training={**planner.model.training, "stages": stages}))

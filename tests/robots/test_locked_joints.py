@@ -88,6 +88,14 @@ def test_mistakes_are_named(tmp_path: Path, locked: str, message: str) -> None:
         load_robot(load_problem(problem_in(tmp_path, locked)))
 
 
+def test_quaternions_of_locked_joints_are_refused() -> None:
+    """As for other joints; zero angles in their place would turn all links that follow."""
+    joint = urdf().replace('"roll" type="revolute">', '"roll" type="revolute"><origin quat_xyzw="0 0 1 0"/>')
+    assert joint != urdf()
+    with pytest.raises(RecipeError, match=r"locked_joints: joint 'roll': <origin quat_xyzw=\.\.\.> is not"):
+        with_locked_joints(joint, {"roll": 0.1}, is_stored=False)
+
+
 def test_joints_without_a_position_are_refused() -> None:
     with pytest.raises(RecipeError, match="joint 'roll' is fixed and has no position"):
         with_locked_joints(

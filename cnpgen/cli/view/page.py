@@ -4,8 +4,6 @@ import base64
 import json
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -65,6 +63,8 @@ def serve(page: Page, watched: Sequence[Path], *, port: int, ready: Callable[[st
         port: Port on the loopback address; 0 for any free port. MachineError if it is taken.
         ready: Called with the address once it is served.
     """
+    from http import HTTPStatus
+    from http.server import BaseHTTPRequestHandler, HTTPServer
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:

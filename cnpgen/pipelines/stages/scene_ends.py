@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.errors import RecipeError
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.symbolic.kinematics import forward_kinematics, tip_position
 from cnpgen.kernels.symbolic.linalg import add, dot, scale, subtract, symbols
@@ -94,7 +95,8 @@ class SceneEnds(Stage):
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             scenes = candidates.scenes
-            assert scenes is not None  # as a stage has written the column "scene"
+            if scenes is None:  # a plug-in may write the column "scene" without scenes
+                raise RecipeError(["stage 'scene-ends' needs scenes: expected a stage 'draw-scenes' before it"])
             pools = states.pools(scenes, random)
             numbers = candidates.draw(random, 1 + NUMBERS_PER_PAIR * MAX_PAIRS_PER_CANDIDATE)
             start, goal = states.pairs(scenes, pools, candidates.scene, numbers)

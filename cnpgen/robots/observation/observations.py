@@ -1,4 +1,4 @@
-"""Kinds of observations of scenes: point clouds, camera views, signed distances, basis points and object tokens."""
+"""Observations of scenes and their NumPy reference: clouds, views, signed distances, basis points and tokens."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Obstacles of samples or scenes as arrays of boxes, spheres, cylinders, capsules and convex meshes with poses."""
+"""Obstacles as arrays of boxes, spheres, cylinders, capsules and convex meshes, and signed distances from them."""
 
 from __future__ import annotations
 
