@@ -9,12 +9,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import chain
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.plans.plans import Plans
 from cnpgen.problems.conditions import measured_needs
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.joint import JointTorque
@@ -28,9 +28,6 @@ from cnpgen.schema.arguments import integer
 from cnpgen.store.joint_units import unit_of
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.world import World
-
-if TYPE_CHECKING:
-    from cnpgen.plans.plans import Plans
 
 Array = NDArray[np.float64]
 # Relative to the bound, or absolute, by the derivative on which a condition depends: more than the condition changes
@@ -77,7 +74,7 @@ def explain_failure(problem: Problem, robot: Robot, boundary: Boundary, scene: S
 
 
 @checked_arguments
-def explain_plans(plans: "Plans", indices: Sequence[int] | None = None) -> dict[int, Explanation]:
+def explain_plans(plans: Plans, indices: Sequence[int] | None = None) -> dict[int, Explanation]:
     """Explain why no valid plans of some problems were found.
 
     Args:
