@@ -17,5 +17,11 @@ def test_a_figure_has_its_size_and_the_format_of_its_suffix(tmp_path: Path, suff
 
 
 def test_a_figure_that_cannot_be_written_is_a_machine_error(tmp_path: Path) -> None:
-    with pytest.raises(MachineError, match=r"cannot write .*no/such/folder\.png"):
+    (tmp_path / "no").write_text("a file")
+    with pytest.raises(MachineError, match=r"cannot write .*no/such/folder\.png: .*a file is where a folder should be"):
         save_figure(new_figure(1, 1), tmp_path / "no" / "such" / "folder.png")
+
+
+def test_the_folder_of_a_figure_is_created(tmp_path: Path) -> None:
+    save_figure(new_figure(1, 1), tmp_path / "new" / "folder" / "figure.png")
+    assert (tmp_path / "new" / "folder" / "figure.png").is_file()

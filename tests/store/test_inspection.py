@@ -233,5 +233,6 @@ def test_missing_matplotlib_is_a_hint_and_not_a_traceback(hits, tmp_path, monkey
 
 @pytest.mark.slow
 def test_a_figure_that_cannot_be_written_is_a_machine_error(hits, tmp_path):
+    (tmp_path / "no").write_text("a file")
     with pytest.raises(MachineError, match="cannot write"):
         plot_dataset(inspect_dataset(hits), tmp_path / "no" / "such" / "folder.png")
