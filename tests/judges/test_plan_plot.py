@@ -227,9 +227,10 @@ def test_a_plan_that_cannot_be_evaluated_raises_an_error(tmp_path):
         draw(plan.changed(path=plan.motion.path * np.nan), tmp_path / "plan.png")
 
 
-def test_a_missing_folder_raises_an_error(tmp_path):
+def test_a_folder_that_cannot_be_created_raises_an_error(tmp_path):
+    (tmp_path / "file").write_text("a file")
     with pytest.raises(MachineError, match="cannot write"):
-        draw(load("hit"), tmp_path / "missing" / "plan.png")
+        draw(load("hit"), tmp_path / "file" / "plan.png")
 
 
 def test_the_error_without_matplotlib_names_the_extra(tmp_path, monkeypatch):

@@ -76,7 +76,8 @@ def test_a_program_has_the_selected_residuals_and_its_sparse_jacobian_equals_the
     shape = motion.evaluate(x).g.shape
     selected = np.random.default_rng(0).random(shape) < 0.2
     bounds = Bounds(np.full(shape, -1.0), np.full(shape, 1.0), np.zeros(shape, bool), np.full(shape, np.inf))
-    nlp = Program(motion, bounds, selected, x).problem()
+    program = Program(motion, bounds, selected, x)  # has the callbacks, so it lives as long as the functions
+    nlp = program.problem()
     derivative = ca.Function("derivative", [nlp["x"]], [ca.jacobian(nlp["g"], nlp["x"])])
     elsewhere = x + 0.05 * np.random.default_rng(1).normal(size=len(x))
     found = derivative(elsewhere)
