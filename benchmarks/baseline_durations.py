@@ -18,10 +18,10 @@ from cnpgen.benchmark.answers import judge_answer
 from cnpgen.benchmark.benchmark_planner import Setting
 from cnpgen.benchmark.planners.rrtconnect import RRTConnect
 from cnpgen.benchmark.suite import load_suite
-from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import as_problem, record_problem
 from cnpgen.refine.refine_plans import solve_plans
+from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.trajectory.sampled_trajectory import Trajectory
 
 MAX_FACTOR, FACTOR_STEPS = 2.0, 12  # of time; bisections

@@ -36,11 +36,11 @@ from cnpgen.judges.trajectories.trajectory_verdict import Decision, TrajectoryVe
 from cnpgen.plans import Plans, load_plans, open_problem
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.exporter import SampledPlan, sample_plan
-from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.import_trajectories import import_trajectories
 from cnpgen.plans.load_trajectories import load_trajectories
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.refine_plans import refine_plans
+from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.trajectory.spline_motion import Motion
 

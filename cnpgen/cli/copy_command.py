@@ -46,7 +46,6 @@ def run(arguments: argparse.Namespace) -> None:
     recipe_names.check_absent(folder, texts, force=arguments.force)
     check_writable(folder)
     for file, text in texts.items():
-        folder.mkdir(parents=True, exist_ok=True)
         write_file(folder / file, text)
     first = folder / next(iter(texts))
     print(first)

@@ -1,8 +1,8 @@
 """Check this machine.
 
-Results are printed on stdout, warnings and problems with their remedies on stderr. The exit code is 3 if a required
-library does not work. Without a C compiler cnpgen works 10 to 20 times slower. 'cnpgen docs troubleshooting' has
-more remedies.
+The report on stdout has all results, warnings and problems with their remedies; problems are also printed on stderr.
+The exit code is 3 if a required library does not work. Without a C compiler cnpgen works 10 to 20 times slower.
+'cnpgen docs troubleshooting' has more remedies.
 """
 
 import argparse

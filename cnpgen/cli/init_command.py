@@ -79,7 +79,6 @@ def _write(folder: Path, texts: Mapping[str, str]) -> None:
     from cnpgen.store.files.atomic import write_file
 
     for name, text in texts.items():
-        folder.mkdir(parents=True, exist_ok=True)
         write_file(folder / name, text)
         print(folder / name)
 

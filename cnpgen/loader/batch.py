@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
 from cnpgen.loader.row_format import Columns, Normalization
-from cnpgen.loader.shard_reader import OBSTACLE_POSES, problem_obstacles
+from cnpgen.loader.shard_reader import problem_obstacles
 from cnpgen.problems.scenes.observe import MAX_SEED, Scenes, observe
 from cnpgen.robots.observation.observations import Observation
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import Scene
 from cnpgen.store.dataset_spec import DatasetSpec
+from cnpgen.store.scene_table import OBSTACLE_POSES
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,13 +18,14 @@ from cnpgen.loader.batch import observer_of
 from cnpgen.loader.batches import Batches, BatchPartition, Observe, checked_position
 from cnpgen.loader.gather import Split, gather
 from cnpgen.loader.row_format import Normalization, RowFormat, make_normalization, make_row_format, select_columns
-from cnpgen.loader.shard_reader import OBSTACLE_POSES, Rows, ShardReader, SplitShards, problem_obstacles, scene_fields
+from cnpgen.loader.shard_reader import Rows, ShardReader, SplitShards, problem_obstacles, scene_fields
 from cnpgen.robots.observation.observations import Observation
 from cnpgen.robots.scene import Scene
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.checked_shard import Shard
 from cnpgen.store.dataset_spec import DatasetSpec, StoredProblem
 from cnpgen.store.field import Field
+from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.store.statistics import FieldStatistics
 
 LIBRARIES = ("polars", "pandas")  # of frames

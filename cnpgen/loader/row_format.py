@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.loader.shard_reader import OBSTACLE_POSES, scene_fields
+from cnpgen.loader.shard_reader import scene_fields
 from cnpgen.store.dataset_spec import DatasetSpec
 from cnpgen.store.field import Field
-from cnpgen.store.scene_table import SCENE_ARRAYS
+from cnpgen.store.scene_table import OBSTACLE_POSES, SCENE_ARRAYS
 from cnpgen.store.statistics import FieldStatistics
 
 Floats = NDArray[np.float64]

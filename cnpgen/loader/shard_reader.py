@@ -23,10 +23,9 @@ from cnpgen.store.dataset_spec import DatasetSpec
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.intact import RERUN_HINT, digest_problem
-from cnpgen.store.scene_table import SCENE_ID, SceneTable
+from cnpgen.store.scene_table import OBSTACLE_POSES, SCENE_ID, SceneTable
 from cnpgen.store.shard import StoredField, storage_dtype
 
-OBSTACLE_POSES = "obstacle_poses"
 Rows = dict[str, NDArray[Any]]
 MAX_MEMORY_MAPS = 32  # kept open; each needs a file descriptor, and its pages can be reclaimed by the system
 

@@ -14,13 +14,13 @@ from cnpgen.machine.threads import one_thread
 from cnpgen.make.on_plan import SHA256, load_stage_planner, model_sha256, planner_boundary
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction
-from cnpgen.plans.format import BOUNDARY, OBSTACLE_POSES
+from cnpgen.plans.format import BOUNDARY
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.refine_engine import Solver, load_solver
 from cnpgen.robots.scene import sample_obstacles, scene_poses
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
-from cnpgen.store.scene_table import OBSTACLE_KINDS, SceneTable
+from cnpgen.store.scene_table import OBSTACLE_KINDS, OBSTACLE_POSES, SceneTable
 from cnpgen.trajectory.spline_motion import Motion
 
 Counts = tuple[int, ...]  # obstacles of each kind

@@ -5,13 +5,12 @@ from pathlib import Path
 from cnpgen.kernels.library import choose_backend
 from cnpgen.make.recipe import MAX_SEED, DatasetRecipe, as_dataset_recipe
 from cnpgen.plans.boundary_problems import plans_of_rows
-from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import record_problem
 from cnpgen.robots.scene import scene_poses
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import check_memory, integer
-from cnpgen.store.scene_table import SCENE_ID, concatenate_scenes
+from cnpgen.store.scene_table import OBSTACLE_POSES, SCENE_ID, concatenate_scenes
 
 SPLIT = "(fresh draws)"  # an invalid name of a split: no dataset contains these rows
 

@@ -24,7 +24,7 @@ from cnpgen.store.dataset_spec import DatasetSpec, ShardTask
 from cnpgen.store.field import Field
 from cnpgen.store.manifest import source_date
 from cnpgen.store.sampling_statistics import SamplingStatistics, merge_sampling
-from cnpgen.store.scene_table import SCENE_ID, SceneTable, concatenate_scenes
+from cnpgen.store.scene_table import OBSTACLE_POSES, SCENE_ID, SceneTable, concatenate_scenes
 from cnpgen.store.shard import storage_dtype
 from cnpgen.store.shard_record import commit_shard
 from cnpgen.store.workspace import require_dataset_spec
@@ -156,7 +156,7 @@ def spot_check(
 
     Return the largest violation of every check, in its unit; raise MachineError if a row fails a check.
     """
-    from cnpgen.judges.rows.verify import OBSTACLE_POSES, verify_rows
+    from cnpgen.judges.rows.verify import verify_rows
 
     rows = np.unique(np.linspace(0, task.rows - 1, MAX_SPOT_CHECK_ROWS).astype(int))
     some = {name: values[rows] for name, values in columns.items()}

@@ -21,12 +21,12 @@ from cnpgen.planner.task_preprocessor import TaskPreprocessor, make_task_preproc
 from cnpgen.planner.tasks import Tasks, ends_of, lanes, rows
 from cnpgen.planner.time_parametrization import TimeParametrization, make_time_parametrization
 from cnpgen.planner.time_scaling import TimeScaling, blocks_of_motions, make_time_scaling
-from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord
 from cnpgen.robots.robot import Robot
+from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.trajectory.boundary import Boundary, anchor_line
 from cnpgen.trajectory.spline import basis, chebyshev
 from cnpgen.trajectory.spline_motion import Motion

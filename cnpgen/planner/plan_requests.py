@@ -23,7 +23,6 @@ from cnpgen.plans.boundary_problems import (
     read_boundary_file,
     scene_columns,
 )
-from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.plausible import check_boundary_units
 from cnpgen.plans.scene_plans import scene_plans, shape_of
@@ -32,7 +31,7 @@ from cnpgen.problems.scenes.scene_problem import SceneProblem, checked_scene
 from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.store.files.documents import canonical_sha256
 from cnpgen.store.reader import open_dataset
-from cnpgen.store.scene_table import SCENE_ID
+from cnpgen.store.scene_table import OBSTACLE_POSES, SCENE_ID
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]

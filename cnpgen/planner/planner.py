@@ -17,13 +17,13 @@ from cnpgen.planner.inference_pipeline import loaded_problem, make_inference_pip
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model, model_for
 from cnpgen.planner.network.features import SCENE
-from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.plausible import check_boundary_units
 from cnpgen.problems.problem import Problem
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import check_memory, concerning, numbers
 from cnpgen.store.dataset_spec import StoredProblem
+from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.trajectory.boundary import Boundary, boundary_of
 from cnpgen.trajectory.remaining_trajectory import remaining_trajectory, with_finer_knots
 

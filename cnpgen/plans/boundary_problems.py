@@ -11,15 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, UsageError, lacks
-from cnpgen.plans.format import (
-    ATTRIBUTES,
-    CONDITIONS,
-    FORMAT,
-    GOAL_OPTION,
-    OBSTACLE_POSES,
-    PLAN_FILE_VERSION,
-    refuse_misspelt,
-)
+from cnpgen.plans.format import ATTRIBUTES, CONDITIONS, FORMAT, GOAL_OPTION, PLAN_FILE_VERSION, refuse_misspelt
 from cnpgen.plans.plan_file import agreed_problem, stored_problem
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.plausible import check_boundary_units
@@ -35,7 +27,7 @@ from cnpgen.store.files.checksum_file import verify_checksum
 from cnpgen.store.files.hdf5 import opened_hdf5
 from cnpgen.store.paths import HDF5_KINDS, require_file, require_folder
 from cnpgen.store.reader import StoredDataset, open_dataset
-from cnpgen.store.scene_table import SCENE_ID
+from cnpgen.store.scene_table import OBSTACLE_POSES, SCENE_ID
 from cnpgen.store.shard import SHARD_FORMAT
 from cnpgen.trajectory.boundary import Boundary, boundary_of
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from cnpgen.errors import DatasetError
 from cnpgen.store.field import Field
 from cnpgen.store.joint_units import units_of_joints
+from cnpgen.store.scene_table import OBSTACLE_POSES
 
 FORMAT = "cnpgen-plans"
 PLAN_FILE_VERSION = 1
@@ -21,7 +22,6 @@ INTEGERS = ("sample_id", "status")
 NOTES = ("source", "refined_with")
 ATTRIBUTES = ("format", "format_version", "degree", "problem", "problem_recipe", "problem_urdf", "problem_sha256")
 
-OBSTACLE_POSES = "obstacle_poses"  # column with the obstacles of every plan, instead of the problem's
 GOAL_OPTION = "goal_option"  # column with the number of a goal state among those of one sample_id, the nearest first
 
 UNITS = {"q": "rad", "dq": "rad/s", "ddq": "rad/s^2", "jerk": "rad/s^3"}  # for revolute joints

@@ -243,5 +243,4 @@ def write_parquet(path: Path, table: Any) -> None:
 
     buffer = io.BytesIO()
     pyarrow.parquet.write_table(table, buffer)
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_file(path, buffer.getvalue())

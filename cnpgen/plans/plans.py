@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError, counted
-from cnpgen.plans.format import FLOATS, INTEGERS, NOTES, OBSTACLE_POSES, PlanStatus
+from cnpgen.plans.format import FLOATS, INTEGERS, NOTES, PlanStatus
 from cnpgen.plans.plausible import check_boundary_units
 from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem import Problem
@@ -22,6 +22,7 @@ from cnpgen.robots.scene import Scene
 from cnpgen.schema.argument_types import check_fields, checked_arguments
 from cnpgen.schema.arguments import check_memory, integer, numbers, reject_masked
 from cnpgen.store.dataset_spec import StoredProblem
+from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion, states_at_times
 from cnpgen.trajectory.trajectory_spec import MAX_CONTROL_POINTS, MAX_DEGREE

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.obstacles import Capacity, with_capacity
 from cnpgen.problems.problem import Problem
@@ -23,6 +22,7 @@ from cnpgen.robots.solid import number_slices, place_obstacles, pose_width
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import numbers
 from cnpgen.schema.units import suggested_unit
+from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.library import KernelLibrary
-from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem import Problem
@@ -20,6 +19,7 @@ from cnpgen.refine.strategy import PlanChecker, refine_task, refine_task_until
 from cnpgen.refine.task import Attempt, RefinementTask
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
+from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.remaining_trajectory import is_finer
 from cnpgen.trajectory.spline_motion import Motion

@@ -17,7 +17,7 @@ from cnpgen.machine.engine import Engine, assembled
 from cnpgen.machine.threads import one_thread
 from cnpgen.machine.times import Stopwatch
 from cnpgen.machine.versions import __version__
-from cnpgen.plans.format import GOAL_OPTION, OBSTACLE_POSES, PlanStatus
+from cnpgen.plans.format import GOAL_OPTION, PlanStatus
 from cnpgen.plans.plans import Plans, screen
 from cnpgen.plans.tips import correct_tips
 from cnpgen.refine.goal_options import Progress, refine_goal_options
@@ -27,6 +27,7 @@ from cnpgen.refine.refinement import Refinement
 from cnpgen.refine.refinement_journal import Journal, open_journal
 from cnpgen.refine.task import Attempt
 from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.store.scene_table import OBSTACLE_POSES
 
 MAX_SERIAL_PLANS = 60  # up to which the start of a second process takes longer than the plans
 PLANS_PER_TASK = 4  # of one of several processes: the transfer of a task takes a twentieth of a plan's time

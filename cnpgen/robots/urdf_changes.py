@@ -35,7 +35,11 @@ def with_locked_joints(urdf: str, positions: Mapping[str, float], *, is_stored: 
         ]
         if not mistakes:
             all_positions = dict(positions) | _mimicking(joints, positions)
-            mistakes += [text for name, q in all_positions.items() for text in _fix(joints[name], q, is_stored)]
+            for name, position in all_positions.items():
+                try:
+                    mistakes += _fix(joints[name], position, is_stored)
+                except ValueError as error:
+                    mistakes.append(f"joint {name!r}: {error}")
     except ValueError as error:
         mistakes.append(str(error))
     if mistakes:
@@ -72,10 +76,7 @@ def _fix(joint: Element, position: float, is_stored: bool) -> list[str]:
     if not np.linalg.norm(axis):
         return [f"joint {name!r} has the axis 0 0 0"]
     axis /= np.linalg.norm(axis)
-    try:
-        placement = placement_of(joint)
-    except ValueError as error:
-        return [f"joint {name!r}: {error}"]
+    placement = placement_of(joint)
     xyz, rotation = placement.translation, placement.rotation
     if kind in _SLIDING:
         xyz = xyz + rotation @ (position * axis)

@@ -18,6 +18,7 @@ from cnpgen.errors import DatasetError
 from cnpgen.store.field import Field
 
 SCENE_ID = "scene_id"
+OBSTACLE_POSES = "obstacle_poses"  # column of a sample or plan with its obstacles, instead of the problem's
 OBSTACLE_KINDS = ("box", "sphere", "cylinder", "capsule")  # index: the code of a kind
 NO_OBSTACLE = -1  # kind of the entries that pad a scene
 _KINDS_TEXT = f"{NO_OBSTACLE} for none; " + ", ".join(f"{code} {kind}" for code, kind in enumerate(OBSTACLE_KINDS))

@@ -16,7 +16,7 @@ from cnpgen.errors import DatasetError, UsageError
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
 from cnpgen.planner.control_points import ControlPoints
-from cnpgen.plans.format import BOUNDARY, CONDITIONS, OBSTACLE_POSES
+from cnpgen.plans.format import BOUNDARY, CONDITIONS
 from cnpgen.plans.scene_plans import scene_plans
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
@@ -24,6 +24,7 @@ from cnpgen.problems.scenes.scene_files import holds_scenes, load_scenes
 from cnpgen.problems.scenes.scene_problem import SceneProblem
 from cnpgen.schema.arguments import concerning
 from cnpgen.store.dataset_spec import StoredProblem
+from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.training.training_rows import TrainingProblems
 from cnpgen.trajectory.boundary import Boundary
 

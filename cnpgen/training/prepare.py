@@ -19,9 +19,9 @@ from cnpgen.planner.network.architecture import Architecture, initial_parameters
 from cnpgen.planner.network.features import SCENE, Features, count_features, feature_blocks, published_features
 from cnpgen.planner.tasks import Tasks
 from cnpgen.plans.evaluate import evaluate_plans
-from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.schema.arguments import check_memory
 from cnpgen.store.files.documents import plain
+from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.training.checkpoint import State, start_state
 from cnpgen.training.data import TrainingData
 from cnpgen.training.settings import Length, TrainingSettings

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import CnpgenError, counted
 from cnpgen.judges.rows.hits import hit_rule, repeated_fraction, speed_fractions
 from cnpgen.judges.rows.row_report import RowReport, merge
-from cnpgen.judges.rows.verify import OBSTACLE_POSES, PlanCheck, check_plans, verify_rows
+from cnpgen.judges.rows.verify import PlanCheck, check_plans, verify_rows
 from cnpgen.machine.engine import Engine, assembled
 from cnpgen.make.recipe import restored
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES
@@ -23,7 +23,7 @@ from cnpgen.store.check import DELETE_HINT, Finding
 from cnpgen.store.checked_shard import Shard, read_checked, read_scenes
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask
 from cnpgen.store.field import Field
-from cnpgen.store.scene_table import SCENE_ID
+from cnpgen.store.scene_table import OBSTACLE_POSES, SCENE_ID
 from cnpgen.store.shard_record import ShardRecord, load_record
 from cnpgen.store.statistics import FieldStatistics, field_statistics
 

@@ -24,7 +24,6 @@ from cnpgen.planner.network.features import (
 from cnpgen.planner.plan_requests import plan_scenes, scene_requests
 from cnpgen.planner.planner import Planner
 from cnpgen.planner.tasks import ends_of
-from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plan_file import load_plans
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.obstacles import with_capacity
@@ -37,6 +36,7 @@ from cnpgen.robots.shape.hull import hull_corners
 from cnpgen.robots.shape.inline import address_of
 from cnpgen.robots.solid import number_slices, place_obstacles
 from cnpgen.scenes import SceneProblem, save_scenes
+from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.training.adam import Clipping
 from cnpgen.training.data import make_scene_rows
 from cnpgen.training.prepare import prepare_run

@@ -20,12 +20,12 @@ from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, Conditio
 from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
+from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.world import World
 
 NO_RULE = HitRule()
-OBSTACLE_POSES = "obstacle_poses"
 VERIFICATION_BLOCK_ROWS = 1024  # measurements of a block need less than 10 MB
 # Tolerances of stored diagnostics, in their units. Coal's distances have errors of 4e-11 m. In float32 the rounding of
 # joint positions moves the arm by 1e-7 m and changes its highest speed by 2e-6 m/s in 40,000 rows.
