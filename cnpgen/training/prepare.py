@@ -55,12 +55,8 @@ def prepare_run(
     boundary = problems.boundary
     zero, fixed = zero_conditions(boundary), boundary.fixed_at_goal
     config = settings.config
-    features: Features | None = None
     if initial_model is None:
-        placed, iterated = loaded.problem.has_sample_obstacles, settings.iterations > 1
-        blocks = feature_blocks(boundary, settings.features, placed=placed, iterated=iterated)
-        if settings.features == "paper":
-            features = published_features(blocks, loaded.robot.velocity_limit, loaded.robot.acceleration_limit)
+        blocks, features = _initial_features(loaded, settings, boundary)
     else:
         config = replace(config, via_points=initial_model.config.via_points)
         blocks, features = initial_model.features.blocks, initial_model.features
@@ -113,6 +109,17 @@ def prepare_run(
         initial_parameters=None if initial_model is None else initial_model.parameters,
     )
     return run, inference
+
+
+def _initial_features(
+    loaded: LoadedProblem, settings: TrainingSettings, boundary: Boundary
+) -> tuple[tuple[str, ...], Features | None]:
+    """Return the blocks of a new model's features, and the features if they do not depend on the rows."""
+    placed, iterated = loaded.problem.has_sample_obstacles, settings.iterations > 1
+    blocks = feature_blocks(boundary, settings.features, placed=placed, iterated=iterated)
+    if settings.features != "paper":
+        return blocks, None
+    return blocks, published_features(blocks, loaded.robot.velocity_limit, loaded.robot.acceleration_limit)
 
 
 def identity(source: TrainingData, settings: TrainingSettings) -> dict[str, Any]:
