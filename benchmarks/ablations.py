@@ -21,7 +21,7 @@ import numpy as np
 from common import arguments, cpu_of, median, progress, report, table
 
 import cnpgen
-from cnpgen.benchmark.hypothesis_tests import wilson
+from cnpgen.addons.benchmark.hypothesis_tests import wilson
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.plans.evaluate import evaluate_plans

@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 from common import arguments, progress, report, table
 
-from cnpgen.benchmark.answers import judge_answer
-from cnpgen.benchmark.benchmark_planner import Setting
-from cnpgen.benchmark.planners.rrtconnect import RRTConnect
-from cnpgen.benchmark.suite import load_suite
+from cnpgen.addons.benchmark.answers import judge_answer
+from cnpgen.addons.benchmark.benchmark_planner import Setting
+from cnpgen.addons.benchmark.planners.rrtconnect import RRTConnect
+from cnpgen.addons.benchmark.suite import load_suite
+from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import as_problem, record_problem
 from cnpgen.refine.refine_plans import solve_plans
 from cnpgen.store.scene_table import OBSTACLE_POSES
-from cnpgen.trajectory.sampled_trajectory import Trajectory
 
 MAX_FACTOR, FACTOR_STEPS = 2.0, 12  # of time; bisections
 TIME_LIMIT_S = 600.0

@@ -17,14 +17,13 @@ import numpy as np
 from common import arguments, progress, report, table
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.answers import execution_of
-from cnpgen.benchmark.benchmark_planner import Setting
-from cnpgen.benchmark.results_file import answer_to_dict
-from cnpgen.benchmark.simulator.challenge import JOINTS, _environment, challenge_plant
-from cnpgen.benchmark.simulator.plant import Plant
-from cnpgen.benchmark.suite import load_suite
+from cnpgen.addons.benchmark.answers import execution_of
+from cnpgen.addons.benchmark.benchmark_planner import Setting, load_kind
+from cnpgen.addons.benchmark.results_file import answer_to_dict
+from cnpgen.addons.benchmark.simulator.challenge import JOINTS, _environment, challenge_plant
+from cnpgen.addons.benchmark.simulator.plant import Plant
+from cnpgen.addons.benchmark.suite import load_suite
 from cnpgen.plans.plans import Plans
-from cnpgen.schema import registry
 from cnpgen.store.files.figure_file import new_figure, save_figure
 
 Array = NDArray[np.float64]
@@ -133,7 +132,7 @@ def measure(folder: Path, step: int) -> dict[str, dict[str, list[dict[str, float
     chosen = [problems[index] for index in range(0, len(problems), step)]
     results: dict[str, dict[str, list[dict[str, float]]]] = {}
     for name in PLANNERS:
-        plan = registry.load(registry.PLANNERS, name)().prepare(Setting(problems.problem, suite.model))
+        plan = load_kind(name)().prepare(Setting(problems.problem, suite.model))
         answers = [answer_to_dict(plan(problem)) for problem in chosen]
         results[name] = {}
         for change in CHANGES:

@@ -61,8 +61,8 @@ class QuotedCommand:
 
     def planning_bound(self) -> float | None:
         """Return the maximum planning time [h] of a comparison with a time limit, including the margin of its stops."""
-        from cnpgen.benchmark.process import STOP_MARGIN_S
-        from cnpgen.benchmark.suite import load_suite
+        from cnpgen.addons.benchmark.process import STOP_MARGIN_S
+        from cnpgen.addons.benchmark.suite import load_suite
         from cnpgen.schema.units import parse_number
 
         words = shlex.split(self.text)

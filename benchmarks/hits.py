@@ -21,10 +21,10 @@ from unittest.mock import patch
 import numpy as np
 from common import arguments, median, progress, report, table, verdict
 
+from cnpgen.addons.online.hit_tasks import hit_tasks, load_completion
+from cnpgen.addons.online.plan_hits import CONTACT_DISTANCE_M, plan_hits
 from cnpgen.machine.threads import one_thread
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
-from cnpgen.planner.hit_tasks import hit_tasks, load_completion
-from cnpgen.planner.plan_hits import CONTACT_DISTANCE_M, plan_hits
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import Plans

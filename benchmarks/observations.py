@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from common import arguments, cpu_of, median, progress, report, table
 
+from cnpgen.addons.families.scene_generator import load_family, shipped_families
 from cnpgen.machine.threads import one_thread
-from cnpgen.pipelines.families.scene_generator import FAMILIES, load_family
 from cnpgen.scenes import (
     BasisPoints,
     CameraCloud,
@@ -61,7 +61,8 @@ def measure(family: str, count: int, reference_count: int, seed: int) -> list[di
 
 def options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
-    parser.add_argument("--families", nargs="*", default=["tabletop", "cubby"], choices=list(FAMILIES), help="families")
+    known = list(shipped_families())
+    parser.add_argument("--families", nargs="*", default=["tabletop", "cubby"], choices=known, help="families")
     parser.add_argument("--count", type=int, default=500, help="scenes")
     parser.add_argument("--reference", type=int, default=10, help="scenes that are observed by the NumPy reference")
     parser.add_argument("--seed", type=int, default=1, help="seed of the scenes")

@@ -63,7 +63,7 @@ def measure(name: str, model: Model, options: argparse.Namespace, *, refined: in
     verdicts = cnpgen.evaluate_plans(plans, workers=1).verdicts
     figures = {
         "strict": np.mean([verdict.valid for verdict in verdicts]),
-        "paper": np.mean([verdict.paper.valid for verdict in verdicts]),
+        "paper": np.mean([verdict.paper.valid for verdict in verdicts if verdict.paper]),
         "duration": plans.duration.mean(),
     }
     if refined:

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 from common import arguments
 
-from cnpgen.benchmark.hypothesis_tests import wilson
-from cnpgen.benchmark.result_tables import PYTHON_LOOPS
+from cnpgen.addons.benchmark.hypothesis_tests import wilson
+from cnpgen.addons.benchmark.result_tables import PYTHON_LOOPS
 
 ARCHIVE = Path(__file__).resolve().parent / "results"
 CHALLENGE, NOMINAL = "challenge", "nominal"

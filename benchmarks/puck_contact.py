@@ -25,10 +25,10 @@ import pinocchio as pin
 from common import arguments, cpu_of, median, progress, report, table, verdict
 from scipy.interpolate import BSpline
 
-from cnpgen.benchmark.simulator.simulate import simulate_plans
+from cnpgen.addons.benchmark.simulator.simulate import simulate_plans
+from cnpgen.addons.online.plan_hits import plan_hits
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.model_file import load_model
-from cnpgen.planner.plan_hits import plan_hits
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import Plans

@@ -18,9 +18,9 @@ from common import arguments, progress, report, table
 from numpy.typing import NDArray
 from scenes import make_checker
 
+from cnpgen.addons.families.scene_generator import shipped_families
 from cnpgen.kernels.collision.collision_checker import CollisionChecker
 from cnpgen.machine.threads import one_thread
-from cnpgen.pipelines.families.scene_generator import FAMILIES
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import Plans
@@ -134,7 +134,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
     parser.add_argument("models", nargs="+", help="models by name or file, of scenes with equal capacity")
     parser.add_argument("--robot", default="panda-3kg", help="problem of a robot")
-    parser.add_argument("--families", nargs="*", choices=list(FAMILIES), help="families of scenes")
+    parser.add_argument("--families", nargs="*", choices=list(shipped_families()), help="families of scenes")
     parser.add_argument("--seed", type=int, default=29_400_001, help="seed of the scenes")
     parser.add_argument("--suite", type=Path, help="file of test problems, such as datasets/suites/clutter.h5")
     parser.add_argument("--alone", action="store_true", help="measure the plans alone, without refining")

@@ -25,10 +25,11 @@ from common import arguments, cpu_of, median, progress, report, table
 from numpy.typing import NDArray
 from scene_datasets import Meshes, plan_states
 
+from cnpgen.addons.families.scene_generator import make_scenes
+from cnpgen.addons.scene_files.scene_files import load_scenes
 from cnpgen.kernels.collision.collision_checker import CollisionChecker, load_collision_library
 from cnpgen.kernels.collision.tree_search import TreeSettings, find_tree_path
 from cnpgen.kernels.library import KernelLibrary, choose_backend
-from cnpgen.pipelines.families.scene_generator import make_scenes
 from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.scene_plans import scene_plans
@@ -38,7 +39,6 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import as_problem, record_problem
-from cnpgen.problems.scenes.scene_files import load_scenes
 from cnpgen.refine.options import DEFAULT_OPTIONS
 from cnpgen.refine.refine_engine import prepare, refine_serially
 from cnpgen.refine.solver.hulls import Hulls

@@ -26,22 +26,22 @@ from typing import Literal
 import numpy as np
 from common import arguments, progress, report, table
 
-from cnpgen.benchmark.planners.rrtconnect import timed_by_toppra
-from cnpgen.benchmark.planners.ruckig import load_ruckig, time_optimal_motion
+from cnpgen.addons.benchmark.planners.rrtconnect import timed_by_toppra
+from cnpgen.addons.benchmark.planners.ruckig import load_ruckig, time_optimal_motion
+from cnpgen.addons.trajectories.import_trajectories import import_trajectories
+from cnpgen.addons.trajectories.interpolate import bounded_jerk
+from cnpgen.addons.trajectories.judge_family import FamilyJudge
+from cnpgen.addons.trajectories.judge_samples import judge_samples
+from cnpgen.addons.trajectories.load_trajectories import load_trajectories
+from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.addons.trajectories.trajectory_verdict import Decision, TrajectoryVerdict
 from cnpgen.judges.plans import Verdict
-from cnpgen.judges.trajectories.interpolate import bounded_jerk
-from cnpgen.judges.trajectories.judge_family import FamilyJudge
-from cnpgen.judges.trajectories.judge_samples import judge_samples
-from cnpgen.judges.trajectories.trajectory_verdict import Decision, TrajectoryVerdict
 from cnpgen.plans import Plans, load_plans, open_problem
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.exporter import SampledPlan, sample_plan
-from cnpgen.plans.import_trajectories import import_trajectories
-from cnpgen.plans.load_trajectories import load_trajectories
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.refine_plans import refine_plans
 from cnpgen.store.scene_table import OBSTACLE_POSES
-from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.trajectory.spline_motion import Motion
 
 EXCESS = 0.01  # outside a limit with its tolerance, relative to the limit

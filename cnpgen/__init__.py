@@ -35,43 +35,24 @@ public names are in these modules:
 * ``cnpgen.scenes``: planning problems in scene files, families of scenes, and plans for them.
 * ``cnpgen.errors``: the exceptions.
 * ``cnpgen.plugins``: contracts of stages, constraints, objectives and exporters.
-* ``cnpgen.benchmark``: comparison of planners, and simulation of plans.
+* ``cnpgen.addons.benchmark``: comparison of planners, and simulation of plans.
 
 Names load on first use, so that importing the package is cheap. ``__init__.pyi`` lists them for type checkers (SPEC 1).
 """
 
-import ast
 import sys
-from collections.abc import Callable
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
+from cnpgen.schema.public_names import lazy_exports
+
 _MODULES = ("benchmark", "errors", "losses", "plugins", "recipes", "results", "scenes", "trajectories")
+_load, _names = lazy_exports(__name__, __file__)
 
 
-def _lazy_exports(package: str, file: str) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
-    """Return ``__all__``, ``__getattr__`` and ``__dir__`` of a module whose stub beside ``file`` lists its names."""
-    stub = ast.parse(Path(file).with_suffix(".pyi").read_text(encoding="utf-8"))
-    imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
-    modules = {alias.name: str(node.module) for node in imports for alias in node.names}
-
-    def load(name: str) -> Any:
-        if package == "cnpgen" and name in _MODULES:
-            return import_module(f"cnpgen.{name}")
-        if name not in modules:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value = getattr(import_module(modules[name]), name)
-        setattr(sys.modules[package], name, value)
-        return value
-
-    def names() -> list[str]:
-        return sorted(modules)
-
-    return list(modules), load, names
-
-
-__all__, __getattr__, _names = _lazy_exports(__name__, __file__)
+def __getattr__(name: str) -> Any:
+    """Load a public name, or a module of public names."""
+    return import_module(f"cnpgen.{name}") if name in _MODULES else _load(name)
 
 
 def __dir__() -> list[str]:

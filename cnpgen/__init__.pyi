@@ -1,3 +1,5 @@
+from typing import Any
+
 from cnpgen.errors import CnpgenError as CnpgenError
 from cnpgen.loader.dataset import Dataset as Dataset
 from cnpgen.loader.load import load_dataset as load_dataset
@@ -12,11 +14,9 @@ from cnpgen.planner.boundary_layer import BoundaryLayer as BoundaryLayer
 from cnpgen.planner.model import Model as Model
 from cnpgen.planner.model_file import load_model as load_model
 from cnpgen.planner.model_file import save_model as save_model
-from cnpgen.planner.plan_hits import plan_hits as plan_hits
 from cnpgen.planner.planner import Planner as Planner
 from cnpgen.plans.boundary_problems import load_boundary_problems as load_boundary_problems
 from cnpgen.plans.evaluate import evaluate_plans as evaluate_plans
-from cnpgen.plans.evaluate_trajectories import evaluate_trajectories as evaluate_trajectories
 from cnpgen.plans.export import export_plans as export_plans
 from cnpgen.plans.join import join_plans as join_plans
 from cnpgen.plans.plan_file import load_plans as load_plans
@@ -38,3 +38,5 @@ from cnpgen.trajectory.boundary import Boundary as Boundary
 from cnpgen.trajectory.spline_motion import Motion as Motion
 from cnpgen.validate.machine import check_machine as check_machine
 from cnpgen.validate.validate_dataset import validate_dataset as validate_dataset
+
+def __getattr__(name: str) -> Any: ...  # names of add-ons

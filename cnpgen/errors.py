@@ -120,6 +120,10 @@ class MissingExtraError(MachineError, ImportError):
     """An optional package that is missing or broken; the message names the extra of cnpgen that installs it."""
 
 
+class MissingAddonError(MachineError, ImportError):
+    """A package below ``cnpgen/addons`` that this installation lacks; the message names it and what needs it."""
+
+
 @contextmanager
 def requires_extra(extra: str, package: str) -> Iterator[None]:
     """Raise MissingExtraError if an import in the block fails.

@@ -1,5 +1,5 @@
 """Classes that public functions return, values of objectives, and the execution of plans (``PlanRuntime``)."""
 
-from cnpgen import _lazy_exports
+from cnpgen.schema.public_names import lazy_exports
 
-__all__, __getattr__, __dir__ = _lazy_exports(__name__, __file__)
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

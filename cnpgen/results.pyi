@@ -1,3 +1,5 @@
+from typing import Any
+
 from cnpgen.judges.plans.verdict import Margin as Margin
 from cnpgen.judges.plans.verdict import Metrics as Metrics
 from cnpgen.judges.plans.verdict import PaperRule as PaperRule
@@ -16,15 +18,9 @@ from cnpgen.make.make_dataset import MadeDataset as MadeDataset
 from cnpgen.planner.control_points import ControlPoints as ControlPoints
 from cnpgen.planner.model import ModelConfig as ModelConfig
 from cnpgen.planner.model import Outputs as Outputs
-from cnpgen.planner.moving_pucks import PuckModel as PuckModel
 from cnpgen.planner.network.architecture import Architecture as Architecture
 from cnpgen.planner.network.architecture import Layer as Layer
 from cnpgen.planner.network.features import Features as Features
-from cnpgen.planner.plan_hits import PlannedHits as PlannedHits
-from cnpgen.planner.plan_runtime import PlanRuntime as PlanRuntime
-from cnpgen.planner.plan_runtime import Switch as Switch
-from cnpgen.planner.plan_runtime import SwitchOutcome as SwitchOutcome
-from cnpgen.planner.set_points import SetPoint as SetPoint
 from cnpgen.planner.tasks import Tasks as Tasks
 from cnpgen.plans.evaluate import Evaluation as Evaluation
 from cnpgen.plans.export import Exported as Exported
@@ -54,3 +50,5 @@ from cnpgen.trajectory.joined import JoinedMotion as JoinedMotion
 from cnpgen.trajectory.spline_motion import States as States
 from cnpgen.validate.machine import MachineReport as MachineReport
 from cnpgen.validate.validate_dataset import ValidationReport as ValidationReport
+
+def __getattr__(name: str) -> Any: ...  # names of add-ons

@@ -1,18 +1,16 @@
+from typing import Any
+
 from cnpgen.loader.batch import BatchObserver as BatchObserver
 from cnpgen.make.solve_scenes import SolvedScenes as SolvedScenes
 from cnpgen.make.solve_scenes import solve_scenes as solve_scenes
-from cnpgen.pipelines.families.family import Grasp as Grasp
-from cnpgen.pipelines.families.family import Layout as Layout
-from cnpgen.pipelines.families.family import SceneFamily as SceneFamily
-from cnpgen.pipelines.families.scene_generator import load_family as load_family
-from cnpgen.pipelines.families.scene_generator import make_scenes as make_scenes
+from cnpgen.pipelines.scene_family import Grasp as Grasp
+from cnpgen.pipelines.scene_family import Layout as Layout
+from cnpgen.pipelines.scene_family import SceneFamily as SceneFamily
 from cnpgen.planner.plan_requests import plan_scenes as plan_scenes
 from cnpgen.plans.scene_plans import scene_plans as scene_plans
 from cnpgen.problems.scenes.observe import observe as observe
 from cnpgen.problems.scenes.observe import scene_bodies as scene_bodies
 from cnpgen.problems.scenes.point_cloud import obstacles_of_points as obstacles_of_points
-from cnpgen.problems.scenes.scene_files import load_scenes as load_scenes
-from cnpgen.problems.scenes.scene_files import save_scenes as save_scenes
 from cnpgen.problems.scenes.scene_problem import GoalPose as GoalPose
 from cnpgen.problems.scenes.scene_problem import SceneError as SceneError
 from cnpgen.problems.scenes.scene_problem import SceneProblem as SceneProblem
@@ -23,3 +21,5 @@ from cnpgen.robots.observation.observations import CameraCloud as CameraCloud
 from cnpgen.robots.observation.observations import DistanceGrid as DistanceGrid
 from cnpgen.robots.observation.observations import ObjectTokens as ObjectTokens
 from cnpgen.robots.observation.observations import SurfaceCloud as SurfaceCloud
+
+def __getattr__(name: str) -> Any: ...  # names of add-ons

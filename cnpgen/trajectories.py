@@ -1,5 +1,5 @@
 """Sampled trajectories of other planners: files, fitted motions and verdicts ('cnpgen docs trajectories')."""
 
-from cnpgen import _lazy_exports
+from cnpgen.schema.public_names import lazy_exports
 
-__all__, __getattr__, __dir__ = _lazy_exports(__name__, __file__)
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

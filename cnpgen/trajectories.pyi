@@ -1,11 +1,6 @@
-from cnpgen.judges.trajectories.trajectory_verdict import ConditionDecision as ConditionDecision
-from cnpgen.judges.trajectories.trajectory_verdict import Decision as Decision
-from cnpgen.judges.trajectories.trajectory_verdict import TrajectoryVerdict as TrajectoryVerdict
-from cnpgen.plans.evaluate_trajectories import TrajectoryEvaluation as TrajectoryEvaluation
-from cnpgen.plans.import_trajectories import ImportedTrajectories as ImportedTrajectories
-from cnpgen.plans.import_trajectories import import_trajectories as import_trajectories
-from cnpgen.plans.load_trajectories import LoadedTrajectories as LoadedTrajectories
-from cnpgen.plans.load_trajectories import load_trajectories as load_trajectories
+from typing import Any
+
 from cnpgen.trajectory.fit import fit_motion as fit_motion
 from cnpgen.trajectory.fit import largest_error as largest_error
-from cnpgen.trajectory.sampled_trajectory import Trajectory as Trajectory
+
+def __getattr__(name: str) -> Any: ...  # names of add-ons

@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 
 import cnpgen
+from cnpgen.addons.view.page import page_of
+from cnpgen.addons.view.view_scene import scene_of_plans
 from cnpgen.cli.copy_command import copied_texts
-from cnpgen.cli.view.page import page_of
-from cnpgen.cli.view.view_scene import scene_of_plans
 from cnpgen.errors import CnpgenError
 from cnpgen.plans import Plans, open_problem
 from cnpgen.plans.join import concatenate

@@ -18,16 +18,16 @@ from typing import Any
 import pytest
 
 import cnpgen
-from cnpgen.benchmark.planners import cbirrt, crocoddyl, drake, rrtconnect, ruckig, sscbirrt
-from cnpgen.benchmark.simulator import rendering
-from cnpgen.benchmark.simulator.execute import load_mujoco
-from cnpgen.cli.view import page
+from cnpgen.addons.benchmark.planners import cbirrt, crocoddyl, drake, rrtconnect, ruckig, sscbirrt
+from cnpgen.addons.benchmark.simulator import rendering
+from cnpgen.addons.benchmark.simulator.execute import load_mujoco
+from cnpgen.addons.clusters.clusters import joined
+from cnpgen.addons.hub.publish import upload_folder
+from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
+from cnpgen.addons.view import page
 from cnpgen.errors import MissingExtraError
 from cnpgen.loader.dataset import make_frame
-from cnpgen.machine.clusters import joined
 from cnpgen.machine.versions import DOCUMENTATION_URL
-from cnpgen.make.publish import upload_folder
-from cnpgen.plans.trajectory_tables import read_trajectory_tables
 from cnpgen.store.files.figure_file import new_figure
 
 ROOT = Path(__file__).parents[1]

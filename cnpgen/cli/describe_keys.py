@@ -5,7 +5,6 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import Any, get_args
 
-from cnpgen.benchmark.suite import Suite
 from cnpgen.cli.describe import quantity, title_lines
 from cnpgen.cli.terminal import table
 from cnpgen.make.recipe import DatasetRecipe
@@ -14,13 +13,12 @@ from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.objectives import ObjectiveTerm
 from cnpgen.problems.problem import Problem
-from cnpgen.schema import registry
+from cnpgen.schema import addons, registry
 from cnpgen.schema.keys import Key, Range, keys
 from cnpgen.schema.toml import Kind
 from cnpgen.schema.units import PLAUSIBLE_MAX
 
-FILES: dict[Kind, type] = {"problem": Problem, "pipeline": Pipeline, "dataset": DatasetRecipe, "suite": Suite}
-"""Kind of a file -> type of its recipe."""
+_CORE_FILES: dict[str, type] = {"problem": Problem, "pipeline": Pipeline, "dataset": DatasetRecipe}
 
 GROUPS = {Stage: registry.STAGES, Constraint: registry.CONSTRAINTS, ObjectiveTerm: registry.OBJECTIVES}
 """Tables with a key ``use`` that names their kind -> registry of the kinds."""
@@ -37,6 +35,12 @@ A number without a unit is in SI. A string may carry another unit of the same di
 Values that are probably in another unit are refused with a suggestion. The largest absolute values are
 {", ".join(f"{value:,.4g} {unit}" for unit, value in PLAUSIBLE_MAX.items())}. Keys of small
 quantities, such as tolerances, have smaller ones. Limits and sizes are also compared with those of the URDF."""
+
+
+def recipe_types() -> dict[str, type]:
+    """Return kind of a file -> type of its recipe, also of add-ons."""
+    others = addons.installed(registry.RECIPES)
+    return _CORE_FILES | {entry.name: addons.load_entry(entry, f"a {entry.name} file") for entry in others}
 
 
 def kind_summary(kind: type) -> str:
@@ -66,14 +70,16 @@ def kind_to_dict(group: str, name: str) -> dict[str, Any]:
 def describe_keys(kinds: Sequence[Kind]) -> str:
     """Describe all keys of files of some kinds, in Markdown."""
     parts = [_INTRODUCTION] if len(kinds) > 1 else []
+    types = recipe_types()
     for kind in kinds:
-        parts += [f"## {kind.capitalize()} files", _first_line(FILES[kind]), *_sections(FILES[kind], "")]
+        parts += [f"## {kind.capitalize()} files", _first_line(types[kind]), *_sections(types[kind], "")]
     return "\n\n".join(parts)
 
 
 def keys_to_dict(kinds: Sequence[Kind]) -> dict[str, Any]:
     """Describe all keys of files of some kinds for JSON; of a table of tables each has its own keys."""
-    return {kind: _table_to_dict(FILES[kind]) for kind in kinds}
+    types = recipe_types()
+    return {kind: _table_to_dict(types[kind]) for kind in kinds}
 
 
 def _sections(cls: type, path: str) -> Iterator[str]:
@@ -101,7 +107,7 @@ def part_of(key: Key) -> type | None:
     found: type = get_args(key.hint)[0] if is_array(key) else key.hint
     if found in GROUPS:
         return found
-    return found if dataclasses.is_dataclass(found) and keys(found) and found not in FILES.values() else None
+    return found if dataclasses.is_dataclass(found) and keys(found) and found not in _CORE_FILES.values() else None
 
 
 def is_array(key: Key) -> bool:

@@ -12,65 +12,14 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
-from cnpgen.cli import (
-    benchmark_command,
-    complete_command,
-    copy_command,
-    docs_command,
-    doctor_command,
-    evaluate_command,
-    export_command,
-    extend_command,
-    import_command,
-    init_command,
-    inspect_command,
-    list_command,
-    make_command,
-    make_scenes_command,
-    merge_command,
-    plan_command,
-    publish_command,
-    refine_command,
-    show_command,
-    simulate_command,
-    solve_command,
-    train_command,
-    validate_command,
-    view_command,
-)
+from cnpgen.cli import docs_command
+from cnpgen.cli.commands import command_names, is_command, load_alternatives, load_command
 from cnpgen.cli.interruption import Terminated, exit_code, interruptible
 from cnpgen.cli.parser import Parser, add_command, add_debug
 from cnpgen.cli.terminal import printing_safely
 from cnpgen.errors import CnpgenError, MachineError, RecipeError, Spelling, python_spelling
 from cnpgen.machine.threads import prefer_one_thread
 from cnpgen.machine.versions import DOCUMENTATION_URL, installed_version
-
-_COMMANDS = {
-    "make-dataset": make_command,
-    "merge": merge_command,
-    "extend": extend_command,
-    "init": init_command,
-    "copy": copy_command,
-    "list": list_command,
-    "show": show_command,
-    "inspect": inspect_command,
-    "validate": validate_command,
-    "train": train_command,
-    "plan": plan_command,
-    "make-scenes": make_scenes_command,
-    "complete": complete_command,
-    "solve": solve_command,
-    "refine": refine_command,
-    "evaluate": evaluate_command,
-    "import": import_command,
-    "view": view_command,
-    "simulate": simulate_command,
-    "benchmark": benchmark_command,
-    "export": export_command,
-    "publish": publish_command,
-    "doctor": doctor_command,
-    "docs": docs_command,
-}
 
 _DESCRIPTION = "Generate and verify datasets for kinodynamic motion planning, train planners and optimize plans."
 
@@ -152,7 +101,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(words: list[str], given: argparse.Namespace) -> int:
     """Parse the words into ``given`` and run the command."""
-    parser = build_parser()
+    first = next((word for word in words if not word.startswith("-")), "")
+    parser = build_parser([first] if first and is_command(first) else None)
     for before, word in zip(["cnpgen", *words], words, strict=False):
         if word == "" or re.fullmatch("--[a-z-]+=", word):
             parser.error(f"the argument after {word or before!r} is empty: is it an unset variable of the shell?")
@@ -171,14 +121,18 @@ def _run(words: list[str], given: argparse.Namespace) -> int:
     return code
 
 
-def build_parser() -> Parser:
-    """Build the parser of all commands."""
+def build_parser(names: Sequence[str] | None = None) -> Parser:
+    """Build the parser of some commands, by default of all; importing the modules of all commands takes time.
+
+    Raises:
+        MissingAddonError: A named command belongs to an add-on that this installation lacks.
+    """
     parser = _LinkedParser(prog="cnpgen", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version")
     add_debug(parser)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=_LinkedParser)
-    for name, module in _COMMANDS.items():
-        add_command(commands, name, module)
+    for name in command_names() if names is None else names:
+        add_command(commands, name, load_command(name), load_alternatives(name))
     return parser
 
 

@@ -9,7 +9,7 @@ import argparse
 import re
 from collections.abc import Sequence
 from types import ModuleType
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Protocol
 
 from cnpgen.cli import values
 from cnpgen.errors import UsageError, nearest
@@ -61,18 +61,54 @@ Commands = argparse._SubParsersAction  # what ``add_subparsers`` returns: comman
 Options = argparse._ActionsContainer  # a parser or a group of its options: options are added to it
 
 
-def add_command(commands: "Commands[Any]", name: str, module: ModuleType) -> None:
+class Alternative(Protocol):
+    """A module with another kind of input of a command.
+
+    Its docstring is a title, which names its options, and the part of the help on this input.
+    """
+
+    __doc__: str | None
+
+    def add_options(self, options: "Options") -> None:
+        """Add the options that only this input has."""
+
+    def accepts(self, arguments: argparse.Namespace) -> bool:
+        """Return whether the arguments name this input; refuse its options if they name another one."""
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """Run the command for this input and return the exit code."""
+
+
+def add_command(
+    commands: "Commands[Any]", name: str, module: ModuleType, alternatives: Sequence[Alternative] = ()
+) -> None:
     """Add the command of a module, whose docstring is the help.
 
     Its function ``add_options`` adds arguments and options to a parser. ``run`` runs the command with the parsed
-    arguments, and returns the exit code if it can be another one than 0.
+    arguments, and returns the exit code if it can be another one than 0. An alternative runs in its place where it
+    accepts the arguments.
     """
-    title, _, text = (module.__doc__ or "").partition("\n\n")
+    title, text = _title_and_text(module)
+    text = "\n".join([text, *(_title_and_text(alternative)[1] for alternative in alternatives)])
     summary = f"{title[:1].lower()}{title[1:]}".rstrip(".\n")
     parser = commands.add_parser(name, help=summary, description=title, epilog=text or None)
     add_debug(parser, default=argparse.SUPPRESS)  # keep an option before the command
     module.add_options(parser)
-    parser.set_defaults(run=module.run, parser=parser)
+    for alternative in alternatives:
+        alternative.add_options(parser.add_argument_group(_title_and_text(alternative)[0].rstrip(".").lower()))
+
+    def run(arguments: argparse.Namespace) -> int | None:
+        chosen = next((item for item in alternatives if item.accepts(arguments)), module)
+        code: int | None = chosen.run(arguments)
+        return code
+
+    parser.set_defaults(run=run, parser=parser)
+
+
+def _title_and_text(module: object) -> tuple[str, str]:
+    """Return the first line of a docstring, and what follows it."""
+    title, _, text = (module.__doc__ or "").partition("\n\n")
+    return title, text
 
 
 def add_debug(parser: Parser, *, default: Any = False) -> None:
@@ -86,8 +122,8 @@ ENGINE = ("workers", "engine", "address")
 def add_engine(parser: Options, workers: str = "processes; default one per available core") -> None:
     """Add the options of ``ENGINE``, with a help for ``--workers``."""
     parser.add_argument("--workers", metavar="W", type=values.positive, help=workers)
-    text = "engine of the workers: local processes (loky, default), or a cluster ('cnpgen docs scale')"
-    parser.add_argument("--engine", choices=("loky", "dask", "ray"), help=text)
+    text = "engine of the workers: local processes (loky, default), or a cluster: dask or ray ('cnpgen docs scale')"
+    parser.add_argument("--engine", metavar="NAME", type=values.engine, help=text)
     text = "address of the cluster, such as tcp://host:8786; without it a local cluster is started"
     parser.add_argument("--address", metavar="A", help=text)
 

@@ -103,7 +103,7 @@ def _complete(arguments: argparse.Namespace) -> None:
 
 def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
     from cnpgen.planner.plan_requests import read_file, read_rows
-    from cnpgen.problems.scenes.scene_files import holds_scenes
+    from cnpgen.problems.scenes.scene_reader import holds_scenes
 
     if recipe_names.is_recipe(arguments.problems):
         return _draws(arguments, model)
@@ -127,11 +127,11 @@ def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
 def _scenes(arguments: argparse.Namespace, model: "Model") -> "Requests":
     """Read the problems of scenes."""
     from cnpgen.planner.plan_requests import scene_requests
-    from cnpgen.problems.scenes.scene_files import load_scenes
+    from cnpgen.problems.scenes.scene_reader import read_scenes
 
     if arguments.split is not None or arguments.other_rows:
         raise UsageError("--split and --other-rows are for datasets; scenes have --first and --n")
-    return scene_requests(model, load_scenes(arguments.problems, start=arguments.first or 0, n=arguments.n))
+    return scene_requests(model, read_scenes(Path(arguments.problems), start=arguments.first or 0, n=arguments.n))
 
 
 def _draws(arguments: argparse.Namespace, model: "Model") -> "Requests":

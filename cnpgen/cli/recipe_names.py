@@ -116,14 +116,6 @@ problem = partial(_recipe, ("problem", "pipeline", "dataset"))  # or a recipe wi
 suite = partial(_recipe, ("suite", "dataset", "pipeline"))
 
 
-def family(text: str) -> str:
-    """Read the name of a family of scenes."""
-    from cnpgen.pipelines.families.scene_generator import load_family
-
-    load_family(text)
-    return text
-
-
 def model(text: str) -> str:
     """Read the name of a shipped model, or its file."""
     from cnpgen.planner.model_file import find_model

@@ -60,10 +60,10 @@ def run(arguments: argparse.Namespace) -> int:
 def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
     from cnpgen.make.solve_scenes import solve_scenes
     from cnpgen.problems.problem_record import as_problem
-    from cnpgen.problems.scenes.scene_files import load_scenes
+    from cnpgen.problems.scenes.scene_reader import read_scenes
 
     refuse(arguments, ["split", "seed", "problem"], "--robot is for scenes, which have --first and --n")
-    scenes = load_scenes(arguments.what, start=arguments.first or 0, n=arguments.n)
+    scenes = read_scenes(Path(arguments.what), start=arguments.first or 0, n=arguments.n)
     problem = as_problem(arguments.robot)
 
     def solve(_: "Plans", **options: Any) -> "SolvedScenes":
@@ -74,7 +74,7 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
 
 def _problems(arguments: argparse.Namespace) -> "Plans":
     """Read or draw the boundary problems, depending on the type of the input."""
-    from cnpgen.problems.scenes.scene_files import holds_scenes
+    from cnpgen.problems.scenes.scene_reader import holds_scenes
     from cnpgen.store.paths import file_kind
 
     what = Path(arguments.what)

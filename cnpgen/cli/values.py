@@ -59,6 +59,14 @@ def part(text: str) -> tuple[int, int]:
     return k, m
 
 
+def engine(text: str) -> str:
+    """Read the name of an engine of workers: "loky", or one that an installed package registers."""
+    from cnpgen.machine.engine import check_engine_name
+
+    check_engine_name(text)
+    return text
+
+
 def toml_value(text: str) -> Any:
     """Read a value as in a recipe, or as plain text."""
     import tomllib

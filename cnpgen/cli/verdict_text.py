@@ -39,7 +39,7 @@ def summary_text(file: Path, found: "Evaluation") -> str:
     if (found.plans.duration > MAX_TIME_SAMPLES * found.step).any():
         step += f" or of {MAX_TIME_SAMPLES:,} in all"
     head = f"{file}: {counted(count, 'plan')} of {found.plans.problem.name}, judged at steps of {step} and between them"
-    counts = {text: (summary[name], summary[f"{name}_ratio"]) for name, text in _TALLIES.items()}
+    counts = {text: (summary[name], summary[f"{name}_ratio"]) for name, text in _TALLIES.items() if name in summary}
     tallies = [(text, f"{number:,} of {count:,}", f"{share:.2%}", "") for text, (number, share) in counts.items()]
     sections = [[head, checksum_text(found.plans), "", *table(tallies, indent="  ", right=(1, 2))]]
     tables = (_reasons(found, summary), (1,)), (_figures(summary), range(1, 7)), (_margins(summary), (1, 2, 3, 5, 6))

@@ -17,10 +17,10 @@ from cnpgen.errors import UsageError
 from cnpgen.kernels.symbolic.linalg import dot
 from cnpgen.kernels.symbolic.symbolic_state import FrozenState, SymbolicState, time_derivatives
 from cnpgen.kernels.tape import Axes, GridSpec
-from cnpgen.losses.published_conditions import published_conditions
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.objectives import ObjectiveTerm
 from cnpgen.problems.problem import Problem
+from cnpgen.problems.published_rules import load_rules
 from cnpgen.robots.robot import Robot
 
 Array = NDArray[Any]
@@ -158,7 +158,8 @@ def penalized_conditions(
 ) -> list[tuple[Constraint, tuple[Condition, ...]]]:
     """Return every constraint with the conditions that the loss penalizes."""
     if form == "paper":
-        return [(constraint, published_conditions(constraint, state)) for constraint in constraints]
+        rules = load_rules(form)
+        return [(constraint, rules.conditions(constraint, state)) for constraint in constraints]
     return [(constraint, constraint.penalized(state)) for constraint in constraints]
 
 

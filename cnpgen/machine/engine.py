@@ -1,22 +1,60 @@
-"""Engines that run distributed work: processes of this machine, or a cluster of dask or ray."""
+"""Engines that run distributed work: processes of this machine, or a cluster of an installed engine."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias, TypeVar
+from typing import Protocol, TypeVar
 
-from cnpgen.errors import UsageError, nearest
+from cnpgen.errors import UsageError, either, nearest
 from cnpgen.machine.workers import distribute, worker_count
+from cnpgen.schema import addons, registry
 from cnpgen.schema.arguments import integer
 
-if TYPE_CHECKING:
-    from cnpgen.machine.clusters import Cluster
-
-CLUSTERS = ("dask", "ray")
-ENGINES = ("loky", *CLUSTERS)
+LOKY = "loky"  # joblib's processes on this machine
 
 T = TypeVar("T")
 R = TypeVar("R")
+
+
+class WorkerPool(Protocol):
+    """Workers that run tasks."""
+
+    @property
+    def size(self) -> int:
+        """Number of tasks that run at once."""
+
+    @property
+    def is_remote(self) -> bool:
+        """Whether workers may be on other machines, with other working directories and caches."""
+
+    def distribute(
+        self, function: Callable[[T], R], tasks: Iterable[T], *, ordered: bool = False, hint: str = ""
+    ) -> Generator[R, None, None]:
+        """Run a function on every task and yield the results; see ``cnpgen.machine.workers.distribute``."""
+
+
+class ClusterEngine(ABC):
+    """Contract of an engine that runs tasks on a cluster; packages register them in the group ``cnpgen.engines``."""
+
+    @abstractmethod
+    def check_address(self, address: str) -> None:
+        """Raise UsageError if a text cannot be the address of a cluster of this engine."""
+
+    @abstractmethod
+    def joined(self, address: str | None, workers: int | None) -> AbstractContextManager[WorkerPool]:
+        """Connect to a cluster for a block; without an address, start one on this machine.
+
+        Raises:
+            MissingExtraError: The package of the engine is not installed.
+            MachineError: The cluster cannot be reached.
+        """
+
+
+def cluster_engine(name: str) -> ClusterEngine:
+    """Load an installed engine by its name; raise MissingAddonError if its add-on is missing."""
+    engine: ClusterEngine = registry.load(registry.ENGINES, name)()
+    return engine
 
 
 @dataclass(frozen=True)
@@ -24,8 +62,8 @@ class Engine:
     """User's choice of the engine.
 
     Attributes:
-        name: "loky" for processes of this machine, which end with this one; "dask" or "ray" for a cluster. None for
-            loky, or the backend of ``joblib.parallel_config``.
+        name: "loky" for processes of this machine, which end with this one, or a cluster engine, such as "dask" or
+            "ray". None for loky, or the backend of ``joblib.parallel_config``.
         address: Address of dask's scheduler ("tcp://host:8786") or ray's head ("host:6379", "auto"). None for a
             temporary cluster on this machine.
         workers: Number of tasks that run at once; None for one per available core.
@@ -41,18 +79,32 @@ class Engine:
     def __post_init__(self) -> None:
         if self.workers is not None:
             integer("workers", self.workers, least=1)
-        if self.name is not None and self.name not in ENGINES:
-            expected = f"expected one of {', '.join(ENGINES)}{nearest(str(self.name), ENGINES)}"
-            raise UsageError(f"engine {self.name!r} does not exist: {expected}", concerns="engine")
-        if self.address is not None and self.name not in CLUSTERS:
+        if self.name is not None:
+            check_engine_name(self.name)
+        if self.name is not None and self.is_cluster:
+            engine = cluster_engine(self.name)
+            if self.address is not None:
+                engine.check_address(self.address)
+        elif self.address is not None:
+            clusters = either(registry.names(registry.ENGINES))
             raise UsageError(
-                f"the address {self.address!r} is that of a cluster: choose {{engine}} dask or ray",
+                f"the address {self.address!r} is that of a cluster: choose {{engine}} {clusters}",
                 remedies={"engine": None},
             )
-        if self.address is not None and self.name is not None:
-            from cnpgen.machine.clusters import check_address
 
-            check_address(self.name, self.address)
+    @property
+    def is_cluster(self) -> bool:
+        """Whether the workers are those of a cluster."""
+        return self.name not in {None, LOKY}
+
+
+def check_engine_name(name: object) -> None:
+    """Raise UsageError if no package registers an engine of this name; engines of missing add-ons have names, too."""
+    if isinstance(name, str) and (name == LOKY or addons.find(registry.ENGINES, name)):
+        return
+    known = (LOKY, *registry.names(registry.ENGINES))
+    expected = f"expected one of {', '.join(known)}{nearest(str(name), known)}"
+    raise UsageError(f"engine {name!r} does not exist: {expected}", concerns="engine")
 
 
 @dataclass(frozen=True)
@@ -74,9 +126,6 @@ class LocalPool:
         return distribute(function, tasks, self.size, ordered=ordered, hint=hint)
 
 
-WorkerPool: TypeAlias = "LocalPool | Cluster"
-
-
 @contextmanager
 def assembled(engine: Engine, tasks: int, *, quick: bool = False) -> Iterator[WorkerPool]:
     """Provide a worker pool for the block: start processes or connect to a cluster.
@@ -91,14 +140,12 @@ def assembled(engine: Engine, tasks: int, *, quick: bool = False) -> Iterator[Wo
         UsageError: The engine's package is not installed.
         MachineError: The cluster cannot be reached.
     """
-    if engine.name in CLUSTERS:
-        from cnpgen.machine.clusters import joined
-
-        with joined(engine.name, engine.address, engine.workers) as cluster:
+    if engine.name is not None and engine.is_cluster:
+        with cluster_engine(engine.name).joined(engine.address, engine.workers) as cluster:
             yield cluster
         return
     backend: AbstractContextManager[object] = nullcontext()
-    if engine.name == "loky":
+    if engine.name == LOKY:
         from joblib import parallel_config
 
         backend = parallel_config(backend="loky")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,12 +16,12 @@ from cnpgen.make.resolve_spec import MAX_ROWS
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.schema.texts import read_own, utf8_text
-from cnpgen.store.card import card_notes
+from cnpgen.store.dataset_document import dataset_documents
 from cnpgen.store.dataset_spec import DatasetSpec, write_dataset_spec
 from cnpgen.store.files.atomic import check_writable
 from cnpgen.store.files.leftovers import remove_leftovers
 from cnpgen.store.intact import RERUN_HINT
-from cnpgen.store.layout import CARD, SPECIFICATION, WORK
+from cnpgen.store.layout import SPECIFICATION, WORK
 from cnpgen.store.paths import require_dataset
 from cnpgen.store.shard_record import pending
 from cnpgen.store.workspace import check_place, find_workspace
@@ -104,7 +105,9 @@ def _extended(folder: Path, begun: DatasetSpec, recipe: DatasetRecipe, n: int) -
 
 def _notes(folder: Path) -> str:
     """Read the notes from the card, their only copy in a dataset."""
-    try:
-        return card_notes(utf8_text(read_own(folder / CARD, folder / SPECIFICATION, "a card")))
-    except (OSError, ValueError):
-        return ""
+    for document in dataset_documents():
+        with suppress(OSError, ValueError):  # a missing card has no notes
+            text = utf8_text(read_own(folder / document.file, folder / SPECIFICATION, "a card"))
+            if notes := document.notes(text):
+                return notes
+    return ""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError, lacks
-from cnpgen.pipelines.families.resting_states import RestingStates, seeds_of
+from cnpgen.pipelines.resting_states import RestingStates, seeds_of
 from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.format import GOAL_OPTION
 from cnpgen.plans.plans import Plans

@@ -19,7 +19,7 @@ from cnpgen.make.goal_poses import (
     nearest_states,
     states_of_pose,
 )
-from cnpgen.pipelines.families.resting_states import RestingStates
+from cnpgen.pipelines.resting_states import RestingStates
 from cnpgen.plans.format import GOAL_OPTION
 from cnpgen.plans.join import concatenate
 from cnpgen.plans.plans import Plans

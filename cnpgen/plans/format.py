@@ -22,6 +22,10 @@ INTEGERS = ("sample_id", "status")
 NOTES = ("source", "refined_with")
 ATTRIBUTES = ("format", "format_version", "degree", "problem", "problem_recipe", "problem_urdf", "problem_sha256")
 
+JOINT_NAMES_KEY = b"cnpgen_joint_names"  # of the metadata of exported Parquet tables, as JSON
+PLAN_COLUMN = "plan"  # of exported tables with several plans: the index of the plan
+PHASE_COLUMN = "path_phase"  # of exported tables: the phase of each sample
+
 GOAL_OPTION = "goal_option"  # column with the number of a goal state among those of one sample_id, the nearest first
 
 UNITS = {"q": "rad", "dq": "rad/s", "ddq": "rad/s^2", "jerk": "rad/s^3"}  # for revolute joints

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError, requires_extra
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan, parameter_columns
-from cnpgen.plans.format import UNITS
-from cnpgen.plans.trajectory_tables import JOINT_NAMES_KEY, PHASE_COLUMN, PLAN_COLUMN
+from cnpgen.plans.format import JOINT_NAMES_KEY, PHASE_COLUMN, PLAN_COLUMN, UNITS
 from cnpgen.store.files.atomic import committing, write_file
 from cnpgen.store.files.hdf5 import create_hdf5
 from cnpgen.store.joint_units import unit_of, units_of_joints

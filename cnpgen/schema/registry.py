@@ -1,10 +1,13 @@
-"""Registry of stages, constraints, objectives, planners, exporters and families, built-in and of installed packages."""
+"""Registry of what recipes, commands and options name: the kinds of the core, of add-ons and of installed packages.
+
+A group is a kind of extension with a contract. The core lists its own kinds here; add-ons and other packages register
+theirs by entry points of the same groups.
+"""
 
 import contextlib
 import dataclasses
 import functools
 import hashlib
-import importlib.metadata
 import inspect
 import pkgutil
 import sys
@@ -13,22 +16,33 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from cnpgen.errors import RecipeError, nearest
+from cnpgen.errors import MissingAddonError, RecipeError, nearest
+from cnpgen.schema import addons
 
 STAGES = "cnpgen.stages"
 CONSTRAINTS = "cnpgen.constraints"
 OBJECTIVES = "cnpgen.objectives"
-PLANNERS = "cnpgen.planners"
 EXPORTERS = "cnpgen.exporters"
 FAMILIES = "cnpgen.families"
+READERS = "cnpgen.readers"
+ENGINES = "cnpgen.engines"
+DOCUMENTS = "cnpgen.documents"
+RULES = "cnpgen.rules"
+RECIPES = "cnpgen.recipes"  # types of recipe files; they have no common base class
+COMMANDS = "cnpgen.commands"  # modules with the functions of ``cnpgen.cli.parser.add_command``
+
+PROJECT = "cnpgen"  # the distribution of core and add-ons
 
 CONTRACTS: dict[str, str] = {  # base class of the kinds of a group
     STAGES: "cnpgen.pipelines.stages.stage:Stage",
     CONSTRAINTS: "cnpgen.problems.constraints.constraint:Constraint",
     OBJECTIVES: "cnpgen.problems.objectives:ObjectiveTerm",
-    PLANNERS: "cnpgen.benchmark.benchmark_planner:BenchmarkPlanner",
     EXPORTERS: "cnpgen.plans.exporter:Exporter",
-    FAMILIES: "cnpgen.pipelines.families.family:SceneFamily",
+    FAMILIES: "cnpgen.pipelines.scene_family:SceneFamily",
+    READERS: "cnpgen.problems.scenes.scene_reader:SceneReader",
+    ENGINES: "cnpgen.machine.engine:ClusterEngine",
+    DOCUMENTS: "cnpgen.store.dataset_document:DatasetDocument",
+    RULES: "cnpgen.problems.published_rules:PublishedRules",
 }
 
 BUILT_IN: dict[str, dict[str, str]] = {
@@ -84,73 +98,50 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "path-length": "cnpgen.problems.objectives:PathLength",
         "tip-reference": "cnpgen.problems.objectives:TipReference",
     },
-    PLANNERS: {
-        "cnpgen": "cnpgen.benchmark.planners.own_planners:ShippedNetwork",
-        "cnpgen+refine": "cnpgen.benchmark.planners.own_planners:RefinedNetwork",
-        "cnp-b-paper": "cnpgen.benchmark.planners.own_planners:PaperNetwork",
-        "solve": "cnpgen.benchmark.planners.own_planners:Solve",
-        "trajopt": "cnpgen.benchmark.planners.trajopt:TrajOpt",
-        "aqp": "cnpgen.benchmark.planners.aqp:AQP",
-        "cbirrt": "cnpgen.benchmark.planners.cbirrt:CBiRRT",
-        "rrtconnect": "cnpgen.benchmark.planners.rrtconnect:RRTConnect",
-        "ruckig": "cnpgen.benchmark.planners.ruckig:Ruckig",
-        "sscbirrt": "cnpgen.benchmark.planners.sscbirrt:SSCBiRRT",
-        "drake": "cnpgen.benchmark.planners.drake:Drake",
-        "crocoddyl": "cnpgen.benchmark.planners.crocoddyl:Crocoddyl",
-        "sst": "cnpgen.benchmark.planners.sst:SST",
-        "mpc-mpnet": "cnpgen.benchmark.planners.mpc_mpnet:MPCMPNet",
-    },
     EXPORTERS: {
         "npz": "cnpgen.plans.formats:NumpyArchive",
         "csv": "cnpgen.plans.formats:CsvTables",
         "joint-trajectory": "cnpgen.plans.formats:JointTrajectory",
         "ros2-control": "cnpgen.plans.formats:TrajectoryControllerGoal",
         "parquet": "cnpgen.plans.formats:ParquetTable",
-        "lerobot": "cnpgen.plans.lerobot_dataset:LeRobotDataset",
         "mpd": "cnpgen.plans.formats:PathSplines",
-    },
-    FAMILIES: {
-        "tabletop": "cnpgen.pipelines.families.tables:Tabletop",
-        "cubby": "cnpgen.pipelines.families.shelves:Cubby",
-        "merged-cubby": "cnpgen.pipelines.families.shelves:MergedCubby",
-        "dresser": "cnpgen.pipelines.families.containers:Dresser",
-        "bookshelf-small": "cnpgen.pipelines.families.shelves:BookshelfSmall",
-        "bookshelf-tall": "cnpgen.pipelines.families.shelves:BookshelfTall",
-        "bookshelf-thin": "cnpgen.pipelines.families.shelves:BookshelfThin",
-        "cage": "cnpgen.pipelines.families.containers:Cage",
-        "box": "cnpgen.pipelines.families.containers:OpenBox",
-        "table-pick": "cnpgen.pipelines.families.tables:TablePick",
-        "table-under-pick": "cnpgen.pipelines.families.tables:TableUnderPick",
-        "free": "cnpgen.pipelines.families.free_mix:FreeMix",
     },
 }
 
-RENAMED: dict[str, dict[str, str]] = {PLANNERS: {"cnp-b": "cnpgen", "cnp-b+refine": "cnpgen+refine"}}  # old -> new
+RENAMED = {"cnpgen.planners": {"cnp-b": "cnpgen", "cnp-b+refine": "cnpgen+refine"}}  # group -> old name -> new name
 
 
 def names(group: str) -> tuple[str, ...]:
     """List the kinds of a group: the built-in ones in their order, then those of installed packages by name."""
-    others = {entry.name for entry in installed(group)} - BUILT_IN[group].keys()
-    return (*BUILT_IN[group], *sorted(others))
+    own = BUILT_IN.get(group, {})
+    others = {entry.name for entry in addons.installed(group)} - own.keys()
+    return (*own, *sorted(others))
 
 
-def load(group: str, name: str) -> type[Any]:
+def load(group: str, name: str, base: type[Any] | None = None) -> type[Any]:
     """Import the class of a kind by its name in recipes, a concrete subclass of the contract of the group.
+
+    ``base`` is the contract of a group that an add-on defines.
 
     Raises:
         RecipeError: The kind is unknown, defined twice, or cannot be imported.
+        MissingAddonError: The kind belongs to an add-on that this installation lacks.
     """
-    sources = _sources(group, name)
     noun = noun_of(group)
+    sources = _sources(group, name)
     if not sources:
+        if entry := addons.find(group, name):
+            addons.load_entry(entry, f"{noun} {name!r}")
         known = f"known: {', '.join(names(group))}, and those of packages with the entry point group {group!r}"
         raise RecipeError([f"unknown {noun} {name!r}{name_hint(group, name)}; {known}"])
     if len(sources) > 1:
         raise RecipeError([f"{noun} {name!r} is defined more than once: by {' and by '.join(sources)}"])
     source, importer = next(iter(sources.items()))
-    what, base = f"{noun} {name!r} of {source}", contract(group)
+    what, base = f"{noun} {name!r} of {source}", base or contract(group)
     try:
         kind: type[Any] = importer()
+    except MissingAddonError:
+        raise
     except Exception as error:  # imported modules may raise any exception
         raise RecipeError([f"{what} cannot be imported: {type(error).__name__}: {error}"]) from error
     if not (inspect.isclass(kind) and issubclass(kind, base)):
@@ -186,10 +177,10 @@ def group_of(kind: type) -> str:
 def name_of(group: str, kind: type) -> str:
     """Return the name under which a class is registered in a group, or ``"module:Class"`` if it is not."""
     spec = f"{kind.__module__}:{kind.__qualname__}"
-    for name, built_in in BUILT_IN[group].items():
+    for name, built_in in BUILT_IN.get(group, {}).items():
         if built_in == spec:
             return name
-    for entry in installed(group):
+    for entry in addons.installed(group):
         with contextlib.suppress(RecipeError):  # ignores broken plug-ins
             if entry.value == spec or load(group, entry.name) is kind:
                 return entry.name
@@ -219,16 +210,18 @@ def package_digest(package: str) -> str:
 def package_of(group: str, kind: type) -> str:
     """Return the name of the installed package that registers a class; empty for built-in and unregistered ones."""
     name = name_of(group, kind)
-    return next((entry.dist.name for entry in installed(group) if entry.name == name and entry.dist), "")
+    distributions = (entry.dist for entry in addons.installed(group) if entry.name == name)
+    return next((dist.name for dist in distributions if dist and dist.name != PROJECT), "")
 
 
 def package_in(error: BaseException) -> str:
     """Return the installed package of plug-ins in whose code an error was raised; empty if there is none."""
     packages = {
         entry.module.partition(".")[0]: entry.dist.name if entry.dist else entry.module
-        for group in CONTRACTS
-        for entry in installed(group)
+        for entries in addons.entry_points().values()
+        for entry in entries
     }
+    packages.pop(PROJECT, None)
     modules = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
     return next((packages[top] for top in (name.partition(".")[0] for name in modules[::-1]) if top in packages), "")
 
@@ -246,21 +239,17 @@ def why_missing(group: str, use: str, package: str) -> str:
     )
 
 
-@functools.cache
-def installed(group: str) -> tuple[importlib.metadata.EntryPoint, ...]:
-    """List the entry points of installed packages; cached, since reading their metadata takes milliseconds."""
-    return tuple(importlib.metadata.entry_points(group=group))
-
-
 def _sources(group: str, name: str) -> dict[str, Callable[[], Any]]:
     """List the packages that define a kind, with import paths."""
     found: dict[str, Callable[[], Any]] = {}
-    if name in BUILT_IN[group]:
-        found["cnpgen"] = functools.partial(pkgutil.resolve_name, BUILT_IN[group][name])
-    for entry in installed(group):
+    if name in BUILT_IN.get(group, {}):
+        found[PROJECT] = functools.partial(pkgutil.resolve_name, BUILT_IN[group][name])
+    for entry in addons.installed(group):
         if entry.name == name:
             package = entry.dist.name if entry.dist else "an installed package"
-            found[f"{package} ({entry.value})"] = entry.load
+            own = f"the add-on {addons.addon_of(entry.module)!r}"
+            source = own if package == PROJECT else f"{package} ({entry.value})"
+            found[source] = functools.partial(addons.load_entry, entry, f"{noun_of(group)} {name!r}")
     return found
 
 

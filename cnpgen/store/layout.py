@@ -22,6 +22,9 @@ CARD = "README.md"
 CROISSANT = "croissant.json"
 WORK = "_work"
 
+DESCRIPTIONS = (CARD, CROISSANT)
+"""Documents that add-ons write; a dataset is complete without them."""
+
 DOCUMENTS = (SPECIFICATION, MANIFEST, STATS, CARD, CROISSANT)
 """The files of a dataset that do not belong to one shard."""
 

@@ -10,20 +10,20 @@ from pathlib import Path
 from typing import Any, cast
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.store.card import card_text
-from cnpgen.store.croissant import croissant_document
+from cnpgen.store.dataset_document import dataset_documents
 from cnpgen.store.dataset_spec import DatasetSpec, shards
 from cnpgen.store.dataset_summary import DatasetSummary, stats_document, summarize_dataset
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import file_sha256, write_file
-from cnpgen.store.files.document_structure import ANY_KEY, TEXT, WHOLE
-from cnpgen.store.files.documents import load_document, plain, render, save_document
+from cnpgen.store.files.document_structure import ANY_KEY, TEXT, WHOLE, check_structure
+from cnpgen.store.files.documents import load_document, plain, save_document
 from cnpgen.store.files.leftovers import remove_all_temporary
-from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, SPECIFICATION, STATS, WORK
+from cnpgen.store.layout import DESCRIPTIONS, MANIFEST, SPECIFICATION, STATS, WORK
 
 MANIFEST_FORMAT = "cnpgen-dataset"
 MANIFEST_VERSION = 2
-LISTED = (SPECIFICATION, STATS, CARD, CROISSANT)  # files with their size and sha256 beside the shards
+LISTED = (SPECIFICATION, STATS, *DESCRIPTIONS)  # files with their size and sha256 beside the shards
+_FILE_STRUCTURE = {"bytes": WHOLE, "sha256": TEXT}
 _SHARD_STRUCTURE = {
     **dict.fromkeys(("file", "sha256"), TEXT),
     **dict.fromkeys(("rows", "first_sample_id", "bytes"), WHOLE),
@@ -33,23 +33,23 @@ MANIFEST_STRUCTURE = {
     "fingerprint": TEXT,
     "specification_fingerprint": TEXT,
     "splits": {ANY_KEY: {"rows": WHOLE, "shards": [_SHARD_STRUCTURE]}},
-    "files": {name: {"bytes": WHOLE, "sha256": TEXT} for name in LISTED},
+    "files": dict.fromkeys((SPECIFICATION, STATS), _FILE_STRUCTURE),
 }
 
 
 def finalize(folder: Path, spec: DatasetSpec, *, notes: str = "") -> dict[str, Any]:
-    """Summarize the shards of a dataset: write statistics, card, Croissant description and, last, the manifest.
+    """Summarize the shards of a dataset: write statistics, descriptions and, last, the manifest.
 
     The same shards give the same files, so several processes may do it at the same time. ``notes`` is Markdown for the
-    card. Errors are those of ``summarize_dataset`` and ``source_date``.
+    descriptions. Errors are those of ``summarize_dataset`` and ``source_date``.
     """
     summary = summarize_dataset(folder, spec)
     created = _created(summary)
     (folder / MANIFEST).unlink(missing_ok=True)
     save_document(folder / STATS, stats_document(summary))
-    write_file(folder / CARD, card_text(summary, folder=_name(folder), notes=notes))
-    croissant = plain(croissant_document(summary, created=created))
-    write_file(folder / CROISSANT, render(croissant) + "\n")
+    for document in dataset_documents():
+        text = document.render(summary, created=created, folder=_name(folder), notes=notes)
+        write_file(folder / document.file, text)
     manifest = _manifest(folder, summary, created=created)
     save_document(folder / MANIFEST, manifest)
     remove_all_temporary(folder / WORK)
@@ -65,7 +65,13 @@ def _name(folder: Path) -> str:
 
 def load_manifest(folder: Path) -> dict[str, Any]:
     """Read ``manifest.json``; raise DatasetError if it is missing, damaged or of another format version."""
-    return load_document(folder / MANIFEST, MANIFEST_FORMAT, version=MANIFEST_VERSION, structure=MANIFEST_STRUCTURE)
+    manifest = load_document(folder / MANIFEST, MANIFEST_FORMAT, version=MANIFEST_VERSION, structure=MANIFEST_STRUCTURE)
+    described = {name: _FILE_STRUCTURE for name in DESCRIPTIONS if name in manifest["files"]}
+    try:
+        check_structure(manifest["files"], described)
+    except ValueError as error:
+        raise DatasetError(f"{folder / MANIFEST} is damaged: files.{error}") from error
+    return manifest
 
 
 def shard_entries(manifest: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -131,7 +137,9 @@ def _manifest(folder: Path, summary: DatasetSummary, *, created: str) -> dict[st
         "splits": {split: _split(folder, summary, split) for split in spec.splits},
         "stats": STATS,
         "files": {
-            name: {"bytes": (folder / name).stat().st_size, "sha256": file_sha256(folder / name)} for name in LISTED
+            name: {"bytes": (folder / name).stat().st_size, "sha256": file_sha256(folder / name)}
+            for name in LISTED
+            if (folder / name).exists()
         },
     }
 

@@ -20,8 +20,8 @@ from cnpgen.plans.format import BOUNDARY, CONDITIONS
 from cnpgen.plans.scene_plans import scene_plans
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
-from cnpgen.problems.scenes.scene_files import holds_scenes, load_scenes
 from cnpgen.problems.scenes.scene_problem import SceneProblem
+from cnpgen.problems.scenes.scene_reader import holds_scenes, read_scenes
 from cnpgen.schema.arguments import concerning
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.scene_table import OBSTACLE_POSES
@@ -184,7 +184,7 @@ def open_training_data(folder: str | Path, robot: str | Path | None = None) -> T
     if robot is not None:
         with concerning("robot"):
             problem = as_problem(robot)
-        return make_scene_rows(problem, load_scenes(folder), str(folder))
+        return make_scene_rows(problem, read_scenes(Path(folder)), str(folder))
     if Path(folder).exists() and holds_scenes(Path(folder)):
         raise UsageError(f"{folder} holds scenes: {{robot}} trains on them", remedies={"robot": "panda"})
     dataset = load_dataset(folder)

@@ -102,7 +102,8 @@ def _draw_terms(axis: "Axes", steps: list[dict[str, Any]]) -> None:
 def _draw_validity(axis: "Axes", checks: list[dict[str, Any]]) -> None:
     seconds = _column(checks, "seconds")
     for name, label in (("valid", "strict verdict"), ("paper_valid", "the paper's rules")):
-        axis.plot(seconds, [100 * record["validation"][name] for record in checks], marker=".", label=label)
+        if all(name in record["validation"] for record in checks):
+            axis.plot(seconds, [100 * record["validation"][name] for record in checks], marker=".", label=label)
     axis.set_ylabel("valid plans [%]")
     axis.set_ylim(0, 101)
     _name_lines(axis)

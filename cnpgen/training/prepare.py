@@ -248,7 +248,8 @@ def validate(
     """Plan for N validation rows and judge the plans in some processes.
 
     Returns:
-        JSON-able: number of ``plans``; fractions ``valid`` and, by the paper's rules, ``paper_valid``; means of some
+        JSON-able: number of ``plans``; fractions ``valid`` and, if the paper's rules are installed,
+        ``paper_valid``; means of some
         metrics; ``broken``, condition -> number of violating plans; ``score``, which compares models: 1 % of the plans
         counts as much as 1 % of the motion time.
     """
@@ -261,7 +262,7 @@ def validate(
     return {
         "plans": summary["plans"],
         "valid": summary["valid_ratio"],
-        "paper_valid": summary["paper_valid_ratio"],
+        **({"paper_valid": summary["paper_valid_ratio"]} if "paper_valid_ratio" in summary else {}),
         **{name: metrics[name]["mean"] for name in MEANS if name in metrics},
         "broken": {
             name: condition["violating_plans"]

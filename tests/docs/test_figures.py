@@ -30,7 +30,7 @@ def test_every_script_with_figures_is_quoted_and_its_options_exist(figures: Modu
     assert scripts >= {path.stem for path in (ROOT / "benchmarks").glob("*.py")} - NOT_QUOTED - {"puck_contact"}
     for command in commands:
         script, *words = command.text.split()
-        known = (ROOT / ("cnpgen/cli/benchmark_command.py" if script == "cnpgen" else script)).read_text()
+        known = (ROOT / ("cnpgen/addons/benchmark/benchmark_command.py" if script == "cnpgen" else script)).read_text()
         options = {word for word in words if word.startswith("--")} - {"--json"}
         assert all(f'"{option}"' in known for option in options), command.text
     suites = [command.text.split()[2] for command in commands if command.text.startswith("cnpgen")]
@@ -77,7 +77,7 @@ def test_the_comparison_of_planners_plans_for_at_most_twelve_hours(
         "online": 24,
     }
     monkeypatch.setattr(
-        "cnpgen.benchmark.suite.load_suite",
+        "cnpgen.addons.benchmark.suite.load_suite",
         lambda name: SimpleNamespace(problems=lambda: (range(counts[name]), None)),
     )
     figures.print_list(figures.quoted_commands(["planners"]))

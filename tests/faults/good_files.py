@@ -8,7 +8,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from cnpgen.benchmark.results_file import answer_to_dict, open_results
+from cnpgen.addons.benchmark.results_file import answer_to_dict, open_results
+from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.recipe import DatasetRecipe, load_dataset_recipe
 from cnpgen.planner.model_file import save_model
@@ -18,7 +19,6 @@ from cnpgen.refine.task import Attempt, Outcome
 from cnpgen.schema.catalogue import list_recipes, recipes_root
 from cnpgen.store.shard import read_shard
 from cnpgen.training.checkpoint import Checkpoints, start_state
-from cnpgen.trajectory.sampled_trajectory import Trajectory
 from tests.examples.models import boundary_of_columns, untrained_model
 from tests.examples.plan_files import plans_of, remove_checksum
 from tests.examples.plans import load as stored_plan

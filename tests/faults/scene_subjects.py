@@ -11,19 +11,19 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.addons.scene_files.scene_files import load_scenes, save_scenes
+from cnpgen.addons.trajectories.evaluate_trajectories import evaluate_trajectories
+from cnpgen.addons.trajectories.import_trajectories import import_trajectories
+from cnpgen.addons.trajectories.load_trajectories import load_trajectories
 from cnpgen.errors import CnpgenError, MissingExtraError
 from cnpgen.plans.boundary_problems import load_boundary_problems
 from cnpgen.plans.evaluate import evaluate_plans
-from cnpgen.plans.evaluate_trajectories import evaluate_trajectories
 from cnpgen.plans.export import export_plans
-from cnpgen.plans.import_trajectories import import_trajectories
-from cnpgen.plans.load_trajectories import load_trajectories
 from cnpgen.plans.plan_file import load_plans, save_plans
 from cnpgen.plans.plans import screen
 from cnpgen.plans.scene_plans import scene_plans
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
-from cnpgen.problems.scenes.scene_files import load_scenes, save_scenes
 from cnpgen.problems.scenes.scene_problem import SceneProblem
 from cnpgen.robots.obstacle import Obstacle
 from tests.examples.plan_files import plans_of, remove_checksum

@@ -15,8 +15,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from cnpgen.benchmark.results_file import answer_from_dict, open_results
-from cnpgen.benchmark.suite import load_suite
+from cnpgen.addons.benchmark.results_file import answer_from_dict, open_results
+from cnpgen.addons.benchmark.suite import load_suite
 from cnpgen.cli.inspect_command import inspection_text
 from cnpgen.errors import CnpgenError
 from cnpgen.loader.load import load_dataset

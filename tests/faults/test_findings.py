@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cnpgen.addons.online.moving_pucks import PuckModel
 from cnpgen.errors import MAX_LINE_LENGTH, DatasetError, RecipeError, UsageError
-from cnpgen.planner.moving_pucks import PuckModel
 from cnpgen.plans import PlanStatus, load_plans, save_plans
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import screen

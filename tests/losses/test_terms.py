@@ -9,13 +9,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from cnpgen.addons.paper.published_conditions import published_conditions
 from cnpgen.kernels.interpreted_kernel import InterpretedGridKernel
 from cnpgen.kernels.symbolic.convex_distances import signed_segment_box_distance
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.symbolic_state import FrozenState, SymbolicState
 from cnpgen.kernels.tape import GridSpec, tape_from_function
 from cnpgen.losses.integrand import constraint_term
-from cnpgen.losses.published_conditions import published_conditions
 from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.solid import place_obstacles

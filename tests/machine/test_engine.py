@@ -22,10 +22,10 @@ import psutil
 import pytest
 
 import cnpgen
+from cnpgen.addons.clusters import clusters
+from cnpgen.addons.clusters.clusters import Cluster
 from cnpgen.cli.main import main
 from cnpgen.errors import MachineError, UsageError
-from cnpgen.machine import clusters
-from cnpgen.machine.clusters import Cluster
 from cnpgen.machine.engine import Engine, assembled
 from cnpgen.make.make_dataset import _without_local_paths
 from cnpgen.make.make_shards import _PREPARED, make_shards
@@ -333,7 +333,7 @@ def test_that_the_last_worker_of_dask_is_gone_is_said_until_another_one_comes(
             logger.removeHandler(self)
             start(*WORKER)
 
-    logger = logging.getLogger("cnpgen.machine.clusters")
+    logger = logging.getLogger("cnpgen.addons.clusters.clusters")
     logger.addHandler(Starter())
     kill = {"progress": lambda *_: first.kill()}
     made = make_tiny(tmp_path / "out", engine="dask", address=scheduler, workers=None, shard_size=50, **kill)

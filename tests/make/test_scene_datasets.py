@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import cnpgen
+from cnpgen.addons.hub.publish import write_repository
 from cnpgen.cli.main import main
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
-from cnpgen.make.publish import write_repository
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.obstacles import with_capacity
 from cnpgen.problems.problem_record import as_record, open_problem

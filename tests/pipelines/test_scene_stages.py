@@ -9,8 +9,8 @@ import pytest
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.tape import Loop
-from cnpgen.pipelines.families.resting_states import RestingStates
 from cnpgen.pipelines.pipeline import Pipeline, load_pipeline
+from cnpgen.pipelines.resting_states import RestingStates
 from cnpgen.pipelines.stages.draw_scenes import TOO_MANY, base_depths
 from cnpgen.pipelines.stages.scene_clearance import SceneClearance
 from cnpgen.pipelines.stages.scene_ends import MAX_POSE_IK_STEPS, NO_ENDS, POSE_TOLERANCE, pose_ik_step

@@ -8,11 +8,11 @@ import h5py
 import numpy as np
 import pytest
 
+from cnpgen.addons.online.hit_tasks import boundary_of_tasks
 from cnpgen.errors import UsageError
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.pipelines.stages.boundary_motion import TableAcceleration
 from cnpgen.pipelines.stages.stage import TaskBatch
-from cnpgen.planner.hit_tasks import boundary_of_tasks
 from cnpgen.planner.model import is_rest_to_rest
 from cnpgen.planner.model_file import load_model
 from cnpgen.planner.plan_requests import read_file, read_rows

@@ -6,9 +6,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from cnpgen.addons.online.plan_hits import plan_hits
 from cnpgen.errors import UsageError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
-from cnpgen.planner.plan_hits import plan_hits
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plan_file import load_plans, save_plans

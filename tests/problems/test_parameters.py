@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 
 import cnpgen
-from cnpgen.benchmark.simulator.simulate import simulate_plans
+from cnpgen.addons.benchmark.simulator.simulate import simulate_plans
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.judges.rows.verify import verify_rows
 from cnpgen.losses.plan_loss import PlanLoss

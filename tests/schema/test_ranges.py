@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import cnpgen
+from cnpgen.addons.online.plan_hits import plan_hits
 from cnpgen.errors import MachineError, RecipeError, UsageError
-from cnpgen.planner.plan_hits import plan_hits
 from cnpgen.problems.problem_record import ProblemRecord, open_problem, record_problem
 from cnpgen.refine.options import RefineOptions
 from cnpgen.robots.observation.camera import Camera

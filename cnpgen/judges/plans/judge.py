@@ -25,7 +25,7 @@ from cnpgen.judges.plans.evaluated_trajectory import (
 from cnpgen.judges.plans.joint_limits import ProvenJointLimits, joint_limits
 from cnpgen.judges.plans.local_maxima import check_local_maxima
 from cnpgen.judges.plans.measure import EvaluationContext, boundary_margins, by_name, evaluation_context, measure
-from cnpgen.judges.plans.paper import metrics_of, paper_rule
+from cnpgen.judges.plans.metrics import metrics_of
 from cnpgen.judges.plans.sampling import (
     EARLY_EXIT_CELLS,
     MAX_DURATION_S,
@@ -40,6 +40,7 @@ from cnpgen.judges.plans.scipy_splines import is_positive
 from cnpgen.judges.plans.tracking_tube import TrackingError, TrackingTube
 from cnpgen.judges.plans.verdict import Margin, Metrics, PaperRule, Reason, Verdict
 from cnpgen.problems.problem import Problem
+from cnpgen.problems.published_rules import find_rules
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
@@ -103,6 +104,7 @@ class Judge:
         self._problem, self._robot, self._step = problem, robot, step
         self._world = PathWorld(robot, problem.obstacle, problem.object_size)
         self._limits = joint_limits(problem, self._world)
+        self._paper = find_rules("paper")
         self._tube = None if tracking_error is None else TrackingTube(problem, robot, tracking_error)
         if self._tube is not None:
             self._limits = self._tube.tighten(self._limits)
@@ -139,16 +141,23 @@ class Judge:
             return Verdict(Reason.NOT_FINITE, metrics=Metrics(duration=float(samples.t[-1])), samples=len(samples.s))
         world.set_path(states.q, states.dq, states.ddq, plan.obstacle_poses, states.jerk, exact=not early_exit)
         ends = boundary_margins(states, plan.boundary, samples, world.robot)
-        metrics, paper = Metrics(), PaperRule()
+        metrics, paper = Metrics(), None if self._paper is None else PaperRule()
         if not early_exit:
             metrics = metrics_of(plan.problem, world, samples, jerks(plan.motion, samples.s))
-            paper = paper_rule(plan.problem, world, plan.obstacle_poses, plan.goal_xyz)
+            paper = self._judge_by_paper(plan)
         curve = SplineCurve(plan.motion)
         context = evaluation_context(plan.problem, curve, plan.obstacle_poses, world, samples, table)
         context = context if self._tube is None else self._tube.widen(context)
         motion = polynomials(plan.motion, jerk=plan.problem.uses_jerk)
         margins = [*ends, *_margins(context, motion, self._limits, early_exit=early_exit)]
         return Verdict(reason_of(margins), by_name(margins), metrics, paper, len(samples.s))
+
+    def _judge_by_paper(self, plan: "_Plan") -> PaperRule | None:
+        """Judge the plan whose samples the world has by the paper's rules, if they are installed."""
+        if self._paper is None:
+            return None
+        finished, broken = self._paper.judge(plan.problem, self._world, plan.obstacle_poses, plan.goal_xyz)
+        return PaperRule(finished, finished and not broken, broken)
 
     def _plans(self, motion: Motion, boundary: Boundary, scene: Scene, goal_xyz: Array) -> "list[_Plan]":
         _check_shapes(self._robot, motion, boundary, scene, goal_xyz)

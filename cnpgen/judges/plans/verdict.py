@@ -114,7 +114,7 @@ class Metrics:
 
 @dataclass(frozen=True)
 class PaperRule:
-    """Result of the paper's looser rules (``cnpgen.judges.plans.paper``).
+    """Result of the paper's looser rules, which the add-on ``paper`` evaluates.
 
     Attributes:
         finished: Whether the tip ends at the goal.
@@ -126,6 +126,10 @@ class PaperRule:
     valid: bool = False
     broken: tuple[str, ...] = ()
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result for JSON."""
+        return {"finished": self.finished, "valid": self.valid, "broken": list(self.broken)}
+
 
 @dataclass(frozen=True)
 class Verdict:
@@ -135,14 +139,14 @@ class Verdict:
         reason: ``Reason.OK``, another ``Reason``, or the ``reason`` of the constraint with the largest violation.
         margins: Condition -> margin; empty if the plan could not be evaluated.
         metrics: Motion time, errors, effort.
-        paper: Result of the paper's rules.
+        paper: Result of the paper's rules; None if they were not evaluated, since the add-on is missing.
         samples: Number of samples.
     """
 
     reason: str
     margins: Mapping[str, Margin] = field(default_factory=dict)
     metrics: Metrics = Metrics()
-    paper: PaperRule = PaperRule()
+    paper: PaperRule | None = PaperRule()
     samples: int = 0
 
     def __str__(self) -> str:
@@ -173,7 +177,7 @@ class Verdict:
             "worst": worst and worst.to_dict(),
             "margins": {name: margin.to_dict() for name, margin in self.margins.items()},
             "metrics": self.metrics.to_dict(),
-            "paper": {"finished": self.paper.finished, "valid": self.paper.valid, "broken": list(self.paper.broken)},
+            "paper": self.paper and self.paper.to_dict(),
             "samples": self.samples,
         }
 
@@ -182,17 +186,18 @@ def summarize_verdicts(verdicts: Sequence[Verdict]) -> dict[str, Any]:
     """Count verdicts and average their metrics.
 
     Returns:
-        For JSON: ``plans``; ``valid``, ``paper_valid`` and ``finished`` with their ratios; ``reasons``, reason ->
-        number of plans; ``metrics_of_valid``, ``metrics_of_paper_valid`` and ``metrics_of_all`` (those that could be
-        evaluated), metric -> mean, median, 95 % quantile and maximum; ``conditions``, condition -> number of plans that
-        violate it and the worst margin, with its plan's index.
+        For JSON: ``plans``; ``valid``, and, if the paper's rules were evaluated, ``paper_valid`` and ``finished``, with
+        their ratios; ``reasons``, reason -> number of plans; ``metrics_of_valid``, ``metrics_of_paper_valid`` and
+        ``metrics_of_all`` (those that could be evaluated), metric -> mean, median, 95 % quantile and maximum;
+        ``conditions``, condition -> number of plans that violate it and the worst margin, with its plan's index.
     """
     n_plans = len(verdicts)
-    counts = {
-        "valid": sum(verdict.valid for verdict in verdicts),
-        "paper_valid": sum(verdict.paper.valid for verdict in verdicts),
-        "finished": sum(verdict.paper.finished for verdict in verdicts),
-    }
+    by_paper = [verdict for verdict in verdicts if verdict.paper and verdict.paper.valid]
+    counts = {"valid": sum(verdict.valid for verdict in verdicts)}
+    rules = [verdict.paper for verdict in verdicts if verdict.paper is not None]
+    if len(rules) == len(verdicts):
+        counts["paper_valid"] = sum(rule.valid for rule in rules)
+        counts["finished"] = sum(rule.finished for rule in rules)
     reasons = Counter(str(verdict.reason) for verdict in verdicts)
     return {
         "plans": n_plans,
@@ -200,7 +205,7 @@ def summarize_verdicts(verdicts: Sequence[Verdict]) -> dict[str, Any]:
         **{f"{name}_ratio": number / n_plans if n_plans else None for name, number in counts.items()},
         "reasons": dict(reasons.most_common()),
         "metrics_of_valid": _statistics([verdict for verdict in verdicts if verdict.valid]),
-        "metrics_of_paper_valid": _statistics([verdict for verdict in verdicts if verdict.paper.valid]),
+        "metrics_of_paper_valid": _statistics(by_paper),
         "metrics_of_all": _statistics([verdict for verdict in verdicts if verdict.margins]),
         "conditions": _conditions(verdicts),
     }

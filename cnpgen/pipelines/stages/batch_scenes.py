@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.collision.body_arrays import BODY, BOX, CYLINDER, Bodies, bounding_boxes
-from cnpgen.pipelines.families.family import Layout
+from cnpgen.pipelines.scene_family import Layout
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import make_scene_table, rotations_of, scene_poses
 from cnpgen.robots.shape.convex_part import PRISM_SIDES

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.pipelines.families.family import Layout, SceneFamily
+from cnpgen.pipelines.scene_family import Layout, SceneFamily
 from cnpgen.pipelines.stages.batch_scenes import batch_scenes
 from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction
 from cnpgen.problems.constraints.clearance import RobotClearance

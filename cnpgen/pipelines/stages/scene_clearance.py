@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from cnpgen.kernels.collision.body_arrays import LANES, PADDING_DISTANCE_M, obstacle_bodies
 from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CollisionChecker, load_collision_library
 from cnpgen.kernels.compiled_kernel import address_of
-from cnpgen.pipelines.families.resting_states import RestingStates
+from cnpgen.pipelines.resting_states import RestingStates
 from cnpgen.pipelines.stages.batch_scenes import BatchScenes
 from cnpgen.pipelines.stages.stage import Array, Context
 from cnpgen.problems.constraints.clearance import RobotClearance

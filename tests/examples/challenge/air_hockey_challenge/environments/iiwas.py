@@ -3,8 +3,8 @@
 import mujoco
 import numpy as np
 
-from cnpgen.benchmark.simulator.plant import PLANTS
-from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene, scene_xml
+from cnpgen.addons.benchmark.simulator.plant import PLANTS
+from cnpgen.addons.benchmark.simulator.simulator_scene import SimulatorScene, scene_xml
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 

@@ -1,0 +1,7 @@
+"""Benchmarks: suites, planners, the simulator and the report."""
+
+from cnpgen.schema.public_names import lazy_exports
+
+NEEDS = ("paper", "scene_files", "trajectories")
+
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

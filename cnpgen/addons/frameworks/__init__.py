@@ -1,0 +1,1 @@
+"""Bridges to torch, JAX and TensorFlow, each imported only if its framework is installed."""

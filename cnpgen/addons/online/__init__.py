@@ -1,0 +1,1 @@
+"""Planning while the robot moves: moving pucks, hits, and the runtime that executes and replaces plans."""

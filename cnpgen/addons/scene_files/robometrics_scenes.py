@@ -1,0 +1,85 @@
+"""Scenes in YAML as robometrics stores the problems of MotionBenchMaker and MPiNets.
+
+A mapping from families to lists of problems with ``start``, ``goal_ik`` (several goal states), ``goal_pose``
+(``position_xyz``, ``quaternion_wxyz``, ``frame``) and ``obstacles``: cuboids with ``dims``, cylinders with ``radius``
+and ``height``, each with a ``pose`` (x, y, z, qw, qx, qy, qz) relative to the robot's base.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cnpgen.problems.scenes.quaternions import quaternion_mistake, rotation_matrix
+from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError, SceneProblem, check_count, make_obstacle
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.store.files.yaml_document import part, scalar, vector
+
+_KINDS = ("cuboid", "cylinder", "sphere")
+
+
+def is_robometrics(document: Any) -> bool:
+    """Return whether a document maps families to lists of problems with obstacles."""
+    if not isinstance(document, dict) or not document:
+        return False
+    first = next(iter(document.values()))
+    return isinstance(first, list) and bool(first) and isinstance(first[0], dict) and "obstacles" in first[0]
+
+
+def read_robometrics(path: Path, document: Any) -> Iterator[SceneProblem]:
+    """Yield the problems of a document."""
+    for family in document:
+        for index, entry in enumerate(part(document, family, list, str(path))):
+            name = f"{family} {index}"
+            yield _problem(path, name, entry, f"{path}: scene {name!r}")
+
+
+def _problem(path: Path, name: str, entry: Any, place: str) -> SceneProblem:
+    start = vector(part(entry, "start", list, place), "", f"{place}: start")
+    goals = [vector(goal, "", f"{place}: goal_ik") for goal in part(entry, "goal_ik", list, place)]
+    if any(goal.shape != start.shape for goal in goals):
+        raise SceneError(f"{place}: every goal_ik must have {len(start)} joint positions like start")
+    pose = _goal_pose(part(entry, "goal_pose", dict, place), place)
+    if not goals and pose is None:
+        raise SceneError(f"{place} has neither goal_ik nor goal_pose")
+    return SceneProblem(
+        name=name,
+        obstacles=tuple(_obstacles(part(entry, "obstacles", dict, place), place)),
+        start_q=start,
+        goal_q=np.array(goals).reshape(len(goals), len(start)),
+        goal_pose=pose,
+        source=str(path),
+    )
+
+
+def _goal_pose(entry: Any, place: str) -> GoalPose | None:
+    if not entry:
+        return None
+    quaternion = vector(entry.get("quaternion_wxyz"), "wxyz", f"{place}: goal_pose")
+    if text := quaternion_mistake(quaternion):
+        raise SceneError(f"{place}: goal_pose: {text}")
+    position = vector(entry.get("position_xyz"), "xyz", f"{place}: goal_pose")
+    return GoalPose(part(entry, "frame", str, place), position, rotation_matrix(quaternion))
+
+
+def _obstacles(obstacles: Any, place: str) -> Iterator[Obstacle]:
+    for kind in obstacles:
+        if kind not in _KINDS:
+            raise SceneError(f"{place} has obstacles of the kind {kind!r}, expected {', '.join(_KINDS)}")
+    check_count(sum(len(part(obstacles, kind, dict, place)) for kind in obstacles), place)
+    for kind in _KINDS:
+        for name, entry in part(obstacles, kind, dict, place).items():
+            where = f"{place}: obstacle {name!r}"
+            pose = vector(part(entry, "pose", list, where), "", f"{where}: pose")
+            if kind == "cuboid":
+                sizes = vector(part(entry, "dims", list, where), "", f"{where}: dims")
+            else:
+                keys = ("radius", "height")[: 2 if kind == "cylinder" else 1]
+                sizes = np.array([scalar(entry.get(key), f"{where}: {key}") for key in keys])
+            if kind == "sphere" and len(pose) == 3:
+                pose = np.array([*pose, 1.0, 0.0, 0.0, 0.0])
+            shape = "box" if kind == "cuboid" else kind
+            yield make_obstacle(name, shape, sizes, pose[:3], pose[3:], place=place)

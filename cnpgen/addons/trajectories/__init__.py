@@ -1,0 +1,1 @@
+"""Sampled trajectories: readers, verdicts, plans of them, and datasets of LeRobot."""

@@ -1,0 +1,98 @@
+"""Sampled trajectories.
+
+With --problem, FILE may also hold sampled trajectories: CSV, JSON, YAML, NPZ, HDF5 or Parquet, messages of ROS and
+MoveIt, or a folder of such files ('cnpgen docs trajectories'). Each trajectory and condition is valid, invalid or
+undecided. The exit code is then 0 if all are valid, otherwise 1; 2 for damaged files and files of other kinds.
+"""
+
+import argparse
+import sys
+from typing import TYPE_CHECKING
+
+from cnpgen.addons.trajectories.trajectory_options import (
+    add_trajectory_options,
+    listing_text,
+    load_file,
+    problem_of,
+    refuse_trajectory_options,
+    summary_text,
+    write_json,
+)
+from cnpgen.cli import values
+from cnpgen.cli.parser import Options
+from cnpgen.cli.terminal import Meter
+from cnpgen.errors import UsageError
+
+if TYPE_CHECKING:
+    from cnpgen.addons.trajectories.evaluate_trajectories import TrajectoryEvaluation
+
+
+def add_options(options: Options) -> None:
+    """Add the options that only sampled trajectories have."""
+    add_trajectory_options(options)
+    option = options.add_argument
+    text = "judge a controller's curve; default: the motion that the samples resolve ('cnpgen docs trajectories')"
+    option("--interpolation", choices=("hold", "linear", "cubic", "quintic"), help=text)
+    text = "judge every curve through the samples whose jerks are at most J [rad/s^3]: one number, or one per joint"
+    option("--max-jerk", metavar="J,...", type=values.amounts, help=text)
+    text = "largest error of the samples in SI units: one number, or of positions, velocities and accelerations"
+    option("--noise", metavar="E,...", type=values.errors, help=text)
+
+
+def accepts(arguments: argparse.Namespace) -> bool:
+    """Return whether the file holds sampled trajectories; refuse their options for other files."""
+    from cnpgen.addons.trajectories.trajectory_tables import holds_trajectories
+
+    if holds_trajectories(arguments.file):
+        return True
+    refuse_trajectory_options(arguments, arguments.file, "interpolation", "max_jerk", "noise")
+    return False
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Judge sampled trajectories."""
+    from cnpgen.addons.trajectories.evaluate_trajectories import evaluate_trajectories
+
+    if arguments.tracking_error is not None:
+        raise UsageError("--tracking-error is for plans: --noise gives the error of sampled trajectories")
+    problem = problem_of(arguments)
+    loaded = load_file(arguments, problem)
+    count = len(loaded.trajectories)
+    if arguments.plan is not None and arguments.plan >= count:
+        raise UsageError(f"{arguments.file} has no trajectory {arguments.plan}: {count} are numbered from 0")
+    with Meter(quiet=not sys.stderr.isatty(), noun="trajectory") as meter:
+        meter.begin(f"judging {arguments.file}", count)
+        found = evaluate_trajectories(
+            problem,
+            loaded.trajectories,
+            interpolation=arguments.interpolation,
+            noise=arguments.noise or 0.0,
+            max_jerk=arguments.max_jerk,
+            step=arguments.step,
+            workers=arguments.workers or 1,
+            progress=meter,
+        )
+    if arguments.json:
+        write_json(arguments.file, found, loaded.labels)
+    else:
+        print(summary_text(arguments.file, found))
+        if arguments.list:
+            print(f"\n{listing_text(found, loaded.labels)}")
+    if arguments.plot:
+        _draw_trajectory(found, arguments.plot, arguments.plan, loaded.labels)
+    return 0 if found.valid.all() else 1
+
+
+def _draw_trajectory(found: "TrajectoryEvaluation", picture: str, index: int | None, labels: tuple[str, ...]) -> None:
+    """Draw a trajectory, by default the first that is not valid, and mark what is not valid."""
+    from cnpgen.addons.trajectories.trajectory_plot import plot_trajectory
+    from cnpgen.plans import open_problem
+
+    first = next((at for at, verdict in enumerate(found.verdicts) if not verdict.valid), 0)
+    chosen = first if index is None else index
+    trajectory, verdict = found.trajectories[chosen], found.verdicts[chosen]
+    margins = [entry.margin for entry in verdict.conditions.values() if not entry.margin.ok]
+    problem, robot = open_problem(found.problem)
+    title = f"{problem.name}, {labels[chosen]}: {trajectory.duration:.3f} s\n{verdict}"
+    plot_trajectory(problem, robot, trajectory, picture, title=title, margins=margins)
+    print(f"drawn: trajectory {chosen} in {picture}", file=sys.stderr)

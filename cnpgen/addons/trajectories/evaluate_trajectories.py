@@ -1,0 +1,192 @@
+"""Evaluation of sampled trajectories of any planner by the independent verdict."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cnpgen.addons.trajectories.interpolate import bounded_jerk, interpolated
+from cnpgen.addons.trajectories.judge_family import FamilyJudge
+from cnpgen.addons.trajectories.judge_samples import judge_samples
+from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.addons.trajectories.trajectory_verdict import Decision, TrajectoryVerdict
+from cnpgen.errors import UsageError, counted
+from cnpgen.judges.plans.judge import check_step
+from cnpgen.plans.evaluate import MAX_VERDICT_STEP_S, judged_in_parts
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
+from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.arguments import number, numbers
+from cnpgen.store.dataset_spec import StoredProblem
+
+Array = NDArray[np.float64]
+
+FORMAT = "cnpgen-trajectory-evaluation"
+TRAJECTORY_EVALUATION_VERSION = 1
+TRAJECTORIES_PER_TASK = 10  # that a process judges at a time
+CONTRADICTION = "no curve with jerks within the bound passes through the samples"
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryEvaluation:
+    """Verdicts of N sampled trajectories.
+
+    Attributes:
+        problem: The problem.
+        trajectories: The trajectories, in the order of the problem's joints.
+        verdicts: Verdicts, in the same order.
+        step: Maximum distance of checked times [s].
+    """
+
+    problem: ProblemRecord
+    trajectories: tuple[Trajectory, ...]
+    verdicts: tuple[TrajectoryVerdict, ...]
+    step: float
+
+    def __repr__(self) -> str:
+        texts = ", ".join(f"{count:,} {decision}" for decision, count in self.counts.items() if count)
+        return f"<{counted(len(self.verdicts), 'trajectory')}: {texts}>"
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Numbers of valid, invalid and undecided trajectories."""
+        found = Counter(str(verdict.decision) for verdict in self.verdicts)
+        return {str(decision): found[str(decision)] for decision in Decision}
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Whether each trajectory is proven to be valid, shape (N,)."""
+        return np.array([verdict.valid for verdict in self.verdicts], bool)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the summary of all trajectories for JSON ('cnpgen docs trajectories')."""
+        conditions: dict[str, dict[str, Any]] = {}
+        for verdict in self.verdicts:
+            for name, entry in verdict.conditions.items():
+                counts = conditions.setdefault(name, {str(decision): 0 for decision in Decision})
+                counts[str(entry.decision)] += 1
+        return {
+            "format": FORMAT,
+            "format_version": TRAJECTORY_EVALUATION_VERSION,
+            "problem": self.problem.name,
+            "problem_sha256": self.problem.comparable_sha256,
+            "step_s": self.step,
+            "trajectories": len(self.verdicts),
+            **self.counts,
+            "reasons": dict(Counter(str(v.reason) for v in self.verdicts if v.reason).most_common()),
+            "conditions": conditions,
+        }
+
+
+@checked_arguments
+def evaluate_trajectories(
+    problem: Problem | StoredProblem | str | Path,
+    trajectories: Sequence[Trajectory],
+    *,
+    interpolation: Literal["hold", "linear", "cubic", "quintic"] | None = None,
+    noise: ArrayLike = 0.0,
+    max_jerk: ArrayLike | None = None,
+    step: float = MAX_VERDICT_STEP_S,
+    workers: int = 1,
+    progress: Callable[[int], None] | None = None,
+) -> TrajectoryEvaluation:
+    """Judge sampled trajectories: valid, invalid or undecided.
+
+    By default, the motion that the samples resolve is judged. It is valid if the smooth curve through exact samples
+    with velocities is valid; otherwise all curves within the errors of the resolution decide. With
+    ``interpolation``, the curve of a controller is judged. With ``max_jerk``, all curves through the samples whose
+    jerks are within it are judged. With noise, so are all curves of samples within the noise. A trajectory is valid
+    if every curve is valid, invalid if every curve violates a condition, and otherwise undecided. Obstacles that
+    depend on the ends of a motion are placed at its first and last sample.
+
+    Args:
+        problem: Problem, record, or name or path of a problem, pipeline or dataset.
+        trajectories: The trajectories, with the problem's joints in their order.
+        interpolation: "hold", "linear", "cubic" or "quintic"; not with ``max_jerk``.
+        noise: Largest error of the samples in SI units: one number for positions, velocities and accelerations, or
+            three.
+        max_jerk: Bound of the jerks [rad/s^3], one number or shape (n,).
+        step: Maximum distance of checked times [s].
+        workers: Number of processes.
+        progress: Called with the number of trajectories that were judged since the last call.
+
+    Raises:
+        UsageError: An argument is invalid, or a trajectory has another number of joints or of parameters.
+        RecipeError: A required plug-in is not installed.
+    """
+    check_step(step := number("step", step))
+    record = as_record(problem)
+    n = len(record.joint_names)
+    check_trajectories(trajectories, record)
+    if interpolation is not None and max_jerk is not None:
+        raise UsageError("interpolation and max_jerk exclude each other", concerns="interpolation")
+    errors = non_negative("noise", noise, 3)
+    jerk = None if max_jerk is None else non_negative("max_jerk", max_jerk, n)
+    task = partial(_judge, record=record, interpolation=interpolation, noise=errors, max_jerk=jerk, step=step)
+    chosen = tuple(trajectories)
+    verdicts = judged_in_parts(task, chosen, size=TRAJECTORIES_PER_TASK, workers=workers, progress=progress)
+    return TrajectoryEvaluation(record, chosen, tuple(verdicts), step)
+
+
+def check_trajectories(trajectories: Sequence[Trajectory], record: ProblemRecord) -> None:
+    """Check that there are trajectories with the joints and the parameters of a problem."""
+    n, names = len(record.joint_names), ", ".join(record.parameters.names)
+    if not len(trajectories):
+        raise UsageError("there are no trajectories", concerns="trajectories")
+    for index, trajectory in enumerate(trajectories):
+        if not isinstance(trajectory, Trajectory):
+            raise UsageError(f"must hold objects of Trajectory, got {trajectory!r:.60}", argument="trajectories")
+        if trajectory.q.shape[1] != n:
+            raise UsageError(
+                f"trajectory {index} has {trajectory.q.shape[1]} joints, the problem plans {n}",
+                concerns="trajectories",
+            )
+        if trajectory.parameters is not None:
+            record.parameters.checked(trajectory.parameters)
+        elif names:
+            text = (
+                f"trajectory {index} has no values of {names}: its file needs columns of these names, or {{parameters}}"
+            )
+            raise UsageError(text, concerns="trajectories", remedies={"parameters": None})
+
+
+def non_negative(name: str, value: ArrayLike, size: int) -> Array:
+    """Return one number or several as an array of shape (size,)."""
+    found = numbers(name, value)
+    if found.shape not in {(), (size,)} or not (np.isfinite(found) & (found >= 0)).all():
+        raise UsageError(f"must be one number or {size}, finite and at least 0, got {found!s:.60}", argument=name)
+    return np.broadcast_to(found, (size,)).astype(float)
+
+
+def _judge(  # noqa: PLR0917 - the arguments of evaluate_trajectories
+    trajectories: Sequence[Trajectory],
+    record: ProblemRecord,
+    interpolation: Literal["hold", "linear", "cubic", "quintic"] | None,
+    noise: Array,
+    max_jerk: Array | None,
+    step: float,
+) -> list[TrajectoryVerdict]:
+    problem, robot = open_problem(record)
+    judge = FamilyJudge(problem, robot, step=step)
+    verdicts = []
+    for trajectory in trajectories:
+        if max_jerk is None and interpolation is None:
+            verdicts.append(judge_samples(judge, trajectory, noise))
+            continue
+        if max_jerk is None:
+            family = interpolated(trajectory, interpolation, noise)
+        else:
+            bounded = bounded_jerk(trajectory, max_jerk, noise)
+            if bounded is None:
+                verdicts.append(TrajectoryVerdict(Decision.UNDECIDED, CONTRADICTION, duration=trajectory.duration))
+                continue
+            family = bounded
+        verdicts.append(judge(family, trajectory))
+    return verdicts

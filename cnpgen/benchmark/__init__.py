@@ -1,5 +1,0 @@
-"""Benchmarks: suites, planners, the simulator and the report."""
-
-from cnpgen import _lazy_exports
-
-__all__, __getattr__, __dir__ = _lazy_exports(__name__, __file__)

@@ -1,1 +1,0 @@
-"""``cnpgen view``: robots, plans and samples as a page that any browser opens."""

@@ -1,1 +1,0 @@
-"""Verdicts on sampled trajectories: the curve of an interpolation, or every curve that the samples allow."""

@@ -1,1 +1,0 @@
-"""Families of scenes: furniture and objects at random, with starts and goals of a robot."""

@@ -1,0 +1,49 @@
+"""Contract of readers of scene files, and the scenes of a path by the reader that accepts it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+
+from cnpgen.problems.scenes.scene_problem import SceneProblem
+from cnpgen.schema import addons, registry
+
+
+class SceneReader(ABC):
+    """Reader of the scene files of other programs; packages register them in the group ``cnpgen.readers``."""
+
+    @abstractmethod
+    def holds(self, path: Path) -> bool:
+        """Return whether a file or a folder contains scenes that this reader reads."""
+
+    @abstractmethod
+    def load(self, path: Path, *, start: int, n: int | None) -> list[SceneProblem]:
+        """Read scenes from the number ``start`` on, at most ``n`` of them, or all that follow.
+
+        Raises:
+            UsageError: There are no scenes, or one is invalid; the message names file, scene and element.
+            DatasetError: A file is damaged.
+            MissingExtraError: A package for the format is missing.
+        """
+
+
+def holds_scenes(path: Path) -> bool:
+    """Return whether an installed reader accepts a path."""
+    return any(reader.holds(path) for reader in _readers())
+
+
+def read_scenes(path: Path, *, start: int = 0, n: int | None = None) -> list[SceneProblem]:
+    """Read the scenes of a path by the reader that accepts it; errors as of ``SceneReader.load``.
+
+    Raises:
+        MissingAddonError: No reader is installed.
+    """
+    readers = _readers()
+    if not readers:
+        raise addons.missing("scene_files", f"reading scenes from {path}")
+    chosen = next((reader for reader in readers if reader.holds(path)), readers[0])
+    return chosen.load(path, start=start, n=n)
+
+
+def _readers() -> list[SceneReader]:
+    return [registry.load(registry.READERS, name)() for name in registry.names(registry.READERS)]
