@@ -133,7 +133,8 @@ def measure(folder: Path, step: int) -> dict[str, dict[str, list[dict[str, float
     results: dict[str, dict[str, list[dict[str, float]]]] = {}
     for name in PLANNERS:
         plan = load_kind(name)().prepare(Setting(problems.problem, suite.model))
-        answers = [answer_to_dict(plan(problem)) for problem in chosen]
+        found = [answer for answer in map(plan, chosen) if answer is not None]
+        answers = list(map(answer_to_dict, found))
         results[name] = {}
         for change in CHANGES:
             progress(f"{name}, {change.title}")

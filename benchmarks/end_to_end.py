@@ -31,14 +31,14 @@ STEPS = (  # before the first row
     (
         "kernels, specification",
         "from pathlib import Path; place = cnpgen.make.make_dataset.find_workspace(Path({out!r}));"
-        " cnpgen.make.make_dataset.draw_up(recipe, place)",
+        " cnpgen.make.make_dataset.resolve(recipe, place)",
     ),
     ("h5py", "import h5py"),
     ("joblib", "from joblib import Parallel, delayed"),
     ("2 workers", "Parallel(n_jobs=2)(delayed(abs)(i) for i in range(2))"),
     (
         "cnpgen in workers",
-        "Parallel(n_jobs=2)(delayed(cnpgen.make.make_dataset.draw_up)(recipe, place) for i in range(2))",
+        "Parallel(n_jobs=2)(delayed(cnpgen.make.make_dataset.resolve)(recipe, place) for i in range(2))",
     ),
 )
 

@@ -74,7 +74,7 @@ def hits(planner: Planner, repeat: int) -> dict[str, Any]:
 
 def hits_and_ways_back(planner: Planner, speed_share: float) -> dict[str, Any]:
     """Plan hits of a grid of pucks from rest and the ways back, one by one; both are judged."""
-    home, still = planner.robot.base, np.zeros(planner.robot.n)
+    home, still = planner.robot.home, np.zeros(planner.robot.n)
     grid = [(x, y) for x in np.linspace(0.8, 1.2, 9) for y in np.linspace(-0.4, 0.4, 9)]
     plan = partial(plan_hits, planner, (home, still, still), target=TARGET, speed_share=speed_share, home=home)
     plan(grid[0])

@@ -43,7 +43,7 @@ class Plans:
 def draw_plans(name: str, count: int) -> Plans:
     problem, random = load_problem(name), np.random.default_rng(0)
     robot, spec = load_robot(problem), load_problem(name).trajectory
-    ends = robot.base + random.uniform(-0.5, 0.5, (2, count, 1, robot.n))
+    ends = robot.home + random.uniform(-0.5, 0.5, (2, count, 1, robot.n))
     along = np.linspace(0, 1, spec.path_control_points)[:, None]
     path = ends[0] * (1 - along) + ends[1] * along
     path += MAX_NOISE_RAD * random.uniform(-1, 1, path.shape)

@@ -161,7 +161,7 @@ class Boxes:
         self.arm = arm
         radius = next(c.radius for c in problem.constraint if isinstance(c, RobotClearance))
         depth = next(c.depth for c in problem.constraint if isinstance(c, ObjectContact))
-        lengths = [np.linalg.norm(b - a) for a, b in self._segments(arm.robot.base)]
+        lengths = [np.linalg.norm(b - a) for a, b in self._segments(arm.robot.home)]
         self.capsules = [coal.Capsule(radius, float(length)) for length in lengths]
         self.held = coal.Box(*(np.array(problem.object.size) - 2 * depth)) if problem.object else None
         self.tables = [(o.x, o.y) for o in problem.obstacle if o.x and o.y]

@@ -87,15 +87,15 @@ class RecipeError(CnpgenError):
     """One or more errors in a problem, pipeline or dataset file.
 
     Args:
-        mistakes: One line per error, with file and key.
+        errors: One line per error, with file and key.
     """
 
-    def __init__(self, mistakes: Sequence[str]) -> None:
-        self.mistakes = tuple(_limited(mistake) for mistake in mistakes)
-        Exception.__init__(self, self.mistakes)  # required for pickling in worker processes
+    def __init__(self, errors: Sequence[str]) -> None:
+        self.errors = tuple(_limited(error) for error in errors)
+        Exception.__init__(self, self.errors)  # required for pickling in worker processes
 
     def __str__(self) -> str:
-        return "\n".join(self.mistakes)
+        return "\n".join(self.errors)
 
 
 class PluginError(RecipeError):

@@ -186,7 +186,7 @@ def _limit_rows(problem: Problem, robot: Robot) -> list[tuple[str, ...]]:
         ("acceleration", "rad/s^2", [f"{x:.4g}" for x in robot.acceleration_limit]),
         ("jerk", "rad/s^3", [f"{x:.6g}" for x in robot.jerk_limit]),
         ("torque", "N m", [f"{x:.4g}" for x in robot.torque_limit]),
-        ("base", "rad", [f"{x:.4g}" for x in robot.base]),
+        ("base", "rad", [f"{x:.4g}" for x in robot.home]),
     ]
     spoken_of = problem.uses_jerk or problem.limits.jerk is not None
     shown = [

@@ -6,7 +6,7 @@ from typing import Any
 from cnpgen.cli.terminal import table
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.make.recipe import DatasetRecipe, load_notes
-from cnpgen.make.resolve_spec import dataset_folder, draw_up
+from cnpgen.make.resolve_spec import dataset_folder, resolve
 from cnpgen.store.dataset_spec import DatasetSpec, shards
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.shard import storage_dtype
@@ -18,10 +18,10 @@ DOCUMENTS = 90_000  # bytes: specification.json, manifest, card and statistics
 
 
 def spec_text(recipe: DatasetRecipe, out: str | None, *, force: bool, **settings: Any) -> str:
-    """Resolve the specification of a dataset by ``draw_up`` without making anything, and describe it."""
+    """Resolve the specification of a dataset by ``resolve`` without making anything, and describe it."""
     load_notes(recipe)
     workspace = find_workspace(dataset_folder(recipe, out))
-    spec = draw_up(recipe, workspace, **settings, force=force).spec
+    spec = resolve(recipe, workspace, **settings, force=force).spec
     files = shards(spec)
     splits = [f"{split} {rows:,}" for split, rows in spec.splits.items()]
     counts = [f"{split} {sum(task.split == split for task in files)}" for split in spec.splits]

@@ -50,7 +50,7 @@ documentation: {DOCUMENTATION_URL}, or 'cnpgen docs' without a network
 stdout is data, stderr everything else. Exit codes:
   0    done
   1    the answer is no: a dataset or a file is damaged, unfinished or of another problem; samples or plans are invalid
-  2    a wrong argument, such as a missing path or one of another kind, or a mistake in a recipe
+  2    a wrong argument, such as a missing path or one of another kind, or an error in a recipe
   3    the machine: no permission to read or write a path, a full disk, no compiler, a broken library; also an internal
        error of cnpgen
   130  interrupted (Ctrl-C); finished shards and plans are kept, the same command resumes
@@ -137,7 +137,7 @@ def build_parser(names: Sequence[str] | None = None) -> Parser:
 
 
 def _report(error: BaseException, options: Container[str]) -> int:
-    """Print an error as one line per mistake, with the options of the command; return its exit code."""
+    """Print an error as one line per error, with the options of the command; return its exit code."""
     if isinstance(error, KeyboardInterrupt):
         what = "terminated" if isinstance(error, Terminated) else "interrupted"
         print(f"cnpgen: {what}: {error}" if str(error) else f"cnpgen: {what}", file=sys.stderr)
@@ -152,7 +152,7 @@ def _report(error: BaseException, options: Container[str]) -> int:
 def _explain(error: BaseException, options: Container[str]) -> tuple[Sequence[str], int]:
     """Return the lines that describe an error, and the exit code."""
     if isinstance(error, RecipeError):
-        return error.mistakes, error.exit_code
+        return error.errors, error.exit_code
     if isinstance(error, CnpgenError):
         return [" ".join(error.text(shell_spelling(options)).split())], error.exit_code
     code = MachineError.exit_code

@@ -37,7 +37,7 @@ class Parser(argparse.ArgumentParser):
         self._negative_number_matcher = _NEGATIVE
 
     def error(self, message: str) -> NoReturn:
-        """Raise UsageError with the mistake and the help command on one line."""
+        """Raise UsageError with the error and the help command on one line."""
         raise UsageError(f"{message.removeprefix('argument ')}; see '{self.prog} --help'")
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:

@@ -1,6 +1,6 @@
 """Describe a recipe, a kind of stage or constraint, or the keys of recipe files.
 
-A dataset is shown with its pipeline and its problem, a pipeline with its problem. Mistakes in a file are
+A dataset is shown with its pipeline and its problem, a pipeline with its problem. Errors in a file are
 reported on stderr with file and key, one per line, and the exit code is 2.
 """
 

@@ -37,7 +37,7 @@ def problem_obstacles(spec: DatasetSpec) -> tuple[Obstacle, ...]:
     tables = spec.recipe["pipeline"]["problem"]["obstacle"]
     given = [{key: value for key, value in table.items() if value is not None} for table in tables]
     with stored_values():
-        parsed = [parse(Obstacle, table, where=RecipeLocation("obstacle"), mistakes=[]) for table in given]
+        parsed = [parse(Obstacle, table, where=RecipeLocation("obstacle"), errors=[]) for table in given]
     return tuple(obstacle for obstacle in parsed if obstacle is not None)
 
 

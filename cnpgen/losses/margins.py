@@ -48,13 +48,13 @@ class Margins:
         """
         if not all(isinstance(term, str) for term in terms):
             raise UsageError(f"must be names of constraint terms, got {terms!r:.100}", argument="terms")
-        for mistake in self._mistakes(terms):
-            raise UsageError(mistake, concerns="terms")
+        for error in self._errors(terms):
+            raise UsageError(error, concerns="terms")
         return np.array(
             [self.factors.get(term, 1.0) for term in terms] + [self.insets.get(term, 0.0) for term in terms], float
         )
 
-    def _mistakes(self, terms: Sequence[str]) -> Iterator[str]:
+    def _errors(self, terms: Sequence[str]) -> Iterator[str]:
         for name in (*self.factors, *self.insets):
             if name not in terms:
                 yield f"margin of {name!r}: no such term; expected one of {', '.join(terms)}{nearest(name, terms)}"

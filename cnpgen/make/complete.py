@@ -29,7 +29,7 @@ from cnpgen.schema.arguments import check_memory_of_rows, numbers
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import machine_errors
 from cnpgen.store.files.csv_table import read_csv_table
-from cnpgen.store.files.hdf5 import opened_hdf5
+from cnpgen.store.files.hdf5 import open_hdf5
 from cnpgen.store.files.kind import is_hdf5
 from cnpgen.store.paths import HDF5_KINDS, require_file
 
@@ -91,7 +91,7 @@ def complete(
         UsageError: A column is unknown, has the wrong shape or is not finite, a goal is missing, there is no such
             table, or table and columns are both given.
         DatasetError: The table is damaged, lacks a goal, or has unknown or contradictory columns.
-        RecipeError: The recipe has mistakes.
+        RecipeError: The recipe has errors.
         MachineError: No backend works, or the table cannot be read.
     """
     problem = problem_of_poses(recipe)
@@ -207,7 +207,7 @@ def _joined(path: Path, field: Field, parts: list[str], columns: Mapping[str, Ar
 
 
 def _hdf5_columns(path: Path) -> dict[str, Array]:
-    with opened_hdf5(path) as file:
+    with open_hdf5(path) as file:
         found = {name: column.read() for name, column in file.columns().items()}
     try:
         columns: dict[str, Array] = {name: numbers(name, values) for name, values in found.items()}

@@ -25,7 +25,7 @@ def draw_boundary_problems(recipe: str | Path | DatasetRecipe, n: int, *, seed: 
         seed: Root seed; by default the recipe's. Equal seeds give equal problems.
 
     Raises:
-        RecipeError: The recipe has mistakes.
+        RecipeError: The recipe has errors.
         UsageError: ``n`` is not a positive integer, ``seed`` is not an integer from 0 to 2^63 - 1, or ``recipe`` is
             not a recipe.
         MachineError: No backend works.

@@ -9,7 +9,7 @@ from pathlib import Path
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.machine.engine import Engine
-from cnpgen.make.make_dataset import Begin, MadeDataset, Progress, carry_out, delete_shards
+from cnpgen.make.make_dataset import Begin, MadeDataset, Progress, delete_shards, run
 from cnpgen.make.make_shards import Job, prepare
 from cnpgen.make.recipe import DatasetRecipe, makes_its_rows, restored, split_rows
 from cnpgen.make.resolve_spec import MAX_ROWS
@@ -74,7 +74,7 @@ def extend_dataset(
             delete_shards(folder, ())
             write_dataset_spec(folder, extended)
         remove_leftovers(folder / WORK)
-        return carry_out(job, notes, engine=where, begin=begin, progress=progress)
+        return run(job, notes, engine=where, begin=begin, progress=progress)
 
 
 def _begun(folder: Path) -> DatasetSpec:

@@ -21,7 +21,7 @@ from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import record_problem
-from cnpgen.problems.scenes.quaternions import quaternion_mistake, rotation_matrix
+from cnpgen.problems.scenes.quaternions import quaternion_error, rotation_matrix
 from cnpgen.problems.scenes.scene_problem import GoalPose
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
@@ -163,7 +163,7 @@ class PoseTasks:
         """
         count = max(map(len, columns.values()))
         given = {name: np.broadcast_to(values, (count, values.shape[1])) for name, values in columns.items()}
-        given.setdefault("start_q", np.broadcast_to(self.robot.base, (count, self.robot.n)))
+        given.setdefault("start_q", np.broadcast_to(self.robot.home, (count, self.robot.n)))
         found = [self._goals(task, given) for task in range(count)]
         reasons = tuple(goals if isinstance(goals, str) else "" for goals in found)
         states = [np.empty((0, self.robot.n)) if isinstance(goals, str) else goals for goals in found]
@@ -190,7 +190,7 @@ class PoseTasks:
     def _pose(self, task: int, given: Mapping[str, Array]) -> GoalPose:
         """Return the goal pose of a task; without an orientation, any is accepted."""
         wxyz = given["goal_wxyz"][task] if "goal_wxyz" in given else np.array([1.0, 0.0, 0.0, 0.0])
-        if text := quaternion_mistake(wxyz):
+        if text := quaternion_error(wxyz):
             raise UsageError(f"{text} in task {task}", argument="goal_wxyz")
         free = np.zeros(3) if "goal_wxyz" in given else np.full(3, np.pi)
         tolerances = {"goal_xyz_tolerance": np.zeros(3), "goal_rotation_tolerance": free}

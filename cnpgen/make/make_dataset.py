@@ -18,7 +18,7 @@ from cnpgen.machine.engine import Engine, assembled
 from cnpgen.make.certify import certified
 from cnpgen.make.make_shards import Job, make_shards
 from cnpgen.make.recipe import DatasetRecipe, as_dataset_recipe, load_notes
-from cnpgen.make.resolve_spec import dataset_folder, draw_up
+from cnpgen.make.resolve_spec import dataset_folder, resolve
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.check import check_documents
@@ -115,7 +115,7 @@ def make_dataset(
             one.
 
     Raises:
-        RecipeError: The recipe has mistakes, or its data card cannot be read.
+        RecipeError: The recipe has errors, or its data card cannot be read.
         UsageError: An argument or SOURCE_DATE_EPOCH is invalid, or the folder holds other content.
         MachineError: No backend works, the disk is full, or a worker died; run again to continue.
         DatasetError: The specification.json in the folder is damaged.
@@ -130,12 +130,12 @@ def make_dataset(
     folder = dataset_folder(loaded, out)
     workspace = find_workspace(folder)
     check_place(workspace)
-    job = draw_up(loaded, workspace, n=n, seed=seed, shard_size=shard_size, dtype=dtype, backend=backend, force=force)
+    job = resolve(loaded, workspace, n=n, seed=seed, shard_size=shard_size, dtype=dtype, backend=backend, force=force)
     job = replace(job, spec=open_workspace(folder, job.spec, force=force))
-    return carry_out(job, notes, engine=where, part=part, begin=begin, progress=progress)
+    return run(job, notes, engine=where, part=part, begin=begin, progress=progress)
 
 
-def carry_out(
+def run(
     job: Job,
     notes: str,
     *,

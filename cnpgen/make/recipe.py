@@ -117,7 +117,7 @@ def load_dataset_recipe(name_or_path: str | Path, *, relative_to: Path | None = 
         relative_to: Base folder of a relative path; by default the working directory.
 
     Raises:
-        RecipeError: One of the three files has mistakes; the error lists all of them.
+        RecipeError: One of the three files has errors; the error lists all of them.
     """
     return load_recipe(("dataset", "pipeline"), name_or_path, relative_to, _dataset)
 
@@ -143,20 +143,20 @@ def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> 
     missing += missing_kinds_of_problem(pipeline_table["problem"])
     if missing:
         raise PluginError(missing)
-    path, mistakes = folder / "recipe.toml", list[str]()
+    path, errors = folder / "recipe.toml", list[str]()
     content, problem = without_defaults(content), restoring_reader(urdf, path)
 
-    def pipeline(value: Any, where: RecipeLocation, mistakes: list[str]) -> Pipeline | None:
+    def pipeline(value: Any, where: RecipeLocation, errors: list[str]) -> Pipeline | None:
         readers: dict[type, Reader] = {Stage: partial(read_kind, registry.STAGES), Problem: problem}
-        parsed = parse(Pipeline, value, where=where, mistakes=mistakes, readers=readers)
+        parsed = parse(Pipeline, value, where=where, errors=errors, readers=readers)
         return parsed and replace(parsed, path=path)
 
     with stored_values():
         recipe = parse(
-            DatasetRecipe, content, where=RecipeLocation(str(path)), mistakes=mistakes, readers={Pipeline: pipeline}
+            DatasetRecipe, content, where=RecipeLocation(str(path)), errors=errors, readers={Pipeline: pipeline}
         )
-    if recipe is None or mistakes:
-        raise RecipeError(mistakes)
+    if recipe is None or errors:
+        raise RecipeError(errors)
     return replace(recipe, path=path)
 
 
@@ -173,15 +173,15 @@ def makes_its_rows(recipe: DatasetRecipe, spec: DatasetSpec) -> bool:
     return spec.revision == GENERATOR_REVISION and recipe_digest(recipe) == spec.recipe_sha256
 
 
-def _dataset(path: Path, mistakes: list[str]) -> DatasetRecipe | None:
-    table = read_table(path, ("dataset", "pipeline"), mistakes)
+def _dataset(path: Path, errors: list[str]) -> DatasetRecipe | None:
+    table = read_table(path, ("dataset", "pipeline"), errors)
     if table is None:
         return None
     if not is_kind("dataset", table) and is_kind("pipeline", table):
-        pipeline = read_pipeline(path, mistakes)
+        pipeline = read_pipeline(path, errors)
         return _wrapped(pipeline) if pipeline else None
     readers: dict[type, Reader] = {Pipeline: reference("pipeline", read_pipeline, path.parent)}
-    recipe = parse(DatasetRecipe, table, where=RecipeLocation(str(path)), mistakes=mistakes, readers=readers)
+    recipe = parse(DatasetRecipe, table, where=RecipeLocation(str(path)), errors=errors, readers=readers)
     return recipe and replace(recipe, path=path.absolute())
 
 

@@ -34,7 +34,7 @@ def dataset_folder(recipe: DatasetRecipe, out: str | Path | None) -> Path:
     return folder.resolve() if ".." in folder.parts and not folder.parent.exists() else folder
 
 
-def draw_up(
+def resolve(
     recipe: DatasetRecipe,
     workspace: Workspace,
     *,

@@ -66,7 +66,7 @@ class Completion:
             candidates[name] = np.ascontiguousarray(same)
         for name in self._derived:
             if name == "start_q":
-                candidates[name] = np.repeat(self.context.robot.base[:, None], candidates.size, axis=1)
+                candidates[name] = np.repeat(self.context.robot.home[:, None], candidates.size, axis=1)
             else:
                 candidates[name] = self.tip_positions(candidates[name.replace("xyz", "q")])
         for label, run_stage in self._stages:

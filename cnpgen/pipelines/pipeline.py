@@ -44,8 +44,8 @@ class Pipeline:
     stage: tuple[Stage, ...] = field("stages, in order", form="[[stage]] tables")
     path: Path = Path()
 
-    def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, mistake) pairs."""
+    def validate(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, error) pairs."""
         if (count := len(self.stage)) > MAX_STAGES:
             yield "stage", f"there are {count:,} stages, expected at most {MAX_STAGES}"
 
@@ -70,14 +70,14 @@ def load_pipeline(name_or_path: str | Path, *, relative_to: Path | None = None) 
         relative_to: Base folder of a relative path; by default the working directory.
 
     Raises:
-        RecipeError: The pipeline or problem file has mistakes; the error lists all of them.
+        RecipeError: The pipeline or problem file has errors; the error lists all of them.
     """
     return load_recipe(("pipeline",), name_or_path, relative_to, read_pipeline)
 
 
-def read_pipeline(path: Path, mistakes: list[str]) -> Pipeline | None:
-    """Read a pipeline file and append its mistakes to ``mistakes``; return None if it is unusable."""
-    table = read_table(path, ("pipeline",), mistakes)
+def read_pipeline(path: Path, errors: list[str]) -> Pipeline | None:
+    """Read a pipeline file and append its errors to ``errors``; return None if it is unusable."""
+    table = read_table(path, ("pipeline",), errors)
     if table is None:
         return None
     readers: dict[type, Reader] = {
@@ -85,21 +85,21 @@ def read_pipeline(path: Path, mistakes: list[str]) -> Pipeline | None:
         Problem: reference("problem", read_problem, path.parent),
     }
     where = RecipeLocation(str(path))
-    pipeline = parse(Pipeline, table, where=where, mistakes=mistakes, readers=readers)
+    pipeline = parse(Pipeline, table, where=where, errors=errors, readers=readers)
     if pipeline is None:
         return None
-    return replace(pipeline, path=path.absolute(), problem=_with_places(pipeline, where, mistakes))
+    return replace(pipeline, path=path.absolute(), problem=_with_places(pipeline, where, errors))
 
 
-def _with_places(pipeline: Pipeline, where: RecipeLocation, mistakes: list[str]) -> Problem:
+def _with_places(pipeline: Pipeline, where: RecipeLocation, errors: list[str]) -> Problem:
     """Return the problem with places for the obstacles of scenes that a stage draws."""
     drawn = [(index, stage) for index, stage in enumerate(pipeline.stage) if isinstance(stage, DrawScenes)]
     if len(drawn) > 1:
-        mistakes.append((where / "stage" / drawn[1][0]).message("a second stage draws scenes, expected one"))
+        errors.append((where / "stage" / drawn[1][0]).message("a second stage draws scenes, expected one"))
     try:
         return with_capacity(pipeline.problem, drawn[0][1].capacity) if drawn else pipeline.problem
     except UsageError as error:
-        mistakes.append((where / "problem").message(str(error)))
+        errors.append((where / "problem").message(str(error)))
         return pipeline.problem
 
 
@@ -108,15 +108,15 @@ def restore_pipeline(name: str, stages: Sequence[Mapping[str, Any]], problem: Pr
     tables = [dict(stage) for stage in stages]
     if missing := missing_kinds(registry.STAGES, list(enumerate(tables))):
         raise PluginError(missing)
-    mistakes = list[str]()
+    errors = list[str]()
     read = partial(read_kind, registry.STAGES)
     with stored_values():
         read_stages = [
-            read(table, RecipeLocation(name) / "stage" / at, mistakes)
+            read(table, RecipeLocation(name) / "stage" / at, errors)
             for at, table in enumerate(without_defaults(tables))
         ]
-    if mistakes:
-        raise RecipeError(mistakes)
+    if errors:
+        raise RecipeError(errors)
     return Pipeline(name=name, problem=problem, stage=tuple(read_stages), path=Path(name))
 
 
@@ -134,7 +134,7 @@ class PipelineStep:
         """Label of the stage in sampling statistics."""
         return f"{self.number}. {self.kind}"
 
-    def mistake(self, text: str) -> str:
+    def error(self, text: str) -> str:
         """Return an error message with file and stage."""
         return f"{self.path}: stage {self.number} ({self.kind}): {text}"
 
@@ -151,17 +151,17 @@ def stored_fields(steps: Sequence[PipelineStep], context: Context) -> tuple[Fiel
     """Merge the outputs of the stages, in stored order; raise RecipeError if two stages declare a field differently."""
     fields: dict[str, Field] = {}
     first: dict[str, PipelineStep] = {}
-    mistakes = []
+    errors = []
     for step in steps:
         for item in step.stage.outputs(context):
             before, origin = fields.setdefault(item.name, item), first.setdefault(item.name, step)
             if _definition(item) != _definition(before):
                 text = f"declares {item.name} as {_declared(item, before)}, but stage {origin.number} ({origin.kind})"
                 text += f" before it as {_declared(before, item)}: a stage may not redefine a field"
-                mistakes.append(step.mistake(text))
+                errors.append(step.error(text))
             fields[item.name] = item
-    if mistakes:
-        raise RecipeError(mistakes)
+    if errors:
+        raise RecipeError(errors)
     known = [fields.pop(name) for name in FIELD_ORDER if name in fields]
     return (*known, *fields.values(), *bookkeeping_fields(scenes=any(step.stage.draws_scenes for step in steps)))
 
@@ -192,31 +192,31 @@ def written_columns(path: Path, steps: Sequence[PipelineStep], context: Context)
     Raise RecipeError if no earlier stage writes an input of a stage, or no stage writes a required column.
     """
     written: set[str] = set()
-    mistakes = []
+    errors = []
     for step in steps:
         if missing := [name for name in step.stage.inputs if name not in written]:
-            mistakes.append(step.mistake(f"needs {', '.join(missing)}, which no stage before it writes"))
+            errors.append(step.error(f"needs {', '.join(missing)}, which no stage before it writes"))
         written.update(step.stage.writes(context))
-    mistakes += [
+    errors += [
         f"{path}: no stage writes {name}, which every sample must have"
         for name in REQUIRED_COLUMNS
         if name not in written
     ]
-    if mistakes:
-        raise RecipeError(mistakes)
+    if errors:
+        raise RecipeError(errors)
     return written
 
 
 def prepare_steps(
     steps: Sequence[PipelineStep], prepare: Callable[[Stage], StageFunction]
 ) -> list[tuple[str, StageFunction]]:
-    """Prepare and label every stage; raise RecipeError with all mistakes, each with file and stage."""
-    functions, mistakes = [], []
+    """Prepare and label every stage; raise RecipeError with all errors, each with file and stage."""
+    functions, errors = [], []
     for step in steps:
         try:
             functions.append((step.label, prepare(step.stage)))
         except RecipeError as error:
-            mistakes += [step.mistake(mistake) for mistake in error.mistakes]
-    if mistakes:
-        raise RecipeError(mistakes)
+            errors += [step.error(error) for error in error.errors]
+    if errors:
+        raise RecipeError(errors)
     return functions

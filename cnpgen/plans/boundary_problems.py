@@ -24,7 +24,7 @@ from cnpgen.schema.arguments import integer
 from cnpgen.store.checked_shard import Shard, read_rows
 from cnpgen.store.dataset_spec import DatasetSpec, StoredProblem, load_dataset_spec, shards
 from cnpgen.store.files.checksum_file import verify_checksum
-from cnpgen.store.files.hdf5 import opened_hdf5
+from cnpgen.store.files.hdf5 import open_hdf5
 from cnpgen.store.paths import HDF5_KINDS, require_file, require_folder
 from cnpgen.store.reader import StoredDataset, open_dataset
 from cnpgen.store.scene_table import OBSTACLE_POSES, SCENE_ID
@@ -125,7 +125,7 @@ def read_boundary_file(path: Path) -> BoundaryFile:
     """
     require_file(path, "a dataset or an HDF5 file of boundary conditions", kinds=HDF5_KINDS)
     has_checksum = verify_checksum(path, kind=FORMAT, version=PLAN_FILE_VERSION)
-    with opened_hdf5(path) as file:
+    with open_hdf5(path) as file:
         attributes = file.attributes.some(SAID)
         columns = {name: file[name].read() for name in ASKED if name in file}
         names = file.names()
@@ -187,7 +187,7 @@ def load_boundary_problems(
         DatasetError: The dataset or the file cannot be read, is incomplete or is of another problem.
         UsageError: The folder, file, split or rows do not exist, or rows of a file are requested.
         UnitError: Boundary conditions of a file are probably in degrees or millimetres.
-        RecipeError: ``problem`` has mistakes.
+        RecipeError: ``problem`` has errors.
     """
     path = Path(path)
     if path.is_file() or (path.suffix == ".h5" and not path.is_dir()):

@@ -96,7 +96,7 @@ def export_plans(
         np.array(kept),
         plans.sample_id[kept],
         problem.joint_names,
-        problem.sliding_joints,
+        problem.prismatic_joints,
         problem.held_joints,
         rate=rate,
         problem=problem.name,

@@ -46,16 +46,16 @@ _OTHERS = (
 )
 
 
-def plan_fields(joints: tuple[str, ...], sliding: tuple[bool, ...]) -> dict[str, Field]:
+def plan_fields(joints: tuple[str, ...], prismatic: tuple[bool, ...]) -> dict[str, Field]:
     """Describe the datasets that have a fixed definition, for planned joints that are prismatic or not."""
     fields = {item.name: item for item in _OTHERS}
     for end, goal in (("start", "the start"), ("goal", "the goal")):
         for what, text in _DESCRIPTIONS.items():
             axes, frame = (("x", "y", "z"), "world") if what == "xyz" else (joints, "")
-            unit = "m" if what == "xyz" else units_of_joints(UNITS[what], sliding)
+            unit = "m" if what == "xyz" else units_of_joints(UNITS[what], prismatic)
             name = f"{end}_{what}"
             fields[name] = Field(name, unit, f"{text} at {goal}", len(axes), axes, frame=frame)
-    name, unit = "path_control_points", units_of_joints(UNITS["q"], sliding)
+    name, unit = "path_control_points", units_of_joints(UNITS["q"], prismatic)
     fields[name] = Field(name, unit, "control points of the path p(s)", names=joints)
     return fields
 

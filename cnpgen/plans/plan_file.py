@@ -39,7 +39,7 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.files.atomic import write_file
 from cnpgen.store.files.checksum_file import HEADER_BYTES, verify_checksum, with_checksum
-from cnpgen.store.files.hdf5 import Column, Hdf5, create_hdf5, opened_hdf5
+from cnpgen.store.files.hdf5 import Column, Hdf5, create_hdf5, open_hdf5
 from cnpgen.store.files.kind import PLANS
 from cnpgen.store.paths import ANY_HDF5, file_kind, require_file
 from cnpgen.store.shard import field_attributes
@@ -61,7 +61,7 @@ def load_plans(path: str | Path, *, problem: Problem | StoredProblem | str | Pat
     Raises:
         UsageError: The file does not exist or is of another kind.
         DatasetError: The file is damaged, incomplete, or of another problem.
-        RecipeError: ``problem`` has mistakes, or a required plug-in is not installed.
+        RecipeError: ``problem`` has errors, or a required plug-in is not installed.
         MachineError: The file cannot be read.
     """
     path = Path(path)
@@ -69,7 +69,7 @@ def load_plans(path: str | Path, *, problem: Problem | StoredProblem | str | Pat
     of_dataset = "'cnpgen solve' and 'cnpgen plan' make plans for its rows"
     require_file(path, "a file of plans", kinds=(PLANS, ANY_HDF5), of_dataset=of_dataset)
     has_checksum = verify_checksum(path, kind=FORMAT, version=PLAN_FILE_VERSION)
-    with opened_hdf5(path) as file:
+    with open_hdf5(path) as file:
         attributes = file.attributes.some((*ATTRIBUTES, *NOTES))
         _check_format(path, attributes)
         columns = _columns(path, file)
@@ -268,7 +268,7 @@ def save_plans(path: str | Path, plans: Plans) -> None:
 
     check_replaceable(Path(path))
     buffer = io.BytesIO()
-    fields = plan_fields(plans.problem.joint_names, plans.problem.sliding_joints)
+    fields = plan_fields(plans.problem.joint_names, plans.problem.prismatic_joints)
     with h5py.File(create_hdf5(buffer, userblock=HEADER_BYTES)) as file:
         for name, values in _datasets(plans).items():
             dataset = file.create_dataset(name, data=values, track_times=False)

@@ -73,18 +73,18 @@ class Plans:
     def __post_init__(self) -> None:
         integer("degree", self.degree, least=3, most=MAX_DEGREE)
         try:
-            wrong = next(_mistakes(self), None)
+            wrong = next(_errors(self), None)
         except (AttributeError, TypeError, IndexError):
             check_fields(self)
             check_fields(self.boundary)
             raise
         if wrong is not None:
             check_fields(self)
-            text = next(_mistakes(self, _rows(self)))
+            text = next(_errors(self, _rows(self)))
             raise UsageError(text, concerns=self._argument_of(text))
 
     def _argument_of(self, message: str) -> str:
-        """Return the name of the argument that a message of ``_mistakes`` begins with, or that holds the array."""
+        """Return the name of the argument that a message of ``_errors`` begins with, or that holds the array."""
         name = message.split(maxsplit=1)[0]
         if name in vars(self.boundary):
             return "boundary"
@@ -300,7 +300,7 @@ def _checked(which: Any, plans: int) -> slice | NDArray[Any]:
     return np.atleast_1d(found)
 
 
-def _mistakes(plans: Plans, rows: int | None = None) -> Iterator[str]:
+def _errors(plans: Plans, rows: int | None = None) -> Iterator[str]:
     """Yield error messages about shapes; the default number of plans is that of the paths."""
     path, rate, degree = plans.path_control_points, plans.rate_control_points, plans.degree
     if path.ndim != 3:
@@ -324,17 +324,17 @@ def _mistakes(plans: Plans, rows: int | None = None) -> Iterator[str]:
     for name, values in plans.boundary.conditions().items():
         if values.shape != (rows, n):
             yield f"{name} must have shape {(rows, n)} (plans, joints), got {values.shape}"
-    yield from _parameter_mistakes(plans, rows)
+    yield from _parameter_errors(plans, rows)
     for name in ("sample_id", "status"):
         if getattr(plans, name).shape != (rows,):
             yield f"{name} must have shape {(rows,)}, got {getattr(plans, name).shape}"
-    yield from _column_mistakes(plans, rows)
+    yield from _column_errors(plans, rows)
     for name in NOTES:
         if not isinstance(getattr(plans, name), str):
             yield f"{name} must be a text, got {getattr(plans, name)!r:.60}"
 
 
-def _parameter_mistakes(plans: Plans, rows: int) -> Iterator[str]:
+def _parameter_errors(plans: Plans, rows: int) -> Iterator[str]:
     parameters, width = plans.boundary.parameters, len(plans.problem.parameters)
     if width and parameters is None:
         names = ", ".join(plans.problem.parameters.names)
@@ -351,7 +351,7 @@ def _rows(plans: Plans) -> int:
     return Counter(len(field) if getattr(field, "ndim", 0) else 0 for field in fields).most_common(1)[0][0]
 
 
-def _column_mistakes(plans: Plans, rows: int) -> Iterator[str]:
+def _column_errors(plans: Plans, rows: int) -> Iterator[str]:
     for name, values in plans.columns.items():
         array: Any = values
         if not isinstance(array, np.ndarray):

@@ -119,7 +119,7 @@ def joint_order(scene: SceneProblem, robot: Robot, states: Array, end: str) -> A
     if violation.size and violation.max() > JOINT_TOLERANCE_RAD:
         goal, joint = np.unravel_index(violation.argmax(), violation.shape)
         low, high = robot.position_lower[joint], robot.position_upper[joint]
-        value, unit = float(states[goal, joint]), "m" if robot.sliding[joint] else "rad"
+        value, unit = float(states[goal, joint]), "m" if robot.prismatic[joint] else "rad"
         raise SceneError(
             f"{scene.place}: {robot.joint_names[joint]} is {value:.4f} {unit} at the {end}, outside of its limits"
             f" [{low:.4f}, {high:.4f}] {unit}{suggested_unit(value, unit, low, high)}"

@@ -87,10 +87,10 @@ class ProblemTables:
         return (*problem.constraint, ObjectClearance())
 
 
-def problem_mistakes(raw: ProblemTables) -> Iterator[str]:
-    """Check conditions across tables, on the raw tables, so that all mistakes are reported together."""
+def problem_errors(raw: ProblemTables) -> Iterator[str]:
+    """Check conditions across tables, on the raw tables, so that all errors are reported together."""
     table, where = raw.table, raw.where
-    yield from _robot_mistakes(raw)
+    yield from _robot_errors(raw)
     yield from _repeated(raw, "constraint", "use")
     yield from _repeated(raw, "obstacle", "name")
     uses = {str(each.get("use")) for _, each in tables(table, "constraint")}
@@ -107,12 +107,12 @@ def problem_mistakes(raw: ProblemTables) -> Iterator[str]:
         elif raw.collision_elements == []:
             yield (where / "constraint" / place).message("object-clearance needs <collision> elements in the URDF")
     if raw.geometry != "urdf":
-        yield from _paper_mistakes(raw)
+        yield from _paper_errors(raw)
     elif raw.collision_elements is not None:
-        yield from _shape_mistakes(raw, raw.collision_elements)
+        yield from _shape_errors(raw, raw.collision_elements)
 
 
-def _robot_mistakes(raw: ProblemTables) -> Iterator[str]:
+def _robot_errors(raw: ProblemTables) -> Iterator[str]:
     """Check that the URDF exists and has the joints and the tip; Pinocchio checks the rest."""
     joints, tip, where = raw.robot.get("joints"), raw.robot.get("tip"), raw.where / "robot"
     planned: list[Any] = joints if isinstance(joints, list) else []
@@ -140,7 +140,7 @@ def _robot_mistakes(raw: ProblemTables) -> Iterator[str]:
         yield (where / "joints").message(text)
 
 
-def _shape_mistakes(raw: ProblemTables, elements: list[ElementTree.Element]) -> Iterator[str]:
+def _shape_errors(raw: ProblemTables, elements: list[ElementTree.Element]) -> Iterator[str]:
     """Check a robot whose shape is that of the collision elements of its URDF."""
     robot, where = raw.robot, raw.where / "robot"
     if not elements:
@@ -164,7 +164,7 @@ def _shape_mistakes(raw: ProblemTables, elements: list[ElementTree.Element]) -> 
         yield (where / "srdf").message(f"no such file: {raw.folder / srdf}")
 
 
-def _paper_mistakes(raw: ProblemTables) -> Iterator[str]:
+def _paper_errors(raw: ProblemTables) -> Iterator[str]:
     """Check a robot with the geometry of the paper."""
     robot, where = raw.robot, raw.where
     for place, constraint in raw.constraints("robot-clearance"):
@@ -185,7 +185,7 @@ def _paper_mistakes(raw: ProblemTables) -> Iterator[str]:
             yield (where / "robot" / key).message('pairs of links matter with geometry = "urdf" only')
 
 
-def limit_mistakes(problem: Problem, raw: ProblemTables) -> Iterator[str]:
+def limit_errors(problem: Problem, raw: ProblemTables) -> Iterator[str]:
     """Check that no limit exceeds that of the URDF so far that it must be in another unit or in percent."""
     spec, limits = problem.robot, problem.limits
     per_joint = {"velocity": limits.velocity, "acceleration": limits.acceleration}  # effort is often a placeholder

@@ -56,7 +56,7 @@ def _changed(
     obstacle_poses, rest = place_obstacles(world.obstacles), [np.zeros(world.robot.n) for _ in states[0]]
 
     def values(dq: Array, ddq: Array, jerk: Array | None = None) -> list[Array]:
-        world.set_state(world.robot.base, dq, ddq, obstacle_poses, jerk)
+        world.set_state(world.robot.home, dq, ddq, obstacle_poses, jerk)
         return [np.array(each.g, float) for form in forms for each in form(world)]
 
     moving = [values(*state) for state in states]

@@ -12,7 +12,7 @@ from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem, kept_folder
 from cnpgen.robots.chain import chain_from_model
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.robot import Attached, Robot, mistakes_in, reduced_model
+from cnpgen.robots.robot import Attached, Robot, recipe_errors_in, reduced_model
 from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.shape.hull import Array
@@ -42,7 +42,7 @@ def load_robot(problem: Problem) -> Robot:
         PluginError: The URDF belongs to a package that is not installed.
     """
     spec, limits = problem.robot, problem.limits
-    with mistakes_in(problem.path):
+    with recipe_errors_in(problem.path):
         urdf, attached = problem.urdf_text, _attached(problem)
         model = reduced_model(problem.urdf_path, urdf, spec.joints, attached)
         chain = chain_from_model(model, attached.tip)
@@ -67,15 +67,15 @@ def load_robot(problem: Problem) -> Robot:
         jerk_limit=jerk,
         torque_limit=limits.torque_scale * torque,
         rated_velocity=rated,
-        base=np.array(spec.base),
+        home=np.array(spec.base),
         chain=chain,
         parameters=problem.parameters,
         table_origin=problem.table_origin,
         nominal_parameters=problem.nominal_parameters,
     )
-    if mistakes := list(_mistakes(problem, robot)):
-        raise RecipeError(mistakes)
-    with mistakes_in(problem.path):
+    if errors := list(_errors(problem, robot)):
+        raise RecipeError(errors)
+    with recipe_errors_in(problem.path):
         shape = load_shape(urdf, robot.model, kept_folder()) if spec.geometry == "urdf" else None
         model, robot = robot.model, replace(robot, shape=shape, held_shape=_held_shape(problem, robot))
     vars(robot)["model"] = model  # a cached property, expensive to build again
@@ -117,7 +117,7 @@ def _held_shape(problem: Problem, robot: Robot) -> Shape | None:
     return load_held_shape(robot.urdf_text, robot.model, problem.object, robot.tip_frame, kept_folder())
 
 
-def _mistakes(problem: Problem, robot: Robot) -> Iterator[str]:
+def _errors(problem: Problem, robot: Robot) -> Iterator[str]:
     """Yield error messages for limits that no motion satisfies."""
     limits = {"velocity": robot.velocity_limit, "torque": robot.torque_limit}
     for what, values in limits.items():
@@ -126,15 +126,15 @@ def _mistakes(problem: Problem, robot: Robot) -> Iterator[str]:
                 yield f"{robot.urdf}: {name}: the {what} limit must be positive and finite, got {value:g}"
     if any(isinstance(constraint, JointTorque) for constraint in problem.constraint):
         yield from _weightless(robot)
-    yield from (mistakes := list(_position_mistakes(problem, robot)))
-    if not mistakes:
-        yield from _base_mistakes(problem, robot)
+    yield from (errors := list(_position_errors(problem, robot)))
+    if not errors:
+        yield from _home_errors(problem, robot)
 
 
-def _position_mistakes(problem: Problem, robot: Robot) -> Iterator[str]:
+def _position_errors(problem: Problem, robot: Robot) -> Iterator[str]:
     """Yield error messages for position limits that are equal or in another unit."""
     limits = zip(robot.joint_names, robot.model.lowerPositionLimit, robot.model.upperPositionLimit, strict=True)
-    for (name, low, high), sliding in zip(limits, robot.sliding, strict=True):
+    for (name, low, high), sliding in zip(limits, robot.prismatic, strict=True):
         text, largest, unit = f"{robot.urdf}: {name}: ", max(low, high, key=abs), "m" if sliding else "rad"
         most = PLAUSIBLE_MAX[unit]
         if low >= high:
@@ -153,9 +153,9 @@ def _weightless(robot: Robot) -> Iterator[str]:
         yield f"{robot.urdf}: {name}: {text}, or leave out the constraint 'joint-torque'"
 
 
-def _base_mistakes(problem: Problem, robot: Robot) -> Iterator[str]:
+def _home_errors(problem: Problem, robot: Robot) -> Iterator[str]:
     """Yield error messages for a base configuration that is inconsistent with the joints or limits."""
-    low, high, base = robot.position_lower, robot.position_upper, robot.base
+    low, high, base = robot.position_lower, robot.position_upper, robot.home
     if base.shape != low.shape:
         yield f"{problem.path}: robot.base: needs {robot.n} values, one per planned joint, got {base.size}"
         return
@@ -176,14 +176,14 @@ def _base_mistakes(problem: Problem, robot: Robot) -> Iterator[str]:
 
 def _check_sizes(problem: Problem, robot: Robot) -> None:
     """Raise an error that lists all lengths and masses that are probably in another unit."""
-    mistakes = [f"{robot.urdf}: {mistake}" for mistake in _robot_mistakes(robot, problem)]
-    if not mistakes:
-        mistakes = [f"{problem.path}: {mistake}" for mistake in _problem_mistakes(robot, problem)]
-    if mistakes:
-        raise RecipeError(mistakes)
+    errors = [f"{robot.urdf}: {error}" for error in _robot_errors(robot, problem)]
+    if not errors:
+        errors = [f"{problem.path}: {error}" for error in _problem_errors(robot, problem)]
+    if errors:
+        raise RecipeError(errors)
 
 
-def _robot_mistakes(robot: Robot, problem: Problem) -> Iterator[str]:
+def _robot_errors(robot: Robot, problem: Problem) -> Iterator[str]:
     """Yield error messages for lengths of the URDF."""
     reach = robot.reach
     if not MIN_REACH_M <= reach <= MAX_REACH_M:
@@ -198,10 +198,10 @@ def _robot_mistakes(robot: Robot, problem: Problem) -> Iterator[str]:
         if max(center, gyration) > MAX_CENTER_RATIO * reach:
             text = f"the center of mass is {center:.3g} m away, the radius of gyration {gyration:.3g} m"
             yield f"{name}: {text}, the arm {reach:.3g} m long; an <inertial> is in kg, m and kg m^2, not in mm or g"
-    yield from _link_mistakes(robot, reach)
+    yield from _link_errors(robot, reach)
 
 
-def _link_mistakes(robot: Robot, reach: float) -> Iterator[str]:
+def _link_errors(robot: Robot, reach: float) -> Iterator[str]:
     """Yield error messages for sizes of links."""
     if robot.shape is None:
         return
@@ -228,7 +228,7 @@ def _mesh_links(urdf: str) -> set[str]:
     return {link.get("name", "") for link in links if link.find("collision/geometry/mesh") is not None}
 
 
-def _problem_mistakes(robot: Robot, problem: Problem) -> Iterator[str]:
+def _problem_errors(robot: Robot, problem: Problem) -> Iterator[str]:
     """Yield error messages for lengths and masses of the problem."""
     reach, payload = robot.reach, problem.payload
     mass = sum(joint.mass for joint in robot.chain.joints)

@@ -128,8 +128,8 @@ class TipReference(ObjectiveTerm):
     unit = "m^2 s"
     points: tuple[tuple[float, ...], ...] = field("corners of the curve, a polyline in the world frame", unit="m")
 
-    def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, mistake) pairs."""
+    def validate(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, error) pairs."""
         if len(self.points) < 2 or any(len(point) != 3 for point in self.points):
             yield "points", "expected at least 2 points of 3 coordinates each"
         elif any(first == second for first, second in zip(self.points, self.points[1:], strict=False)):
@@ -199,14 +199,14 @@ def _term(name: str, weight: float) -> ObjectiveTerm:
     if name not in known:
         expected = f"expected one of {', '.join(known)}{nearest(name, known)}"
         raise UsageError(f"objective {name!r} does not exist: {expected}")
-    mistakes: list[str] = []
+    errors: list[str] = []
     try:
         term: Any = parse(
-            registry.load(registry.OBJECTIVES, name), {"weight": weight}, where=RecipeLocation(name), mistakes=mistakes
+            registry.load(registry.OBJECTIVES, name), {"weight": weight}, where=RecipeLocation(name), errors=errors
         )
     except RecipeError as error:
         raise UsageError(str(error)) from error
     if term is None:
-        raise UsageError(f"{'; '.join(mistakes)}: write the term as [[objective.term]] in the problem file")
+        raise UsageError(f"{'; '.join(errors)}: write the term as [[objective.term]] in the problem file")
     found: ObjectiveTerm = term
     return found

@@ -97,14 +97,14 @@ def goal_velocities(problem: Problem, robot: Robot, goal_q: Array, goal_dq: Arra
 
 def with_capacity(problem: Problem, capacity: Capacity) -> Problem:
     """Return a problem with further obstacles, which stand far below the robot until a plan places them."""
-    mistake = ""
+    error = ""
     if problem.first(RobotClearance) is None:
-        mistake = "has no constraint robot-clearance: obstacles would be ignored"
+        error = "has no constraint robot-clearance: obstacles would be ignored"
     elif problem.parameters or problem.scene_constraint is not None:
         values = "values of each sample (parameters or a puck)"
-        mistake = f"has {values}, which are not supported among obstacles that samples place"
-    if mistake:
-        raise UsageError(f"the problem {problem.name!r} {mistake}", concerns="problem")
+        error = f"has {values}, which are not supported among obstacles that samples place"
+    if error:
+        raise UsageError(f"the problem {problem.name!r} {error}", concerns="problem")
     shapes = [*KINDS, *sorted(capacity.keys() - set(KINDS))]
     parked = [_parked(shape, index) for shape in shapes for index in range(1, capacity.get(shape, 0) + 1)]
     full = replace(problem, obstacle=(*problem.obstacle, *parked))

@@ -109,8 +109,8 @@ class Problem:
         Raises:
             UsageError: A size or a pose of an obstacle is not finite, too large or not positive.
         """
-        if mistake := invalid_obstacle(obstacles):
-            raise UsageError(mistake, concerns="obstacles")
+        if error := invalid_obstacle(obstacles):
+            raise UsageError(error, concerns="obstacles")
         other = dataclasses.replace(self, obstacle=tuple(obstacles))
         vars(other)["urdf_text"] = self.urdf_text  # a cached property, expensive to read again
         return other
@@ -141,8 +141,8 @@ class Problem:
         clearance = self.first(RobotClearance)
         return None if clearance is None else clearance.radius
 
-    def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, mistake) pairs."""
+    def validate(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, error) pairs."""
         for key in ("obstacle", "constraint"):
             if (count := len(getattr(self, key))) > MAX_TABLES:
                 yield key, f"there are {count:,} of them, expected at most {MAX_TABLES}: kernels grow with each"
@@ -156,9 +156,9 @@ class Problem:
                 " expected more than twice the depth",
             )
 
-        yield from self._parameter_mistakes()
+        yield from self._parameter_errors()
 
-    def _parameter_mistakes(self) -> Iterator[tuple[str, str]]:
+    def _parameter_errors(self) -> Iterator[tuple[str, str]]:
         if self.parameters.changes_payload and self.payload is None:
             (name, *_) = (name for name in self.parameters.names if name in PAYLOAD_PARAMETERS)
             yield "parameters", f"{name} needs the body of the load: give [payload], too"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from cnpgen.errors import PluginError, RecipeError
-from cnpgen.problems.checks import ProblemTables, limit_mistakes, problem_mistakes, tables
+from cnpgen.problems.checks import ProblemTables, limit_errors, problem_errors, tables
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.objectives import ObjectiveTerm
 from cnpgen.problems.problem import FILES, Problem
@@ -35,7 +35,7 @@ def load_problem(name_or_path: str | Path, *, relative_to: Path | None = None) -
         relative_to: Base folder of a relative path; by default the working directory.
 
     Raises:
-        RecipeError: The file has mistakes; the error lists all of them.
+        RecipeError: The file has errors; the error lists all of them.
     """
     return load_recipe(("problem",), name_or_path, relative_to, read_problem)
 
@@ -47,46 +47,46 @@ KIND_READERS: dict[type, Reader] = {
 
 
 def load_problem_behind(name_or_path: str | Path) -> Problem:
-    """Load the problem of a problem, pipeline or dataset recipe, by name or path; RecipeError if it has mistakes."""
+    """Load the problem of a problem, pipeline or dataset recipe, by name or path; RecipeError if it has errors."""
     return load_recipe(("problem", "pipeline", "dataset"), name_or_path, None, _read_behind)
 
 
-def _read_behind(path: Path, mistakes: list[str]) -> Problem | None:
+def _read_behind(path: Path, errors: list[str]) -> Problem | None:
     """Follow the references of a recipe file to its problem and read it."""
-    table = read_table(path, ("problem", "pipeline", "dataset"), mistakes)
+    table = read_table(path, ("problem", "pipeline", "dataset"), errors)
     if table is None:
         return None
     kinds: tuple[Kind, ...] = ("pipeline", "problem")
     key = next((kind for kind in kinds if kind in table), None)
     if key is None:
-        return read_problem(path, mistakes)
+        return read_problem(path, errors)
     where = RecipeLocation(str(path)) / key
     try:
-        found: Problem | None = reference(key, _read_behind, path.parent)(table[key], where, mistakes)
+        found: Problem | None = reference(key, _read_behind, path.parent)(table[key], where, errors)
     except ValueError as error:
-        mistakes.append(where.message(str(error)))
+        errors.append(where.message(str(error)))
         return None
     return found
 
 
-def read_problem(path: Path, mistakes: list[str]) -> Problem | None:
-    """Read a problem file and append its mistakes to ``mistakes``; return None if it is unusable."""
-    table = read_table(path, ("problem",), mistakes)
+def read_problem(path: Path, errors: list[str]) -> Problem | None:
+    """Read a problem file and append its errors to ``errors``; return None if it is unusable."""
+    table = read_table(path, ("problem",), errors)
     if table is None:
         return None
     raw = ProblemTables(table, where := RecipeLocation(str(path)), path.parent)
-    problem = parse(Problem, table, where=where, mistakes=mistakes, readers=KIND_READERS)
-    before = len(mistakes)
-    mistakes.extend(problem_mistakes(raw))
-    obstacles = () if problem is None else _with_meshes(problem, path, where, mistakes)
-    if problem is None or len(mistakes) > before:
+    problem = parse(Problem, table, where=where, errors=errors, readers=KIND_READERS)
+    before = len(errors)
+    errors.extend(problem_errors(raw))
+    obstacles = () if problem is None else _with_meshes(problem, path, where, errors)
+    if problem is None or len(errors) > before:
         return None
-    mistakes.extend(limit_mistakes(problem, raw))
+    errors.extend(limit_errors(problem, raw))
     spec, constraints = replace(problem.robot, geometry=raw.geometry), raw.with_object_clearance(problem)
     return replace(problem, path=path.absolute(), robot=spec, obstacle=obstacles, constraint=constraints)
 
 
-def _with_meshes(problem: Problem, path: Path, where: RecipeLocation, mistakes: list[str]) -> tuple[Obstacle, ...]:
+def _with_meshes(problem: Problem, path: Path, where: RecipeLocation, errors: list[str]) -> tuple[Obstacle, ...]:
     """Return the obstacles with inline hulls of their mesh files."""
     packages = [path.parent / each for each in problem.robot.packages]
     found = []
@@ -97,7 +97,7 @@ def _with_meshes(problem: Problem, path: Path, where: RecipeLocation, mistakes: 
                 mesh = inline_mesh(find_named_file(each.mesh, path, packages), np.array(each.scale))
                 obstacle = replace(each, mesh=mesh, scale=Obstacle.scale)
             except RecipeError as error:
-                mistakes += [(where / "obstacle" / index / "mesh").message(text) for text in error.mistakes]
+                errors += [(where / "obstacle" / index / "mesh").message(text) for text in error.errors]
         found.append(obstacle)
     return tuple(found)
 
@@ -117,12 +117,12 @@ def restore_problem(content: dict[str, Any], urdf: str, folder: Path) -> Problem
     """Rebuild a problem from its resolved form and the text of its URDF, for whose file there is a folder."""
     if missing := missing_kinds_of_problem(content):
         raise PluginError(missing)
-    path, mistakes = folder / "recipe.toml", list[str]()
+    path, errors = folder / "recipe.toml", list[str]()
     problem: Problem | None = restoring_reader(urdf, path)(
-        without_defaults(content), RecipeLocation(str(path)), mistakes
+        without_defaults(content), RecipeLocation(str(path)), errors
     )
-    if problem is None or mistakes:
-        raise RecipeError(mistakes)
+    if problem is None or errors:
+        raise RecipeError(errors)
     return problem
 
 
@@ -133,15 +133,15 @@ def restoring_reader(urdf: str, path: Path) -> Reader:
     """
     (path.parent / "robot.urdf").write_text(urdf, encoding="utf-8")
 
-    def read(value: Any, where: RecipeLocation, mistakes: list[str]) -> Problem | None:
+    def read(value: Any, where: RecipeLocation, errors: list[str]) -> Problem | None:
         if not isinstance(value, dict) or not isinstance(value.get("robot"), dict):
-            raise ValueError("expected the table of a problem, with a robot")  # noqa: TRY004 - as of other mistakes
+            raise ValueError("expected the table of a problem, with a robot")  # noqa: TRY004 - as of other errors
         robot = {key: entry for key, entry in value["robot"].items() if key not in FILES}
         value = {**value, "robot": robot | {"urdf": "robot.urdf"}}
         with stored_values():
-            made = parse(Problem, value, where=where, mistakes=mistakes, readers=KIND_READERS)
+            made = parse(Problem, value, where=where, errors=errors, readers=KIND_READERS)
         if made is None or (named := list(_meshes_on_disk(made, urdf, where))):
-            mistakes.extend(() if made is None else named)
+            errors.extend(() if made is None else named)
             return None
         return replace(made, path=path, is_stored=True)
 

@@ -79,7 +79,7 @@ class ProblemRecord(StoredProblem):
         return tuple(self.content["robot"]["joints"])
 
     @cached_property
-    def sliding_joints(self) -> tuple[bool, ...]:
+    def prismatic_joints(self) -> tuple[bool, ...]:
         """Whether each planned joint is prismatic."""
         joints = urdf_tree(self.urdf).iter("joint")
         sliding = {joint.get("name") for joint in joints if joint.get("type") == "prismatic"}
@@ -111,11 +111,11 @@ class ProblemRecord(StoredProblem):
         return self._parsed(ParameterRanges, "parameters", self.content.get("parameters", {}))
 
     def _parsed(self, kind: type[T], key: str, table: Any) -> T:
-        mistakes: list[str] = []
+        errors: list[str] = []
         with stored_values():
-            parsed = parse(kind, table, where=RecipeLocation("problem_recipe", key), mistakes=mistakes)
+            parsed = parse(kind, table, where=RecipeLocation("problem_recipe", key), errors=errors)
         if parsed is None:
-            raise RecipeError(mistakes)
+            raise RecipeError(errors)
         return parsed
 
     @cached_property
@@ -237,7 +237,7 @@ def open_problem(record: ProblemRecord) -> tuple[Problem, Robot]:
 
     with record.restored() as problem:
         if problem.obstacle:
-            with suppress(RecipeError):  # mistakes are reported below, with the whole problem
+            with suppress(RecipeError):  # errors are reported below, with the whole problem
                 content = {**record.content, "obstacle": []}
                 return problem, _robot_of(ProblemRecord(json.dumps(content), record.urdf))
         return problem, load_robot(problem)

@@ -84,7 +84,7 @@ class RobotModel:
         problem: The problem.
         joint_names: Names of the n planned joints.
         tip: Name of the tip frame.
-        base: Base configuration [rad], shape (n,).
+        home: Home configuration [rad], the key `base` of files, shape (n,).
         position_lower: Planning limits of joint positions [rad], shape (n,).
         position_upper: Planning limits of joint positions [rad], shape (n,).
         velocity_limit: Planning limits of joint velocities [rad/s], shape (n,).
@@ -94,7 +94,7 @@ class RobotModel:
 
     Raises:
         UsageError: ``problem`` is no problem, or ``backend`` is unknown.
-        RecipeError: The recipe has mistakes.
+        RecipeError: The recipe has errors.
         MachineError: The backend is not available.
     """
 
@@ -105,7 +105,7 @@ class RobotModel:
         self.problem = as_problem(problem)
         self._robot: Robot = load_robot(self.problem)
         robot = self._robot
-        self.joint_names, self.tip, self.base = robot.joint_names, robot.tip, robot.base
+        self.joint_names, self.tip, self.home = robot.joint_names, robot.tip, robot.home
         self.position_lower, self.position_upper = robot.position_lower, robot.position_upper
         self.velocity_limit, self.acceleration_limit = robot.velocity_limit, robot.acceleration_limit
         self.jerk_limit, self.torque_limit = robot.jerk_limit, robot.torque_limit
@@ -310,7 +310,7 @@ def tip_pose(robot: Robot) -> Any:
 
     q_sx, q = symbols("q", robot.n)
     kin = forward_kinematics(robot.chain, q)
-    angular = [axis if turns else [0.0, 0.0, 0.0] for axis, turns in zip(kin.axes, kin.turning, strict=True)]
+    angular = [axis if turns else [0.0, 0.0, 0.0] for axis, turns in zip(kin.axes, kin.revolute, strict=True)]
     jacobian = [column[row] for columns in (kin.jacobian, angular) for row in range(3) for column in columns]
     rotation = [value for row in kin.rotation for value in row]
     outputs = [ca.densify(ca.vertcat(*map(ca.SX, values))) for values in (kin.tip, rotation, jacobian)]

@@ -297,7 +297,7 @@ class Refiner:
         arguments, center = self._guess_arguments(task), (self.robot.position_lower + self.robot.position_upper) / 2
         guesses = [
             initial_guesses.straight_line(*arguments),
-            initial_guesses.line_through(*arguments, configuration=self.robot.base),
+            initial_guesses.line_through(*arguments, configuration=self.robot.home),
             initial_guesses.quintic(*arguments),
             initial_guesses.line_through(*arguments, configuration=center),
         ]

@@ -62,12 +62,12 @@ class Obstacle:
         "scale factors of the mesh along x, y and z", default=_OPTIONAL["scale"]
     )
 
-    def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, mistake) pairs."""
+    def validate(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, error) pairs."""
         yield from self._mistakes_upright() if self.upright else self._mistakes_posed()
 
-    def value_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, mistake) pairs of an obstacle that Python has built: its kind, missing keys, and numbers."""
+    def value_errors(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, error) pairs of an obstacle that Python has built: its kind, missing keys, and numbers."""
         if self.kind not in _KEYS:
             yield "kind", f"must be one of {', '.join(_KEYS)}, got {self.kind!r}"
             return
@@ -89,7 +89,7 @@ class Obstacle:
                 yield key.name, f"must be at most {limit:.4g} {key.unit}, got {value}{hint}"
             elif key.low is not None and numbers and min(numbers) < key.low:
                 yield key.name, f"must be at least {key.low:g} {key.unit}, got {value}"
-        yield from self.find_mistakes()
+        yield from self.validate()
 
     @property
     def upright(self) -> bool:
@@ -136,9 +136,9 @@ class Obstacle:
 
 
 def invalid_obstacle(obstacles: Iterable[Obstacle]) -> str:
-    """Return the first mistake of obstacles, with the name of the obstacle; empty without one."""
-    mistakes = ((f"obstacle {each.name!r}", *mistake) for each in obstacles for mistake in each.value_mistakes())
-    return next((text if text.startswith(name) else f"{name}: {key} {text}" for name, key, text in mistakes), "")
+    """Return the first error of obstacles, with the name of the obstacle; empty without one."""
+    errors = ((f"obstacle {each.name!r}", *error) for each in obstacles for error in each.value_errors())
+    return next((text if text.startswith(name) else f"{name}: {key} {text}" for name, key, text in errors), "")
 
 
 def _listed(keys: Sequence[str]) -> str:

@@ -67,7 +67,7 @@ class Robot:
         jerk_limit: Symmetric planning limit of joint jerks [rad/s^3], shape (n,); only ``joint-jerk`` constrains them.
         torque_limit: Symmetric planning limit of joint torques [N m], shape (n,).
         rated_velocity: The URDF's own velocity limit [rad/s], shape (n,).
-        base: Base configuration [rad], shape (n,).
+        home: Home configuration [rad], the key `base` of files, shape (n,).
         chain: Parameters of the kinematic chain from the world to the tip.
         shape: Collision geometry; None for the paper's, a line through the joint origins.
         held_shape: Link geometry and the held object, for collisions between the two; None if these are not checked.
@@ -88,7 +88,7 @@ class Robot:
     jerk_limit: Array
     torque_limit: Array
     rated_velocity: Array
-    base: Array
+    home: Array
     chain: Chain
     shape: Shape | None = None
     held_shape: Shape | None = None
@@ -109,13 +109,13 @@ class Robot:
         return np.concatenate(2 * low), np.concatenate(2 * [self.position_upper, *moving])
 
     @cached_property
-    def sliding(self) -> tuple[bool, ...]:
+    def prismatic(self) -> tuple[bool, ...]:
         """Whether each joint is prismatic [m] and not revolute [rad]."""
         return tuple(joint.prismatic for joint in self.chain.joints)
 
-    def units(self, turning: str) -> str:
+    def units(self, revolute: str) -> str:
         """Return the units of a joint quantity from its unit for revolute joints; see ``units_of_joints``."""
-        return units_of_joints(turning, self.sliding)
+        return units_of_joints(revolute, self.prismatic)
 
     @cached_property
     def capsule_axes(self) -> tuple[tuple[int, int], ...]:
@@ -162,16 +162,16 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
 
     try:
         tree = urdf_tree(text)
-        if mistakes := [f"robot.joints: {text}" for text in _mimic_mistakes(tree, joints)]:
-            raise RecipeError(mistakes)
+        if errors := [f"robot.joints: {text}" for text in _mimic_errors(tree, joints)]:
+            raise RecipeError(errors)
         limited = bounded(text, tree, attached)
-        with mistakes_in(urdf):
+        with recipe_errors_in(urdf):
             parameters = urdf_parameters(tree)
             _check_order_of_limits(parameters, joints)
         try:
             model = pin.buildModelFromXML(limited)
         except ValueError:
-            with mistakes_in(urdf):
+            with recipe_errors_in(urdf):
                 _check_order_of_limits(parameters, [joint.name for joint in parameters.joints.values()])
             raise
         name_links_uniquely(model)
@@ -185,13 +185,13 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
     reduced = pin.buildReducedModel(model, locked, pin.neutral(model)) if locked else model
     if tuple(reduced.names)[1:] != tuple(joints):
         raise RecipeError([f"robot.joints: must be in the URDF's order {list(reduced.names)[1:]}, got {list(joints)}"])
-    with mistakes_in(urdf):
+    with recipe_errors_in(urdf):
         check_model(reduced, parameters)
     attach(reduced, attached)
     return reduced
 
 
-def _mimic_mistakes(tree: ElementTree.Element, planned: Sequence[str]) -> Iterator[str]:
+def _mimic_errors(tree: ElementTree.Element, planned: Sequence[str]) -> Iterator[str]:
     """Yield error messages for mimic joints, which Pinocchio treats as independent, in a wrong position."""
     for joint in tree.iter("joint"):
         mimic = joint.find("mimic")
@@ -217,22 +217,22 @@ def _mimic_offset(mimic: ElementTree.Element) -> str:
 def _check_order_of_limits(parameters: UrdfParameters, joints: Collection[str]) -> None:
     """Raise an error that lists the joints whose lower limits are above the upper ones."""
     limits = {joint.name: joint.limits for joint in parameters.joints.values() if joint.name in joints}
-    mistakes = [
+    errors = [
         f"joint {name!r}: its limits lower={of['lower']:g} and upper={of['upper']:g} are swapped: exchange them"
         for name, of in limits.items()
         if of.get("lower", 0.0) > of.get("upper", 0.0)
     ]
-    if mistakes:
-        raise RecipeError(mistakes)
+    if errors:
+        raise RecipeError(errors)
 
 
 @contextmanager
-def mistakes_in(urdf: Path) -> Iterator[None]:
-    """Put the name of a file, such as the URDF, before the mistakes that the block raises."""
+def recipe_errors_in(urdf: Path) -> Iterator[None]:
+    """Put the name of a file, such as the URDF, before the errors that the block raises."""
     try:
         yield
     except RecipeError as error:
-        raise type(error)([f"{urdf}: {mistake}" for mistake in error.mistakes]) from error
+        raise type(error)([f"{urdf}: {error}" for error in error.errors]) from error
 
 
 def _capsule_axes(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:

@@ -69,8 +69,8 @@ class RobotSpec:
         "pairs of links whose collisions are not checked, besides those of the SRDF", default=()
     )
 
-    def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, mistake) pairs."""
+    def validate(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, error) pairs."""
         twice = sorted({name for name in self.joints if self.joints.count(name) > 1})
         if twice:
             yield "joints", f"each joint can be planned once, got {', '.join(twice)} more than once"
@@ -150,8 +150,8 @@ class Payload:
         default=(),
     )
 
-    def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, mistake) pairs."""
+    def validate(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, error) pairs."""
         if self.inertia is not None and self.size is not None and not self.touch_links:
             yield "size", "the payload has both an 'inertia' and a 'size', expected one of them"
         if self.touch_links and self.size is None:

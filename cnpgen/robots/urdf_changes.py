@@ -26,24 +26,24 @@ def with_locked_joints(urdf: str, positions: Mapping[str, float], *, is_stored: 
     """
     if not positions:
         return urdf
-    mistakes = list[str]()
+    errors = list[str]()
     try:
         robot = urdf_tree(urdf)
         joints = {joint.get("name", ""): joint for joint in robot.findall("joint")}
-        mistakes += [
+        errors += [
             f"the URDF has no joint {name!r}{nearest(name, joints)}" for name in positions if name not in joints
         ]
-        if not mistakes:
+        if not errors:
             all_positions = dict(positions) | _mimicking(joints, positions)
             for name, position in all_positions.items():
                 try:
-                    mistakes += _fix(joints[name], position, is_stored)
+                    errors += _fix(joints[name], position, is_stored)
                 except ValueError as error:
-                    mistakes.append(f"joint {name!r}: {error}")
+                    errors.append(f"joint {name!r}: {error}")
     except ValueError as error:
-        mistakes.append(str(error))
-    if mistakes:
-        raise RecipeError([f"robot.locked_joints: {text}" for text in mistakes])
+        errors.append(str(error))
+    if errors:
+        raise RecipeError([f"robot.locked_joints: {text}" for text in errors])
     return ElementTree.tostring(robot, encoding="unicode")
 
 
@@ -59,7 +59,7 @@ def _mimicking(joints: Mapping[str, Element], positions: Mapping[str, float]) ->
 
 
 def _fix(joint: Element, position: float, is_stored: bool) -> list[str]:
-    """Make a joint fixed at a position; return its mistakes."""
+    """Make a joint fixed at a position; return its errors."""
     import pinocchio as pin
 
     name, kind = joint.get("name", ""), joint.get("type", "")

@@ -82,16 +82,16 @@ class UrdfParameters:
 
 def urdf_parameters(tree: Element) -> UrdfParameters:
     """Read the numbers of all links and joints; RecipeError lists missing ones and those not plain finite decimals."""
-    mistakes: list[str] = []
+    errors: list[str] = []
     inertias: dict[str, LinkInertia | None] = {}
     joints: dict[str, UrdfJoint] = {}
     for link in tree.findall("link"):
-        _read_named(link, lambda link: inertias.update({link.get("name", ""): _inertia(link)}), mistakes)
+        _read_named(link, lambda link: inertias.update({link.get("name", ""): _inertia(link)}), errors)
     for element in tree.findall("joint"):
-        _read_named(element, lambda element: joints.update({(joint := _joint(element)).child: joint}), mistakes)
-    mistakes += [f"link {link!r}: its joints form a cycle" for link in _links_in_cycles(joints)]
-    if mistakes:
-        raise RecipeError(mistakes)
+        _read_named(element, lambda element: joints.update({(joint := _joint(element)).child: joint}), errors)
+    errors += [f"link {link!r}: its joints form a cycle" for link in _links_in_cycles(joints)]
+    if errors:
+        raise RecipeError(errors)
     return UrdfParameters(inertias, joints)
 
 
@@ -109,15 +109,15 @@ def _links_in_cycles(joints: Mapping[str, UrdfJoint]) -> list[str]:
     return found
 
 
-def _read_named(element: Element, read: Callable[[Element], None], mistakes: list[str]) -> None:
-    """Read an element; add its error to the mistakes, with the name of the element."""
+def _read_named(element: Element, read: Callable[[Element], None], errors: list[str]) -> None:
+    """Read an element; add its error to the errors, with the name of the element."""
     problems = list(_unread(element))
     try:
         if not problems:
             read(element)
     except ValueError as error:
         problems.append(str(error))
-    mistakes += [f"{element.tag} {element.get('name', '')!r}: {problem}" for problem in problems]
+    errors += [f"{element.tag} {element.get('name', '')!r}: {problem}" for problem in problems]
 
 
 def _unread(element: Element) -> Iterator[str]:
@@ -182,8 +182,8 @@ def placement_of(element: Element) -> LinkFrame:
 
 def check_model(model: "pin.Model", parameters: UrdfParameters) -> None:
     """Raise an error that lists how a model, all joints of a URDF or some with others at zero, differs from its XML."""
-    if mistakes := list(_Comparison(model, parameters).mistakes()):
-        raise RecipeError(mistakes)
+    if errors := list(_Comparison(model, parameters).errors()):
+        raise RecipeError(errors)
 
 
 class _Comparison:
@@ -209,7 +209,7 @@ class _Comparison:
             inner, link = joint.origin.of(inner), joint.parent
         return WORLD, inner
 
-    def mistakes(self) -> Iterator[str]:
+    def errors(self) -> Iterator[str]:
         """Yield an error message for every difference."""
         for joint in self.parameters.joints.values():
             if joint.name in self.joints:

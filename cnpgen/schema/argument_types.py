@@ -128,15 +128,15 @@ def _check_of(hint: Any, *, strict: bool = False) -> Check | None:
     def check_options(name: str, value: Any) -> Any:
         if (optional and value is None) or (arrays and type(value) is np.ndarray):  # the usual case
             return value
-        mistakes = []
+        errors = []
         for check in checks:
             try:
                 return check(name, value)
             except UsageError as error:
-                mistakes.append(error.args[0])
-        expected = either([mistake.partition(", got ")[0].removeprefix("must be ") for mistake in mistakes])
-        got = mistakes[0].partition(", got ")[2]
-        raise UsageError(f"must be {expected}, got {got}" if len(mistakes) > 1 else mistakes[0], argument=name)
+                errors.append(error.args[0])
+        expected = either([error.partition(", got ")[0].removeprefix("must be ") for error in errors])
+        got = errors[0].partition(", got ")[2]
+        raise UsageError(f"must be {expected}, got {got}" if len(errors) > 1 else errors[0], argument=name)
 
     return check_options if checks else None
 

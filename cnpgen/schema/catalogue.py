@@ -89,27 +89,27 @@ def load_recipe(
     folder: Path | None,
     build: Callable[[Path, list[str]], Recipe | None],
 ) -> Recipe:
-    """Find, read and build a recipe, or raise all mistakes at once."""
-    mistakes: list[str] = []
-    recipe = build(find_recipe(kinds, name_or_path, folder), mistakes)
-    if recipe is None or mistakes:
-        raise RecipeError(mistakes)
+    """Find, read and build a recipe, or raise all errors at once."""
+    errors: list[str] = []
+    recipe = build(find_recipe(kinds, name_or_path, folder), errors)
+    if recipe is None or errors:
+        raise RecipeError(errors)
     return recipe
 
 
 def reference(kind: Kind, build: Callable[[Path, list[str]], Any], folder: Path) -> Reader:
     """Return a reader of keys that refer to another recipe."""
 
-    def read(value: Any, where: RecipeLocation, mistakes: list[str]) -> Any:
+    def read(value: Any, where: RecipeLocation, errors: list[str]) -> Any:
         if isinstance(value, str):
-            return build(find_file((kind,), value, folder), mistakes)
-        mistakes.append(where.message(f"expected a name or a path, got {show(value)}"))
+            return build(find_file((kind,), value, folder), errors)
+        errors.append(where.message(f"expected a name or a path, got {show(value)}"))
         return None
 
     return read
 
 
-def read_kind(group: str, value: Any, where: RecipeLocation, mistakes: list[str]) -> Any:
+def read_kind(group: str, value: Any, where: RecipeLocation, errors: list[str]) -> Any:
     """Read a ``[[stage]]`` or ``[[constraint]]`` table, whose key ``use`` names the kind."""
     use = value.get("use") if isinstance(value, dict) else None
     if not isinstance(use, str):
@@ -117,16 +117,16 @@ def read_kind(group: str, value: Any, where: RecipeLocation, mistakes: list[str]
         given = isinstance(value, dict) and "use" in value
         text = f"expected one of {known}"
         text = f"{text}, got {show(value['use'])}" if given else f"missing key, {text}"
-        mistakes.append((where / "use").message(text))
+        errors.append((where / "use").message(text))
         return None
     try:
         kind = registry.load(group, use)
     except RecipeError as error:
-        mistakes.extend((where / "use").message(text) for text in error.mistakes)
+        errors.extend((where / "use").message(text) for text in error.errors)
         return None
     rest = {key: entry for key, entry in value.items() if key != "use"}
     hints = {hint for key in keys(kind) for hint in get_args(key.hint) if isinstance(hint, type)}
     readers: dict[type, Reader] = {
         hint: partial(read_kind, nested) for hint in hints if (nested := registry.group_of(hint))
     }
-    return parse(kind, rest, where=where, mistakes=mistakes, readers=readers)
+    return parse(kind, rest, where=where, errors=errors, readers=readers)

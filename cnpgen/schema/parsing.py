@@ -1,4 +1,4 @@
-"""Parser of TOML tables to dataclasses: checks types, units and bounds, and reports mistakes with file and key."""
+"""Parser of TOML tables to dataclasses: checks types, units and bounds, and reports errors with file and key."""
 
 import dataclasses
 import math
@@ -31,7 +31,7 @@ def stored_values() -> Iterator[None]:
 
 
 Reader = Callable[[Any, RecipeLocation, list[str]], Any]
-"""Function of (TOML value, location, mistakes) that returns an object, or None after adding to the mistakes."""
+"""Function of (TOML value, location, errors) that returns an object, or None after adding to the errors."""
 
 
 def parse(
@@ -39,61 +39,61 @@ def parse(
     table: object,
     *,
     where: RecipeLocation,
-    mistakes: list[str],
+    errors: list[str],
     readers: Mapping[type, Reader] | None = None,
 ) -> T | None:
     """Build a dataclass declared with ``field`` from the table at a location; all values are in SI.
 
-    Returns None after a mistake, and appends one line per mistake to ``mistakes``. Field types that are not tables of
+    Returns None after an error, and appends one line per error to ``errors``. Field types that are not tables of
     their own keys have ``readers``. Further conditions are checked by the dataclass: by a ValueError in
-    ``__post_init__``, or by a method ``find_mistakes()`` that yields (key, mistake) pairs. The method also runs if
-    other keys have mistakes, and then stops at the first use of such a key.
+    ``__post_init__``, or by a method ``validate()`` that yields (key, error) pairs. The method also runs if
+    other keys have errors, and then stops at the first use of such a key.
     """
-    before = len(mistakes)
-    parser = _Parser(mistakes, readers or {})
+    before = len(errors)
+    parser = _Parser(errors, readers or {})
     made: T | None = parser.attempt(lambda: parser.table(cls, table, where), where)
-    return made if len(mistakes) == before else None
+    return made if len(errors) == before else None
 
 
 @dataclass(frozen=True)
 class _Parser:
-    """Parser of values of all supported types; None marks a mistake, since TOML has no null."""
+    """Parser of values of all supported types; None marks an error, since TOML has no null."""
 
-    mistakes: list[str]
+    errors: list[str]
     readers: Mapping[type, Reader]
 
     def attempt(self, read: Callable[[], Any], where: RecipeLocation) -> Any:
         try:
             return read()
         except ValueError as error:
-            self.mistakes.append(where.message(str(error)))
+            self.errors.append(where.message(str(error)))
             return None
 
     def table(self, cls: type[T], table: Any, where: RecipeLocation) -> T | None:
         if not isinstance(table, dict):
-            raise ValueError(f"expected a table, got {show(table)}")  # noqa: TRY004 - a user's mistake
-        before = len(self.mistakes)
+            raise ValueError(f"expected a table, got {show(table)}")  # noqa: TRY004 - a user's error
+        before = len(self.errors)
         known = {key.name: key for key in keys(cls)}
         unknown = [name for name in table if name not in known]
         for name in unknown[:MAX_UNKNOWN_KEYS]:
             hint = nearest(name, known) or f", known: {', '.join(known)}"
-            self.mistakes.append((where / name).message(f"unknown key{hint}"))
+            self.errors.append((where / name).message(f"unknown key{hint}"))
         if len(unknown) > MAX_UNKNOWN_KEYS:
-            self.mistakes.append(where.message(f"and {len(unknown) - MAX_UNKNOWN_KEYS:,} more unknown keys"))
+            self.errors.append(where.message(f"and {len(unknown) - MAX_UNKNOWN_KEYS:,} more unknown keys"))
         for name, key in known.items():
             if key.required and name not in table:
-                self.mistakes.append((where / name).message(f"missing key, expected {key.expected}: {key.doc}"))
+                self.errors.append((where / name).message(f"missing key, expected {key.expected}: {key.doc}"))
         given = [key for name, key in known.items() if name in table]
         values = {key.name: self.value(key.hint, table[key.name], key, where / key.name) for key in given}
-        if len(self.mistakes) == before:
+        if len(self.errors) == before:
             made = cls(**values)
-            self.check(getattr(made, "find_mistakes", tuple)(), where)
+            self.check(getattr(made, "validate", tuple)(), where)
             return made
-        self.check(_first_mistakes_of(_partly(cls, known, values)), where)
+        self.check(_first_errors_of(_partly(cls, known, values)), where)
         return None
 
-    def check(self, mistakes: Iterable[tuple[str, str]], where: RecipeLocation) -> None:
-        self.mistakes.extend((where / name).message(text) for name, text in mistakes)
+    def check(self, errors: Iterable[tuple[str, str]], where: RecipeLocation) -> None:
+        self.errors.extend((where / name).message(text) for name, text in errors)
 
     def value(self, hint: Any, value: Any, key: Key, where: RecipeLocation) -> Any:
         return self.attempt(lambda: self.read(hint, value, key, where), where)
@@ -101,7 +101,7 @@ class _Parser:
     def read(self, hint: Any, value: Any, key: Key, where: RecipeLocation) -> Any:
         args = get_args(hint)
         if hint in self.readers:
-            return self.readers[hint](value, where, self.mistakes)
+            return self.readers[hint](value, where, self.errors)
         if hint in _LEAVES:
             return _plausible(_LEAVES[hint](value, key), value, key)
         if dataclasses.is_dataclass(hint):
@@ -126,22 +126,22 @@ class _Parser:
         _check_filled(dict, values, key)
         for name in values:
             if key.pattern and not re.fullmatch(key.pattern, name):
-                self.mistakes.append((where / name).message(f"the name {show(name)} does not match {key.pattern}"))
+                self.errors.append((where / name).message(f"the name {show(name)} does not match {key.pattern}"))
         return {name: self.value(hint, item, key, where / name) for name, item in values.items()}
 
 
 class _Wrong:
-    """Placeholder of a value with a mistake; every use raises TypeError."""
+    """Placeholder of a value with an error; every use raises TypeError."""
 
     def _refuse(self, *_: Any) -> NoReturn:
-        raise TypeError("a value with a mistake cannot be used")
+        raise TypeError("a value with an error cannot be used")
 
     __bool__ = __len__ = __iter__ = __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = _refuse
     __hash__ = None  # type: ignore[assignment]
 
 
 def _partly(cls: type[T], known: Mapping[str, Key], values: Mapping[str, Any]) -> T:
-    """Build an object with placeholders for missing values and values with mistakes."""
+    """Build an object with placeholders for missing values and values with errors."""
     made = object.__new__(cls)
     for name, key in known.items():
         value = values.get(name, key.default)
@@ -149,18 +149,18 @@ def _partly(cls: type[T], known: Mapping[str, Key], values: Mapping[str, Any]) -
     return made
 
 
-def _first_mistakes_of(made: object) -> list[tuple[str, str]]:
-    """List the mistakes of an object up to the first check that uses a value with a mistake."""
+def _first_errors_of(made: object) -> list[tuple[str, str]]:
+    """List the errors of an object up to the first check that uses a value with an error."""
     found: list[tuple[str, str]] = []
     with suppress(TypeError, AttributeError):
-        for mistake in getattr(made, "find_mistakes", tuple)():
-            found.append(mistake)  # noqa: PERF402 - keeps the mistakes before an error
+        for error in getattr(made, "validate", tuple)():
+            found.append(error)  # noqa: PERF402 - keeps the errors before an error
     return found
 
 
 def _check_filled(kind: type, value: Any, key: Key) -> None:
     if not isinstance(value, kind):
-        raise ValueError(f"expected {key.expected}, got {show(value)}")  # noqa: TRY004 - a user's mistake
+        raise ValueError(f"expected {key.expected}, got {show(value)}")  # noqa: TRY004 - a user's error
     if not value:
         raise ValueError(f"is empty, expected at least one: {key.doc}")
 
@@ -183,7 +183,7 @@ def _bool(value: Any, _: Key) -> bool:
 
 def _str(value: Any, key: Key) -> str:
     if not isinstance(value, str):
-        raise ValueError(f"expected a string, got {show(value)}")  # noqa: TRY004 - a user's mistake
+        raise ValueError(f"expected a string, got {show(value)}")  # noqa: TRY004 - a user's error
     if key.choices and value not in key.choices:
         raise ValueError(f"expected {key.expected}, got {show(value)}{nearest(value, key.choices)}")
     if key.pattern and not re.fullmatch(key.pattern, value):

@@ -1,4 +1,4 @@
-"""Reader of recipe files: TOML tables, line numbers of mistakes, kinds of recipes."""
+"""Reader of recipe files: TOML tables, line numbers of errors, kinds of recipes."""
 
 import re
 import tomllib
@@ -35,27 +35,27 @@ def kind_of_file(path: Path) -> Kind:
     return next((kind for kind in MARKS if is_kind(kind, table)), "dataset")
 
 
-def read_table(path: Path, kinds: tuple[Kind, ...], mistakes: list[str]) -> dict[str, Any] | None:
-    """Return the top-level table of a recipe file, or None after a mistake, such as a recipe of another kind."""
+def read_table(path: Path, kinds: tuple[Kind, ...], errors: list[str]) -> dict[str, Any] | None:
+    """Return the top-level table of a recipe file, or None after an error, such as a recipe of another kind."""
     try:
         table = _read(path)
     except OSError as error:
-        mistakes.append(f"{path}: cannot be read: {error.strerror}")
+        errors.append(f"{path}: cannot be read: {error.strerror}")
         return None
     except ValueError as error:
-        mistakes.append(f"{path}: {error}")
+        errors.append(f"{path}: {error}")
         return None
     found = [kind for kind in MARKS if is_kind(kind, table)]
     if not found or set(found) & set(kinds):
         return table
     beside = [path.parent / f"{kind}.toml" for kind in kinds]
     hint = next((f" (did you mean {file}?)" for file in beside if file.is_file() and file != path), "")
-    mistakes.append(f"{path}: is a {found[0]}, expected a {' or a '.join(kinds)}{hint}")
+    errors.append(f"{path}: is a {found[0]}, expected a {' or a '.join(kinds)}{hint}")
     return None
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Read a file and parse it as TOML; raise ValueError with the line of a mistake."""
+    """Read a file and parse it as TOML; raise ValueError with the line of an error."""
     data = read_at_most(path, MAX_RECIPE_BYTES, "a recipe")
     content = utf8_text(data)
     if key := _LONG_KEY.search(content):

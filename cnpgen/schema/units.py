@@ -36,7 +36,7 @@ PLAUSIBLE_MAX = {si: largest for si, (_, largest, _) in _QUANTITIES.items() if l
 """SI unit -> largest plausible absolute value of a quantity; larger ones are probably in another unit."""
 
 OTHER_UNITS = {"rad": "deg", "m": "mm", "s": "ms", "kg": "g"}
-"""SI unit -> unit in which values are often given by mistake."""
+"""SI unit -> unit in which values are often given by error."""
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _QUANTITY = re.compile(rf"\s*({_NUMBER.pattern})(.*)", re.DOTALL)
@@ -53,7 +53,7 @@ def dimension(unit: str) -> str:
 def suggested_unit(value: float, unit: str, low: float = -math.inf, high: float = math.inf) -> str:
     """Return a hint for a value [unit] outside of its plausible range: ``"; did you mean 15 deg = 0.262 rad?"``.
 
-    The hint is empty for units without a common mistake, and if the converted value is outside of ``low`` to ``high``.
+    The hint is empty for units without a common error, and if the converted value is outside of ``low`` to ``high``.
     """
     base, slash, per = unit.partition("/")
     factor = float(UNITS[OTHER_UNITS[base]][1]) if base in OTHER_UNITS else 0.0
@@ -81,7 +81,7 @@ def parse_number(value: Any, unit: str) -> float:
         ordinary = 0.0 < abs(float(match[1])) < math.inf
         return _finite(Decimal(match[1]) if ordinary else float(match[1]), match[2], value, unit)
     if isinstance(value, bool | str) or not isinstance(value, int | float):
-        raise ValueError(f"expected {dimension(unit)}, got {show(value)}")  # noqa: TRY004 - a user's mistake
+        raise ValueError(f"expected {dimension(unit)}, got {show(value)}")  # noqa: TRY004 - a user's error
     return _finite(value, "", value, unit)
 
 
@@ -96,7 +96,7 @@ def parse_numbers(value: Any, unit: str, *, count: int | None = None) -> tuple[f
         _check_commas(match, value)
     items = [f"{item.strip()} {match[2].strip()}".strip() for item in match[1].split(",")] if match else value
     if not isinstance(items, list):
-        raise ValueError(f"expected a list, each {dimension(unit)}, got {show(value)}")  # noqa: TRY004 - a user's mistake
+        raise ValueError(f"expected a list, each {dimension(unit)}, got {show(value)}")  # noqa: TRY004 - a user's error
     if not items or (match and not match[1].strip()):
         raise ValueError("is empty, expected at least one number")
     if count not in (None, len(items)):

@@ -89,10 +89,10 @@ def file_kind(path: Path) -> str:
 
 
 def _hdf5_kind(path: Path) -> str:
-    from cnpgen.store.files.hdf5 import opened_hdf5
+    from cnpgen.store.files.hdf5 import open_hdf5
 
     try:
-        with opened_hdf5(path) as file:
+        with open_hdf5(path) as file:
             format_name, names = file.attributes.some(["format"]).get("format"), set(file)
     except (DatasetError, MachineError):
         return ANY_HDF5

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import DatasetError, nearest
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import committing
-from cnpgen.store.files.hdf5 import create_hdf5, opened_hdf5
+from cnpgen.store.files.hdf5 import create_hdf5, open_hdf5
 from cnpgen.store.scene_table import SceneTable, scene_attributes
 
 SHARD_FORMAT = "cnpgen-shard"
@@ -71,7 +71,7 @@ def write_shard(
     content = _encode(parts, attributes)
     with committing(path, work) as temporary:
         temporary.write_bytes(content)
-        with opened_hdf5(temporary) as file:
+        with open_hdf5(temporary) as file:
             shapes = {name: item.shape for name, item in file.columns().items()}
         expected = {field.name: field.shape(rows) for field in fields}
         if shapes != expected | {name: values.shape for name, values in arrays.items()}:
@@ -129,7 +129,7 @@ def read_shard(path: Path, fields: Sequence[str] | None = None) -> dict[str, NDA
 
     A damaged file and an unknown field raise DatasetError.
     """
-    with opened_hdf5(path) as file:
+    with open_hdf5(path) as file:
         known = list(file)
         for name in fields or ():
             if name not in known:
@@ -139,7 +139,7 @@ def read_shard(path: Path, fields: Sequence[str] | None = None) -> dict[str, NDA
 
 def read_attributes(path: Path, names: Sequence[str] | None = None) -> dict[str, str | int]:
     """Read attributes of a shard, by default all; a missing one raises DatasetError."""
-    with opened_hdf5(path) as file:
+    with open_hdf5(path) as file:
         values = {name: file.attributes[name] for name in (file.attributes if names is None else names)}
         return {name: value if isinstance(value, str) else int(value) for name, value in values.items()}
 
@@ -159,7 +159,7 @@ class StoredField:
 
 def read_schema(path: Path) -> dict[str, StoredField]:
     """Read the descriptions of the datasets of a shard, without their values."""
-    with opened_hdf5(path) as file:
+    with open_hdf5(path) as file:
         columns = file.columns().items()
         return {name: StoredField(item.shape, item.dtype, item.offset, item.attributes.all()) for name, item in columns}
 
@@ -169,7 +169,7 @@ def read_placements(path: Path) -> tuple[dict[str, StoredField], dict[str, int]]
 
     The identity consists of the attributes ``specification_key``, ``first_sample_id`` and ``rows`` of the file.
     """
-    with opened_hdf5(path) as file:
+    with open_hdf5(path) as file:
         columns = file.columns().items()
         placements = {name: StoredField(item.shape, item.dtype, item.offset, {}) for name, item in columns}
         return placements, {

@@ -44,7 +44,7 @@ def with_via_points(model: Model, boundary: Boundary, *, count: int = 24, seed: 
     with loaded_problem(model.problem) as loaded:
         if loaded.problem.has_sample_obstacles:
             raise UsageError("via points are for problems that place their obstacles", concerns="model")
-        placeholder = (tuple(loaded.robot.base.tolist()),)  # its value is not used
+        placeholder = (tuple(loaded.robot.home.tolist()),)  # its value is not used
         config = replace(model.config, via_points=placeholder)
         inference = make_inference_pipeline(loaded, config, scale_time=False, fixed_at_goal=model.fixed_at_goal)
         lower, upper = loaded.robot.position_lower, loaded.robot.position_upper

@@ -20,7 +20,7 @@ class TrajectorySpec:
         "control points of r(s) = ds/dt, the rate along it", default=20, low=4, high=MAX_CONTROL_POINTS
     )
 
-    def find_mistakes(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> Iterator[tuple[str, str]]:
         """Yield pairs of a key and its error message."""
         for key in ("path_control_points", "rate_control_points"):
             if getattr(self, key) <= self.degree:

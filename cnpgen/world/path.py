@@ -49,7 +49,7 @@ class PathWorld(RobotWorld[Array]):
         self._turn, self._offset = tip[:3, :3], tip[:3, 3].copy()
         self._segment_ends = np.array(self.robot.capsule_axes, np.int64).reshape(-1, 2)
         rest = np.zeros((self.robot.n, 1))
-        self.set_path(self.robot.base[:, None], rest, rest, place_obstacles(self.obstacles), rest)
+        self.set_path(self.robot.home[:, None], rest, rest, place_obstacles(self.obstacles), rest)
 
     def set_path(
         self, q: Array, dq: Array, ddq: Array, obstacle_poses: Array, jerk: Array | None = None, *, exact: bool = True

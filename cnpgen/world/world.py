@@ -186,7 +186,7 @@ class World(RobotWorld[float]):
         self._dynamics_data = self._model.createData()  # separate: RNEA's accelerations include gravity
         self._joints = sorted({point for segment in self.robot.capsule_axes for point in segment} - {self.robot.n})
         zero = np.zeros(self.robot.n)
-        self.set_state(self.robot.base, zero, zero, place_obstacles(self.obstacles))
+        self.set_state(self.robot.home, zero, zero, place_obstacles(self.obstacles))
 
     def set_state(self, q: Array, dq: Array, ddq: Array, obstacle_poses: Array, jerk: Array | None = None) -> None:
         """Move to a state.

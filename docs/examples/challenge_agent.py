@@ -123,7 +123,7 @@ class HitAgent(AgentBase):
     def __init__(self, env_info, **kwargs):
         super().__init__(env_info, **kwargs)
         self.planner = cnpgen.Planner("airhockey-online")
-        self.home = self.planner.robot.base
+        self.home = self.planner.robot.home
         self.mallet = Mallet(env_info)
         self.log = []
         self.reset()

@@ -180,14 +180,14 @@ def test_a_tracking_error_widens_the_margins_of_positions(run: Run, saved: Calla
     assert json.loads(out)["tracking_error_rad"] == [pytest.approx(np.deg2rad(2))]
     code, out, _ = run(file, "--tracking-error", ",".join(["0"] * 7))
     assert code == 0
-    for value, mistake in (
+    for value, error in (
         ("-1deg", "expected angles"),
         ("2 deg of", "expected angles"),
         ("1deg,1deg", "one per joint"),
     ):
         code, _, err = run(file, f"--tracking-error={value}")
         assert code == 2
-        assert mistake in err
+        assert error in err
 
 
 def test_the_problem_that_is_given_decides_and_must_be_the_same(run: Run, saved: Callable[[Plans], Path]) -> None:

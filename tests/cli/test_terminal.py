@@ -64,7 +64,7 @@ def test_a_name_that_does_not_exist_is_shown_so(tmp_path: Path, capsys: pytest.C
     assert r"\u001b[31m is not there" in capsys.readouterr().err
 
 
-def test_mistakes_in_a_recipe_are_shown_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_recipe_errors_in_a_recipe_are_shown_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "evil.toml").write_text('"\\u001b[31mkey" = 1\nname = "\\u001b[31m"\n"\\u009b2J" = 2', encoding="utf-8")
     assert main(["show", str(tmp_path / "evil.toml")]) == 2
     assert not {"\x1b", "\x9b"} & set(capsys.readouterr().err)

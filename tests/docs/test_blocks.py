@@ -165,7 +165,7 @@ def test_the_constraint_of_the_docs_is_measured_along_a_path_as_at_single_states
     keep_out = module["KeepOut"](x=1.0, y=0.0, radius=0.1, tolerance=1e-3)
     problem = load_problem("airhockey")
     robot = load_robot(problem)
-    q = np.linspace(robot.base, 0.5 * robot.base, 20).T
+    q = np.linspace(robot.home, 0.5 * robot.home, 20).T
     path, world, still = (
         PathWorld(robot, problem.obstacle, problem.object_size),
         World(robot, problem.obstacle, problem.object_size),

@@ -102,13 +102,13 @@ def test_the_search_finds_words_of_pages_and_names(site: Path) -> None:
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("mistake", ["[gone](gone.md)", "[gone](splines.md#no-such-heading)"])
-def test_a_broken_link_fails_the_build(mistake: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("error", ["[gone](gone.md)", "[gone](splines.md#no-such-heading)"])
+def test_a_broken_link_fails_the_build(error: str, tmp_path: Path) -> None:
     for library in ("sphinx", "myst_parser", "furo"):
         pytest.importorskip(library)
     source = copy_of_the_repository(tmp_path / "source")
     with (source / "docs" / "concepts" / "scenes.md").open("a", encoding="utf-8") as page:
-        page.write(f"\n{mistake}\n")
+        page.write(f"\n{error}\n")
     done = build(source, tmp_path / "site", builder="dummy")  # resolves links and writes nothing
     assert done.returncode != 0
     assert "scenes.md" in done.stderr

@@ -72,7 +72,7 @@ def differences(robot: Robot, bodies: Sequence[Body], *, rtol: float = 1e-9) -> 
             "mass times center": (inertia.mass * lever, body.mass_center),
             "inertia about the origin": (about_origin, body.inertia),
             "placement": (placement.homogeneous, body.placement),
-            "axis": (subspace[:3] if robot.sliding[index - 1] else subspace[3:], body.axis),
+            "axis": (subspace[:3] if robot.prismatic[index - 1] else subspace[3:], body.axis),
             "limits": (np.array(limits), body.limits),
         }
         for part, (actual, expected) in pairs.items():

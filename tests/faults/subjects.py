@@ -450,7 +450,7 @@ def _read_embedded(folder: Path, draw: Random) -> None:
         model = load_model(folder / "model.h5")
         record, robot = model.problem, open_problem(model.problem)[1]
         if draw.random() < 0.2:
-            Planner(model, backend="numpy").plan(robot.base, robot.base + 0.1)
+            Planner(model, backend="numpy").plan(robot.home, robot.home + 0.1)
     assert differences(robot, bodies_in(record.urdf, robot.joint_names)) == []
 
 

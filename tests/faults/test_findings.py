@@ -58,8 +58,8 @@ def test_an_archive_whose_damage_a_library_reports_with_the_content_of_the_file(
 
 def test_a_long_line_of_a_recipe() -> None:
     error = RecipeError(["key" * MAX_LINE_LENGTH, "another"])
-    assert [len(line) <= MAX_LINE_LENGTH for line in error.mistakes] == [True, True]
-    assert RecipeError(error.mistakes).mistakes == error.mistakes
+    assert [len(line) <= MAX_LINE_LENGTH for line in error.errors] == [True, True]
+    assert RecipeError(error.errors).errors == error.errors
 
 
 @pytest.mark.parametrize("planned", [True, False])

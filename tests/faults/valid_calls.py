@@ -134,7 +134,7 @@ def _of_problems(problem: Any, plans: Any) -> list[ValidCall]:
     robot, q = cnpgen.RobotModel(problem), plans.boundary.start_q
     place = {"start_xyz": plans.columns["start_xyz"], "goal_xyz": plans.columns["goal_xyz"]}
     scene = robot.scene(**place)
-    base = robot.base
+    base = robot.home
     goal = plans.columns["goal_xyz"][0]
     return [
         ValidCall("load_problem", cnpgen.load_problem, {"name_or_path": "airhockey"}),
@@ -145,7 +145,7 @@ def _of_problems(problem: Any, plans: Any) -> list[ValidCall]:
             {"recipe": "airhockey-hit", "start_q": base, "goal_xyz": goal, "hit_angle": 0.1, "hit_speed_share": 0.5},
         ),
         ValidCall("Problem", cnpgen.Problem, _fields(problem)),
-        ValidCall("Problem.find_mistakes", problem.find_mistakes),
+        ValidCall("Problem.validate", problem.validate),
         ValidCall("Problem.first", problem.first, {"kind": type(problem.constraint[0])}),
         ValidCall("RobotModel", cnpgen.RobotModel, {"problem": problem}),
         ValidCall("RobotModel.constraint_values", robot.constraint_values, {"q": q}),
@@ -231,7 +231,7 @@ def _of_planners(folder: Path, model: Any, dataset: Any, plans: Any) -> list[Val
         "path_gradient": np.zeros_like(plans.path_control_points),
         "rate_gradient": np.zeros_like(plans.rate_control_points),
     }
-    base = hits.robot.base
+    base = hits.robot.home
     rest = planner.plan(base, base + 0.1)
     state = (base, np.zeros(6), np.zeros(6))
     long_runs = frozenset({"steps", "epochs", "cpu_seconds", "check_rows"})
@@ -325,15 +325,15 @@ def _of_benchmark(folder: Path, problem: Any, plans: Any) -> list[ValidCall]:
     prefix = benchmark.ExecutedPrefix(plans.motion, plans.duration / 2)
     return [
         ValidCall("ReplanningScenario", benchmark.ReplanningScenario, _fields(scenario)),
-        ValidCall("ReplanningScenario.find_mistakes", scenario.find_mistakes),
+        ValidCall("ReplanningScenario.validate", scenario.validate),
         ValidCall("load_suite", benchmark.load_suite, {"name_or_path": "hits-81"}),
         ValidCall("Suite", benchmark.Suite, _fields(suite)),
-        ValidCall("Suite.find_mistakes", suite.find_mistakes),
+        ValidCall("Suite.validate", suite.validate),
         ValidCall("Suite.problems", suite.problems, {"n": 1}),
         ValidCall("SampledProblems", benchmark.SampledProblems, {"recipe": "airhockey-hit"}),
         ValidCall("SceneFileProblems", benchmark.SceneFileProblems, {"file": "scenes.h5", "robot": "panda"}),
         ValidCall("Pucks", benchmark.Pucks, _fields(suite.pucks)),
-        ValidCall("Pucks.find_mistakes", suite.pucks.find_mistakes),
+        ValidCall("Pucks.validate", suite.pucks.validate),
         ValidCall("Pucks.positions", suite.pucks.positions),
         ValidCall("Plant", benchmark.Plant, {"name": "mine", "title": "mine"}),
         ValidCall("Setting", benchmark.Setting, {"problem": plans.problem}),
@@ -375,7 +375,7 @@ def _of_recipes(problem: Any) -> list[ValidCall]:
         ValidCall("load_pipeline", recipes.load_pipeline, {"name_or_path": "airhockey-hit"}),
         ValidCall("DatasetRecipe", recipes.DatasetRecipe, _fields(recipe)),
         ValidCall("Pipeline", recipes.Pipeline, _fields(recipe.pipeline)),
-        ValidCall("Pipeline.find_mistakes", recipe.pipeline.find_mistakes),
+        ValidCall("Pipeline.validate", recipe.pipeline.validate),
         ValidCall("ProblemRecord", recipes.ProblemRecord, {"recipe": stored.recipe, "urdf": stored.urdf}),
         ValidCall("ProblemRecord.differences", stored.differences, {"other": stored}),
         ValidCall("ProblemRecord.restored", stored.restored),
@@ -428,7 +428,7 @@ def _of_sampled(folder: Path, problem: Any, plans: Any) -> list[ValidCall]:
 
 def _of_runtime() -> list[ValidCall]:
     planner = cnpgen.Planner("airhockey-replan")
-    base = planner.robot.base
+    base = planner.robot.home
     runtime = results.PlanRuntime(planner, base)
     plan = planner.plan(base, base)
     return [

@@ -122,7 +122,7 @@ def test_maxima_that_are_not_parabolic_are_decided_correctly(
 def test_a_kink_of_the_torque_at_a_knot_of_either_spline_is_sampled() -> None:
     """Splines of degree 3 have accelerations with kinks, here with a maximum at a knot of one of them."""
     plan, points, rates, knot = load("hit"), 9, 16, 1 / 6
-    path = np.repeat(plan.robot.base[None, None], points, axis=1)
+    path = np.repeat(plan.robot.home[None, None], points, axis=1)
     bumps = np.clip(1 - 6 * np.abs(np.arange(7) / 6 - knot), 0, None) - 0.5 * (np.abs(np.arange(7) - 1) == 1)
     path[0, :, 1] += 300 * np.linalg.lstsq(basis(np.arange(7) / 6, points, 3, 2), bumps, rcond=None)[0]
     motion = Motion(path, np.full((1, rates), 2.0), 3)

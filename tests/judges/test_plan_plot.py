@@ -147,7 +147,7 @@ def test_the_arm_of_a_transport_is_as_wide_as_its_capsules(drawn):
 def test_an_arm_with_link_geometry_is_drawn_by_its_parts(drawn, tmp_path):
     problem = load_problem(write_problem(tmp_path))
     robot = load_robot(problem)
-    path, rate = np.tile(robot.base, (1, 15, 1)), np.ones((1, 20))
+    path, rate = np.tile(robot.home, (1, 15, 1)), np.ones((1, 20))
     path[0, 7] += 0.3
     plot_plan(problem, robot, Motion(path, rate, 7), 0, Path("plan.png"))
     areas = axes_of(drawn[0])["top view"].collections

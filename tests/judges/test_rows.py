@@ -72,7 +72,7 @@ def hit_row(robot: Robot, random: np.random.Generator, *, share: float) -> Colum
     """Draw a motion that starts near the table and hits with a fraction of the highest possible speed."""
     start_xyz = np.array([random.uniform(0.7, 0.9), random.uniform(-0.2, 0.2), 0.16 + random.uniform(-4e-3, 4e-3)])
     goal_xyz = np.array([random.uniform(0.8, 1.0), random.uniform(-0.2, 0.2), 0.16])
-    start_q, goal_q = (inverse_kinematics(robot, robot.base, xyz, upright=False) for xyz in (start_xyz, goal_xyz))
+    start_q, goal_q = (inverse_kinematics(robot, robot.home, xyz, upright=False) for xyz in (start_xyz, goal_xyz))
     gain = jacobian(robot, start_q)[2]
     start_dq = random.uniform(-1, 1, robot.n)
     start_dq -= gain * (gain @ start_dq) / (gain @ gain)
@@ -348,7 +348,7 @@ def rise_faster(case: Case, columns: Columns, row: int) -> None:
 
 def leave_table(case: Case, columns: Columns, row: int) -> None:
     xyz = np.array([0.6 - 1e-5, 0.0, 0.16])
-    columns["start_q"][row] = inverse_kinematics(case.robot, case.robot.base, xyz, upright=False)
+    columns["start_q"][row] = inverse_kinematics(case.robot, case.robot.home, xyz, upright=False)
     columns["start_xyz"][row], columns["start_dq"][row], columns["start_ddq"][row] = xyz, 0.0, 0.0
 
 

@@ -332,7 +332,7 @@ def test_solvers_give_the_same_bits_in_any_order_of_lanes(prepare: Prepare, back
     else:
         loop = Loop(hitting_newton.NEWTON_TOLERANCE_RAD, hitting_newton.MAX_NEWTON_STEPS)
         kernel = kernels.load(hitting_newton.newton_step, loop)
-        arguments = [q, p, np.stack([np.cos(angle), np.sin(angle)]), np.repeat(robot.base[:, None], 203, axis=1)]
+        arguments = [q, p, np.stack([np.cos(angle), np.sin(angle)]), np.repeat(robot.home[:, None], 203, axis=1)]
     whole = kernel(*arguments)
     for order in (random.permutation(203), np.arange(202, -1, -1), random.permutation(203)[:77]):
         again = kernel(*(np.ascontiguousarray(x[:, order]) for x in arguments))

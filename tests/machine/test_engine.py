@@ -29,7 +29,7 @@ from cnpgen.errors import MachineError, UsageError
 from cnpgen.machine.engine import Engine, assembled
 from cnpgen.make.make_dataset import _without_local_paths
 from cnpgen.make.make_shards import _PREPARED, make_shards
-from cnpgen.make.resolve_spec import draw_up
+from cnpgen.make.resolve_spec import resolve
 from cnpgen.store.dataset_spec import shards, write_dataset_spec
 from cnpgen.store.workspace import find_workspace
 from cnpgen.validate.validate_dataset import validate_dataset
@@ -169,7 +169,7 @@ def test_that_nobody_works_is_said_again_after_twice_the_time(monkeypatch, caplo
 def test_a_machine_elsewhere_needs_nothing_but_the_folder_and_refuses_to_make_other_rows(tmp_path, monkeypatch):
     recipe = tiny_recipe("airhockey-hit")
     folder = tmp_path / "out"
-    job = draw_up(recipe, find_workspace(folder), shard_size=TINY_SHARD, backend="numpy")
+    job = resolve(recipe, find_workspace(folder), shard_size=TINY_SHARD, backend="numpy")
     theirs = pickle.loads(pickle.dumps(_without_local_paths(job)))
     assert theirs.pipeline is theirs.cache_folder is None
     monkeypatch.chdir(tmp_path)

@@ -264,7 +264,7 @@ def test_a_place_that_the_system_does_not_give_is_a_machine_error(capsys):
 @pytest.mark.usefixtures("file_permissions")
 def test_a_read_only_folder_is_a_machine_error_before_any_work_is_done(tmp_path, capsys, monkeypatch):
     tmp_path.chmod(0o555)
-    monkeypatch.setattr("cnpgen.make.make_dataset.draw_up", None)
+    monkeypatch.setattr("cnpgen.make.make_dataset.resolve", None)
     code, line = refused(capsys, str(tmp_path / "new"))
     assert code == 3
     assert line.endswith("new: Permission denied; choose a folder that you may write to")

@@ -18,7 +18,7 @@ from cnpgen.make.make_dataset import _part as make_part
 from cnpgen.make.make_dataset import is_quick, make_dataset, runs
 from cnpgen.make.make_shards import Job, make_shards, shard_columns
 from cnpgen.make.recipe import load_dataset_recipe
-from cnpgen.make.resolve_spec import draw_up
+from cnpgen.make.resolve_spec import resolve
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.pipelines.stages.ik import StartIK
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS
@@ -128,7 +128,7 @@ def test_the_default_folder_is_named_after_the_dataset_and_its_major_version(tmp
 
 
 def test_planning_writes_nothing(tmp_path):
-    job = draw_up(tiny_recipe("airhockey-hit"), find_workspace(tmp_path / "out"))
+    job = resolve(tiny_recipe("airhockey-hit"), find_workspace(tmp_path / "out"))
     assert sum(job.spec.splits.values()) == 660
     assert list(tmp_path.iterdir()) == []
 
@@ -218,7 +218,7 @@ def test_the_worst_violation_of_every_check_is_recorded(tiny):
 @pytest.fixture(scope="module")
 def job(tmp_path_factory: pytest.TempPathFactory) -> Job:
     folder = tmp_path_factory.mktemp("job") / "out"
-    job = draw_up(tiny_recipe("airhockey-hit"), find_workspace(folder), shard_size=TINY_SHARD)
+    job = resolve(tiny_recipe("airhockey-hit"), find_workspace(folder), shard_size=TINY_SHARD)
     open_workspace(job.folder, job.spec)
     return job
 

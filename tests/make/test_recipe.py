@@ -123,15 +123,15 @@ def test_the_digest_changes_with_stages_problem_and_urdf(recipe, tmp_path):
 
 def test_base_has_one_value_per_planned_joint():
     robot = RobotSpec(urdf="arm.urdf", joints=("a", "b"), tip="hand", base=(0.0, 0.0))
-    assert list(robot.find_mistakes()) == []
-    assert list(replace(robot, base=(0.0,)).find_mistakes()) == [
+    assert list(robot.validate()) == []
+    assert list(replace(robot, base=(0.0,)).validate()) == [
         ("base", "expected 2 numbers, one per planned joint, got 1")
     ]
 
 
 def test_a_joint_is_planned_once():
     robot = RobotSpec(urdf="arm.urdf", joints=("a", "a"), tip="hand", base=(0.0, 0.0))
-    assert [key for key, _ in robot.find_mistakes()] == ["joints"]
+    assert [key for key, _ in robot.validate()] == ["joints"]
 
 
 @pytest.mark.parametrize(
@@ -139,18 +139,18 @@ def test_a_joint_is_planned_once():
 )
 def test_an_obstacle_has_either_a_top_or_an_object_on_it(top, below, keys):
     obstacle = Obstacle(name="box", x=Range(0.0, 1.0), y=Range(0.0, 1.0), top=top, below=below)
-    assert [key for key, _ in obstacle.find_mistakes()] == keys
+    assert [key for key, _ in obstacle.validate()] == keys
 
 
 def test_an_obstacle_has_an_extent():
     obstacle = Obstacle(name="box", x=Range(0.0, 0.0), y=Range(1.0, 1.0), top=0.0)
-    assert [key for key, _ in obstacle.find_mistakes()] == ["x", "y"]
+    assert [key for key, _ in obstacle.validate()] == ["x", "y"]
 
 
 @pytest.mark.parametrize(("count", "keys"), [(8, []), (7, ["path_control_points"])])
 def test_a_spline_has_more_control_points_than_its_degree(count, keys):
     spec = TrajectorySpec(degree=7, path_control_points=count)
-    assert [key for key, _ in spec.find_mistakes()] == keys
+    assert [key for key, _ in spec.validate()] == keys
 
 
 @pytest.mark.parametrize("name", list_recipes("dataset"))
@@ -173,10 +173,10 @@ def thin_object(folder: Path, size: str) -> Path:
 def test_there_are_not_more_of_anything_than_kernels_can_be_compiled_for(recipe, key):
     whole = recipe.pipeline if key == "stage" else load_problem("heavy-object")
     many = replace(whole, **{key: getattr(whole, key)[:1] * 101})
-    assert [(where, text.partition(" of them")[0].partition(" stages")[0]) for where, text in many.find_mistakes()] == [
+    assert [(where, text.partition(" of them")[0].partition(" stages")[0]) for where, text in many.validate()] == [
         (key, "there are 101")
     ]
-    assert list(replace(whole, **{key: getattr(whole, key)[:1] * 100}).find_mistakes()) == []
+    assert list(replace(whole, **{key: getattr(whole, key)[:1] * 100}).validate()) == []
 
 
 def test_notes_that_are_a_link_to_another_folder_are_not_passed_on(tmp_path):

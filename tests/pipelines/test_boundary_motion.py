@@ -145,7 +145,7 @@ def test_velocities_in_a_singular_pose_stay_within_their_limits_and_on_the_table
     prepared = prepare("airhockey-replan")
     robot, arm = prepared.context.robot, Arm(prepared.context.robot)
     kernel = prepared.context.kernels.load(table_velocity)
-    q = np.repeat(np.where(np.arange(6) % 2 == 0, 0.0, robot.base)[:, None], 200, axis=1)
+    q = np.repeat(np.where(np.arange(6) % 2 == 0, 0.0, robot.home)[:, None], 200, axis=1)
     random = np.random.default_rng(64)
     dq, _ = kernel(q, random.uniform(-1, 1, q.shape), random.random((1, 200)))
     assert np.all(np.abs(dq) <= robot.velocity_limit[:, None])

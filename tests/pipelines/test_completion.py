@@ -66,7 +66,7 @@ def test_a_start_given_by_its_position_is_at_this_position(prepared, rows):
 def test_a_missing_start_is_the_base_at_rest(prepare):
     prepared = prepare("airhockey-replan")
     tasks = completed(prepared, {"goal_xyz": np.array([[1.0], [0.1]]), "hit_angle": np.array([[0.2]])})
-    np.testing.assert_array_equal(tasks["start_q"][:, 0], prepared.context.robot.base)
+    np.testing.assert_array_equal(tasks["start_q"][:, 0], prepared.context.robot.home)
     assert not tasks["start_dq"].any()
     assert np.abs(tasks["start_ddq"]).max() < 1e-12
     np.testing.assert_array_equal(tasks["goal_xyz"][:, 0], [1.0, 0.1, 0.16])  # the table has one height
@@ -109,7 +109,7 @@ def test_an_unsolved_task_has_a_reason_and_does_not_change_other_tasks(prepare, 
 
 def test_a_measured_start_has_the_tolerance_of_motions(prepare):
     prepared = prepare("airhockey-replan")
-    base = prepared.context.robot.base
+    base = prepared.context.robot.home
     start = np.repeat(base[:, None], 3, axis=1)
     start[5, 1] += 3e-3
     start[3, 2] += 0.1

@@ -133,7 +133,7 @@ def test_the_heavy_object_guess_is_table_ii_with_its_erratum(prepare):
 def test_without_a_guess_the_search_starts_from_the_base_configuration(prepare):
     prepared = prepare("airhockey-hit")
     guess = run_stages(prepared, 50, until="StartIK")["guess_q"]
-    np.testing.assert_array_equal(guess, np.repeat(prepared.context.robot.base[:, None], guess.shape[1], axis=1))
+    np.testing.assert_array_equal(guess, np.repeat(prepared.context.robot.home[:, None], guess.shape[1], axis=1))
 
 
 # --- directions -------------------------------------------------------------------------------------------------------

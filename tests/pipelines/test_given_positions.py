@@ -65,7 +65,7 @@ def test_the_81_pucks_are_met_behind_their_centres_as_fast_as_possible(prepare: 
     along /= np.linalg.norm(along, axis=0)
     np.testing.assert_allclose(rows["goal_xyz"][:2], puck - 0.07 * along, atol=1e-12)
     np.testing.assert_array_equal(rows["hit_speed"], rows["hit_speed_max"])
-    np.testing.assert_array_equal(rows["start_q"].T, [prepared.context.robot.base] * 81)
+    np.testing.assert_array_equal(rows["start_q"].T, [prepared.context.robot.home] * 81)
     arm = Arm(prepared.context.robot)
     for i in range(0, 81, 9):
         q, dq = rows["goal_q"][:, i].copy(), rows["goal_dq"][:, i].copy()
@@ -119,7 +119,7 @@ def test_two_splits_of_the_same_tasks_raise_an_error(recipe, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("positions", "mistake"),
+    ("positions", "error"),
     [
         ("", "stage 1.goal: either a list of goals or a grid"),
         (THREE + '\ngrid = ["[0, 1] m", "0 m", "0 m"]\ncounts = [1, 1, 1]', "either a list of goals or a grid"),
@@ -132,10 +132,10 @@ def test_two_splits_of_the_same_tasks_raise_an_error(recipe, tmp_path):
         ('grid = ["[0, 1] m", "0 m", "0 m"]\ncounts = [2, 0, 1]', "0 is too small, expected at least 1"),
     ],
 )
-def test_mistakes_in_the_recipe_name_their_keys(recipe, positions, mistake):
+def test_recipe_errors_in_the_recipe_name_their_keys(recipe, positions, error):
     with pytest.raises(RecipeError) as error:
         load_pipeline(recipe(positions))
-    assert mistake in str(error.value)
+    assert error in str(error.value)
 
 
 def test_listed_starts_are_solved_by_a_later_stage(tmp_path, prepare):

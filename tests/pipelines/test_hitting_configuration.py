@@ -60,7 +60,7 @@ def solved(request: pytest.FixtureRequest, prepare: Prepare) -> list[tuple[Searc
     robot, arm = prepared.context.robot, Arm(prepared.context.robot)
     candidates = run_stages(prepared, 80, seed=41, until="HittingConfiguration")
     n = len(candidates.alive)
-    home = np.repeat(robot.base[:, None], n, axis=1) if request.param == "airhockey-hit" else candidates["start_q"]
+    home = np.repeat(robot.home[:, None], n, axis=1) if request.param == "airhockey-hit" else candidates["start_q"]
     first = prepared.context.kernels.load(ik_step, Loop(IK_TOLERANCE, MAX_IK_STEPS), vertical=False, max_step=0.4)
     guess, _ = first(home, candidates["goal_xyz"])
     angle = candidates["hit_angle"][0]
@@ -163,7 +163,7 @@ def test_eliminated_joints_move_the_tip_in_all_directions_near_the_base(prepare)
     robot = prepare("airhockey-hit").context.robot
     arm, joints, random = Arm(robot), basic_joints(robot), np.random.default_rng(44)
     for _ in range(200):
-        q = np.clip(robot.base + random.uniform(-0.5, 0.5, robot.n), robot.position_lower, robot.position_upper)
+        q = np.clip(robot.home + random.uniform(-0.5, 0.5, robot.n), robot.position_lower, robot.position_upper)
         assert abs(np.linalg.det(arm.jacobian(q)[:3, joints])) > 1e-3
 
 
@@ -203,7 +203,7 @@ def test_no_candidate_is_rejected_at_a_joint_limit(prepare):
 def cramped(prepare: Prepare) -> list[tuple[Search, Array]]:
     """Searches of an arm that may move each joint 0.6 rad only, and our optima that are on a limit."""
     context = prepare("airhockey-replan").context
-    base, low, high = context.robot.base, context.robot.position_lower, context.robot.position_upper
+    base, low, high = context.robot.home, context.robot.position_lower, context.robot.position_upper
     robot = replace(
         context.robot, position_lower=np.maximum(low, base - 0.6), position_upper=np.minimum(high, base + 0.6)
     )

@@ -25,8 +25,8 @@ def states(kind: str, robot) -> list[tuple[Array, Array]]:
     random = np.random.default_rng(51)
     poses = [random.uniform(robot.position_lower, robot.position_upper) for _ in range(60)]
     if kind == "base":
-        exact = np.where(np.arange(6) % 2 == 0, 0.0, robot.base)
-        return [(q, d) for q in (robot.base, exact) for d in AXES + any_direction(random, 20)]
+        exact = np.where(np.arange(6) % 2 == 0, 0.0, robot.home)
+        return [(q, d) for q in (robot.home, exact) for d in AXES + any_direction(random, 20)]
     if kind == "anywhere":
         return [(q, d) for q in poses for d in AXES[:3] + any_direction(random, 3)]
     if kind == "in a vertical plane":  # q1 = q3 = q5 = 0: the joints' axes are parallel in pairs
@@ -162,9 +162,9 @@ def test_a_stretched_arm_that_cannot_move_along_the_hit_is_rejected(prepare: Pre
 def test_hits_below_the_minimum_speed_are_rejected(prepare: Prepare):
     prepared = prepare("airhockey-hit")
     robot = prepared.context.robot
-    assert len(stage_on(prepared, robot.base, 0.0).alive) == 1
+    assert len(stage_on(prepared, robot.home, 0.0).alive) == 1
     candidates = CandidateBatch(1)
-    candidates["goal_q"], candidates["hit_angle"] = robot.base[:, None].copy(), np.zeros((1, 1))
+    candidates["goal_q"], candidates["hit_angle"] = robot.home[:, None].copy(), np.zeros((1, 1))
     HittingVelocity(full_speed=1.0, min_speed=10.0).prepare(prepared.context)(candidates, np.random.default_rng(0))
     assert candidates.reasons == ["no hitting velocity"]
     assert len(candidates.alive) == 0

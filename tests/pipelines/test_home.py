@@ -42,7 +42,7 @@ def test_a_home_is_the_start_the_base_or_a_configuration_at_a_random_position(st
     guess = next(stage for stage in prepared.pipeline.stage if type(stage).__name__ == "StartIK").guess
     found = after(prepared, candidates, Home(at_start=0.5, at_base=0.2, position=BOX, guess=guess))
     start = (found["home_q"] == found["start_q"]).all(axis=0)
-    base = (found["home_q"] == prepared.context.robot.base[:, None]).all(axis=0)
+    base = (found["home_q"] == prepared.context.robot.home[:, None]).all(axis=0)
     assert start.mean() == pytest.approx(0.5, abs=0.04)
     assert base.mean() == pytest.approx(0.2, abs=0.04)
     arm = Arm(prepared.context.robot)
@@ -65,10 +65,10 @@ def test_the_home_of_a_task_is_its_start(started) -> None:
 
 
 def test_fractions_with_a_sum_above_one_are_a_mistake() -> None:
-    mistakes: list[str] = []
+    errors: list[str] = []
     table = {"use": "home", "at_start": 0.7, "at_base": 0.4, "position": ["[0.6, 1.3] m", "[-0.4, 0.4] m", "0.16 m"]}
-    read_kind(registry.STAGES, table, RecipeLocation("x.toml"), mistakes)
-    assert "must not be more than 1 together, got 1.1" in mistakes[0]
+    read_kind(registry.STAGES, table, RecipeLocation("x.toml"), errors)
+    assert "must not be more than 1 together, got 1.1" in errors[0]
 
 
 def test_a_goal_sampled_alone_has_the_minimum_distance_from_the_start(started) -> None:

@@ -77,7 +77,7 @@ def test_an_object_held_upside_down_is_turned_upright(prepare):
 def test_positions_out_of_reach_are_rejected(prepare):
     prepared = prepare("airhockey-hit")
     kernel = prepared.context.kernels.load(ik_step, Loop(IK_TOLERANCE, MAX_IK_STEPS), vertical=False, max_step=0.4)
-    base = np.repeat(prepared.context.robot.base[:, None], 5, axis=1)
+    base = np.repeat(prepared.context.robot.home[:, None], 5, axis=1)
     far = np.array([[3.0, 0.0, 0.16], [1.2, 1.2, 0.16], [0.0, 0.0, 2.9], [5.0, 5.0, 5.0], [0.65, 0.0, 0.16]]).T.copy()
     q, error = kernel(base, far)
     assert np.all(error[0, :4] > 1e-2)
@@ -214,6 +214,6 @@ def test_goals_of_tasks_are_solved_from_the_start(prepare, anywhere):
 
 @pytest.mark.parametrize("key", ["from_start", "at_limit"])
 def test_options_of_guesses_require_guesses(key):
-    mistakes: list[str] = []
-    read_kind(registry.STAGES, {"use": "goal-ik", key: 0.5}, RecipeLocation("x.toml"), mistakes)
-    assert f"{key}: needs random guesses" in mistakes[0]
+    errors: list[str] = []
+    read_kind(registry.STAGES, {"use": "goal-ik", key: 0.5}, RecipeLocation("x.toml"), errors)
+    assert f"{key}: needs random guesses" in errors[0]

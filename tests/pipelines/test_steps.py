@@ -51,12 +51,12 @@ def test_a_stage_that_changes_unit_and_width_of_a_field_raises_an_error(
     pipeline = with_stage(kind, monkeypatch)
     with pytest.raises(RecipeError) as caught:
         prepare(pipeline)
-    (mistake,) = caught.value.mistakes
-    assert mistake.startswith(
+    (error,) = caught.value.errors
+    assert error.startswith(
         f"{pipeline.path}: stage {len(pipeline.stage)} (again): declares start_q as unit 'furlong', "
     )
     text = r"width 2, names \('a', 'b'\), but stage \d \(.*\) before it as unit 'rad', width 6, names \('joint_1', "
-    assert re.search(text, mistake)
+    assert re.search(text, error)
 
 
 @pytest.mark.parametrize(("key", "value"), [("dtype", "int64"), ("frame", "table"), ("names", tuple("abcdef"))])

@@ -235,7 +235,7 @@ def test_a_tip_speed_limit_of_a_plug_in_scales_time_and_projects_no_line(tmp_pat
     kernels = problem_kernels(problem, given.robot, "numpy", tmp_path)
     assert effective_steps(kernels, 1) == 1
     assert kernels.tape(equality_residuals).outputs == given.kernels.tape(equality_residuals).outputs
-    q = np.stack([given.robot.base, given.robot.base])
+    q = np.stack([given.robot.home, given.robot.home])
     q[1, 0] += 0.3
     rest = np.zeros((1, 6))
     boundary, rate = Boundary(q[:1], rest, rest, q[1:], rest), np.full((1, 20), 1.0)

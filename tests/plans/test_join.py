@@ -58,11 +58,11 @@ def test_what_is_joined_is_each_plan_in_its_time_and_nowhere_jumps(three):
 
 
 def test_what_follows_a_whole_plan_begins_at_its_end(planner):
-    aside = planner.robot.base.copy()
+    aside = planner.robot.home.copy()
     aside[0] += 0.1
-    first = planner.plan(planner.robot.base, aside)
+    first = planner.plan(planner.robot.home, aside)
     end = first.states_at(first.duration)
-    second = planner.plan(end[0], planner.robot.base, start_dq=end[1], start_ddq=end[2])
+    second = planner.plan(end[0], planner.robot.home, start_dq=end[1], start_ddq=end[2])
     np.testing.assert_allclose(join_plans(first, second).duration, first.duration + second.duration)
 
 

@@ -1,4 +1,4 @@
-"""Mistakes in robots are reported with the element that has them."""
+"""Errors in robots are reported with the element that has them."""
 
 from pathlib import Path
 from xml.etree import ElementTree
@@ -22,7 +22,7 @@ def crane(folder: Path, old: str, new: str, more: str = "") -> Path:
     return file
 
 
-def mistakes(file: Path) -> str:
+def errors(file: Path) -> str:
     with pytest.raises(RecipeError) as caught:
         load_robot(load_problem(file))
     return str(caught.value)
@@ -30,7 +30,7 @@ def mistakes(file: Path) -> str:
 
 def test_a_file_for_xacro_is_told_from_a_urdf(tmp_path):
     new = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="crane"><xacro:arm side="left"/>'
-    found = mistakes(crane(tmp_path, '<robot name="crane" version="1.2">', new))
+    found = errors(crane(tmp_path, '<robot name="crane" version="1.2">', new))
     assert (
         "robot.urdf: crane.urdf is to be read by xacro, expected a URDF: run 'xacro crane.urdf > robot.urdf'" in found
     )
@@ -43,7 +43,7 @@ def test_a_locked_joint_that_cannot_stand_at_zero_is_a_mistake(tmp_path):
     file = write_problem(tmp_path)
     text = before + f'<joint name="{grip}"' + after.replace(limit, limit.replace('lower="-2.5"', 'lower="0.1"'))
     (tmp_path / "crane" / "crane.urdf").write_text(text)
-    assert "'grip' is not planned and stays at zero, which is outside of its limits [0.1, 2.5]" in mistakes(file)
+    assert "'grip' is not planned and stays at zero, which is outside of its limits [0.1, 2.5]" in errors(file)
     end = text.index("</joint>", text.index(f'<joint name="{grip}"'))
     follows = text[:end] + '<mimic joint="other"/>' + text[end:]  # where such a joint stands is checked elsewhere
     (tmp_path / "crane" / "crane.urdf").write_text(follows)
@@ -52,7 +52,7 @@ def test_a_locked_joint_that_cannot_stand_at_zero_is_a_mistake(tmp_path):
 
 def test_joints_that_move_nothing_heavy_have_no_torques(tmp_path):
     file = crane(tmp_path, '<mass value="1"/>', '<mass value="0"/>', more=TORQUE)
-    found = mistakes(file)
+    found = errors(file)
     assert found.count("no link that it moves has a mass") == 4
     assert "swing: no link that it moves has a mass" in found
     (tmp_path / "problem.toml").write_text(file.read_text().replace(TORQUE, ""))
@@ -62,7 +62,7 @@ def test_joints_that_move_nothing_heavy_have_no_torques(tmp_path):
 def test_a_tip_that_is_not_there_is_refused_with_all_frames(tmp_path):
     file = write_problem(tmp_path)
     file.write_text(file.read_text().replace('tip = "hand"', 'tip = "hnad"'))
-    found = mistakes(file)
+    found = errors(file)
     assert "robot.tip: crane.urdf has no frame 'hnad' (did you mean 'hand'?); its frames: base, turret, arm" in found
 
 
@@ -86,7 +86,7 @@ def limited(folder: Path, limit: str) -> Path:
     ],
 )
 def test_limits_far_above_those_of_the_urdf_are_in_another_unit(tmp_path, limit, text):
-    found = mistakes(limited(tmp_path, limit))
+    found = errors(limited(tmp_path, limit))
     assert text in found
     assert "did you mean" in found
     assert ("'velocity_scale' is a fraction of the URDF's limit" in found) == limit.startswith("velocity")
@@ -98,7 +98,7 @@ def test_joints_of_transmissions_have_no_limits(tmp_path):
     (urdf,) = tmp_path.rglob("*.urdf")
     transmission = '<transmission name="t"><joint name="swing"/></transmission></robot>'
     urdf.write_text(urdf.read_text(encoding="utf-8").replace("</robot>", transmission), encoding="utf-8")
-    assert "limits.velocity: swing: must be from 0 to 20 rad/s" in mistakes(file)
+    assert "limits.velocity: swing: must be from 0 to 20 rad/s" in errors(file)
 
 
 @pytest.mark.parametrize(
@@ -123,14 +123,14 @@ def test_joints_of_transmissions_have_no_limits(tmp_path):
     ids=["mesh in mm", "tiny mesh", "joints in mm", "degrees", "swapped", "center in mm", "inertia in g mm^2"],
 )
 def test_a_urdf_that_was_changed_later_is_checked_again(tmp_path, old, new, text):
-    assert text in mistakes(crane(tmp_path, old, new))
+    assert text in errors(crane(tmp_path, old, new))
 
 
 def test_obstacles_far_out_of_reach_are_in_another_unit(tmp_path):
     file = write_problem(tmp_path)
     file.write_text(file.read_text(encoding="utf-8").replace("x = [0.45, 0.55]", "x = [45, 55]"), encoding="utf-8")
     text = "obstacle 1: 'wall' is 45 m away, where the arm is 1.02 m long: check its unit"
-    assert text in mistakes(file)
+    assert text in errors(file)
 
 
 def test_payloads_in_grams_or_millimetres_are_refused(tmp_path):
@@ -142,13 +142,13 @@ def test_payloads_in_grams_or_millimetres_are_refused(tmp_path):
         file = write_problem(tmp_path)
         content = file.read_text(encoding="utf-8").replace("[robot]", f"[payload]\n{payload}\n[robot]")
         file.write_text(content, encoding="utf-8")
-        assert text in mistakes(file)
+        assert text in errors(file)
 
 
 def test_obstacles_that_no_constraint_uses_are_refused(tmp_path):
     file = write_problem(tmp_path)
     file.write_text(file.read_text(encoding="utf-8").replace("robot-clearance", "self-clearance"), encoding="utf-8")
-    assert 'obstacle 1: no constraint uses it: add a [[constraint]] with use = "robot-clearance"' in mistakes(file)
+    assert 'obstacle 1: no constraint uses it: add a [[constraint]] with use = "robot-clearance"' in errors(file)
 
 
 @pytest.mark.parametrize("limit", ["velocity = 19", 'velocity = "80 deg/s"', "acceleration = 190", "torque = 5000"])
@@ -166,8 +166,8 @@ def test_a_message_lists_at_most_twenty_frames() -> None:
 
 
 @pytest.mark.parametrize("use", ['["robot-clearance"]', "[]", "{ a = 1 }", "3"])
-def test_kinds_that_are_no_text_are_mistakes(tmp_path, use):
+def test_kinds_that_are_no_text_are_errors(tmp_path, use):
     file = write_problem(tmp_path)
     file.write_text(file.read_text(encoding="utf-8").replace('use = "robot-clearance"', f"use = {use}"), "utf-8")
-    assert "constraint 2.use: expected one of joint-position, " in (text := mistakes(file))
+    assert "constraint 2.use: expected one of joint-position, " in (text := errors(file))
     assert ", got " in text

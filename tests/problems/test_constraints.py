@@ -313,12 +313,12 @@ def test_joint_rates_are_met_on_the_limit_and_violated_outside(benches, name, wh
     bench = benches["airhockey"]
     limit = getattr(bench.robot, f"{name}_limit")
     kind, sign = KINDS[f"joint-{name}"], np.array([1, -1, 1, -1, 1, -1])
-    expect(kind, bench.state(bench.robot.base, **{what: limit * sign}), {})
+    expect(kind, bench.state(bench.robot.home, **{what: limit * sign}), {})
     expect(
-        kind, bench.state(bench.robot.base, **{what: sign * limit + [0, -1e-3, 0, 0, 0, 0]}), {f"joint {name}": 1e-3}
+        kind, bench.state(bench.robot.home, **{what: sign * limit + [0, -1e-3, 0, 0, 0, 0]}), {f"joint {name}": 1e-3}
     )
     over = limit * (1 + 1e-9)
-    expect(kind, bench.state(bench.robot.base, **{what: over}), {f"joint {name}": 1e-9 * limit.max()})
+    expect(kind, bench.state(bench.robot.home, **{what: over}), {f"joint {name}": 1e-9 * limit.max()})
 
 
 def test_joint_torque_is_met_at_rest_and_violated_by_a_hard_acceleration(benches):
@@ -338,7 +338,7 @@ def test_joint_torque_is_met_at_rest_and_violated_by_a_hard_acceleration(benches
 
 def at_tip(robot: Robot, target: list[float]) -> np.ndarray:
     """Solve ``FK(q) = target`` from the base configuration."""
-    model, data, q = robot.model, robot.model.createData(), robot.base.copy()
+    model, data, q = robot.model, robot.model.createData(), robot.home.copy()
     frame, local = model.getFrameId(robot.tip), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     for _ in range(50):
         jacobian = pin.computeFrameJacobian(model, data, q, frame, local)[:3]
@@ -552,7 +552,7 @@ def test_tolerance_of_a_motion_is_absolute_or_a_fraction_of_the_limit(benches, n
 
 
 def test_the_verdict_limits_the_angle_of_a_tilt_and_not_its_components(benches):
-    world = benches["heavy-object"].state(benches["heavy-object"].robot.base)
+    world = benches["heavy-object"].state(benches["heavy-object"].robot.home)
     tilted = pin.exp3(np.deg2rad(1.6) * np.array([1.0, 1.0, 0.0]))[:, 2]  # 2.26 deg, 1.6 deg about x and about y
     aligned = Axis(direction=tuple(world.tip_rotation @ tilted), tolerance=np.deg2rad(1.8))
     (angle,) = aligned.judged(world)
@@ -564,7 +564,7 @@ def test_the_verdict_limits_the_angle_of_a_tilt_and_not_its_components(benches):
 
 def test_the_time_varying_bound_admits_only_motions_down_to_the_table(benches):
     s, start = np.array([0.0, 0.1, 0.2, 0.3, 1.0]), np.array([0.8, 0.1, 0.157])
-    rectangle, height = KINDS["table"].measured(benches["airhockey"].state(benches["airhockey"].robot.base))
+    rectangle, height = KINDS["table"].measured(benches["airhockey"].state(benches["airhockey"].robot.home))
     np.testing.assert_allclose(
         KINDS["table"].bound_relaxation(height, s, start), [0.003, 0.003, 0.0015, 0.0, 0.0], atol=1e-15
     )

@@ -16,10 +16,10 @@ RADIUS = 'radius = "0.1 m"'
 PAPER = 'geometry = "paper-capsules"'
 
 
-def mistakes(file: Path) -> list[str]:
+def errors(file: Path) -> list[str]:
     with pytest.raises(RecipeError) as caught:
         load_problem(file)
-    return [mistake.removeprefix(f"{file}: ") for mistake in caught.value.mistakes]
+    return [error.removeprefix(f"{file}: ") for error in caught.value.errors]
 
 
 @pytest.mark.parametrize(
@@ -58,21 +58,21 @@ def test_a_urdf_without_shapes_is_a_line_through_its_joints(tmp_path):
     ],
 )
 def test_what_does_not_go_with_the_shape_is_a_mistake(tmp_path, changes, place, text):
-    (found,) = (each for each in mistakes(write_problem(tmp_path, **changes)) if each.startswith(f"{place}: "))
+    (found,) = (each for each in errors(write_problem(tmp_path, **changes)) if each.startswith(f"{place}: "))
     assert text in found
 
 
 def test_a_named_shape_that_the_urdf_does_not_have_is_a_mistake(tmp_path):
     file = write_problem(tmp_path, robot='geometry = "urdf"')
     write_crane(tmp_path, {link: [] for link in LINKS})
-    (found,) = mistakes(file)
+    (found,) = errors(file)
     assert found.startswith("robot.geometry: the URDF gives no shape")
 
 
 def test_a_missing_mesh_is_a_mistake_of_the_problem(tmp_path):
     file = write_problem(tmp_path)
     (tmp_path / "crane" / "meshes" / "wedge.stl").unlink()
-    (found,) = mistakes(file)
+    (found,) = errors(file)
     assert found.startswith("robot.urdf: ")
     assert f"searched paths:\n  {tmp_path}/crane/crane/meshes/wedge.stl\n" in found
 

@@ -69,7 +69,7 @@ def test_every_key_of_a_recipe_but_its_labels_changes_the_identity(name: str) ->
     problem = PROBLEMS[name]
     found = [(key, other) for key, other in changes(problem) if key not in LABELS]
     keys_seen = {key for key, _ in found}
-    assert {"name", "robot.joints", "robot.tip", "robot.base", "limits.torque_scale", "constraint"} < keys_seen
+    assert {"name", "robot.joints", "robot.tip", "robot.home", "limits.torque_scale", "constraint"} < keys_seen
     assert {"trajectory.degree", "trajectory.rate_control_points", "objective.centrifugal"} < keys_seen
     assert len(found) > 40
     identities = {other.identity for _, other in found}

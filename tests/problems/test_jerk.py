@@ -94,7 +94,7 @@ def test_both_forms_state_the_same_limits_of_what_they_are_given() -> None:
     column, jerk = symbols("jerk", robot.n)
     (symbolic,) = JERK.symbolic(state_of(problem, jerk))
     world, values = World(robot), np.random.default_rng(1).normal(size=robot.n)
-    world.set_state(robot.base, 0 * values, 0 * values, np.zeros(0), values)
+    world.set_state(robot.home, 0 * values, 0 * values, np.zeros(0), values)
     (measured,) = JERK.measured(world)
     np.testing.assert_array_equal(measured.g, values)
     np.testing.assert_array_equal(
@@ -125,7 +125,7 @@ def test_what_depends_on_the_jerk_is_found_out() -> None:
 def test_residuals_of_a_motion_have_the_jerk_and_its_derivatives() -> None:
     problem, robot = jerk_limited("airhockey")
     n, random = robot.n, np.random.default_rng(4)
-    w = np.concatenate([robot.base, random.normal(size=3 * n), [0.9, 0.4, -0.3]])
+    w = np.concatenate([robot.home, random.normal(size=3 * n), [0.9, 0.4, -0.3]])
     p1, p2, p3, (r, r1, r2) = w[n : 2 * n], w[2 * n : 3 * n], w[3 * n : 4 * n], w[4 * n :]
     value = stage_values(robot, problem)
     g, columns = (np.array(part) for part in stage_jacobian(robot, problem)(w, []))

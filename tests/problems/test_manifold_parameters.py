@@ -109,7 +109,7 @@ def test_both_forms_agree_on_motions_and_at_their_ends(problem: Problem) -> None
     exact = tuple(item for item in problem.constraint if isinstance(item, Table | TipAxis))
     problem = replace(problem, constraint=exact, obstacle=(), object=None)
     model, values = cnpgen.RobotModel(problem, backend="numpy"), drawn(problem, n)
-    q, dq, ddq = (mean + random.uniform(-1, 1, (n, robot.n)) for mean in (robot.base, 0, 0))
+    q, dq, ddq = (mean + random.uniform(-1, 1, (n, robot.n)) for mean in (robot.home, 0, 0))
     tip = model.forward_kinematics(q)[0]
     scene = model.scene(tip, tip, parameters=values)
     found = model.constraint_values(q, dq, ddq, scene=scene)
@@ -205,8 +205,8 @@ def test_a_planner_projects_onto_the_manifold_of_each_sample(tmp_path: Path) -> 
         (LOADS, ParameterRanges(upright_tolerance=Range(0.1, 0.2)), "upright_tolerance must include 0.0314159"),
     ],
 )
-def test_mistakes_in_ranges_are_named(problem: Problem, ranges: ParameterRanges, text: str) -> None:
-    assert any(text in mistake for _, mistake in replace(problem, parameters=ranges).find_mistakes())
+def test_recipe_errors_in_ranges_are_named(problem: Problem, ranges: ParameterRanges, text: str) -> None:
+    assert any(text in error for _, error in replace(problem, parameters=ranges).validate())
 
 
 def test_configurations_of_tasks_are_along_the_direction_of_each_sample() -> None:

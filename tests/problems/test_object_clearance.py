@@ -1,4 +1,4 @@
-"""Clearance of the held object from the links: both forms against trimeshes of Coal, defaults, and mistakes."""
+"""Clearance of the held object from the links: both forms against trimeshes of Coal, defaults, and errors."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -44,7 +44,7 @@ def states(problem: Problem, n: int, seed: int = 0) -> list[np.ndarray]:
     limits = np.full(robot.n, 0.5), robot.velocity_limit, robot.acceleration_limit
     return [
         mean + random.uniform(-1, 1, (n, robot.n)) * limit
-        for mean, limit in zip((robot.base, 0, 0), limits, strict=True)
+        for mean, limit in zip((robot.home, 0, 0), limits, strict=True)
     ]
 
 
@@ -235,7 +235,7 @@ def test_values_are_checked_against_their_ranges() -> None:
         ("[payload] ", "[trash] ", "payload_mass needs the body"),
     ],
 )
-def test_mistakes_in_ranges_are_named(tmp_path: Path, old: str, new: str, text: str) -> None:
+def test_recipe_errors_in_ranges_are_named(tmp_path: Path, old: str, new: str, text: str) -> None:
     content = LOADS.path.read_text()
     assert old in content
     (tmp_path / "iiwa14_gripper.urdf").write_text(LOADS.urdf_text)

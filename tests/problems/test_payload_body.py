@@ -94,11 +94,11 @@ def test_the_payload_does_not_enter_obstacles(tmp_path):
     for each, touches in ((problem, True), (bare, False)):
         robot = load_robot(each)
         model = cnpgen.RobotModel(each)
-        position, rotation = model.forward_kinematics(robot.base)
+        position, rotation = model.forward_kinematics(robot.home)
         center = np.ravel(position) + np.reshape(rotation, (3, 3)) @ [0.1, 0.0, 0.32]
         obstacle = cnpgen.recipes.Obstacle(name="ball", kind="sphere", position=tuple(center), radius=0.01)
         among = cnpgen.RobotModel(each.with_obstacles([obstacle]))
-        assert bool(np.ravel(among.is_collision_free(robot.base))[0]) != touches
+        assert bool(np.ravel(among.is_collision_free(robot.home))[0]) != touches
 
 
 @pytest.mark.parametrize(

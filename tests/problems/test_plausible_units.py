@@ -46,10 +46,10 @@ def changed(text: str, table: str, key: str, value: object) -> str:
     return text[: head.end()] + f"{key} = {value}\n" + other + (text[end:] if end > 0 else "")
 
 
-def mistakes(load, file) -> list[str]:
+def errors(load, file) -> list[str]:
     with pytest.raises(RecipeError) as caught:
         load(file)
-    return caught.value.mistakes
+    return caught.value.errors
 
 
 @pytest.mark.parametrize(("recipe", "table", "key", "value"), cases(PROBLEMS))
@@ -58,7 +58,7 @@ def test_problems_refuse_quantities_in_another_unit(tmp_path, recipe, table, key
     file = tmp_path / "problem.toml"
     text = changed(source.read_text(encoding="utf-8"), table, key, value)
     file.write_text(re.sub(r'urdf = "([^:"]*)"', rf'urdf = "{source.parent}/\1"', text), encoding="utf-8")
-    found = mistakes(lambda path: load_robot(load_problem(path)), file)
+    found = errors(lambda path: load_robot(load_problem(path)), file)
     assert any(f"{key}" in each and "did you mean" in each for each in found), found
 
 
@@ -67,5 +67,5 @@ def test_pipelines_refuse_quantities_in_another_unit(tmp_path, recipe, table, ke
     file = tmp_path / "pipeline.toml"
     text = changed(find_recipe(("pipeline",), recipe).read_text(encoding="utf-8"), table, key, value)
     file.write_text(text, encoding="utf-8")
-    found = mistakes(load_pipeline, file)
+    found = errors(load_pipeline, file)
     assert any(f"{key}" in each and "did you mean" in each for each in found), found

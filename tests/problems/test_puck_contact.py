@@ -165,4 +165,4 @@ def test_inconsistent_distances_are_refused(tmp_path, old, new, expected):
 
 def test_a_problem_has_at_most_one_constraint_with_values_of_each_motion(tmp_path):
     twice = replace(AIRHOCKEY, constraint=(*AIRHOCKEY.constraint, CONTACT))
-    assert [key for key, _ in twice.find_mistakes()] == ["constraint"]
+    assert [key for key, _ in twice.validate()] == ["constraint"]

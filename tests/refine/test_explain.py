@@ -173,7 +173,7 @@ def test_a_bound_of_the_tip_over_a_box_is_below_every_sample_and_tight(name: str
 @pytest.mark.parametrize("name", ["airhockey", "heavy-object"])
 def test_derivatives_of_the_tip_are_those_of_finite_differences_and_within_the_reach(name: str) -> None:
     robot, arm = ROBOTS[name], ArmKinematics(ROBOTS[name])
-    q, step, direction = robot.base + 0.3, 1e-6, np.array([0.3, -0.8, 0.5])
+    q, step, direction = robot.home + 0.3, 1e-6, np.array([0.3, -0.8, 0.5])
     tip = arm.at(q)
     np.testing.assert_allclose(tip.position, tip_at(name, q), atol=1e-14)
     for joint, unit in enumerate(np.eye(robot.n)):

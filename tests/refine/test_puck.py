@@ -41,7 +41,7 @@ def hits() -> tuple[Plans, np.ndarray]:
     planner = Planner("airhockey-hit", backend="numpy")
     _, robot = open_problem(planner.model.problem)
     arm, rest = Arm(robot), np.zeros((1, 6))
-    q = robot.base.copy()
+    q = robot.home.copy()
     for _ in range(50):  # the tip is moved to x = 1 m by Gauss-Newton steps
         error = np.array([1.0, 0.0, 0.16]) - arm.pose(q).translation
         q = q + np.linalg.lstsq(arm.jacobian(q)[:3], error, rcond=None)[0]

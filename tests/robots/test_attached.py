@@ -39,7 +39,7 @@ def written(folder: Path, *, robot: str = "", limits: str = "", more: str = "", 
     return load_problem(folder / "problem.toml")
 
 
-def mistake(problem: Problem) -> str:
+def error(problem: Problem) -> str:
     with pytest.raises(RecipeError) as caught:
         load_robot(problem)
     return str(caught.value)
@@ -120,13 +120,13 @@ def test_limits_are_typed_in_for_all_joints_or_one_by_one(tmp_path):
     ],
 )
 def test_limits_for_another_number_of_joints_are_refused(tmp_path, limits, text):
-    assert text in mistake(written(tmp_path, limits=limits))
+    assert text in error(written(tmp_path, limits=limits))
 
 
 def test_a_limit_is_above_zero_and_has_a_unit(tmp_path):
     with pytest.raises(RecipeError) as caught:
         written(tmp_path, limits='velocity = "[1, 2] m"\nacceleration = [1.0, -1.0]\ntorque = "much"\n')
-    found = "\n".join(caught.value.mistakes)
+    found = "\n".join(caught.value.errors)
     for text in ("limits.velocity: ", "limits.acceleration: -1.0 rad/s^2 is too small", "limits.torque: "):
         assert text in found
 
@@ -143,7 +143,7 @@ def test_continuous_joints_are_planned_within_the_ranges_that_they_are_given(tmp
     assert (robot.velocity_limit > 0).all()
     assert "continuous" in robot.urdf_text  # the URDF itself is kept as it is
     (tmp_path / "other").mkdir()
-    assert "give ranges to all joints" in mistake(written(tmp_path / "other", urdf=turning))
+    assert "give ranges to all joints" in error(written(tmp_path / "other", urdf=turning))
 
 
 def test_a_record_keeps_what_was_added(tmp_path):
@@ -159,7 +159,7 @@ def test_a_record_keeps_what_was_added(tmp_path):
 
 def test_an_unknown_frame_is_refused_with_the_nearest_and_the_first_known_ones(tmp_path):
     problem = written(tmp_path)
-    text = mistake(replace(problem, robot=replace(problem.robot, tip="objekt")))
+    text = error(replace(problem, robot=replace(problem.robot, tip="objekt")))
     assert "has no frame 'objekt' (did you mean 'object'?)" in text
     assert "its frames: universe, " in text
     assert re.search(r" and \d+ more$", text)

@@ -1,4 +1,4 @@
-"""Locked joints: the model is that of Pinocchio with these joints at their positions, and mistakes are named."""
+"""Locked joints: the model is that of Pinocchio with these joints at their positions, and errors are named."""
 
 from pathlib import Path
 

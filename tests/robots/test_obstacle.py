@@ -22,8 +22,8 @@ from tests.examples.shaped_robot import KINDS, WEDGE, write_problem
 HERE = (0.1, 0.2, 0.3)
 
 
-def mistakes(**keys: Any) -> dict[str, str]:
-    return dict(Obstacle(name="it", **keys).find_mistakes())
+def errors(**keys: Any) -> dict[str, str]:
+    return dict(Obstacle(name="it", **keys).validate())
 
 
 @pytest.mark.parametrize(
@@ -38,10 +38,10 @@ def mistakes(**keys: Any) -> dict[str, str]:
     ],
 )
 def test_what_has_all_that_its_kind_needs_is_an_obstacle(keys: dict[str, Any]) -> None:
-    assert not mistakes(**keys)
+    assert not errors(**keys)
     for key in set(keys) - {"kind", "rotation", "scale", "below"}:
         without = {name: value for name, value in keys.items() if name != key}
-        assert "needs 'position'" in mistakes(**without)[key]
+        assert "needs 'position'" in errors(**without)[key]
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_what_has_all_that_its_kind_needs_is_an_obstacle(keys: dict[str, Any]) -
     ],
 )
 def test_what_does_not_go_with_a_kind_is_refused(keys: dict[str, Any], key: str, says: str) -> None:
-    assert says in mistakes(**keys)[key]
+    assert says in errors(**keys)[key]
 
 
 def test_an_upright_box_has_no_pose(tmp_path: Path) -> None:
@@ -106,7 +106,7 @@ def test_a_missing_mesh_is_reported_with_the_searched_paths(tmp_path: Path) -> N
 )
 def test_corners_that_are_none_are_refused(content: bytes) -> None:
     address = "data:application/octet-stream;base64," + base64.b64encode(content).decode()
-    assert "mesh" in mistakes(kind="mesh", position=HERE, mesh=address)
+    assert "mesh" in errors(kind="mesh", position=HERE, mesh=address)
 
 
 def test_poses_hold_the_entries_of_all_obstacles(tmp_path: Path) -> None:

@@ -32,8 +32,8 @@ def with_urdf(folder: Path, old: str, new: str) -> Problem:
 def mistake_of(problem: Problem) -> str:
     with pytest.raises(RecipeError) as raised:
         load_robot(problem)
-    (mistake,) = raised.value.mistakes
-    return mistake
+    (error,) = raised.value.errors
+    return error
 
 
 @pytest.mark.parametrize("problem", [AIRHOCKEY, HEAVY], ids=lambda problem: problem.name)
@@ -44,7 +44,7 @@ def test_limits_are_those_of_the_urdf_scaled(problem):
     np.testing.assert_allclose(robot.position_upper, model.upperPositionLimit, rtol=1e-15)
     np.testing.assert_allclose(robot.velocity_limit, 0.8 * np.array(model.velocityLimit), rtol=1e-15)
     np.testing.assert_allclose(robot.torque_limit, 0.8 * np.array(model.effortLimit), rtol=1e-15)
-    np.testing.assert_array_equal(robot.base, problem.robot.base)
+    np.testing.assert_array_equal(robot.home, problem.robot.home)
 
 
 def test_acceleration_limit_is_the_rate_times_the_velocity_limit_up_to_the_cap():
@@ -87,26 +87,26 @@ def test_locked_inner_joints_leave_angled_capsule_axes():
 
 
 def test_unknown_joint_is_named_with_the_nearest_one():
-    mistake = mistake_of(changed(HEAVY, joints=("joint1", *HEAVY.robot.joints[1:])))
-    assert mistake.startswith(f"{HEAVY.path}: robot.joints: ")
-    assert "'joint1' (did you mean 'joint_1'?)" in mistake
+    error = mistake_of(changed(HEAVY, joints=("joint1", *HEAVY.robot.joints[1:])))
+    assert error.startswith(f"{HEAVY.path}: robot.joints: ")
+    assert "'joint1' (did you mean 'joint_1'?)" in error
 
 
 def test_unknown_tip_is_named_with_the_nearest_one():
-    mistake = mistake_of(changed(HEAVY, tip="objekt"))
-    assert mistake.startswith(f"{HEAVY.path}: robot.tip: ")
-    assert "'objekt' (did you mean 'object'?)" in mistake
+    error = mistake_of(changed(HEAVY, tip="objekt"))
+    assert error.startswith(f"{HEAVY.path}: robot.tip: ")
+    assert "'objekt' (did you mean 'object'?)" in error
 
 
 def test_tip_must_be_behind_the_last_planned_joint():
-    mistake = mistake_of(changed(HEAVY, tip="link_4"))
-    assert "robot.tip: frame 'link_4' is not moved by the last planned joint 'joint_7'" in mistake
+    error = mistake_of(changed(HEAVY, tip="link_4"))
+    assert "robot.tip: frame 'link_4' is not moved by the last planned joint 'joint_7'" in error
 
 
 def test_joints_must_be_in_the_order_of_the_urdf():
-    mistake = mistake_of(changed(HEAVY, joints=HEAVY.robot.joints[::-1]))
-    assert "robot.joints: must be in the URDF's order ['joint_1', 'joint_2'," in mistake
-    assert "got ['joint_7', 'joint_6'," in mistake
+    error = mistake_of(changed(HEAVY, joints=HEAVY.robot.joints[::-1]))
+    assert "robot.joints: must be in the URDF's order ['joint_1', 'joint_2'," in error
+    assert "got ['joint_7', 'joint_6'," in error
 
 
 def test_base_needs_one_value_per_joint():
@@ -114,8 +114,8 @@ def test_base_needs_one_value_per_joint():
 
 
 def test_base_outside_its_limits_names_the_joint_that_is_furthest_out():
-    mistake = mistake_of(changed(HEAVY, base=(0.0, 2.2, 0.0, -2.5, 0.0, 0.0, 0.0)))
-    assert "robot.base: joint_4 = -2.5 rad is outside its planning limits [-2.0944, 2.0944]" in mistake
+    error = mistake_of(changed(HEAVY, base=(0.0, 2.2, 0.0, -2.5, 0.0, 0.0, 0.0)))
+    assert "robot.base: joint_4 = -2.5 rad is outside its planning limits [-2.0944, 2.0944]" in error
 
 
 def test_a_tip_below_the_table_is_a_mistake_with_its_height():

@@ -145,8 +145,8 @@ def test_what_is_no_mesh_is_said_to_be_none(tmp_path):
     (tmp_path / "crane" / "meshes" / "claw.obj").unlink()
     with pytest.raises(RecipeError) as caught:
         with_inline_meshes(file.read_text(), file)
-    assert "not a mesh that can be read" in caught.value.mistakes[0]
-    assert "claw.obj' is missing" in caught.value.mistakes[1]
+    assert "not a mesh that can be read" in caught.value.errors[0]
+    assert "claw.obj' is missing" in caught.value.errors[1]
 
 
 def test_only_meshes_of_a_bounded_size_are_given_to_their_reader(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""URDFs of strangers: what would end the process, or is no URDF, is a mistake in the recipe."""
+"""URDFs of strangers: what would end the process, or is no URDF, is an error in the recipe."""
 
 import os
 from dataclasses import replace

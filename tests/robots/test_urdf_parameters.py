@@ -107,8 +107,8 @@ def test_all_mistakes_of_a_file_are_listed_with_its_name(tmp_path: Path) -> None
     (tmp_path / "robot.urdf").write_text(urdf, encoding="utf-8")
     with pytest.raises(RecipeError) as error:
         load_robot(load_problem(tmp_path / "problem.toml"))
-    assert len(error.value.mistakes) == 2
-    assert all("robot.urdf: " in mistake for mistake in error.value.mistakes)
+    assert len(error.value.errors) == 2
+    assert all("robot.urdf: " in error for error in error.value.errors)
 
 
 def test_plans_with_such_a_urdf_are_not_judged(tmp_path: Path) -> None:

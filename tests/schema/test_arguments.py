@@ -10,7 +10,7 @@ import pytest
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.recipe import DatasetRecipe, as_dataset_recipe
-from cnpgen.make.resolve_spec import draw_up
+from cnpgen.make.resolve_spec import resolve
 from cnpgen.pipelines.pipeline import load_pipeline
 from cnpgen.schema.arguments import flag, integer, number, numbers
 from cnpgen.store.workspace import find_workspace
@@ -113,7 +113,7 @@ def test_a_wrong_type_is_a_usage_error_that_names_the_argument_and_touches_nothi
 
 def test_whole_numbers_of_numpy_give_the_specification_of_python_integers(tmp_path: Path) -> None:
     recipe, place = tiny_recipe("airhockey-hit"), find_workspace(tmp_path)
-    jobs = [draw_up(recipe, place, n=kind(50), seed=kind(3), shard_size=kind(20)) for kind in (int, np.int64)]
+    jobs = [resolve(recipe, place, n=kind(50), seed=kind(3), shard_size=kind(20)) for kind in (int, np.int64)]
     assert jobs[0].spec.fingerprint == jobs[1].spec.fingerprint
 
 
@@ -142,7 +142,7 @@ def test_a_pipeline_is_refused_with_the_dataset_recipe_to_make_of_it() -> None:
 @pytest.mark.parametrize(("splits", "said"), [({}, "has no splits"), ({"train": 9.5}, "split 'train' must be an int")])
 def test_splits_that_no_file_could_have_are_refused(tmp_path: Path, splits: Any, said: str) -> None:
     with pytest.raises(UsageError, match=said):
-        draw_up(replace(tiny_recipe("airhockey-hit"), splits=splits), find_workspace(tmp_path), n=50)
+        resolve(replace(tiny_recipe("airhockey-hit"), splits=splits), find_workspace(tmp_path), n=50)
 
 
 @pytest.mark.parametrize("regenerate", [1.5, "1", True, -1])

@@ -129,10 +129,10 @@ def edit(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new, 1))
 
 
-def mistakes_of(load, path: Path) -> list[str]:
+def errors_of(load, path: Path) -> list[str]:
     with pytest.raises(RecipeError) as caught:
         load(path)
-    return [mistake.replace(f"{path}: ", "") for mistake in caught.value.mistakes]
+    return [error.replace(f"{path}: ", "") for error in caught.value.errors]
 
 
 def test_three_correct_files_load(files):
@@ -165,7 +165,7 @@ def test_mistakes_of_all_three_files_are_raised_at_once(files):
     folder = files["dataset"].parent
     pipeline = folder / "../pipelines/roll.toml"
     problem = pipeline.parent / "../problems/arm/problem.toml"
-    assert caught.value.mistakes == (
+    assert caught.value.errors == (
         f"{files['dataset']}: sed: unknown key (did you mean 'seed'?)",
         f"{problem}: robot.tip: expected a string, got 3",
         f"{problem}: limits.velocity_scale: 1.5 is too large, expected at most 1",
@@ -176,7 +176,7 @@ def test_mistakes_of_all_three_files_are_raised_at_once(files):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "mistake"),
+    ("old", "new", "error"),
     [
         ('name = "arm"', 'name = "Arm"', "name: 'Arm' does not match"),
         ('name = "arm"', 'name = "-arm"', "name: '-arm' does not match"),
@@ -207,11 +207,11 @@ def test_mistakes_of_all_three_files_are_raised_at_once(files):
         ('urdf = "arm.urdf"', 'urdf = "arm"', "robot.urdf: no such file: "),
     ],
 )
-def test_a_mistake_in_a_problem_is_reported_with_its_key(files, old, new, mistake):
+def test_a_mistake_in_a_problem_is_reported_with_its_key(files, old, new, error):
     edit(files["problem"], old, new)
-    mistakes = mistakes_of(load_problem, files["problem"])
-    assert len(mistakes) == 1
-    assert mistakes[0].startswith(mistake)
+    errors = errors_of(load_problem, files["problem"])
+    assert len(errors) == 1
+    assert errors[0].startswith(error)
 
 
 def test_a_mistake_does_not_hide_another_one_that_has_nothing_to_do_with_it(files):
@@ -222,10 +222,10 @@ def test_a_mistake_does_not_hide_another_one_that_has_nothing_to_do_with_it(file
     edit(files["problem"], 'y = "[0, 1] m"', 'y = "[1, 1] m"')
     edit(files["problem"], 'below = "start"', "")
     edit(files["problem"], "[limits]", "[trajectory]\npath_control_points = 6\nrate_control_points = 4.5\n[limits]")
-    keys = [mistake.split(":")[0] for mistake in mistakes_of(load_problem, files["problem"])]
+    keys = [error.split(":")[0] for error in errors_of(load_problem, files["problem"])]
     assert keys == [
         "robot.joints",
-        "robot.base",
+        "robot.home",
         "limits.velocity_scale",
         "obstacle 1.x",
         "obstacle 1.top",
@@ -245,14 +245,14 @@ def test_semantic_mistakes_are_reported_along_with_wrong_types(files):
     edit(files["problem"], "velocity_scale = 0.8", "velocity_scale = true")
     edit(files["problem"], 'urdf = "arm.urdf"', 'urdf = "ar.urdf"')
     edit(files["problem"], 'use = "still"', 'use = "level"')
-    mistakes = mistakes_of(load_problem, files["problem"])
-    keys = [mistake.split(":")[0] for mistake in mistakes]
+    errors = errors_of(load_problem, files["problem"])
+    keys = [error.split(":")[0] for error in errors]
     assert keys == ["limits.velocity_scale", "robot.urdf", "constraint 2.use"]
-    assert mistakes[1].endswith("(did you mean 'arm.urdf'?)")
+    assert errors[1].endswith("(did you mean 'arm.urdf'?)")
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "mistake"),
+    ("old", "new", "error"),
     [
         ('version = "1.2.3"', 'version = "1.2"', "version: '1.2' does not match"),
         ('version = "1.2.3"', 'version = "01.2.3"', "version: '01.2.3' does not match"),
@@ -270,11 +270,11 @@ def test_semantic_mistakes_are_reported_along_with_wrong_types(files):
         ('pipeline = "../pipelines/roll.toml"', 'pipeline = "../pipelines/"', "pipeline: "),
     ],
 )
-def test_a_mistake_in_a_dataset_is_reported_with_its_key(files, old, new, mistake):
+def test_a_mistake_in_a_dataset_is_reported_with_its_key(files, old, new, error):
     edit(files["dataset"], old, new)
-    mistakes = mistakes_of(load_dataset_recipe, files["dataset"])
-    assert len(mistakes) == 1
-    assert mistakes[0].startswith(mistake)
+    errors = errors_of(load_dataset_recipe, files["dataset"])
+    assert len(errors) == 1
+    assert errors[0].startswith(error)
 
 
 @pytest.mark.parametrize("stages", ["stage = []", "stage = 3", 'stage = ["roll"]', ""])
@@ -282,11 +282,11 @@ def test_a_pipeline_without_stages_is_a_mistake(files, stages):
     head = PIPELINE[: PIPELINE.index("[[stage]]")]
     files["pipeline"].write_text(head + stages)
     for load in (load_pipeline, load_dataset_recipe):
-        assert mistakes_of(load, files["pipeline"])[0].startswith("stage")
+        assert errors_of(load, files["pipeline"])[0].startswith("stage")
 
 
 @pytest.mark.parametrize(
-    ("content", "mistake"),
+    ("content", "error"),
     [
         (b'name = "arm"\n\ntitle = \n', "line 3: not valid TOML: Invalid value"),
         (b'name = "arm"\nname = "leg"\n', "line 2: not valid TOML: Cannot overwrite a value"),
@@ -297,16 +297,16 @@ def test_a_pipeline_without_stages_is_a_mistake(files, stages):
         (b"seed = " + b"9" * 5000, "line 1: not valid TOML: "),
     ],
 )
-def test_a_file_that_is_not_toml_is_a_recipe_error_with_its_line(files, content, mistake):
+def test_a_file_that_is_not_toml_is_a_recipe_error_with_its_line(files, content, error):
     files["problem"].write_bytes(content)
-    mistakes = mistakes_of(load_problem, files["problem"])
-    assert len(mistakes) == 1
-    assert mistakes[0].startswith(mistake)
+    errors = errors_of(load_problem, files["problem"])
+    assert len(errors) == 1
+    assert errors[0].startswith(error)
 
 
 def test_an_empty_file_misses_every_required_key(files):
     files["dataset"].write_text("")
-    keys = [mistake.split(":")[0] for mistake in mistakes_of(load_dataset_recipe, files["dataset"])]
+    keys = [error.split(":")[0] for error in errors_of(load_dataset_recipe, files["dataset"])]
     assert keys == ["name", "pipeline", "splits"]
 
 
@@ -316,9 +316,9 @@ def test_a_byte_order_mark_is_ignored(files):
 
 
 def test_a_recipe_of_another_kind_is_a_mistake(files):
-    assert mistakes_of(load_dataset_recipe, files["problem"]) == ["is a problem, expected a dataset or a pipeline"]
-    assert mistakes_of(load_pipeline, files["dataset"]) == ["is a dataset, expected a pipeline"]
-    assert mistakes_of(load_problem, files["pipeline"]) == ["is a pipeline, expected a problem"]
+    assert errors_of(load_dataset_recipe, files["problem"]) == ["is a problem, expected a dataset or a pipeline"]
+    assert errors_of(load_pipeline, files["dataset"]) == ["is a dataset, expected a pipeline"]
+    assert errors_of(load_problem, files["pipeline"]) == ["is a pipeline, expected a problem"]
 
 
 def test_a_pipeline_is_wrapped_where_a_dataset_is_expected(shipped):
@@ -351,7 +351,7 @@ def test_a_reference_can_be_the_name_of_a_shipped_recipe(shipped):
 
 def test_an_unknown_reference_is_reported_where_it_is_made(shipped):
     edit(shipped["pipeline"], "../problems/arm/problem.toml", "amr")
-    assert mistakes_of(load_pipeline, shipped["pipeline"]) == [
+    assert errors_of(load_pipeline, shipped["pipeline"]) == [
         "problem: unknown problem 'amr' (did you mean 'arm'?); known: arm"
     ]
 
@@ -393,8 +393,8 @@ def test_a_recipe_that_is_not_there_is_an_error(shipped, text, message, tmp_path
 def test_a_name_of_another_kind_is_said_to_be_one(load, name, message):
     with pytest.raises(RecipeError) as caught:
         load(name)
-    (mistake,) = caught.value.mistakes
-    assert mistake.startswith(message)
+    (error,) = caught.value.errors
+    assert error.startswith(message)
 
 
 def test_a_file_without_suffix_is_a_path(shipped, tmp_path, monkeypatch):

@@ -38,20 +38,20 @@ class Cart:
     path: Path = Path()
     digest: str = ""
 
-    def find_mistakes(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> Iterator[tuple[str, str]]:
         if self.load is not None and self.load > 100 and not self.braked:
             yield "load", "a heavy cart needs brakes"
 
 
 def read(text: str) -> tuple[Cart | None, list[str]]:
-    mistakes: list[str] = []
-    return parse(Cart, tomllib.loads(text), where=RecipeLocation("cart.toml"), mistakes=mistakes), mistakes
+    errors: list[str] = []
+    return parse(Cart, tomllib.loads(text), where=RecipeLocation("cart.toml"), errors=errors), errors
 
 
-def mistakes_of(text: str) -> list[str]:
-    cart, mistakes = read('name = "cart"\n' + text)
+def errors_of(text: str) -> list[str]:
+    cart, errors = read('name = "cart"\n' + text)
     assert cart is None
-    return mistakes
+    return errors
 
 
 FULL = """
@@ -77,8 +77,8 @@ spokes = 16
 
 
 def test_every_supported_type_is_read_in_si():
-    cart, mistakes = read(FULL)
-    assert mistakes == []
+    cart, errors = read(FULL)
+    assert errors == []
     assert cart == Cart(
         name="cart",
         braked=True,
@@ -98,12 +98,12 @@ def test_every_supported_type_is_read_in_si():
 
 
 def test_absent_keys_have_their_defaults():
-    cart, mistakes = read('name = "cart"')
-    assert (cart, mistakes) == (Cart(name="cart"), [])
+    cart, errors = read('name = "cart"')
+    assert (cart, errors) == (Cart(name="cart"), [])
 
 
 def test_every_mistake_is_reported_with_file_and_key():
-    _, mistakes = read(
+    _, errors = read(
         """
         nam = "cart"
         braked = 1
@@ -120,7 +120,7 @@ def test_every_mistake_is_reported_with_file_and_key():
         spoke = 3
         """
     )
-    assert mistakes == [
+    assert errors == [
         "cart.toml: nam: unknown key (did you mean 'name'?)",
         "cart.toml: name: missing key, expected a string: name of the cart",
         "cart.toml: front.radius: missing key, expected a length [m]: radius of the wheel",
@@ -137,7 +137,7 @@ def test_every_mistake_is_reported_with_file_and_key():
 
 
 @pytest.mark.parametrize(
-    ("text", "mistake"),
+    ("text", "error"),
     [
         ("xyzzy = 1", "xyzzy: unknown key, known: name, front, wheel"),
         ('"a b" = 1', '"a b": unknown key'),
@@ -178,10 +178,10 @@ def test_every_mistake_is_reported_with_file_and_key():
         ("seats = {Back = 1}", "seats.Back: the name 'Back' does not match ^[a-z]+$"),
     ],
 )
-def test_a_wrong_value_is_a_mistake(text, mistake):
-    mistakes = mistakes_of(text)
-    assert len(mistakes) == 1
-    assert mistakes[0].startswith(f"cart.toml: {mistake}")
+def test_a_wrong_value_is_a_mistake(text, error):
+    errors = errors_of(text)
+    assert len(errors) == 1
+    assert errors[0].startswith(f"cart.toml: {error}")
 
 
 @pytest.mark.parametrize(
@@ -197,9 +197,9 @@ def test_a_wrong_value_is_a_mistake(text, mistake):
     ],
 )
 def test_a_value_on_its_bound_is_accepted(text):
-    cart, mistakes = read('name = "cart"\n' + text)
+    cart, errors = read('name = "cart"\n' + text)
     assert cart is not None
-    assert mistakes == []
+    assert errors == []
 
 
 def test_a_string_must_match_its_pattern():
@@ -207,9 +207,9 @@ def test_a_string_must_match_its_pattern():
 
 
 def test_what_is_not_a_table_is_a_mistake():
-    mistakes: list[str] = []
-    assert parse(Cart, 3, where=RecipeLocation("cart.toml"), mistakes=mistakes) is None
-    assert mistakes == ["cart.toml: expected a table, got 3"]
+    errors: list[str] = []
+    assert parse(Cart, 3, where=RecipeLocation("cart.toml"), errors=errors) is None
+    assert errors == ["cart.toml: expected a table, got 3"]
 
 
 def test_a_value_error_of_the_constructor_is_a_mistake():
@@ -221,10 +221,10 @@ def test_a_value_error_of_the_constructor_is_a_mistake():
             if self.even % 2:
                 raise ValueError(f"{self.even} is odd")
 
-    mistakes: list[str] = []
-    assert parse(Picky, {"even": 2}, where=RecipeLocation("f"), mistakes=mistakes) == Picky(2)
-    assert parse(Picky, {"even": 3}, where=RecipeLocation("f"), mistakes=mistakes) is None
-    assert mistakes == ["f: 3 is odd"]
+    errors: list[str] = []
+    assert parse(Picky, {"even": 2}, where=RecipeLocation("f"), errors=errors) == Picky(2)
+    assert parse(Picky, {"even": 3}, where=RecipeLocation("f"), errors=errors) is None
+    assert errors == ["f: 3 is odd"]
 
 
 @pytest.mark.parametrize(
@@ -238,7 +238,7 @@ def test_a_value_error_of_the_constructor_is_a_mistake():
     ],
 )
 def test_what_a_dataclass_checks_itself_is_checked_as_far_as_other_mistakes_let_it(text, keys):
-    assert [mistake.split(": ")[1] for mistake in mistakes_of(text)] == keys
+    assert [error.split(": ")[1] for error in errors_of(text)] == keys
 
 
 def test_a_type_that_recipes_cannot_hold_is_a_mistake():
@@ -246,30 +246,30 @@ def test_a_type_that_recipes_cannot_hold_is_a_mistake():
     class Odd:
         when: complex = field("a complex number")
 
-    mistakes: list[str] = []
-    assert parse(Odd, {"when": 2}, where=RecipeLocation("f"), mistakes=mistakes) is None
-    assert "not one that a recipe can hold" in mistakes[0]
+    errors: list[str] = []
+    assert parse(Odd, {"when": 2}, where=RecipeLocation("f"), errors=errors) is None
+    assert "not one that a recipe can hold" in errors[0]
 
 
 def test_a_reader_replaces_the_table_of_a_type():
-    def by_size(value, where, mistakes):
+    def by_size(value, where, errors):
         if value != "big":
-            mistakes.append(where.message("no such size"))
+            errors.append(where.message("no such size"))
             return None
         return Wheel(radius=1.0)
 
-    mistakes: list[str] = []
+    errors: list[str] = []
     table = {"name": "cart", "front": "big", "wheel": ["big", "small"]}
-    assert parse(Cart, table, where=RecipeLocation("f"), mistakes=mistakes, readers={Wheel: by_size}) is None
-    assert mistakes == ["f: wheel 2: no such size"]
+    assert parse(Cart, table, where=RecipeLocation("f"), errors=errors, readers={Wheel: by_size}) is None
+    assert errors == ["f: wheel 2: no such size"]
     table["wheel"] = ["big"]
-    cart = parse(Cart, table, where=RecipeLocation("f"), mistakes=[], readers={Wheel: by_size})
+    cart = parse(Cart, table, where=RecipeLocation("f"), errors=[], readers={Wheel: by_size})
     assert cart is not None
     assert (cart.front, cart.wheel) == (Wheel(radius=1.0), (Wheel(radius=1.0),))
 
 
 def test_earlier_mistakes_do_not_spoil_a_correct_table():
-    assert parse(Wheel, {"radius": 0.5}, where=RecipeLocation("f"), mistakes=["something else"]) == Wheel(radius=0.5)
+    assert parse(Wheel, {"radius": 0.5}, where=RecipeLocation("f"), errors=["something else"]) == Wheel(radius=0.5)
 
 
 def test_keys_lists_what_a_table_may_hold():
@@ -299,7 +299,7 @@ def test_to_dict_is_plain_json_and_reads_back_as_the_same_object():
     assert json.loads(json.dumps(plain)) == plain
     assert plain["stops"] == [[0.0, 0.1], [1.0, 2.0], [3.0, 3.0]]
     assert "path" not in plain
-    assert parse(Cart, plain, where=RecipeLocation("f"), mistakes=[]) == cart
+    assert parse(Cart, plain, where=RecipeLocation("f"), errors=[]) == cart
 
 
 def test_to_dict_labels_nested_objects():
@@ -315,7 +315,7 @@ def test_a_place_names_file_and_key():
 
 
 @pytest.mark.parametrize(
-    ("text", "mistake"),
+    ("text", "error"),
     [
         ("angles = [10, 45]", "angles: 45.0 rad is too large, expected at most 25.13 rad; 45 rad is 2578 deg; did you"),
         ("angles = [-90]", "angles: -90.0 rad is too small, expected at least -25.13 rad; -90 rad is -5157 deg; did"),
@@ -324,7 +324,7 @@ def test_a_place_names_file_and_key():
         ("tilt = [0, 30]", "tilt: 30.0 rad is too large, expected at most 1 rad; 30 rad is 1719 deg; did you mean 30"),
     ],
 )
-def test_values_that_are_probably_in_another_unit_have_a_suggestion(text, mistake):
-    (found,) = mistakes_of(text)
-    assert found.startswith(f"cart.toml: {mistake}")
+def test_values_that_are_probably_in_another_unit_have_a_suggestion(text, error):
+    (found,) = errors_of(text)
+    assert found.startswith(f"cart.toml: {error}")
     assert "did you mean" in found

@@ -34,8 +34,8 @@ def test_a_value_in_another_unit_has_a_suggestion():
 
 
 def test_public_functions_check_their_ranges(planner):
-    state = (planner.robot.base, *np.zeros((2, planner.robot.n)))
-    plans = planner.plan(planner.robot.base, planner.robot.base + 0.1)
+    state = (planner.robot.home, *np.zeros((2, planner.robot.n)))
+    plans = planner.plan(planner.robot.home, planner.robot.home + 0.1)
     calls = {
         "meeting_time": lambda: plan_hits(planner, state, [1.0, 0.1], [2.49, 0.0], meeting_time=500),
         "puck_velocity": lambda: plan_hits(planner, state, [1.0, 0.1], [2.49, 0.0], puck_velocity=[900.0, 0.0]),
@@ -67,7 +67,7 @@ def test_names_of_no_recipe_carry_the_argument(call, argument):
 
 
 def test_views_that_repeat_values_are_compared_with_the_memory(planner):
-    q = np.broadcast_to(planner.robot.base, (10**13, planner.robot.n))
+    q = np.broadcast_to(planner.robot.home, (10**13, planner.robot.n))
     with pytest.raises(UsageError, match=r"start_q must be smaller: 10,000,000,000,000 needs at least .* GB"):
         planner.plan(q, q)
     with pytest.raises(UsageError, match="goal_xyz must be smaller"):
@@ -75,7 +75,7 @@ def test_views_that_repeat_values_are_compared_with_the_memory(planner):
 
 
 def test_many_plans_are_compared_with_the_memory(planner, monkeypatch):
-    q = np.repeat(planner.robot.base[None], 1000, axis=0)
+    q = np.repeat(planner.robot.home[None], 1000, axis=0)
     monkeypatch.setattr(arguments, "MIN_CHECKED_SIZE", 100)
     monkeypatch.setattr(arguments, "available_bytes", lambda: 100_000)
     with pytest.raises(UsageError, match=r"start_q must be smaller: 1,000 needs at least"):

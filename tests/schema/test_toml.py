@@ -11,7 +11,7 @@ from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.schema.toml import MAX_KEY_PARTS, MAX_RECIPE_BYTES, kind_of_file, read_table
 
 
-def mistakes_of(path: Path) -> list[str]:
+def errors_of(path: Path) -> list[str]:
     found: list[str] = []
     assert read_table(path, ("dataset",), found) is None
     return found
@@ -34,10 +34,10 @@ def test_a_file_that_would_take_long_is_refused_at_once(tmp_path: Path, text: st
     path = tmp_path / "recipe.toml"
     path.write_text(text)
     begun = time.process_time()
-    (mistake,) = mistakes_of(path)
-    assert mistake.startswith(f"{path}: ")
-    assert message in mistake
-    assert len(mistake) < 400
+    (error,) = errors_of(path)
+    assert error.startswith(f"{path}: ")
+    assert message in error
+    assert len(error) < 400
     assert kind_of_file(path) == "dataset"
     assert time.process_time() - begun < 2
 
@@ -53,8 +53,8 @@ def test_many_unknown_keys_are_counted(tmp_path: Path) -> None:
     path.write_text("pipeline = 'airhockey-hit'\n" + "".join(f"key{i} = 1\n" for i in range(10_000)))
     with pytest.raises(RecipeError) as caught:
         load_dataset_recipe(path)
-    assert f"{path}: and 9,980 more unknown keys" in caught.value.mistakes
-    assert len(caught.value.mistakes) < 30
+    assert f"{path}: and 9,980 more unknown keys" in caught.value.errors
+    assert len(caught.value.errors) < 30
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_long_names_are_mistakes_that_are_told_in_short(tmp_path: Path, text: st
     path.write_text(text)
     with pytest.raises(RecipeError, match=message) as caught:
         load_dataset_recipe(path)
-    assert all(len(mistake) < 600 for mistake in caught.value.mistakes)
+    assert all(len(error) < 600 for error in caught.value.errors)
 
 
 def test_a_name_from_the_shell_may_be_of_any_length() -> None:
@@ -88,6 +88,6 @@ def test_what_is_no_file_is_not_read(tmp_path: Path, what: str) -> None:
         os.mkfifo(path)
     else:
         path.symlink_to("/dev/zero")
-    assert mistakes_of(path) == [f"{path}: not a file"]
+    assert errors_of(path) == [f"{path}: not a file"]
     with pytest.raises(RecipeError, match="no such file"):
         load_dataset_recipe(path)

@@ -14,7 +14,7 @@ import cnpgen
 from cnpgen.errors import DatasetError
 from cnpgen.plans import load_plans
 from cnpgen.store.files.checksum_file import HEADER_BYTES, read_with_checksum, with_checksum
-from cnpgen.store.files.hdf5 import opened_hdf5
+from cnpgen.store.files.hdf5 import open_hdf5
 from cnpgen.store.files.size_limits import MAX_EXPANSION, MIN_EXPANSION_LIMIT_BYTES
 from cnpgen.store.shard import read_placements, read_shard
 from tests.plans.test_plans import write_minimal
@@ -133,7 +133,7 @@ def test_datasets_that_are_not_read_are_not_checked(tmp_path: Path) -> None:
     with h5py.File(path, "a") as file:
         outside(file, tmp_path)
         file["group/inside"] = h5py.SoftLink("/nowhere")
-    with opened_hdf5(path) as file:
+    with open_hdf5(path) as file:
         assert "note" in file
         assert file["start_q"].read().shape == (3, 6)
         assert "group" not in set(file)
@@ -159,7 +159,7 @@ def test_the_size_limit_applies_to_all_datasets_together(tmp_path: Path) -> None
         for index in range(4):
             file.create_dataset(f"note{index}", shape=(each,), dtype="f8")
     assert MAX_EXPANSION * path.stat().st_size < MIN_EXPANSION_LIMIT_BYTES
-    with opened_hdf5(path) as file:
+    with open_hdf5(path) as file:
         assert len({name: file[name] for name in ("note0", "note1", "note2")}) == 3
         with pytest.raises(DatasetError, match="note3 declares"):
             file["note3"]
@@ -187,7 +187,7 @@ def test_a_name_that_is_not_utf8_is_damage(tmp_path: Path) -> None:
 
 
 def test_a_device_is_not_a_file() -> None:
-    with pytest.raises(DatasetError, match="/dev/zero is not a file"), opened_hdf5(Path("/dev/zero")):
+    with pytest.raises(DatasetError, match="/dev/zero is not a file"), open_hdf5(Path("/dev/zero")):
         pass
 
 
@@ -211,7 +211,7 @@ def test_heaps_at_the_end_of_a_file_are_checked(tmp_path: Path, monkeypatch: pyt
     content[content.index(b"GCOL\x01\0\0\0") + 9] ^= 0x20
     path.write_bytes(content)
     monkeypatch.setattr("cnpgen.store.files.heaps._CHUNK_BYTES", 56)
-    with pytest.raises(DatasetError, match="its texts at byte"), opened_hdf5(path):
+    with pytest.raises(DatasetError, match="its texts at byte"), open_hdf5(path):
         pass
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from cnpgen.errors import DatasetError
 from cnpgen.plans import load_plans
-from cnpgen.store.files.hdf5 import opened_hdf5
+from cnpgen.store.files.hdf5 import open_hdf5
 from cnpgen.store.files.heaps import check_heaps
 from tests.plans.test_plans import write_minimal
 
@@ -55,5 +55,5 @@ def test_numbers_that_look_like_a_heap_are_numbers(tmp_path: Path) -> None:
 
 def test_an_empty_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "empty.h5").touch()
-    with pytest.raises(DatasetError, match="it is empty"), opened_hdf5(tmp_path / "empty.h5"):
+    with pytest.raises(DatasetError, match="it is empty"), open_hdf5(tmp_path / "empty.h5"):
         pass

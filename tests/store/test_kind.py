@@ -17,7 +17,7 @@ from cnpgen.planner.model_file import load_model
 from cnpgen.plans import load_plans
 from cnpgen.plans.boundary_problems import load_boundary_problems
 from cnpgen.store.files.checksum_file import read_with_checksum
-from cnpgen.store.files.hdf5 import opened_hdf5
+from cnpgen.store.files.hdf5 import open_hdf5
 from cnpgen.store.files.kind import apparent_kind
 from cnpgen.store.paths import file_kind
 from cnpgen.store.shard import read_shard
@@ -54,7 +54,7 @@ def test_files_of_other_kinds_are_named_by_their_kind(tmp_path: Path, kind: str)
     path = tmp_path / "given.h5"
     path.write_bytes(content)
     assert apparent_kind(path) == apparent
-    with pytest.raises(DatasetError) as caught, opened_hdf5(path):
+    with pytest.raises(DatasetError) as caught, open_hdf5(path):
         pass
     assert str(caught.value) == f"{path} is not an HDF5 file, or its beginning is damaged{apparent}"
 

@@ -94,9 +94,9 @@ def load_planner(name: str, parameters: Mapping[str, Any]) -> BenchmarkPlanner:
         RecipeError: The planner is unknown or cannot be imported.
         UsageError: A parameter is unknown or invalid.
     """
-    mistakes: list[str] = []
-    planner = parse(load_kind(name), dict(parameters), where=RecipeLocation(name), mistakes=mistakes)
+    errors: list[str] = []
+    planner = parse(load_kind(name), dict(parameters), where=RecipeLocation(name), errors=errors)
     if planner is None:
-        raise UsageError("; ".join(mistakes), concerns="parameters")
+        raise UsageError("; ".join(errors), concerns="parameters")
     assert isinstance(planner, BenchmarkPlanner)
     return planner

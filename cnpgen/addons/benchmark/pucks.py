@@ -49,8 +49,8 @@ class Pucks:
     goal: tuple[float, float] = field("target of the pucks: x, y", unit="m")
     behind: float = field("distance of the tip behind the puck's centre at the hit", unit="m", low=0.0, plausible=1.0)
 
-    def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, mistake) pairs."""
+    def validate(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, error) pairs."""
         if (count := self.columns * self.rows) > MAX_TASKS:
             yield "columns", f"a grid of {count:,} pucks is too large, expected at most {MAX_TASKS:,}"
 
@@ -63,7 +63,7 @@ class Pucks:
 def hits_of(pucks: Pucks) -> Plans:
     """Return the boundary problems of hitting every puck of a grid from rest in the base configuration."""
     puck = pucks.positions()
-    start_q = np.tile(load_robot(pucks.problem).base, (puck.shape[1], 1))
+    start_q = np.tile(load_robot(pucks.problem).home, (puck.shape[1], 1))
     still = np.zeros_like(start_q)
     return hits_from(pucks, puck, (start_q, still, still))
 
@@ -106,8 +106,8 @@ class ReplanningScenario:
     switch_times: tuple[float, ...] = field("times at which the arm leaves its first motion", unit="s", low=0.0)
     pucks: Pucks = field("grid of pucks of the first and of the second motion")
 
-    def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, mistake) pairs."""
+    def validate(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, error) pairs."""
         if self.pucks.columns * self.pucks.rows % 2:
             yield "pucks", "the grid has a puck in its centre, which has no opposite: expected an even number of pucks"
         if (count := self.pucks.columns * self.pucks.rows * len(self.switch_times)) > MAX_SCENARIOS:

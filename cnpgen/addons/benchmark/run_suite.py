@@ -144,7 +144,7 @@ def run_benchmark(
     Raises:
         UsageError: A planner, plant or environment is unknown or unsuitable, or the folder has results of another
             run.
-        RecipeError: The suite has mistakes.
+        RecipeError: The suite has errors.
         MachineError: MuJoCo is missing, the results cannot be written, or a cluster cannot be reached.
     """
     where = Engine(engine, address, workers)

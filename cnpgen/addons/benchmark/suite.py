@@ -66,8 +66,8 @@ class Suite:
         "fields of planners, in a table per planner", default=None, form="a table of tables", since_version=2
     )
 
-    def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, mistake) pairs."""
+    def validate(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, error) pairs."""
         if sum(part is not None for part in (self.pucks, self.replanning, self.samples, self.scenes)) != 1:
             yield "pucks", "expected exactly one of [pucks], [replanning], [samples] and [scenes]"
 
@@ -82,7 +82,7 @@ class Suite:
             The problems and, of replanning scenarios, the prefixes of the first motions.
 
         Raises:
-            RecipeError: A recipe has mistakes.
+            RecipeError: A recipe has errors.
             UsageError: ``n`` is not positive.
         """
         n = None if n is None else integer("n", n, least=1)
@@ -105,7 +105,7 @@ def load_suite(name_or_path: str | Path) -> Suite:
         name_or_path: Name of a shipped suite, dataset or pipeline, or path of such a file.
 
     Raises:
-        RecipeError: With every mistake in the file.
+        RecipeError: With every error in the file.
     """
     return load_recipe(("suite", "dataset", "pipeline"), name_or_path, None, _read)
 
@@ -115,28 +115,28 @@ def _beside(folder: Path, name: str) -> str:
     return str(folder / name) if (folder / name).is_file() else name
 
 
-def _read_planners(tables: Any, where: RecipeLocation, mistakes: list[str]) -> PlannerFields | None:
+def _read_planners(tables: Any, where: RecipeLocation, errors: list[str]) -> PlannerFields | None:
     """Return the fields of planners after checking them."""
-    before, known = len(mistakes), registry.names(PLANNERS)
+    before, known = len(errors), registry.names(PLANNERS)
     if not isinstance(tables, dict):
-        mistakes.append(where.message(f"expected a table per planner, got {show(tables)}"))
+        errors.append(where.message(f"expected a table per planner, got {show(tables)}"))
         return None
     for name, fields in tables.items():
         if name not in known:
             hint = nearest(name, known) or f"; known: {', '.join(known)}"
-            mistakes.append((where / name).message(f"unknown planner{hint}"))
+            errors.append((where / name).message(f"unknown planner{hint}"))
             continue
         try:
             planner = load_kind(name)
         except CnpgenError as error:
-            mistakes.append((where / name).message(str(error)))
+            errors.append((where / name).message(str(error)))
             continue
-        parse(planner, fields, where=where / name, mistakes=mistakes)
-    return tables if len(mistakes) == before else None
+        parse(planner, fields, where=where / name, errors=errors)
+    return tables if len(errors) == before else None
 
 
-def _read(path: Path, mistakes: list[str]) -> Suite | None:
-    table = read_table(path, ("suite", "dataset", "pipeline"), mistakes)
+def _read(path: Path, errors: list[str]) -> Suite | None:
+    table = read_table(path, ("suite", "dataset", "pipeline"), errors)
     if table is None:
         return None
     if is_kind("dataset", table) or is_kind("pipeline", table):
@@ -152,7 +152,7 @@ def _read(path: Path, mistakes: list[str]) -> Suite | None:
         Problem: reference("problem", read_problem, path.parent),
         PlannerFields: _read_planners,
     }
-    suite = parse(Suite, table, where=RecipeLocation(str(path)), mistakes=mistakes, readers=readers)
+    suite = parse(Suite, table, where=RecipeLocation(str(path)), errors=errors, readers=readers)
     if suite is not None and suite.scenes is not None:
         file, robot = str(path.parent / suite.scenes.file), _beside(path.parent, suite.scenes.robot)
         return replace(suite, scenes=SceneFileProblems(file=file, robot=robot))

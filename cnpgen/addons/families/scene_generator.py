@@ -62,14 +62,14 @@ def load_family(name: str, parameters: Mapping[str, Any] | None = None) -> Scene
     if name not in known:
         text = f"unknown family {name!r}{nearest(name, known)}, expected one of {', '.join(known)}"
         raise UsageError(text, concerns="name")
-    mistakes: list[str] = []
+    errors: list[str] = []
     try:
         kind = registry.load(registry.FAMILIES, name)
     except RecipeError as error:
         raise UsageError(str(error), concerns="family") from error
-    family = parse(kind, dict(parameters or {}), where=RecipeLocation(name), mistakes=mistakes)
-    if family is None or mistakes:
-        raise UsageError("; ".join(mistakes), concerns="parameters")
+    family = parse(kind, dict(parameters or {}), where=RecipeLocation(name), errors=errors)
+    if family is None or errors:
+        raise UsageError("; ".join(errors), concerns="parameters")
     assert isinstance(family, SceneFamily)
     return family
 
@@ -135,7 +135,7 @@ def make_scenes(
 def _check_no_manifold(problem: Problem, robot: Robot) -> None:
     """Raise UsageError for constraints that hardly any drawn end meets."""
     world, rest, zero = World(robot, problem.obstacle, problem.object_size), np.zeros(robot.n), np.zeros((1, 3))
-    world.set_state(robot.base, rest, rest, scene_of(problem, zero, zero, zero).poses[0])
+    world.set_state(robot.home, rest, rest, scene_of(problem, zero, zero, zero).poses[0])
     for constraint in problem.constraint if robot.shape is not None else ():  # the lack of a shape is reported later
         if any(condition.g and condition.is_equality for condition in constraint.measured(world)):
             name = registry.name_of(registry.CONSTRAINTS, type(constraint))
@@ -208,7 +208,7 @@ class _Generator:
             chosen = grasps[int(random.integers(len(grasps)))]
             return np.asarray(chosen[random.integers(len(chosen))])
         if kind == "neutral":
-            q = self.robot.base + NEUTRAL_SPREAD_RAD * random.standard_normal(self.robot.n)
+            q = self.robot.home + NEUTRAL_SPREAD_RAD * random.standard_normal(self.robot.n)
         else:
             q = seeds_of(self.robot, 1, random)[:, 0]
         return q if states.are_ends(q[:, None], margin=END_MARGIN_M)[0] else None

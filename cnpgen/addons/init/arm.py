@@ -9,7 +9,7 @@ import numpy as np
 
 from cnpgen.errors import RecipeError, UsageError, listed
 from cnpgen.problems.checks import frames_of, missing_frame, unread_xacro
-from cnpgen.robots.robot import mistakes_in
+from cnpgen.robots.robot import recipe_errors_in
 from cnpgen.robots.urdf import read_urdf, urdf_tree
 from cnpgen.robots.urdf_parameters import LinkInertia, UrdfJoint, urdf_parameters
 
@@ -66,7 +66,7 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
         raise RecipeError([f"{urdf}: {error}"]) from error
     if text := unread_xacro(tree, urdf):
         raise RecipeError([text])
-    with mistakes_in(urdf):
+    with recipe_errors_in(urdf):
         parameters = urdf_parameters(tree)
     links, joints = list(parameters.inertias), parameters.joints
     if not links:

@@ -38,7 +38,7 @@ class {kind}(BenchmarkPlanner):
     def prepare(self, setting):
         """Load what all boundary problems share; this time is not measured."""
         robot = RobotModel(setting.problem)  # limits, kinematics, dynamics and collisions
-        robot.forward_kinematics(robot.base), robot.jacobian(robot.base), robot.inverse_dynamics(robot.base)  # compiles
+        robot.forward_kinematics(robot.home), robot.jacobian(robot.home), robot.inverse_dynamics(robot.home)  # compiles
         tables = [constraint for constraint in setting.problem.content["constraint"] if constraint["use"] == "table"]
         height = tables[0]["z"] if tables else None  # m
 

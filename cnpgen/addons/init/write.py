@@ -71,7 +71,7 @@ def _notes(arm: Arm) -> Mapping[str, str]:
     put = {"position": ranges, "velocity": f"{DEFAULT_SPEED:g} rad/s or m/s", "torque": torques}
     base = "Found by sampling: in front of the robot, far from its limits, with high manipulability."
     jerk = f"{INITIAL_JERK_RATE:.0f}/s times the acceleration limits; a Franka Research 3 has 500/s. Look them up."
-    notes = {"robot.base": base, "limits.jerk": jerk}
+    notes = {"robot.home": base, "limits.jerk": jerk}
     for what, instead in put.items():
         without = [joint.name for joint in arm.planned if what in joint.missing]
         if without:
@@ -122,13 +122,13 @@ def _gap_rows(overlaps: LinkOverlaps) -> list[tuple[str, ...]]:
 
 
 def _joint_rows(arm: Arm) -> Iterator[tuple[str, ...]]:
-    sliding = tuple(joint.kind == "prismatic" for joint in arm.planned)
+    prismatic = tuple(joint.kind == "prismatic" for joint in arm.planned)
     limits = {
         ("position", "rad"): [f"{joint.lower:.4g} to {joint.upper:.4g}" for joint in arm.planned],
         ("velocity", "rad/s"): [f"{joint.velocity:.4g}" for joint in arm.planned],
         ("torque", "N m"): [f"{joint.effort:.4g}" for joint in arm.planned],
     }
-    columns = [(name, *with_units(units_of_joints(unit, sliding), cells)) for (name, unit), cells in limits.items()]
+    columns = [(name, *with_units(units_of_joints(unit, prismatic), cells)) for (name, unit), cells in limits.items()]
     yield from zip(
         ("joint", "", *(joint.name for joint in arm.planned)),
         ("type", "", *(joint.kind for joint in arm.planned)),

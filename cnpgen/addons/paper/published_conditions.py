@@ -53,7 +53,7 @@ def _zero(name: str, unit: str, value: Any) -> tuple[Condition, ...]:
 
 def _points(state: SymbolicState) -> list[Vec]:
     """Return the ends of the robot's capsule axes, each once, and points between them."""
-    base = forward_kinematics(state.robot.chain, [float(q) for q in state.robot.base])
+    base = forward_kinematics(state.robot.chain, [float(q) for q in state.robot.home])
     origins = [np.array(x, float) for x in (*base.origins, base.tip)]
     ends: dict[int, Vec] = {}
     between: list[Vec] = []

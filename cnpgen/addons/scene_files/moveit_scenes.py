@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.problems.scenes.quaternions import quaternion_mistake, quaternion_of, rotation_matrix
+from cnpgen.problems.scenes.quaternions import quaternion_error, quaternion_of, rotation_matrix
 from cnpgen.problems.scenes.scene_problem import (
     GoalPose,
     SceneError,
@@ -221,7 +221,7 @@ def _pose(pose: Any, where: str) -> Pose:
 
 def _rotation(xyzw: Any, where: str) -> Array:
     quaternion = vector(xyzw, "xyzw", f"{where}: orientation")
-    if text := quaternion_mistake(quaternion):
+    if text := quaternion_error(quaternion):
         raise SceneError(f"{where}: {text}")
     return rotation_matrix(quaternion[[3, 0, 1, 2]])
 

@@ -21,7 +21,7 @@ from cnpgen.problems.scenes.scene_problem import MAX_SCENES, SceneError, ScenePr
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.shape.hull import Array
-from cnpgen.store.files.hdf5 import Hdf5, create_hdf5, opened_hdf5
+from cnpgen.store.files.hdf5 import Hdf5, create_hdf5, open_hdf5
 
 _ENDS = (("start_q", "goal_q"), ("start_configs", "target_configs"))
 _TRAJECTORIES = ("global_solutions", "hybrid_solutions", "solutions")  # shape (N, T, n)
@@ -35,13 +35,13 @@ SCENE_NAMES = "scene_names"  # attribute: a line of text per scene
 
 def is_mpinets(path: Path) -> bool:
     """Return whether an HDF5 file has the datasets of obstacles."""
-    with opened_hdf5(path) as file:
+    with open_hdf5(path) as file:
         return "cuboid_dims" in file or "cylinder_radii" in file
 
 
 def read_mpinets(path: Path, rows: slice) -> Iterator[SceneProblem]:
     """Yield the problems of a file; DatasetError if it is damaged, SceneError if a dataset or obstacle is invalid."""
-    with opened_hdf5(path) as file:
+    with open_hdf5(path) as file:
         start, goal = _ends(file, rows)
         count = len(start)
         shapes = {kind: _entries(file, kind, rows, count) for kind in _SHAPES}

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.problems.scenes.quaternions import quaternion_mistake, rotation_matrix
+from cnpgen.problems.scenes.quaternions import quaternion_error, rotation_matrix
 from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError, SceneProblem, check_count, make_obstacle
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.store.files.yaml_document import part, scalar, vector
@@ -59,7 +59,7 @@ def _goal_pose(entry: Any, place: str) -> GoalPose | None:
     if not entry:
         return None
     quaternion = vector(entry.get("quaternion_wxyz"), "wxyz", f"{place}: goal_pose")
-    if text := quaternion_mistake(quaternion):
+    if text := quaternion_error(quaternion):
         raise SceneError(f"{place}: goal_pose: {text}")
     position = vector(entry.get("position_xyz"), "xyz", f"{place}: goal_pose")
     return GoalPose(part(entry, "frame", str, place), position, rotation_matrix(quaternion))

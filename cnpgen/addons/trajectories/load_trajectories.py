@@ -193,7 +193,7 @@ class _Reader:
             if values is not None and len(values) != len(q):
                 raise self._error(f"{len(values)} {name} for {len(q)} positions")
         if self.unwrap:
-            turning = [not sliding for sliding in self.record.sliding_joints]
+            turning = [not sliding for sliding in self.record.prismatic_joints]
             q[:, turning] = np.unwrap(q[:, turning], axis=0)
         parameters = self._parameters()
         phase = self._numbers(PHASE_COLUMN, ndim=1) if PHASE_COLUMN in self.table.columns else None
@@ -335,7 +335,7 @@ class _Reader:
         """Return the factors to SI units of the columns of a kind, one per joint, shape (n,)."""
         exponent = {"q": "", "dq": "/s", "ddq": "/s^2"}[kind]
         turning = ("rad", _DEGREE if self.degrees else 1.0)
-        units = [("m", 1.0) if slides else turning for slides in self.record.sliding_joints]
+        units = [("m", 1.0) if slides else turning for slides in self.record.prismatic_joints]
         parts = zip(names, units, strict=True)
         return np.array([self._factor(name, unit + exponent, usual) for name, (unit, usual) in parts])
 

@@ -17,7 +17,7 @@ from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.store.files.atomic import machine_error, read_file
 from cnpgen.store.files.csv_table import read_csv_table
 from cnpgen.store.files.documents import parse_json
-from cnpgen.store.files.hdf5 import opened_hdf5
+from cnpgen.store.files.hdf5 import open_hdf5
 from cnpgen.store.files.kind import HDF5_SUFFIXES, is_hdf5, kind_of_content
 from cnpgen.store.files.size_limits import MAX_TABLE_BYTES
 from cnpgen.store.files.yaml_document import read_yaml
@@ -110,7 +110,7 @@ def holds_trajectories(path: Path) -> bool:
             raise UsageError(f"{path} is {kind}, expected {expected}")
         return False
     try:
-        with opened_hdf5(path) as file:
+        with open_hdf5(path) as file:
             return "path_control_points" not in file and bool({"q", "positions"} & set(file))
     except CnpgenError:
         return False
@@ -142,7 +142,7 @@ def _read_npz(path: Path) -> Iterator[TrajectoryTable]:
 
 
 def _read_hdf5(path: Path) -> Iterator[TrajectoryTable]:
-    with opened_hdf5(path) as file:
+    with open_hdf5(path) as file:
         arrays = {name: column.read() for name, column in file.columns().items()}
     yield from _split(path, arrays, ())
 

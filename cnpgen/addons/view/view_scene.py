@@ -82,7 +82,7 @@ class ViewScene:
 
 def scene_of_problem(problem: Problem, robot: Robot) -> ViewScene:
     """Show a robot in its base configuration."""
-    q = robot.base[:, None]
+    q = robot.home[:, None]
     tip = _poses(robot, q)[:, -1, :3, 3]
     scene = scene_of(problem, tip, tip, np.zeros((1, 3)))
     view = _still(problem, robot, f"{problem.name}: base configuration", q, ("base",), scene)

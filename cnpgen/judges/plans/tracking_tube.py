@@ -45,7 +45,7 @@ class TrackingTube:
         if values.shape not in ((), (robot.n,)) or not np.isfinite(values).all():
             expected = f"one number [rad], or {robot.n}, one per joint"
             raise UsageError(f"must be {expected}, got {error!r}", argument="tracking_error")
-        unit = "m" if all(robot.sliding) else "rad"
+        unit = "m" if all(robot.prismatic) else "rad"
         check_range("tracking_error", values, 0.0, MAX_TRACKING_ERROR, unit)
         self._problem, self._error = problem, np.broadcast_to(values, robot.n).copy()
         self._world = PathWorld(robot, problem.obstacle, problem.object_size)

@@ -62,7 +62,7 @@ def judge_goals(
     judged = []
     if rule.near and "hit_angle" in columns:
         q = columns["goal_q"][finite]
-        near_base = np.broadcast_to(robot.base, q.shape)
+        near_base = np.broadcast_to(robot.home, q.shape)
         home = near_base if rule.near == "base" else columns[f"{rule.near}_q"][finite]
         direction = _directions(robot, columns, finite)
         error = _projected_gradients(robot, q, home, direction, ACTIVE_LIMIT_TOLERANCES_RAD[dtype])

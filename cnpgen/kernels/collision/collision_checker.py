@@ -84,7 +84,7 @@ class CollisionChecker:
         chain = [np.append(joint.rotation.ravel(), joint.translation) for joint in robot.chain.joints]
         self._set("place", np.array(chain, np.float64))
         self._set("axis", np.array([joint.axis for joint in robot.chain.joints], np.float64))
-        self._set("sliding", np.array(robot.sliding, np.int64))
+        self._set("sliding", np.array(robot.prismatic, np.int64))
         parts, blocks, first = np.zeros(len(shape.convex_parts), BODY), list[Array](), 0
         for body, part in zip(parts, shape.convex_parts, strict=True):
             blocks.append(hull_vertices(part.vertices))

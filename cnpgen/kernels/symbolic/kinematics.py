@@ -36,7 +36,7 @@ class Kinematics:
         tip: Tip position p [m], 3.
         rotation: Tip rotation, 3 rows of 3.
         jacobian: Columns dp/dq_i [m/rad], n lists of 3.
-        turning: Whether joint i is revolute.
+        revolute: Whether joint i is revolute.
         frames: Rotations of the joints' frames, n times 3 rows of 3.
     """
 
@@ -45,7 +45,7 @@ class Kinematics:
     tip: Vec
     rotation: list[Vec]
     jacobian: list[Vec]
-    turning: list[bool]
+    revolute: list[bool]
     frames: list[list[Vec]]
 
 
@@ -64,9 +64,9 @@ def forward_kinematics(chain: Chain, q: Vec) -> Kinematics:
         origins.append(position)
         frames.append(rotation)
     tip = add(position, times(rotation, constants(chain.tip_translation)))
-    turning = [not joint.prismatic for joint in chain.joints]
-    jacobian = [cross(z, subtract(tip, o)) if turns else z for z, o, turns in zip(axes, origins, turning, strict=True)]
-    return Kinematics(axes, origins, tip, product(rotation, rows_of(chain.tip_rotation)), jacobian, turning, frames)
+    revolute = [not joint.prismatic for joint in chain.joints]
+    jacobian = [cross(z, subtract(tip, o)) if turns else z for z, o, turns in zip(axes, origins, revolute, strict=True)]
+    return Kinematics(axes, origins, tip, product(rotation, rows_of(chain.tip_rotation)), jacobian, revolute, frames)
 
 
 def tip_velocity(kin: Kinematics, dq: Vec) -> Vec:
@@ -81,7 +81,7 @@ def bias_acceleration(kin: Kinematics, dq: Vec) -> Vec:
     bias: Vec = [0.0, 0.0, 0.0]
     previous: Vec = [0.0, 0.0, 0.0]
     tip = tip_velocity(kin, dq)
-    for z, o, column, rate, turns in zip(kin.axes, kin.origins, kin.jacobian, dq, kin.turning, strict=True):
+    for z, o, column, rate, turns in zip(kin.axes, kin.origins, kin.jacobian, dq, kin.revolute, strict=True):
         velocity = add(velocity, cross(omega, subtract(o, previous)))
         if turns:
             moving = cross(z, subtract(tip, velocity))

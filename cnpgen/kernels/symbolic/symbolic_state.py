@@ -161,7 +161,7 @@ class SymbolicState:
         omega: Vec = [0.0, 0.0, 0.0]
         alpha: Vec = [0.0, 0.0, 0.0]
         kin = self.kinematics
-        for z, rate, rate2, turns in zip(kin.axes, self.dq, self.ddq, kin.turning, strict=True):
+        for z, rate, rate2, turns in zip(kin.axes, self.dq, self.ddq, kin.revolute, strict=True):
             if turns:
                 alpha = add(alpha, add(scale(z, rate2), scale(cross(omega, z), rate)))
                 omega = add(omega, scale(z, rate))

@@ -84,18 +84,18 @@ class DrawGoal(Stage):
 
 def check_reach(context: Context, boxes: Iterable[tuple[str, tuple[Range, ...]]]) -> None:
     """Raise RecipeError if the arm cannot reach one of the boxes, given as (name, box)."""
-    mistakes = []
+    errors = []
     shoulder = context.robot.chain.joints[0].translation
     for name, box in boxes:
         nearest = np.clip(shoulder, [axis.low for axis in box], [axis.high for axis in box])
         distance = float(np.linalg.norm(nearest - shoulder))
         if distance > context.robot.chain.reach:
-            mistakes.append(
+            errors.append(
                 f"{name}: the whole box {_box(box)} m is out of reach:"
                 f" {distance:.2f} m from the first joint, the arm is {context.robot.chain.reach:.2f} m long"
             )
-    if mistakes:
-        raise RecipeError(mistakes)
+    if errors:
+        raise RecipeError(errors)
 
 
 def position_field(end: str, low: Sequence[float], high: Sequence[float]) -> Field:
@@ -127,7 +127,7 @@ class GivenPositions(Stage):
         "start positions, one for all or one per goal; default: the base configuration", unit="m", default=()
     )
 
-    def find_mistakes(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> Iterator[tuple[str, str]]:
         if bool(self.goal) == bool(self.grid):
             yield "goal", "either a list of goals or a grid must be given, and not both"
         for key in ("grid", "counts"):
@@ -162,7 +162,7 @@ class GivenPositions(Stage):
     def prepare(self, context: Context) -> StageFunction:
         columns = {"start_xyz": self._starts(context).T, "goal_xyz": self._goals().T}
         if not self.start:
-            columns["start_q"] = context.robot.base[:, None]
+            columns["start_q"] = context.robot.home[:, None]
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             for name, values in columns.items():
@@ -181,7 +181,7 @@ class GivenPositions(Stage):
         """Return the start positions [m], shape (tasks or 1, 3)."""
         if self.start:
             return np.array(self.start)
-        (tip,) = context.kernels.load(tip_position)(context.robot.base[:, None])
+        (tip,) = context.kernels.load(tip_position)(context.robot.home[:, None])
         return np.ascontiguousarray(tip.T)
 
 

@@ -90,21 +90,21 @@ class DrawScenes(Stage):
 
     def _check(self, context: Context) -> None:
         """Raise RecipeError if the problem cannot have these scenes."""
-        problem, mistakes = context.problem, list[str]()
+        problem, errors = context.problem, list[str]()
         places = {kind: len(parked) for kind, parked in sample_obstacles(problem.obstacle).items() if parked}
         if places != self.capacity:
-            mistakes.append(
+            errors.append(
                 f"capacity: the problem has places for {places or 'no obstacles of samples'}, expected"
                 f" {self.capacity}: load the pipeline from a file, which adds them"
             )
         if any(obstacle.below for obstacle in problem.obstacle):
-            mistakes.append("obstacles below the object are not supported in scenes: give them a height")
+            errors.append("obstacles below the object are not supported in scenes: give them a height")
         if context.robot.shape is None or problem.first(RobotClearance) is None:
-            mistakes.append('needs a constraint robot-clearance and geometry = "urdf" in [robot] of the problem')
+            errors.append('needs a constraint robot-clearance and geometry = "urdf" in [robot] of the problem')
         if not any(family.share for family in self.family):
-            mistakes.append("family: all shares are 0, expected at least one larger")
-        if mistakes:
-            raise RecipeError(mistakes)
+            errors.append("family: all shares are 0, expected at least one larger")
+        if errors:
+            raise RecipeError(errors)
 
 
 @contextmanager

@@ -59,7 +59,7 @@ class HittingConfiguration(Stage):
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             n = len(candidates.alive)
-            home = np.repeat(robot.base[:, None], n, axis=1) if self.near == "base" else candidates[f"{self.near}_q"]
+            home = np.repeat(robot.home[:, None], n, axis=1) if self.near == "base" else candidates[f"{self.near}_q"]
             direction = hit_direction(context, candidates)
             candidates["goal_q"], solved, value = search.solve(candidates["goal_xyz"], direction, home)
             candidates.reject_first(np.array([solved, value > -np.inf]), REASONS)

@@ -260,7 +260,7 @@ def basic_joints(robot: Robot) -> tuple[int, int, int]:
     import pinocchio as pin
 
     random = np.random.default_rng(0)
-    low, high = np.maximum(robot.base - 0.7, robot.position_lower), np.minimum(robot.base + 0.7, robot.position_upper)
+    low, high = np.maximum(robot.home - 0.7, robot.position_lower), np.minimum(robot.home + 0.7, robot.position_upper)
     data, tip = robot.model.createData(), robot.tip_frame
     frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     jacobians = np.array(

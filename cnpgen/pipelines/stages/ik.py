@@ -87,11 +87,11 @@ class GuessedIK(Stage):
         if self.guess and len(self.guess) != n:
             raise RecipeError([f"guess: needs {n} ranges, one per planned joint, got {len(self.guess)}"])
         for index, each in enumerate(() if context.problem.is_stored else self.guess):
-            ends = np.full((2, n), robot.base)
+            ends = np.full((2, n), robot.home)
             ends[:, index] = each.low, each.high
             if wrong := find_implausible_value(robot, "guess_q", ends, robot.units("rad")):
                 raise RecipeError([f"guess: {robot.joint_names[index]}: {wrong}"])
-        guess = self.guess or tuple(Range(float(x), float(x)) for x in robot.base)
+        guess = self.guess or tuple(Range(float(x), float(x)) for x in robot.home)
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             candidates["guess_q"] = uniform(candidates.draw(random, n), guess)
@@ -138,7 +138,7 @@ class GoalIK(GuessedIK):
         "maximum difference of a joint between start and goal", unit="rad", low=1e-3, default=None, since_version=2
     )
 
-    def find_mistakes(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> Iterator[tuple[str, str]]:
         for name in ("from_start", "at_limit"):
             if getattr(self, name) and not self.guess:
                 yield name, "needs random guesses: give guess, too"
@@ -240,7 +240,7 @@ def _tilt(kin: Kinematics, frame: list[Vec] | None) -> tuple[Vec, list[Vec]]:
         turns_about = [[dot(axis, turning) for axis in frame] for turning in kin.axes]
     stretch = 2.0 / ca.fmax(1.0 + up[2], 1e-3)
     rows = [
-        [axis[row] if turns else 0.0 for axis, turns in zip(turns_about, kin.turning, strict=True)] for row in range(2)
+        [axis[row] if turns else 0.0 for axis, turns in zip(turns_about, kin.revolute, strict=True)] for row in range(2)
     ]
     return [up[1] * stretch, -up[0] * stretch], rows
 
@@ -273,7 +273,7 @@ class Home(GuessedIK):
     at_base: float = fraction("fraction of homes at the base configuration", default=0.0)
     position: tuple[Range, Range, Range] = field("box of tip positions of the other homes: x, y, z", unit="m")
 
-    def find_mistakes(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> Iterator[tuple[str, str]]:
         if self.at_start + self.at_base > 1:
             yield "at_base", f"the fractions must not be more than 1 together, got {self.at_start + self.at_base:g}"
 
@@ -295,7 +295,7 @@ class Home(GuessedIK):
     def prepare(self, context: Context) -> StageFunction:
         check_reach(context, (("position", self.position),))
         guess_home, tip = self._solve_guessed(context, "home"), context.kernels.load(tip_position)
-        base = context.robot.base[:, None]
+        base = context.robot.home[:, None]
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             candidates["home_xyz"] = uniform(candidates.draw(random, 3), self.position)

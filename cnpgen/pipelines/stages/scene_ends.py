@@ -62,7 +62,7 @@ class SceneEnds(Stage):
     grasps: int = field("grasps of a scene that are tried", default=8, low=1, high=100)
     poses: int = field("random poses at each grasp", default=12, low=1, high=100)
 
-    def find_mistakes(self) -> Iterator[tuple[str, str]]:
+    def validate(self) -> Iterator[tuple[str, str]]:
         total = self.neutral + self.grasp + self.random
         if abs(total - 1) > 1e-9:
             yield "random", f"the shares of starts must add up to 1, got {total:g}"
@@ -158,7 +158,7 @@ class _EndStates:
         """Draw states of all scenes and keep the valid ones."""
         robot, count = self._robot, len(scenes)
         low, high = robot.position_lower[:, None], robot.position_upper[:, None]
-        neutral = robot.base[:, None] + self._stage.spread * random.standard_normal((robot.n, count * NEUTRAL_STATES))
+        neutral = robot.home[:, None] + self._stage.spread * random.standard_normal((robot.n, count * NEUTRAL_STATES))
         anywhere = low + (high - low) * random.random((robot.n, count * RANDOM_STATES))
         q, key = self._grasp_states(scenes, random)
         owners = [np.repeat(np.arange(count), each) for each in (NEUTRAL_STATES, RANDOM_STATES)]
@@ -306,7 +306,7 @@ def pose_ik_step(robot: Robot) -> Any:
     stretch = METERS_PER_RADIAN * 2.0 / ca.fmax(1.0 + trace, 1e-2)
     turn = [relative[2][1] - relative[1][2], relative[0][2] - relative[2][0], relative[1][0] - relative[0][1]]
     error = [*subtract(p, kin.tip), *scale(turn, stretch)]
-    axes = [axis if turns else [0.0] * 3 for axis, turns in zip(kin.axes, kin.turning, strict=True)]
+    axes = [axis if turns else [0.0] * 3 for axis, turns in zip(kin.axes, kin.revolute, strict=True)]
     rows = [[column[row] for column in kin.jacobian] for row in range(3)]
     rows += [[METERS_PER_RADIAN * axis[row] for axis in axes] for row in range(3)]
     square = dot(error, error)

@@ -59,8 +59,8 @@ class PuckContact(Constraint):
     last: float = field("length of the end of the path on which contact is allowed", unit="m", low=1e-6, plausible=0.5)
     tolerance: float = field("violation that a valid motion may have", unit="m", low=0.0, plausible=0.5)
 
-    def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, mistake) pairs."""
+    def validate(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, error) pairs."""
         if not 0 < self.overlap < self.last - ADDED_RADIUS_M:
             yield (
                 "contact_distance",

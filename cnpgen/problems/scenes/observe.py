@@ -73,6 +73,6 @@ def scene_bodies(scenes: Scenes) -> Primitives:
     for scene, obstacles in enumerate(bodies):
         if not isinstance(obstacles, list | tuple) or not all(isinstance(body, Obstacle) for body in obstacles):
             raise UsageError(f"must contain scene problems or obstacles, not so at scene {scene}", argument="scenes")
-        if mistake := invalid_obstacle(obstacles):
-            raise UsageError(f"scene {scene}: {mistake}", concerns="scenes")
+        if error := invalid_obstacle(obstacles):
+            raise UsageError(f"scene {scene}: {error}", concerns="scenes")
     return scene_primitives(bodies)

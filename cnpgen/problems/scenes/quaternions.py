@@ -10,7 +10,7 @@ from cnpgen.robots.shape.hull import Array
 MAX_NORM_ERROR = 0.01  # of a quaternion that is accepted and normalized
 
 
-def quaternion_mistake(quaternion: Array) -> str:
+def quaternion_error(quaternion: Array) -> str:
     """Return an error message for a quaternion, shape (4,), that is not of unit length; empty for a valid one."""
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) <= MAX_NORM_ERROR:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cnpgen.errors import UsageError
-from cnpgen.problems.scenes.quaternions import quaternion_mistake, roll_pitch_yaw, rotation_matrix
+from cnpgen.problems.scenes.quaternions import quaternion_error, roll_pitch_yaw, rotation_matrix
 from cnpgen.robots.observation.primitives import KINDS, primitives_of, signed_distances
 from cnpgen.robots.obstacle import Obstacle, invalid_obstacle
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, Array, check_solid, hull_corners
@@ -116,7 +116,7 @@ def make_obstacle(
             raise SceneError(f"{where}: {what} must be finite and at most {MAX_COORDINATE_M:g}, got {values.tolist()}")
     if (sizes < MIN_OBSTACLE_SIZE_M).any():
         raise SceneError(f"{where}: sizes must be at least {MIN_OBSTACLE_SIZE_M:g} m, got {sizes.tolist()}")
-    if text := quaternion_mistake(wxyz):
+    if text := quaternion_error(wxyz):
         raise SceneError(f"{where}: {text}")
     x, y, z = position.tolist()
     turn = roll_pitch_yaw(rotation_matrix(wxyz))
@@ -191,8 +191,8 @@ def check_scenes(scenes: Sequence[SceneProblem]) -> None:
     for index, scene in enumerate(scenes):
         if not isinstance(scene, SceneProblem):
             raise UsageError(f"must be SceneProblems, got {scene!r:.100} at {index}", argument="scenes")
-        if mistake := invalid_obstacle(scene.obstacles):
-            raise SceneError(f"{scene.place}: {mistake}")
+        if error := invalid_obstacle(scene.obstacles):
+            raise SceneError(f"{scene.place}: {error}")
         for name, axes, expected in (("start_q", 1, "(n,)"), ("goal_q", 2, "(G, n)")):
             shape = np.shape(getattr(scene, name))
             if len(shape) != axes:

@@ -106,7 +106,7 @@ def condition_orders(problem: Problem, world: World) -> list[int]:
     forms, structure = [constraint.solved for constraint in problem.constraint], problem.structure
     rest = [np.zeros(world.robot.n)] * (3 if problem.uses_jerk else 2)
     if structure is not None and structure in _ORDERS:
-        world.set_state(world.robot.base, rest[0], rest[1], place_obstacles(world.obstacles), *rest[2:])
+        world.set_state(world.robot.home, rest[0], rest[1], place_obstacles(world.obstacles), *rest[2:])
         return _ORDERS[structure]
     orders = measured_needs(forms, world, jerk=problem.uses_jerk)
     if structure is not None:

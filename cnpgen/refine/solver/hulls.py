@@ -101,7 +101,7 @@ class Hulls:
             of_pairs = {pair: added[HELD_OBJECT in pair] for pair in names_of_pairs}
             self.checker = CollisionChecker(library, robot, shape, of_parts, of_pairs)
         self._axes = np.array([joint.axis for joint in robot.chain.joints])
-        self._sliding = np.array(robot.sliding)
+        self._sliding = np.array(robot.prismatic)
         supports = [list(joints) for joints in robot.model.supports]
         self._moves = np.array([[joint in above for joint in range(1, robot.n + 1)] for above in supports])
 

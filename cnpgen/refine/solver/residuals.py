@@ -147,6 +147,6 @@ def _state(robot: Robot) -> tuple[Any, SymbolicState]:
 def _restored(tables: list[dict[str, Any]]) -> list[ObjectiveTerm]:
     """Return the terms of ``CostTerm.tables``, of weight 1."""
     keys = [{key: value for key, value in table.items() if key not in {"source", "package"}} for table in tables]
-    mistakes: list[str] = []
+    errors: list[str] = []
     with stored_values():
-        return [read_kind(registry.OBJECTIVES, table, RecipeLocation(table["use"]), mistakes) for table in keys]
+        return [read_kind(registry.OBJECTIVES, table, RecipeLocation(table["use"]), errors) for table in keys]

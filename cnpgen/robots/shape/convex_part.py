@@ -60,16 +60,16 @@ def link_convex_parts(urdf: str) -> list[ConvexPart]:
 
     A cylinder becomes a prism of ``PRISM_SIDES`` sides that contains it; all other geometry is exact.
     """
-    found, mistakes = list[ConvexPart](), list[str]()
+    found, errors = list[ConvexPart](), list[str]()
     for link in urdf_tree(urdf).iter("link"):
         for element in link.iter("collision"):
             name = link.get("name", "")
             try:
                 found.append(convex_part_of(name, element))
             except (ValueError, TypeError) as error:
-                mistakes.append(f"the collision geometry of link {name!r} cannot be read: {error}")
-    if mistakes:
-        raise RecipeError(mistakes)
+                errors.append(f"the collision geometry of link {name!r} cannot be read: {error}")
+    if errors:
+        raise RecipeError(errors)
     return found
 
 

@@ -21,7 +21,7 @@ SIMILAR_PLANES_COSINE = math.cos(math.radians(3))  # of the angle below which pl
 MIN_THICKNESS_M = 1e-6  # coplanar points are extended by this on both sides, so that they have a hull
 MAX_CORNERS = 10_000  # of a body; finer meshes take minutes without benefit
 ENCLOSING_PLANES = 2_000  # of the body that replaces a finer one; it is about 0.1 % larger
-MAX_COORDINATE_M = 1e4  # larger coordinates are treated as mistakes of units
+MAX_COORDINATE_M = 1e4  # larger coordinates are treated as errors of units
 
 
 def check_solid(corners: Array) -> None:

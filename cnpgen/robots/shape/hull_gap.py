@@ -111,7 +111,7 @@ def _reference_bodies(
     urdf: str, path: Path, packages: Sequence[Path], model: "pin.Model"
 ) -> list[tuple[str, CollisionBody]]:
     """Return (link, body) of all collision elements, in the frames of the joints that move the links."""
-    bodies, mistakes = [], list[str]()
+    bodies, errors = [], list[str]()
     for link in urdf_tree(urdf).iter("link"):
         name = link.get("name", "")
         for element in link.iter("collision"):
@@ -120,9 +120,9 @@ def _reference_bodies(
             try:
                 bodies.append((name, _body(name, element, path, packages, placement)))
             except RecipeError as error:
-                mistakes += error.mistakes
-    if mistakes:
-        raise RecipeError(list(dict.fromkeys(mistakes)))
+                errors += error.errors
+    if errors:
+        raise RecipeError(list(dict.fromkeys(errors)))
     return bodies
 
 

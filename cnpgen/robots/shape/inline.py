@@ -52,19 +52,19 @@ def with_inline_meshes(
         return urdf
     elements = [(link, element) for link in tree.iter("link") for element in link.findall("collision")]
     meshes = [(link, element, mesh) for link, element in elements if (mesh := _mesh_file(element)) is not None]
-    mistakes = _unknown_links(tree, links)
+    errors = _unknown_links(tree, links)
     for link, element, mesh in meshes:
         parts = most if not links or link.get("name") in links else 1
         try:
             file = find_named_file(mesh.get("filename", ""), path, packages)
             addresses = [address_of(part) for part in _parts_of_file(file, scale_of(mesh), parts, keep)]
         except RecipeError as error:
-            mistakes += error.mistakes
+            errors += error.errors
         else:
             mesh.attrib.pop("scale", None)
             _replace(link, element, mesh, addresses)
-    if mistakes:
-        raise RecipeError(list(dict.fromkeys(mistakes)))
+    if errors:
+        raise RecipeError(list(dict.fromkeys(errors)))
     unversioned = tree.find(".//collision/geometry/capsule") is not None and tree.get("version", "1.0") < _CAPSULES
     if unversioned:  # the URDF parser would ignore capsules, with warnings on stderr
         tree.set("version", _CAPSULES)
@@ -152,7 +152,7 @@ def _parts_of_file(path: Path, scale: Array, most: int, keep: Path | None) -> li
     try:
         parts = [hull_corners(points)] if most == 1 else convex_parts(points, sides_of(mesh), most, keep)
     except RecipeError as error:
-        raise RecipeError([f"{path}: {text}" for text in error.mistakes]) from error
+        raise RecipeError([f"{path}: {text}" for text in error.errors]) from error
     _warn_about(path, points, scale)
     return [_simplified(path, part) for part in parts]
 

@@ -23,7 +23,7 @@ def find_urdf(name: str, problem: Path, packages: Sequence[Path] = ()) -> Path:
     try:
         return _find(name, problem, packages)
     except RecipeError as error:
-        raise PluginError(error.mistakes) from None
+        raise PluginError(error.errors) from None
 
 
 def find_named_file(name: str, urdf: Path, packages: Sequence[Path] = ()) -> Path:
@@ -37,7 +37,7 @@ def find_named_file(name: str, urdf: Path, packages: Sequence[Path] = ()) -> Pat
     try:
         return _find(name, urdf, packages)
     except RecipeError as error:
-        raise RecipeError([f"{urdf}: {mistake}" for mistake in error.mistakes]) from None
+        raise RecipeError([f"{urdf}: {error}" for error in error.errors]) from None
 
 
 def packages_of_environment(names: Iterable[str], urdf: Path, packages: Sequence[Path] = ()) -> tuple[Path, ...]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
 from cnpgen.store.files.atomic import machine_errors, read_file, write_file
-from cnpgen.store.files.hdf5 import create_hdf5, opened_hdf5, require_possible_size
+from cnpgen.store.files.hdf5 import create_hdf5, open_hdf5, require_possible_size
 from cnpgen.store.files.kind import HDF5, apparent_kind, kind_name, own_kind
 from cnpgen.store.files.size_limits import MAX_CHECKSUM_FILE_BYTES
 
@@ -106,7 +106,7 @@ def read_with_checksum(path: Path, *, kind: str, version: int) -> Content:
     _check_checksum(
         path, data[:HEADER_BYTES], hashlib.sha256(data[HEADER_BYTES:]).hexdigest(), kind=kind, version=version
     )
-    with opened_hdf5(path, data) as file:
+    with open_hdf5(path, data) as file:
         values = {name: item.read() for name, item in file.columns().items()}
     try:
         texts = {name: value.tobytes().decode() for name, value in values.items() if value.dtype == np.uint8}

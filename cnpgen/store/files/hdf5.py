@@ -223,7 +223,7 @@ def _type_text(dataset: Any) -> str:
 
 
 @contextmanager
-def opened_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
+def open_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
     """Open an HDF5 file for reading, or its content if that has been read already.
 
     All handles are closed at the end of the block, so processes cannot share them.

@@ -1,4 +1,4 @@
-"""Suites: pucks on grids, samples of datasets, mistakes in the file."""
+"""Suites: pucks on grids, samples of datasets, errors in the file."""
 
 from pathlib import Path
 
@@ -29,7 +29,7 @@ def test_hits_81_has_every_puck_of_the_grid_with_a_hit_towards_the_goal() -> Non
     across = (puck - tip[:, :2])[:, 0] * direction[:, 1] - (puck - tip[:, :2])[:, 1] * direction[:, 0]
     assert np.abs(across).max() < 1e-12
     np.testing.assert_allclose(problems.problem.tip_positions(problems.boundary.goal_q), tip, atol=1e-8)
-    assert np.all(problems.boundary.start_q == robot.base)
+    assert np.all(problems.boundary.start_q == robot.home)
     assert not problems.boundary.start_dq.any()
     assert np.abs(problems.boundary.goal_dq).max() <= robot.velocity_limit.max() * (1 + 1e-12)
     assert np.isnan(problems.path_control_points).all()
@@ -56,7 +56,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("text", MISTAKES)
-def test_mistakes_in_a_suite_are_named(text: str, tmp_path: Path) -> None:
+def test_recipe_errors_in_a_suite_are_named(text: str, tmp_path: Path) -> None:
     (tmp_path / "suite.toml").write_text(text, encoding="utf-8")
     with pytest.raises(RecipeError) as caught:
         load_suite(tmp_path / "suite.toml")

@@ -36,7 +36,7 @@ def test_layouts_are_valid_and_depend_on_the_random_numbers_only(name: str) -> N
         again = family.draw(np.random.default_rng(seed))
         assert layout.obstacles == again.obstacles
         assert len(layout.grasps) >= 2
-        assert all(not list(obstacle.find_mistakes()) for obstacle in layout.obstacles)
+        assert all(not list(obstacle.validate()) for obstacle in layout.obstacles)
         assert len({obstacle.name for obstacle in layout.obstacles}) == len(layout.obstacles) <= 40
         assert all(np.linalg.norm(grasp.approach) == pytest.approx(1) for grasp in layout.grasps)
         counts.add(len(layout.obstacles))

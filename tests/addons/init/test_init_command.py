@@ -175,7 +175,7 @@ def test_convex_parts_reject_less_than_two_percent_of_the_free_states(name, tmp_
                 free, rejected = free + 1, rejected + touches
     print(f"{name}: {rejected} of {free} free states are rejected")
     assert rejected < 0.02 * free
-    assert not meshes.touches(robot.base)
+    assert not meshes.touches(robot.home)
     for pair in robot.shape.pairs:
         if pair.left_out == "always":
             assert any(f"{pair.first}, {pair.second}" in note for note in initial.notes)

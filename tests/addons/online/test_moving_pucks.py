@@ -26,7 +26,7 @@ def planner() -> Planner:
 
 @pytest.fixture(scope="module")
 def still(planner):
-    return planner.robot.base, np.zeros(6), np.zeros(6)
+    return planner.robot.home, np.zeros(6), np.zeros(6)
 
 
 @pytest.fixture(scope="module")
@@ -165,13 +165,13 @@ def test_a_puck_at_rest_gives_the_same_hit_as_without_velocity(planner, still):
 
 def test_ways_back_continue_hits_without_a_jump_and_are_valid(planner, still, pucks):
     hits = plan_hits(
-        planner, still, pucks[0], TARGET, puck_velocity=pucks[1], speed_share=0.95, home=planner.robot.base
+        planner, still, pucks[0], TARGET, puck_velocity=pucks[1], speed_share=0.95, home=planner.robot.home
     )
     assert evaluate_plans(hits.return_plans).valid.all()
     sequences = hits.sequences
     np.testing.assert_allclose(sequences.duration, hits.plans.duration + hits.return_plans.duration)
     end = sequences.motion.at_times(sequences.duration[:, None])
-    np.testing.assert_allclose(end.q[:, 0], np.tile(planner.robot.base, (len(sequences), 1)), atol=1e-9)
+    np.testing.assert_allclose(end.q[:, 0], np.tile(planner.robot.home, (len(sequences), 1)), atol=1e-9)
     np.testing.assert_allclose(end.dq, 0.0, atol=1e-9)
 
 

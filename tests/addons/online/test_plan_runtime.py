@@ -31,12 +31,12 @@ def hit_and_return(planner: Planner, state, puck) -> JoinedPlans:
     """A hit and the way back to the base configuration."""
     hit = plan_hits(planner, state, puck, TARGET, speed_share=SHARE).plans
     q, dq, ddq = hit.states_at(hit.duration)
-    return join_plans(hit, planner.plan(q, planner.robot.base, start_dq=dq, start_ddq=ddq))
+    return join_plans(hit, planner.plan(q, planner.robot.home, start_dq=dq, start_ddq=ddq))
 
 
 @pytest.fixture
 def runtime(planner) -> PlanRuntime:
-    return PlanRuntime(planner, planner.robot.base)
+    return PlanRuntime(planner, planner.robot.home)
 
 
 @pytest.fixture
@@ -77,7 +77,7 @@ def test_set_points_are_the_states_of_the_plan(planner, runtime):
     points = runtime.set_point(times)
     np.testing.assert_allclose(points.q, q, atol=1e-8)
     np.testing.assert_allclose(points.dq, dq, atol=1e-6)
-    np.testing.assert_allclose(runtime.set_point(9.0).q, planner.robot.base, atol=1e-9)
+    np.testing.assert_allclose(runtime.set_point(9.0).q, planner.robot.home, atol=1e-9)
     assert not runtime.set_point(9.0).dq.any()
     assert runtime.end_time == pytest.approx(float(sequence.duration[0]))
 
@@ -99,7 +99,7 @@ def test_plans_that_must_not_be_executed_are_refused_and_the_motion_continues(pl
     state, end = executing.state_at(0.3), executing.end_time
     sequence = hit_and_return(planner, state, [1.05, -0.1])
     before = executing.state_at(np.linspace(0.1, end, 40))
-    far = planner.plan(state.q, planner.robot.base + 0.6, start_dq=state.dq, start_ddq=state.ddq)
+    far = planner.plan(state.q, planner.robot.home + 0.6, start_dq=state.dq, start_ddq=state.ddq)
     refusals = {
         SwitchOutcome.NO_PLAN: executing.switch(None, 0.3),
         SwitchOutcome.MOVING: executing.switch(sequence.parts[0], 0.3),
@@ -156,7 +156,7 @@ def test_a_stop_is_faster_than_the_motion_and_valid(planner, executing, at):
 
 def test_a_stop_of_an_arm_at_rest_changes_nothing(planner, runtime):
     assert runtime.stop(0.5).accepted
-    np.testing.assert_array_equal(runtime.set_point(2.0).q, planner.robot.base)
+    np.testing.assert_array_equal(runtime.set_point(2.0).q, planner.robot.home)
 
 
 def test_invalid_arguments_raise_errors(planner, runtime):
@@ -191,7 +191,7 @@ def test_a_hit_that_is_replanned_in_flight_scores_in_the_simulator_at_1_khz(plan
     assert execution.executed.success
     assert execution.executed.plane_error < 5e-3
     assert execution.executed.torque_use < 1
-    base = Arm(open_problem(planner.model.problem)[1]).pose(planner.robot.base).translation
+    base = Arm(open_problem(planner.model.problem)[1]).pose(planner.robot.home).translation
     resting = execution.tip[min(2400, len(execution.tip) - 1)]
     assert np.linalg.norm(resting - base) < 5e-3
     assert evaluate_plans(hit).valid.all()
@@ -199,11 +199,11 @@ def test_a_hit_that_is_replanned_in_flight_scores_in_the_simulator_at_1_khz(plan
 
 @pytest.mark.parametrize("time", [np.nan, np.inf, [0.0, np.nan], [], [[0.0]]])
 def test_set_points_at_impossible_times_are_refused_and_change_nothing(planner, time):
-    runtime = PlanRuntime(planner, planner.robot.base)
+    runtime = PlanRuntime(planner, planner.robot.home)
     for evaluate in (runtime.set_point, runtime.state_at):
         with pytest.raises(UsageError, match=r"^time must be"):
             evaluate(time)
-    assert runtime.switch(planner.plan(planner.robot.base, planner.robot.base), 0.0).outcome != SwitchOutcome.LATE
+    assert runtime.switch(planner.plan(planner.robot.home, planner.robot.home), 0.0).outcome != SwitchOutcome.LATE
 
 
 def test_plans_and_stops_have_the_parameters_of_the_runtime():

@@ -65,14 +65,14 @@ def test_the_command_line_states_values_that_a_file_lacks(tmp_path: Path, capsys
     names, values = plans().problem.parameters.names, plans().boundary.parameters[0].tolist()
     assert main([*words, "--parameters", ",".join(map("{}={!r}".format, names, values))]) == 0
     assert json.loads(capsys.readouterr().out)["valid"] == 1
-    for value, mistake in (
+    for value, error in (
         ("payload=1", "expected NAME=VALUE with one of table_height"),
         ("payload_mass=6kg", "'payload_mass' is not a parameter of 'airhockey-tables'"),
         ("table_height=2deg", "table_height: expected a length [m]"),
         ("table_height=9,table_roll=0,table_pitch=0,velocity_factor=1", "table_height must be from"),
     ):
         assert main([*words, "--parameters", value]) == 2
-        assert mistake in capsys.readouterr().err, value
+        assert error in capsys.readouterr().err, value
     export_plans(plans()[:1], tmp_path / "hits", to="csv", rate=500)
     assert main(["evaluate", str(tmp_path / "hits"), "--problem", "airhockey", "--parameters", "table_height=0"]) == 2
     assert "the problem has no parameters" in capsys.readouterr().err

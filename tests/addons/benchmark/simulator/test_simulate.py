@@ -173,7 +173,7 @@ def test_a_mallet_on_the_table_is_carried_by_it() -> None:
     scene = simulator_scene(
         solve_plans(draw_boundary_problems("airhockey-pucks", 1, seed=1), workers=1).plans, PLANTS["nominal"]
     )
-    base = scene.robot.base
+    base = scene.robot.home
     still = Reference(np.repeat(base[None], 500, axis=0), np.zeros((500, 6)), np.zeros((500, 6)), 0.499)
     run = _Run(replace(scene, puck=np.array([2.0, 0.0])), lowered(still, scene, 0.002))
     record = run.simulate(np.zeros(6))

@@ -71,7 +71,7 @@ def test_motors_saturate_at_the_torques_of_the_problem() -> None:
     tool = with_tool()
     control = Controller(tool.problem, tool.robot, tool.plant)
     still = np.zeros(tool.robot.n)
-    torques = [control(tool.robot.base, still, (tool.robot.base + offset, still, still)) for offset in 10 * np.eye(7)]
+    torques = [control(tool.robot.home, still, (tool.robot.home + offset, still, still)) for offset in 10 * np.eye(7)]
     assert tool.problem.limits.torque is not None
     limit = np.array(tool.problem.limits.torque.values)
     for torque in torques:
@@ -104,7 +104,7 @@ def test_a_falling_arm_conserves_energy(name: str) -> None:
     robot, model = ROBOTS[name], without_friction(scene(name))
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
     data, other = mujoco.MjData(model), robot.model.createData()
-    data.qpos[: robot.n] = robot.base + 0.3
+    data.qpos[: robot.n] = robot.home + 0.3
     first = pin.computeMechanicalEnergy(robot.model, other, data.qpos[: robot.n].copy(), np.zeros(robot.n))
     mujoco.mj_step(model, data, 4000)
     q, dq = data.qpos[: robot.n].copy(), data.qvel[: robot.n].copy()
@@ -116,7 +116,7 @@ def test_friction_dissipates_energy() -> None:
     robot = ROBOTS["airhockey"]
     model = mujoco.MjModel.from_xml_string(scene_xml(scene("airhockey")))
     data, other = mujoco.MjData(model), robot.model.createData()
-    data.qpos[: robot.n] = robot.base + 0.3
+    data.qpos[: robot.n] = robot.home + 0.3
     first = pin.computeMechanicalEnergy(robot.model, other, data.qpos[: robot.n].copy(), np.zeros(robot.n))
     mujoco.mj_step(model, data, 1600)
     last = pin.computeMechanicalEnergy(robot.model, other, data.qpos[: robot.n].copy(), data.qvel[: robot.n].copy())
