@@ -12,7 +12,9 @@ class SiteAddresses(MetadataHookInterface):  # type: ignore[misc]
 
     def update(self, metadata: dict[str, Any]) -> None:
         """Add the addresses to the metadata."""
-        text = (Path(self.root) / "cnpgen" / "machine" / "versions.py").read_text(encoding="utf-8")
+        text = (Path(self.root) / "cnpgen" / "machine" / "versions.py").read_text(
+            encoding="utf-8"
+        )
         found = re.search(r'^DOCUMENTATION_URL = "([^"]+)"', text, re.MULTILINE)
         assert found is not None
         site = found[1]

@@ -36,7 +36,9 @@ ROWS, VALIDATION_ROWS = 18_000, 200
 CHECK_ROWS, VALIDATIONS = 100, 5
 PROBLEM_SEED, DATA_SEED = 31_415, 27_182  # used nowhere else
 TIMED_PLANS = 200
-MAX_REPEATED_FACTOR = 1.0  # of the training time; variants with a larger one have one seed
+MAX_REPEATED_FACTOR = (
+    1.0  # of the training time; variants with a larger one have one seed
+)
 BASE = TrainingSettings(validations=VALIDATIONS)
 VALID_AXIS, RATIO_AXIS = (80.0, 100.5), (0.98, 1.15)  # of the figure
 
@@ -69,30 +71,63 @@ def variants() -> Iterator[Variant]:
         yield Variant("metric", name, replace(BASE, metric=METRICS[name]))
     steps = {"no path": (1, 0), "no line": (0, 1), "neither": (0, 0)}
     for name, (line, path) in steps.items():
-        yield Variant("projection", name, replace(BASE, line_projection_steps=line, projection_steps=path))
-    yield Variant("head", "pi, Glorot", replace(BASE, path_scale=math.pi, head_scale=1.0, rate_bias=0.0))
+        yield Variant(
+            "projection",
+            name,
+            replace(BASE, line_projection_steps=line, projection_steps=path),
+        )
+    yield Variant(
+        "head",
+        "pi, Glorot",
+        replace(BASE, path_scale=math.pi, head_scale=1.0, rate_bias=0.0),
+    )
     for name in ("states", "paper"):
         yield Variant("features", name, replace(BASE, features=name))
     yield Variant("margins", "none", replace(BASE, usual_margins=False))
-    yield Variant("clipping", "none", replace(BASE, sample_clip=math.inf, batch_clip=math.inf))
+    yield Variant(
+        "clipping", "none", replace(BASE, sample_clip=math.inf, batch_clip=math.inf)
+    )
     yield Variant("average", "none", replace(BASE, memory=0.0))
-    yield Variant("learning rate", "5e-5, constant", replace(BASE, learning_rate=5e-5, final_rate=1.0, warm_up=0))
+    yield Variant(
+        "learning rate",
+        "5e-5, constant",
+        replace(BASE, learning_rate=5e-5, final_rate=1.0, warm_up=0),
+    )
     for hidden in (64, 256):
         yield Variant("width", str(hidden), replace(BASE, hidden=hidden))
     for layers in (3, 8):
         yield Variant("depth", str(layers), replace(BASE, layers=layers))
     for count in (9, 10, 20):  # 8 do not suffice for boundary accelerations
-        yield Variant("control points of the path", str(count), replace(BASE, path_control_points=count))
+        yield Variant(
+            "control points of the path",
+            str(count),
+            replace(BASE, path_control_points=count),
+        )
     for count in (8, 10, 15):
-        yield Variant("control points of the rate", str(count), replace(BASE, rate_control_points=count))
+        yield Variant(
+            "control points of the rate",
+            str(count),
+            replace(BASE, rate_control_points=count),
+        )
     for rows in (1_000, 5_000, 120_000):
         yield Variant("samples", f"{rows:,}", rows=rows)
-    yield Variant("precision of the loss", "float64", replace(BASE, precision="float64"))
+    yield Variant(
+        "precision of the loss", "float64", replace(BASE, precision="float64")
+    )
     for factor in (0.5, 4.0, 15.0, 60.0):
-        yield Variant("training time", f"x {factor:g}", time_factor=factor, once=factor > MAX_REPEATED_FACTOR)
+        yield Variant(
+            "training time",
+            f"x {factor:g}",
+            time_factor=factor,
+            once=factor > MAX_REPEATED_FACTOR,
+        )
     published = replace(PAPER.settings, hidden=128, validations=VALIDATIONS)
     yield Variant("paper", "preset, 5 x 128", published)
-    yield Variant("paper", "preset, ramped metric", replace(published, metric=METRICS["ramped"], loss_form="signed"))
+    yield Variant(
+        "paper",
+        "preset, ramped metric",
+        replace(published, metric=METRICS["ramped"], loss_form="signed"),
+    )
 
 
 @dataclass(frozen=True)
@@ -107,17 +142,25 @@ def new_problems(dataset: str, n: int) -> Test:
     """Draw problems that no training has seen; refine the shipped planner's plans for them."""
     progress(f"refining {n:,} new problems")
     problems = cnpgen.draw_boundary_problems(dataset, n, seed=PROBLEM_SEED)
-    drafts = cnpgen.Planner(dataset).plan_batch(problems.boundary, columns=problems.columns)
+    drafts = cnpgen.Planner(dataset).plan_batch(
+        problems.boundary, columns=problems.columns
+    )
     refinement = refine_plans(drafts, workers=1)
     return Test(problems, np.where(refinement.valid, refinement.plans.duration, np.nan))
 
 
-def result_of(variant: Variant, seed: int, test: Test, options: argparse.Namespace) -> dict[str, Any]:
+def result_of(
+    variant: Variant, seed: int, test: Test, options: argparse.Namespace
+) -> dict[str, Any]:
     """Train one variant with one seed and judge it."""
     folder: Path = options.folder
     data = folder / f"{options.dataset}-{variant.rows}"
     splits = {"train": variant.rows, "validation": VALIDATION_ROWS}
-    make_dataset(replace(load_dataset_recipe(options.dataset), splits=splits, seed=DATA_SEED), data, workers=1)
+    make_dataset(
+        replace(load_dataset_recipe(options.dataset), splits=splits, seed=DATA_SEED),
+        data,
+        workers=1,
+    )
     trained = train_model(
         data,
         folder / f"{key_of(variant, seed).replace(' ', '-').replace(',', '')}.h5",
@@ -129,7 +172,10 @@ def result_of(variant: Variant, seed: int, test: Test, options: argparse.Namespa
     planner = cnpgen.Planner(trained.path)
     plans = planner.plan_batch(test.problems.boundary, columns=test.problems.columns)
     evaluation = evaluate_plans(plans, workers=1)
-    worst = [max((m.severity for m in verdict.margins.values()), default=math.inf) for verdict in evaluation.verdicts]
+    worst = [
+        max((m.severity for m in verdict.margins.values()), default=math.inf)
+        for verdict in evaluation.verdicts
+    ]
     summary = evaluation.summary()
     return {
         "variant": key_of(variant, seed),
@@ -153,7 +199,9 @@ def planning_time(planner: cnpgen.Planner, test: Test) -> float:
     """Measure the median CPU time of single plans [ms]."""
     count = min(TIMED_PLANS, len(test.refined))
     boundaries = [test.problems.boundary[index : index + 1] for index in range(count)]
-    return 1e3 * median(cpu_of(partial(planner.plan_batch, boundary)) for boundary in boundaries)
+    return 1e3 * median(
+        cpu_of(partial(planner.plan_batch, boundary)) for boundary in boundaries
+    )
 
 
 def key_of(variant: Variant, seed: int) -> str:
@@ -165,12 +213,27 @@ def run(options: argparse.Namespace) -> list[dict[str, Any]]:
     """Compute the missing results: all variants with the first seed, then with the next ones."""
     options.folder.mkdir(parents=True, exist_ok=True)
     file = options.folder / "results.jsonl"
-    chosen = [variant for variant in variants() if not options.only or variant.group in {"base", *options.only}]
+    chosen = [
+        variant
+        for variant in variants()
+        if not options.only or variant.group in {"base", *options.only}
+    ]
     seeds = list(enumerate(options.seeds))
-    wanted = [(variant, seed) for index, seed in seeds for variant in chosen if not (index and variant.once)]
+    wanted = [
+        (variant, seed)
+        for index, seed in seeds
+        for variant in chosen
+        if not (index and variant.once)
+    ]
     done = read(file)
-    missing = [(variant, seed) for variant, seed in wanted if key_of(variant, seed) not in done]
-    test = new_problems(options.dataset, options.n) if missing and not options.tables else None
+    missing = [
+        (variant, seed) for variant, seed in wanted if key_of(variant, seed) not in done
+    ]
+    test = (
+        new_problems(options.dataset, options.n)
+        if missing and not options.tables
+        else None
+    )
     for variant, seed in missing if test is not None else ():
         progress(key_of(variant, seed))
         assert test is not None
@@ -211,7 +274,11 @@ def rows_of(results: list[dict[str, Any]]) -> list[Row]:
     """Group the results by variant, in the order of ``variants``."""
     rows = []
     for variant in variants():
-        records = [item for item in results if (item["group"], item["name"]) == (variant.group, variant.name)]
+        records = [
+            item
+            for item in results
+            if (item["group"], item["name"]) == (variant.group, variant.name)
+        ]
         if records:
             rows.append(Row(variant.group, variant.name, records))
     return rows
@@ -220,12 +287,22 @@ def rows_of(results: list[dict[str, Any]]) -> list[Row]:
 def cells(row: Row) -> tuple[str, ...]:
     """Format a row of the table."""
     valid, paper = row.ratio("valid"), row.ratio("paper_valid")
-    ratios = (f"{100 * value:.1f} ({100 * low:.1f} to {100 * high:.1f})" for value, low, high in (valid, paper))
-    per_seed = " ".join(f"{100 * record['valid'] / record['problems']:.1f}" for record in row.records)
+    ratios = (
+        f"{100 * value:.1f} ({100 * low:.1f} to {100 * high:.1f})"
+        for value, low, high in (valid, paper)
+    )
+    per_seed = " ".join(
+        f"{100 * record['valid'] / record['problems']:.1f}" for record in row.records
+    )
     duration, worst = row.spread("duration_ratio"), row.spread("worst_median")
     tail, steps = row.spread("worst_p95"), row.spread("steps")
     times = row.spread("training_cpu_s")[0], row.spread("planning_cpu_ms")[0]
-    figures = (f"{duration[0]:.3f}", f"{worst[0]:.2f}, {tail[0]:.2f}", f"{steps[0]:,.0f}", f"{times[0]:.0f}")
+    figures = (
+        f"{duration[0]:.3f}",
+        f"{worst[0]:.2f}, {tail[0]:.2f}",
+        f"{steps[0]:,.0f}",
+        f"{times[0]:.0f}",
+    )
     return (row.group, row.name, *ratios, per_seed, *figures, f"{times[1]:.2f}")
 
 
@@ -242,7 +319,13 @@ def plot(rows: list[Row], path: str) -> None:
         for place, row in zip(places, rows, strict=True):
             factor, limits = (1, RATIO_AXIS) if axis is right else (100, VALID_AXIS)
             value, low, high = row.spread(key) if axis is right else row.ratio(key)
-            draw_interval(axis, place, (factor * value, factor * low, factor * high), limits, color)
+            draw_interval(
+                axis,
+                place,
+                (factor * value, factor * low, factor * high),
+                limits,
+                color,
+            )
         axis.plot([], [], "o", color=color, label=label)
     left.set(xlim=VALID_AXIS, xlabel="valid plans [%]")
     left.set_yticks(places, [f"{row.group}: {row.name}" for row in rows], fontsize=7)
@@ -253,7 +336,11 @@ def plot(rows: list[Row], path: str) -> None:
 
 
 def draw_interval(
-    axis: Any, place: int, interval: tuple[float, float, float], limits: tuple[float, float], color: str
+    axis: Any,
+    place: int,
+    interval: tuple[float, float, float],
+    limits: tuple[float, float],
+    color: str,
 ) -> None:
     """Draw a value with its bounds in a row, or print it at the edge of the axis outside of which it lies."""
     value, low, high = interval
@@ -264,18 +351,34 @@ def draw_interval(
     is_low = value < limits[0]
     edge, alignment = (limits[0], "left") if is_low else (limits[1], "right")
     text = f" \u2190 {value:.3g}" if is_low else f"{value:.3g} \u2192 "
-    axis.text(edge, place, text, color=color, fontsize=7, va="bottom" if color == "C1" else "center", ha=alignment)
+    axis.text(
+        edge,
+        place,
+        text,
+        color=color,
+        fontsize=7,
+        va="bottom" if color == "C1" else "center",
+        ha=alignment,
+    )
 
 
 def main() -> None:
     def add(parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("folder", type=Path, help="folder of datasets, models and results")
-        parser.add_argument("--dataset", default="airhockey-hit", help="dataset and shipped model")
-        parser.add_argument("--seconds", type=float, default=60.0, help="CPU time of a training [s]")
+        parser.add_argument(
+            "folder", type=Path, help="folder of datasets, models and results"
+        )
+        parser.add_argument(
+            "--dataset", default="airhockey-hit", help="dataset and shipped model"
+        )
+        parser.add_argument(
+            "--seconds", type=float, default=60.0, help="CPU time of a training [s]"
+        )
         parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
         parser.add_argument("--n", type=int, default=1000, help="new problems")
         parser.add_argument("--only", nargs="+", help="groups of variants")
-        parser.add_argument("--tables", action="store_true", help="print finished results only")
+        parser.add_argument(
+            "--tables", action="store_true", help="print finished results only"
+        )
         parser.add_argument("--plot", metavar="FILE", help="figure to write")
 
     options = arguments(__doc__, add)
@@ -283,8 +386,20 @@ def main() -> None:
     rows = rows_of(results)
     if options.plot:
         plot(rows, options.plot)
-    head = ("subject", "variant", "valid %", "paper's rules %", "valid % by seed", "duration / refined")
-    figures = ("violation / tolerance: median, p95", "steps", "training s", "planning ms")
+    head = (
+        "subject",
+        "variant",
+        "valid %",
+        "paper's rules %",
+        "valid % by seed",
+        "duration / refined",
+    )
+    figures = (
+        "violation / tolerance: median, p95",
+        "steps",
+        "training s",
+        "planning ms",
+    )
     title = f"{options.dataset}: {options.seconds:g} CPU s, {options.n:,} new problems, 95 % intervals over seeds"
     report(
         {"results": results, "base": str(asdict(BASE))},

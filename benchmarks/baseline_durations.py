@@ -36,16 +36,28 @@ def scaled_in_time(trajectory: Trajectory, factor: float) -> Trajectory:
 def with_limits_only(problems: Plans) -> Plans:
     """Return boundary problems without obstacles and without constraints other than limits of the joints."""
     problem = as_problem(problems.problem)
-    limits = tuple(constraint for constraint in problem.constraint if constraint.reason.startswith("joint"))
+    limits = tuple(
+        constraint
+        for constraint in problem.constraint
+        if constraint.reason.startswith("joint")
+    )
     record = record_problem(replace(problem, constraint=limits, obstacle=()))
-    columns = {name: values for name, values in problems.columns.items() if name != OBSTACLE_POSES}
+    columns = {
+        name: values
+        for name, values in problems.columns.items()
+        if name != OBSTACLE_POSES
+    }
     return replace(problems, problem=record, columns=columns)
 
 
 def meets_limits(problem: Plans, trajectory: Trajectory) -> bool:
     """Return whether a trajectory meets the limits of the joints."""
     margins = judge_answer(problem, trajectory).margins.values()
-    return all(margin.violation <= margin.tolerance for margin in margins if margin.name.startswith("joint"))
+    return all(
+        margin.violation <= margin.tolerance
+        for margin in margins
+        if margin.name.startswith("joint")
+    )
 
 
 def least_factor(problem: Plans, trajectory: Trajectory) -> float:
@@ -57,30 +69,59 @@ def least_factor(problem: Plans, trajectory: Trajectory) -> float:
         return float("nan")
     for _ in range(FACTOR_STEPS):
         factor = (low + high) / 2
-        low, high = (low, factor) if meets_limits(problem, scaled_in_time(trajectory, factor)) else (factor, high)
+        low, high = (
+            (low, factor)
+            if meets_limits(problem, scaled_in_time(trajectory, factor))
+            else (factor, high)
+        )
     return high
 
 
-def measure(numbers: tuple[int, int], seed: int, simplify_time: float) -> list[dict[str, Any]]:
+def measure(
+    numbers: tuple[int, int], seed: int, simplify_time: float
+) -> list[dict[str, Any]]:
     """Return the durations of both planners in some problems [s]."""
     suite, (first, last) = load_suite("clutter"), numbers
     problems, _ = suite.problems(last)
-    setting, limits = Setting(problems.problem, suite.model, TIME_LIMIT_S, seed), with_limits_only(problems)
+    setting, limits = (
+        Setting(problems.problem, suite.model, TIME_LIMIT_S, seed),
+        with_limits_only(problems),
+    )
     plan, rows = RRTConnect(simplify_time=simplify_time).prepare(setting), []
     for index in range(first, last):
         problem = problems[index : index + 1]
         baseline, own = plan(problem), solve_plans(problem, workers=1)
         if isinstance(baseline, Trajectory) and own.valid[0]:
             factor = least_factor(limits[index : index + 1], baseline)
-            rows.append({"problem": index, "solve": own.plans.duration[0], "baseline": baseline.duration, "k": factor})
-            progress(f"problem {index}: {rows[-1]['solve'] / baseline.duration:.4f}, scaled by {factor:.4f}")
+            rows.append(
+                {
+                    "problem": index,
+                    "solve": own.plans.duration[0],
+                    "baseline": baseline.duration,
+                    "k": factor,
+                }
+            )
+            progress(
+                f"problem {index}: {rows[-1]['solve'] / baseline.duration:.4f}, scaled by {factor:.4f}"
+            )
     return rows
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--problems", type=int, nargs=2, default=(0, 200), help="first one and the one after the last")
+    parser.add_argument(
+        "--problems",
+        type=int,
+        nargs=2,
+        default=(0, 200),
+        help="first one and the one after the last",
+    )
     parser.add_argument("--seed", type=int, default=3, help="seed of the baseline")
-    parser.add_argument("--simplify", type=float, default=8.0, help="largest time of its simplification [s]")
+    parser.add_argument(
+        "--simplify",
+        type=float,
+        default=8.0,
+        help="largest time of its simplification [s]",
+    )
 
 
 def main() -> None:
@@ -89,8 +130,17 @@ def main() -> None:
     planned = np.array([row["solve"] / row["baseline"] for row in rows])
     factors = np.array([row["k"] for row in rows])
     lines = [
-        (name, f"{len(ratios)}", f"{np.median(ratios):.3f}", f"{(ratios < 1).sum()}", f"{ratios.max():.4f}")
-        for name, ratios in (("as planned", planned), ("scaled to the limits", planned / factors))
+        (
+            name,
+            f"{len(ratios)}",
+            f"{np.median(ratios):.3f}",
+            f"{(ratios < 1).sum()}",
+            f"{ratios.max():.4f}",
+        )
+        for name, ratios in (
+            ("as planned", planned),
+            ("scaled to the limits", planned / factors),
+        )
     ]
     head = ("baseline", "problems", "median ratio", "solve is shorter", "largest ratio")
     title = f"Duration of solve relative to the baseline, scaled by {np.median(factors):.3f} in the median"

@@ -32,7 +32,9 @@ def measure(name: str, rows: int, seed: int) -> dict[str, dict[str, float]]:
         start: PreparedPipeline(variant.pipeline, backend=backend, cache_folder=folder)
         for start, variant in recipes.items()
     }
-    totals: dict[str, dict[str, Any]] = {start: {"seconds": 0.0, "unplanned": 0, "time": []} for start in recipes}
+    totals: dict[str, dict[str, Any]] = {
+        start: {"seconds": 0.0, "unplanned": 0, "time": []} for start in recipes
+    }
     size = CertifiedPlan.block_rows
     for pipeline in prepared.values():
         pipeline.block(seed, "warm-up", 0, stop=1)
@@ -43,12 +45,18 @@ def measure(name: str, rows: int, seed: int) -> dict[str, dict[str, float]]:
             block = pipeline.block(seed, "train", index)
             totals[start]["seconds"] += time.process_time() - clock
             totals[start]["time"].append(block.columns["duration"][0])
-            totals[start]["unplanned"] += block.sampling.rejections.get("no plan found", 0)
+            totals[start]["unplanned"] += block.sampling.rejections.get(
+                "no plan found", 0
+            )
     rows_made = size * -(-rows // size)
     return {
         start: {
             "rows per second": rows_made / total["seconds"],
-            "minutes for 120,000 rows on two cores": ROWS * total["seconds"] / rows_made / CORES / 60,
+            "minutes for 120,000 rows on two cores": ROWS
+            * total["seconds"]
+            / rows_made
+            / CORES
+            / 60,
             "no plan found": total["unplanned"],
             "mean motion time [s]": float(np.concatenate(total["time"]).mean()),
         }
@@ -60,7 +68,9 @@ def rows_of(name: str, figures: dict[str, dict[str, float]]) -> list[tuple[str, 
     """Return the rows of the table."""
     rows: list[tuple[str, ...]] = []
     for figure in figures[NO_GUESS]:
-        without_guess, from_planner = (figures[start][figure] for start in (NO_GUESS, PLANNER))
+        without_guess, from_planner = (
+            figures[start][figure] for start in (NO_GUESS, PLANNER)
+        )
         goal = TARGET_MINUTES.get(name) if figure.startswith("minutes") else None
         ratio = f"{from_planner / without_guess:.3f}" if without_guess else ""
         rows.append(
@@ -78,7 +88,12 @@ def rows_of(name: str, figures: dict[str, dict[str, float]]) -> list[tuple[str, 
 
 def options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
-    parser.add_argument("--recipes", nargs="+", default=list(RECIPES), help="by default all with a shipped planner")
+    parser.add_argument(
+        "--recipes",
+        nargs="+",
+        default=list(RECIPES),
+        help="by default all with a shipped planner",
+    )
     parser.add_argument("--rows", type=int, default=128, help="rows of each recipe")
     parser.add_argument("--seed", type=int, default=20_000_003, help="seed of the rows")
 
@@ -87,9 +102,15 @@ def main() -> None:
     """Run the benchmark."""
     chosen = arguments(__doc__, options)
     figures = {name: measure(name, chosen.rows, chosen.seed) for name in chosen.recipes}
-    rows = [row for name, measured in figures.items() for row in rows_of(name, measured)]
+    rows = [
+        row for name, measured in figures.items() for row in rows_of(name, measured)
+    ]
     head = ("recipe", "figure", NO_GUESS, PLANNER, "ratio", "target", "")
-    report({"certify": figures}, [table("certified rows", head, rows, left=2)], as_json=chosen.json)
+    report(
+        {"certify": figures},
+        [table("certified rows", head, rows, left=2)],
+        as_json=chosen.json,
+    )
 
 
 if __name__ == "__main__":

@@ -20,7 +20,11 @@ from numpy.typing import NDArray
 from cnpgen.addons.benchmark.answers import execution_of
 from cnpgen.addons.benchmark.benchmark_planner import Setting, load_kind
 from cnpgen.addons.benchmark.results_file import answer_to_dict
-from cnpgen.addons.benchmark.simulator.challenge import JOINTS, _environment, challenge_plant
+from cnpgen.addons.benchmark.simulator.challenge import (
+    JOINTS,
+    _environment,
+    challenge_plant,
+)
 from cnpgen.addons.benchmark.simulator.plant import Plant
 from cnpgen.addons.benchmark.suite import load_suite
 from cnpgen.plans.plans import Plans
@@ -31,7 +35,11 @@ Array = NDArray[np.float64]
 PLANNERS = ("aqp", "cnpgen")
 MALLET, DISC = "iiwa_1/striker_mallet", "iiwa_1/ee"
 LIGHT_KG = 1e-3
-STIFFNESS_N_M_RAD, DAMPING_N_M_S_RAD, MAX_TORQUE_N_M = 200.0, 2.2, 10.0  # of a nearly rigid universal joint
+STIFFNESS_N_M_RAD, DAMPING_N_M_S_RAD, MAX_TORQUE_N_M = (
+    200.0,
+    2.2,
+    10.0,
+)  # of a nearly rigid universal joint
 LATERAL_WINDOW_TICKS = 25  # before the planned contact
 
 
@@ -66,10 +74,15 @@ def rigid_joint(plugin: Any) -> Callable[[], None]:
 
     def control() -> None:
         desired = plugin._compute_universal_joint()
-        q, dq = (values[plugin.universal_joint_ids].copy() for values in (plugin.env_data.qpos, plugin.env_data.qvel))
+        q, dq = (
+            values[plugin.universal_joint_ids].copy()
+            for values in (plugin.env_data.qpos, plugin.env_data.qvel)
+        )
         plugin.u_joint_pos_prev = q
         torque = STIFFNESS_N_M_RAD * (desired - q) - DAMPING_N_M_S_RAD * dq
-        plugin.env_data.ctrl[plugin.universal_joint_ctrl_ids] = np.clip(torque, -MAX_TORQUE_N_M, MAX_TORQUE_N_M)
+        plugin.env_data.ctrl[plugin.universal_joint_ctrl_ids] = np.clip(
+            torque, -MAX_TORQUE_N_M, MAX_TORQUE_N_M
+        )
 
     return control
 
@@ -78,7 +91,9 @@ def exact_tracking(environment: Any) -> Callable[..., Array]:
     """Return a controller that puts the arm on its reference."""
 
     def control(q: Array, dq: Array, ddq: Array, *_: Array) -> Array:
-        for name, position, velocity in zip(JOINTS, q.tolist(), dq.tolist(), strict=True):
+        for name, position, velocity in zip(
+            JOINTS, q.tolist(), dq.tolist(), strict=True
+        ):
             joint = environment._data.joint(f"iiwa_1/{name}")
             joint.qpos, joint.qvel = position, velocity
         return np.array(type(environment)._controller(environment, q, dq, ddq, q, dq))
@@ -90,7 +105,10 @@ def apply(change: Change, environment: Any, mass: float) -> None:
     """Change the environment, from its original state."""
     environment._model.body(MALLET).mass = LIGHT_KG if change.light else mass
     plugin = environment.universal_joint_plugin
-    for target, name in ((plugin, "_control_universal_joint"), (environment, "_controller")):
+    for target, name in (
+        (plugin, "_control_universal_joint"),
+        (environment, "_controller"),
+    ):
         vars(target).pop(name, None)
     if change.rigid:
         plugin._control_universal_joint = rigid_joint(plugin)
@@ -98,7 +116,9 @@ def apply(change: Change, environment: Any, mass: float) -> None:
         environment._controller = exact_tracking(environment)
 
 
-def measure_hit(environment: Any, plant: Plant, problem: Plans, content: dict[str, Any]) -> dict[str, float]:
+def measure_hit(
+    environment: Any, plant: Plant, problem: Plans, content: dict[str, Any]
+) -> dict[str, float]:
     """Execute one hit and measure the mallet at the contact, along and across the line from puck to goal."""
     discs: list[Array] = []
 
@@ -116,9 +136,13 @@ def measure_hit(environment: Any, plant: Plant, problem: Plans, content: dict[st
     window = slice(max(first - LATERAL_WINDOW_TICKS, 0), first + 1)
     return {
         "scored": float(bool(execution.executed.scored)),
-        "acceleration": float(np.abs(1e6 * np.diff(planned[window], 2, axis=0) @ across).max()),
-        "tracking_mm": 1e3 * float(abs((execution.tip[first, :2] - planned[first]) @ across)),
-        "swing_mm": 1e3 * float(abs((discs[first][:2] - execution.tip[first, :2]) @ across)),
+        "acceleration": float(
+            np.abs(1e6 * np.diff(planned[window], 2, axis=0) @ across).max()
+        ),
+        "tracking_mm": 1e3
+        * float(abs((execution.tip[first, :2] - planned[first]) @ across)),
+        "swing_mm": 1e3
+        * float(abs((discs[first][:2] - execution.tip[first, :2]) @ across)),
         "offset_mm": 1e3 * float(abs((discs[first][:2] - puck) @ across)),
     }
 
@@ -153,12 +177,32 @@ def draw(results: dict[str, dict[str, list[dict[str, float]]]], path: Path) -> N
         axes = figure.add_subplot(1, 2, place)
         for name, marker in zip(PLANNERS, "os", strict=True):
             for scored, color in ((1.0, "tab:blue"), (0.0, "tab:red")):
-                hits = [hit for hit in results[name][change.title] if hit["scored"] == scored]
-                label = f"{name}, {'scored' if scored else 'missed the goal'} ({len(hits)})"
-                x, y = ([hit[key] for hit in hits] for key in ("acceleration", "offset_mm"))
-                axes.scatter(x, y, s=14, marker=marker, facecolors="none", edgecolors=color, label=label)
-        axes.set_title("environment as it is" if place == 1 else change.title, fontsize=9)
-        axes.set_xlabel("planned lateral acceleration before the contact [m/s²]", fontsize=8)
+                hits = [
+                    hit
+                    for hit in results[name][change.title]
+                    if hit["scored"] == scored
+                ]
+                label = (
+                    f"{name}, {'scored' if scored else 'missed the goal'} ({len(hits)})"
+                )
+                x, y = (
+                    [hit[key] for hit in hits] for key in ("acceleration", "offset_mm")
+                )
+                axes.scatter(
+                    x,
+                    y,
+                    s=14,
+                    marker=marker,
+                    facecolors="none",
+                    edgecolors=color,
+                    label=label,
+                )
+        axes.set_title(
+            "environment as it is" if place == 1 else change.title, fontsize=9
+        )
+        axes.set_xlabel(
+            "planned lateral acceleration before the contact [m/s²]", fontsize=8
+        )
         axes.set_ylabel("lateral offset of the mallet from the puck [mm]", fontsize=8)
         axes.set_ylim(0, 14)
         axes.legend(fontsize=7)
@@ -166,7 +210,9 @@ def draw(results: dict[str, dict[str, list[dict[str, float]]]], path: Path) -> N
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("environment", type=Path, help="clone of the Air Hockey Challenge")
+    parser.add_argument(
+        "environment", type=Path, help="clone of the Air Hockey Challenge"
+    )
     parser.add_argument("--step", type=int, default=1, help="use every STEP-th hit")
     parser.add_argument("--figure", type=Path, help="also draw the hits")
 
@@ -182,10 +228,23 @@ def main() -> None:
          f"{max(hit['offset_mm'] for hit in hits):.1f}")
         for name, changes in results.items() for change, hits in changes.items()
     ]  # fmt: skip
-    head = ("planner", "change", "scored", "lateral m/s^2", "tracking mm", "swing mm", "offset mm", "largest mm")
+    head = (
+        "planner",
+        "change",
+        "scored",
+        "lateral m/s^2",
+        "tracking mm",
+        "swing mm",
+        "offset mm",
+        "largest mm",
+    )
     if chosen.figure:
         draw(results, chosen.figure)
-    report({"hits": results}, [table("medians at the first contact", head, rows, left=2)], as_json=chosen.json)
+    report(
+        {"hits": results},
+        [table("medians at the first contact", head, rows, left=2)],
+        as_json=chosen.json,
+    )
 
 
 if __name__ == "__main__":

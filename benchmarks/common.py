@@ -13,15 +13,25 @@ from typing import Any
 from cnpgen.machine.versions import __version__, installed_version, processor_entry
 
 LIBRARIES = ("numpy", "scipy", "casadi", "pin", "coal", "h5py", "joblib")
-ROBOT_RECIPES = ("panda-cup", "panda-scenes", "ur5-wipe")  # recipes of robots that come with the extra cnpgen[robots]
+ROBOT_RECIPES = (
+    "panda-cup",
+    "panda-scenes",
+    "ur5-wipe",
+)  # recipes of robots that come with the extra cnpgen[robots]
 INSTRUCTION_SETS = ("avx512f", "avx2", "avx", "asimd")  # best first
 
 
-def arguments(text: str | None, add: Callable[[argparse.ArgumentParser], None]) -> argparse.Namespace:
+def arguments(
+    text: str | None, add: Callable[[argparse.ArgumentParser], None]
+) -> argparse.Namespace:
     """Parse the command line: the options that ``add`` adds, and ``--json``."""
-    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=text, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     add(parser)
-    parser.add_argument("--json", action="store_true", help="write JSON instead of tables")
+    parser.add_argument(
+        "--json", action="store_true", help="write JSON instead of tables"
+    )
     return parser.parse_args()
 
 
@@ -31,10 +41,13 @@ def machine() -> dict[str, Any]:
     return {
         "cores": os.cpu_count(),
         "cpu": processor_entry("model name").strip() or platform.machine(),
-        "instructions": next((name for name in INSTRUCTION_SETS if name in flags), platform.machine()),
+        "instructions": next(
+            (name for name in INSTRUCTION_SETS if name in flags), platform.machine()
+        ),
         "load": round(os.getloadavg()[0], 2),
         "python": platform.python_version(),
-        "versions": {"cnpgen": __version__} | {name: installed_version(name) or "not installed" for name in LIBRARIES},
+        "versions": {"cnpgen": __version__}
+        | {name: installed_version(name) or "not installed" for name in LIBRARIES},
     }
 
 
@@ -51,7 +64,9 @@ def installed_recipes(names: Iterable[str]) -> list[str]:
     recipes = list(names)
     if installed_version("example-robot-data"):
         return recipes
-    progress(f"without {', '.join(ROBOT_RECIPES)}, which need pip install 'cnpgen[robots]'")
+    progress(
+        f"without {', '.join(ROBOT_RECIPES)}, which need pip install 'cnpgen[robots]'"
+    )
     return [name for name in recipes if name not in ROBOT_RECIPES]
 
 
@@ -68,7 +83,9 @@ def median(values: Iterable[float]) -> float:
     return statistics.median(numbers) if numbers else float("nan")
 
 
-def verdict(value: float, target: float | None, *, at_most: bool = False) -> tuple[str, str]:
+def verdict(
+    value: float, target: float | None, *, at_most: bool = False
+) -> tuple[str, str]:
     """Return a target and whether a value meets it, as cells of a table."""
     if target is None:
         return "", ""
@@ -76,13 +93,16 @@ def verdict(value: float, target: float | None, *, at_most: bool = False) -> tup
     return f"{target:,.10g}", "PASS" if met else "BELOW"
 
 
-def table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]], *, left: int = 1) -> str:
+def table(
+    title: str, head: Sequence[str], rows: Iterable[Sequence[str]], *, left: int = 1
+) -> str:
     """Format a table: the first ``left`` columns aligned to the left, the others to the right."""
     cells = [tuple(head), *(tuple(row) for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
     lines = [
         "  ".join(
-            text.ljust(w) if i < left else text.rjust(w) for i, (text, w) in enumerate(zip(row, widths, strict=True))
+            text.ljust(w) if i < left else text.rjust(w)
+            for i, (text, w) in enumerate(zip(row, widths, strict=True))
         )
         for row in cells
     ]

@@ -26,7 +26,10 @@ STEPS = (  # before the first row
     ("Python", "pass"),
     ("NumPy", "import numpy"),
     ("cnpgen.make.make_dataset", "import cnpgen.make.make_dataset"),
-    ("recipe", "from cnpgen.make.recipe import load_dataset_recipe; recipe = load_dataset_recipe({name!r})"),
+    (
+        "recipe",
+        "from cnpgen.make.recipe import load_dataset_recipe; recipe = load_dataset_recipe({name!r})",
+    ),
     ("Pinocchio, Coal", "import pinocchio, coal"),
     (
         "kernels, specification",
@@ -67,11 +70,19 @@ class Case:
 
     def run(self, folder: Path) -> None:
         """Make the dataset once."""
-        cache = Path(tempfile.mkdtemp(prefix="empty-cache-", dir=folder)) if not self.warm else folder / "cache"
+        cache = (
+            Path(tempfile.mkdtemp(prefix="empty-cache-", dir=folder))
+            if not self.warm
+            else folder / "cache"
+        )
         with tempfile.TemporaryDirectory(dir=folder) as out:
-            command = make_command(self.name, self.rows, self.workers, Path(out) / "dataset")
+            command = make_command(
+                self.name, self.rows, self.workers, Path(out) / "dataset"
+            )
             before, start = _children(), time.perf_counter()
-            subprocess.run(command, check=True, capture_output=True, env=environment(cache))
+            subprocess.run(
+                command, check=True, capture_output=True, env=environment(cache)
+            )
             self.walls.append(time.perf_counter() - start)
             self.cpus.append(_children() - before)
 
@@ -91,13 +102,25 @@ CASES = (
 
 def make_command(name: str, rows: int, workers: int, out: Path) -> list[str]:
     """Return the command that makes a dataset."""
-    options = ["--n", str(rows), "--workers", str(workers), "--out", str(out), "--quiet"]
+    options = [
+        "--n",
+        str(rows),
+        "--workers",
+        str(workers),
+        "--out",
+        str(out),
+        "--quiet",
+    ]
     return [sys.executable, "-m", "cnpgen", "make-dataset", name, *options]
 
 
 def environment(cache: Path) -> dict[str, str]:
     """Return the environment of a run; modules keep their bytecode, like those of an installed package."""
-    variables = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    variables = {
+        name: value
+        for name, value in os.environ.items()
+        if name != "PYTHONDONTWRITEBYTECODE"
+    }
     return variables | {"CNPGEN_CACHE": str(cache)}
 
 
@@ -124,12 +147,21 @@ def measure(folder: Path, repeat: int, cold: int) -> list[Case]:
 
 def measure_start(folder: Path, name: str, repeat: int) -> dict[str, float]:
     """Run the steps of a start in a new process; return the time of each [s]."""
-    lines = [line.format(name=name, out=str(folder / "none")) + "; print(time.time())" for _, line in STEPS]
+    lines = [
+        line.format(name=name, out=str(folder / "none")) + "; print(time.time())"
+        for _, line in STEPS
+    ]
     command = [sys.executable, "-c", "\n".join(["import time", *lines])]
     clocks: list[list[float]] = []
     for _ in range(repeat):
         start = time.time()
-        done = subprocess.run(command, check=True, stdout=subprocess.PIPE, env=environment(folder / "cache"), text=True)
+        done = subprocess.run(
+            command,
+            check=True,
+            stdout=subprocess.PIPE,
+            env=environment(folder / "cache"),
+            text=True,
+        )
         clocks.append([start, *map(float, done.stdout.split())])
     return {
         step: median(times[number] - times[number - 1] for times in clocks)
@@ -140,13 +172,33 @@ def measure_start(folder: Path, name: str, repeat: int) -> dict[str, float]:
 def case_table(cases: list[Case]) -> str:
     rows = []
     for case in cases:
-        single = next((c for c in cases if (c.name, c.workers, c.warm) == (case.name, 1, case.warm)), None)
-        pairs = zip(case.walls, single.walls, strict=True) if single and single is not case else ()
+        single = next(
+            (
+                c
+                for c in cases
+                if (c.name, c.workers, c.warm) == (case.name, 1, case.warm)
+            ),
+            None,
+        )
+        pairs = (
+            zip(case.walls, single.walls, strict=True)
+            if single and single is not case
+            else ()
+        )
         ratio = median(a / b for a, b in pairs)
         rows.append(
             (
-                *(case.name, f"{case.rows:,}", str(case.workers), "warm" if case.warm else "empty"),
-                *(f"{case.wall:.2f}", f"{min(case.walls):.2f}", f"{median(case.cpus):.2f}"),
+                *(
+                    case.name,
+                    f"{case.rows:,}",
+                    str(case.workers),
+                    "warm" if case.warm else "empty",
+                ),
+                *(
+                    f"{case.wall:.2f}",
+                    f"{min(case.walls):.2f}",
+                    f"{median(case.cpus):.2f}",
+                ),
                 f"{case.rows / case.wall:,.0f}",
                 "" if ratio != ratio else f"{ratio:.2f}",
                 *verdict(case.wall, case.target, at_most=True),
@@ -162,7 +214,11 @@ def case_table(cases: list[Case]) -> str:
 def start_table(name: str, steps: dict[str, float]) -> str:
     rows = [(step, f"{1e3 * seconds:.0f}") for step, seconds in steps.items()]
     rows.append(("sum", f"{1e3 * sum(steps.values()):.0f}"))
-    return table(f"Start-up of {name}, warm: wall time of each step (median)", ("step", "ms"), rows)
+    return table(
+        f"Start-up of {name}, warm: wall time of each step (median)",
+        ("step", "ms"),
+        rows,
+    )
 
 
 def run_large(folder: Path, rows: int) -> tuple[float, list[Sample]]:
@@ -171,7 +227,9 @@ def run_large(folder: Path, rows: int) -> tuple[float, list[Sample]]:
     out = folder / "large"
     command = make_command("airhockey-replan", rows, 2, out)
     start = time.perf_counter()
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, env=environment(folder / "cache")) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, env=environment(folder / "cache")
+    ) as process:
         samples = sample_memory(process, out, rows)
     if process.returncode:
         sys.exit(f"make-dataset failed with exit code {process.returncode}")
@@ -180,7 +238,14 @@ def run_large(folder: Path, rows: int) -> tuple[float, list[Sample]]:
 
 def large_table(rows: int, wall: float, samples: list[Sample]) -> str:
     lines = [
-        (f"{mark:.0%}", f"{sample.seconds:.1f}", str(pid), kind, f"{peak:.1f}", f"{now:.1f}")
+        (
+            f"{mark:.0%}",
+            f"{sample.seconds:.1f}",
+            str(pid),
+            kind,
+            f"{peak:.1f}",
+            f"{now:.1f}",
+        )
         for mark, sample in zip(MARKS, samples, strict=True)
         for pid, (kind, peak, now) in sample.peaks.items()
     ]
@@ -192,25 +257,46 @@ def large_table(rows: int, wall: float, samples: list[Sample]) -> str:
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--repeat", type=int, default=5, help="runs with a warm cache")
     parser.add_argument("--cold", type=int, default=2, help="runs with an empty cache")
-    parser.add_argument("--large", type=int, metavar="N", help="make N rows and measure the workers' memory instead")
     parser.add_argument(
-        "--folder", type=Path, help="folder of the datasets, which are deleted; default a temporary one"
+        "--large",
+        type=int,
+        metavar="N",
+        help="make N rows and measure the workers' memory instead",
+    )
+    parser.add_argument(
+        "--folder",
+        type=Path,
+        help="folder of the datasets, which are deleted; default a temporary one",
     )
 
 
 def main() -> None:
     options = arguments(__doc__, add_options)
-    with tempfile.TemporaryDirectory(prefix="cnpgen-benchmark-", dir=options.folder) as name:
+    with tempfile.TemporaryDirectory(
+        prefix="cnpgen-benchmark-", dir=options.folder
+    ) as name:
         folder = Path(name)
         if options.large:
             wall, samples = run_large(folder, options.large)
-            results: dict[str, Any] = {"rows": options.large, "wall": wall, "samples": [vars(s) for s in samples]}
-            report(results, [large_table(options.large, wall, samples)], as_json=options.json)
+            results: dict[str, Any] = {
+                "rows": options.large,
+                "wall": wall,
+                "samples": [vars(s) for s in samples],
+            }
+            report(
+                results,
+                [large_table(options.large, wall, samples)],
+                as_json=options.json,
+            )
             return
         cases = measure(folder, options.repeat, options.cold)
         steps = measure_start(folder, "airhockey-replan", options.repeat)
     results = {"cases": [vars(case) for case in cases], "start": steps}
-    report(results, [case_table(cases), start_table("airhockey-replan", steps)], as_json=options.json)
+    report(
+        results,
+        [case_table(cases), start_table("airhockey-replan", steps)],
+        as_json=options.json,
+    )
 
 
 if __name__ == "__main__":

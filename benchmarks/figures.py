@@ -20,9 +20,13 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 QUOTED = r"(?:benchmarks/\w+\.py|cnpgen benchmark [\w-]+ --sim)"
-COMMAND = re.compile(rf"`(?:python )?({QUOTED}[^`]*)`|^(?:python )?({QUOTED}.*)$", re.MULTILINE)
+COMMAND = re.compile(
+    rf"`(?:python )?({QUOTED}[^`]*)`|^(?:python )?({QUOTED}.*)$", re.MULTILINE
+)
 OWN_NAME = Path(__file__).name
-OTHER_PAGES = tuple(ROOT / "docs" / "how-to" / name for name in ("benchmark.md", "trajectories.md"))
+OTHER_PAGES = tuple(
+    ROOT / "docs" / "how-to" / name for name in ("benchmark.md", "trajectories.md")
+)
 CLONE, FOLDER = "air_hockey_challenge", "FOLDER"
 GIVEN_FILE = re.compile(r"[*?]|\bFILE\b")  # a file that the reader makes first
 DEFAULT_TIME_LIMIT_S = 12 * 3600.0
@@ -44,7 +48,10 @@ class QuotedCommand:
     @property
     def file_name(self) -> str:
         """Name of the file of its output."""
-        return re.sub(r"[^\w.+-]+", "_", self.text.removeprefix("benchmarks/"))[:150] + ".txt"
+        return (
+            re.sub(r"[^\w.+-]+", "_", self.text.removeprefix("benchmarks/"))[:150]
+            + ".txt"
+        )
 
     def arguments(self, out: Path, environment: Path | None) -> list[str] | None:
         """Return the arguments of the process, or None if the command needs a clone or files that are missing."""
@@ -53,7 +60,10 @@ class QuotedCommand:
             return None
         if CLONE in words and environment is None:
             return None
-        known = {FOLDER: str(out / "work" / Path(words[0]).stem), CLONE: str(environment)}
+        known = {
+            FOLDER: str(out / "work" / Path(words[0]).stem),
+            CLONE: str(environment),
+        }
         words = [known.get(word, word) for word in words]
         if words[0] == "cnpgen":
             return [sys.executable, "-m", *words, "-o", str(out / "work" / words[2])]
@@ -69,7 +79,12 @@ class QuotedCommand:
         if words[0] != "cnpgen" or "--time-limit" not in words:
             return None
         limit = parse_number(words[words.index("--time-limit") + 1], "s")
-        planners = list(takewhile(lambda word: not word.startswith("--"), words[words.index("--planners") + 1 :]))
+        planners = list(
+            takewhile(
+                lambda word: not word.startswith("--"),
+                words[words.index("--planners") + 1 :],
+            )
+        )
         problems, _ = load_suite(words[2]).problems()
         return len(planners) * len(problems) * (limit + STOP_MARGIN_S) / HOUR_S
 
@@ -81,7 +96,11 @@ def quoted_commands(pages: list[str] | None = None) -> list[QuotedCommand]:
         pages: Names of pages; all by default.
     """
     found: dict[str, QuotedCommand] = {}
-    for path in (ROOT / "README.md", *sorted((ROOT / "docs" / "benchmarks").glob("*.md")), *OTHER_PAGES):
+    for path in (
+        ROOT / "README.md",
+        *sorted((ROOT / "docs" / "benchmarks").glob("*.md")),
+        *OTHER_PAGES,
+    ):
         if pages and path.stem not in pages:
             continue
         for texts in COMMAND.findall(path.read_text(encoding="utf-8")):
@@ -94,10 +113,14 @@ def quoted_commands(pages: list[str] | None = None) -> list[QuotedCommand]:
 def is_program(text: str) -> bool:
     """Return whether a quotation is a command, and neither the name of a module nor this script."""
     script = ROOT / text.split(maxsplit=1)[0]
-    return script.name == "cnpgen" or (script.name != OWN_NAME and "__main__" in script.read_text(encoding="utf-8"))
+    return script.name == "cnpgen" or (
+        script.name != OWN_NAME and "__main__" in script.read_text(encoding="utf-8")
+    )
 
 
-def run(command: QuotedCommand, out: Path, environment: Path | None, time_limit: float) -> str:
+def run(
+    command: QuotedCommand, out: Path, environment: Path | None, time_limit: float
+) -> str:
     """Run a command unless its output exists; return a word for the outcome."""
     path = out / command.file_name
     if path.exists():
@@ -112,7 +135,9 @@ def run(command: QuotedCommand, out: Path, environment: Path | None, time_limit:
         file.write(f"$ {command.text}\n")
         file.flush()
         try:
-            code = subprocess.run(words, cwd=ROOT, stdout=file, check=False, timeout=time_limit).returncode
+            code = subprocess.run(
+                words, cwd=ROOT, stdout=file, check=False, timeout=time_limit
+            ).returncode
         except subprocess.TimeoutExpired:
             return f"failed: longer than {time_limit:g} s"
     if code:
@@ -135,12 +160,31 @@ def print_list(commands: list[QuotedCommand]) -> None:
 
 def main() -> int:
     """Run the command."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("out", type=Path, nargs="?", default=Path("figures"), help="folder of the outputs")
-    parser.add_argument("--list", action="store_true", help="list the commands and their pages")
-    parser.add_argument("--pages", nargs="+", help="names of pages, for example planners loss")
-    parser.add_argument("--environment", type=Path, help="clone of the Air Hockey Challenge")
-    parser.add_argument("--time-limit", type=float, default=DEFAULT_TIME_LIMIT_S, help="of one command [s]")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "out",
+        type=Path,
+        nargs="?",
+        default=Path("figures"),
+        help="folder of the outputs",
+    )
+    parser.add_argument(
+        "--list", action="store_true", help="list the commands and their pages"
+    )
+    parser.add_argument(
+        "--pages", nargs="+", help="names of pages, for example planners loss"
+    )
+    parser.add_argument(
+        "--environment", type=Path, help="clone of the Air Hockey Challenge"
+    )
+    parser.add_argument(
+        "--time-limit",
+        type=float,
+        default=DEFAULT_TIME_LIMIT_S,
+        help="of one command [s]",
+    )
     options = parser.parse_args()
     commands = quoted_commands(options.pages)
     if options.list:
@@ -148,7 +192,9 @@ def main() -> int:
         return 0
     failed = False
     for command in commands:
-        outcome = run(command, options.out.resolve(), options.environment, options.time_limit)
+        outcome = run(
+            command, options.out.resolve(), options.environment, options.time_limit
+        )
         failed |= outcome.startswith("failed")
         print(f"{command.page}: {command.text}: {outcome}", flush=True)
     return int(failed)

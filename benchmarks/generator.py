@@ -12,14 +12,33 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
-from common import arguments, installed_recipes, median, progress, report, table, verdict
+from common import (
+    arguments,
+    installed_recipes,
+    median,
+    progress,
+    report,
+    table,
+    verdict,
+)
 
 from cnpgen.kernels.library import choose_backend
 from cnpgen.pipelines.pipeline import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline
-from cnpgen.pipelines.stages.stage import BLOCK_ROWS, CandidateBatch, Stage, StageFunction
+from cnpgen.pipelines.stages.stage import (
+    BLOCK_ROWS,
+    CandidateBatch,
+    Stage,
+    StageFunction,
+)
 
-PIPELINES = ("airhockey-replan", "airhockey-hit", "heavy-object", "panda-cup", "ur5-wipe")
+PIPELINES = (
+    "airhockey-replan",
+    "airhockey-hit",
+    "heavy-object",
+    "panda-cup",
+    "ur5-wipe",
+)
 BLOCKS = {"compiled": 16, "numpy": 4, "casadi": 1}  # per repetition
 TARGETS = {  # accepted rows per second and core
     ("airhockey-replan", "compiled"): 120_000,
@@ -83,7 +102,9 @@ class Case:
         """Make fresh blocks; return the CPU time [s] and the number of candidates."""
         start, candidates = time.process_time(), 0
         for _ in range(blocks):
-            candidates += self.prepared.block(1, "benchmark", self.next_block).sampling.tried
+            candidates += self.prepared.block(
+                1, "benchmark", self.next_block
+            ).sampling.tried
             self.next_block += 1
         return time.process_time() - start, candidates
 
@@ -91,7 +112,13 @@ class Case:
 def prepare(pipeline: str, backend: str) -> Case:
     """Load a pipeline and run one block to warm it up."""
     chosen, cache_folder = choose_backend(backend)
-    case = Case(pipeline, backend, PreparedPipeline(load_pipeline(pipeline), backend=chosen, cache_folder=cache_folder))
+    case = Case(
+        pipeline,
+        backend,
+        PreparedPipeline(
+            load_pipeline(pipeline), backend=chosen, cache_folder=cache_folder
+        ),
+    )
     case.make(1)
     return case
 
@@ -109,10 +136,20 @@ def measure_stages(case: Case, blocks: int) -> None:
     """Time every stage of some blocks."""
     prepared = case.prepared
     stages, accept = prepared._stages, prepared._accept
-    names = [_name(label, stage) for (label, _), stage in zip(stages, prepared.pipeline.stage, strict=True)]
+    names = [
+        _name(label, stage)
+        for (label, _), stage in zip(stages, prepared.pipeline.stage, strict=True)
+    ]
     case.stages = [StageTime(name) for name in [*names, "(acceptance)"]]
-    timed = [stage.timed(run) for stage, run in zip(case.stages, [*(run for _, run in stages), accept], strict=True)]
-    prepared._stages = [(label, run) for (label, _), run in zip(stages, timed, strict=False)]
+    timed = [
+        stage.timed(run)
+        for stage, run in zip(
+            case.stages, [*(run for _, run in stages), accept], strict=True
+        )
+    ]
+    prepared._stages = [
+        (label, run) for (label, _), run in zip(stages, timed, strict=False)
+    ]
     prepared._accept = timed[-1]
     case.total, case.candidates = case.make(blocks)
     case.rows = blocks * BLOCK_ROWS
@@ -122,7 +159,9 @@ def measure_stages(case: Case, blocks: int) -> None:
 def _name(label: str, stage: Stage) -> str:
     """Name a stage by the kind in its label and by the options that distinguish stages of one kind."""
     details = [getattr(stage, key, None) for key in ("end", "judge")]
-    return " ".join([label.partition(". ")[2], *(str(detail) for detail in details if detail)])
+    return " ".join(
+        [label.partition(". ")[2], *(str(detail) for detail in details if detail)]
+    )
 
 
 def rate_table(cases: list[Case]) -> str:
@@ -130,12 +169,40 @@ def rate_table(cases: list[Case]) -> str:
     for case in cases:
         first = next(other for other in cases if other.pipeline == case.pipeline)
         ratio = median(a / b for a, b in zip(first.rates, case.rates, strict=True))
-        numbers = (f"{case.rate:,.0f}", f"{max(case.rates):,.0f}", f"{1e6 / case.rate:.2f}")
+        numbers = (
+            f"{case.rate:,.0f}",
+            f"{max(case.rates):,.0f}",
+            f"{1e6 / case.rate:.2f}",
+        )
         candidates = f"{case.candidates / case.rows:.3f}"
         target = TARGETS.get((case.pipeline, case.backend))
-        rows.append((case.pipeline, case.backend, *numbers, candidates, f"{ratio:.1f}", *verdict(case.rate, target)))
-    head = ("pipeline", "backend", "rows/s/core", "best", "us/row", "candidates/row", "times slower", "target", "")
-    return table("Accepted rows per second of CPU time (median, and best repetition)", head, rows, left=2)
+        rows.append(
+            (
+                case.pipeline,
+                case.backend,
+                *numbers,
+                candidates,
+                f"{ratio:.1f}",
+                *verdict(case.rate, target),
+            )
+        )
+    head = (
+        "pipeline",
+        "backend",
+        "rows/s/core",
+        "best",
+        "us/row",
+        "candidates/row",
+        "times slower",
+        "target",
+        "",
+    )
+    return table(
+        "Accepted rows per second of CPU time (median, and best repetition)",
+        head,
+        rows,
+        left=2,
+    )
 
 
 def stage_table(case: Case) -> str:
@@ -153,7 +220,11 @@ def stage_table(case: Case) -> str:
             "",
         )
     )
-    return table(f"{case.pipeline}, {case.backend}", ("stage", "share", "us/row", "accepted"), rows)
+    return table(
+        f"{case.pipeline}, {case.backend}",
+        ("stage", "share", "us/row", "accepted"),
+        rows,
+    )
 
 
 def results(cases: list[Case]) -> dict[str, Any]:
@@ -167,7 +238,8 @@ def results(cases: list[Case]) -> dict[str, Any]:
                 "candidates_per_row": case.candidates / case.rows,
                 "target": TARGETS.get((case.pipeline, case.backend)),
                 "stage_seconds": {
-                    f"{number}. {stage.name}": stage.seconds for number, stage in enumerate(case.stages, 1)
+                    f"{number}. {stage.name}": stage.seconds
+                    for number, stage in enumerate(case.stages, 1)
                 },
                 "total_seconds": case.total,
             }
@@ -177,21 +249,41 @@ def results(cases: list[Case]) -> dict[str, Any]:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--pipeline", nargs="+", help="pipelines; by default all whose robots are installed")
-    parser.add_argument("--backend", nargs="+", default=("compiled", "numpy"), choices=BLOCKS, help="backends")
+    parser.add_argument(
+        "--pipeline",
+        nargs="+",
+        help="pipelines; by default all whose robots are installed",
+    )
+    parser.add_argument(
+        "--backend",
+        nargs="+",
+        default=("compiled", "numpy"),
+        choices=BLOCKS,
+        help="backends",
+    )
     parser.add_argument("--repeat", type=int, default=9, help="repetitions")
-    parser.add_argument("--blocks", type=int, help=f"blocks of {BLOCK_ROWS} rows per repetition; default {BLOCKS}")
+    parser.add_argument(
+        "--blocks",
+        type=int,
+        help=f"blocks of {BLOCK_ROWS} rows per repetition; default {BLOCKS}",
+    )
 
 
 def main() -> None:
     options = arguments(__doc__, add_options)
     chosen = options.pipeline or installed_recipes(PIPELINES)
     blocks = {name: options.blocks or number for name, number in BLOCKS.items()}
-    cases = [prepare(pipeline, backend) for pipeline in chosen for backend in options.backend]
+    cases = [
+        prepare(pipeline, backend) for pipeline in chosen for backend in options.backend
+    ]
     measure_rates(cases, options.repeat, blocks)
     for case in cases:
         measure_stages(case, 2 * blocks[case.backend])
-    report(results(cases), [rate_table(cases), *map(stage_table, cases)], as_json=options.json)
+    report(
+        results(cases),
+        [rate_table(cases), *map(stage_table, cases)],
+        as_json=options.json,
+    )
 
 
 if __name__ == "__main__":

@@ -35,8 +35,16 @@ from cnpgen.refine.refine_plans import refine_plans
 NAME, TIME_PARAMETRIZED = "airhockey-replan", "airhockey-online"
 BATCH = 1024
 TARGET = np.array([2.49, 0.0])  # m, target of the pucks
-TARGETS_MS = {(1, "completed"): 0.3, (1, "planned"): 0.3, (1, "both"): 0.6, (BATCH, "both"): 0.04}
-SPEED_SHARES = (0.98, 0.9)  # of the maximum hitting speed: the way back must stay within the velocity limits
+TARGETS_MS = {
+    (1, "completed"): 0.3,
+    (1, "planned"): 0.3,
+    (1, "both"): 0.6,
+    (BATCH, "both"): 0.04,
+}
+SPEED_SHARES = (
+    0.98,
+    0.9,
+)  # of the maximum hitting speed: the way back must stay within the velocity limits
 REPLAN_TIMES = (0.1, 0.3, 0.5, 0.7, 0.9, 0.95)  # fractions of the motion time
 DEADLINES = (None, 10e-3, 20e-3, 40e-3, 60e-3, 80e-3)  # s
 
@@ -45,7 +53,9 @@ def hits(planner: Planner, repeat: int) -> dict[str, Any]:
     """Measure the CPU time per hit [ms], of the completion, of the planning, and of both."""
     first = planner.plan_batch(draw_boundary_problems(NAME, BATCH, seed=5).boundary)
     states, random = first.states_at(0.4 * first.duration), np.random.default_rng(0)
-    pucks = np.stack([random.uniform(0.8, 1.2, BATCH), random.uniform(-0.3, 0.3, BATCH)], axis=1)
+    pucks = np.stack(
+        [random.uniform(0.8, 1.2, BATCH), random.uniform(-0.3, 0.3, BATCH)], axis=1
+    )
     completion, results = load_completion(planner.model, None), {}
     for size in (1, BATCH):
         times: dict[str, list[float]] = {"completed": [], "planned": [], "both": []}
@@ -57,7 +67,14 @@ def hits(planner: Planner, repeat: int) -> dict[str, Any]:
                 continue
             clock = [time.process_time()]
             with one_thread():
-                hit_tasks(completion, state, puck, TARGET, contact_distance=CONTACT_DISTANCE_M, share=1.0)
+                hit_tasks(
+                    completion,
+                    state,
+                    puck,
+                    TARGET,
+                    contact_distance=CONTACT_DISTANCE_M,
+                    share=1.0,
+                )
             clock.append(time.process_time())
             planner.plan_batch(planned.plans.boundary)
             clock.append(time.process_time())
@@ -68,7 +85,10 @@ def hits(planner: Planner, repeat: int) -> dict[str, Any]:
         for part, durations in times.items():
             results[f"{size} {part}"] = 1e3 * median(durations) / size
     planned = plan_hits(planner, states, pucks, TARGET)
-    results |= {"planned": len(planned.plans) / BATCH, "valid": float(evaluate_plans(planned.plans).valid.mean())}
+    results |= {
+        "planned": len(planned.plans) / BATCH,
+        "valid": float(evaluate_plans(planned.plans).valid.mean()),
+    }
     return results
 
 
@@ -76,9 +96,22 @@ def hits_and_ways_back(planner: Planner, speed_share: float) -> dict[str, Any]:
     """Plan hits of a grid of pucks from rest and the ways back, one by one; both are judged."""
     home, still = planner.robot.home, np.zeros(planner.robot.n)
     grid = [(x, y) for x in np.linspace(0.8, 1.2, 9) for y in np.linspace(-0.4, 0.4, 9)]
-    plan = partial(plan_hits, planner, (home, still, still), target=TARGET, speed_share=speed_share, home=home)
+    plan = partial(
+        plan_hits,
+        planner,
+        (home, still, still),
+        target=TARGET,
+        speed_share=speed_share,
+        home=home,
+    )
     plan(grid[0])
-    found: dict[str, list[float]] = {"planning ms": [], "hit s": [], "both s": [], "speed m/s": [], "valid": []}
+    found: dict[str, list[float]] = {
+        "planning ms": [],
+        "hit s": [],
+        "both s": [],
+        "speed m/s": [],
+        "valid": [],
+    }
     for puck in grid:
         start = time.process_time()
         planned = plan(puck)
@@ -95,7 +128,12 @@ def hits_and_ways_back(planner: Planner, speed_share: float) -> dict[str, Any]:
         )
         for name, value in zip(found, values, strict=True):
             found[name].append(value)
-    return {"speed share": speed_share, "pucks": len(grid), "answers": len(found["valid"]), **found}
+    return {
+        "speed share": speed_share,
+        "pucks": len(grid),
+        "answers": len(found["valid"]),
+        **found,
+    }
 
 
 def same_goal(planner: Planner, plans: Plans, source: str) -> list[dict[str, Any]]:
@@ -123,7 +161,9 @@ def same_goal(planner: Planner, plans: Plans, source: str) -> list[dict[str, Any
 def deadlines(plans: Plans) -> list[dict[str, Any]]:
     """Refine plans one by one until deadlines in CPU time."""
     records, input_valid = [], evaluate_plans(plans).valid
-    cost = [refined.cost for refined in refine_serially(plans, RefineOptions(deadline=1e-9))]  # of the input
+    cost = [
+        refined.cost for refined in refine_serially(plans, RefineOptions(deadline=1e-9))
+    ]  # of the input
     with patch("time.perf_counter", time.thread_time):
         for deadline in DEADLINES:
             options, times, results = RefineOptions(deadline=deadline), [], []
@@ -136,7 +176,9 @@ def deadlines(plans: Plans) -> list[dict[str, Any]]:
             records.append(
                 {
                     "deadline ms": None if deadline is None else 1e3 * deadline,
-                    "ms": [float(value) for value in np.percentile(times, [50, 95, 100])],
+                    "ms": [
+                        float(value) for value in np.percentile(times, [50, 95, 100])
+                    ],
                     "input valid": float(input_valid.mean()),
                     "valid": float(valid.mean()),
                     "worse": int((input_valid & ~valid).sum()),
@@ -166,7 +208,9 @@ def quartiles(values: list[float]) -> str:
 
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--repeat", type=int, default=300)
-    parser.add_argument("--plans", type=int, default=100, help="plans that are replanned and refined")
+    parser.add_argument(
+        "--plans", type=int, default=100, help="plans that are replanned and refined"
+    )
 
 
 def main() -> None:
@@ -177,30 +221,50 @@ def main() -> None:
         hit_results[name] = hits(Planner(name), chosen.repeat)
     planner = Planner(NAME)
     progress("replanning to the same goal")
-    plans = planner.plan_batch(draw_boundary_problems(NAME, chosen.plans, seed=6).boundary)
+    plans = planner.plan_batch(
+        draw_boundary_problems(NAME, chosen.plans, seed=6).boundary
+    )
     valid_plans = plans[evaluate_plans(plans).valid]
     same_goal_records = same_goal(planner, valid_plans, "network") + same_goal(
         planner, refine_plans(valid_plans).plans, "refined"
     )
     progress("hits and ways back")
-    ways_back = [hits_and_ways_back(Planner(TIME_PARAMETRIZED), share) for share in SPEED_SHARES]
+    ways_back = [
+        hits_and_ways_back(Planner(TIME_PARAMETRIZED), share) for share in SPEED_SHARES
+    ]
     progress("refining until deadlines")
     deadline_records = deadlines(plans)
     head = ("planner", "batch", "part", "ms", "of planning", "target", "")
     tables = [
-        table("CPU time per hit [ms]", head, [row for item in hit_results.items() for row in rows_of(*item)], left=3),
+        table(
+            "CPU time per hit [ms]",
+            head,
+            [row for item in hit_results.items() for row in rows_of(*item)],
+            left=3,
+        ),
         *(
             f"{name}: {results['planned']:.1%} of the hits are planned; {results['valid']:.1%} of their plans are valid"
             for name, results in hit_results.items()
         ),
         table(
             f"hits and ways back, one puck at a time, {TIME_PARAMETRIZED}: median, and from first to third quartile",
-            ("speed share", "answers", "planning, ms", "hit, s", "both, s", "hit speed, m/s", "valid"),
+            (
+                "speed share",
+                "answers",
+                "planning, ms",
+                "hit, s",
+                "both, s",
+                "hit speed, m/s",
+                "valid",
+            ),
             [
                 (
                     f"{record['speed share']:g}",
                     f"{record['answers']} of {record['pucks']}",
-                    *(quartiles(record[name]) for name in ("planning ms", "hit s", "both s", "speed m/s")),
+                    *(
+                        quartiles(record[name])
+                        for name in ("planning ms", "hit s", "both s", "speed m/s")
+                    ),
                     f"{np.mean(record['valid']):.1%}",
                 )
                 for record in ways_back
@@ -208,7 +272,15 @@ def main() -> None:
         ),
         table(
             "replanning to the same goal, motion time over the remaining time",
-            ("plans", "at", "network, median", "valid", "replan, maximum", "valid", "path points"),
+            (
+                "plans",
+                "at",
+                "network, median",
+                "valid",
+                "replan, maximum",
+                "valid",
+                "path points",
+            ),
             [
                 (
                     record["of"],
@@ -225,10 +297,21 @@ def main() -> None:
         ),
         table(
             "refining until a deadline",
-            ("deadline", "ms, median", "95 %", "maximum", "input valid", "valid", "worse", "objective / input"),
+            (
+                "deadline",
+                "ms, median",
+                "95 %",
+                "maximum",
+                "input valid",
+                "valid",
+                "worse",
+                "objective / input",
+            ),
             [
                 (
-                    "none" if record["deadline ms"] is None else f"{record['deadline ms']:g} ms",
+                    "none"
+                    if record["deadline ms"] is None
+                    else f"{record['deadline ms']:g} ms",
                     *(f"{value:.1f}" for value in record["ms"]),
                     f"{record['input valid']:.1%}",
                     f"{record['valid']:.1%}",
@@ -240,7 +323,12 @@ def main() -> None:
         ),
     ]
     report(
-        {"hits": hit_results, "ways back": ways_back, "same goal": same_goal_records, "deadlines": deadline_records},
+        {
+            "hits": hit_results,
+            "ways back": ways_back,
+            "same goal": same_goal_records,
+            "deadlines": deadline_records,
+        },
         tables,
         as_json=chosen.json,
     )

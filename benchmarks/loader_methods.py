@@ -63,7 +63,9 @@ class Reader:
     def table(self) -> NDArray[np.float32]:
         """All rows, packed and normalized, shape (rows, D)."""
         arrays = self.dataset.arrays("train", normalize=True, dtype="float32")
-        return np.concatenate([values.reshape(len(values), -1) for values in arrays.values()], axis=1)
+        return np.concatenate(
+            [values.reshape(len(values), -1) for values in arrays.values()], axis=1
+        )
 
     @cached_property
     def names(self) -> list[str]:
@@ -82,7 +84,10 @@ class Reader:
 
         for shard in self.dataset.shards["train"]:
             with h5py.File(shard.path) as file:
-                yield np.concatenate([file[name][()].reshape(shard.rows, -1) for name in self.names], axis=1)
+                yield np.concatenate(
+                    [file[name][()].reshape(shard.rows, -1) for name in self.names],
+                    axis=1,
+                )
 
     @cached_property
     def in_memory(self) -> Batches:
@@ -97,7 +102,10 @@ class Reader:
         """Read batches with cnpgen from the files in every epoch, as for a split that exceeds the memory limit."""
         limit, windows.MAX_IN_MEMORY_BYTES = windows.MAX_IN_MEMORY_BYTES, 0
         try:
-            yield from (batch.table for batch in self.dataset.batches(self.batch_size, **options))
+            yield from (
+                batch.table
+                for batch in self.dataset.batches(self.batch_size, **options)
+            )
         finally:
             windows.MAX_IN_MEMORY_BYTES = limit
 
@@ -107,7 +115,9 @@ class Reader:
 
         from cnpgen.interop.torch import BatchDataset
 
-        for batch in DataLoader(BatchDataset(self.in_memory), batch_size=None, num_workers=workers):
+        for batch in DataLoader(
+            BatchDataset(self.in_memory), batch_size=None, num_workers=workers
+        ):
             yield batch.table.numpy()
 
     def torch_rows(self, workers: int) -> Tables:
@@ -118,7 +128,13 @@ class Reader:
 
         rows = RowDataset(self.dataset)
         return self._packed(
-            DataLoader(rows, self.batch_size, shuffle=True, collate_fn=rows.collate, num_workers=workers)
+            DataLoader(
+                rows,
+                self.batch_size,
+                shuffle=True,
+                collate_fn=rows.collate,
+                num_workers=workers,
+            )
         )
 
     def torch_per_row(self, workers: int) -> Tables:
@@ -126,13 +142,18 @@ class Reader:
         from torch.utils.data import DataLoader
 
         rows = PerRow(self.dataset, self.names)
-        return self._packed(DataLoader(rows, self.batch_size, shuffle=True, num_workers=workers))
+        return self._packed(
+            DataLoader(rows, self.batch_size, shuffle=True, num_workers=workers)
+        )
 
     @staticmethod
     def _packed(loader: Any) -> Tables:
         """Concatenate the tensors of a batch."""
         for batch in loader:
-            yield np.concatenate([values.numpy().reshape(len(values), -1) for values in batch.values()], axis=1)
+            yield np.concatenate(
+                [values.numpy().reshape(len(values), -1) for values in batch.values()],
+                axis=1,
+            )
 
 
 class PerRow:
@@ -145,10 +166,16 @@ class PerRow:
 
     def __init__(self, dataset: Dataset, names: list[str]) -> None:
         shards = dataset.shards["train"]
-        self.paths, self.ends = [shard.path for shard in shards], np.cumsum([shard.rows for shard in shards])
+        self.paths, self.ends = (
+            [shard.path for shard in shards],
+            np.cumsum([shard.rows for shard in shards]),
+        )
         self.names, self.length = names, dataset.splits["train"]
         means, scales = dataset.normalization.mean, dataset.normalization.scale  # type: ignore[union-attr]
-        self.scaling = {name: (means[name].astype("f4"), scales[name].astype("f4")) for name in names}
+        self.scaling = {
+            name: (means[name].astype("f4"), scales[name].astype("f4"))
+            for name in names
+        }
         self.files: dict[int, Any] = {}
 
     def __len__(self) -> int:

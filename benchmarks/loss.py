@@ -25,7 +25,12 @@ from cnpgen.problems.problem_file import load_problem
 
 Array = np.ndarray[Any, np.dtype[Any]]
 PROBLEMS = ("airhockey", "heavy-object")
-VARIANTS = (("compiled", "float32"), ("compiled", "float64"), ("numpy", "float32"), ("casadi", "float64"))
+VARIANTS = (
+    ("compiled", "float32"),
+    ("compiled", "float64"),
+    ("numpy", "float32"),
+    ("casadi", "float64"),
+)
 TARGET_US = 0.3  # per point of the gradient kernel in float32
 REFERENCE_NODES = 4096
 MAX_NOISE_RAD = 0.05
@@ -73,7 +78,13 @@ class Case:
     def call(self, *, gradient: bool = True) -> None:
         """Evaluate the batch."""
         plans, weights = self.plans, np.ones(len(self.loss.terms) - 1)
-        self.loss(plans.path, plans.rate, weights=weights, obstacle_poses=plans.obstacle_poses, gradient=gradient)
+        self.loss(
+            plans.path,
+            plans.rate,
+            weights=weights,
+            obstacle_poses=plans.obstacle_poses,
+            gradient=gradient,
+        )
 
     def measure(self) -> None:
         """Time a call with gradient, the kernel in it, and a call without gradient."""
@@ -101,8 +112,11 @@ def elapsed(function: Callable[[], Any]) -> float:
     return time.perf_counter() - start
 
 
-def prepare(problem: str, backend: str, dtype: str, options: argparse.Namespace) -> Case:
-    loss = PlanLoss(load_problem(problem), dtype=dtype, nodes=options.nodes, backend=backend)  # type: ignore[arg-type]
+def prepare(
+    problem: str, backend: str, dtype: str, options: argparse.Namespace
+) -> Case:
+    choice: dict[str, Any] = {"dtype": dtype, "backend": backend}
+    loss = PlanLoss(load_problem(problem), nodes=options.nodes, **choice)
     plans = draw_plans(problem, options.batch)
     if dtype == "float32":
         plans = Plans(*(value.astype(np.float32) for value in vars(plans).values()))
@@ -116,16 +130,32 @@ def speed_table(cases: list[Case], points: int) -> str:
     rows = []
     for case in cases:
         first = next(other for other in cases if other.problem == case.problem)
-        slower = median(other / own for own, other in zip(first.calls, case.calls, strict=True))
+        slower = median(
+            other / own for own, other in zip(first.calls, case.calls, strict=True)
+        )
         per_point = 1e6 * median(case.kernels) / points
-        target = TARGET_US if (case.backend, case.dtype) == ("compiled", "float32") else None
+        target = (
+            TARGET_US if (case.backend, case.dtype) == ("compiled", "float32") else None
+        )
         rows.append(
             (case.problem, case.backend, case.dtype, f"{len(case.loss._gradient.tape):,}", f"{per_point:.3f}",
              f"{1e3 * median(case.calls):.2f}", f"{1e3 * median(case.values):.2f}", f"{slower:.1f}",
              *verdict(per_point, target, at_most=True))
         )  # fmt: skip
-    head = ("problem", "backend", "type", "operations", "us/point", "ms/batch", "no gradient", "times slower", "target")
-    title = f"Loss and gradient: kernel per point, whole call per batch ({points:,} points)"
+    head = (
+        "problem",
+        "backend",
+        "type",
+        "operations",
+        "us/point",
+        "ms/batch",
+        "no gradient",
+        "times slower",
+        "target",
+    )
+    title = (
+        f"Loss and gradient: kernel per point, whole call per batch ({points:,} points)"
+    )
     return table(title, (*head, ""), rows, left=3)
 
 
@@ -135,30 +165,61 @@ def torch_row(case: Case, options: argparse.Namespace) -> tuple[str, ...]:
     from cnpgen.interop.torch import TensorLoss
 
     torch.set_num_threads(1)
-    dtype, device, poses = getattr(torch, options.dtype), options.device, case.plans.obstacle_poses
-    path, rate = (
-        torch.tensor(x, requires_grad=True, dtype=dtype, device=device) for x in (case.plans.path, case.plans.rate)
+    dtype, device, poses = (
+        getattr(torch, options.dtype),
+        options.device,
+        case.plans.obstacle_poses,
     )
-    loss, weights = TensorLoss(case.loss, compiled=options.compiled), np.ones(len(case.loss.terms) - 1)
-    fixed = {"weights": torch.tensor(weights, device=device), "obstacle_poses": torch.tensor(poses, device=device)}
+    path, rate = (
+        torch.tensor(x, requires_grad=True, dtype=dtype, device=device)
+        for x in (case.plans.path, case.plans.rate)
+    )
+    loss, weights = (
+        TensorLoss(case.loss, compiled=options.compiled),
+        np.ones(len(case.loss.terms) - 1),
+    )
+    fixed = {
+        "weights": torch.tensor(weights, device=device),
+        "obstacle_poses": torch.tensor(poses, device=device),
+    }
 
     def gradient() -> Any:
-        return torch.autograd.grad(loss(path, rate, **fixed)[0].sum(), [path])[0].cpu().numpy()  # waits for the GPU
+        return (
+            torch.autograd.grad(loss(path, rate, **fixed)[0].sum(), [path])[0]
+            .cpu()
+            .numpy()
+        )  # waits for the GPU
 
     first, seconds = elapsed(gradient), cpu_of if device == "cpu" else elapsed
     times = [(seconds(gradient), cpu_of(case.call)) for _ in range(options.repeat)]
-    expected = case.loss(case.plans.path, case.plans.rate, weights=weights, obstacle_poses=poses).path_gradient
+    expected = case.loss(
+        case.plans.path, case.plans.rate, weights=weights, obstacle_poses=poses
+    ).path_gradient
     error = np.abs(gradient() - expected).max() / np.abs(expected).max()
     slower = median(a / b for a, b in times)
-    return case.problem, f"{first:.1f}", f"{1e3 * median(a for a, _ in times):.1f}", f"{slower:.2f}", f"{error:.1e}"
+    return (
+        case.problem,
+        f"{first:.1f}",
+        f"{1e3 * median(a for a, _ in times):.1f}",
+        f"{slower:.2f}",
+        f"{error:.1e}",
+    )
 
 
 def torch_table(cases: list[Case], options: argparse.Namespace) -> str:
     """Compare the loss in torch operations with the compiled one on one thread of the CPU."""
     rows = [torch_row(case, options) for case in cases]
-    head = ("problem", "first call, s", "ms/batch", "times slower", "relative difference of the gradient")
+    head = (
+        "problem",
+        "first call, s",
+        "ms/batch",
+        "times slower",
+        "relative difference of the gradient",
+    )
     title = f"TensorLoss with its gradient on {options.device}, {options.dtype}, {options.batch} plans"
-    return table(f"{title}, against the compiled loss in float64 on one thread", head, rows)
+    return table(
+        f"{title}, against the compiled loss in float64 on one thread", head, rows
+    )
 
 
 @dataclass(frozen=True)
@@ -178,7 +239,12 @@ def rule_errors(problem: str, plans: Plans) -> list[RuleError]:
     def evaluate(rule: str, nodes: int) -> tuple[Array, Array]:
         rules.basis_table.cache_clear()
         loss = PlanLoss(load_problem(problem), dtype="float64", nodes=nodes, rule=rule)
-        value = loss(plans.path, plans.rate, weights=np.ones(len(loss.terms) - 1), obstacle_poses=plans.obstacle_poses)
+        value = loss(
+            plans.path,
+            plans.rate,
+            weights=np.ones(len(loss.terms) - 1),
+            obstacle_poses=plans.obstacle_poses,
+        )
         rules.basis_table.cache_clear()
         return value.total, value.path_gradient.reshape(len(plans.path), -1)
 
@@ -186,18 +252,29 @@ def rule_errors(problem: str, plans: Plans) -> list[RuleError]:
 
     def error(label: str, nodes: int, rule: str) -> RuleError:
         value_total, computed_gradient = evaluate(rule, nodes)
-        gradient_errors = np.linalg.norm(computed_gradient - gradient, axis=1) / np.linalg.norm(gradient, axis=1)
+        gradient_errors = np.linalg.norm(
+            computed_gradient - gradient, axis=1
+        ) / np.linalg.norm(gradient, axis=1)
         return RuleError(
-            problem, label, nodes, float(np.mean(np.abs(value_total - total) / total)), float(np.mean(gradient_errors))
+            problem,
+            label,
+            nodes,
+            float(np.mean(np.abs(value_total - total) / total)),
+            float(np.mean(gradient_errors)),
         )
 
-    errors = [error(rule, nodes, rule) for nodes in (32, 64, 128) for rule in rules.RULES]
+    errors = [
+        error(rule, nodes, rule) for nodes in (32, 64, 128) for rule in rules.RULES
+    ]
     with mock.patch.object(rules, "quadrature", uniform):
         return errors + [error("uniform", nodes, "cosine") for nodes in (64, 256, 1024)]
 
 
 def rule_table(errors: list[RuleError]) -> str:
-    rows = [(e.rule, str(e.nodes), f"{100 * e.total:.2f} %", f"{100 * e.gradient:.2f} %") for e in errors]
+    rows = [
+        (e.rule, str(e.nodes), f"{100 * e.total:.2f} %", f"{100 * e.gradient:.2f} %")
+        for e in errors
+    ]
     title = f"{errors[0].problem}: errors of quadrature rules against {REFERENCE_NODES} nodes"
     return table(title, ("rule", "nodes", "total", "gradient"), rows)
 
@@ -207,7 +284,9 @@ def uniform(_rule: str, nodes: int, _shift: float = 0.0) -> tuple[Array, Array]:
     return np.linspace(0, 1, nodes), np.full(nodes, 1 / nodes)
 
 
-def results(cases: list[Case], points: int, errors: list[list[RuleError]]) -> dict[str, Any]:
+def results(
+    cases: list[Case], points: int, errors: list[list[RuleError]]
+) -> dict[str, Any]:
     return {
         "points": points,
         "rules": [vars(error) for of_problem in errors for error in of_problem],
@@ -229,10 +308,22 @@ def results(cases: list[Case], points: int, errors: list[list[RuleError]]) -> di
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--batch", type=int, default=128, help="plans per batch")
     parser.add_argument("--nodes", type=int, default=64, help="quadrature nodes")
-    parser.add_argument("--torch", action="store_true", help="compare with the loss in torch operations, and stop")
-    parser.add_argument("--device", default="cpu", help="device of the torch operations")
-    parser.add_argument("--dtype", choices=("float32", "float64"), default="float64", help="their type")
-    parser.add_argument("--compiled", action="store_true", help="fuse them with torch.compile, which takes minutes")
+    parser.add_argument(
+        "--torch",
+        action="store_true",
+        help="compare with the loss in torch operations, and stop",
+    )
+    parser.add_argument(
+        "--device", default="cpu", help="device of the torch operations"
+    )
+    parser.add_argument(
+        "--dtype", choices=("float32", "float64"), default="float64", help="their type"
+    )
+    parser.add_argument(
+        "--compiled",
+        action="store_true",
+        help="fuse them with torch.compile, which takes minutes",
+    )
     parser.add_argument("--repeat", type=int, default=15, help="repetitions")
 
 
@@ -240,10 +331,16 @@ def main() -> None:
     options = arguments(__doc__, add_options)
     points = options.batch * options.nodes
     if options.torch:
-        cases = [prepare(problem, "compiled", "float64", options) for problem in PROBLEMS]
+        cases = [
+            prepare(problem, "compiled", "float64", options) for problem in PROBLEMS
+        ]
         report({}, [torch_table(cases, options)], as_json=options.json)
         return
-    cases = [prepare(problem, *variant, options) for problem in PROBLEMS for variant in VARIANTS]
+    cases = [
+        prepare(problem, *variant, options)
+        for problem in PROBLEMS
+        for variant in VARIANTS
+    ]
     for number in range(options.repeat):
         progress(f"repetition {number + 1} of {options.repeat}")
         for case in cases:

@@ -48,7 +48,10 @@ def run(schedule: str, data: Path, options: argparse.Namespace) -> Curve:
         cpu_seconds=options.seconds,
         workers=1,
     )
-    records = [json.loads(line) for line in model.with_suffix(".jsonl").read_text(encoding="utf-8").splitlines()]
+    records = [
+        json.loads(line)
+        for line in model.with_suffix(".jsonl").read_text(encoding="utf-8").splitlines()
+    ]
     return Curve(
         schedule,
         [record for record in records if "validation" in record],
@@ -62,10 +65,14 @@ def curve_table(curves: list[Curve]) -> str:
     for curve in curves:
         for check in curve.checks:
             validation = check["validation"]
-            rows.append((curve.schedule, f"{check['seconds']:.0f}", *_numbers(validation)))
+            rows.append(
+                (curve.schedule, f"{check['seconds']:.0f}", *_numbers(validation))
+            )
         rows.append((curve.schedule, "best, all rows", *_numbers(curve.final)))
     head = ("metric", "CPU s", "valid", "paper's rule", "motion time s", "z error mm s")
-    return table("Validation during training (on a part of the rows) and at the end", head, rows)
+    return table(
+        "Validation during training (on a part of the rows) and at the end", head, rows
+    )
 
 
 def _numbers(validation: dict[str, Any]) -> tuple[str, str, str, str]:
@@ -87,13 +94,21 @@ def plot(curves: list[Curve], path: str) -> None:
     for number, curve in enumerate(curves):
         seconds = [check["seconds"] for check in curve.checks]
         for axis, key in ((axes[0], "valid"), (axes[1], "paper_valid")):
-            axis.plot(seconds, [100 * check["validation"][key] for check in curve.checks], label=curve.schedule)
+            axis.plot(
+                seconds,
+                [100 * check["validation"][key] for check in curve.checks],
+                label=curve.schedule,
+            )
         times = [record["seconds"] for record in curve.weights]
         for name, style in zip(PLOTTED_TERMS, ("-", "--", ":"), strict=True):
             label = f"{name.removeprefix('joint-')}" if number == 0 else None
             values = [record["weights"][name] for record in curve.weights]
             axes[2].semilogy(times, values, style, color=f"C{number}", label=label)
-    for axis, title in zip(axes, ("valid [%]", "valid by the paper's rule [%]", "weights e^alpha"), strict=True):
+    for axis, title in zip(
+        axes,
+        ("valid [%]", "valid by the paper's rule [%]", "weights e^alpha"),
+        strict=True,
+    ):
         axis.set(title=title, xlabel="CPU s")
         axis.grid(alpha=0.3)
     axes[0].legend()
@@ -102,11 +117,24 @@ def plot(curves: list[Curve], path: str) -> None:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--schedule", nargs="+", default=METRICS, choices=METRICS, help="schedules of the metric")
-    parser.add_argument("--seconds", type=float, default=60, help="CPU seconds of training each")
+    parser.add_argument(
+        "--schedule",
+        nargs="+",
+        default=METRICS,
+        choices=METRICS,
+        help="schedules of the metric",
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=60, help="CPU seconds of training each"
+    )
     parser.add_argument("--dataset", default="airhockey-hit", help="dataset")
     parser.add_argument("--n", type=int, default=19_800, help="rows of the dataset")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the initial parameters and of the order of rows")
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=0,
+        help="seed of the initial parameters and of the order of rows",
+    )
     parser.add_argument("--plot", metavar="FILE.png", help="draw the curves")
 
 
@@ -118,7 +146,11 @@ def main() -> None:
         curves = [run(schedule, data, options) for schedule in options.schedule]
     if options.plot:
         plot(curves, options.plot)
-    report({"curves": [vars(curve) for curve in curves]}, [curve_table(curves)], as_json=options.json)
+    report(
+        {"curves": [vars(curve) for curve in curves]},
+        [curve_table(curves)],
+        as_json=options.json,
+    )
 
 
 if __name__ == "__main__":

@@ -25,10 +25,18 @@ from cnpgen.scenes import (
 
 TARGETS = {"cloud": 10_000.0, "camera": 1_000.0}  # scenes/s
 REPETITIONS = 5
-KINDS = (SurfaceCloud(), CameraCloud(), DistanceGrid(), BasisPoints(), ObjectTokens(capacity=40))
+KINDS = (
+    SurfaceCloud(),
+    CameraCloud(),
+    DistanceGrid(),
+    BasisPoints(),
+    ObjectTokens(capacity=40),
+)
 
 
-def measure(family: str, count: int, reference_count: int, seed: int) -> list[dict[str, Any]]:
+def measure(
+    family: str, count: int, reference_count: int, seed: int
+) -> list[dict[str, Any]]:
     """Return the rates of all observations of scenes of a family."""
     random, drawer = np.random.default_rng(seed), load_family(family)
     bodies = scene_bodies([drawer.draw(random).obstacles for _ in range(count)])
@@ -41,7 +49,12 @@ def measure(family: str, count: int, reference_count: int, seed: int) -> list[di
         reference = observe(few, kind, backend="numpy")
         seconds = time.process_time() - begun
         difference = max(
-            float(np.nanmax(np.abs(compiled[name][: len(few)].astype(float) - values), initial=0.0))
+            float(
+                np.nanmax(
+                    np.abs(compiled[name][: len(few)].astype(float) - values),
+                    initial=0.0,
+                )
+            )
             for name, values in reference.items()
         )
         rate = count / median(times)
@@ -62,9 +75,20 @@ def measure(family: str, count: int, reference_count: int, seed: int) -> list[di
 def options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
     known = list(shipped_families())
-    parser.add_argument("--families", nargs="*", default=["tabletop", "cubby"], choices=known, help="families")
+    parser.add_argument(
+        "--families",
+        nargs="*",
+        default=["tabletop", "cubby"],
+        choices=known,
+        help="families",
+    )
     parser.add_argument("--count", type=int, default=500, help="scenes")
-    parser.add_argument("--reference", type=int, default=10, help="scenes that are observed by the NumPy reference")
+    parser.add_argument(
+        "--reference",
+        type=int,
+        default=10,
+        help="scenes that are observed by the NumPy reference",
+    )
     parser.add_argument("--seed", type=int, default=1, help="seed of the scenes")
 
 
@@ -76,7 +100,16 @@ def main() -> None:
         for family in chosen.families:
             progress(family)
             results += measure(family, chosen.count, chosen.reference, chosen.seed)
-    head = ("family", "observation", "bodies", "scenes/s", "target", "NumPy scenes/s", "ratio", "difference")
+    head = (
+        "family",
+        "observation",
+        "bodies",
+        "scenes/s",
+        "target",
+        "NumPy scenes/s",
+        "ratio",
+        "difference",
+    )
     rows = [
         (
             each["family"],
@@ -90,7 +123,11 @@ def main() -> None:
         )
         for each in results
     ]
-    report({"observations": results}, [table("observations of scenes", head, rows, left=2)], as_json=chosen.json)
+    report(
+        {"observations": results},
+        [table("observations of scenes", head, rows, left=2)],
+        as_json=chosen.json,
+    )
 
 
 if __name__ == "__main__":

@@ -43,7 +43,10 @@ from cnpgen.refine.refiner import Refiner
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
-FIRST = ("airhockey-replan", "airhockey-hit")  # datasets and planners of the first motions
+FIRST = (
+    "airhockey-replan",
+    "airhockey-hit",
+)  # datasets and planners of the first motions
 SWITCH_RANGE = (0.05, 0.95)  # of T
 TIMES_PER_REFINED_MOTION = 4
 OVERSAMPLING = 1.25  # problems sampled per problem: some first motions are invalid, some tasks are infeasible
@@ -58,7 +61,9 @@ VALID_TARGETS = {  # fraction of valid plans of the network
 REFINED_VALID, TIME_RATIO, REFINE_MS, REFINE_P95_MS = 0.998, 1.08, 8.0, 15.0  # targets
 
 State = tuple[Any, Any, Any]
-Targets = dict[str, tuple[float, bool]]  # figure -> target, and whether it is an upper bound
+Targets = dict[
+    str, tuple[float, bool]
+]  # figure -> target, and whether it is an upper bound
 
 
 @dataclass(frozen=True)
@@ -77,7 +82,11 @@ class Problems:
 
     def __getitem__(self, rows: NDArray[np.int64]) -> "Problems":
         executed = None if self.executed is None else self.executed[rows]
-        return Problems(self.boundary[rows], executed, None if self.time is None else self.time[rows])
+        return Problems(
+            self.boundary[rows],
+            executed,
+            None if self.time is None else self.time[rows],
+        )
 
 
 def first_motions(count: int, seed: int) -> Plans:
@@ -85,7 +94,9 @@ def first_motions(count: int, seed: int) -> Plans:
     parts = []
     for name in FIRST:
         plans = Planner(name).plan_batch(
-            draw_boundary_problems(name, int(OVERSAMPLING * count / 2), seed=seed).boundary
+            draw_boundary_problems(
+                name, int(OVERSAMPLING * count / 2), seed=seed
+            ).boundary
         )
         parts.append(plans[evaluate_plans(plans).valid][: count // 2])
     return concatenate(parts)
@@ -101,15 +112,23 @@ def states_of(plans: Plans, random: np.random.Generator) -> State:
     return plans.states_at(times_of(plans, random))
 
 
-def to_new_pucks(state: State, problem: ProblemRecord, random: np.random.Generator) -> Boundary:
+def to_new_pucks(
+    state: State, problem: ProblemRecord, random: np.random.Generator
+) -> Boundary:
     """Return the feasible problems from states to pucks anywhere on the table."""
     q, dq, ddq = state
     count = len(q)
     goal = random.uniform(TABLE_RANGE_M[:, 0], TABLE_RANGE_M[:, 1], (count, 2))
     x, y = (goal - problem.tip_positions(q)[:, :2]).T
     tasks = {"start_q": q, "start_dq": dq, "start_ddq": ddq, "goal_xyz": goal}
-    tasks["hit_angle"] = np.arctan2(y, x) + random.uniform(-MAX_DIRECTION_ERROR_RAD, MAX_DIRECTION_ERROR_RAD, count)
-    share = np.where(random.uniform(size=count) < FULL_SPEED_FRACTION, 1.0, random.uniform(1e-3, 1.0, count))
+    tasks["hit_angle"] = np.arctan2(y, x) + random.uniform(
+        -MAX_DIRECTION_ERROR_RAD, MAX_DIRECTION_ERROR_RAD, count
+    )
+    share = np.where(
+        random.uniform(size=count) < FULL_SPEED_FRACTION,
+        1.0,
+        random.uniform(1e-3, 1.0, count),
+    )
     return complete("airhockey-replan", **tasks, hit_speed_share=share).plans.boundary
 
 
@@ -141,17 +160,29 @@ def sets(count: int, seed: int) -> dict[str, Problems]:
     random, sampled = np.random.default_rng(seed), int(OVERSAMPLING * count)
     progress(f"{sampled} first motions")
     plans = first_motions(sampled, seed)
-    other_goals = draw_boundary_problems("airhockey-replan", sampled, seed=seed + 1).boundary
+    other_goals = draw_boundary_problems(
+        "airhockey-replan", sampled, seed=seed + 1
+    ).boundary
     progress(f"{sampled // TIMES_PER_REFINED_MOTION} first motions refined")
     refined = refine_plans(plans[::TIMES_PER_REFINED_MOTION])
-    executed = refined.plans[np.repeat(np.flatnonzero(refined.valid), TIMES_PER_REFINED_MOTION)]
+    executed = refined.plans[
+        np.repeat(np.flatnonzero(refined.valid), TIMES_PER_REFINED_MOTION)
+    ]
     problems = {
-        "new puck": Problems(to_new_pucks(states_of(plans, random), plans.problem, random)),
+        "new puck": Problems(
+            to_new_pucks(states_of(plans, random), plans.problem, random)
+        ),
         "same goal": to_same_goals(plans, random),
-        "near the base": Problems(to_goals(states_of(plans, random), full_speed_hits(sampled, seed + 2))),
+        "near the base": Problems(
+            to_goals(states_of(plans, random), full_speed_hits(sampled, seed + 2))
+        ),
         "another problem's": Problems(to_goals(states_of(plans, random), other_goals)),
-        "on refined plans": Problems(to_new_pucks(states_of(executed, random), plans.problem, random)),
-        "dataset rows": Problems(draw_boundary_problems("airhockey-replan", count, seed=seed + 3).boundary),
+        "on refined plans": Problems(
+            to_new_pucks(states_of(executed, random), plans.problem, random)
+        ),
+        "dataset rows": Problems(
+            draw_boundary_problems("airhockey-replan", count, seed=seed + 3).boundary
+        ),
     }
     return {
         name: problem_set[random.permutation(len(problem_set.boundary))[:count]]
@@ -167,46 +198,90 @@ def measure(planner: Planner, problems: Problems, refined: int) -> dict[str, flo
     if problems.executed is None or problems.time is None:
         return results
     replans = replanned(planner, problems, problems.executed, problems.time)
-    refined_replans = [plan for answer in replans[:refined] for plan in refine_each(answer)]
+    refined_replans = [
+        plan for answer in replans[:refined] for plan in refine_each(answer)
+    ]
     results |= {
-        f"replan, {key}": value for key, value in figures(replans, refined_replans).items() if key != "problems"
+        f"replan, {key}": value
+        for key, value in figures(replans, refined_replans).items()
+        if key != "problems"
     }
-    both_valid = np.array([a.valid and b.valid for a, b in zip(refined_plans, refined_replans, strict=True)])
-    best = np.array([min(a.duration, b.duration) for a, b in zip(refined_plans, refined_replans, strict=True)])[
-        both_valid
-    ].mean()
-    replan_times, remaining = durations(replans), problems.executed.duration - problems.time
+    both_valid = np.array(
+        [
+            a.valid and b.valid
+            for a, b in zip(refined_plans, refined_replans, strict=True)
+        ]
+    )
+    best = np.array(
+        [
+            min(a.duration, b.duration)
+            for a, b in zip(refined_plans, refined_replans, strict=True)
+        ]
+    )[both_valid].mean()
+    replan_times, remaining = (
+        durations(replans),
+        problems.executed.duration - problems.time,
+    )
     return (
         results
         | {
             "replan, remaining trajectories of the old plan": float(
                 (np.abs(replan_times - remaining) < TIME_TOLERANCE_S).mean()
             ),
-            "T / best refined of both": float(plans.duration[:refined][both_valid].mean() / best),
-            "replan, T / best refined of both": float(replan_times[:refined][both_valid].mean() / best),
+            "T / best refined of both": float(
+                plans.duration[:refined][both_valid].mean() / best
+            ),
+            "replan, T / best refined of both": float(
+                replan_times[:refined][both_valid].mean() / best
+            ),
         }
         | refine_finer_knots(replans[:refined], refined_replans, plans.motion.spec)
     )
 
 
-def replanned(planner: Planner, problems: Problems, executed: Plans, time: NDArray[np.float64]) -> list[Plans]:
+def replanned(
+    planner: Planner, problems: Problems, executed: Plans, time: NDArray[np.float64]
+) -> list[Plans]:
     """Replan to unchanged goals, one after the other."""
     goals = problems.boundary
     rows = (slice(i, i + 1) for i in range(len(executed)))
-    return [planner.replan(executed[i], time[i], goal_q=goals.goal_q[i], goal_dq=goals.goal_dq[i]) for i in rows]
+    return [
+        planner.replan(
+            executed[i], time[i], goal_q=goals.goal_q[i], goal_dq=goals.goal_dq[i]
+        )
+        for i in rows
+    ]
 
 
-def refine_finer_knots(plans: list[Plans], refined: list[Made], spec: TrajectorySpec) -> dict[str, float]:
+def refine_finer_knots(
+    plans: list[Plans], refined: list[Made], spec: TrajectorySpec
+) -> dict[str, float]:
     """Refine plans that have finer knots with all of their control points; return times and gains."""
-    pairs = [(plan, result) for plan, result in zip(plans, refined, strict=True) if plan.motion.spec != spec]
+    pairs = [
+        (plan, result)
+        for plan, result in zip(plans, refined, strict=True)
+        if plan.motion.spec != spec
+    ]
     if not pairs:
         return {}
-    fine_refined = [result for plan, _ in pairs for result in refine_each(plan, load_refiner_of(plan))]
-    ratio = [a.duration / b.duration for (_, a), b in zip(pairs, fine_refined, strict=True) if b.valid]
+    fine_refined = [
+        result
+        for plan, _ in pairs
+        for result in refine_each(plan, load_refiner_of(plan))
+    ]
+    ratio = [
+        a.duration / b.duration
+        for (_, a), b in zip(pairs, fine_refined, strict=True)
+        if b.valid
+    ]
     return {
         "replan, with finer knots": len(pairs) / len(plans),
-        "replan, finer knots, refine, median ms": median(result.ms for _, result in pairs),
-        "replan, finer knots, refine with all points, median ms": median(result.ms for result in fine_refined),
+        "replan, finer knots, refine, median ms": median(
+            result.ms for _, result in pairs
+        ),
+        "replan, finer knots, refine with all points, median ms": median(
+            result.ms for result in fine_refined
+        ),
         "replan, finer knots, refined / refined with all points": float(np.mean(ratio)),
     }
 
@@ -231,12 +306,21 @@ def durations(parts: list[Plans]) -> NDArray[np.float64]:
 def figures(parts: list[Plans], refined: list[Made]) -> dict[str, float]:
     """Return the figures of plans; the first ones are compared with the refined plans."""
     valid, before = np.array([item.valid for item in refined]), durations(parts)
-    after, ms = np.array([item.duration for item in refined]), [item.ms for item in refined]
+    after, ms = (
+        np.array([item.duration for item in refined]),
+        [item.ms for item in refined],
+    )
     return {
         "problems": len(before),
-        "valid, planned": float(np.concatenate([evaluate_plans(item, workers=1).valid for item in parts]).mean()),
+        "valid, planned": float(
+            np.concatenate(
+                [evaluate_plans(item, workers=1).valid for item in parts]
+            ).mean()
+        ),
         "valid, refined": float(valid.mean()),
-        "T / refined": float(before[: len(refined)][valid].mean() / after[valid].mean()),
+        "T / refined": float(
+            before[: len(refined)][valid].mean() / after[valid].mean()
+        ),
         "refine, median ms": median(ms),
         "refine, p95 ms": float(np.quantile(ms, 0.95)),
     }
@@ -251,42 +335,84 @@ def targets_of(name: str) -> Targets:
     }  # fmt: skip
 
 
-def rows_of(model: str, name: str, figures: dict[str, float], targets: Targets) -> list[tuple[str, ...]]:
+def rows_of(
+    model: str, name: str, figures: dict[str, float], targets: Targets
+) -> list[tuple[str, ...]]:
     """Return the rows of a set."""
     rows: list[tuple[str, ...]] = []
     for figure, value in figures.items():
         target, at_most = targets.get(figure.removeprefix("replan, "), (None, False))
-        rows.append((model, name, figure, f"{value:,.4g}", *verdict(value, target, at_most=at_most)))
+        rows.append(
+            (
+                model,
+                name,
+                figure,
+                f"{value:,.4g}",
+                *verdict(value, target, at_most=at_most),
+            )
+        )
     return rows
 
 
 def options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
-    parser.add_argument("--models", nargs="+", default=["airhockey-online"], help="names or files of models")
     parser.add_argument(
-        "--sets", nargs="+", choices=VALID_TARGETS, default=list(VALID_TARGETS), metavar="SET", help="sets of problems"
+        "--models",
+        nargs="+",
+        default=["airhockey-online"],
+        help="names or files of models",
     )
-    parser.add_argument("--problems", type=int, default=300, help="problems of each set")
-    parser.add_argument("--refined", type=int, default=60, help="refined problems of each set")
-    parser.add_argument("--seed", type=int, default=271_828_183, help="seed of the problems")
+    parser.add_argument(
+        "--sets",
+        nargs="+",
+        choices=VALID_TARGETS,
+        default=list(VALID_TARGETS),
+        metavar="SET",
+        help="sets of problems",
+    )
+    parser.add_argument(
+        "--problems", type=int, default=300, help="problems of each set"
+    )
+    parser.add_argument(
+        "--refined", type=int, default=60, help="refined problems of each set"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=271_828_183, help="seed of the problems"
+    )
 
 
 def main() -> None:
     """Run the benchmark."""
     chosen = arguments(__doc__, options)
     problems = {
-        name: problem_set for name, problem_set in sets(chosen.problems, chosen.seed).items() if name in chosen.sets
+        name: problem_set
+        for name, problem_set in sets(chosen.problems, chosen.seed).items()
+        if name in chosen.sets
     }
     results: dict[str, Any] = {}
     for model in chosen.models:
         planner = Planner(model)
         for name, problem_set in problems.items():
             progress(f"{model}: {name}")
-            results.setdefault(model, {})[name] = measure(planner, problem_set, chosen.refined)
-    measured = ((model, name, figures) for model, by_set in results.items() for name, figures in by_set.items())
-    rows = [row for model, name, figures in measured for row in rows_of(model, name, figures, targets_of(name))]
+            results.setdefault(model, {})[name] = measure(
+                planner, problem_set, chosen.refined
+            )
+    measured = (
+        (model, name, figures)
+        for model, by_set in results.items()
+        for name, figures in by_set.items()
+    )
+    rows = [
+        row
+        for model, name, figures in measured
+        for row in rows_of(model, name, figures, targets_of(name))
+    ]
     head = ("planner", "problems", "figure", "value", "target", "")
-    report({"online_replanning": results}, [table("online planning", head, rows, left=3)], as_json=chosen.json)
+    report(
+        {"online_replanning": results},
+        [table("online planning", head, rows, left=3)],
+        as_json=chosen.json,
+    )
 
 
 if __name__ == "__main__":

@@ -49,12 +49,17 @@ def read(path: Path, factor: float) -> Curve:
         text = path.read_text(encoding="utf-8")
     else:
         model = cnpgen.load_model(path)
-        text, factor = model.log, float(model.training["settings"]["metric"].get("budget_factor", 1.0))
+        text, factor = (
+            model.log,
+            float(model.training["settings"]["metric"].get("budget_factor", 1.0)),
+        )
     records = [json.loads(line) for line in text.splitlines()]
     steps = [record for record in records if "weights" in record]
     checks = [record for record in records if "validation" in record]
     if not records or "final" not in records[-1]:
-        raise SystemExit(f"{path}: expected the log of a finished training, whose last line has the key 'final'")
+        raise SystemExit(
+            f"{path}: expected the log of a finished training, whose last line has the key 'final'"
+        )
     return Curve(path.stem, steps, checks, records[-1]["final"], factor)
 
 
@@ -65,15 +70,27 @@ def learned_terms(curve: Curve) -> list[str]:
 
 def ratios(curve: Curve, record: dict[str, Any], names: list[str]) -> list[float]:
     """Return the means of terms over their budgets."""
-    return [record["terms"][name] / record["budgets"][name] / curve.budget_factor for name in names]
+    return [
+        record["terms"][name] / record["budgets"][name] / curve.budget_factor
+        for name in names
+    ]
 
 
 def epoch_of_met_budgets(curve: Curve, tolerance: float = 0.05) -> str:
     """Return the first epoch from which velocity and acceleration stay within a tolerance of their budgets."""
     names = ["joint-velocity", "joint-acceleration"]
-    outside = [max(abs(ratio - 1) for ratio in ratios(curve, record, names)) > tolerance for record in curve.steps]
-    first = max((index + 1 for index, is_outside in enumerate(outside) if is_outside), default=0)
-    return "not reached" if first == len(outside) else f"{curve.steps[first]['epoch']:,.0f}"
+    outside = [
+        max(abs(ratio - 1) for ratio in ratios(curve, record, names)) > tolerance
+        for record in curve.steps
+    ]
+    first = max(
+        (index + 1 for index, is_outside in enumerate(outside) if is_outside), default=0
+    )
+    return (
+        "not reached"
+        if first == len(outside)
+        else f"{curve.steps[first]['epoch']:,.0f}"
+    )
 
 
 def rows(curves: list[Curve]) -> list[tuple[str, ...]]:
@@ -86,7 +103,18 @@ def rows(curves: list[Curve]) -> list[tuple[str, ...]]:
         shares = (f"{100 * score[key]:.1f} %" for key in ("valid", "paper_valid"))
         lengths = f"{last['epoch']:,.0f}", f"{last['seconds']:,.0f}"
         met, duration = epoch_of_met_budgets(curve), f"{score['duration_s']:.3f}"
-        cells.append((curve.name, *lengths, met, f"{curve.budget_factor:g}", violations, weights, *shares, duration))
+        cells.append(
+            (
+                curve.name,
+                *lengths,
+                met,
+                f"{curve.budget_factor:g}",
+                violations,
+                weights,
+                *shares,
+                duration,
+            )
+        )
     return cells
 
 
@@ -95,18 +123,49 @@ def save_csv(curves: list[Curve], path: Path) -> None:
     names = learned_terms(curves[0])
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
-        head = ["model", "step", "epoch", "cpu_s", "loss", "task_loss", *names, *(f"weight {name}" for name in names)]
+        head = [
+            "model",
+            "step",
+            "epoch",
+            "cpu_s",
+            "loss",
+            "task_loss",
+            *names,
+            *(f"weight {name}" for name in names),
+        ]
         writer.writerow([*head, "valid", "paper_valid", "duration_s"])
         for curve in curves:
             for record in curve.steps:
-                values = [record["loss"], record["terms"]["time"], *(record["terms"][name] for name in names)]
-                common = [curve.name, record["step"], record["epoch"], record["seconds"], *values]
+                values = [
+                    record["loss"],
+                    record["terms"]["time"],
+                    *(record["terms"][name] for name in names),
+                ]
+                common = [
+                    curve.name,
+                    record["step"],
+                    record["epoch"],
+                    record["seconds"],
+                    *values,
+                ]
                 writer.writerow([*common, *(record["weights"][name] for name in names)])
             for record in curve.checks:
-                found, epoch = record["validation"], record["step"] / curve.steps_per_epoch
+                found, epoch = (
+                    record["validation"],
+                    record["step"] / curve.steps_per_epoch,
+                )
                 blank = [""] * (2 + 2 * len(names))
                 values = [found["valid"], found["paper_valid"], found["duration_s"]]
-                writer.writerow([curve.name, record["step"], epoch, record["seconds"], *blank, *values])
+                writer.writerow(
+                    [
+                        curve.name,
+                        record["step"],
+                        epoch,
+                        record["seconds"],
+                        *blank,
+                        *values,
+                    ]
+                )
 
 
 def plot(curves: list[Curve], path: Path) -> None:
@@ -115,8 +174,17 @@ def plot(curves: list[Curve], path: Path) -> None:
     axes = figure.subplots(2, 2, sharex=True).ravel()
     styles = ("-", "--", ":", "-.")
     for number, curve in enumerate(curves):
-        style, epochs = styles[number % len(styles)], [record["epoch"] for record in curve.steps]
-        axes[0].plot(epochs, [record["loss"] for record in curve.steps], style, color="C0", label=curve.name)
+        style, epochs = (
+            styles[number % len(styles)],
+            [record["epoch"] for record in curve.steps],
+        )
+        axes[0].plot(
+            epochs,
+            [record["loss"] for record in curve.steps],
+            style,
+            color="C0",
+            label=curve.name,
+        )
         for index, name in enumerate(learned_terms(curve)):
             label = name if number == 0 else None
             means = [ratios(curve, record, [name])[0] for record in curve.steps]
@@ -126,9 +194,18 @@ def plot(curves: list[Curve], path: Path) -> None:
         checked = [record["step"] / curve.steps_per_epoch for record in curve.checks]
         for key, color in (("paper_valid", "C1"), ("valid", "C0")):
             shares = [100 * record["validation"][key] for record in curve.checks]
-            label = {"valid": "strict", "paper_valid": "paper's rules"}[key] if number == 0 else None
+            label = (
+                {"valid": "strict", "paper_valid": "paper's rules"}[key]
+                if number == 0
+                else None
+            )
             axes[3].plot(checked, shares, style, color=color, label=label)
-    titles = ("loss [s]", "mean violation / budget", "weights e^alpha", "valid plans [%]")
+    titles = (
+        "loss [s]",
+        "mean violation / budget",
+        "weights e^alpha",
+        "valid plans [%]",
+    )
     for axis, title in zip(axes, titles, strict=True):
         axis.set_title(title, fontsize=9)
         axis.grid(alpha=0.3)
@@ -146,10 +223,15 @@ def main() -> None:
     def add(parser: argparse.ArgumentParser) -> None:
         parser.add_argument("files", nargs="+", type=Path, help="logs or models")
         parser.add_argument(
-            "--budget-factor", type=float, default=1.0, help="factor of the budgets of logs (default: 1)"
+            "--budget-factor",
+            type=float,
+            default=1.0,
+            help="factor of the budgets of logs (default: 1)",
         )
         parser.add_argument("--plot", metavar="FILE", type=Path, help="figure to write")
-        parser.add_argument("--csv", metavar="FILE", type=Path, help="table of the curves to write")
+        parser.add_argument(
+            "--csv", metavar="FILE", type=Path, help="table of the curves to write"
+        )
 
     options = arguments(__doc__, add)
     curves = [read(path, options.budget_factor) for path in options.files]
@@ -158,10 +240,21 @@ def main() -> None:
     if options.csv:
         save_csv(curves, options.csv)
     names = ", ".join(learned_terms(curves[0]))
-    head = ("training", "epochs", "seconds", "budgets met from epoch", "budget factor", f"violation / budget: {names}")
+    head = (
+        "training",
+        "epochs",
+        "seconds",
+        "budgets met from epoch",
+        "budget factor",
+        f"violation / budget: {names}",
+    )
     outcome = ("weights", "valid", "paper's rules", "duration s")
     results = {"trainings": {curve.name: curve.score for curve in curves}}
-    report(results, [table("The paper's preset", (*head, *outcome), rows(curves))], as_json=options.json)
+    report(
+        results,
+        [table("The paper's preset", (*head, *outcome), rows(curves))],
+        as_json=options.json,
+    )
 
 
 if __name__ == "__main__":

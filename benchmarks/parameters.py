@@ -54,7 +54,9 @@ def single_value_model(name: str) -> Model:
     )
 
 
-def measure(name: str, model: Model, options: argparse.Namespace, *, refined: int) -> dict[str, Any]:
+def measure(
+    name: str, model: Model, options: argparse.Namespace, *, refined: int
+) -> dict[str, Any]:
     """Plan new problems; refine some of the plans."""
     problems = draw_boundary_problems(name, options.problems, seed=options.seed)
     planner = cnpgen.Planner(model, scale_time=not options.no_time_scaling)
@@ -63,12 +65,19 @@ def measure(name: str, model: Model, options: argparse.Namespace, *, refined: in
     verdicts = cnpgen.evaluate_plans(plans, workers=1).verdicts
     figures = {
         "strict": np.mean([verdict.valid for verdict in verdicts]),
-        "paper": np.mean([verdict.paper.valid for verdict in verdicts if verdict.paper]),
+        "paper": np.mean(
+            [verdict.paper.valid for verdict in verdicts if verdict.paper]
+        ),
         "duration": plans.duration.mean(),
     }
     if refined:
         result = refine_plans(plans[:refined], workers=1).plans
-        valid = np.array([verdict.valid for verdict in cnpgen.evaluate_plans(result, workers=1).verdicts])
+        valid = np.array(
+            [
+                verdict.valid
+                for verdict in cnpgen.evaluate_plans(result, workers=1).verdicts
+            ]
+        )
         ratio = plans.duration[:refined] / result.duration
         figures |= {"refined": valid.mean(), "over refined": ratio[valid].mean()}
     return {key: float(value) for key, value in figures.items()}
@@ -76,13 +85,38 @@ def measure(name: str, model: Model, options: argparse.Namespace, *, refined: in
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
-    parser.add_argument("--problems", type=int, default=1000, help="new problems of each set")
-    parser.add_argument("--refined", type=int, default=200, help="plans that are refined")
-    parser.add_argument("--seed", type=int, default=480_213, help="seed of the problems")
-    parser.add_argument("--sets", nargs="+", choices=SINGLE, default=list(SINGLE), help="sets of problems")
-    parser.add_argument("--no-time-scaling", action="store_true", help="do not scale motions from rest to rest in time")
-    parser.add_argument("--models", nargs="+", type=Path, help="model files in place of the shipped ones")
-    parser.add_argument("--start", type=Path, help="file for the network of the first set to start training from")
+    parser.add_argument(
+        "--problems", type=int, default=1000, help="new problems of each set"
+    )
+    parser.add_argument(
+        "--refined", type=int, default=200, help="plans that are refined"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=480_213, help="seed of the problems"
+    )
+    parser.add_argument(
+        "--sets",
+        nargs="+",
+        choices=SINGLE,
+        default=list(SINGLE),
+        help="sets of problems",
+    )
+    parser.add_argument(
+        "--no-time-scaling",
+        action="store_true",
+        help="do not scale motions from rest to rest in time",
+    )
+    parser.add_argument(
+        "--models",
+        nargs="+",
+        type=Path,
+        help="model files in place of the shipped ones",
+    )
+    parser.add_argument(
+        "--start",
+        type=Path,
+        help="file for the network of the first set to start training from",
+    )
 
 
 def main() -> None:
@@ -93,11 +127,17 @@ def main() -> None:
         return
     rows, models = [], options.models or options.sets
     for name, file in zip(options.sets, models, strict=True):
-        for label, model in (("all values", load_model(str(file))), ("one value", single_value_model(name))):
+        for label, model in (
+            ("all values", load_model(str(file))),
+            ("one value", single_value_model(name)),
+        ):
             figures = measure(name, model, options, refined=options.refined)
             rows.append({"set": name, "trained for": label, **figures})
     heads = {key: None for row in rows for key in row}
-    cells = [[value if isinstance(value, str) else f"{value:.4g}" for value in row.values()] for row in rows]
+    cells = [
+        [value if isinstance(value, str) else f"{value:.4g}" for value in row.values()]
+        for row in rows
+    ]
     report(
         {"parameters": rows},
         [table("planners for many values and for one", [*heads], cells, left=2)],

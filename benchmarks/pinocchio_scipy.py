@@ -35,12 +35,18 @@ class Arm:
 
     def jacobian(self, q: Array) -> Array:
         """Return the Jacobian of the tip in world axes, shape (6, n)."""
-        return np.array(pin.computeFrameJacobian(self.model, self.data, q, self.tip, WORLD))
+        return np.array(
+            pin.computeFrameJacobian(self.model, self.data, q, self.tip, WORLD)
+        )
 
     def jacobian_rate(self, q: Array, dq: Array) -> Array:
         """Return the time derivative of the translational Jacobian, shape (3, n)."""
         pin.computeJointJacobiansTimeVariation(self.model, self.data, q, dq)
-        return np.array(pin.getFrameJacobianTimeVariation(self.model, self.data, self.tip, WORLD)[:3])
+        return np.array(
+            pin.getFrameJacobianTimeVariation(self.model, self.data, self.tip, WORLD)[
+                :3
+            ]
+        )
 
     def torque(self, q: Array, dq: Array, ddq: Array) -> Array:
         """Compute the inverse dynamics [N m]."""
@@ -76,10 +82,14 @@ def solve_upright_ik(arm: Arm, target: Array, guess: Array) -> Array | None:
         jacobian, position = arm.jacobian(q), arm.position(q)
         up = arm.data.oMf[arm.tip].rotation[:, 2]
         residual = np.concatenate([position, up]) - goal
-        return float(residual @ residual), 2 * np.hstack([jacobian[:3].T, np.cross(jacobian[3:].T, up)]) @ residual
+        return float(residual @ residual), 2 * np.hstack(
+            [jacobian[:3].T, np.cross(jacobian[3:].T, up)]
+        ) @ residual
 
     options = {"ftol": 1e-16, "maxiter": 300}
-    solution = minimize(error, guess, jac=True, bounds=arm.bounds, method="SLSQP", options=options)
+    solution = minimize(
+        error, guess, jac=True, bounds=arm.bounds, method="SLSQP", options=options
+    )
     return solution.x if solution.fun < SLSQP_TOLERANCE**2 else None
 
 
@@ -119,7 +129,12 @@ class Hit:
             method="SLSQP",
             options={"ftol": 1e-12, "maxiter": 200},
         )
-        return solution.x if np.linalg.norm(self.arm.position(solution.x) - self.target) < SLSQP_TOLERANCE else None
+        return (
+            solution.x
+            if np.linalg.norm(self.arm.position(solution.x) - self.target)
+            < SLSQP_TOLERANCE
+            else None
+        )
 
 
 def hitting_speed(arm: Arm, q: Array, direction: Array) -> tuple[Array, float] | None:
@@ -127,7 +142,13 @@ def hitting_speed(arm: Arm, q: Array, direction: Array) -> tuple[Array, float] |
     jacobian, limit = arm.jacobian(q)[:3], arm.robot.velocity_limit
     across = np.array([[-direction[1], direction[0], 0.0], [0.0, 0.0, 1.0]])
     bounds = np.column_stack([-limit, limit])
-    solution = linprog(-jacobian.T @ direction, A_eq=across @ jacobian, b_eq=np.zeros(2), bounds=bounds, method="highs")
+    solution = linprog(
+        -jacobian.T @ direction,
+        A_eq=across @ jacobian,
+        b_eq=np.zeros(2),
+        bounds=bounds,
+        method="highs",
+    )
     return (solution.x, -solution.fun) if solution.success else None
 
 
@@ -139,19 +160,30 @@ def table_velocity(arm: Arm, q: Array, random: np.random.Generator) -> Array:
     return dq * random.uniform() / np.max(np.abs(dq) / limit)
 
 
-def table_acceleration(arm: Arm, q: Array, dq: Array, random: np.random.Generator) -> Array | None:
+def table_acceleration(
+    arm: Arm, q: Array, dq: Array, random: np.random.Generator
+) -> Array | None:
     """Sample an acceleration with ``J_z ddq + dJ_z dq = 0`` within the limits of acceleration and torque."""
     limit, row = arm.robot.acceleration_limit, arm.jacobian(q)[2]
     share = -(arm.jacobian_rate(q, dq)[2] @ dq) / (limit @ np.abs(row))
-    particular, direction = share * limit * np.sign(row), limit * random.uniform(-1, 1, len(q))
+    particular, direction = (
+        share * limit * np.sign(row),
+        limit * random.uniform(-1, 1, len(q)),
+    )
     direction -= limit**2 * row * (row @ direction) / (limit**2 @ row**2)
     torque = arm.torque(q, dq, particular)
     value = np.concatenate([particular, torque])
-    gradient = np.concatenate([direction, arm.torque(q, dq, particular + direction) - torque])
+    gradient = np.concatenate(
+        [direction, arm.torque(q, dq, particular + direction) - torque]
+    )
     bound = np.concatenate([limit, arm.robot.torque_limit])
-    ends = np.sort(np.array([(bound - value) / gradient, (-bound - value) / gradient]), axis=0)
+    ends = np.sort(
+        np.array([(bound - value) / gradient, (-bound - value) / gradient]), axis=0
+    )
     low, high = ends[0].max(), ends[1].min()
-    return particular + random.uniform(low, high) * direction if low <= 0 <= high else None
+    return (
+        particular + random.uniform(low, high) * direction if low <= 0 <= high else None
+    )
 
 
 class Boxes:
@@ -159,18 +191,30 @@ class Boxes:
 
     def __init__(self, problem: Problem, arm: Arm) -> None:
         self.arm = arm
-        radius = next(c.radius for c in problem.constraint if isinstance(c, RobotClearance))
-        depth = next(c.depth for c in problem.constraint if isinstance(c, ObjectContact))
+        radius = next(
+            c.radius for c in problem.constraint if isinstance(c, RobotClearance)
+        )
+        depth = next(
+            c.depth for c in problem.constraint if isinstance(c, ObjectContact)
+        )
         lengths = [np.linalg.norm(b - a) for a, b in self._segments(arm.robot.home)]
         self.capsules = [coal.Capsule(radius, float(length)) for length in lengths]
-        self.held = coal.Box(*(np.array(problem.object.size) - 2 * depth)) if problem.object else None
+        self.held = (
+            coal.Box(*(np.array(problem.object.size) - 2 * depth))
+            if problem.object
+            else None
+        )
         self.tables = [(o.x, o.y) for o in problem.obstacle if o.x and o.y]
-        self.boxes = [coal.Box(x.high - x.low, y.high - y.low, 10.0) for x, y in self.tables]
+        self.boxes = [
+            coal.Box(x.high - x.low, y.high - y.low, 10.0) for x, y in self.tables
+        ]
 
     def _segments(self, q: Array) -> list[tuple[Array, Array]]:
         tip = self.arm.position(q)
         poses = self.arm.data.oMi
-        points = [np.array(poses[i].translation) for i in range(1, self.arm.robot.n + 1)] + [tip]
+        points = [
+            np.array(poses[i].translation) for i in range(1, self.arm.robot.n + 1)
+        ] + [tip]
         return [(points[a], points[b]) for a, b in self.arm.robot.capsule_axes]
 
     def collide(self, q: Array, obstacle_poses: Array) -> bool:
@@ -182,15 +226,26 @@ class Boxes:
         ]
         if self.held is not None:
             pose = self.arm.data.oMf[self.arm.tip]
-            moving.append((self.held, coal.Transform3s(pose.rotation, pose.translation)))
-        for (x, y), box, top in zip(self.tables, self.boxes, obstacle_poses, strict=True):
+            moving.append(
+                (self.held, coal.Transform3s(pose.rotation, pose.translation))
+            )
+        for (x, y), box, top in zip(
+            self.tables, self.boxes, obstacle_poses, strict=True
+        ):
             center = [(x.low + x.high) / 2, (y.low + y.high) / 2, top - 5.0]
             place = coal.Transform3s(np.eye(3), np.array(center))
-            if any(coal.collide(s, pose, box, place, request, coal.CollisionResult()) for s, pose in moving):
+            if any(
+                coal.collide(s, pose, box, place, request, coal.CollisionResult())
+                for s, pose in moving
+            ):
                 return True
         return False
 
 
 def _towards(along: Array) -> Array:
     z = np.array([0.0, 0.0, 1.0])
-    return np.array(pin.Quaternion.FromTwoVectors(z, along / np.linalg.norm(along)).toRotationMatrix())
+    return np.array(
+        pin.Quaternion.FromTwoVectors(
+            z, along / np.linalg.norm(along)
+        ).toRotationMatrix()
+    )

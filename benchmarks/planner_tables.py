@@ -24,7 +24,16 @@ ARCHIVE = Path(__file__).resolve().parent / "results"
 CHALLENGE, NOMINAL = "challenge", "nominal"
 ANY_PLANT = "any"
 ORDER = (
-    *("cnpgen+refine", "cnpgen", "solve", "aqp", "trajopt", "ruckig", "rrtconnect", "cbirrt"),
+    *(
+        "cnpgen+refine",
+        "cnpgen",
+        "solve",
+        "aqp",
+        "trajopt",
+        "ruckig",
+        "rrtconnect",
+        "cbirrt",
+    ),
     *("sscbirrt", "drake", "crocoddyl", "sst", "mpc-mpnet"),
 )
 
@@ -45,9 +54,13 @@ class Suite:
     def __init__(self, path: Path) -> None:
         self.name = path.name.removesuffix(".csv.gz")
         with gzip.open(path, "rt", encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+            rows = list(
+                csv.DictReader(line for line in file if not line.startswith("#"))
+            )
         self._repeated = [
-            row for row in rows if row["planner"] in {r["planner"] for r in rows if r["repetition"] != "0"}
+            row
+            for row in rows
+            if row["planner"] in {r["planner"] for r in rows if r["repetition"] != "0"}
         ]
         rows = [row for row in rows if row["repetition"] == "0"]
         names = {row["planner"] for row in rows if row["planned"] == "1"}
@@ -68,14 +81,28 @@ class Suite:
             return []
         counts: dict[str, dict[str, dict[str, int]]] = {}
         for row in self._repeated:
-            of_plant = counts.setdefault(row["planner"], {}).setdefault(row["plant"], {})
-            of_plant[row["repetition"]] = of_plant.get(row["repetition"], 0) + (row["success"] == "1")
-        most = max(len(found) for of_plants in counts.values() for found in of_plants.values())
-        plants = [plant for plant in self.plants if all(len(of.get(plant, {})) == most for of in counts.values())]
-        head = f"| {self.name}, successes of {most} repetitions | {' | '.join(plants)} |"
+            of_plant = counts.setdefault(row["planner"], {}).setdefault(
+                row["plant"], {}
+            )
+            of_plant[row["repetition"]] = of_plant.get(row["repetition"], 0) + (
+                row["success"] == "1"
+            )
+        most = max(
+            len(found) for of_plants in counts.values() for found in of_plants.values()
+        )
+        plants = [
+            plant
+            for plant in self.plants
+            if all(len(of.get(plant, {})) == most for of in counts.values())
+        ]
+        head = (
+            f"| {self.name}, successes of {most} repetitions | {' | '.join(plants)} |"
+        )
         lines = [head, f"|{'---|' * (len(plants) + 1)}"]
         for planner in (name for name in ORDER if name in counts):
-            cells = (", ".join(map(str, counts[planner][plant].values())) for plant in plants)
+            cells = (
+                ", ".join(map(str, counts[planner][plant].values())) for plant in plants
+            )
             lines.append(f"| `{planner}` | {' | '.join(cells)} |")
         return ["\n".join(lines)]
 
@@ -85,7 +112,11 @@ class Suite:
         A problem without plan has no plant, and counts on each.
         """
         found = self._rows.get((planner, plant), [])
-        return found if plant == ANY_PLANT else [*found, *self._rows.get((planner, ""), [])]
+        return (
+            found
+            if plant == ANY_PLANT
+            else [*found, *self._rows.get((planner, ""), [])]
+        )
 
     def count(self, key: str, planner: str, plant: str = ANY_PLANT) -> str:
         """Count the problems with a flag; empty if the plant has executed no plan."""
@@ -113,7 +144,11 @@ class Suite:
     def median_and_largest(self, key: str, planner: str, plant: str = ANY_PLANT) -> str:
         """Format median and largest value of a figure; empty without values."""
         numbers = self.numbers(key, planner, plant)
-        return f"{number_text(float(np.median(numbers)))}, {number_text(max(numbers))}" if numbers else ""
+        return (
+            f"{number_text(float(np.median(numbers)))}, {number_text(max(numbers))}"
+            if numbers
+            else ""
+        )
 
 
 def number_text(value: float) -> str:
@@ -123,12 +158,16 @@ def number_text(value: float) -> str:
 
 def planning_time(suite: Suite, planner: str) -> str:
     """Format the CPU time of planning; an asterisk marks inner loops in Python."""
-    return suite.median_and_largest("planning_cpu_ms", planner) + ("*" if planner in PYTHON_LOOPS else "")
+    return suite.median_and_largest("planning_cpu_ms", planner) + (
+        "*" if planner in PYTHON_LOOPS else ""
+    )
 
 
 def pair(key: str, plants: Iterable[str]) -> Callable[[Suite, str], str]:
     """Return a column with the counts on several plants."""
-    return lambda suite, planner: ", ".join(text for plant in plants if (text := suite.count(key, planner, plant)))
+    return lambda suite, planner: ", ".join(
+        text for plant in plants if (text := suite.count(key, planner, plant))
+    )
 
 
 def flag(key: str, plant: str = ANY_PLANT) -> Callable[[Suite, str], str]:
@@ -191,7 +230,10 @@ TABLES: dict[str, tuple[tuple[Column, ...], ...]] = {
             ("touched the puck early", pair("touched_early", (NOMINAL, CHALLENGE))),
             ("violated a constraint, Challenge", flag("violated", CHALLENGE)),
             ("puck speed, Challenge [m/s]", median("puck_speed_m_s", CHALLENGE)),
-            ("height error, Challenge: median, largest [mm]", extremes("plane_error_mm", CHALLENGE)),
+            (
+                "height error, Challenge: median, largest [mm]",
+                extremes("plane_error_mm", CHALLENGE),
+            ),
         ),
         HITS,
     ),
@@ -219,14 +261,19 @@ TABLES: dict[str, tuple[tuple[Column, ...], ...]] = {
         (
             ("motion time [s]", median("duration_s")),
             ("vertical error, planned [rad s]", median("planned_vertical_error_rad_s")),
-            ("vertical error, executed [rad s]", median("vertical_error_rad_s", NOMINAL)),
+            (
+                "vertical error, executed [rad s]",
+                median("vertical_error_rad_s", NOMINAL),
+            ),
             ("acceleration / limit: median, largest", extremes("acceleration_use")),
         ),
     ),
     "replans-200": (REPLANS,),
     "replan": (REPLANS,),
     "online": (REPLANS,),
-    "clutter": ((*PLANS[:2], TIME, ("motion time [s]", median("duration_s")), HITS[6]),),
+    "clutter": (
+        (*PLANS[:2], TIME, ("motion time [s]", median("duration_s")), HITS[6]),
+    ),
 }
 
 
@@ -234,7 +281,10 @@ def tables(suite: Suite) -> list[str]:
     """Return the Markdown tables of a suite: a row per planner."""
     texts = []
     for columns in TABLES[suite.name]:
-        lines = [f"| {suite.name} | {' | '.join(text for text, _ in columns)} |", f"|{'---|' * (len(columns) + 1)}"]
+        lines = [
+            f"| {suite.name} | {' | '.join(text for text, _ in columns)} |",
+            f"|{'---|' * (len(columns) + 1)}",
+        ]
         lines.extend(
             f"| `{planner}` | {' | '.join(column(suite, planner) for _, column in columns)} |"
             for planner in suite.planners

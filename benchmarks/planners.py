@@ -17,7 +17,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from common import arguments, installed_recipes, median, progress, report, table, verdict
+from common import (
+    arguments,
+    installed_recipes,
+    median,
+    progress,
+    report,
+    table,
+    verdict,
+)
 from generator import measure_rates, prepare
 from refiner_problems import PUCKS, make_each
 
@@ -31,12 +39,21 @@ from cnpgen.refine.options import DEFAULT_OPTIONS
 from cnpgen.refine.refine_plans import refine_plans
 
 PLANNED, REFINED = 1000, {"airhockey-hit": 1000, "airhockey-replan": 1000}
-SOLVED, REFINED_OF_OTHERS = 200, 300  # solved plans; refined plans of the other planners
+SOLVED, REFINED_OF_OTHERS = (
+    200,
+    300,
+)  # solved plans; refined plans of the other planners
 BLOCKS, REPETITIONS = {"compiled": 4}, 3  # blocks of rows per repetition
 GRID_PLANNER = "airhockey-hit"
 SMALL = {"planned": 500, "refined": 40, "solved": 40}
-REPLANNER, SWITCH_TIMES = "airhockey-replan", (0.0, 0.1, 0.2, 0.4, 0.6, 0.8)  # fractions of T
-ITERATIONS, LIMITED = (1, 2, 3, 4, 6, 10), 100  # limits of the refiner's iterations; plans
+REPLANNER, SWITCH_TIMES = (
+    "airhockey-replan",
+    (0.0, 0.1, 0.2, 0.4, 0.6, 0.8),
+)  # fractions of T
+ITERATIONS, LIMITED = (
+    (1, 2, 3, 4, 6, 10),
+    100,
+)  # limits of the refiner's iterations; plans
 
 
 @dataclass(frozen=True)
@@ -83,10 +100,15 @@ def judge(plans: Plans) -> dict[str, float]:
     """Return verdicts and metrics of plans of the network."""
     summary = evaluate_plans(plans).summary()
     metrics = summary["metrics_of_all"]
-    keys = {"z error [mm s]": "z_error_mm_s", "vertical error [rad s]": "vertical_error_rad_s"}
+    keys = {
+        "z error [mm s]": "z_error_mm_s",
+        "vertical error [rad s]": "vertical_error_rad_s",
+    }
     figures = {"strict": summary["valid_ratio"], "loose": summary["paper_valid_ratio"]}
     figures["motion time [s]"] = metrics["duration_s"]["mean"]
-    return figures | {name: metrics[key]["mean"] for name, key in keys.items() if key in metrics}
+    return figures | {
+        name: metrics[key]["mean"] for name, key in keys.items() if key in metrics
+    }
 
 
 def draw_rate(name: str) -> float:
@@ -112,7 +134,10 @@ def refine(plans: Plans) -> dict[str, float]:
     with one_thread():
         refined = make_each(plans, DEFAULT_OPTIONS)
     valid = np.array([plan.valid for plan in refined])
-    after, ms = np.array([plan.duration for plan in refined]), [plan.ms for plan in refined]
+    after, ms = (
+        np.array([plan.duration for plan in refined]),
+        [plan.ms for plan in refined],
+    )
     return {
         "T / refined": float(plans.duration[valid].mean() / after[valid].mean()),
         "refined valid": float(valid.mean()),
@@ -126,40 +151,64 @@ def refine(plans: Plans) -> dict[str, float]:
 def measure_grid(name: str) -> dict[str, float]:
     """Measure the hits of 81 pucks on a grid from rest."""
     progress(f"{name}: 81 pucks on a grid")
-    plans = Planner(name).plan_batch(draw_boundary_problems("airhockey-pucks", PUCKS).boundary)
+    plans = Planner(name).plan_batch(
+        draw_boundary_problems("airhockey-pucks", PUCKS).boundary
+    )
     refined = make_each(plans, DEFAULT_OPTIONS)
     strict = int(evaluate_plans(plans).valid.sum())
-    return {"grid, strict of 81": strict, "grid, refined valid of 81": sum(plan.valid for plan in refined)}
+    return {
+        "grid, strict of 81": strict,
+        "grid, refined valid of 81": sum(plan.valid for plan in refined),
+    }
 
 
 def replan(name: str, seed: int, planned: int, refined: int) -> list[dict[str, Any]]:
     """Replan from states of valid plans by the network, to the same goal and to another one."""
     planner = Planner(name)
-    plans = planner.plan_batch(draw_boundary_problems(name, planned, seed=seed).boundary)
+    plans = planner.plan_batch(
+        draw_boundary_problems(name, planned, seed=seed).boundary
+    )
     plans, records = plans[evaluate_plans(plans).valid], []
     other = np.roll(np.arange(len(plans)), 1)
     for goal, ends in (("same", plans.boundary), ("another", plans.boundary[other])):
         for fraction in SWITCH_TIMES:
-            progress(f"{name}: {len(plans)} plans replanned at {fraction:g} T to {goal} goal")
+            progress(
+                f"{name}: {len(plans)} plans replanned at {fraction:g} T to {goal} goal"
+            )
             q, dq, ddq = plans.states_at(fraction * plans.duration)
-            new = planner.plan(q, ends.goal_q, start_dq=dq, start_ddq=ddq, goal_dq=ends.goal_dq)
-            facts = {"goal": goal, "at": fraction, "plans": len(new), "valid": float(evaluate_plans(new).valid.mean())}
+            new = planner.plan(
+                q, ends.goal_q, start_dq=dq, start_ddq=ddq, goal_dq=ends.goal_dq
+            )
+            facts = {
+                "goal": goal,
+                "at": fraction,
+                "plans": len(new),
+                "valid": float(evaluate_plans(new).valid.mean()),
+            }
             facts["refined valid"] = float(refine_plans(new[:refined]).valid.mean())
-            facts["T / remaining"] = float(new.duration.mean() / ((1 - fraction) * plans.duration.mean()))
+            facts["T / remaining"] = float(
+                new.duration.mean() / ((1 - fraction) * plans.duration.mean())
+            )
             records.append(facts)
     return records
 
 
 def curve(name: str, seed: int, count: int) -> dict[int, float]:
     """Refine with few iterations; return the mean ratios of motion times to the default, of valid pairs."""
-    plans = Planner(name).plan_batch(draw_boundary_problems(name, count, seed=seed).boundary)
+    plans = Planner(name).plan_batch(
+        draw_boundary_problems(name, count, seed=seed).boundary
+    )
     ratios = {}
     with one_thread():
         full = make_each(plans, DEFAULT_OPTIONS)
         for steps in ITERATIONS:
             progress(f"{name}: {count} plans, at most {steps} iterations")
             limited = make_each(plans, replace(DEFAULT_OPTIONS, max_iterations=steps))
-            both = [(a.duration, b.duration) for a, b in zip(limited, full, strict=True) if a.valid and b.valid]
+            both = [
+                (a.duration, b.duration)
+                for a, b in zip(limited, full, strict=True)
+                if a.valid and b.valid
+            ]
             few_iterations, default = np.array(both).T
             ratios[steps] = float(np.mean(few_iterations / default))
     return ratios
@@ -173,60 +222,113 @@ def replan_table(records: list[dict[str, Any]]) -> str:
         for record in records
     ]  # fmt: skip
     head = ("goal", "at", "valid", "refined valid", "T / remaining")
-    return table(f"replanned from states of {records[0]['plans']} valid plans", head, rows, left=2)
+    return table(
+        f"replanned from states of {records[0]['plans']} valid plans",
+        head,
+        rows,
+        left=2,
+    )
 
 
 def measure(name: str, seed: int, sizes: dict[str, int]) -> dict[str, float]:
     planned, refined, solved = (sizes[key] for key in ("planned", "refined", "solved"))
     progress(f"{name}: {planned} plans, {refined} of them refined, {solved} solved")
-    planner, problems = Planner(name), draw_boundary_problems(name, max(sizes.values()), seed=seed)
+    planner, problems = (
+        Planner(name),
+        draw_boundary_problems(name, max(sizes.values()), seed=seed),
+    )
     planner.plan_batch(problems.boundary[:10])  # warm-up
     start = time.process_time()
     plans = planner.plan_batch(problems.boundary)
-    planning = {"plan, ms per plan of a batch": 1e3 * (time.process_time() - start) / len(plans)}
+    planning = {
+        "plan, ms per plan of a batch": 1e3 * (time.process_time() - start) / len(plans)
+    }
     rate = {"rows/s/core": draw_rate(name)}
-    return rate | planning | judge(plans[:planned]) | refine(plans[:refined]) | solve(problems[:solved])
+    return (
+        rate
+        | planning
+        | judge(plans[:planned])
+        | refine(plans[:refined])
+        | solve(problems[:solved])
+    )
 
 
 def rows_of(name: str, figures: dict[str, float]) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
     for figure, value in figures.items():
         target = TARGETS.get(name, {}).get(figure)
-        cells = verdict(value, target.value if target else None, at_most=bool(target and target.at_most))
+        cells = verdict(
+            value,
+            target.value if target else None,
+            at_most=bool(target and target.at_most),
+        )
         ratio = f"{value / target.value:.3f}" if target else ""
         rows.append((name, figure, f"{value:,.4g}", *cells, ratio))
     return rows
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--models", nargs="+", help="by default all shipped models whose robots are installed")
-    parser.add_argument("--full", action="store_true", help="the numbers of plans of the targets")
-    parser.add_argument("--curves", type=int, help="plans refined with few iterations; 0 omits replanning, too")
-    parser.add_argument("--seed", type=int, default=987_654_321, help="seed of the problems")
+    parser.add_argument(
+        "--models",
+        nargs="+",
+        help="by default all shipped models whose robots are installed",
+    )
+    parser.add_argument(
+        "--full", action="store_true", help="the numbers of plans of the targets"
+    )
+    parser.add_argument(
+        "--curves",
+        type=int,
+        help="plans refined with few iterations; 0 omits replanning, too",
+    )
+    parser.add_argument(
+        "--seed", type=int, default=987_654_321, help="seed of the problems"
+    )
 
 
 def main() -> None:
     chosen = arguments(__doc__, options)
     figures: dict[str, Any] = {}
     models = chosen.models or installed_recipes(shipped_models())
-    limited = (LIMITED if chosen.full else SMALL["refined"]) if chosen.curves is None else chosen.curves
+    limited = (
+        (LIMITED if chosen.full else SMALL["refined"])
+        if chosen.curves is None
+        else chosen.curves
+    )
     for name in models:
-        full = {"planned": PLANNED, "refined": REFINED.get(name, REFINED_OF_OTHERS), "solved": SOLVED}
+        full = {
+            "planned": PLANNED,
+            "refined": REFINED.get(name, REFINED_OF_OTHERS),
+            "solved": SOLVED,
+        }
         figures[name] = measure(name, chosen.seed, full if chosen.full else SMALL)
         figures[name] |= measure_grid(name) if name == GRID_PLANNER else {}
     rows = [row for name, values in figures.items() for row in rows_of(name, values)]
     head = ("planner", "figure", "value", "target", "", "ratio")
     tables = [table("datasets and their planners, new problems", head, rows, left=2)]
     curves = {name: curve(name, chosen.seed, limited) for name in models if limited}
-    lines = [(name, *(f"{value:.4f}" for value in values.values())) for name, values in curves.items()]
+    lines = [
+        (name, *(f"{value:.4f}" for value in values.values()))
+        for name, values in curves.items()
+    ]
     steps = [f"{step} iteration{'s' if step > 1 else ''}" for step in ITERATIONS]
     if curves:
-        tables.append(table("motion time after few iterations over that of the default", ("planner", *steps), lines))
+        tables.append(
+            table(
+                "motion time after few iterations over that of the default",
+                ("planner", *steps),
+                lines,
+            )
+        )
     replanned = []
     if REPLANNER in models and limited:
         replanned = replan(REPLANNER, chosen.seed, SMALL["planned"], SMALL["refined"])
         tables.append(replan_table(replanned))
-    report({"planners": figures, "curves": curves, "replanned": replanned}, tables, as_json=chosen.json)
+    report(
+        {"planners": figures, "curves": curves, "replanned": replanned},
+        tables,
+        as_json=chosen.json,
+    )
 
 
 if __name__ == "__main__":

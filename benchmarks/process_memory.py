@@ -27,14 +27,18 @@ class Sample:
     peaks: dict[int, tuple[str, float, float]]
 
 
-def sample_memory(process: "subprocess.Popen[bytes]", out: Path, rows: int) -> list[Sample]:
+def sample_memory(
+    process: "subprocess.Popen[bytes]", out: Path, rows: int
+) -> list[Sample]:
     """Sample a run until it ends; return the samples at ``MARKS``, the last one just before the end."""
     start, latest = time.perf_counter(), Sample(0.0, 0.0, {})
     samples: list[Sample] = []
     while process.poll() is None:
         peaks = memory(process.pid)
         if any(kind == "worker" for kind, _, _ in peaks.values()):
-            latest = Sample(committed(out, rows) / rows, time.perf_counter() - start, peaks)
+            latest = Sample(
+                committed(out, rows) / rows, time.perf_counter() - start, peaks
+            )
         if len(samples) < len(MARKS) - 1 and latest.done >= MARKS[len(samples)]:
             samples.append(latest)
             progress(f"{latest.done:.0%} after {latest.seconds:.1f} s")
@@ -52,12 +56,23 @@ def memory(pid: int) -> dict[int, tuple[str, float, float]]:
     sizes_of = {}
     for child in (pid, *children(pid)):
         try:
-            command = Path(f"/proc/{child}/cmdline").read_text(encoding="utf-8", errors="replace")
-            status = dict(line.split(":", 1) for line in Path(f"/proc/{child}/status").read_text().splitlines())
+            command = Path(f"/proc/{child}/cmdline").read_text(
+                encoding="utf-8", errors="replace"
+            )
+            status = dict(
+                line.split(":", 1)
+                for line in Path(f"/proc/{child}/status").read_text().splitlines()
+            )
             sizes = [int(status[name].split()[0]) / 1024 for name in ("VmHWM", "VmRSS")]
         except (OSError, KeyError, ValueError):
             continue  # the process has ended
-        kind = "maker" if child == pid else "worker" if "popen_loky" in command else "other"
+        kind = (
+            "maker"
+            if child == pid
+            else "worker"
+            if "popen_loky" in command
+            else "other"
+        )
         if kind != "other":
             sizes_of[child] = (kind, sizes[0], sizes[1])
     return sizes_of
@@ -66,8 +81,13 @@ def memory(pid: int) -> dict[int, tuple[str, float, float]]:
 def children(pid: int) -> list[int]:
     """List the descendants of a process."""
     try:
-        text = "".join(path.read_text() for path in Path(f"/proc/{pid}/task").glob("*/children"))
+        text = "".join(
+            path.read_text() for path in Path(f"/proc/{pid}/task").glob("*/children")
+        )
     except OSError:
         return []
     direct = [int(word) for word in text.split()]
-    return [*direct, *(grandchild for child in direct for grandchild in children(child))]
+    return [
+        *direct,
+        *(grandchild for child in direct for grandchild in children(child)),
+    ]

@@ -35,7 +35,9 @@ from cnpgen.pipelines.pipeline import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS, CandidateBatch
 
-OBJECTIVE_TOLERANCE = 1e-6  # a lower objective than that of the reference counts as worse
+OBJECTIVE_TOLERANCE = (
+    1e-6  # a lower objective than that of the reference counts as worse
+)
 
 
 @dataclass
@@ -84,8 +86,13 @@ class Comparison:
         """Add the objectives of one sample."""
         self.margins.setdefault(objective, []).append(ours - theirs)
         if ours < theirs - OBJECTIVE_TOLERANCE:
-            plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in case.items()}
-            self.worse.append({"objective": objective, "ours": ours, "theirs": theirs, **plain})
+            plain = {
+                name: value.tolist() if isinstance(value, np.ndarray) else value
+                for name, value in case.items()
+            }
+            self.worse.append(
+                {"objective": objective, "ours": ours, "theirs": theirs, **plain}
+            )
 
 
 def our_rows(prepared: PreparedPipeline, samples: int, seed: int) -> CandidateBatch:
@@ -109,22 +116,44 @@ def our_seconds(prepared: PreparedPipeline, repeat: int = 9) -> float:
     return median(seconds)
 
 
-def compare_replan(prepared: PreparedPipeline, samples: int, seed: int, starts: int) -> Comparison:
+def compare_replan(
+    prepared: PreparedPipeline, samples: int, seed: int, starts: int
+) -> Comparison:
     """Solve rows of airhockey-replan by the reference."""
-    arm, batch, timer = Arm(prepared.context.robot), our_rows(prepared, samples, seed), StepTimer()
+    arm, batch, timer = (
+        Arm(prepared.context.robot),
+        our_rows(prepared, samples, seed),
+        StepTimer(),
+    )
     comparison = Comparison("airhockey-replan", samples, our_seconds(prepared))
     random = np.random.default_rng(seed)
     for row in range(samples):
-        sample = {name: np.ascontiguousarray(values[:, row]) for name, values in batch.columns.items()}
+        sample = {
+            name: np.ascontiguousarray(values[:, row])
+            for name, values in batch.columns.items()
+        }
         angle = float(sample["hit_angle"][0])
         direction = np.array([np.cos(angle), np.sin(angle), 0.0])
         _reference_start(arm, sample, comparison, timer=timer, random=random)
-        _reference_goal(arm, sample, comparison, timer=timer, direction=direction, random=random, starts=starts)
+        _reference_goal(
+            arm,
+            sample,
+            comparison,
+            timer=timer,
+            direction=direction,
+            random=random,
+            starts=starts,
+        )
     return _finish(comparison, timer)
 
 
 def _reference_start(
-    arm: Arm, sample: dict[str, Array], comparison: Comparison, *, timer: StepTimer, random: np.random.Generator
+    arm: Arm,
+    sample: dict[str, Array],
+    comparison: Comparison,
+    *,
+    timer: StepTimer,
+    random: np.random.Generator,
 ) -> None:
     with timer.step("start: IK (Gauss-Newton)"):
         q = solve_ik(arm, sample["start_xyz"], sample["guess_q"])
@@ -166,31 +195,50 @@ def _reference_goal(
         solved = [x for x in configurations if x is not None]
         if solved:
             best, ours = max(solved, key=hit.objective), sample["goal_q"]
-            case = {"start_q": hit.home, "p": hit.target, "d": direction, "our_q": ours, "their_q": best}
+            case = {
+                "start_q": hit.home,
+                "p": hit.target,
+                "d": direction,
+                "our_q": ours,
+                "their_q": best,
+            }
             comparison.compare(name, hit.objective(ours), hit.objective(best), **case)
     program = hitting_speed(arm, sample["goal_q"], direction)
     if program is not None:
         speed = float(sample["hit_speed_max"][0])
-        comparison.compare("hitting velocity", speed, program[1], goal_q=sample["goal_q"], d=direction)
+        comparison.compare(
+            "hitting velocity", speed, program[1], goal_q=sample["goal_q"], d=direction
+        )
 
 
 def _nearby(arm: Arm, hit: Hit, random: np.random.Generator) -> Array:
     """Sample a configuration near the start; move it to the goal if inverse kinematics converge."""
     guess = hit.home + 0.5 * random.standard_normal(arm.robot.n)
     solution = solve_ik(arm, hit.target, guess)
-    return np.clip(guess, arm.bounds.lb, arm.bounds.ub) if solution is None else solution
+    return (
+        np.clip(guess, arm.bounds.lb, arm.bounds.ub) if solution is None else solution
+    )
 
 
 def compare_heavy(prepared: PreparedPipeline, samples: int, seed: int) -> Comparison:
     """Solve rows of heavy-object by the reference."""
-    arm, batch, timer = Arm(prepared.context.robot), our_rows(prepared, samples, seed), StepTimer()
+    arm, batch, timer = (
+        Arm(prepared.context.robot),
+        our_rows(prepared, samples, seed),
+        StepTimer(),
+    )
     problem = prepared.context.problem
     boxes, zero = Boxes(problem, arm), np.zeros(arm.robot.n)
     half = problem.object.size[2] / 2 if problem.object else 0.0
     comparison = Comparison("heavy-object", samples, our_seconds(prepared))
     for row in range(samples):
-        sample = {name: np.ascontiguousarray(values[:, row]) for name, values in batch.columns.items()}
-        obstacle_poses = np.array([sample[f"{box.below}_xyz"][2] - half for box in problem.obstacle])
+        sample = {
+            name: np.ascontiguousarray(values[:, row])
+            for name, values in batch.columns.items()
+        }
+        obstacle_poses = np.array(
+            [sample[f"{box.below}_xyz"][2] - half for box in problem.obstacle]
+        )
         guess = sample["guess_q"]
         for end in ("start", "goal"):
             with timer.step(f"{end}: IK (SLSQP)"):
@@ -199,7 +247,9 @@ def compare_heavy(prepared: PreparedPipeline, samples: int, seed: int) -> Compar
                 comparison.fail(f"{end} IK")
                 break
             with timer.step(f"{end}: torque and collision (Coal)"):
-                fits = bool(np.all(np.abs(arm.torque(q, zero, zero)) <= arm.robot.torque_limit))
+                fits = bool(
+                    np.all(np.abs(arm.torque(q, zero, zero)) <= arm.robot.torque_limit)
+                )
                 collides = boxes.collide(q, obstacle_poses)
             if collides or not fits:
                 comparison.fail(f"{end} in collision or too heavy")
@@ -209,15 +259,28 @@ def compare_heavy(prepared: PreparedPipeline, samples: int, seed: int) -> Compar
     return _finish(comparison, timer)
 
 
-def _check_collisions(comparison: Comparison, boxes: Boxes, sample: dict[str, Array], obstacle_poses: Array) -> None:
+def _check_collisions(
+    comparison: Comparison,
+    boxes: Boxes,
+    sample: dict[str, Array],
+    obstacle_poses: Array,
+) -> None:
     """Check our configurations by the reference; an accepted row that it finds in collision counts as worse."""
     for end in ("start", "goal"):
         ours = -1.0 if boxes.collide(sample[f"{end}_q"], obstacle_poses) else 0.0
-        comparison.compare("free of collision", ours, 0.0, q=sample[f"{end}_q"], obstacle_poses=obstacle_poses)
+        comparison.compare(
+            "free of collision",
+            ours,
+            0.0,
+            q=sample[f"{end}_q"],
+            obstacle_poses=obstacle_poses,
+        )
 
 
 def _finish(comparison: Comparison, timer: StepTimer) -> Comparison:
-    comparison.steps = {name: seconds / comparison.samples for name, seconds in timer.seconds.items()}
+    comparison.steps = {
+        name: seconds / comparison.samples for name, seconds in timer.seconds.items()
+    }
     comparison.reference = sum(comparison.steps.values())
     return comparison
 
@@ -232,7 +295,8 @@ def speed_table(comparisons: list[Comparison]) -> str:
                 f"{1e6 * comparison.reference:,.0f}",
             ),
             f"{comparison.reference / comparison.ours:,.0f}",
-            ", ".join(f"{count} x {step}" for step, count in comparison.failed.items()) or "none",
+            ", ".join(f"{count} x {step}" for step, count in comparison.failed.items())
+            or "none",
         )
         for comparison in comparisons
     ]
@@ -243,8 +307,12 @@ def speed_table(comparisons: list[Comparison]) -> str:
 
 
 def step_table(comparison: Comparison) -> str:
-    rows = [(name, f"{1e6 * seconds:,.0f}") for name, seconds in comparison.steps.items()]
-    return table(f"{comparison.pipeline}: the reference's steps", ("step", "us/sample"), rows)
+    rows = [
+        (name, f"{1e6 * seconds:,.0f}") for name, seconds in comparison.steps.items()
+    ]
+    return table(
+        f"{comparison.pipeline}: the reference's steps", ("step", "us/sample"), rows
+    )
 
 
 def margin_table(comparisons: list[Comparison]) -> str:
@@ -258,9 +326,23 @@ def margin_table(comparisons: list[Comparison]) -> str:
             )
             worst = f"{max(0.0, -float(values.min())):.1e}"
             rows.append(
-                (objective, str(len(values)), str(equal), str(better), str(len(values) - equal - better), worst)
+                (
+                    objective,
+                    str(len(values)),
+                    str(equal),
+                    str(better),
+                    str(len(values) - equal - better),
+                    worst,
+                )
             )
-    head = ("objective", "compared", "equal", "ours better", "ours worse", "worst shortfall")
+    head = (
+        "objective",
+        "compared",
+        "equal",
+        "ours better",
+        "ours worse",
+        "worst shortfall",
+    )
     return table(f"Objectives, equal within {OBJECTIVE_TOLERANCE:g}", head, rows)
 
 
@@ -271,25 +353,50 @@ def worse_table(comparisons: list[Comparison]) -> str:
 
 def prepare(pipeline: str, backend: str | None) -> PreparedPipeline:
     chosen, cache_folder = choose_backend(backend)
-    return PreparedPipeline(load_pipeline(pipeline), backend=chosen, cache_folder=cache_folder)
+    return PreparedPipeline(
+        load_pipeline(pipeline), backend=chosen, cache_folder=cache_folder
+    )
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--samples", type=int, default=100, help="samples of each pipeline")
+    parser.add_argument(
+        "--samples", type=int, default=100, help="samples of each pipeline"
+    )
     parser.add_argument("--seed", type=int, default=1, help="seed of the candidates")
-    parser.add_argument("--starts", type=int, default=1, help="starts of the reference for the hitting configuration")
+    parser.add_argument(
+        "--starts",
+        type=int,
+        default=1,
+        help="starts of the reference for the hitting configuration",
+    )
     parser.add_argument("--backend", help="backend of cnpgen")
 
 
 def main() -> None:
     options = arguments(__doc__, add_options)
     progress("airhockey-replan")
-    replan = compare_replan(prepare("airhockey-replan", options.backend), options.samples, options.seed, options.starts)
+    replan = compare_replan(
+        prepare("airhockey-replan", options.backend),
+        options.samples,
+        options.seed,
+        options.starts,
+    )
     progress("heavy-object")
-    heavy = compare_heavy(prepare("heavy-object", options.backend), options.samples, options.seed)
+    heavy = compare_heavy(
+        prepare("heavy-object", options.backend), options.samples, options.seed
+    )
     both = [replan, heavy]
-    tables: list[str] = [speed_table(both), *map(step_table, both), margin_table(both), worse_table(both)]
-    report({"comparisons": [vars(comparison) for comparison in both]}, filter(None, tables), as_json=options.json)
+    tables: list[str] = [
+        speed_table(both),
+        *map(step_table, both),
+        margin_table(both),
+        worse_table(both),
+    ]
+    report(
+        {"comparisons": [vars(comparison) for comparison in both]},
+        filter(None, tables),
+        as_json=options.json,
+    )
 
 
 if __name__ == "__main__":

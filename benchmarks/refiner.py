@@ -45,7 +45,14 @@ from cnpgen.trajectory.spline_motion import Motion
 PIPELINES = ("airhockey-hit", "airhockey-replan", "heavy-object")
 GRID_RUNS = 5
 WORKER_RUNS = 3  # of one and of two processes
-SMALL = {"fresh": (60, 60, 20), "planned": (60, 60, 20), "ipopt": 4, "height": 30, "slsqp": 2, "workers": 80}
+SMALL = {
+    "fresh": (60, 60, 20),
+    "planned": (60, 60, 20),
+    "ipopt": 4,
+    "height": 30,
+    "slsqp": 2,
+    "workers": 80,
+}
 FULL = {
     "fresh": (1000, 1000, 300),
     "planned": (300, 300, 300),
@@ -54,8 +61,16 @@ FULL = {
     "slsqp": 10,
     "workers": 1000,
 }
-VALID_TARGETS = {"airhockey-hit": 0.995, "airhockey-replan": 0.995, "heavy-object": 0.97}
-SOLVED_MS = {"airhockey-hit": 16.0, "airhockey-replan": 18.0, "heavy-object": 30.0}  # median, without initial guess
+VALID_TARGETS = {
+    "airhockey-hit": 0.995,
+    "airhockey-replan": 0.995,
+    "heavy-object": 0.97,
+}
+SOLVED_MS = {
+    "airhockey-hit": 16.0,
+    "airhockey-replan": 18.0,
+    "heavy-object": 30.0,
+}  # median, without initial guess
 PLANNED_MS = {
     "airhockey-hit": (8.0, 15.0),
     "airhockey-replan": (8.0, 15.0),
@@ -69,24 +84,45 @@ Result = tuple[dict[str, Any], list[str]]
 def grid(_: dict[str, Any], options: argparse.Namespace) -> Result:
     """Solve the 81 hits several times; report the median run and the minimum times of the plans."""
     problems = draw_boundary_problems("airhockey-pucks", PUCKS)
-    guesses = network_like_plans(problems, make_each(problems, RefineOptions()), options.seed)
+    guesses = network_like_plans(
+        problems, make_each(problems, RefineOptions()), options.seed
+    )
     plans = {"without guess": problems, "network-like guess": guesses}
     runs = [
-        {guess: make_each(problem_set, RefineOptions()) for guess, problem_set in plans.items()}
+        {
+            guess: make_each(problem_set, RefineOptions())
+            for guess, problem_set in plans.items()
+        }
         for _ in range(GRID_RUNS)
     ]
     fastest = {
-        guess: [min(same, key=lambda result: result.ms) for same in zip(*(run[guess] for run in runs), strict=True)]
+        guess: [
+            min(same, key=lambda result: result.ms)
+            for same in zip(*(run[guess] for run in runs), strict=True)
+        ]
         for guess in plans
     }
     targets = {"without guess": 40.0, "network-like guess": 15.0}
     facts, rows = {}, []
     for guess, results in fastest.items():
-        valid, judging = sum(result.valid for result in results), median_verdict_ms(results)
+        valid, judging = (
+            sum(result.valid for result in results),
+            median_verdict_ms(results),
+        )
         medians = [median_ms(run[guess]) for run in runs]
-        facts[guess] = {"valid": valid, "median_ms": medians, "minimum_ms": median_ms(results), "verdict_ms": judging}
+        facts[guess] = {
+            "valid": valid,
+            "median_ms": medians,
+            "minimum_ms": median_ms(results),
+            "verdict_ms": judging,
+        }
         target = verdict(median(medians), targets[guess], at_most=True)
-        times = f"{median(medians):.1f}", *target, *statistics(results), f"{judging:.1f}"
+        times = (
+            f"{median(medians):.1f}",
+            *target,
+            *statistics(results),
+            f"{judging:.1f}",
+        )
         rows.append((guess, str(valid), *verdict(valid, 81), *times))
     head = (
         "initial guess", "valid", "target", "", "median", "target", "", *(f"{name} of minima" for name in STATISTICS),
@@ -105,18 +141,59 @@ def fresh(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
         results = make_each(problems, RefineOptions())
         share = float(np.mean([result.valid for result in results]))
         mean = float(np.mean([result.ms for result in results]))
-        ms, target = statistics(results), verdict(median_ms(results), SOLVED_MS[name], at_most=True)
+        ms, target = (
+            statistics(results),
+            verdict(median_ms(results), SOLVED_MS[name], at_most=True),
+        )
         rows.append(
-            (name, ms[0], *target, *ms[1:], f"{mean:.1f}", f"{share:.2%}", *verdict(share, VALID_TARGETS[name]))
+            (
+                name,
+                ms[0],
+                *target,
+                *ms[1:],
+                f"{mean:.1f}",
+                f"{share:.2%}",
+                *verdict(share, VALID_TARGETS[name]),
+            )
         )
         failed = [index for index, result in enumerate(results) if not result.valid]
         findings = explain_plans(problems, failed)
-        failures += [(name, str(index), str(results[index].refined.reason), str(findings[index])) for index in failed]
-        facts[name] = {"valid": share, "mean_ms": mean, "failures": {i: str(findings[i]) for i in failed}}
-    head = ("problems", STATISTICS[0], "target", "", *STATISTICS[1:], "mean", "valid", "target", "")
-    tables = [table(f"new problems, seed {options.seed}, CPU time per plan without initial guess [ms]", head, rows)]
+        failures += [
+            (name, str(index), str(results[index].refined.reason), str(findings[index]))
+            for index in failed
+        ]
+        facts[name] = {
+            "valid": share,
+            "mean_ms": mean,
+            "failures": {i: str(findings[i]) for i in failed},
+        }
+    head = (
+        "problems",
+        STATISTICS[0],
+        "target",
+        "",
+        *STATISTICS[1:],
+        "mean",
+        "valid",
+        "target",
+        "",
+    )
+    tables = [
+        table(
+            f"new problems, seed {options.seed}, CPU time per plan without initial guess [ms]",
+            head,
+            rows,
+        )
+    ]
     if failures:
-        tables.append(table("invalid", ("problems", "row", "reason", "explanation"), failures, left=4))
+        tables.append(
+            table(
+                "invalid",
+                ("problems", "row", "reason", "explanation"),
+                failures,
+                left=4,
+            )
+        )
     return {"fresh": facts}, tables
 
 
@@ -125,17 +202,31 @@ def planned(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
     facts, rows = {}, []
     for name, count in zip(PIPELINES, sizes["planned"], strict=True):
         progress(f"{count} of {name}, planned")
-        plans = Planner(name).plan_batch(draw_boundary_problems(name, count, seed=options.seed + 5).boundary)
+        plans = Planner(name).plan_batch(
+            draw_boundary_problems(name, count, seed=options.seed + 5).boundary
+        )
         compiled, numpy_results = (
             make_each(plans, RefineOptions()),
             make_each(plans, RefineOptions(), with_numpy(plans)),
         )
-        center, p95 = (float(value) for value in np.percentile([result.ms for result in compiled], [50, 95]))
-        ratio = np.median([a.duration / b.duration for a, b in zip(compiled, numpy_results, strict=True)])
+        center, p95 = (
+            float(value)
+            for value in np.percentile([result.ms for result in compiled], [50, 95])
+        )
+        ratio = np.median(
+            [
+                a.duration / b.duration
+                for a, b in zip(compiled, numpy_results, strict=True)
+            ]
+        )
         targets = [
-            verdict(value, goal, at_most=True) for value, goal in zip((center, p95), PLANNED_MS[name], strict=True)
+            verdict(value, goal, at_most=True)
+            for value, goal in zip((center, p95), PLANNED_MS[name], strict=True)
         ]
-        valid = [f"{np.mean([result.valid for result in results]):.2%}" for results in (compiled, numpy_results)]
+        valid = [
+            f"{np.mean([result.valid for result in results]):.2%}"
+            for results in (compiled, numpy_results)
+        ]
         ms = (
             f"{center:.1f}",
             *targets[0],
@@ -154,7 +245,9 @@ def planned(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
         "plans", "n", "median", "target", "", "p95", "target", "", "verdict", "median, NumPy", "valid",
         "valid, NumPy", "T ratio",
     )  # fmt: skip
-    return {"planned": facts}, [table("plans of the shipped planners, CPU time per plan [ms]", head, rows)]
+    return {"planned": facts}, [
+        table("plans of the shipped planners, CPU time per plan [ms]", head, rows)
+    ]
 
 
 def with_numpy(plans: Plans) -> Refiner:
@@ -171,25 +264,57 @@ def ipopt(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
         progress(f"{name} with Ipopt")
         problems = draw_boundary_problems(name, sizes["ipopt"], seed=options.seed + 1)
         refiner = prepare(problems, RefineOptions())
-        own, other = (make_each(problems, RefineOptions(), variant) for variant in (refiner, with_ipopt(refiner)))
-        both = [index for index in range(len(own)) if own[index].valid and other[index].valid]
+        own, other = (
+            make_each(problems, RefineOptions(), variant)
+            for variant in (refiner, with_ipopt(refiner))
+        )
+        both = [
+            index
+            for index in range(len(own))
+            if own[index].valid and other[index].valid
+        ]
         times = np.array([own[i].duration / other[i].duration for i in both])
         costs = np.array([own[i].refined.cost / other[i].refined.cost for i in both])
         slower = [both[k] for k in np.flatnonzero(times > MAX_TIME_RATIO)]
-        worse += [f"  {name} row {i}: {own[i].duration:.4f} s, Ipopt {other[i].duration:.4f} s" for i in slower]
+        worse += [
+            f"  {name} row {i}: {own[i].duration:.4f} s, Ipopt {other[i].duration:.4f} s"
+            for i in slower
+        ]
         valid = [sum(variant.valid for variant in results) for results in (own, other)]
         speed = median_ms(other) / median_ms(own)
         target = verdict(len(both) - len(slower), len(both))
         counts = len(own), *valid, len(both) - len(slower)
-        rows.append((name, *map(str, counts), *target, spread(times), spread(costs), f"{speed:.0f}"))
-        facts[name] = {"time": times.tolist(), "objective": costs.tolist(), "rows": both, "times_faster": speed}
+        rows.append(
+            (
+                name,
+                *map(str, counts),
+                *target,
+                spread(times),
+                spread(costs),
+                f"{speed:.0f}",
+            )
+        )
+        facts[name] = {
+            "time": times.tolist(),
+            "objective": costs.tolist(),
+            "rows": both,
+            "times_faster": speed,
+        }
     head = (
         "problems", "n", "valid", "valid, Ipopt", "within 0.5 %", "target", "", "motion time", "objective",
         "times faster",
     )  # fmt: skip
-    tables = [table("ratios to Ipopt from the same initial guess, median and maximum", head, rows)]
+    tables = [
+        table(
+            "ratios to Ipopt from the same initial guess, median and maximum",
+            head,
+            rows,
+        )
+    ]
     if worse:
-        tables.append("\n".join(["", "motion times more than 0.5 % above those of Ipopt", *worse]))
+        tables.append(
+            "\n".join(["", "motion times more than 0.5 % above those of Ipopt", *worse])
+        )
     return {"ipopt": facts}, tables
 
 
@@ -198,19 +323,39 @@ def height(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
     facts, rows = {}, []
     for name in PIPELINES[:2]:
         problems = draw_boundary_problems(name, sizes["height"], seed=options.seed + 2)
-        narrow, wide = make_each(problems, RefineOptions()), make_each(problems, RefineOptions(), wide_band(problems))
-        pairs = [(a, b) for a, b in zip(narrow, wide, strict=True) if a.valid and b.valid]
+        narrow, wide = (
+            make_each(problems, RefineOptions()),
+            make_each(problems, RefineOptions(), wide_band(problems)),
+        )
+        pairs = [
+            (a, b) for a, b in zip(narrow, wide, strict=True) if a.valid and b.valid
+        ]
         time_costs = np.array([a.duration / b.duration - 1 for a, b in pairs])
         errors = [height_errors(problems, results) for results in (narrow, wide)]
         within = float(np.mean([error <= MAX_HEIGHT_ERROR_M for error in errors[0]]))
         worst = (f"{1e3 * max(values):.3f}" for values in errors)
-        target, cost_target = verdict(within, 1.0), verdict(100 * float(time_costs.mean()), 0.1, at_most=True)
-        rows.append((name, str(len(pairs)), *worst, f"{within:.1%}", *target, f"{time_costs.mean():.3%}", *cost_target))
+        target, cost_target = (
+            verdict(within, 1.0),
+            verdict(100 * float(time_costs.mean()), 0.1, at_most=True),
+        )
+        rows.append(
+            (
+                name,
+                str(len(pairs)),
+                *worst,
+                f"{within:.1%}",
+                *target,
+                f"{time_costs.mean():.3%}",
+                *cost_target,
+            )
+        )
         facts[name] = {"errors_m": errors, "loss": time_costs.tolist()}
     head = (
         "problems", "n", "z error [mm]", "whole band", "within 0.1 mm", "target", "", "time lost [%]", "target", "",
     )  # fmt: skip
-    return {"height": facts}, [table("maximum height error of all plans and times", head, rows)]
+    return {"height": facts}, [
+        table("maximum height error of all plans and times", head, rows)
+    ]
 
 
 def slsqp(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
@@ -231,18 +376,40 @@ def slsqp(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
             ratio = 1e3 * median(seconds) / median_ms(own)
             ours = sum(result.valid for result in own)
             counts = str(len(own)), str(ours), *verdict(ours, sum(valid))
-            rows.append((name, guess, *counts, f"{median(seconds):.2f}", f"{ratio:.0f}", *verdict(ratio, target)))
-            facts[f"{name}, {guess}"] = {"seconds": seconds, "valid": valid, "ratio": ratio}
+            rows.append(
+                (
+                    name,
+                    guess,
+                    *counts,
+                    f"{median(seconds):.2f}",
+                    f"{ratio:.0f}",
+                    *verdict(ratio, target),
+                )
+            )
+            facts[f"{name}, {guess}"] = {
+                "seconds": seconds,
+                "valid": valid,
+                "ratio": ratio,
+            }
     head = (
         "problems", "initial guess", "n", "valid", "valid, SLSQP", "", "SLSQP, median [s]", "times faster", "target",
         "",
     )  # fmt: skip
-    return {"slsqp": facts}, [table(f"comparison with SLSQP, stopped after {options.cap:g} s", head, rows, left=2)]
+    return {"slsqp": facts}, [
+        table(
+            f"comparison with SLSQP, stopped after {options.cap:g} s",
+            head,
+            rows,
+            left=2,
+        )
+    ]
 
 
 def workers(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
     """Measure plans per second including the start of the processes, and the median of the ratios."""
-    problems = draw_boundary_problems("airhockey-hit", sizes["workers"], seed=options.seed + 4)
+    problems = draw_boundary_problems(
+        "airhockey-hit", sizes["workers"], seed=options.seed + 4
+    )
     speeds: dict[int, list[float]] = {1: [], 2: []}
     for number in range(WORKER_RUNS):
         progress(f"repetition {number + 1} of {WORKER_RUNS}")
@@ -251,9 +418,14 @@ def workers(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
             refine_plans(problems, workers=count)
             rates.append(len(problems) / (time.perf_counter() - start))
     ratios = [two / one for one, two in zip(speeds[1], speeds[2], strict=True)]
-    rows = [(f"{one:.1f}", f"{two:.1f}", f"{two / one:.2f}", "", "") for one, two in zip(*speeds.values(), strict=True)]
+    rows = [
+        (f"{one:.1f}", f"{two:.1f}", f"{two / one:.2f}", "", "")
+        for one, two in zip(*speeds.values(), strict=True)
+    ]
     rows.append(("", "median", f"{median(ratios):.2f}", *verdict(median(ratios), 1.8)))
-    return {"workers": speeds}, [table("plans per second", ("one", "two", "ratio", "target", ""), rows, left=0)]
+    return {"workers": speeds}, [
+        table("plans per second", ("one", "two", "ratio", "target", ""), rows, left=0)
+    ]
 
 
 STATISTICS = ("median", "p95", "maximum")
@@ -284,7 +456,10 @@ def wide_band(problems: Plans) -> Refiner:
     """Return a refiner that uses most of the tolerance of the tip height."""
     problem, robot = open_problem(problems.problem)
     usual = vars(default_grid_levels(problem, Settings()))
-    wider = {name: replace(level, tightening=replace(level.tightening, band=0.9)) for name, level in usual.items()}
+    wider = {
+        name: replace(level, tightening=replace(level.tightening, band=0.9))
+        for name, level in usual.items()
+    }
     refiner = Refiner(problem, robot, levels=GridLevels(**wider))
     refiner.check.equalities = set()  # plans that use the tolerance need no finer level
     return refiner
@@ -296,12 +471,16 @@ def height_errors(problems: Plans, results: list[Made]) -> list[float]:
     checker = PlanChecker(problem, robot, degree=problems.degree)
     pairs = zip(tasks_of(problems), results, strict=True)
     verdicts = [
-        checker.verdict(task, result.refined.path, result.refined.rate) for task, result in pairs if result.valid
+        checker.verdict(task, result.refined.path, result.refined.rate)
+        for task, result in pairs
+        if result.valid
     ]
     return [result.margins["table height"].violation for result in verdicts]
 
 
-def run_slsqp(refiner: Refiner, plans: Plans, cap: float) -> tuple[list[bool], list[float]]:
+def run_slsqp(
+    refiner: Refiner, plans: Plans, cap: float
+) -> tuple[list[bool], list[float]]:
     """Solve plans with SLSQP; return which are valid and the CPU times [s]."""
     problem, robot = open_problem(plans.problem)
     checker, valid, seconds = PlanChecker(problem, robot, degree=plans.degree), [], []
@@ -317,17 +496,32 @@ def run_slsqp(refiner: Refiner, plans: Plans, cap: float) -> tuple[list[bool], l
 
 
 PARTS: dict[str, Callable[[dict[str, Any], argparse.Namespace], Result]] = {
-    part.__name__: part for part in (grid, fresh, planned, ipopt, height, slsqp, workers)
+    part.__name__: part
+    for part in (grid, fresh, planned, ipopt, height, slsqp, workers)
 }
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
-    parser.add_argument("--parts", metavar="PART", nargs="+", choices=PARTS, default=list(PARTS), help=", ".join(PARTS))
-    parser.add_argument("--full", action="store_true", help="the sizes of the documentation's figures")
+    parser.add_argument(
+        "--parts",
+        metavar="PART",
+        nargs="+",
+        choices=PARTS,
+        default=list(PARTS),
+        help=", ".join(PARTS),
+    )
+    parser.add_argument(
+        "--full", action="store_true", help="the sizes of the documentation's figures"
+    )
     parser.add_argument("--n", type=int, help="problems of each part")
     parser.add_argument("--seed", type=int, default=20261, help="seed of the problems")
-    parser.add_argument("--cap", type=float, default=60.0, help="CPU seconds after which SLSQP is stopped")
+    parser.add_argument(
+        "--cap",
+        type=float,
+        default=60.0,
+        help="CPU seconds after which SLSQP is stopped",
+    )
 
 
 def main() -> None:
@@ -335,7 +529,10 @@ def main() -> None:
     options = arguments(__doc__, add)
     sizes: dict[str, Any] = dict(FULL if options.full else SMALL)
     if options.n is not None:
-        sizes = {name: (options.n,) * 3 if isinstance(size, tuple) else options.n for name, size in sizes.items()}
+        sizes = {
+            name: (options.n,) * 3 if isinstance(size, tuple) else options.n
+            for name, size in sizes.items()
+        }
     results: dict[str, Any] = {}
     tables: list[str] = []
     for name in options.parts:

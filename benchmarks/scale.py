@@ -78,11 +78,18 @@ def measure(name: str, rows: int, sample: int, **options: Any) -> Costs:
         folder = Path(temporary) / "out"
         settings = {"workers": 1, "shard_size": min(shard_rows, sample), **options}
         cnpgen.make_dataset(
-            name, Path(temporary) / "first", n=block, **{**settings, "shard_size": block}
+            name,
+            Path(temporary) / "first",
+            n=block,
+            **{**settings, "shard_size": block},
         )  # compiles kernels
         start_times: list[float] = []  # times after the preparation, which is done once
         cnpgen.make_dataset(
-            name, folder, n=sample, begin=lambda *_: start_times.append(time.process_time()), **settings
+            name,
+            folder,
+            n=sample,
+            begin=lambda *_: start_times.append(time.process_time()),
+            **settings,
         )
         make = time.process_time() - start_times[-1]
         deep = cpu_of(lambda: cnpgen.validate_dataset(folder, deep=True, workers=1))
@@ -92,10 +99,16 @@ def measure(name: str, rows: int, sample: int, **options: Any) -> Costs:
         summed = cpu_of(lambda: finish(folder, spec, "", made=1, exclusive=True))
         size = sum(path.stat().st_size for path in folder.glob("*/*"))
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    title = f"{name}, certified" if options.get("certify") else f"{name}, {options.get('dtype', 'float64')}"
+    title = (
+        f"{name}, certified"
+        if options.get("certify")
+        else f"{name}, {options.get('dtype', 'float64')}"
+    )
     per_row, width = (make / sample, check / sample, deep / sample), row_bytes(spec)
     overhead = (size - sample * width) / len(tasks)
-    return Costs(title, rows, *per_row, summed / len(tasks), width, overhead, shard_rows, memory)
+    return Costs(
+        title, rows, *per_row, summed / len(tasks), width, overhead, shard_rows, memory
+    )
 
 
 def rows_of(costs: list[Costs]) -> list[list[str]]:
@@ -124,10 +137,21 @@ HEAD = (
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--rows", type=float, default=1e8, help="rows of the datasets without plans")
-    parser.add_argument("--certified", type=float, default=1e7, help="rows of the certified dataset")
-    parser.add_argument("--sample", type=int, default=131072, help="rows of the small datasets")
-    parser.add_argument("--certified-sample", type=int, default=128, help="rows of the small certified dataset")
+    parser.add_argument(
+        "--rows", type=float, default=1e8, help="rows of the datasets without plans"
+    )
+    parser.add_argument(
+        "--certified", type=float, default=1e7, help="rows of the certified dataset"
+    )
+    parser.add_argument(
+        "--sample", type=int, default=131072, help="rows of the small datasets"
+    )
+    parser.add_argument(
+        "--certified-sample",
+        type=int,
+        default=128,
+        help="rows of the small certified dataset",
+    )
 
 
 def main() -> None:
@@ -137,9 +161,18 @@ def main() -> None:
         progress(f"{name}: {options.sample} rows")
         costs.append(measure(name, int(options.rows), options.sample, dtype="float32"))
     progress(f"airhockey-hit: {options.certified_sample} rows with plans")
-    costs.append(measure("airhockey-hit", int(options.certified), options.certified_sample, certify=True))
+    costs.append(
+        measure(
+            "airhockey-hit",
+            int(options.certified),
+            options.certified_sample,
+            certify=True,
+        )
+    )
     report(
-        {"datasets": [asdict(cost) for cost in costs]}, [table("datasets", HEAD, rows_of(costs))], as_json=options.json
+        {"datasets": [asdict(cost) for cost in costs]},
+        [table("datasets", HEAD, rows_of(costs))],
+        as_json=options.json,
     )
 
 

@@ -76,15 +76,28 @@ def without_motions(plans: Plans) -> Plans:
 
 def fitting(planner: Planner, scenes: Sequence[SceneProblem]) -> list[SceneProblem]:
     """Return the scenes with at most as many obstacles of each kind as the problem of the planner's model."""
-    most = Counter(obstacle.kind for obstacle in as_problem(planner.model.problem).obstacle)
-    return [scene for scene in scenes if Counter(obstacle.kind for obstacle in scene.obstacles) <= most]
+    most = Counter(
+        obstacle.kind for obstacle in as_problem(planner.model.problem).obstacle
+    )
+    return [
+        scene
+        for scene in scenes
+        if Counter(obstacle.kind for obstacle in scene.obstacles) <= most
+    ]
 
 
 def measure(
-    models: Sequence[str], robot: str, family: str, scenes: Sequence[SceneProblem], *, refining: bool
+    models: Sequence[str],
+    robot: str,
+    family: str,
+    scenes: Sequence[SceneProblem],
+    *,
+    refining: bool,
 ) -> list[dict[str, Any]]:
     """Return the figures of models for the scenes of one family; with ``refining`` also those of ``solve``."""
-    planners = [Planner(name if not Path(name).exists() else Path(name)) for name in models]
+    planners = [
+        Planner(name if not Path(name).exists() else Path(name)) for name in models
+    ]
     scenes = fitting(planners[0], colliding_lines(robot, scenes))
     if not scenes:
         return []
@@ -117,7 +130,9 @@ def measure(
                 "solve": float(np.mean([each.valid for each in solved[0]])),
                 "solve cpu [s]": float(solved[1].mean()),
                 "refine / solve, medians": float(np.median(cpu) / np.median(solved[1])),
-                "motion time": float(np.median(plans.duration / [each.cost for each in attempts])),
+                "motion time": float(
+                    np.median(plans.duration / [each.cost for each in attempts])
+                ),
             }
         )
     return results
@@ -132,13 +147,35 @@ def cell(facts: dict[str, Any], key: str) -> str:
 
 def options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
-    parser.add_argument("models", nargs="+", help="models by name or file, of scenes with equal capacity")
+    parser.add_argument(
+        "models",
+        nargs="+",
+        help="models by name or file, of scenes with equal capacity",
+    )
     parser.add_argument("--robot", default="panda-3kg", help="problem of a robot")
-    parser.add_argument("--families", nargs="*", choices=list(shipped_families()), help="families of scenes")
-    parser.add_argument("--seed", type=int, default=29_400_001, help="seed of the scenes")
-    parser.add_argument("--suite", type=Path, help="file of test problems, such as datasets/suites/clutter.h5")
-    parser.add_argument("--alone", action="store_true", help="measure the plans alone, without refining")
-    parser.add_argument("--count", type=int, default=100, help="test problems of every family, before the selection")
+    parser.add_argument(
+        "--families",
+        nargs="*",
+        choices=list(shipped_families()),
+        help="families of scenes",
+    )
+    parser.add_argument(
+        "--seed", type=int, default=29_400_001, help="seed of the scenes"
+    )
+    parser.add_argument(
+        "--suite",
+        type=Path,
+        help="file of test problems, such as datasets/suites/clutter.h5",
+    )
+    parser.add_argument(
+        "--alone", action="store_true", help="measure the plans alone, without refining"
+    )
+    parser.add_argument(
+        "--count",
+        type=int,
+        default=100,
+        help="test problems of every family, before the selection",
+    )
 
 
 def main() -> None:
@@ -149,27 +186,54 @@ def main() -> None:
         for family in chosen.families or DEFAULT_FAMILIES:
             progress(family)
             if chosen.suite is None:
-                scenes = make_scenes(family, chosen.robot, chosen.count, seed=chosen.seed, per_scene=2)
+                scenes = make_scenes(
+                    family, chosen.robot, chosen.count, seed=chosen.seed, per_scene=2
+                )
             else:
-                scenes = [scene for scene in load_scenes(chosen.suite) if scene.name.rsplit(" ", 2)[0] == family]
-            results += measure(chosen.models, chosen.robot, family, scenes, refining=not chosen.alone)
+                scenes = [
+                    scene
+                    for scene in load_scenes(chosen.suite)
+                    if scene.name.rsplit(" ", 2)[0] == family
+                ]
+            results += measure(
+                chosen.models, chosen.robot, family, scenes, refining=not chosen.alone
+            )
     shares = ("alone", "refined", "with others", "solve")
-    head = ("family", "model", "problems", *shares, "cpu: plan", "refine", "solve", "refine / solve, medians")
+    head = (
+        "family",
+        "model",
+        "problems",
+        *shares,
+        "cpu: plan",
+        "refine",
+        "solve",
+        "refine / solve, medians",
+    )
     rows = [
         (
             each["family"],
             each["model"],
             f"{each['problems']}",
-            *(cell(each, key) for key in ("alone", "refined", "refined, other guesses too", "solve")),
             *(
                 cell(each, key)
-                for key in ("planning cpu [s]", "refining cpu [s]", "solve cpu [s]", "refine / solve, medians")
+                for key in ("alone", "refined", "refined, other guesses too", "solve")
+            ),
+            *(
+                cell(each, key)
+                for key in (
+                    "planning cpu [s]",
+                    "refining cpu [s]",
+                    "solve cpu [s]",
+                    "refine / solve, medians",
+                )
             ),
         )
         for each in results
     ]
     report(
-        {"planners": results}, [table("unseen scenes, straight line collides", head, rows, left=2)], as_json=chosen.json
+        {"planners": results},
+        [table("unseen scenes, straight line collides", head, rows, left=2)],
+        as_json=chosen.json,
     )
 
 

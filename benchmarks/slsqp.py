@@ -54,15 +54,21 @@ class Function:
     def margins(self, x: Array) -> Array:
         """Return the margins of the residuals to their bounds."""
         g = self.evaluate(x).g
-        return np.concatenate([(self.bounds.upper - g)[self.above], (g - self.bounds.lower)[self.below]])
+        return np.concatenate(
+            [(self.bounds.upper - g)[self.above], (g - self.bounds.lower)[self.below]]
+        )
 
     def margins_jacobian(self, x: Array) -> Array:
         """Return the Jacobian of the margins, shape (m, nx)."""
         at = self.evaluate(x)
-        return np.vstack([-self.motion.rows(at, *self.above), self.motion.rows(at, *self.below)])
+        return np.vstack(
+            [-self.motion.rows(at, *self.above), self.motion.rows(at, *self.below)]
+        )
 
 
-def minimize_slsqp(refiner: Refiner, task: RefinementTask, x: Array, *, cap: float) -> tuple[Array, float]:
+def minimize_slsqp(
+    refiner: Refiner, task: RefinementTask, x: Array, *, cap: float
+) -> tuple[Array, float]:
     """Minimize from x; return the last iterate and the CPU time [s].
 
     Args:
@@ -83,9 +89,16 @@ def minimize_slsqp(refiner: Refiner, task: RefinementTask, x: Array, *, cap: flo
                 lambda x: function.evaluate(x).cost,
                 x,
                 jac=lambda x: function.evaluate(x).gradient,
-                constraints={"type": "ineq", "fun": function.margins, "jac": function.margins_jacobian},
+                constraints={
+                    "type": "ineq",
+                    "fun": function.margins,
+                    "jac": function.margins_jacobian,
+                },
                 method="SLSQP",
-                options={"ftol": level.settings.cost_tolerance / 10, "maxiter": MAX_ITERATIONS},
+                options={
+                    "ftol": level.settings.cost_tolerance / 10,
+                    "maxiter": MAX_ITERATIONS,
+                },
             )
         end = np.array(solution.x)
     except OutOfTimeError:

@@ -36,9 +36,19 @@ from cnpgen.training.settings import Length, TrainingSettings
 from cnpgen.training.train import train_model
 
 DATASETS = ("airhockey-hit", "heavy-object")
-NETWORKS = ((128, 64), (256, 128), (512, 128), (2048, 128))  # width and batch; all have a trunk of five layers
+NETWORKS = (
+    (128, 64),
+    (256, 128),
+    (512, 128),
+    (2048, 128),
+)  # width and batch; all have a trunk of five layers
 TARGETS = {(256, 128): 12.0, (512, 128): 35.0, (2048, 128): 700.0}  # ms
-TIMED = {"forward": "forward", "control_points": "control points", "vjp": "control points", "backward": "backward"}
+TIMED = {
+    "forward": "forward",
+    "control_points": "control points",
+    "vjp": "control points",
+    "backward": "backward",
+}
 PARTS = ("forward", "backward", "loss", "projection", "control points", "rest")
 SCORE_TARGETS = {  # CPU time [s] of training from scratch; figure -> bound, and whether it is an upper bound
     "airhockey-hit": (120.0, {
@@ -73,7 +83,9 @@ class Clock:
         return run
 
 
-def time_steps(folder: Path, hidden: int, batch: int, *, steps: int, backend: str) -> dict[str, Any]:
+def time_steps(
+    folder: Path, hidden: int, batch: int, *, steps: int, backend: str
+) -> dict[str, Any]:
     """Measure steps of one network: the time [ms] and the fraction of every part."""
     settings = TrainingSettings(hidden=hidden, batch_size=batch)
     source, clock = open_training_data(folder), Clock({})
@@ -87,7 +99,10 @@ def time_steps(folder: Path, hidden: int, batch: int, *, steps: int, backend: st
             times = [cpu_of(lambda: run.step(state, gradient)) for _ in range(steps)]
     total = sum(times)
     shares = {name: clock.spent.get(name, 0.0) / total for name in PARTS[:-1]}
-    return {"ms": 1e3 * median(times), "shares": shares | {"rest": 1 - sum(shares.values())}}
+    return {
+        "ms": 1e3 * median(times),
+        "shares": shares | {"rest": 1 - sum(shares.values())},
+    }
 
 
 @contextmanager
@@ -96,9 +111,12 @@ def patched(clock: Clock, run: Any) -> Iterator[None]:
     originals = {name: getattr(parts, name) for name in TIMED}
     learner, projection = run.learner, run.learner.projection
     timed = SimpleNamespace(
-        project=clock.timed("projection", projection.project), vjp=clock.timed("projection", projection.vjp)
+        project=clock.timed("projection", projection.project),
+        vjp=clock.timed("projection", projection.vjp),
     )
-    run.learner = replace(learner, loss=clock.timed("loss", learner.loss), projection=timed)
+    run.learner = replace(
+        learner, loss=clock.timed("loss", learner.loss), projection=timed
+    )
     for name, function in originals.items():
         setattr(parts, name, clock.timed(TIMED[name], function))
     yield
@@ -107,7 +125,9 @@ def patched(clock: Clock, run: Any) -> Iterator[None]:
     run.learner = learner
 
 
-def measure_steps(folders: dict[str, Path], count: int) -> tuple[list[dict[str, Any]], str]:
+def measure_steps(
+    folders: dict[str, Path], count: int
+) -> tuple[list[dict[str, Any]], str]:
     results, rows = [], []
     for name, folder in folders.items():
         cases = [(*network, "compiled") for network in NETWORKS] + [(128, 64, "numpy")]
@@ -115,21 +135,45 @@ def measure_steps(folders: dict[str, Path], count: int) -> tuple[list[dict[str, 
             progress(f"{name}, 5 x {hidden}, batch {batch}, {backend}")
             steps = max(count * 128 // hidden, 5) if backend == "compiled" else 10
             result = time_steps(folder, hidden, batch, steps=steps, backend=backend)
-            results.append({"dataset": name, "hidden": hidden, "batch": batch, "backend": backend, **result})
+            results.append(
+                {
+                    "dataset": name,
+                    "hidden": hidden,
+                    "batch": batch,
+                    "backend": backend,
+                    **result,
+                }
+            )
             target = TARGETS.get((hidden, batch)) if backend == "compiled" else None
             shares = " / ".join(f"{100 * result['shares'][part]:.0f}" for part in PARTS)
             cells = (name, f"5 x {hidden}", str(batch), backend, f"{result['ms']:.2f}")
             rows.append((*cells, shares, *compared(result["ms"], target, at_most=True)))
-    head = ("dataset", "network", "batch", "backend", "ms", f"% {' / '.join(PARTS)}", "target", "", "ratio")
+    head = (
+        "dataset",
+        "network",
+        "batch",
+        "backend",
+        "ms",
+        f"% {' / '.join(PARTS)}",
+        "target",
+        "",
+        "ratio",
+    )
     return results, table("a training step", head, rows, left=2)
 
 
-def compared(value: float, target: float | None, *, at_most: bool) -> tuple[str, str, str]:
+def compared(
+    value: float, target: float | None, *, at_most: bool
+) -> tuple[str, str, str]:
     """Return a target, whether a value meets it, and their ratio, as cells of a table."""
-    return *verdict(value, target, at_most=at_most), f"{value / target:.3f}" if target else ""
+    return *verdict(
+        value, target, at_most=at_most
+    ), f"{value / target:.3f}" if target else ""
 
 
-def learn(name: str, seconds: float, rows: int, seed: int, folder: Path) -> tuple[dict[str, Any], str]:
+def learn(
+    name: str, seconds: float, rows: int, seed: int, folder: Path
+) -> tuple[dict[str, Any], str]:
     """Train on new rows, judge all test rows, and refine some plans."""
     data, out = folder / "rows", folder / "model.h5"
     progress(f"making {rows:,} rows of {name}")
@@ -144,7 +188,11 @@ def learn(name: str, seconds: float, rows: int, seed: int, folder: Path) -> tupl
     valid = refined.valid
     ratio = plans.duration[valid].mean() / refined.plans.duration[valid].mean()
     facts = {
-        **{key: value for key, value in trained.score.items() if key not in {"score", "broken"}},
+        **{
+            key: value
+            for key, value in trained.score.items()
+            if key not in {"score", "broken"}
+        },
         "cpu_seconds": trained.model.training["cpu_seconds"],
         "steps": trained.model.training["steps"],
         "duration_over_refined": float(ratio),
@@ -155,18 +203,35 @@ def learn(name: str, seconds: float, rows: int, seed: int, folder: Path) -> tupl
     cells = []
     for key, value in facts.items():
         bound, upper = bounds.get(key, (None, False))
-        cells.append((key.replace("_", " "), f"{value:,.4g}", *compared(value, bound, at_most=upper)))
-    return facts, table(f"{name} from scratch", ("figure", "value", "target", "", "ratio"), cells)
+        cells.append(
+            (
+                key.replace("_", " "),
+                f"{value:,.4g}",
+                *compared(value, bound, at_most=upper),
+            )
+        )
+    return facts, table(
+        f"{name} from scratch", ("figure", "value", "target", "", "ratio"), cells
+    )
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--steps", type=int, default=100, help="timed steps of the smallest network")
     parser.add_argument(
-        "--learn", choices=(*DATASETS, "airhockey-replan"), help="train on this dataset instead of timing steps"
+        "--steps", type=int, default=100, help="timed steps of the smallest network"
+    )
+    parser.add_argument(
+        "--learn",
+        choices=(*DATASETS, "airhockey-replan"),
+        help="train on this dataset instead of timing steps",
     )
     parser.add_argument("--cpu-seconds", type=float, default=120.0)
     parser.add_argument("--rows", type=int, default=200_000)
-    parser.add_argument("--seed", type=int, default=1, help="seed of the rows; the shipped datasets have another one")
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=1,
+        help="seed of the rows; the shipped datasets have another one",
+    )
 
 
 def main() -> None:
@@ -174,7 +239,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         if chosen.learn:
-            facts, text = learn(chosen.learn, chosen.cpu_seconds, chosen.rows, chosen.seed, folder)
+            facts, text = learn(
+                chosen.learn, chosen.cpu_seconds, chosen.rows, chosen.seed, folder
+            )
             report({"learned": facts}, [text], as_json=chosen.json)
             return
         folders = {dataset: folder / dataset for dataset in DATASETS}

@@ -77,7 +77,9 @@ class Case:
     @property
     def error(self) -> float:
         """Largest error of the values in SI units."""
-        return self.noise + (0.0 if self.decimals is None else 0.5 * 10.0**-self.decimals)
+        return self.noise + (
+            0.0 if self.decimals is None else 0.5 * 10.0**-self.decimals
+        )
 
 
 CASES = (
@@ -137,10 +139,15 @@ class Counts:
 
     def shares(self) -> dict[str, float]:
         """Return the decided share of every condition."""
-        return {name: 1 - c[str(Decision.UNDECIDED)] / c.total() for name, c in self.conditions.items()}
+        return {
+            name: 1 - c[str(Decision.UNDECIDED)] / c.total()
+            for name, c in self.conditions.items()
+        }
 
 
-def trajectory_of(plan: SampledPlan, case: Case, random: np.random.Generator) -> Trajectory:
+def trajectory_of(
+    plan: SampledPlan, case: Case, random: np.random.Generator
+) -> Trajectory:
     """Return a sampled plan with the errors of a case."""
     values = []
     for array in (plan.q, plan.dq, plan.ddq)[: case.orders + 1]:
@@ -163,7 +170,11 @@ def too_fast(motion: Motion, verdict: Verdict, name: str) -> Motion:
 def measure(plans: Plans, case: Case, truths: tuple[Verdict, ...]) -> Counts:
     """Judge sampled plans."""
     problem, robot = open_problem(plans.problem)
-    judge, counts, random = FamilyJudge(problem, robot), Counts(), np.random.default_rng(0)
+    judge, counts, random = (
+        FamilyJudge(problem, robot),
+        Counts(),
+        np.random.default_rng(0),
+    )
     error = np.full(3, case.error)
     for index, truth in enumerate(truths):
         motion = plans.motion[[index]]
@@ -197,10 +208,18 @@ def trajectories_of(plans: Plans, case: Case) -> list[Trajectory]:
     found = []
     for index in range(len(plans)):
         if case.source == "ruckig":
-            found.append(time_optimal_motion(load_ruckig(), robot, plans.boundary[index : index + 1]))
+            found.append(
+                time_optimal_motion(
+                    load_ruckig(), robot, plans.boundary[index : index + 1]
+                )
+            )
         elif case.source == "toppra":
             path = plans.motion[[index]].at(np.linspace(0, 1, PATH_POINTS)[None]).q[0]
-            found.append(resampled(timed_by_toppra(path, robot, plans.boundary.goal_dq[index]), case))
+            found.append(
+                resampled(
+                    timed_by_toppra(path, robot, plans.boundary.goal_dq[index]), case
+                )
+            )
         else:
             found.append(trajectory_of(sampled_plan(plans, case, index), case, random))
     return [trajectory for trajectory in found if trajectory is not None]
@@ -210,7 +229,9 @@ def resampled(trajectory: Trajectory | None, case: Case) -> Trajectory | None:
     """Sample a trajectory at the rate of a case."""
     if trajectory is None:
         return None
-    t = np.linspace(0, trajectory.duration, int(np.ceil(trajectory.duration * case.rate)) + 1)
+    t = np.linspace(
+        0, trajectory.duration, int(np.ceil(trajectory.duration * case.rate)) + 1
+    )
     q, *derivatives = trajectory.states(t)
     return Trajectory(t, q, *derivatives[: case.orders])
 
@@ -223,7 +244,14 @@ def through_degrees(trajectory: Trajectory, plans: Plans) -> Trajectory:
     head = ",".join(["t", *names, *(f"{name}_velocity" for name in names)])
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "degrees.csv"
-        np.savetxt(path, np.stack(columns, axis=1), delimiter=",", header=head, comments="", fmt="%.6f")
+        np.savetxt(
+            path,
+            np.stack(columns, axis=1),
+            delimiter=",",
+            header=head,
+            comments="",
+            fmt="%.6f",
+        )
         return load_trajectories(path, plans.problem.name, unit="deg").trajectories[0]
 
 
@@ -231,28 +259,49 @@ def chosen(cases: Sequence[Case], names: Sequence[str]) -> list[Case]:
     """Return the named cases, or all."""
     unknown = set(names) - {case.name for case in cases}
     if unknown:
-        raise SystemExit(f"no case {', '.join(unknown)}; expected {'; '.join(case.name for case in cases)}")
+        raise SystemExit(
+            f"no case {', '.join(unknown)}; expected {'; '.join(case.name for case in cases)}"
+        )
     return [case for case in cases if case.name in names or not names]
 
 
 def refined(
-    plans: Plans, case: Case, stay_within: float | None, at_rest: bool | Literal["start", "goal"]
+    plans: Plans,
+    case: Case,
+    stay_within: float | None,
+    at_rest: bool | Literal["start", "goal"],
 ) -> tuple[str, ...]:
     """Import and refine sampled plans; return a row of the table."""
     sampled = trajectories_of(plans, case)
     if case.degrees:
         sampled = [through_degrees(trajectory, plans) for trajectory in sampled]
-    imported = import_trajectories(plans.problem, sampled, noise=case.error, at_rest=at_rest)
+    imported = import_trajectories(
+        plans.problem, sampled, noise=case.error, at_rest=at_rest
+    )
     valid = evaluate_plans(imported.plans, workers=1).valid
-    options = RefineOptions(stay_within=None if stay_within is None else np.deg2rad(stay_within))
+    options = RefineOptions(
+        stay_within=None if stay_within is None else np.deg2rad(stay_within)
+    )
     refinement = refine_plans(imported.plans, options=options, workers=1)
     after = evaluate_plans(refinement.plans, workers=1)
-    reasons = Counter(str(verdict.reason) for verdict in after.verdicts if not verdict.valid)
+    reasons = Counter(
+        str(verdict.reason) for verdict in after.verdicts if not verdict.valid
+    )
     text = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
-    counts = str(len(sampled)), f"{int(valid.sum())}", f"{int(after.valid.sum())}", f"{after.valid.mean():.1%}"
+    counts = (
+        str(len(sampled)),
+        f"{int(valid.sum())}",
+        f"{int(after.valid.sum())}",
+        f"{after.valid.mean():.1%}",
+    )
     moved = float(np.nanmax(imported.snapped, initial=0.0))
-    progress(f"{plans.problem.name}, {case.name}: {int(after.valid.sum())} of {len(sampled)} valid; {text}")
-    lengths = [f"{length:.1e}" for length in (imported.deviation.max(), moved, refinement.deviation.max())]
+    progress(
+        f"{plans.problem.name}, {case.name}: {int(after.valid.sum())} of {len(sampled)} valid; {text}"
+    )
+    lengths = [
+        f"{length:.1e}"
+        for length in (imported.deviation.max(), moved, refinement.deviation.max())
+    ]
     return plans.problem.name, case.name, *counts, *lengths, text
 
 
@@ -266,7 +315,10 @@ def import_all(given: argparse.Namespace) -> None:
     for file in given.files:
         plans = load_plans(file)
         plans = plans[np.flatnonzero(evaluate_plans(plans, workers=1).valid)[: given.n]]
-        rows += [refined(plans, case, given.stay_within, given.at_rest) for case in chosen(IMPORTS, given.case)]
+        rows += [
+            refined(plans, case, given.stay_within, given.at_rest)
+            for case in chosen(IMPORTS, given.case)
+        ]
         progress(f"{file}: done")
     results = {"rows": [dict(zip(head, row, strict=True)) for row in rows]}
     report(results, [table("imported plans", head, rows, left=2)], as_json=given.json)
@@ -277,13 +329,34 @@ def main() -> None:
 
     def add(parser: argparse.ArgumentParser) -> None:
         parser.add_argument("files", nargs="+", type=Path, help="files of plans")
-        parser.add_argument("--n", type=int, default=200, help="valid plans of each file (default: 200)")
-        parser.add_argument("--case", action="append", default=[], help="only the samples of this name")
-        parser.add_argument("--import", dest="imports", action="store_true", help="import and refine instead")
+        parser.add_argument(
+            "--n", type=int, default=200, help="valid plans of each file (default: 200)"
+        )
+        parser.add_argument(
+            "--case", action="append", default=[], help="only the samples of this name"
+        )
+        parser.add_argument(
+            "--import",
+            dest="imports",
+            action="store_true",
+            help="import and refine instead",
+        )
 
         text = "end of imported motions at rest; both without a value"
-        parser.add_argument("--at-rest", choices=("start", "goal"), nargs="?", const=True, default=False, help=text)
-        parser.add_argument("--stay-within", metavar="DEG", type=float, help="largest distance from the imported path")
+        parser.add_argument(
+            "--at-rest",
+            choices=("start", "goal"),
+            nargs="?",
+            const=True,
+            default=False,
+            help=text,
+        )
+        parser.add_argument(
+            "--stay-within",
+            metavar="DEG",
+            type=float,
+            help="largest distance from the imported path",
+        )
 
     given = arguments(__doc__, add)
     import_all(given) if given.imports else judge_all(given)
@@ -291,7 +364,10 @@ def main() -> None:
 
 def shares_text(shares: dict[str, float]) -> str:
     """Return the shares below 1, by condition."""
-    return ", ".join(f"{name} {share:.1%}" for name, share in shares.items() if share < 1) or "all"
+    return (
+        ", ".join(f"{name} {share:.1%}" for name, share in shares.items() if share < 1)
+        or "all"
+    )
 
 
 def judge_all(given: argparse.Namespace) -> None:
@@ -301,16 +377,28 @@ def judge_all(given: argparse.Namespace) -> None:
         plans = load_plans(file)
         evaluation = evaluate_plans(plans, workers=1)
         valid = np.flatnonzero(evaluation.valid)[: given.n]
-        plans, truths = plans[valid], tuple(evaluation.verdicts[index] for index in valid.tolist())
+        plans, truths = (
+            plans[valid],
+            tuple(evaluation.verdicts[index] for index in valid.tolist()),
+        )
         names = ("joint velocity", "joint acceleration")
-        fast = [too_fast(plans.motion[[k]], truth, names[k % 2]) for k, truth in enumerate(truths)]
+        fast = [
+            too_fast(plans.motion[[k]], truth, names[k % 2])
+            for k, truth in enumerate(truths)
+        ]
         rates = np.concatenate([motion.rate for motion in fast])
         faster = replace(plans, rate_control_points=rates)
-        sets = {"valid": (plans, truths), "too fast": (faster, evaluate_plans(faster, workers=1).verdicts)}
+        sets = {
+            "valid": (plans, truths),
+            "too fast": (faster, evaluate_plans(faster, workers=1).verdicts),
+        }
         for label, (members, verdicts) in sets.items():
             for case in chosen(CASES, given.case):
                 counts = measure(members, case, verdicts)
-                found = {str(decision): counts.decisions[str(decision)] for decision in Decision}
+                found = {
+                    str(decision): counts.decisions[str(decision)]
+                    for decision in Decision
+                }
                 rows.append(
                     {
                         "problem": plans.problem.name,
@@ -322,9 +410,26 @@ def judge_all(given: argparse.Namespace) -> None:
                     }
                 )
                 progress(f"{file}: {label}, {case.name}: {rows[-1]}")
-    head = ("problem", "plans", "samples", *map(str, Decision), "wrong", "decided conditions")
-    cells = [[shares_text(value) if isinstance(value, dict) else str(value) for value in row.values()] for row in rows]
-    report({"rows": rows}, [table("sampled plans", head, cells, left=3)], as_json=given.json)
+    head = (
+        "problem",
+        "plans",
+        "samples",
+        *map(str, Decision),
+        "wrong",
+        "decided conditions",
+    )
+    cells = [
+        [
+            shares_text(value) if isinstance(value, dict) else str(value)
+            for value in row.values()
+        ]
+        for row in rows
+    ]
+    report(
+        {"rows": rows},
+        [table("sampled plans", head, cells, left=3)],
+        as_json=given.json,
+    )
 
 
 if __name__ == "__main__":

@@ -87,18 +87,28 @@ def on_limits(boundary: Boundary) -> NDArray[np.bool_]:
 def to_goals_of_others(count: int, seed: int) -> Boundary:
     """Return problems from the start of one row to the goal configuration of the next."""
     rows = draw_boundary_problems(NEAR_GOALS, OVERSAMPLING * count, seed=seed).boundary
-    problems = complete(NEAR_GOALS, start_q=rows.start_q, goal_q=np.roll(rows.goal_q, 1, axis=0)).plans.boundary
-    near = np.abs(problems.goal_q - problems.start_q).max(axis=1) <= MAX_JOINT_CHANGE_RAD
+    problems = complete(
+        NEAR_GOALS, start_q=rows.start_q, goal_q=np.roll(rows.goal_q, 1, axis=0)
+    ).plans.boundary
+    near = (
+        np.abs(problems.goal_q - problems.start_q).max(axis=1) <= MAX_JOINT_CHANGE_RAD
+    )
     return problems[np.flatnonzero(near)[:count]]
 
 
 def sets(count: int, seed: int) -> dict[str, Boundary]:
     """Make the five sets."""
-    limits = draw_boundary_problems(independent(at_limit=0.5), OVERSAMPLING * count, seed=seed + 2).boundary
+    limits = draw_boundary_problems(
+        independent(at_limit=0.5), OVERSAMPLING * count, seed=seed + 2
+    ).boundary
     return {
-        "the dataset's": draw_boundary_problems(ALL_GOALS, count, seed=seed + 4).boundary,
+        "the dataset's": draw_boundary_problems(
+            ALL_GOALS, count, seed=seed + 4
+        ).boundary,
         "ik from start": draw_boundary_problems(NEAR_GOALS, count, seed=seed).boundary,
-        "independent": draw_boundary_problems(independent(at_limit=0.0), count, seed=seed + 1).boundary,
+        "independent": draw_boundary_problems(
+            independent(at_limit=0.0), count, seed=seed + 1
+        ).boundary,
         "on joint limits": limits[np.flatnonzero(on_limits(limits))[:count]],
         "another problem's": to_goals_of_others(count, seed + 3),
     }
@@ -134,7 +144,9 @@ def in_arm_links(plans: Plans, refined: list[Made]) -> dict[str, float]:
     urdf = problem.urdf_path.read_text(encoding="utf-8")
     model = pin.buildModelFromXML(urdf)
     links = pin.buildGeomFromUrdfString(model, urdf, pin.COLLISION).geometryObjects
-    links = [link for link in links if model.frames[link.parentFrame].name not in touch_links]
+    links = [
+        link for link in links if model.frames[link.parentFrame].name not in touch_links
+    ]
     data, tip = model.createData(), model.getFrameId(problem.robot.tip)
 
     def is_inside(q: NDArray[np.float64]) -> bool:
@@ -144,29 +156,55 @@ def in_arm_links(plans: Plans, refined: list[Made]) -> dict[str, float]:
             pose = data.oMi[link.parentJoint] * link.placement
             request, result = coal.DistanceRequest(True, True), coal.DistanceResult()
             shape = coal.Transform3s(pose.rotation, pose.translation)
-            if coal.distance(body, place, link.geometry, shape, request, result) < -MAX_PENETRATION_M:
+            if (
+                coal.distance(body, place, link.geometry, shape, request, result)
+                < -MAX_PENETRATION_M
+            ):
                 return True
         return False
 
     attempts = [item.refined for item in refined]
-    states = [plan_states(each.path, each.rate, plans.degree, STATE_PERIOD_S) for each in attempts]
-    return {"object in an arm link": float(np.mean([any(map(is_inside, q)) for q in states]))}
+    states = [
+        plan_states(each.path, each.rate, plans.degree, STATE_PERIOD_S)
+        for each in attempts
+    ]
+    return {
+        "object in an arm link": float(
+            np.mean([any(map(is_inside, q)) for q in states])
+        )
+    }
 
 
 def refined_again(planner: Planner, boundary: Boundary) -> dict[str, dict[str, int]]:
     """Refine and solve, refine both results again, and count the plans that improve."""
     plans = planner.plan_batch(boundary)
-    first = {"refined": refine_plans(plans, workers=1), "solved": solve_plans(plans, workers=1)}
-    later = {name: refine_plans(refinement.plans, workers=1) for name, refinement in first.items()}
-    min_duration = np.min([valid_durations(refinement) for refinement in (*first.values(), *later.values())], axis=0)
+    first = {
+        "refined": refine_plans(plans, workers=1),
+        "solved": solve_plans(plans, workers=1),
+    }
+    later = {
+        name: refine_plans(refinement.plans, workers=1)
+        for name, refinement in first.items()
+    }
+    min_duration = np.min(
+        [
+            valid_durations(refinement)
+            for refinement in (*first.values(), *later.values())
+        ],
+        axis=0,
+    )
     counts = {}
     for name, refinement in first.items():
         before, after = valid_durations(refinement), valid_durations(later[name])
         counts[name] = {
             "valid": int(refinement.valid.sum()),
             "later": int((~refinement.valid & np.isfinite(min_duration)).sum()),
-            "refining again": int((refinement.valid & (before > MIN_SHORTENING * after)).sum()),
-            "above the fastest": int((refinement.valid & (before > MIN_SHORTENING * min_duration)).sum()),
+            "refining again": int(
+                (refinement.valid & (before > MIN_SHORTENING * after)).sum()
+            ),
+            "above the fastest": int(
+                (refinement.valid & (before > MIN_SHORTENING * min_duration)).sum()
+            ),
         }
     return counts
 
@@ -178,39 +216,83 @@ def valid_durations(refinement: Refinement) -> NDArray[np.float64]:
 
 def options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
-    parser.add_argument("--models", nargs="+", default=[ALL_GOALS], help="names or files of models")
-    parser.add_argument("--problems", type=int, default=300, help="problems of each set")
-    parser.add_argument("--refined", type=int, default=60, help="refined problems of each set")
-    parser.add_argument("--again", type=int, default=0, metavar="N", help="problems of each set that are refined twice")
-    parser.add_argument("--sets", nargs="+", choices=VALID_TARGETS, default=list(VALID_TARGETS), metavar="SET")
-    parser.add_argument("--seed", type=int, default=408_163_275, help="seed of the problems")
+    parser.add_argument(
+        "--models", nargs="+", default=[ALL_GOALS], help="names or files of models"
+    )
+    parser.add_argument(
+        "--problems", type=int, default=300, help="problems of each set"
+    )
+    parser.add_argument(
+        "--refined", type=int, default=60, help="refined problems of each set"
+    )
+    parser.add_argument(
+        "--again",
+        type=int,
+        default=0,
+        metavar="N",
+        help="problems of each set that are refined twice",
+    )
+    parser.add_argument(
+        "--sets",
+        nargs="+",
+        choices=VALID_TARGETS,
+        default=list(VALID_TARGETS),
+        metavar="SET",
+    )
+    parser.add_argument(
+        "--seed", type=int, default=408_163_275, help="seed of the problems"
+    )
 
 
 def main() -> None:
     """Run the benchmark."""
     chosen = arguments(__doc__, options)
-    problems, results, rows, again_rows = sets(chosen.problems, chosen.seed), dict[str, Any](), [], []
+    problems, results, rows, again_rows = (
+        sets(chosen.problems, chosen.seed),
+        dict[str, Any](),
+        [],
+        [],
+    )
     for model in chosen.models:
         planner = Planner(model)
         for name, boundary in ((name, problems[name]) for name in chosen.sets):
             progress(f"{model}: {name}")
             plans = planner.plan_batch(boundary)
             refined = refine_each(plans[: chosen.refined])
-            figures_of_set = figures([plans], refined) | durations_of_valid_plans(plans[: chosen.refined], refined)
+            figures_of_set = figures([plans], refined) | durations_of_valid_plans(
+                plans[: chosen.refined], refined
+            )
             figures_of_set |= in_arm_links(plans, refined)
             results.setdefault(model, {})[name] = figures_of_set
             rows += rows_of(model, name, figures_of_set, targets_of(name))
             if chosen.again:
                 again = refined_again(planner, boundary[: chosen.again])
                 results[model][name] = {**figures_of_set, "again": again}
-                again_rows += [(model, name, source, *map(str, counts.values())) for source, counts in again.items()]
-    tables = [table("transports", ("planner", "problems", "figure", "value", "target", ""), rows, left=3)]
+                again_rows += [
+                    (model, name, source, *map(str, counts.values()))
+                    for source, counts in again.items()
+                ]
+    tables = [
+        table(
+            "transports",
+            ("planner", "problems", "figure", "value", "target", ""),
+            rows,
+            left=3,
+        )
+    ]
     if again_rows:
         head = (
             "planner", "problems", "plans", "valid", "valid later", "2 % shorter if refined again",
             "2 % above the fastest",
         )  # fmt: skip
-        tables.append(table(f"{chosen.again} problems of each set, refined again", head, again_rows, left=3))
+        tables.append(
+            table(
+                f"{chosen.again} problems of each set, refined again",
+                head,
+                again_rows,
+                left=3,
+            )
+        )
     report({"transports": results}, tables, as_json=chosen.json)
 
 

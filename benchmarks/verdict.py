@@ -78,7 +78,9 @@ def state_by_state(plans: Plans) -> tuple[list[dict[str, float]], float]:
         states = evaluate_trajectory(motion, times.s)
         severity: dict[str, float] = {}
         for k, phase in enumerate(times.s):
-            q, dq, ddq = (values[:, k].copy() for values in (states.q, states.dq, states.ddq))
+            q, dq, ddq = (
+                values[:, k].copy() for values in (states.q, states.dq, states.ddq)
+            )
             world.set_state(q, dq, ddq, obstacle_poses[index])
             for constraint in problem.constraint:
                 for condition in constraint.measured(world):
@@ -86,9 +88,14 @@ def state_by_state(plans: Plans) -> tuple[list[dict[str, float]], float]:
                         condition, np.array([phase]), plans.columns["start_xyz"][index]
                     )
                     g = np.array(condition.g, float)
-                    excess = np.maximum(condition.lower - g, g - condition.upper) - relaxation
+                    excess = (
+                        np.maximum(condition.lower - g, g - condition.upper)
+                        - relaxation
+                    )
                     worst = float(np.max(excess / constraint.allowed(condition)))
-                    severity[condition.name] = max(severity.get(condition.name, -np.inf), worst)
+                    severity[condition.name] = max(
+                        severity.get(condition.name, -np.inf), worst
+                    )
         severities.append(severity)
     return severities, time.process_time() - start
 
@@ -107,7 +114,15 @@ def measure(plans: Plans, *, repeat: int, slow: int) -> Timing:
                 missed = max(missed, severity - result.margins[name].severity)
                 between = max(between, result.margins[name].severity - severity)
     samples = float(np.mean([result.samples for result in verdicts]))
-    return Timing(plans.problem.name, len(plans), samples, 1e3 * median(times), median(ratios), missed, between)
+    return Timing(
+        plans.problem.name,
+        len(plans),
+        samples,
+        1e3 * median(times),
+        median(ratios),
+        missed,
+        between,
+    )
 
 
 @dataclass(frozen=True)
@@ -128,8 +143,15 @@ class ToleranceTest:
 def at_the_tolerance(problem: Problem, margin: Margin, by: float) -> Problem:
     """Return the problem with one constraint only, whose tolerance is the violation times ``1 + by``."""
     factor = margin.violation / margin.tolerance * (1 + by)
-    constraints = [constraint for constraint in problem.constraint if constraint.reason == margin.reason]
-    changed = [replace(constraint, tolerance=constraint.tolerance * factor) for constraint in constraints]
+    constraints = [
+        constraint
+        for constraint in problem.constraint
+        if constraint.reason == margin.reason
+    ]
+    changed = [
+        replace(constraint, tolerance=constraint.tolerance * factor)
+        for constraint in constraints
+    ]
     return replace(problem, constraint=tuple(changed))
 
 
@@ -152,11 +174,22 @@ def check_steps(plans: Plans, count: int, seed: int) -> ToleranceTest:
         ]
         name, changed = exceeded[random.integers(len(exceeded))], problem
         for _ in range(4):  # the violation depends on the tolerance
-            changed = at_the_tolerance(changed, judge(changed, robot, *arguments, step=STEP_S)[0].margins[name], 0.0)
+            changed = at_the_tolerance(
+                changed,
+                judge(changed, robot, *arguments, step=STEP_S)[0].margins[name],
+                0.0,
+            )
         by = TOLERANCE_DISTANCE if k % 2 else -TOLERANCE_DISTANCE
-        final = at_the_tolerance(changed, judge(changed, robot, *arguments, step=STEP_S)[0].margins[name], by)
-        validity = {judge(final, robot, *arguments, step=step)[0].valid for step in STEPS_S}
-        differ += len(validity | {Judge(final, robot)(*arguments, early_exit=True)[0].valid}) > 1
+        final = at_the_tolerance(
+            changed, judge(changed, robot, *arguments, step=STEP_S)[0].margins[name], by
+        )
+        validity = {
+            judge(final, robot, *arguments, step=step)[0].valid for step in STEPS_S
+        }
+        differ += (
+            len(validity | {Judge(final, robot)(*arguments, early_exit=True)[0].valid})
+            > 1
+        )
     return ToleranceTest(plans.problem.name, count, differ)
 
 
@@ -164,16 +197,42 @@ def add(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
     parser.add_argument("file", nargs="+", type=Path, help="plan files")
     parser.add_argument("--repeat", type=int, default=3, help="repetitions")
-    parser.add_argument("--always", type=int, default=0, metavar="N", help="plans of each file at a tolerance")
-    parser.add_argument("--seed", type=int, default=20265, help="seed of the plans at a tolerance")
-    parser.add_argument("--slow", type=int, default=4, help="plans of each file that are checked state by state")
+    parser.add_argument(
+        "--always",
+        type=int,
+        default=0,
+        metavar="N",
+        help="plans of each file at a tolerance",
+    )
+    parser.add_argument(
+        "--seed", type=int, default=20265, help="seed of the plans at a tolerance"
+    )
+    parser.add_argument(
+        "--slow",
+        type=int,
+        default=4,
+        help="plans of each file that are checked state by state",
+    )
 
 
 def main() -> None:
     """Run the benchmark."""
     options = arguments(__doc__, add)
-    timings = [measure(load_plans(file), repeat=options.repeat, slow=options.slow) for file in options.file]
-    head = ("problem", "plans", "times", "ms per plan", "target", "", "times faster", "missed", "between")
+    timings = [
+        measure(load_plans(file), repeat=options.repeat, slow=options.slow)
+        for file in options.file
+    ]
+    head = (
+        "problem",
+        "plans",
+        "times",
+        "ms per plan",
+        "target",
+        "",
+        "times faster",
+        "missed",
+        "between",
+    )
     rows = [
         (
             item.problem,
@@ -190,7 +249,10 @@ def main() -> None:
     tables = [table("CPU time of the verdict on one core", head, rows)]
     content = {"verdict": [vars(item) for item in timings]}
     if options.always:
-        tests = [check_steps(load_plans(file), options.always, options.seed) for file in options.file]
+        tests = [
+            check_steps(load_plans(file), options.always, options.seed)
+            for file in options.file
+        ]
         differ = [(item.problem, str(item.plans), str(item.differ)) for item in tests]
         title = f"plans at a tolerance, judged every {', '.join(f'{1e6 * step:g}' for step in STEPS_S)} us"
         tables.append(table(title, ("problem", "plans", "validity differs"), differ))

@@ -53,18 +53,28 @@ def commands() -> list[str]:
 
 def robots() -> Path:
     """Return the folder of the robots."""
-    share = metadata.distribution("example-robot-data").locate_file("cmeel.prefix/share")
+    share = metadata.distribution("example-robot-data").locate_file(
+        "cmeel.prefix/share"
+    )
     return Path(str(share)) / "example-robot-data" / "robots"
 
 
 def complete(name: str, urdf: Path, tip: str, seconds: float) -> dict[str, Any]:
     """Run the commands of the page for one arm, up to the first that fails."""
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
-    environment, started, done = {**os.environ, "PATH": path, "OMP_NUM_THREADS": "1"}, time.monotonic(), 0
+    environment, started, done = (
+        {**os.environ, "PATH": path, "OMP_NUM_THREADS": "1"},
+        time.monotonic(),
+        0,
+    )
     blocks, outcome = commands(), "completed"
     with tempfile.TemporaryDirectory(prefix="cnpgen-arm-") as folder:
         for block in blocks:
-            text = block.replace("turret.urdf", str(urdf)).replace("--tip tool", f"--tip {tip}").replace("turret", name)
+            text = (
+                block.replace("turret.urdf", str(urdf))
+                .replace("--tip tool", f"--tip {tip}")
+                .replace("turret", name)
+            )
             left = seconds - (time.monotonic() - started)
             try:
                 subprocess.run(
@@ -78,7 +88,9 @@ def complete(name: str, urdf: Path, tip: str, seconds: float) -> dict[str, Any]:
             except subprocess.TimeoutExpired:
                 outcome = f"not finished within {seconds:g} s"
             except subprocess.CalledProcessError as error:
-                lines = error.stderr.decode(errors="replace").strip().splitlines() or ["no message"]
+                lines = error.stderr.decode(errors="replace").strip().splitlines() or [
+                    "no message"
+                ]
                 outcome = f"exit code {error.returncode}: {lines[-1]:.120}"
             if outcome != "completed":
                 break
@@ -92,13 +104,34 @@ def gap(name: str, urdf: Path, tip: str) -> dict[str, Any]:
     from cnpgen.problems.problem_file import load_problem
 
     with tempfile.TemporaryDirectory(prefix="cnpgen-arm-") as folder:
-        command = [sys.executable, "-m", "cnpgen", "init", name, "--urdf", str(urdf), "--tip", tip]
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        command = [
+            sys.executable,
+            "-m",
+            "cnpgen",
+            "init",
+            name,
+            "--urdf",
+            str(urdf),
+            "--tip",
+            tip,
+        ]
+        done = subprocess.run(
+            command, cwd=folder, capture_output=True, text=True, check=False
+        )
         if done.returncode:
-            return {"arm": name, "outcome": f"{done.stderr.strip().splitlines()[-1]:.120}"}
+            return {
+                "arm": name,
+                "outcome": f"{done.stderr.strip().splitlines()[-1]:.120}",
+            }
         robot = load_problem(Path(folder) / name / "problem.toml").robot
-    hulls = re.search(r"convex hulls of the meshes reject ([\d.]+)% of the states", done.stderr)
-    return {"arm": name, "hulls": float(hulls[1]) / 100 if hulls else None, "parts": robot.hull_gap}
+    hulls = re.search(
+        r"convex hulls of the meshes reject ([\d.]+)% of the states", done.stderr
+    )
+    return {
+        "arm": name,
+        "hulls": float(hulls[1]) / 100 if hulls else None,
+        "parts": robot.hull_gap,
+    }
 
 
 def named_urdf(text: str) -> tuple[str, tuple[str, str]]:
@@ -114,21 +147,32 @@ def report_gaps(found: dict[str, tuple[str, str]], *, as_json: bool) -> None:
         rows.append(gap(name, robots() / file, tip))
         progress(f"{name}: {rows[-1]}")
     cells = [
-        (row["arm"], f"{row['hulls']:.2%}", f"{row['parts']:.2%}", *verdict(row["parts"], MAX_GAP, at_most=True))
+        (
+            row["arm"],
+            f"{row['hulls']:.2%}",
+            f"{row['parts']:.2%}",
+            *verdict(row["parts"], MAX_GAP, at_most=True),
+        )
         if "parts" in row
         else (row["arm"], "", "", row["outcome"], "")
         for row in rows
     ]
     report(
-        {"gaps": rows}, [table("free states rejected", ("arm", "hulls", "parts", "target", ""), cells)], as_json=as_json
+        {"gaps": rows},
+        [table("free states rejected", ("arm", "hulls", "parts", "target", ""), cells)],
+        as_json=as_json,
     )
 
 
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--arms", nargs="+", choices=tuple(ARMS), default=[*ARMS])
     parser.add_argument("--timeout", type=float, default=3600, help="seconds per arm")
-    parser.add_argument("--gaps", action="store_true", help="measure the convex parts of links instead")
-    parser.add_argument("--urdf", nargs="+", type=named_urdf, default=[], metavar="NAME=FILE:TIP")
+    parser.add_argument(
+        "--gaps", action="store_true", help="measure the convex parts of links instead"
+    )
+    parser.add_argument(
+        "--urdf", nargs="+", type=named_urdf, default=[], metavar="NAME=FILE:TIP"
+    )
 
 
 def main() -> None:
@@ -136,11 +180,24 @@ def main() -> None:
     if chosen.gaps:
         report_gaps({**GAP_ARMS, **dict(chosen.urdf)}, as_json=chosen.json)
         return
-    rows = [complete(name, robots() / ARMS[name][0], ARMS[name][1], chosen.timeout) for name in chosen.arms]
+    rows = [
+        complete(name, robots() / ARMS[name][0], ARMS[name][1], chosen.timeout)
+        for name in chosen.arms
+    ]
     count = sum(row["outcome"] == "completed" for row in rows)
-    cells = [(row["arm"], f"{row['blocks']} of {row['of']}", row["outcome"]) for row in rows]
-    total = ("arms that complete the page", str(count), " ".join(verdict(count, min(TARGET, len(rows)))))
-    report({"arms": rows}, [table("other arms", ("arm", "blocks", "outcome"), [*cells, total])], as_json=chosen.json)
+    cells = [
+        (row["arm"], f"{row['blocks']} of {row['of']}", row["outcome"]) for row in rows
+    ]
+    total = (
+        "arms that complete the page",
+        str(count),
+        " ".join(verdict(count, min(TARGET, len(rows)))),
+    )
+    report(
+        {"arms": rows},
+        [table("other arms", ("arm", "blocks", "outcome"), [*cells, total])],
+        as_json=chosen.json,
+    )
 
 
 if __name__ == "__main__":

@@ -12,21 +12,20 @@ Example:
     >>> cnpgen.evaluate_plans(refined).valid  # judge with Pinocchio and Coal
     >>> cnpgen.save_plans("plans.h5", refined)
 
-Functions:
-    Datasets: ``make_dataset``, ``extend_dataset``, ``merge_datasets``, ``load_dataset``, ``inspect_dataset``,
-    ``validate_dataset``.
-    Problems: ``load_problem``, ``load_boundary_problems``, ``draw_boundary_problems``, ``complete``.
-    Plans: ``make_plans``, ``load_plans``, ``save_plans``, ``join_plans``, ``solve_plans``,
-    ``refine_plans``, ``explain_plans``, ``evaluate_plans``, ``evaluate_trajectories``, ``export_plans``.
-    Models: ``train_model``, ``load_model``, ``save_model``, ``plan_hits``.
-    Machine: ``check_machine``.
+Functions: Datasets: ``make_dataset``, ``extend_dataset``, ``merge_datasets``,
+    ``load_dataset``, ``inspect_dataset``, ``validate_dataset``. Problems:
+    ``load_problem``, ``load_boundary_problems``, ``draw_boundary_problems``,
+    ``complete``. Plans: ``make_plans``, ``load_plans``, ``save_plans``, ``join_plans``,
+    ``solve_plans``, ``refine_plans``, ``explain_plans``, ``evaluate_plans``,
+    ``evaluate_trajectories``, ``export_plans``. Models: ``train_model``,
+    ``load_model``, ``save_model``, ``plan_hits``. Machine: ``check_machine``.
 
-Classes:
-    ``Dataset``, ``Problem``, ``Scene``, ``RobotModel``, ``Boundary``, ``Motion``, ``Plans``, ``Planner``, ``Model``,
-    ``BoundaryLayer``, ``PlanLoss``, ``TrainingSettings``, ``RefineOptions``, ``CnpgenError``.
+Classes: ``Dataset``, ``Problem``, ``Scene``, ``RobotModel``, ``Boundary``, ``Motion``,
+    ``Plans``, ``Planner``, ``Model``, ``BoundaryLayer``, ``PlanLoss``,
+    ``TrainingSettings``, ``RefineOptions``, ``CnpgenError``.
 
-``help(cnpgen.Plans)`` documents one name, and the command ``cnpgen docs`` prints pages of the documentation. Other
-public names are in these modules:
+``help(cnpgen.Plans)`` documents one name, and the command ``cnpgen docs`` prints pages
+of the documentation. Other public names are in these modules:
 
 * ``cnpgen.recipes``: recipes of problems, pipelines and datasets, and their parts.
 * ``cnpgen.losses``: the loss of a plan, its metric and its margins.
@@ -37,7 +36,8 @@ public names are in these modules:
 * ``cnpgen.plugins``: contracts of stages, constraints, objectives and exporters.
 * ``cnpgen.addons.benchmark``: comparison of planners, and simulation of plans.
 
-Names load on first use, so that importing the package is cheap. ``__init__.pyi`` lists them for type checkers (SPEC 1).
+Names load on first use, so that importing the package is cheap. ``__init__.pyi`` lists
+them for type checkers (SPEC 1).
 """
 
 import sys
@@ -46,7 +46,16 @@ from typing import Any
 
 from cnpgen.schema.public_names import lazy_exports
 
-_MODULES = ("benchmark", "errors", "losses", "plugins", "recipes", "results", "scenes", "trajectories")
+_MODULES = (
+    "benchmark",
+    "errors",
+    "losses",
+    "plugins",
+    "recipes",
+    "results",
+    "scenes",
+    "trajectories",
+)
 _load, _names = lazy_exports(__name__, __file__)
 
 
@@ -56,6 +65,9 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """List the public names; none for ``help(cnpgen)``, which would print every class in full."""
+    """List the public names.
+
+    None for ``help(cnpgen)``, which would print every class in full.
+    """
     caller = sys._getframe(1).f_globals.get("__name__")
     return [] if caller == "inspect" else _names()

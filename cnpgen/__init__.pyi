@@ -6,7 +6,9 @@ from cnpgen.loader.load import load_dataset as load_dataset
 from cnpgen.losses.plan_loss import PlanLoss as PlanLoss
 from cnpgen.machine.versions import __version__ as __version__
 from cnpgen.make.complete import complete as complete
-from cnpgen.make.draw_boundary_problems import draw_boundary_problems as draw_boundary_problems
+from cnpgen.make.draw_boundary_problems import (
+    draw_boundary_problems as draw_boundary_problems,
+)
 from cnpgen.make.extend import extend_dataset as extend_dataset
 from cnpgen.make.make_dataset import make_dataset as make_dataset
 from cnpgen.make.merge import merge_datasets as merge_datasets
@@ -15,7 +17,9 @@ from cnpgen.planner.model import Model as Model
 from cnpgen.planner.model_file import load_model as load_model
 from cnpgen.planner.model_file import save_model as save_model
 from cnpgen.planner.planner import Planner as Planner
-from cnpgen.plans.boundary_problems import load_boundary_problems as load_boundary_problems
+from cnpgen.plans.boundary_problems import (
+    load_boundary_problems as load_boundary_problems,
+)
 from cnpgen.plans.evaluate import evaluate_plans as evaluate_plans
 from cnpgen.plans.export import export_plans as export_plans
 from cnpgen.plans.join import join_plans as join_plans

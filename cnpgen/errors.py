@@ -27,12 +27,14 @@ def _limited(text: str) -> str:
 class CnpgenError(Exception):
     """Base class of all exceptions that cnpgen raises intentionally.
 
-    Args:
-        message: The error. With ``argument`` it is a predicate: "must be positive, got 0". ``{name}`` stands for an
+    Args: message: The error. With ``argument`` it is a predicate: "must be positive,
+        got 0". ``{name}`` stands for an
             argument of ``remedies``.
         argument: Name of the invalid argument, which begins the text.
-        concerns: Name of the invalid argument if the message is a whole sentence; by default the first of ``remedies``.
-        remedies: Arguments that the message proposes, name -> value; None for any value.
+        concerns: Name of the invalid argument if the message is a whole sentence; by
+            default the first of ``remedies``.
+        remedies: Arguments that the message proposes, name -> value; None for any
+            value.
 
     Attributes:
         exit_code: Exit code of the command line.
@@ -66,7 +68,8 @@ class CnpgenError(Exception):
     def text(self, spelling: Spelling = python_spelling) -> str:
         """Return the message with all arguments in one spelling, by default as in a Python call.
 
-        A message of more than ``MAX_LINE_LENGTH`` characters keeps its beginning and its end.
+        A message of more than ``MAX_LINE_LENGTH`` characters keeps its beginning and
+        its end.
         """
         text = " ".join(str(part) for part in self.args)
         for name, value in self.remedies.items():
@@ -92,7 +95,9 @@ class RecipeError(CnpgenError):
 
     def __init__(self, errors: Sequence[str]) -> None:
         self.errors = tuple(_limited(error) for error in errors)
-        Exception.__init__(self, self.errors)  # required for pickling in worker processes
+        Exception.__init__(
+            self, self.errors
+        )  # required for pickling in worker processes
 
     def __str__(self) -> str:
         return "\n".join(self.errors)
@@ -117,11 +122,17 @@ class MachineError(CnpgenError):
 
 
 class MissingExtraError(MachineError, ImportError):
-    """An optional package that is missing or broken; the message names the extra of cnpgen that installs it."""
+    """An optional package that is missing or broken.
+
+    The message names the extra of cnpgen that installs it.
+    """
 
 
 class MissingAddonError(MachineError, ImportError):
-    """A package below ``cnpgen/addons`` that this installation lacks; the message names it and what needs it."""
+    """A package below ``cnpgen/addons`` that this installation lacks.
+
+    The message names it and what needs it.
+    """
 
 
 @contextmanager
@@ -134,8 +145,14 @@ def requires_extra(extra: str, package: str) -> Iterator[None]:
     """
     try:
         yield
-    except (ImportError, OSError, AttributeError) as error:  # broken installations raise any of them
-        raise MissingExtraError(f"{package} cannot be imported ({error}): pip install 'cnpgen[{extra}]'") from error
+    except (
+        ImportError,
+        OSError,
+        AttributeError,
+    ) as error:  # broken installations raise any of them
+        raise MissingExtraError(
+            f"{package} cannot be imported ({error}): pip install 'cnpgen[{extra}]'"
+        ) from error
 
 
 SYNONYMS = {  # words of other projects -> the word of a name here
@@ -165,8 +182,12 @@ def nearest(name: str, known: Iterable[str], *, similarity: float = 0.5) -> str:
     meant = "-".join(SYNONYMS.get(word, word) for word in name.split("-"))
     if meant != name and meant in names:
         return f" (did you mean {meant!r}?)"
-    completions = [candidate for candidate in names if len(name) > 2 and candidate.startswith(name)]
-    close = difflib.get_close_matches(name, names, n=1, cutoff=similarity) or completions
+    completions = [
+        candidate for candidate in names if len(name) > 2 and candidate.startswith(name)
+    ]
+    close = (
+        difflib.get_close_matches(name, names, n=1, cutoff=similarity) or completions
+    )
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
@@ -179,7 +200,9 @@ def listed(names: Sequence[object], most: int = 20) -> str:
 def lacks(noun: str, name: str, known: Iterable[str]) -> str:
     """Return the message for an unknown name: ``"has no split 'x', only train, test"``."""
     names = list(known)
-    return f"has no {noun} {name!r}{nearest(name, names)}, only {listed(names) or 'none'}"
+    return (
+        f"has no {noun} {name!r}{nearest(name, names)}, only {listed(names) or 'none'}"
+    )
 
 
 def either(choices: Sequence[str]) -> str:

@@ -18,7 +18,10 @@ from pathlib import Path
 from sphinx.application import Sphinx
 
 DOCS = Path(__file__).resolve().parent
-sys.path[:0] = [str(DOCS.parent), str(DOCS)]  # the package of this checkout; the scripts beside this file
+sys.path[:0] = [
+    str(DOCS.parent),
+    str(DOCS),
+]  # the package of this checkout; the scripts beside this file
 
 from gallery import CARDS, available, write_gallery  # noqa: E402
 from generate import BRIDGES, bridge_names, public_objects  # noqa: E402
@@ -31,7 +34,14 @@ author = "The cnpgen developers"
 copyright = author  # noqa: A001 - Sphinx reads this name
 version = release = __version__
 root_doc = "docs/index"
-include_patterns = ["*.md", "docs/**", "datasets/*.md", "datasets/**/*.md", "pipelines/*.md", "problems/*.md"]
+include_patterns = [
+    "*.md",
+    "docs/**",
+    "datasets/*.md",
+    "datasets/**/*.md",
+    "pipelines/*.md",
+    "problems/*.md",
+]
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 myst_heading_anchors = 4  # the anchors of headings are GitHub's
@@ -40,7 +50,10 @@ highlight_language = "none"  # blocks without a language
 autodoc_typehints_format = "short"
 autodoc_mock_imports = list(BRIDGES)  # the pages of the bridges need no framework
 napoleon_use_ivar = True  # attributes in docstrings describe those that autodoc lists
-linkcheck_ignore = [re.escape(DOCUMENTATION_URL), r"https?://(localhost|[\w.]*\bexample\.(org|com))\b"]  # not published
+linkcheck_ignore = [
+    re.escape(DOCUMENTATION_URL),
+    r"https?://(localhost|[\w.]*\bexample\.(org|com))\b",
+]  # not published
 linkcheck_timeout = 20  # [s]
 linkcheck_retries = 2
 
@@ -59,28 +72,48 @@ CAPTIONS = {
     "reference": "Reference",
     "benchmarks": "Benchmarks",
 }
-OTHERS = ("README", "CHANGELOG", "CONTRIBUTING", "SECURITY", "datasets/**", "pipelines/**", "problems/**")
+OTHERS = (
+    "README",
+    "CHANGELOG",
+    "CONTRIBUTING",
+    "SECURITY",
+    "datasets/**",
+    "pipelines/**",
+    "problems/**",
+)
 
 
 def toctree(entries: list[str], *options: str) -> str:
     """Return a hidden table of contents in MyST."""
-    return "\n".join(["", "```{toctree}", ":hidden:", *options, "", *entries, "```", ""])
+    return "\n".join(
+        ["", "```{toctree}", ":hidden:", *options, "", *entries, "```", ""]
+    )
 
 
 def add_navigation(_: Sphinx, docname: str, source: list[str]) -> None:
     """Append tables of contents to the pages that list others."""
     if docname == root_doc:
-        lists = source[0].partition("## Tutorials")[2]  # the table above it repeats some links
+        lists = source[0].partition("## Tutorials")[
+            2
+        ]  # the table above it repeats some links
         links = re.findall(r"\]\(([\w-]+)/([\w-]+)\.md\)", lists)
         for folder, caption in CAPTIONS.items():
-            pages = list(dict.fromkeys(f"{kind}/{page}" for kind, page in links if kind == folder))
+            pages = list(
+                dict.fromkeys(
+                    f"{kind}/{page}" for kind, page in links if kind == folder
+                )
+            )
             source[0] += toctree(pages, f":caption: {caption}")
-        source[0] += toctree([f"/{name}" for name in OTHERS], ":caption: Project", ":glob:")
+        source[0] += toctree(
+            [f"/{name}" for name in OTHERS], ":caption: Project", ":glob:"
+        )
     if docname.startswith("docs/tutorials/"):
         file = f"../../notebooks/{docname.rpartition('/')[2]}.ipynb"
         source[0] += f'\n<p><a href="{file}" download>This page as a notebook</a></p>\n'
     if docname.startswith("datasets/") and not source[0].startswith("#"):
-        source[0] = f"# {docname.rpartition('/')[2]}\n\n{source[0]}"  # cards have no heading
+        source[0] = (
+            f"# {docname.rpartition('/')[2]}\n\n{source[0]}"  # cards have no heading
+        )
     if docname == "docs/how-to/gallery":
         source[0] = with_pages(source[0])
     if docname == "docs/reference/api":
@@ -93,11 +126,15 @@ def with_pages(text: str) -> str:
         frame = f'<iframe src="../../gallery/{name}.html" title="{name}" loading="lazy"></iframe>'
         pattern = rf"<!-- gallery: {name} -->\n\n!\[[^\]]*\]\([^)]*\)"
         link = f'<a href="../../gallery/{name}.html">Open this page alone</a>'
-        text = re.sub(pattern, f'<div class="gallery">\n{frame}\n</div>\n<p>{link}</p>', text)
+        text = re.sub(
+            pattern, f'<div class="gallery">\n{frame}\n</div>\n<p>{link}</p>', text
+        )
     for name in CARDS:
         alt = f"Histograms, task space and acceptance of {name}"
         picture = f'<p><img src="../../gallery/{name}.png" alt="{alt}"></p>'
-        text = text.replace(f"<!-- card: {name} -->", picture if find_spec("matplotlib") else "")
+        text = text.replace(
+            f"<!-- card: {name} -->", picture if find_spec("matplotlib") else ""
+        )
     return text
 
 
@@ -109,8 +146,14 @@ def write_api_pages(app: Sphinx) -> None:
         old.unlink()
     objects, once = public_objects(), set[int]()
     kinds = {name: _kind(value) for name, value in objects.items()}
-    for name, kind in (kinds | {name: kind for name, (kind, _) in bridge_names().items()}).items():
-        members = "\n   :members:\n   :inherited-members: Exception, tuple, int, str" if kind == "class" else ""
+    for name, kind in (
+        kinds | {name: kind for name, (kind, _) in bridge_names().items()}
+    ).items():
+        members = (
+            "\n   :members:\n   :inherited-members: Exception, tuple, int, str"
+            if kind == "class"
+            else ""
+        )
         repeated = id(objects.get(name, name)) in once
         once.add(id(objects.get(name, name)))
         members += "\n   :no-index:" if repeated else ""  # a name of two modules
@@ -125,11 +168,21 @@ def _kind(value: object) -> str:
     return "function" if inspect.isroutine(value) else "data"
 
 
-def escape_bars(_: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:  # noqa: ARG001
+def escape_bars(
+    _: Sphinx,
+    what: str,  # noqa: ARG001
+    name: str,  # noqa: ARG001
+    obj: object,  # noqa: ARG001
+    options: object,  # noqa: ARG001
+    lines: list[str],
+) -> None:
     """Escape |x| outside of code: it is an absolute value, and reStructuredText has substitutions there."""
     for number, line in enumerate(lines):
         parts = re.split(r"(``.*?``)", line)
-        lines[number] = "".join(part if part.startswith("``") else part.replace("|", r"\|") for part in parts)
+        lines[number] = "".join(
+            part if part.startswith("``") else part.replace("|", r"\|")
+            for part in parts
+        )
 
 
 def write_downloads(app: Sphinx, error: Exception | None) -> None:

@@ -31,7 +31,11 @@ from cnpgen.store.inspection import inspect_dataset
 
 IMAGES = Path(__file__).parent / "images"
 SEED = 11
-CARDS = {"airhockey-hit": 3_000, "airhockey-replan": 3_000, "heavy-object": 3_000}  # dataset -> rows of its picture
+CARDS = {
+    "airhockey-hit": 3_000,
+    "airhockey-replan": 3_000,
+    "heavy-object": 3_000,
+}  # dataset -> rows of its picture
 PICTURE_SIZE = (900, 560)  # of a page in the browser [pixels]
 PICTURE_COLORS = 128
 CLUTTER = """
@@ -81,21 +85,33 @@ class Entry:
 
 def solved(recipe: str | Path, count: int, seed: int = SEED) -> Plans:
     """Solve the first problems of a recipe."""
-    return cnpgen.solve_plans(cnpgen.draw_boundary_problems(recipe, count, seed=seed), workers=1).plans
+    return cnpgen.solve_plans(
+        cnpgen.draw_boundary_problems(recipe, count, seed=seed), workers=1
+    ).plans
 
 
 def of_recipe(recipe: str, count: int) -> Callable[[], tuple[Plans, list[str]]]:
     """Return plans of a recipe, with their numbers as titles."""
-    return lambda: (solved(recipe, count), [f"{recipe}, problem {number}" for number in range(count)])
+    return lambda: (
+        solved(recipe, count),
+        [f"{recipe}, problem {number}" for number in range(count)],
+    )
 
 
 def clutter() -> tuple[Plans, list[str]]:
     """Solve problems of the heavy object among further obstacles."""
     with tempfile.TemporaryDirectory() as folder:
-        for name, text in copied_texts(load_pipeline("heavy-object"), "clutter").items():
-            (Path(folder) / name).write_text(text + (CLUTTER if name == "problem.toml" else ""), encoding="utf-8")
+        for name, text in copied_texts(
+            load_pipeline("heavy-object"), "clutter"
+        ).items():
+            (Path(folder) / name).write_text(
+                text + (CLUTTER if name == "problem.toml" else ""), encoding="utf-8"
+            )
         plans = solved(Path(folder) / "pipeline.toml", 3)
-    return plans, [f"heavy object among six obstacles, problem {number}" for number in range(len(plans))]
+    return plans, [
+        f"heavy object among six obstacles, problem {number}"
+        for number in range(len(plans))
+    ]
 
 
 def comparison() -> tuple[Plans, list[str]]:
@@ -106,11 +122,19 @@ def comparison() -> tuple[Plans, list[str]]:
     solution = cnpgen.solve_plans(problems, workers=1).plans
     shared = planned.columns.keys() & solution.columns.keys()
     parts = [
-        replace(part, columns={name: part.columns[name] for name in shared}) for part in (planned, refined, solution)
+        replace(part, columns={name: part.columns[name] for name in shared})
+        for part in (planned, refined, solution)
     ]
     plans = concatenate(parts)
-    names = ("shipped planner", "shipped planner, then refined", "solved without an initial guess")
-    titles = [f"{name}: {1e3 * time:.0f} ms" for name, time in zip(names, plans.duration, strict=True)]
+    names = (
+        "shipped planner",
+        "shipped planner, then refined",
+        "solved without an initial guess",
+    )
+    titles = [
+        f"{name}: {1e3 * time:.0f} ms"
+        for name, time in zip(names, plans.duration, strict=True)
+    ]
     return plans, titles
 
 
@@ -131,7 +155,11 @@ def available() -> list[str]:
         load_robot(cnpgen.load_problem("panda-cup"))
     except CnpgenError:
         has_robots = False
-    return [name for name, entry in ENTRIES.items() if has_viewer and (has_robots or not entry.robots)]
+    return [
+        name
+        for name, entry in ENTRIES.items()
+        if has_viewer and (has_robots or not entry.robots)
+    ]
 
 
 def write_page(name: str, folder: Path) -> Path:
@@ -158,7 +186,9 @@ def write_gallery(folder: Path) -> list[Path]:
     """Write all pages and cards that can be made here."""
     folder.mkdir(parents=True, exist_ok=True)
     pages = [write_page(name, folder) for name in available()]
-    cards = [write_card(name, folder) for name in CARDS] if find_spec("matplotlib") else []
+    cards = (
+        [write_card(name, folder) for name in CARDS] if find_spec("matplotlib") else []
+    )
     return [*pages, *cards]
 
 
@@ -166,31 +196,55 @@ def take_picture(page: Path, out: Path, frame: int) -> None:
     """Take a picture of a page with Chromium."""
     from PIL import Image
 
-    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    browser = (
+        shutil.which("chromium")
+        or shutil.which("chromium-browser")
+        or shutil.which("google-chrome")
+    )
     if browser is None:
         raise SystemExit("pictures need Chromium")
     with tempfile.TemporaryDirectory() as profile:
         shot = Path(profile) / "shot.png"
-        flags = ["--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", f"--screenshot={shot}"]
-        flags += ["--enable-unsafe-swiftshader", f"--user-data-dir={profile}", "--virtual-time-budget=8000"]
+        flags = [
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--use-angle=swiftshader",
+            f"--screenshot={shot}",
+        ]
+        flags += [
+            "--enable-unsafe-swiftshader",
+            f"--user-data-dir={profile}",
+            "--virtual-time-budget=8000",
+        ]
         size = "--window-size={},{}".format(*PICTURE_SIZE)
         subprocess.run(
-            [browser, *flags, size, f"{page.absolute().as_uri()}#time={frame}"], check=True, capture_output=True
+            [browser, *flags, size, f"{page.absolute().as_uri()}#time={frame}"],
+            check=True,
+            capture_output=True,
         )
         picture = Image.open(shot).convert("RGB")
-    picture.quantize(PICTURE_COLORS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(out, optimize=True)
+    picture.quantize(
+        PICTURE_COLORS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
+    ).save(out, optimize=True)
 
 
 def main() -> None:
     """Write the gallery into a folder."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--pictures", action="store_true", help="also take the pictures of the pages")
+    parser.add_argument(
+        "--pictures", action="store_true", help="also take the pictures of the pages"
+    )
     arguments = parser.parse_args()
     for path in write_gallery(arguments.folder):
         print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
         if arguments.pictures and path.suffix == ".html":
-            take_picture(path, IMAGES / f"gallery-{path.stem}.png", ENTRIES[path.stem].frame)
+            take_picture(
+                path, IMAGES / f"gallery-{path.stem}.png", ENTRIES[path.stem].frame
+            )
 
 
 if __name__ == "__main__":

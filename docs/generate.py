@@ -20,8 +20,21 @@ from cnpgen.cli.describe_keys import FILES, describe_keys
 from cnpgen.cli.main import build_parser
 
 FOLDER = Path(__file__).parent
-MODULES = ("recipes", "losses", "results", "benchmark", "scenes", "trajectories", "plugins", "errors")
-BRIDGES = ("torch", "jax", "tensorflow")  # their modules are read without an import of the framework
+MODULES = (
+    "recipes",
+    "losses",
+    "results",
+    "benchmark",
+    "scenes",
+    "trajectories",
+    "plugins",
+    "errors",
+)
+BRIDGES = (
+    "torch",
+    "jax",
+    "tensorflow",
+)  # their modules are read without an import of the framework
 
 COMMANDS_INTRODUCTION = """\
 # Command line
@@ -41,10 +54,16 @@ Names that are not listed here may change in every version ([releases](releases.
 
 def public_objects() -> dict[str, Any]:
     """Return all public names with their objects; a name of the package is not repeated for its modules."""
-    objects = {f"cnpgen.{name}": getattr(cnpgen, name) for name in sorted(dir(cnpgen)) if name != "__version__"}
+    objects = {
+        f"cnpgen.{name}": getattr(cnpgen, name)
+        for name in sorted(dir(cnpgen))
+        if name != "__version__"
+    }
     for part in MODULES:
         module = importlib.import_module(f"cnpgen.{part}")
-        names = getattr(module, "__all__", [name for name in vars(module) if name.endswith("Error")])
+        names = getattr(
+            module, "__all__", [name for name in vars(module) if name.endswith("Error")]
+        )
         for name in sorted(names):
             if getattr(cnpgen, name, None) is not getattr(module, name):
                 objects[f"cnpgen.{part}.{name}"] = getattr(module, name)
@@ -57,70 +76,123 @@ def bridge_names() -> dict[str, tuple[str, str]]:
     names = {}
     for framework in BRIDGES:
         single = folder / f"{framework}.py"
-        for file in [single] if single.is_file() else sorted((folder / framework).glob("*.py")):
-            public = _imported(folder / framework / "__init__.py") if file != single else None
+        for file in (
+            [single] if single.is_file() else sorted((folder / framework).glob("*.py"))
+        ):
+            public = (
+                _imported(folder / framework / "__init__.py")
+                if file != single
+                else None
+            )
             for node in ast.parse(file.read_text("utf-8")).body:
-                if not isinstance(node, ast.ClassDef | ast.FunctionDef) or node.name.startswith("_"):
+                if not isinstance(
+                    node, ast.ClassDef | ast.FunctionDef
+                ) or node.name.startswith("_"):
                     continue
                 if public is None or node.name in public:
                     kind = "class" if isinstance(node, ast.ClassDef) else "function"
-                    names[f"cnpgen.interop.{framework}.{node.name}"] = kind, ast.get_docstring(node) or ""
+                    names[f"cnpgen.interop.{framework}.{node.name}"] = (
+                        kind,
+                        ast.get_docstring(node) or "",
+                    )
     return dict(sorted(names.items()))
 
 
 def _imported(file: Path) -> set[str]:
     """Return the names that a module imports."""
     nodes = ast.walk(ast.parse(file.read_text("utf-8")))
-    return {alias.name for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names}
+    return {
+        alias.name
+        for node in nodes
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
 
 
 def describe_commands() -> str:
     """Describe all commands in Markdown."""
     parser = build_parser()
-    (commands,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+    (commands,) = (
+        action
+        for action in parser._actions
+        if isinstance(action, argparse._SubParsersAction)
+    )
     parts = [COMMANDS_INTRODUCTION]
     for name, command in commands.choices.items():
-        parts += [f"## `cnpgen {name}`", _escaped(command.description), *_tables(command)]
+        parts += [
+            f"## `cnpgen {name}`",
+            _escaped(command.description),
+            *_tables(command),
+        ]
         parts += [f"```\n{command.epilog.strip()}\n```"] if command.epilog else []
     codes = str(parser.epilog).partition("Exit codes:\n")[2]
-    rows = [" ".join(row.split()).partition(" ") for row in re.split(r"\n(?=  \d)", codes.strip("\n"))]
+    rows = [
+        " ".join(row.split()).partition(" ")
+        for row in re.split(r"\n(?=  \d)", codes.strip("\n"))
+    ]
     return "\n\n".join(
-        [*parts, "## Exit codes", _table(("code", "definition"), [(code, text) for code, _, text in rows])]
+        [
+            *parts,
+            "## Exit codes",
+            _table(("code", "definition"), [(code, text) for code, _, text in rows]),
+        ]
     )
 
 
 def _tables(command: argparse.ArgumentParser) -> Iterator[str]:
     """Yield the tables of the positional arguments and of the options."""
-    shown = [action for action in command._actions if action.help is not argparse.SUPPRESS]
+    shown = [
+        action for action in command._actions if action.help is not argparse.SUPPRESS
+    ]
     arguments = [action for action in shown if not action.option_strings]
-    options = [action for action in shown if action.option_strings and action.dest not in {"help", "debug"}]
+    options = [
+        action
+        for action in shown
+        if action.option_strings and action.dest not in {"help", "debug"}
+    ]
     for head, actions in (("argument", arguments), ("option", options)):
         if actions:
-            yield _table((head, "description"), [(f"`{_spelling(action)}`", _help(action)) for action in actions])
+            yield _table(
+                (head, "description"),
+                [(f"`{_spelling(action)}`", _help(action)) for action in actions],
+            )
 
 
 def _spelling(action: argparse.Action) -> str:
     """Return an argument as users write it: ``-o FILE, --out FILE``."""
-    value = action.metavar or ("|".join(map(str, action.choices)) if action.choices else action.dest.upper())
+    value = action.metavar or (
+        "|".join(map(str, action.choices)) if action.choices else action.dest.upper()
+    )
     value = " ".join(value) if isinstance(value, tuple) else value
-    value = {"+": f"{value}...", "*": f"[{value}...]", "?": f"[{value}]"}.get(str(action.nargs), value)
+    value = {"+": f"{value}...", "*": f"[{value}...]", "?": f"[{value}]"}.get(
+        str(action.nargs), value
+    )
     if not action.option_strings:
         return value
-    return ", ".join(option if action.nargs == 0 else f"{option} {value}" for option in action.option_strings)
+    return ", ".join(
+        option if action.nargs == 0 else f"{option} {value}"
+        for option in action.option_strings
+    )
 
 
 def _help(action: argparse.Action) -> str:
     """Return the help of an argument with its choices."""
     text = (action.help or "") % {**vars(action), "prog": "cnpgen"}
     hidden = action.choices if action.metavar else None
-    return text if hidden is None or all(str(choice) in text for choice in hidden) else f"{text} ({', '.join(hidden)})"
+    return (
+        text
+        if hidden is None or all(str(choice) in text for choice in hidden)
+        else f"{text} ({', '.join(hidden)})"
+    )
 
 
 def describe_names() -> str:
     """List all public names in Markdown."""
     groups: dict[str, list[tuple[str, str]]] = {}
     texts = {name: _documentation(value) for name, value in public_objects().items()}
-    for name, text in (texts | {name: text for name, (_, text) in bridge_names().items()}).items():
+    for name, text in (
+        texts | {name: text for name, (_, text) in bridge_names().items()}
+    ).items():
         summary = re.split(r"(?<=\.)\s", re.sub(r":\w+:`|``", "`", text))[0]
         module, _, short = name.rpartition(".")
         groups.setdefault(module, []).append((f"`{short}`", " ".join(summary.split())))
@@ -131,15 +203,25 @@ def describe_names() -> str:
 
 
 def _documentation(value: Any) -> str:
-    return inspect.getdoc(value) or "" if inspect.isclass(value) or inspect.isroutine(value) else "Constant."
+    return (
+        inspect.getdoc(value) or ""
+        if inspect.isclass(value) or inspect.isroutine(value)
+        else "Constant."
+    )
 
 
 def describe_index() -> str:
     """Return the first page, with the sections of the README that help to decide on cnpgen."""
     shared = (FOLDER.parent / "README.md").read_text(encoding="utf-8")
-    shared = shared[shared.index("## Two commands") : shared.index("## How it works")].replace("](docs/", "](")
+    shared = shared[
+        shared.index("## Two commands") : shared.index("## How it works")
+    ].replace("](docs/", "](")
     page = (FOLDER / "index.md").read_text(encoding="utf-8")
-    return page[: page.index("## Two commands")] + shared + page[page.index("## Tutorials") :].rstrip("\n")
+    return (
+        page[: page.index("## Two commands")]
+        + shared
+        + page[page.index("## Tutorials") :].rstrip("\n")
+    )
 
 
 def _table(head: tuple[str, str], rows: list[tuple[str, str]]) -> str:

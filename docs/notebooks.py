@@ -26,8 +26,12 @@ def write_notebooks(folder: Path) -> None:
     """Write one notebook for each tutorial."""
     folder.mkdir(parents=True, exist_ok=True)
     for page in sorted(TUTORIALS.glob("*.md")):
-        text = FILE_BLOCK.sub(r"```python\n%%writefile \1\n", page.read_text(encoding="utf-8"))
-        jupytext.write(jupytext.reads(HEADER + text, fmt="md"), folder / f"{page.stem}.ipynb")
+        text = FILE_BLOCK.sub(
+            r"```python\n%%writefile \1\n", page.read_text(encoding="utf-8")
+        )
+        jupytext.write(
+            jupytext.reads(HEADER + text, fmt="md"), folder / f"{page.stem}.ipynb"
+        )
 
 
 if __name__ == "__main__":

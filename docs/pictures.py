@@ -14,7 +14,9 @@ import cnpgen
 
 FOLDER = Path(__file__).parent / "images"
 BLUE, RED, GRAY, GREEN = "#1f5fa8", "#c0392b", "#7f8c8d", "#2e8b57"
-START = np.array([[-0.031, 0.728, -0.177, -0.573, -0.139, 1.590]])  # on the table, as in the tutorial
+START = np.array(
+    [[-0.031, 0.728, -0.177, -0.573, -0.139, 1.590]]
+)  # on the table, as in the tutorial
 GOAL = np.array([[0.025, 0.884, 0.185, -0.505, 0.112, 1.189]])
 
 
@@ -59,12 +61,23 @@ def draw_splines(plans: cnpgen.Plans) -> None:
     drawn = figure(6.4, 5.2)
     parts = drawn.subplot_mosaic([["path", "rate"], ["motion", "motion"]])
     path, rate, result = parts["path"], parts["rate"], parts["motion"]
-    for axes, points, color in ((path, motion.path[0, :, joint], BLUE), (rate, motion.rate[0], RED)):
+    for axes, points, color in (
+        (path, motion.path[0, :, joint], BLUE),
+        (rate, motion.rate[0], RED),
+    ):
         basis = BSpline(knots(len(points), degree), np.eye(len(points)), degree)(s)
         low, high = points.min(), points.max()
-        axes.plot(s, low - 0.45 * (high - low) + 0.3 * (high - low) * basis, color=GRAY, linewidth=0.6)
+        axes.plot(
+            s,
+            low - 0.45 * (high - low) + 0.3 * (high - low) * basis,
+            color=GRAY,
+            linewidth=0.6,
+        )
         axes.plot(s, basis @ points, color=color)
-        greville = [knots(len(points), degree)[i + 1 : i + 1 + degree].mean() for i in range(len(points))]
+        greville = [
+            knots(len(points), degree)[i + 1 : i + 1 + degree].mean()
+            for i in range(len(points))
+        ]
         axes.plot(greville, points, "o--", color=color, markersize=3, linewidth=0.5)
         axes.set_xlabel("phase s")
     path.set_title("path p(s) [rad]: joint 3")
@@ -85,7 +98,9 @@ def draw_manifold(plans: cnpgen.Plans) -> None:
     robot, s = cnpgen.RobotModel("airhockey"), np.linspace(0, 1, 200)
     layer = cnpgen.BoundaryLayer("airhockey", projection_steps=0)
     tasks = layer.tasks(rest_problem())
-    projected = layer.plans(tasks, np.zeros((1, layer.path_outputs)), np.zeros((1, layer.rate_outputs)))
+    projected = layer.plans(
+        tasks, np.zeros((1, layer.path_outputs)), np.zeros((1, layer.rate_outputs))
+    )
     line = START + s[:, None] * (GOAL - START)
     paths = {
         "line in joint space": (line, RED),
@@ -102,7 +117,13 @@ def draw_manifold(plans: cnpgen.Plans) -> None:
     side.set(title="height of the tip [mm]", xlabel="phase s")
     side.legend(fontsize=9)
     top.add_patch(Rectangle((-0.45, 0.6), 0.9, 1.4, fill=False, color=GRAY))
-    top.set(title="the tip seen from above [m]", xlabel="y", ylabel="x", xlim=(0.5, -0.5), ylim=(0.55, 1.25))
+    top.set(
+        title="the tip seen from above [m]",
+        xlabel="y",
+        ylabel="x",
+        xlim=(0.5, -0.5),
+        ylim=(0.55, 1.25),
+    )
     save(drawn, "manifold")
 
 
@@ -121,7 +142,9 @@ def draw_verdict(plans: cnpgen.Plans) -> None:
         part = slice(first, first + step + 1)
         second = np.gradient(np.gradient(value[part], t[part]), t[part])
         chord = np.interp(t[part], t[part][[0, -1]], value[part][[0, -1]])
-        swell = 0.5 * (t[part] - t[first]) * (t[first + step] - t[part])  # at most h^2 / 8
+        swell = (
+            0.5 * (t[part] - t[first]) * (t[first + step] - t[part])
+        )  # at most h^2 / 8
         low, high = chord - swell * second.max(), chord - swell * second.min()
         between.fill_between(t[part], low, high, color=BLUE, alpha=0.3, linewidth=0)
     between.plot(t, value, color=BLUE, linewidth=1)
@@ -130,7 +153,9 @@ def draw_verdict(plans: cnpgen.Plans) -> None:
         axes.axhline(1, color=RED, linewidth=0.8)
         axes.set_xlabel("t [s]")
     limits.set(title="accelerations / limit", ylim=(0, 1.15))
-    between.set(title="joint 4: samples, bounds, value", xlim=(0.03, 0.16), ylim=(-0.35, 1.15))
+    between.set(
+        title="joint 4: samples, bounds, value", xlim=(0.03, 0.16), ylim=(-0.35, 1.15)
+    )
     save(drawn, "verdict")
 
 
@@ -142,13 +167,42 @@ def draw_scenes() -> None:
     drawn = figure(6.4, 1.9)
     for sample, axes in enumerate(drawn.subplots(1, 3, sharey=True)):
         for body in plans.scene.bodies(sample):
-            low, high = body.position + body.corners.min(axis=0), body.position + body.corners.max(axis=0)
-            axes.add_patch(Rectangle((low[1], 0), high[1] - low[1], high[2], color=GRAY, alpha=0.6, linewidth=0))
-        positions, _ = robot.forward_kinematics(plans.motion.at(np.linspace(0, 1, 7)).q[sample])
+            low, high = (
+                body.position + body.corners.min(axis=0),
+                body.position + body.corners.max(axis=0),
+            )
+            axes.add_patch(
+                Rectangle(
+                    (low[1], 0),
+                    high[1] - low[1],
+                    high[2],
+                    color=GRAY,
+                    alpha=0.6,
+                    linewidth=0,
+                )
+            )
+        positions, _ = robot.forward_kinematics(
+            plans.motion.at(np.linspace(0, 1, 7)).q[sample]
+        )
         for number, (_, y, z) in enumerate(positions):
             ends = number in {0, len(positions) - 1}
-            axes.add_patch(Rectangle((y - 0.1, z - 0.15), 0.2, 0.3, fill=False, color=BLUE, alpha=1.0 if ends else 0.4))
-        axes.set(title=f"sample {sample}", xlabel="y [m]", xlim=(-0.8, 0.8), ylim=(0, 1.0), aspect="equal")
+            axes.add_patch(
+                Rectangle(
+                    (y - 0.1, z - 0.15),
+                    0.2,
+                    0.3,
+                    fill=False,
+                    color=BLUE,
+                    alpha=1.0 if ends else 0.4,
+                )
+            )
+        axes.set(
+            title=f"sample {sample}",
+            xlabel="y [m]",
+            xlim=(-0.8, 0.8),
+            ylim=(0, 1.0),
+            aspect="equal",
+        )
     drawn.axes[0].set_ylabel("z [m]")
     save(drawn, "scenes")
 
@@ -165,11 +219,20 @@ def draw_certification() -> None:
         x, y, _ = robot.forward_kinematics(q)[0].T
         axes.plot(x, y, color=BLUE if valid else RED, linewidth=0.7)
         axes.plot(x[0], y[0], "o", color=BLUE, markersize=2.5)
-        axes.annotate("", (x[-1], y[-1]), (x[-3], y[-3]), arrowprops={"arrowstyle": "->", "color": BLUE, "lw": 0.7})
+        axes.annotate(
+            "",
+            (x[-1], y[-1]),
+            (x[-3], y[-3]),
+            arrowprops={"arrowstyle": "->", "color": BLUE, "lw": 0.7},
+        )
     axes.add_patch(Rectangle((0.6, -0.45), 1.4, 0.9, fill=False, color=GRAY))
     count = int(refinement.valid.sum())
-    axes.set(title=f"{count} of {len(refinement.valid)} problems with a valid plan: paths of the tip [m]")
-    axes.set(xlabel="x", ylabel="y", xlim=(0.55, 1.45), ylim=(-0.5, 0.5), aspect="equal")
+    axes.set(
+        title=f"{count} of {len(refinement.valid)} problems with a valid plan: paths of the tip [m]"
+    )
+    axes.set(
+        xlabel="x", ylabel="y", xlim=(0.55, 1.45), ylim=(-0.5, 0.5), aspect="equal"
+    )
     save(drawn, "certification")
 
 

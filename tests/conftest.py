@@ -3,10 +3,21 @@
 # ruff: noqa: E402 - the environment comes first
 import os
 
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
-    os.environ[_variable] = "1"  # before NumPy is imported: its result must not depend on the machine's load
-os.environ["LOKY_MAX_CPU_COUNT"] = "1"  # the tests run side by side already: workers only where a test requests them
-os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # hundreds of processes would compile the whole package each
+for _variable in (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+):
+    os.environ[_variable] = (
+        "1"  # before NumPy is imported: its result must not depend on the machine's load
+    )
+os.environ["LOKY_MAX_CPU_COUNT"] = (
+    "1"  # the tests run side by side already: workers only where a test requests them
+)
+os.environ.pop(
+    "PYTHONDONTWRITEBYTECODE", None
+)  # hundreds of processes would compile the whole package each
 
 import ctypes
 import shutil
@@ -35,33 +46,47 @@ from cnpgen.store.layout import MANIFEST
 SHIPPED = ("airhockey-hit", "airhockey-replan", "heavy-object")
 TINY_ROWS = 660  # 600 + 60: three shards of training and one of validation
 TINY_SHARD = 250
-CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH, CAPABILITY_VERSION = 1, 2, 0x20080522  # of Linux: capabilities(7)
+CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH, CAPABILITY_VERSION = (
+    1,
+    2,
+    0x20080522,
+)  # of Linux: capabilities(7)
 HANGING = 1800  # [s] a longer run hangs on any machine
 
 
 def some(values: Iterable[Any], kept: int = 1, mark: str = "extended") -> list[Any]:
     """Parameters: the first few in every run, the others, which repeat the claim, in the slow or the extended run."""
-    return [value if at < kept else _marked(value, mark) for at, value in enumerate(values)]
+    return [
+        value if at < kept else _marked(value, mark) for at, value in enumerate(values)
+    ]
 
 
 def _marked(value: Any, mark: str) -> Any:
     chosen = getattr(pytest.mark, mark)
     if isinstance(value, type(pytest.param())):
         return pytest.param(*value.values, marks=(*value.marks, chosen), id=value.id)
-    return pytest.param(*(value if isinstance(value, tuple) else (value,)), marks=chosen)
+    return pytest.param(
+        *(value if isinstance(value, tuple) else (value,)), marks=chosen
+    )
 
 
-needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler on this machine")
+needs_compiler = pytest.mark.skipif(
+    find_compiler() is None, reason="no C compiler on this machine"
+)
 
 Prepare = Callable[..., PreparedPipeline]
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Let the tests run where there is no compiler, every dataset then after a warning, and in the background."""
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells start what runs in the background
+    if (
+        signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    ):  # as shells start what runs in the background
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if find_compiler() is None:
-        config.addinivalue_line("filterwarnings", "ignore:.*running on the NumPy backend:RuntimeWarning")
+        config.addinivalue_line(
+            "filterwarnings", "ignore:.*running on the NumPy backend:RuntimeWarning"
+        )
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -107,12 +132,18 @@ def prepare(fastest: Backend, cache_folder: Path) -> Prepare:
 
     @cache
     def by_name(name: str, backend: Backend, dtype: str) -> PreparedPipeline:
-        return PreparedPipeline(load_pipeline(name), backend=backend, cache_folder=cache_folder, dtype=dtype)
+        return PreparedPipeline(
+            load_pipeline(name), backend=backend, cache_folder=cache_folder, dtype=dtype
+        )
 
-    def prepared(what: str | Pipeline, backend: Backend | None = None, dtype: str = "float64") -> PreparedPipeline:
+    def prepared(
+        what: str | Pipeline, backend: Backend | None = None, dtype: str = "float64"
+    ) -> PreparedPipeline:
         if isinstance(what, str):
             return by_name(what, backend or fastest, dtype)
-        return PreparedPipeline(what, backend=backend or fastest, cache_folder=cache_folder, dtype=dtype)
+        return PreparedPipeline(
+            what, backend=backend or fastest, cache_folder=cache_folder, dtype=dtype
+        )
 
     return prepared
 
@@ -127,7 +158,9 @@ def kernels_of(cache_folder: Path) -> Callable[..., KernelLibrary]:
     return library
 
 
-def run_stages(prepared: PreparedPipeline, size: int, *, seed: int = 0, until: str = "") -> CandidateBatch:
+def run_stages(
+    prepared: PreparedPipeline, size: int, *, seed: int = 0, until: str = ""
+) -> CandidateBatch:
     """Run one round of draws through the stages, up to and including the first one of class ``until``."""
     draws, random = CandidateBatch(size), random_generator(seed, "train", 0)
     for stage in prepared.pipeline.stage:
@@ -148,7 +181,10 @@ class Arm:
         import pinocchio as pin
 
         self.pin, self.model, self.data = pin, robot.model, robot.model.createData()
-        self.tip, self.frame = robot.model.getFrameId(robot.tip), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        self.tip, self.frame = (
+            robot.model.getFrameId(robot.tip),
+            pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
+        )
 
     def pose(self, q: np.ndarray) -> Any:
         """Placement of the tip in the world."""
@@ -157,17 +193,31 @@ class Arm:
 
     def jacobian(self, q: np.ndarray) -> np.ndarray:
         """Jacobian of the tip in world axes, linear rows first, shape (6, n)."""
-        return np.array(self.pin.computeFrameJacobian(self.model, self.data, q, self.tip, self.frame))
+        return np.array(
+            self.pin.computeFrameJacobian(
+                self.model, self.data, q, self.tip, self.frame
+            )
+        )
 
     def velocity(self, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
         """Velocity of the tip [m/s]."""
         self.pin.forwardKinematics(self.model, self.data, q, dq)
-        return np.array(self.pin.getFrameVelocity(self.model, self.data, self.tip, self.frame).linear)
+        return np.array(
+            self.pin.getFrameVelocity(
+                self.model, self.data, self.tip, self.frame
+            ).linear
+        )
 
-    def acceleration(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
+    def acceleration(
+        self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray
+    ) -> np.ndarray:
         """Acceleration of the tip [m/s^2]."""
         self.pin.forwardKinematics(self.model, self.data, q, dq, ddq)
-        return np.array(self.pin.getFrameClassicalAcceleration(self.model, self.data, self.tip, self.frame).linear)
+        return np.array(
+            self.pin.getFrameClassicalAcceleration(
+                self.model, self.data, self.tip, self.frame
+            ).linear
+        )
 
     def torque(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
         """Inverse dynamics [N m]."""
@@ -176,12 +226,19 @@ class Arm:
 
 def without_stages(pipeline: Pipeline, *kinds: str) -> Pipeline:
     """Return the pipeline without its stages of some classes."""
-    return replace(pipeline, stage=tuple(stage for stage in pipeline.stage if type(stage).__name__ not in kinds))
+    return replace(
+        pipeline,
+        stage=tuple(
+            stage for stage in pipeline.stage if type(stage).__name__ not in kinds
+        ),
+    )
 
 
 def tiny_recipe(name: str, **changes: Any) -> DatasetRecipe:
     """A shipped recipe with few rows: 600 of training, 60 of validation."""
-    return replace(load_dataset_recipe(name), splits={"train": 600, "validation": 60}, **changes)
+    return replace(
+        load_dataset_recipe(name), splits={"train": 600, "validation": 60}, **changes
+    )
 
 
 @pytest.fixture(scope="session")
@@ -196,7 +253,9 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
         folder = shared / name
         with exclusive_lock(shared / f"{name}.lock"):
             if not (folder / MANIFEST).exists():
-                make_dataset(tiny_recipe(name), folder, shard_size=TINY_SHARD, workers=1)
+                make_dataset(
+                    tiny_recipe(name), folder, shard_size=TINY_SHARD, workers=1
+                )
         return folder
 
     return made

@@ -33,17 +33,38 @@ MAX_PACKAGES = 26
 # Packages of lower layers that must not be imported: the judge shares no code with the solvers that it checks.
 SOLVERS = ("kernels", "pipelines", "losses", "refine", "planner")
 INDEPENDENT = {"judges": SOLVERS, "world": SOLVERS, "benchmark.simulator": SOLVERS}
-HEAVY = ("casadi", "pinocchio", "coal", "h5py", "joblib", "scipy", "matplotlib", "daqp", "mujoco", "imageio", "ompl")
+HEAVY = (
+    "casadi",
+    "pinocchio",
+    "coal",
+    "h5py",
+    "joblib",
+    "scipy",
+    "matplotlib",
+    "daqp",
+    "mujoco",
+    "imageio",
+    "ompl",
+)
 FRAMEWORKS = ("torch", "jax", "tensorflow")
-BRIDGES = ("interop.jax", "interop.tensorflow")  # bridges of one file; users import them
+BRIDGES = (
+    "interop.jax",
+    "interop.tensorflow",
+)  # bridges of one file; users import them
 MODULES = sorted(
-    path.relative_to(PACKAGE).with_suffix("") for path in PACKAGE.rglob("*.py") if "_recipes" not in path.parts
+    path.relative_to(PACKAGE).with_suffix("")
+    for path in PACKAGE.rglob("*.py")
+    if "_recipes" not in path.parts
 )
 
 
 def name(module: Path) -> str:
     """Return the dotted name of a module without "cnpgen.": "store.files.atomic", "store" for its __init__."""
-    parts = module.parts[:-1] if module.name == "__init__" and len(module.parts) > 1 else module.parts
+    parts = (
+        module.parts[:-1]
+        if module.name == "__init__" and len(module.parts) > 1
+        else module.parts
+    )
     return ".".join(parts)
 
 
@@ -52,8 +73,12 @@ def package(module: str) -> str:
 
 
 def layer(module: str) -> int:
-    layers = [index for index, packages in enumerate(LAYERS) if package(module) in packages]
-    assert len(layers) == 1, f"the package {package(module)!r} is in {len(layers)} layers, expected one"
+    layers = [
+        index for index, packages in enumerate(LAYERS) if package(module) in packages
+    ]
+    assert len(layers) == 1, (
+        f"the package {package(module)!r} is in {len(layers)} layers, expected one"
+    )
     return layers[0]
 
 
@@ -82,7 +107,11 @@ NAMES = {name(module): module for module in MODULES}
 
 def modules_of(imported: Collection[str]) -> set[str]:
     """Return the package's own modules among imported names."""
-    return {target for target in (item.removeprefix("cnpgen.") for item in imported) if target in NAMES}
+    return {
+        target
+        for target in (item.removeprefix("cnpgen.") for item in imported)
+        if target in NAMES
+    }
 
 
 def test_a_module_imports_its_own_package_and_lower_layers_only() -> None:
@@ -94,20 +123,38 @@ def test_a_module_imports_its_own_package_and_lower_layers_only() -> None:
 
 
 def test_the_docs_list_every_package_in_its_layer() -> None:
-    page = (PACKAGE.parent / "docs" / "concepts" / "architecture.md").read_text(encoding="utf-8")
+    page = (PACKAGE.parent / "docs" / "concepts" / "architecture.md").read_text(
+        encoding="utf-8"
+    )
     block = page.split("## Import rules")[1].split("```")[1]
-    layers = tuple(tuple(line.split("  ")[0].split(", ")) for line in block.splitlines() if line.strip())
+    layers = tuple(
+        tuple(line.split("  ")[0].split(", "))
+        for line in block.splitlines()
+        if line.strip()
+    )
     assert layers == LAYERS
-    assert len([name for row in layers for name in row if (PACKAGE / name).is_dir()]) <= MAX_PACKAGES
-    assert {name for row in LAYERS for name in row} == {package(module) for module in NAMES}
+    assert (
+        len([name for row in layers for name in row if (PACKAGE / name).is_dir()])
+        <= MAX_PACKAGES
+    )
+    assert {name for row in LAYERS for name in row} == {
+        package(module) for module in NAMES
+    }
 
 
 def test_the_picture_shows_every_package_above_the_layers_that_it_may_import() -> None:
     picture = ElementTree.parse(PACKAGE.parent / "docs" / "images" / "packages.svg")
-    texts = [text for text in picture.iter("{http://www.w3.org/2000/svg}text") if text.get("class") == "n"]
+    texts = [
+        text
+        for text in picture.iter("{http://www.w3.org/2000/svg}text")
+        if text.get("class") == "n"
+    ]
     heights = {str(text.text): float(text.get("y", "nan")) for text in texts}
     assert heights.pop("cnpgen") < min(heights.values())  # the title
-    drawn = [{name for name, y in heights.items() if y == height} for height in sorted(set(heights.values()))]
+    drawn = [
+        {name for name, y in heights.items() if y == height}
+        for height in sorted(set(heights.values()))
+    ]
     assert drawn == [set(row) for row in reversed(LAYERS)]
 
 
@@ -121,7 +168,11 @@ def test_no_import_cycle_exists_not_even_for_types() -> None:
 def test_judges_do_not_import_the_solvers_that_they_check(part: str) -> None:
     for own, module in NAMES.items():
         if own == part or own.startswith(f"{part}."):
-            shared = {target for target in modules_of(imports(module)) if package(target) in INDEPENDENT[part]}
+            shared = {
+                target
+                for target in modules_of(imports(module))
+                if package(target) in INDEPENDENT[part]
+            }
             assert not shared, f"cnpgen.{own} imports {shared}"
 
 
@@ -131,14 +182,26 @@ def test_verdicts_evaluate_splines_by_their_own_code() -> None:
     for own, module in NAMES.items():
         if own.startswith("judges.plans."):
             prefix = "cnpgen.trajectory."
-            shared = {item.removeprefix(prefix) for item in imports(module) if item.startswith(prefix)}
+            shared = {
+                item.removeprefix(prefix)
+                for item in imports(module)
+                if item.startswith(prefix)
+            }
             assert shared <= data, f"cnpgen.{own} imports {shared - data}"
 
 
-def test_every_trace_of_the_docs_needs_at_most_nine_files_and_never_returns_to_one() -> None:
+def test_every_trace_of_the_docs_needs_at_most_nine_files_and_never_returns_to_one() -> (
+    None
+):
     """A file of a later step imports none of an earlier step, so that its calls lead forwards only."""
-    page = (PACKAGE.parent / "docs" / "concepts" / "architecture.md").read_text(encoding="utf-8")
-    traces = [re.findall(r"`([\w/]+)\.(?:py|c)`", section) for section in page.split("\n## ") if section[:2] == "A "]
+    page = (PACKAGE.parent / "docs" / "concepts" / "architecture.md").read_text(
+        encoding="utf-8"
+    )
+    traces = [
+        re.findall(r"`([\w/]+)\.(?:py|c)`", section)
+        for section in page.split("\n## ")
+        if section[:2] == "A "
+    ]
     assert len(traces) == 3
     for files in traces:
         assert len(files) == len(set(files)) <= 9, files
@@ -146,28 +209,47 @@ def test_every_trace_of_the_docs_needs_at_most_nine_files_and_never_returns_to_o
         assert set(names) <= set(NAMES), set(names) - set(NAMES)
         for step, own in enumerate(names):
             returns = modules_of(imports(NAMES[own])) & set(names[:step])
-            assert not returns, f"cnpgen.{own} imports {returns}, which an earlier step of its trace has left"
+            assert not returns, (
+                f"cnpgen.{own} imports {returns}, which an earlier step of its trace has left"
+            )
 
 
 def test_the_simulator_does_not_import_the_rest_of_the_benchmark() -> None:
     for own, module in NAMES.items():
         if own.startswith("benchmark.simulator"):
-            around = {target for target in modules_of(imports(module)) if package(target) == "benchmark"}
-            assert all(target.startswith("benchmark.simulator") for target in around - {"benchmark"}), (own, around)
+            around = {
+                target
+                for target in modules_of(imports(module))
+                if package(target) == "benchmark"
+            }
+            assert all(
+                target.startswith("benchmark.simulator")
+                for target in around - {"benchmark"}
+            ), (own, around)
 
 
 def test_problems_import_kernels_and_world_on_use_only() -> None:
     for own, module in NAMES.items():
         if package(own) == "problems":
             loaded = modules_of(imports(module, everywhere=False))
-            assert not {target for target in loaded if package(target) in {"kernels", "world"}}, own
+            assert not {
+                target for target in loaded if package(target) in {"kernels", "world"}
+            }, own
 
 
 def test_every_module_is_imported_or_registered() -> None:
     """Registered kinds are loaded by name; plug-in contracts, facades and bridges are for users."""
-    used = {target for module in MODULES for target in modules_of(imports(module))} | modules_of(public_modules())
-    by_name = {value.partition(":")[0].removeprefix("cnpgen.") for value in kinds_by_name()}
-    unused = {own for own, module in NAMES.items() if own not in used | by_name and module.name != "__init__"}
+    used = {
+        target for module in MODULES for target in modules_of(imports(module))
+    } | modules_of(public_modules())
+    by_name = {
+        value.partition(":")[0].removeprefix("cnpgen.") for value in kinds_by_name()
+    }
+    unused = {
+        own
+        for own, module in NAMES.items()
+        if own not in used | by_name and module.name != "__init__"
+    }
     assert unused <= {
         "__main__",
         "plugins",
@@ -182,8 +264,15 @@ def test_every_module_is_imported_or_registered() -> None:
 
 def public_modules() -> set[str]:
     """Return the modules of the public names in the stubs."""
-    stubs = [ast.parse(path.read_text(encoding="utf-8")) for path in PACKAGE.rglob("*.pyi")]
-    return {str(node.module) for stub in stubs for node in stub.body if isinstance(node, ast.ImportFrom)}
+    stubs = [
+        ast.parse(path.read_text(encoding="utf-8")) for path in PACKAGE.rglob("*.pyi")
+    ]
+    return {
+        str(node.module)
+        for stub in stubs
+        for node in stub.body
+        if isinstance(node, ast.ImportFrom)
+    }
 
 
 def kinds_by_name() -> set[str]:
@@ -194,20 +283,34 @@ def kinds_by_name() -> set[str]:
 
 def test_no_module_imports_a_heavy_library_at_module_level() -> None:
     for own, module in NAMES.items():
-        heavy = {imported.split(".")[0] for imported in imports(module, everywhere=False)} & set(HEAVY)
+        heavy = {
+            imported.split(".")[0] for imported in imports(module, everywhere=False)
+        } & set(HEAVY)
         assert not heavy, f"cnpgen.{own} imports {heavy}"
 
 
 def test_only_the_bridge_of_a_framework_imports_it() -> None:
     for module in MODULES:
-        frameworks = {imported.split(".")[0] for imported in imports(module)} & set(FRAMEWORKS)
-        own = set(name(module).split(".")[1:2]) if package(name(module)) == "interop" else set()
+        frameworks = {imported.split(".")[0] for imported in imports(module)} & set(
+            FRAMEWORKS
+        )
+        own = (
+            set(name(module).split(".")[1:2])
+            if package(name(module)) == "interop"
+            else set()
+        )
         assert frameworks <= own, f"{name(module)} imports {frameworks}"
 
 
 def python(code: str) -> str:
     root = str(PACKAGE.parent)
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=root,
+    )
     return done.stdout.splitlines()[-1]
 
 

@@ -10,9 +10,22 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-REPLACEMENTS: dict[str, str] = json.loads((ROOT / "tests" / "data" / "vocabulary.json").read_text(encoding="utf-8"))
-PREFIXES = {"MOST_": "MAX_", "ENOUGH": "MIN_", "ALONE": "MAX_ or MIN_", "SPARE": "MARGIN_", "DEEP": "DEPTH_"}
-EXCLUDED = {"CHANGELOG.md", "glossary.md", "references.md", "test_language.py"}  # old names, synonyms, titles, examples
+REPLACEMENTS: dict[str, str] = json.loads(
+    (ROOT / "tests" / "data" / "vocabulary.json").read_text(encoding="utf-8")
+)
+PREFIXES = {
+    "MOST_": "MAX_",
+    "ENOUGH": "MIN_",
+    "ALONE": "MAX_ or MIN_",
+    "SPARE": "MARGIN_",
+    "DEEP": "DEPTH_",
+}
+EXCLUDED = {
+    "CHANGELOG.md",
+    "glossary.md",
+    "references.md",
+    "test_language.py",
+}  # old names, synonyms, titles, examples
 EXTERNAL_NAMES = re.compile(r"warm_start_slack_\w+")  # options of Ipopt
 TEXT = ("*.py", "*.pyi", "*.c", "*.h", "*.html", "*.md", "*.toml")
 MAX_WORDS = 25
@@ -23,15 +36,30 @@ FOLDERS = ("cnpgen", "tests", "benchmarks", "docs", "problems", "pipelines", "da
 
 def texts() -> Iterator[Path]:
     """Yield every text file of the project."""
-    paths = [*ROOT.glob("*.md"), *(path for folder in FOLDERS for kind in TEXT for path in (ROOT / folder).rglob(kind))]
-    yield from (path for path in sorted(paths) if path.name not in EXCLUDED and "_recipes" not in path.parts)
+    paths = [
+        *ROOT.glob("*.md"),
+        *(
+            path
+            for folder in FOLDERS
+            for kind in TEXT
+            for path in (ROOT / folder).rglob(kind)
+        ),
+    ]
+    yield from (
+        path
+        for path in sorted(paths)
+        if path.name not in EXCLUDED and "_recipes" not in path.parts
+    )
 
 
 def sources() -> Iterator[tuple[str, ast.Module]]:
     """Yield the path and the syntax tree of every module of the package."""
     for path in sorted((ROOT / "cnpgen").rglob("*.py*")):
         if path.suffix in {".py", ".pyi"}:
-            yield path.relative_to(ROOT).as_posix(), ast.parse(path.read_text(encoding="utf-8"))
+            yield (
+                path.relative_to(ROOT).as_posix(),
+                ast.parse(path.read_text(encoding="utf-8")),
+            )
 
 
 def words_in(text: str) -> list[str]:
@@ -61,20 +89,33 @@ def test_private_words_occur_nowhere() -> None:
 
 
 def test_private_words_are_recognized_in_names_and_prose() -> None:
-    found = list(private_words("def settle_it(MOST_ROWS):\n    return FatesTable  # likewise"))
-    assert [word for _, word, _ in found] == ["settle", "MOST_ROWS", "fates", "likewise"]
+    found = list(
+        private_words("def settle_it(MOST_ROWS):\n    return FatesTable  # likewise")
+    )
+    assert [word for _, word, _ in found] == [
+        "settle",
+        "MOST_ROWS",
+        "fates",
+        "likewise",
+    ]
     assert found[0] == (1, "settle", "decide")
 
 
 def docstrings() -> Iterator[tuple[str, ast.AST, str]]:
     for path, tree in sources():
         for node in ast.walk(tree):
-            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (text := ast.get_docstring(node)):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (
+                text := ast.get_docstring(node)
+            ):
                 yield f"{path}:{getattr(node, 'lineno', 1)}", node, text
 
 
 def is_boolean_property(node: ast.AST) -> bool:
-    return isinstance(node, ast.FunctionDef) and node.returns is not None and "bool" in ast.unparse(node.returns)
+    return (
+        isinstance(node, ast.FunctionDef)
+        and node.returns is not None
+        and "bool" in ast.unparse(node.returns)
+    )
 
 
 def test_docstrings_begin_with_a_verb_or_a_noun() -> None:
@@ -89,10 +130,22 @@ def test_docstrings_begin_with_a_verb_or_a_noun() -> None:
 
 def is_number(node: ast.expr | None) -> bool:
     parts = (
-        [] if node is None else [part for part in ast.walk(node) if not isinstance(part, ast.operator | ast.unaryop)]
+        []
+        if node is None
+        else [
+            part
+            for part in ast.walk(node)
+            if not isinstance(part, ast.operator | ast.unaryop)
+        ]
     )
-    numbers = [part for part in parts if isinstance(part, ast.Constant) and isinstance(part.value, int | float)]
-    return bool(numbers) and all(isinstance(part, ast.BinOp | ast.UnaryOp) or part in numbers for part in parts)
+    numbers = [
+        part
+        for part in parts
+        if isinstance(part, ast.Constant) and isinstance(part.value, int | float)
+    ]
+    return bool(numbers) and all(
+        isinstance(part, ast.BinOp | ast.UnaryOp) or part in numbers for part in parts
+    )
 
 
 def test_no_numeric_constant_has_two_values() -> None:
@@ -107,25 +160,41 @@ def test_no_numeric_constant_has_two_values() -> None:
                 else []
             )
             for target in targets:
-                if isinstance(target, ast.Name) and target.id.isupper() and is_number(getattr(node, "value", None)):
-                    values[target.id][ast.unparse(node.value)].append(f"{path}:{node.lineno}")
+                if (
+                    isinstance(target, ast.Name)
+                    and target.id.isupper()
+                    and is_number(getattr(node, "value", None))
+                ):
+                    values[target.id][ast.unparse(node.value)].append(
+                        f"{path}:{node.lineno}"
+                    )
     findings = [
-        f"{name} = {dict(places)}: give each a name of its own" for name, places in values.items() if len(places) > 1
+        f"{name} = {dict(places)}: give each a name of its own"
+        for name, places in values.items()
+        if len(places) > 1
     ]
     assert not findings, "\n".join(findings)
 
 
 def test_no_constant_is_assigned_twice_without_use_of_its_first_value() -> None:
     findings = []
-    for path in (path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py"))):
+    for path in (
+        path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py"))
+    ):
         lines: dict[str, int] = {}
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
             for target in node.targets if isinstance(node, ast.Assign) else []:
                 if not isinstance(target, ast.Name) or not target.id.isupper():
                     continue
-                used = {part.id for part in ast.walk(node.value) if isinstance(part, ast.Name)}
+                used = {
+                    part.id
+                    for part in ast.walk(node.value)
+                    if isinstance(part, ast.Name)
+                }
                 if target.id in lines and target.id not in used:
-                    findings.append(f"{path.relative_to(ROOT)}:{node.lineno}: {target.id}, see line {lines[target.id]}")
+                    findings.append(
+                        f"{path.relative_to(ROOT)}:{node.lineno}: {target.id}, see line {lines[target.id]}"
+                    )
                 lines[target.id] = node.lineno
     assert not findings, "\n".join(findings)
 
@@ -136,7 +205,11 @@ def test_no_two_classes_have_the_same_name() -> None:
         for node in ast.walk(tree):
             if isinstance(node, ast.ClassDef):
                 classes[node.name].append(f"{path}:{node.lineno}")
-    findings = [f"{name}: {', '.join(places)}" for name, places in classes.items() if len(places) > 1]
+    findings = [
+        f"{name}: {', '.join(places)}"
+        for name, places in classes.items()
+        if len(places) > 1
+    ]
     assert not findings, "\n".join(findings)
 
 
@@ -144,7 +217,9 @@ def test_few_file_names_occur_in_several_packages() -> None:
     places: dict[str, list[str]] = defaultdict(list)
     for path, _ in sources():
         stem = Path(path).stem
-        if stem not in {"__init__", "__main__"} and not path.endswith(".pyi"):  # stubs have the names of their modules
+        if stem not in {"__init__", "__main__"} and not path.endswith(
+            ".pyi"
+        ):  # stubs have the names of their modules
             places[stem].append(path)
     repeated = {stem: paths for stem, paths in places.items() if len(paths) > 1}
     assert len(repeated) < 8, repeated
@@ -152,9 +227,18 @@ def test_few_file_names_occur_in_several_packages() -> None:
 
 def sentences(text: str) -> list[str]:
     """Split a page into sentences of more than three words, without code, tables, comments and pictures."""
-    prose = re.sub(r"```[\s\S]*?```|<!--[\s\S]*?-->|!\[[^\]]*\]\([^)]*\)|^[|#].*$", "", text, flags=re.MULTILINE)
+    prose = re.sub(
+        r"```[\s\S]*?```|<!--[\s\S]*?-->|!\[[^\]]*\]\([^)]*\)|^[|#].*$",
+        "",
+        text,
+        flags=re.MULTILINE,
+    )
     paragraphs = re.split(r"\n\s*\n|^\s*(?:[-*]|\d+\.)\s", prose, flags=re.MULTILINE)
-    parts = [part for paragraph in paragraphs for part in re.split(r"(?<=[.!?])\s+(?=[A-Z`])", paragraph)]
+    parts = [
+        part
+        for paragraph in paragraphs
+        for part in re.split(r"(?<=[.!?])\s+(?=[A-Z`])", paragraph)
+    ]
     return [part for part in parts if len(part.split()) > 3]
 
 
@@ -163,14 +247,25 @@ BIBLIOGRAPHY = "references.md"  # titles of articles are not sentences
 
 
 @pytest.mark.parametrize(
-    "page", [page for page in PAGES if page.name != BIBLIOGRAPHY], ids=lambda page: page.relative_to(ROOT).as_posix()
+    "page",
+    [page for page in PAGES if page.name != BIBLIOGRAPHY],
+    ids=lambda page: page.relative_to(ROOT).as_posix(),
 )
 def test_sentences_of_a_page_are_short(page: Path) -> None:
-    lengths = {" ".join(text.split()): len(text.split()) for text in sentences(page.read_text(encoding="utf-8"))}
-    long = [f"{words} words: {text}" for text, words in lengths.items() if words > MAX_WORDS]
+    lengths = {
+        " ".join(text.split()): len(text.split())
+        for text in sentences(page.read_text(encoding="utf-8"))
+    }
+    long = [
+        f"{words} words: {text}" for text, words in lengths.items() if words > MAX_WORDS
+    ]
     assert len(long) <= MAX_LONG_SHARE * max(len(lengths), 1), "\n".join(long)
 
 
 def test_the_mean_length_of_all_sentences_is_small() -> None:
-    lengths = [len(text.split()) for page in PAGES for text in sentences(page.read_text(encoding="utf-8"))]
+    lengths = [
+        len(text.split())
+        for page in PAGES
+        for text in sentences(page.read_text(encoding="utf-8"))
+    ]
     assert sum(lengths) / len(lengths) <= MAX_MEAN_WORDS

@@ -18,7 +18,14 @@ from typing import Any
 import pytest
 
 import cnpgen
-from cnpgen.addons.benchmark.planners import cbirrt, crocoddyl, drake, rrtconnect, ruckig, sscbirrt
+from cnpgen.addons.benchmark.planners import (
+    cbirrt,
+    crocoddyl,
+    drake,
+    rrtconnect,
+    ruckig,
+    sscbirrt,
+)
 from cnpgen.addons.benchmark.simulator import rendering
 from cnpgen.addons.benchmark.simulator.execute import load_mujoco
 from cnpgen.addons.clusters.clusters import joined
@@ -51,12 +58,23 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
     pytest.importorskip("hatchling")
     copy, out = tmp_path_factory.mktemp("copy"), tmp_path_factory.mktemp("wheel")
     for name in ("cnpgen", "problems", "pipelines", "datasets", "docs"):
-        shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(
+            ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__")
+        )
     for name in ("pyproject.toml", "hatch_build.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, copy)
     for name in STRAY:
         (copy / name).write_text("stray")
-    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), str(copy)]
+    command = [
+        sys.executable,
+        "-m",
+        "build",
+        "--wheel",
+        "--no-isolation",
+        "--outdir",
+        str(out),
+        str(copy),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return zipfile.ZipFile(next(out.glob("*.whl")))
@@ -71,11 +89,21 @@ def test_the_wheel_carries_every_recipe_and_robot(wheel: zipfile.ZipFile) -> Non
     for folder in ("problems", "pipelines", "datasets"):
         for path in (ROOT / folder).rglob("*"):
             if path.is_file():
-                assert f"cnpgen/_recipes/{path.relative_to(ROOT).as_posix()}" in wheel.namelist()
+                assert (
+                    f"cnpgen/_recipes/{path.relative_to(ROOT).as_posix()}"
+                    in wheel.namelist()
+                )
     assert "cnpgen/py.typed" in wheel.namelist()
-    pages = {f"cnpgen/_recipes/{path.relative_to(ROOT).as_posix()}" for path in (ROOT / "docs").rglob("*.md")}
-    assert pages == {name for name in wheel.namelist() if name.startswith("cnpgen/_recipes/docs/")}
-    sources = [path.relative_to(ROOT).as_posix() for path in (ROOT / "cnpgen").rglob("*.[ch]")]
+    pages = {
+        f"cnpgen/_recipes/{path.relative_to(ROOT).as_posix()}"
+        for path in (ROOT / "docs").rglob("*.md")
+    }
+    assert pages == {
+        name for name in wheel.namelist() if name.startswith("cnpgen/_recipes/docs/")
+    }
+    sources = [
+        path.relative_to(ROOT).as_posix() for path in (ROOT / "cnpgen").rglob("*.[ch]")
+    ]
     assert "cnpgen/refine/solver/step.c" in sources
     assert set(sources) <= set(wheel.namelist())
 
@@ -88,7 +116,11 @@ def test_the_wheel_has_no_stray_files(wheel: zipfile.ZipFile) -> None:
         for folder in ("cnpgen", "problems", "pipelines", "datasets", "docs")
         for path in (ROOT / folder).rglob("*")
     )
-    expected = {path.relative_to(ROOT).as_posix() for path in tracked if path.is_file() and path.suffix != ".pyc"}
+    expected = {
+        path.relative_to(ROOT).as_posix()
+        for path in tracked
+        if path.is_file() and path.suffix != ".pyc"
+    }
     assert {name for name in shipped if ".dist-info/" not in name} <= expected
 
 
@@ -113,20 +145,26 @@ print(version("cnpgen"), len(cnpgen.recipes.list_recipes("dataset")))
 
 
 @pytest.mark.slow
-def test_what_the_wheel_installs_works_by_itself(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
+def test_what_the_wheel_installs_works_by_itself(
+    wheel: zipfile.ZipFile, tmp_path: Path
+) -> None:
     """Unpacked elsewhere, away from the repository: names, recipes, version, script."""
     site, home = tmp_path / "site", tmp_path / "home"
     wheel.extractall(site)
     home.mkdir()
     environment = {**os.environ, "PYTHONPATH": str(site)}
     command = [sys.executable, "-c", INSTALLED, str(site)]
-    done = subprocess.run(command, cwd=home, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=home, env=environment, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     shipped = len(list((ROOT / "datasets").glob("*.toml")))
     assert done.stdout.split() == [cnpgen.__version__, str(shipped)]
 
 
-def test_every_library_that_is_imported_is_a_declared_dependency(wheel: zipfile.ZipFile) -> None:
+def test_every_library_that_is_imported_is_a_declared_dependency(
+    wheel: zipfile.ZipFile,
+) -> None:
     imported = set()
     for path in (ROOT / "cnpgen").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -134,20 +172,35 @@ def test_every_library_that_is_imported_is_a_declared_dependency(wheel: zipfile.
                 imported |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
                 imported.add(node.module.split(".")[0])
-    (metadata,) = [name for name in wheel.namelist() if name.endswith(".dist-info/METADATA")]
-    declared = Parser().parsestr(wheel.read(metadata).decode()).get_all("Requires-Dist") or []
+    (metadata,) = [
+        name for name in wheel.namelist() if name.endswith(".dist-info/METADATA")
+    ]
+    declared = (
+        Parser().parsestr(wheel.read(metadata).decode()).get_all("Requires-Dist") or []
+    )
     libraries = {re.split(r"[^A-Za-z0-9_.-]", text)[0] for text in declared}
     others = imported - set(sys.stdlib_module_names) - {"cnpgen"}
-    assert {{"pinocchio": "pin", **NAMES_IN_THE_INDEX}.get(name, name) for name in others} <= libraries
+    assert {
+        {"pinocchio": "pin", **NAMES_IN_THE_INDEX}.get(name, name) for name in others
+    } <= libraries
 
 
-def test_what_the_default_run_of_the_tests_leaves_out_is_run_before_a_change_lands() -> None:
-    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["pytest"]["ini_options"]
+def test_what_the_default_run_of_the_tests_leaves_out_is_run_before_a_change_lands() -> (
+    None
+):
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))[
+        "tool"
+    ]["pytest"]["ini_options"]
     assert settings["addopts"][-2:] == ["-m", "not slow and not extended"]
-    assert {text.partition(":")[0] for text in settings["markers"]} == {"slow", "extended"}
+    assert {text.partition(":")[0] for text in settings["markers"]} == {
+        "slow",
+        "extended",
+    }
     command, script = "-m 'slow and not extended'", ROOT / ".ci" / "run"
     assert command in (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    assert not script.exists() or command in script.read_text(encoding="utf-8")  # a source distribution has none
+    assert not script.exists() or command in script.read_text(
+        encoding="utf-8"
+    )  # a source distribution has none
 
 
 def test_no_code_lives_beside_the_package() -> None:
@@ -167,19 +220,36 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 
 
 def test_the_version_and_the_address_are_the_same_everywhere() -> None:
-    citation = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.M)
-    changelog = re.search(r"^## \[(\d\S*)\]", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.M)
+    citation = re.search(
+        r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.M
+    )
+    changelog = re.search(
+        r"^## \[(\d\S*)\]", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.M
+    )
     assert citation is not None
     assert changelog is not None
     assert citation[1] == changelog[1] == cnpgen.__version__
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))[
+        "project"
+    ]
     assert project["dynamic"] == ["version", "urls"]
-    urls = dict(entry.split(", ") for entry in importlib.metadata.metadata("cnpgen").get_all("Project-URL", []))
+    urls = dict(
+        entry.split(", ")
+        for entry in importlib.metadata.metadata("cnpgen").get_all("Project-URL", [])
+    )
     assert urls["Homepage"] == DOCUMENTATION_URL
     assert urls.keys() >= {"Documentation", "Changelog"}
     assert all(url.startswith(DOCUMENTATION_URL) for url in urls.values())
-    sources = [path for pattern in ("*.toml", "cnpgen/**/*.py", "docs/**/*.md") for path in ROOT.glob(pattern)]
-    holders = [path.name for path in sources if DOCUMENTATION_URL in path.read_text(encoding="utf-8")]
+    sources = [
+        path
+        for pattern in ("*.toml", "cnpgen/**/*.py", "docs/**/*.md")
+        for path in ROOT.glob(pattern)
+    ]
+    holders = [
+        path.name
+        for path in sources
+        if DOCUMENTATION_URL in path.read_text(encoding="utf-8")
+    ]
     assert holders == ["versions.py"]
 
 
@@ -188,7 +258,11 @@ def bridge(framework: str) -> Callable[[], object]:
 
     def load() -> object:
         name = f"cnpgen.interop.{framework}"
-        loaded = [module for module in sys.modules if module == name or module.startswith(f"{name}.")]
+        loaded = [
+            module
+            for module in sys.modules
+            if module == name or module.startswith(f"{name}.")
+        ]
         for module in loaded:
             del sys.modules[module]
         return importlib.import_module(name)
@@ -230,15 +304,26 @@ OPTIONAL = {  # package that cnpgen imports -> extra that installs it, function 
     "pandas": ("pandas", lambda: frame("pandas")),
     "pyarrow": ("parquet", lambda: trajectories(".parquet")),
     "yaml": ("ros", lambda: trajectories(".yaml")),
-    "huggingface_hub": ("hub", lambda: upload_folder(Path(), "user/name", private=False)),
+    "huggingface_hub": (
+        "hub",
+        lambda: upload_folder(Path(), "user/name", private=False),
+    ),
 }
-NAMES_IN_THE_INDEX = {"yaml": "pyyaml", "pydrake": "drake", "huggingface_hub": "huggingface-hub"}
+NAMES_IN_THE_INDEX = {
+    "yaml": "pyyaml",
+    "pydrake": "drake",
+    "huggingface_hub": "huggingface-hub",
+}
 BY_NAME = {"meshcat", "polars", "pandas"}  # loaded by name, without an import statement
-SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))[
+    "project"
+]
 
 
 @pytest.mark.parametrize("package", OPTIONAL)
-def test_the_error_without_an_optional_package_names_its_extra(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_without_an_optional_package_names_its_extra(
+    package: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def without(name: str) -> Any:
         raise importlib.metadata.PackageNotFoundError(name)
 
@@ -247,10 +332,14 @@ def test_the_error_without_an_optional_package_names_its_extra(package: str, mon
     for name in (package, *parts):
         monkeypatch.setitem(sys.modules, name, None)
     for name in [name for name in sys.modules if name.startswith("cnpgen.interop.")]:
-        monkeypatch.setitem(sys.modules, name, sys.modules[name])  # put back after the test
+        monkeypatch.setitem(
+            sys.modules, name, sys.modules[name]
+        )  # put back after the test
     for function in ("version", "distribution"):
         monkeypatch.setattr(importlib.metadata, function, without)
-    with pytest.raises(MissingExtraError, match=rf"pip install 'cnpgen\[{extra}\]'") as caught:
+    with pytest.raises(
+        MissingExtraError, match=rf"pip install 'cnpgen\[{extra}\]'"
+    ) as caught:
         use()
     assert caught.value.exit_code == 3
     assert any(
@@ -265,14 +354,30 @@ def test_the_list_of_optional_packages_is_complete() -> None:
         for file in (ROOT / "cnpgen").rglob("*.py")
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
         if isinstance(node, ast.Import | ast.ImportFrom)
-        for name in ([node.module] if isinstance(node, ast.ImportFrom) else [alias.name for alias in node.names])
+        for name in (
+            [node.module]
+            if isinstance(node, ast.ImportFrom)
+            else [alias.name for alias in node.names]
+        )
     }
-    required = {re.split(r"[^\w-]", requirement)[0] for requirement in SETTINGS["dependencies"]}
+    required = {
+        re.split(r"[^\w-]", requirement)[0] for requirement in SETTINGS["dependencies"]
+    }
     required |= {"pinocchio", "cnpgen"}  # pinocchio is installed by `pin`
     assert imported - required - sys.stdlib_module_names == OPTIONAL.keys() - BY_NAME
 
 
-CITATION_KEYS = ("cff-version", "message", "title", "abstract", "type", "authors", "version", "license", "keywords")
+CITATION_KEYS = (
+    "cff-version",
+    "message",
+    "title",
+    "abstract",
+    "type",
+    "authors",
+    "version",
+    "license",
+    "keywords",
+)
 LEFT_TO_THE_PUBLISHER = ("date-released", "doi", "repository-code", "url")
 
 
@@ -287,45 +392,95 @@ def test_the_citation_is_complete_but_for_marked_lines_of_the_publisher() -> Non
         assert key in citation or re.search(rf"^# {key}: ", marked, re.M), key
 
 
-METADATA = ("Name", "Version", "Summary", "License-Expression", "Requires-Python", "Author", "Keywords", "Project-URL")
+METADATA = (
+    "Name",
+    "Version",
+    "Summary",
+    "License-Expression",
+    "Requires-Python",
+    "Author",
+    "Keywords",
+    "Project-URL",
+)
 
 
 def test_the_metadata_of_the_wheel_are_complete(wheel: zipfile.ZipFile) -> None:
-    (name,) = [name for name in wheel.namelist() if name.endswith(".dist-info/METADATA")]
+    (name,) = [
+        name for name in wheel.namelist() if name.endswith(".dist-info/METADATA")
+    ]
     metadata = Parser().parsestr(wheel.read(name).decode())
     assert [key for key in METADATA if not metadata.get(key)] == []
     assert metadata["Version"] == cnpgen.__version__
     assert metadata["Description-Content-Type"] == "text/markdown"
     assert metadata.get_payload().startswith("# cnpgen")
-    assert "License :: " not in str(metadata.get_all("Classifier"))  # replaced by the license expression
+    assert "License :: " not in str(
+        metadata.get_all("Classifier")
+    )  # replaced by the license expression
 
 
 def _install_command() -> str:
     """Return the install command of the README."""
     (block,) = re.findall(
-        r"<!-- install -->\n```bash\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S
+        r"<!-- install -->\n```bash\n(.*?)```",
+        (ROOT / "README.md").read_text(encoding="utf-8"),
+        re.S,
     )
     return str(block).strip()
 
 
 @pytest.mark.extended
-def test_the_release_is_built_and_the_install_command_of_the_readme_works_with_its_wheel(tmp_path: Path) -> None:
+def test_the_release_is_built_and_the_install_command_of_the_readme_works_with_its_wheel(
+    tmp_path: Path,
+) -> None:
     pytest.importorskip("build")
     source, dist, home = tmp_path / "source", tmp_path / "dist", tmp_path / "home"
-    ignored = shutil.ignore_patterns("__pycache__", ".git", ".venv", ".*_cache", "build", "dist", "shared")
+    ignored = shutil.ignore_patterns(
+        "__pycache__", ".git", ".venv", ".*_cache", "build", "dist", "shared"
+    )
     shutil.copytree(ROOT, source, ignore=ignored)
     home.mkdir()
-    _checked([sys.executable, "-m", "build", "--no-isolation", "--outdir", str(dist), str(source)], home)
+    _checked(
+        [
+            sys.executable,
+            "-m",
+            "build",
+            "--no-isolation",
+            "--outdir",
+            str(dist),
+            str(source),
+        ],
+        home,
+    )
     (built,), (archive,) = dist.glob("*.whl"), dist.glob("*.tar.gz")
     assert built.name == f"cnpgen-{cnpgen.__version__}-py3-none-any.whl"
     assert archive.name == f"cnpgen-{cnpgen.__version__}.tar.gz"
     if importlib.util.find_spec("twine"):
-        _checked([sys.executable, "-m", "twine", "check", "--strict", str(built), str(archive)], home)
+        _checked(
+            [
+                sys.executable,
+                "-m",
+                "twine",
+                "check",
+                "--strict",
+                str(built),
+                str(archive),
+            ],
+            home,
+        )
     command = _install_command()
     assert "'.[plot]'" in command
     if not _has_index(home):
         pytest.skip("no package index")
-    _checked(["bash", "-euo", "pipefail", "-c", command.replace("'.[plot]'", f"'{built}[plot]'")], home)
+    _checked(
+        [
+            "bash",
+            "-euo",
+            "pipefail",
+            "-c",
+            command.replace("'.[plot]'", f"'{built}[plot]'"),
+        ],
+        home,
+    )
     assert (home / "airhockey-replan-v1" / "manifest.json").is_file()
     script = str(home / ".venv" / "bin" / "cnpgen")
     assert "airhockey-hit" in _checked([script, "list"], home)
@@ -335,8 +490,17 @@ def test_the_release_is_built_and_the_install_command_of_the_readme_works_with_i
 
 def _checked(command: list[str], folder: Path) -> str:
     """Run a command without the repository on the path; return its output."""
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    environment = {
+        name: value for name, value in os.environ.items() if name != "PYTHONPATH"
+    }
+    done = subprocess.run(
+        command,
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -354,4 +518,7 @@ def _has_index(folder: Path) -> bool:
         str(folder / "probe"),
         "joblib",
     ]
-    return subprocess.run(command, cwd=folder, capture_output=True, check=False).returncode == 0
+    return (
+        subprocess.run(command, cwd=folder, capture_output=True, check=False).returncode
+        == 0
+    )

@@ -50,9 +50,15 @@ def names_in(module: str) -> dict[str, Any]:
             for line in node.body:
                 if isinstance(line, ast.ImportFrom) and line.module:
                     home = importlib.import_module(line.module)
-                    found |= {alias.asname or alias.name: getattr(home, alias.name) for alias in line.names}
+                    found |= {
+                        alias.asname or alias.name: getattr(home, alias.name)
+                        for alias in line.names
+                    }
                 elif isinstance(line, ast.Import):
-                    found |= {alias.asname or alias.name: importlib.import_module(alias.name) for alias in line.names}
+                    found |= {
+                        alias.asname or alias.name: importlib.import_module(alias.name)
+                        for alias in line.names
+                    }
     return found
 
 
@@ -69,9 +75,15 @@ def functions_of(kind: type) -> Iterator[FunctionType]:
     """Methods and properties that users call."""
     for name, member in vars(kind).items():
         if name in SPECIAL or not name.startswith("_"):
-            inner = member.fget if isinstance(member, property) else getattr(member, "func", member)
+            inner = (
+                member.fget
+                if isinstance(member, property)
+                else getattr(member, "func", member)
+            )
             function = inspect.unwrap(getattr(inner, "__func__", inner))
-            if inspect.isfunction(function) and function.__module__.startswith("cnpgen."):
+            if inspect.isfunction(function) and function.__module__.startswith(
+                "cnpgen."
+            ):
                 yield function
 
 
@@ -80,8 +92,12 @@ def annotated(public: Any) -> Iterator[tuple[str, Any]]:
     if inspect.isfunction(public):
         yield from typing.get_type_hints(public, names_in(public.__module__)).items()
     elif inspect.isclass(public):
-        for base in (each for each in public.__mro__ if each.__module__.startswith("cnpgen.")):
-            for name, hint in typing.get_type_hints(base, names_in(base.__module__)).items():
+        for base in (
+            each for each in public.__mro__ if each.__module__.startswith("cnpgen.")
+        ):
+            for name, hint in typing.get_type_hints(
+                base, names_in(base.__module__)
+            ).items():
                 if not name.startswith("_"):
                     yield name, hint
             for function in functions_of(base):
@@ -89,16 +105,31 @@ def annotated(public: Any) -> Iterator[tuple[str, Any]]:
                     yield f"{function.__name__}: {name}", hint
 
 
-MODULES = ("benchmark", "errors", "losses", "plugins", "recipes", "results", "scenes", "trajectories")
+MODULES = (
+    "benchmark",
+    "errors",
+    "losses",
+    "plugins",
+    "recipes",
+    "results",
+    "scenes",
+    "trajectories",
+)
 MAX_NAMES, MAX_HELP_LINES = 40, 400
-MAX_ANNOTATION_CHARACTERS = 80  # of one argument in a signature; NumPy's ArrayLike in full has 300
+MAX_ANNOTATION_CHARACTERS = (
+    80  # of one argument in a signature; NumPy's ArrayLike in full has 300
+)
 
 
 def public_names() -> dict[str, Any]:
     """Return all public names: those of the package and of its public modules."""
-    names = {name: getattr(cnpgen, name) for name in cnpgen.__all__ if name != "__version__"}
+    names = {
+        name: getattr(cnpgen, name) for name in cnpgen.__all__ if name != "__version__"
+    }
     for module in map(importlib.import_module, (f"cnpgen.{name}" for name in MODULES)):
-        listed = getattr(module, "__all__", [name for name in vars(module) if name.endswith("Error")])
+        listed = getattr(
+            module, "__all__", [name for name in vars(module) if name.endswith("Error")]
+        )
         names |= {f"{module.__name__}.{name}": getattr(module, name) for name in listed}
     return names
 
@@ -112,8 +143,14 @@ def test_every_class_in_a_public_signature_is_public() -> None:
         for kind in classes_in(hint)
         if kind not in known
     }
-    assert [f"{kind.__name__} in {where}" for kind, where in inner if kind.__name__ not in INNER] == []
-    assert {kind.__name__ for kind, _ in inner} == set(INNER), "listed here, but in no public signature"
+    assert [
+        f"{kind.__name__} in {where}"
+        for kind, where in inner
+        if kind.__name__ not in INNER
+    ] == []
+    assert {kind.__name__ for kind, _ in inner} == set(INNER), (
+        "listed here, but in no public signature"
+    )
 
 
 def test_the_walk_sees_functions_fields_methods_and_properties() -> None:
@@ -123,7 +160,12 @@ def test_the_walk_sees_functions_fields_methods_and_properties() -> None:
         for _, hint in annotated(owner)
         for kind in classes_in(hint)
     }
-    assert {cnpgen.Problem, cnpgen.Boundary, cnpgen.Scene, cnpgen.recipes.TrajectorySpec} <= classes
+    assert {
+        cnpgen.Problem,
+        cnpgen.Boundary,
+        cnpgen.Scene,
+        cnpgen.recipes.TrajectorySpec,
+    } <= classes
 
 
 STUBS = ["cnpgen", *(f"cnpgen.{name}" for name in MODULES if name != "errors")]
@@ -143,13 +185,20 @@ def test_the_package_has_few_names_and_help_is_short() -> None:
     assert len(lines) <= MAX_HELP_LINES
     assert any("cnpgen.make_dataset(" in line for line in lines[:15])
     text = "\n".join(lines)
-    assert all(f"``{name}``" in text for name in cnpgen.__all__ if name != "__version__")
+    assert all(
+        f"``{name}``" in text for name in cnpgen.__all__ if name != "__version__"
+    )
 
 
 def test_signatures_name_aliases_of_types_and_do_not_expand_them() -> None:
     public = public_names().values()
     classes = [kind for kind in public if inspect.isclass(kind)]
-    bases = {base for kind in classes for base in kind.__mro__ if base.__module__.startswith("cnpgen.")}
+    bases = {
+        base
+        for kind in classes
+        for base in kind.__mro__
+        if base.__module__.startswith("cnpgen.")
+    }
     functions = [each for each in public if inspect.isfunction(each)]
     functions += [function for base in bases for function in functions_of(base)]
     assert len(classes) > 80
@@ -157,8 +206,15 @@ def test_signatures_name_aliases_of_types_and_do_not_expand_them() -> None:
     long = {}
     for function in (*classes, *functions):
         signature = inspect.signature(function)
-        hints = [signature.return_annotation, *(each.annotation for each in signature.parameters.values())]
-        texts = [text for text in map(inspect.formatannotation, hints) if len(text) > MAX_ANNOTATION_CHARACTERS]
+        hints = [
+            signature.return_annotation,
+            *(each.annotation for each in signature.parameters.values()),
+        ]
+        texts = [
+            text
+            for text in map(inspect.formatannotation, hints)
+            if len(text) > MAX_ANNOTATION_CHARACTERS
+        ]
         long |= {function.__qualname__: texts} if texts else {}
     assert long == {}, "let the module begin with 'from __future__ import annotations'"
 
@@ -171,5 +227,7 @@ def test_public_modules_begin_with_one_sentence() -> None:
 
 def test_importing_the_package_loads_none_of_its_packages() -> None:
     code = "import sys, cnpgen; print(*sorted(name for name in sys.modules if name.startswith(('cnpgen', 'numpy'))))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert done.stdout.split() == ["cnpgen"]

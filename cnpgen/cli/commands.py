@@ -1,7 +1,8 @@
 """The commands of the core, and those that add-ons and other packages register in the group ``cnpgen.commands``.
 
-A command is a module with the functions of ``cnpgen.cli.parser.add_command``. An entry point with a dot in its name,
-such as ``evaluate.trajectories``, is an alternative input of a command (``cnpgen.cli.parser.Alternative``).
+A command is a module with the functions of ``cnpgen.cli.parser.add_command``. An entry
+point with a dot in its name, such as ``evaluate.trajectories``, is an alternative input
+of a command (``cnpgen.cli.parser.Alternative``).
 """
 
 from importlib import import_module
@@ -34,20 +35,27 @@ _CORE = {  # command -> module of cnpgen.cli, in the order of the help
 
 def command_names() -> list[str]:
     """List the commands: those of the core in the order of the help, then the others by name."""
-    others = {entry.name for entry in addons.installed(COMMANDS) if "." not in entry.name}
+    others = {
+        entry.name for entry in addons.installed(COMMANDS) if "." not in entry.name
+    }
     return [*_CORE, *sorted(others - _CORE.keys())]
 
 
 def is_command(name: str) -> bool:
-    """Return whether a word is a command, also one of a missing add-on; the core's need no metadata of packages."""
-    return name in _CORE or ("." not in name and addons.find(COMMANDS, name) is not None)
+    """Return whether a word is a command, also one of a missing add-on.
+
+    The core's need no metadata of packages.
+    """
+    return name in _CORE or (
+        "." not in name and addons.find(COMMANDS, name) is not None
+    )
 
 
 def load_command(name: str) -> ModuleType:
     """Import the module of a command.
 
-    Raises:
-        MissingAddonError: The command belongs to an add-on that this installation lacks.
+    Raises: MissingAddonError: The command belongs to an add-on that this installation
+        lacks.
     """
     if name in _CORE:
         return import_module(f"cnpgen.cli.{_CORE[name]}")
@@ -59,5 +67,9 @@ def load_command(name: str) -> ModuleType:
 
 def load_alternatives(name: str) -> list[Any]:
     """Import the alternative inputs of a command."""
-    entries = [entry for entry in addons.installed(COMMANDS) if entry.name.startswith(f"{name}.")]
+    entries = [
+        entry
+        for entry in addons.installed(COMMANDS)
+        if entry.name.startswith(f"{name}.")
+    ]
     return [addons.load_entry(entry, f"the command {name!r}") for entry in entries]

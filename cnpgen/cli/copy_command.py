@@ -1,8 +1,9 @@
 """Copy a recipe for editing.
 
-A dataset is copied as DIR/dataset.toml with its DIR/pipeline.toml and DIR/problem.toml, a pipeline with its problem.
-The copies have the name of the folder and refer to each other; the URDF is copied unless it belongs to a package. The
-path of the first file is printed on stdout. Existing files are replaced only with --force.
+A dataset is copied as DIR/dataset.toml with its DIR/pipeline.toml and DIR/problem.toml,
+a pipeline with its problem. The copies have the name of the folder and refer to each
+other; the URDF is copied unless it belongs to a package. The path of the first file is
+printed on stdout. Existing files are replaced only with --force.
 """
 
 import argparse
@@ -28,8 +29,14 @@ _NEXT = {
 def add_options(parser: Parser) -> None:
     text = "a shipped dataset, pipeline or problem (see 'cnpgen list')"
     parser.add_argument("recipe", metavar="NAME", type=recipe_names.shipped, help=text)
-    parser.add_argument("folder", metavar="DIR", help="folder of the copies; its name becomes theirs")
-    parser.add_argument("--kind", choices=("dataset", "pipeline", "problem"), help="kind, if several have this name")
+    parser.add_argument(
+        "folder", metavar="DIR", help="folder of the copies; its name becomes theirs"
+    )
+    parser.add_argument(
+        "--kind",
+        choices=("dataset", "pipeline", "problem"),
+        help="kind, if several have this name",
+    )
     parser.add_argument("--force", action="store_true", help="replace existing files")
 
 
@@ -41,7 +48,9 @@ def run(arguments: argparse.Namespace) -> None:
     folder = Path(arguments.folder)
     recipe, name = load_any(arguments.recipe, arguments.kind), folder.resolve().name
     if not re.match(NAME, name):
-        raise UsageError(f"DIR must be lower-case letters, digits and hyphens, such as my-hits; got {name!r}")
+        raise UsageError(
+            f"DIR must be lower-case letters, digits and hyphens, such as my-hits; got {name!r}"
+        )
     texts = copied_texts(recipe, name)
     recipe_names.check_absent(folder, texts, force=arguments.force)
     check_writable(folder)
@@ -49,7 +58,10 @@ def run(arguments: argparse.Namespace) -> None:
         write_file(folder / file, text)
     first = folder / next(iter(texts))
     print(first)
-    print(f"next: edit the files in {folder}, then: {_NEXT[first.stem].format(first)}", file=sys.stderr)
+    print(
+        f"next: edit the files in {folder}, then: {_NEXT[first.stem].format(first)}",
+        file=sys.stderr,
+    )
 
 
 def copied_texts(recipe: "Recipe", name: str) -> dict[str, str]:
@@ -73,5 +85,11 @@ def _changed(file: Path, **keys: str) -> str:
     """Return the text of a recipe file with other values of keys; comments stay."""
     text = file.read_text(encoding="utf-8")
     for key, value in keys.items():
-        text = re.sub(rf'^{key} *= *"[^"]*"', f'{key} = "{value}"', text, count=1, flags=re.MULTILINE)
+        text = re.sub(
+            rf'^{key} *= *"[^"]*"',
+            f'{key} = "{value}"',
+            text,
+            count=1,
+            flags=re.MULTILINE,
+        )
     return text

@@ -41,7 +41,10 @@ _LEFT_OUT = {
 
 
 def describe(recipe: Recipe) -> str:
-    """Describe a recipe, with everything that it refers to; raise RecipeError if the URDF does not fit the problem."""
+    """Describe a recipe, with everything that it refers to.
+
+    Raise RecipeError if the URDF does not fit the problem.
+    """
     if isinstance(recipe, DatasetRecipe):
         return f"{describe_dataset(recipe)}\n\n{describe(recipe.pipeline)}"
     if isinstance(recipe, Pipeline):
@@ -65,22 +68,42 @@ def describe_dataset(recipe: DatasetRecipe) -> str:
 
 def describe_pipeline(pipeline: Pipeline) -> str:
     """Describe the stages of a pipeline, numbered."""
-    steps = [(f"{number}.", kind_name(stage), stage.describe()) for number, stage in enumerate(pipeline.stage, 1)]
-    steps.append(("", "(always)", "reject samples whose stored values violate a constraint"))
-    return "\n".join([f"pipeline {pipeline.name}", *title_lines(pipeline.title), *table(steps, indent="  ")])
+    steps = [
+        (f"{number}.", kind_name(stage), stage.describe())
+        for number, stage in enumerate(pipeline.stage, 1)
+    ]
+    steps.append(
+        ("", "(always)", "reject samples whose stored values violate a constraint")
+    )
+    return "\n".join(
+        [
+            f"pipeline {pipeline.name}",
+            *title_lines(pipeline.title),
+            *table(steps, indent="  "),
+        ]
+    )
 
 
 def describe_problem(problem: Problem) -> str:
-    """Describe a problem: its robot, limits and constraints; raise RecipeError if the URDF does not fit."""
+    """Describe a problem: its robot, limits and constraints.
+
+    Raise RecipeError if the URDF does not fit.
+    """
     spec = problem.robot
-    facts = [("robot", f"{spec.urdf}, {len(spec.joints)} planned joints, tip {spec.tip!r}")]
+    facts = [
+        ("robot", f"{spec.urdf}, {len(spec.joints)} planned joints, tip {spec.tip!r}")
+    ]
     facts += [("object", numbers(problem.object))] if problem.object else []
     facts += [("payload", numbers(problem.payload))] if problem.payload else []
     facts += [("parameter", text) for text in problem.parameters.describe()]
-    facts += [("obstacle", f"{each.name}: {_obstacle(each)}") for each in problem.obstacle]
+    facts += [
+        ("obstacle", f"{each.name}: {_obstacle(each)}") for each in problem.obstacle
+    ]
     facts += [("motion", numbers(problem.trajectory))]
     objective = numbers(problem.objective)
-    facts += [("objective", f"minimum time, and {objective}" if objective else "minimum time")]
+    facts += [
+        ("objective", f"minimum time, and {objective}" if objective else "minimum time")
+    ]
     constraints = [(kind_name(item), numbers(item)) for item in problem.constraint]
     robot = load_robot(problem)
     return "\n".join(
@@ -101,9 +124,15 @@ def describe_problem(problem: Problem) -> str:
 
 def _obstacle(obstacle: Obstacle) -> str:
     """Describe an obstacle; a mesh by the number of its corners."""
-    same = [key.name for key in keys(Obstacle) if getattr(obstacle, key.name) == key.default]
+    same = [
+        key.name for key in keys(Obstacle) if getattr(obstacle, key.name) == key.default
+    ]
     text = numbers(obstacle, leave_out=("name", "mesh", *same))
-    return f"{text}, the hull of {len(corners_of(obstacle.mesh))} corners" if obstacle.mesh else text
+    return (
+        f"{text}, the hull of {len(corners_of(obstacle.mesh))} corners"
+        if obstacle.mesh
+        else text
+    )
 
 
 def _shape(problem: Problem, robot: Robot) -> list[str]:
@@ -125,25 +154,56 @@ def _shape(problem: Problem, robot: Robot) -> list[str]:
 
 def link_rows(shape: Shape) -> list[tuple[str, ...]]:
     """List the links: numbers of convex parts and corners, and the capsule that covers them."""
-    head = ("link", "convex parts", "corners", "capsule length [mm]", "radius [mm]", "overhang [mm]", "joint")
+    head = (
+        "link",
+        "convex parts",
+        "corners",
+        "capsule length [mm]",
+        "radius [mm]",
+        "overhang [mm]",
+        "joint",
+    )
     rows: list[tuple[str, ...]] = [head]
     for capsule in shape.capsules:
         parts = [part for part in shape.convex_parts if part.link == capsule.link]
-        corners, length = sum(len(part.vertices) for part in parts), math.dist(capsule.first, capsule.second)
-        lengths = (f"{1e3 * value:.1f}" for value in (length, capsule.radius, capsule.overhang))
+        corners, length = (
+            sum(len(part.vertices) for part in parts),
+            math.dist(capsule.first, capsule.second),
+        )
+        lengths = (
+            f"{1e3 * value:.1f}" for value in (length, capsule.radius, capsule.overhang)
+        )
         joint = shape.joints[capsule.link]
-        rows.append((capsule.link, str(len(parts)), str(corners), *lengths, str(joint) if joint else "none"))
+        rows.append(
+            (
+                capsule.link,
+                str(len(parts)),
+                str(corners),
+                *lengths,
+                str(joint) if joint else "none",
+            )
+        )
     return rows
 
 
 def pair_rows(shape: Shape) -> list[tuple[str, ...]]:
     """List the pairs of links: share of random states in which they collide, and their users."""
     head = ("links", "", "colliding", "false capsule contacts", "checked by")
-    return [head, *((pair.first, pair.second, *_shares(pair), _use(pair)) for pair in shape.pairs)]
+    return [
+        head,
+        *(
+            (pair.first, pair.second, *_shares(pair), _use(pair))
+            for pair in shape.pairs
+        ),
+    ]
 
 
 def _shares(pair: LinkPair) -> tuple[str, str]:
-    return ("", "") if math.isnan(pair.colliding) else (f"{pair.colliding:.2%}", f"{pair.mistaken:.2%}")
+    return (
+        ("", "")
+        if math.isnan(pair.colliding)
+        else (f"{pair.colliding:.2%}", f"{pair.mistaken:.2%}")
+    )
 
 
 def _use(pair: LinkPair) -> str:
@@ -159,7 +219,11 @@ def shape_to_dict(shape: Shape) -> dict[str, Any]:
             "link": each.link,
             "joint": shape.joints[each.link],
             "convex_parts": sum(part.link == each.link for part in shape.convex_parts),
-            "capsule": {"first": each.first.tolist(), "second": each.second.tolist(), "radius": each.radius},
+            "capsule": {
+                "first": each.first.tolist(),
+                "second": each.second.tolist(),
+                "radius": each.radius,
+            },
             "overhang": each.overhang,
         }
         for each in shape.capsules
@@ -190,13 +254,18 @@ def _limit_rows(problem: Problem, robot: Robot) -> list[tuple[str, ...]]:
     ]
     spoken_of = problem.uses_jerk or problem.limits.jerk is not None
     shown = [
-        (name, *with_units(robot.units(unit), cells)) for name, unit, cells in columns if spoken_of or name != "jerk"
+        (name, *with_units(robot.units(unit), cells))
+        for name, unit, cells in columns
+        if spoken_of or name != "jerk"
     ]
     return list(zip(("joint", "", *robot.joint_names), *shown, strict=True))
 
 
 def with_units(units: str, cells: Sequence[str]) -> tuple[str, ...]:
-    """Return a column of a table: the unit, then a cell per joint; cells have theirs where joints turn and slide."""
+    """Return a column of a table: the unit, then a cell per joint.
+
+    Cells have theirs where joints turn and slide.
+    """
     each = [unit_of(units, index) for index in range(len(cells))]
     if len(set(each)) == 1:
         return f"[{each[0]}]", *cells
@@ -210,7 +279,11 @@ def title_lines(title: str) -> list[str]:
 
 def numbers(obj: Any, *, leave_out: Sequence[str] = ()) -> str:
     """List the keys of an object that was read from a table, with values and units, without those left at nothing."""
-    values = [(key, getattr(obj, key.name)) for key in keys(type(obj)) if key.name not in leave_out]
+    values = [
+        (key, getattr(obj, key.name))
+        for key in keys(type(obj))
+        if key.name not in leave_out
+    ]
     shown = [(key, value) for key, value in values if value != key.default or value]
     return ", ".join(f"{key.name} {quantity(value, key.unit)}" for key, value in shown)
 
@@ -223,7 +296,11 @@ def quantity(value: Any, unit: str = "1") -> str:
 
 def _number(value: Any) -> str:
     if isinstance(value, Range):
-        return f"[{value.low:.6g}, {value.high:.6g}]" if value.low < value.high else f"{value.low:.6g}"
+        return (
+            f"[{value.low:.6g}, {value.high:.6g}]"
+            if value.low < value.high
+            else f"{value.low:.6g}"
+        )
     if isinstance(value, PerJoint):
         return _number(value.values)
     if isinstance(value, bool):
@@ -248,15 +325,27 @@ def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
     pipeline = recipe.pipeline if isinstance(recipe, DatasetRecipe) else recipe
     problem = pipeline.problem if isinstance(pipeline, Pipeline) else pipeline
     robot = load_robot(problem)
-    kind = {Problem: "problem", Pipeline: "pipeline", DatasetRecipe: "dataset"}[type(recipe)]
-    content: dict[str, Any] = {"kind": kind, "file": str(recipe.path), "recipe": resolved(recipe)}
+    kind = {Problem: "problem", Pipeline: "pipeline", DatasetRecipe: "dataset"}[
+        type(recipe)
+    ]
+    content: dict[str, Any] = {
+        "kind": kind,
+        "file": str(recipe.path),
+        "recipe": resolved(recipe),
+    }
     if isinstance(pipeline, Pipeline):
         content["recipe_sha256"] = recipe_digest(pipeline)
-        content["stages"] = [{"use": kind_name(stage), "text": stage.describe()} for stage in pipeline.stage]
+        content["stages"] = [
+            {"use": kind_name(stage), "text": stage.describe()}
+            for stage in pipeline.stage
+        ]
     content["joints"] = list(robot.joint_names)
     if robot.shape:
-        content["shape"] = shape_to_dict(robot.shape) | {"hull_gap": problem.robot.hull_gap}
+        content["shape"] = shape_to_dict(robot.shape) | {
+            "hull_gap": problem.robot.hull_gap
+        }
     content["limits"] = {
-        name: {"unit": robot.units(unit), "values": list(getattr(robot, name))} for name, unit in LIMITS.items()
+        name: {"unit": robot.units(unit), "values": list(getattr(robot, name))}
+        for name, unit in LIMITS.items()
     }
     return content

@@ -18,9 +18,17 @@ from cnpgen.schema.keys import Key, Range, keys
 from cnpgen.schema.toml import Kind
 from cnpgen.schema.units import PLAUSIBLE_MAX
 
-_CORE_FILES: dict[str, type] = {"problem": Problem, "pipeline": Pipeline, "dataset": DatasetRecipe}
+_CORE_FILES: dict[str, type] = {
+    "problem": Problem,
+    "pipeline": Pipeline,
+    "dataset": DatasetRecipe,
+}
 
-GROUPS = {Stage: registry.STAGES, Constraint: registry.CONSTRAINTS, ObjectiveTerm: registry.OBJECTIVES}
+GROUPS = {
+    Stage: registry.STAGES,
+    Constraint: registry.CONSTRAINTS,
+    ObjectiveTerm: registry.OBJECTIVES,
+}
 """Tables with a key ``use`` that names their kind -> registry of the kinds."""
 
 _INTRODUCTION = f"""\
@@ -40,7 +48,9 @@ quantities, such as tolerances, have smaller ones. Limits and sizes are also com
 def recipe_types() -> dict[str, type]:
     """Return kind of a file -> type of its recipe, also of add-ons."""
     others = addons.installed(registry.RECIPES)
-    return _CORE_FILES | {entry.name: addons.load_entry(entry, f"a {entry.name} file") for entry in others}
+    return _CORE_FILES | {
+        entry.name: addons.load_entry(entry, f"a {entry.name} file") for entry in others
+    }
 
 
 def kind_summary(kind: type) -> str:
@@ -57,14 +67,27 @@ def describe_kind(group: str, name: str) -> str:
     """Describe a kind of stage, constraint or objective term: its purpose, and the keys of its table."""
     kind = registry.load(group, name)
     head = ("key", "default", "description (value)")
-    rows = [(key.name, _default(key), f"{key.doc} ({_expected(key)})") for key in keys(kind)]
+    rows = [
+        (key.name, _default(key), f"{key.doc} ({_expected(key)})") for key in keys(kind)
+    ]
     text = table([head, *rows], indent="  ") if rows else ["  it has no keys"]
-    return "\n".join([f"{registry.noun_of(group)} {name}", *title_lines(kind_summary(kind)), "", *text])
+    return "\n".join(
+        [
+            f"{registry.noun_of(group)} {name}",
+            *title_lines(kind_summary(kind)),
+            "",
+            *text,
+        ]
+    )
 
 
 def kind_to_dict(group: str, name: str) -> dict[str, Any]:
     """Describe a kind of stage or constraint for JSON."""
-    return {"kind": registry.noun_of(group), "name": name, **_table_to_dict(registry.load(group, name))}
+    return {
+        "kind": registry.noun_of(group),
+        "name": name,
+        **_table_to_dict(registry.load(group, name)),
+    }
 
 
 def describe_keys(kinds: Sequence[Kind]) -> str:
@@ -72,12 +95,19 @@ def describe_keys(kinds: Sequence[Kind]) -> str:
     parts = [_INTRODUCTION] if len(kinds) > 1 else []
     types = recipe_types()
     for kind in kinds:
-        parts += [f"## {kind.capitalize()} files", _first_line(types[kind]), *_sections(types[kind], "")]
+        parts += [
+            f"## {kind.capitalize()} files",
+            _first_line(types[kind]),
+            *_sections(types[kind], ""),
+        ]
     return "\n\n".join(parts)
 
 
 def keys_to_dict(kinds: Sequence[Kind]) -> dict[str, Any]:
-    """Describe all keys of files of some kinds for JSON; of a table of tables each has its own keys."""
+    """Describe all keys of files of some kinds for JSON.
+
+    Of a table of tables each has its own keys.
+    """
     types = recipe_types()
     return {kind: _table_to_dict(types[kind]) for kind in kinds}
 
@@ -103,11 +133,20 @@ def _sections(cls: type, path: str) -> Iterator[str]:
 
 
 def part_of(key: Key) -> type | None:
-    """Return the table, or one of the tables, that a key holds in the same file; None where it holds a value."""
+    """Return the table, or one of the tables, that a key holds in the same file.
+
+    None where it holds a value.
+    """
     found: type = get_args(key.hint)[0] if is_array(key) else key.hint
     if found in GROUPS:
         return found
-    return found if dataclasses.is_dataclass(found) and keys(found) and found not in _CORE_FILES.values() else None
+    return (
+        found
+        if dataclasses.is_dataclass(found)
+        and keys(found)
+        and found not in _CORE_FILES.values()
+        else None
+    )
 
 
 def is_array(key: Key) -> bool:
@@ -118,7 +157,13 @@ def is_array(key: Key) -> bool:
 
 def _markdown_table(cls: type) -> str:
     rows = [
-        (f"`{key.name}`", _escaped(_expected(key)), _escaped(_default(key)), _escaped(key.doc)) for key in keys(cls)
+        (
+            f"`{key.name}`",
+            _escaped(_expected(key)),
+            _escaped(_default(key)),
+            _escaped(key.doc),
+        )
+        for key in keys(cls)
     ]
     lines = [("key", "value", "default", "description"), ("---",) * 4, *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
@@ -141,24 +186,40 @@ def _expected(key: Key) -> str:
     """Describe the accepted values: ``"a length [m], at least 0"``."""
     bounds = {"at least": key.low, "at most": key.high}
     given = ((which, bound) for which, bound in bounds.items() if bound is not None)
-    limits = [f"{which} {bound}" if isinstance(bound, int) else f"{which} {bound:g}" for which, bound in given]
+    limits = [
+        f"{which} {bound}" if isinstance(bound, int) else f"{which} {bound:g}"
+        for which, bound in given
+    ]
     return ", ".join([key.expected, *limits])
 
 
 def _table_to_dict(cls: type) -> dict[str, Any]:
-    return {"summary": kind_summary(cls), "keys": [_key_to_dict(key) for key in keys(cls)]}
+    return {
+        "summary": kind_summary(cls),
+        "keys": [_key_to_dict(key) for key in keys(cls)],
+    }
 
 
 def _key_to_dict(key: Key) -> dict[str, Any]:
     """Describe a key, and the table or the tables that it holds."""
     left_out, part = ("hint", "default", "since_version"), part_of(key)
-    content = {spec.name: getattr(key, spec.name) for spec in dataclasses.fields(key) if spec.name not in left_out}
+    content = {
+        spec.name: getattr(key, spec.name)
+        for spec in dataclasses.fields(key)
+        if spec.name not in left_out
+    }
     content |= {"expected": key.expected, "required": key.required}
     if part in GROUPS:
         group = GROUPS[part]
-        return content | {"kinds": [kind_to_dict(group, use) for use in registry.names(group)]}
+        return content | {
+            "kinds": [kind_to_dict(group, use) for use in registry.names(group)]
+        }
     if part is not None:
         return content | {"table": _table_to_dict(part)}
     if key.required:
         return content
-    return content | {"default": [key.default.low, key.default.high] if isinstance(key.default, Range) else key.default}
+    return content | {
+        "default": [key.default.low, key.default.high]
+        if isinstance(key.default, Range)
+        else key.default
+    }

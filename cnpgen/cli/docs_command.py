@@ -1,7 +1,7 @@
 """Print a page of the documentation as Markdown.
 
-Without PAGE it lists all pages. --search lists the lines that contain TEXT. Pictures are on the site and in the
-repository only.
+Without PAGE it lists all pages. --search lists the lines that contain TEXT. Pictures
+are on the site and in the repository only.
 """
 
 import argparse
@@ -18,9 +18,17 @@ KINDS = ("tutorials", "how-to", "concepts", "reference", "benchmarks")
 
 def add_options(parser: Parser) -> None:
     what = parser.add_mutually_exclusive_group()
-    what.add_argument("page", metavar="PAGE", nargs="?", help="name of a page, such as hit-a-puck")
-    what.add_argument("--search", metavar="TEXT", help="list the lines with TEXT on all pages, in any case")
-    parser.add_argument("--url", action="store_true", help="print the address of PAGE on the site")
+    what.add_argument(
+        "page", metavar="PAGE", nargs="?", help="name of a page, such as hit-a-puck"
+    )
+    what.add_argument(
+        "--search",
+        metavar="TEXT",
+        help="list the lines with TEXT on all pages, in any case",
+    )
+    parser.add_argument(
+        "--url", action="store_true", help="print the address of PAGE on the site"
+    )
     add_json(parser)
 
 
@@ -34,7 +42,9 @@ def run(arguments: argparse.Namespace) -> int:
     elif name is None:
         _list(pages, as_json=arguments.json)
     elif arguments.json:
-        _print_json({"page": name, "url": page_url(pages[name]), "markdown": _text(pages[name])})
+        _print_json(
+            {"page": name, "url": page_url(pages[name]), "markdown": _text(pages[name])}
+        )
     else:
         print(_text(pages[name]), end="")
     return 0
@@ -55,18 +65,28 @@ def list_pages() -> dict[str, Path]:
     """
     folder = docs_folder()
     if not (folder / "index.md").is_file():
-        raise MachineError(f"{folder} has no pages of the documentation: reinstall cnpgen")
+        raise MachineError(
+            f"{folder} has no pages of the documentation: reinstall cnpgen"
+        )
     pages = {"index": folder / "index.md"}
-    lists = _text(pages["index"]).partition("## Tutorials")[2]  # the table above it repeats some links
+    lists = _text(pages["index"]).partition("## Tutorials")[
+        2
+    ]  # the table above it repeats some links
     for kind in KINDS:
         prefix = "benchmarks/" if kind == "benchmarks" else ""
-        files = sorted((folder / kind).glob("*.md"), key=lambda file: lists.find(f"{file.parent.name}/{file.name}"))
+        files = sorted(
+            (folder / kind).glob("*.md"),
+            key=lambda file: lists.find(f"{file.parent.name}/{file.name}"),
+        )
         pages |= {prefix + file.stem: file for file in files}
     return pages
 
 
 def page_name(text: str, pages: dict[str, Path]) -> str:
-    """Return the name of a page from its name, its path, or a link to it; raise UsageError for other texts."""
+    """Return the name of a page from its name, its path, or a link to it.
+
+    Raise UsageError for other texts.
+    """
     path = PurePosixPath(text.partition("#")[0].removesuffix(".md"))
     folder = path.parent.name
     name = f"benchmarks/{path.name}" if folder == "benchmarks" else path.name
@@ -83,7 +103,10 @@ def page_url(page: Path) -> str:
 
 
 def mentioned_addresses(text: str) -> list[str]:
-    """Return the addresses of the pages that a text names as ``'cnpgen docs PAGE'``; none without installed pages."""
+    """Return the addresses of the pages that a text names as ``'cnpgen docs PAGE'``.
+
+    None without installed pages.
+    """
     names = re.findall(r"'cnpgen docs ([\w/-]+)'", " ".join(text.split()))
     with suppress(CnpgenError):
         pages = list_pages() if names else {}
@@ -97,17 +120,29 @@ def _text(page: Path) -> str:
 
 def _list(pages: dict[str, Path], *, as_json: bool) -> None:
     listed = {name: file for name, file in pages.items() if name != "index"}
-    titles = {name: _text(file).partition("\n")[0].removeprefix("# ") for name, file in listed.items()}
-    rows = [{"page": name, "kind": file.parent.name, "title": titles[name]} for name, file in listed.items()]
+    titles = {
+        name: _text(file).partition("\n")[0].removeprefix("# ")
+        for name, file in listed.items()
+    }
+    rows = [
+        {"page": name, "kind": file.parent.name, "title": titles[name]}
+        for name, file in listed.items()
+    ]
     if as_json:
         _print_json(rows)
         return
     width = max(map(len, pages))
     for kind in KINDS:
         print(f"{kind}:")
-        lines = [f"  {row['page']:<{width}}  {row['title']}" for row in rows if row["kind"] == kind]
+        lines = [
+            f"  {row['page']:<{width}}  {row['title']}"
+            for row in rows
+            if row["kind"] == kind
+        ]
         print(*lines, sep="\n", end="\n\n")
-    print("'cnpgen docs PAGE' prints a page, 'cnpgen docs --search TEXT' searches all pages.")
+    print(
+        "'cnpgen docs PAGE' prints a page, 'cnpgen docs --search TEXT' searches all pages."
+    )
 
 
 def _search(text: str, pages: dict[str, Path], *, as_json: bool) -> int:

@@ -1,8 +1,9 @@
 """Check this machine.
 
-The report on stdout has all results, warnings and problems with their remedies; problems are also printed on stderr.
-The exit code is 3 if a required library does not work. Without a C compiler cnpgen works 10 to 20 times slower.
-'cnpgen docs troubleshooting' has more remedies.
+The report on stdout has all results, warnings and problems with their remedies;
+problems are also printed on stderr. The exit code is 3 if a required library does not
+work. Without a C compiler cnpgen works 10 to 20 times slower. 'cnpgen docs
+troubleshooting' has more remedies.
 """
 
 import argparse
@@ -27,7 +28,11 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.validate.machine import check_machine
 
     report = check_machine()
-    print(json.dumps(report.to_dict(), indent=2) if arguments.json else machine_text(report))
+    print(
+        json.dumps(report.to_dict(), indent=2)
+        if arguments.json
+        else machine_text(report)
+    )
     for problem in report.problems:
         print(f"cnpgen: error: {problem}", file=sys.stderr)
     return 0 if report.ok else MachineError.exit_code
@@ -35,8 +40,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 def machine_text(report: "MachineReport") -> str:
     """Lay out a report for people."""
-    libraries = ", ".join(f"{name} {version}" for name, version in report.libraries.items())
-    settings = ", ".join(f"{name}={value}" for name, value in report.environment.items())
+    libraries = ", ".join(
+        f"{name} {version}" for name, version in report.libraries.items()
+    )
+    settings = ", ".join(
+        f"{name}={value}" for name, value in report.environment.items()
+    )
     facts = {
         "cnpgen": report.cnpgen,
         "python": f"{report.python}, {report.executable}",
@@ -52,7 +61,9 @@ def machine_text(report: "MachineReport") -> str:
         "free disk": f"{report.free_bytes / 1e9:,.1f} GB here",
         "verdict": _verdict(report),
     }
-    findings = [("problem", problem) for problem in report.problems] + [("warning", note) for note in report.notes]
+    findings = [("problem", problem) for problem in report.problems] + [
+        ("warning", note) for note in report.notes
+    ]
     return "\n".join(table([*facts.items(), *findings]))
 
 
@@ -66,4 +77,8 @@ def _verdict(report: "MachineReport") -> str:
     if not report.ok:
         return f"cnpgen does not work here: {counted(len(report.problems), 'problem')}, below"
     text = "all requirements are met"
-    return f"{text}; {counted(len(report.notes), 'warning')}, below" if report.notes else text
+    return (
+        f"{text}; {counted(len(report.notes), 'warning')}, below"
+        if report.notes
+        else text
+    )

@@ -11,26 +11,44 @@ from cnpgen.store.dataset_spec import DatasetSpec, shards
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.shard import storage_dtype
 from cnpgen.store.shard_record import pending
-from cnpgen.store.workspace import Workspace, check_clearable, find_workspace, started_spec
+from cnpgen.store.workspace import (
+    Workspace,
+    check_clearable,
+    find_workspace,
+    started_spec,
+)
 
-SHARD_OVERHEAD = 41_000  # bytes: what the HDF5 file and the sidecar of a shard take beside the rows
+SHARD_OVERHEAD = (
+    41_000  # bytes: what the HDF5 file and the sidecar of a shard take beside the rows
+)
 DOCUMENTS = 90_000  # bytes: specification.json, manifest, card and statistics
 
 
-def spec_text(recipe: DatasetRecipe, out: str | None, *, force: bool, **settings: Any) -> str:
+def spec_text(
+    recipe: DatasetRecipe, out: str | None, *, force: bool, **settings: Any
+) -> str:
     """Resolve the specification of a dataset by ``resolve`` without making anything, and describe it."""
     load_notes(recipe)
     workspace = find_workspace(dataset_folder(recipe, out))
     spec = resolve(recipe, workspace, **settings, force=force).spec
     files = shards(spec)
     splits = [f"{split} {rows:,}" for split, rows in spec.splits.items()]
-    counts = [f"{split} {sum(task.split == split for task in files)}" for split in spec.splits]
-    size = sum(spec.splits.values()) * row_bytes(spec) + len(files) * SHARD_OVERHEAD + DOCUMENTS
+    counts = [
+        f"{split} {sum(task.split == split for task in files)}" for split in spec.splits
+    ]
+    size = (
+        sum(spec.splits.values()) * row_bytes(spec)
+        + len(files) * SHARD_OVERHEAD
+        + DOCUMENTS
+    )
     facts = [
         ("folder", workspace.folder),
         ("state", folder_state(workspace, spec, force=force)),
         ("rows", f"{sum(spec.splits.values()):,}: {', '.join(splits)}"),
-        ("shards", f"{len(files)} of at most {spec.shard_size:,} rows: {', '.join(counts)}"),
+        (
+            "shards",
+            f"{len(files)} of at most {spec.shard_size:,} rows: {', '.join(counts)}",
+        ),
         ("size", f"about {size_text(size)}, {row_bytes(spec)} bytes per row"),
         ("seed", str(spec.seed)),
         ("backend", spec.backend),
@@ -38,14 +56,22 @@ def spec_text(recipe: DatasetRecipe, out: str | None, *, force: bool, **settings
         ("recipe", f"sha256 {spec.recipe_sha256}"),
     ]
     fields = [("field", "columns", "unit", "what")]
-    fields += [(item.name, str(item.width or "-"), item.unit, item.long_name) for item in spec.fields]
+    fields += [
+        (item.name, str(item.width or "-"), item.unit, item.long_name)
+        for item in spec.fields
+    ]
     head = f"{spec.name} {spec.version}"
-    return "\n".join([head, *table(facts, indent="  "), "", *table(fields, indent="  ", right=(1,))])
+    return "\n".join(
+        [head, *table(facts, indent="  "), "", *table(fields, indent="  ", right=(1,))]
+    )
 
 
 def row_bytes(spec: DatasetSpec) -> int:
     """Return the size of a row in bytes."""
-    return sum(max(field.width, 1) * storage_dtype(field, spec.dtype).itemsize for field in spec.fields)
+    return sum(
+        max(field.width, 1) * storage_dtype(field, spec.dtype).itemsize
+        for field in spec.fields
+    )
 
 
 def folder_state(workspace: Workspace, spec: DatasetSpec, *, force: bool) -> str:
@@ -69,14 +95,21 @@ def _replacement(workspace: Workspace) -> str:
 
 
 def _refusal(workspace: Workspace, spec: DatasetSpec) -> str:
-    """Describe why another dataset in the folder would be refused; empty if it is the same one."""
+    """Describe why another dataset in the folder would be refused.
+
+    Empty if it is the same one.
+    """
     try:
         begun = started_spec(workspace, spec)
     except UsageError:
         return "holds another dataset: would be refused without --force"
     except DatasetError:
         return "holds a dataset with a damaged specification.json: would be refused without --force"
-    return "" if begun is not None else "holds a specification.json without shards: would be replaced"
+    return (
+        ""
+        if begun is not None
+        else "holds a specification.json without shards: would be replaced"
+    )
 
 
 def _progress(folder: Path, spec: DatasetSpec) -> str:

@@ -1,8 +1,9 @@
 """Judge plans or sampled trajectories.
 
-Every plan is checked on a fine time grid and between its samples ('cnpgen docs verdict'). The exit code is 0 if every
-plan is valid, and 1 if a plan is invalid, if the file holds no plans, or if it is damaged. It is 2 for files of
-another kind. --workers changes only the time.
+Every plan is checked on a fine time grid and between its samples ('cnpgen docs
+verdict'). The exit code is 0 if every plan is valid, and 1 if a plan is invalid, if the
+file holds no plans, or if it is damaged. It is 2 for files of another kind. --workers
+changes only the time.
 
 """
 
@@ -23,7 +24,12 @@ if TYPE_CHECKING:
 
 def add_options(parser: Parser) -> None:
     option = parser.add_argument
-    option("file", metavar="FILE", type=Path, help="plan file, .h5, or sampled trajectories")
+    option(
+        "file",
+        metavar="FILE",
+        type=Path,
+        help="plan file, .h5, or sampled trajectories",
+    )
     text = "the problem of the plans; its tolerances are used"
     option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     text = "time between two samples (default: 1ms, at most 10ms)"
@@ -31,9 +37,23 @@ def add_options(parser: Parser) -> None:
     text = "largest tracking error of the joints, such as 2deg: position limits, clearances and the manifold hold"
     text += " within it; one number, or one per joint (default: exact tracking)"
     option("--tracking-error", metavar="E,...", type=values.tracking_errors, help=text)
-    option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
-    option("--list", action="store_true", help="also list the plans, one per line, invalid ones first")
-    option("--plot", metavar="PICTURE", type=values.plot_file, help="draw one plan or trajectory: .png, .pdf or .svg")
+    option(
+        "--workers",
+        metavar="W",
+        type=values.positive,
+        help="processes; default one per available core",
+    )
+    option(
+        "--list",
+        action="store_true",
+        help="also list the plans, one per line, invalid ones first",
+    )
+    option(
+        "--plot",
+        metavar="PICTURE",
+        type=values.plot_file,
+        help="draw one plan or trajectory: .png, .pdf or .svg",
+    )
     text = "plan or trajectory to draw; default the first that is not valid, or 0"
     option("--plan", metavar="I", type=values.natural, help=text)
     add_json(parser)
@@ -59,7 +79,9 @@ def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
 
     plans = recipe_names.read_plans(arguments.file, problem=arguments.problem)
     if arguments.plan is not None and arguments.plan >= len(plans):
-        raise UsageError(f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0")
+        raise UsageError(
+            f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0"
+        )
     with Meter(quiet=not sys.stderr.isatty(), noun="plan") as meter:
         meter.begin(f"judging {arguments.file}", len(plans))
         return evaluate_plans(
@@ -78,7 +100,10 @@ def _write_json(file: Path, found: "Evaluation") -> None:
     head = render({"file": str(file), **found.summary()})
     print(head.removesuffix("\n}") + ',\n  "verdicts": [', end="")
     for index, row in enumerate(found.rows()):
-        print(f"{',' if index else ''}\n    {json.dumps(row, ensure_ascii=False, allow_nan=False)}", end="")
+        print(
+            f"{',' if index else ''}\n    {json.dumps(row, ensure_ascii=False, allow_nan=False)}",
+            end="",
+        )
     print("\n  ]\n}")
 
 
@@ -90,7 +115,16 @@ def _draw(found: "Evaluation", picture: str, index: int | None) -> None:
     problem, robot = open_problem(plans.problem)
     verdict = found.verdicts[chosen]
     note = f"sample {plans.sample_id[chosen]}: {verdict}"
-    plot_plan(problem, robot, plans.motion, chosen, picture, scene=plans.scene[chosen], note=note, verdict=verdict)
+    plot_plan(
+        problem,
+        robot,
+        plans.motion,
+        chosen,
+        picture,
+        scene=plans.scene[chosen],
+        note=note,
+        verdict=verdict,
+    )
     print(f"drawn: plan {chosen} in {picture}", file=sys.stderr)
 
 

@@ -1,12 +1,14 @@
 """Write plans as sampled trajectories.
 
-npz, parquet and mpd (B-splines of the paths) are one file. csv, joint-trajectory (a message of ROS 2, as JSON) and
-ros2-control (the goal of a trajectory controller, as YAML) are a folder with one file per plan. lerobot is a
-dataset in a folder (LeRobotDataset v3), with --rate frames per second.
-'cnpgen list exporters' shows all formats, including those of installed packages. 'cnpgen docs plan-format' shows how to
-read them. The path of the output is printed on stdout. Plans that cannot be sampled are left out and listed on
-stderr; the exit code is then 1. With --join, positions, velocities and accelerations must be
-continuous from plan to plan (1e-9 in SI); otherwise nothing is written.
+npz, parquet and mpd (B-splines of the paths) are one file. csv, joint-trajectory (a
+message of ROS 2, as JSON) and ros2-control (the goal of a trajectory controller, as
+YAML) are a folder with one file per plan. lerobot is a dataset in a folder
+(LeRobotDataset v3), with --rate frames per second. 'cnpgen list exporters' shows all
+formats, including those of installed packages. 'cnpgen docs plan-format' shows how to
+read them. The path of the output is printed on stdout. Plans that cannot be sampled are
+left out and listed on stderr; the exit code is then 1. With --join, positions,
+velocities and accelerations must be continuous from plan to plan (1e-9 in SI);
+otherwise nothing is written.
 """
 
 import argparse
@@ -32,11 +34,27 @@ def add_options(parser: Parser) -> None:
     option("file", metavar="FILE", type=recipe_names.present, help="plan file, .h5")
     text = "format: npz, csv, parquet, lerobot, mpd, ... ('cnpgen list exporters')"
     option("--to", metavar="FORMAT", required=True, help=text)
-    option("--rate", metavar="HZ", type=values.hertz, default=1000.0, help="samples per second (default: 1000)")
+    option(
+        "--rate",
+        metavar="HZ",
+        type=values.hertz,
+        default=1000.0,
+        help="samples per second (default: 1000)",
+    )
     text = "file (npz) or folder to write; default: in the current folder, named after FILE and FORMAT"
     option("-o", "--out", metavar="PATH", type=Path, help=text)
-    option("--plan", metavar="I", type=values.numbers, help="these plans only, by index: 0,3,10-12")
-    option("--sample", metavar="I", type=values.numbers, help="these samples' plans only, by sample_id; adds to --plan")
+    option(
+        "--plan",
+        metavar="I",
+        type=values.numbers,
+        help="these plans only, by index: 0,3,10-12",
+    )
+    option(
+        "--sample",
+        metavar="I",
+        type=values.numbers,
+        help="these samples' plans only, by sample_id; adds to --plan",
+    )
     text = "cut every plan of FILE and continue with the plan of the same number of this file; may be repeated"
     option("--join", metavar="NEXT", type=Path, action="append", help=text)
     text = "time at which NEXT takes over: 330ms; once per --join (default: at the end)"
@@ -51,7 +69,9 @@ def run(arguments: argparse.Namespace) -> int:
     exporter = load_exporter(arguments.to)
     plans = _plans(arguments)
     chosen, out = _chosen(plans, arguments), _place(arguments, exporter)
-    exported = export_plans(plans, out, to=arguments.to, rate=arguments.rate, only=chosen)
+    exported = export_plans(
+        plans, out, to=arguments.to, rate=arguments.rate, only=chosen
+    )
     for why in exported.refused.values():
         print(f"cnpgen: left out: {why}", file=sys.stderr)
     if exported.invalid:
@@ -60,8 +80,13 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"cnpgen: warning: {text}", file=sys.stderr)
     if open_problem(plans.problem)[0].has_sample_obstacles:
         print(f"cnpgen: note: {NO_OBSTACLES}", file=sys.stderr)
-    of_all = f" of {exported.count + len(exported.refused):,}" if exported.refused else ""
-    print(f"exported {counted(exported.count, 'plan')}{of_all} at {arguments.rate:g} Hz", file=sys.stderr)
+    of_all = (
+        f" of {exported.count + len(exported.refused):,}" if exported.refused else ""
+    )
+    print(
+        f"exported {counted(exported.count, 'plan')}{of_all} at {arguments.rate:g} Hz",
+        file=sys.stderr,
+    )
     print(exported.files[0] if exporter.single_file else out)
     return 1 if exported.refused else 0
 
@@ -85,19 +110,29 @@ def _place(arguments: argparse.Namespace, exporter: "Exporter") -> Path:
     from cnpgen.store.files.atomic import check_writable
 
     file: Path = arguments.file
-    name = f"{file.stem}{exporter.suffix}" if exporter.single_file else f"{file.stem}-{arguments.to}"
+    name = (
+        f"{file.stem}{exporter.suffix}"
+        if exporter.single_file
+        else f"{file.stem}-{arguments.to}"
+    )
     out: Path = arguments.out or Path(name)
     if not out.parent.is_dir():
         raise UsageError(f"{out} must be in a folder that exists")
     inside = exporter.single_file and out.is_dir() and not exporter.is_folder
     target = out / f"plans{exporter.suffix}" if inside else out
-    if target.exists() and not arguments.force and not (target.is_dir() and not any(target.iterdir())):
+    if (
+        target.exists()
+        and not arguments.force
+        and not (target.is_dir() and not any(target.iterdir()))
+    ):
         raise UsageError(f"{target} exists; --force replaces files of the same name")
     check_writable(out)
     return out
 
 
-def _chosen(plans: "Plans | JoinedPlans", arguments: argparse.Namespace) -> list[int] | None:
+def _chosen(
+    plans: "Plans | JoinedPlans", arguments: argparse.Namespace
+) -> list[int] | None:
     """Return the indices of the selected plans, or None for all of them."""
     import numpy as np
 
@@ -105,10 +140,14 @@ def _chosen(plans: "Plans | JoinedPlans", arguments: argparse.Namespace) -> list
         return None
     chosen = set(arguments.plan or ())
     if chosen and max(chosen) >= len(plans):
-        raise UsageError(f"there is no plan {max(chosen)}: {len(plans)} plans are numbered from 0")
+        raise UsageError(
+            f"there is no plan {max(chosen)}: {len(plans)} plans are numbered from 0"
+        )
     if arguments.sample is not None:
         missing = np.setdiff1d(arguments.sample, plans.sample_id)
         if missing.size:
             raise UsageError(f"{arguments.file} has no plan of sample {missing[0]}")
-        chosen |= set(np.flatnonzero(np.isin(plans.sample_id, arguments.sample)).tolist())
+        chosen |= set(
+            np.flatnonzero(np.isin(plans.sample_id, arguments.sample)).tolist()
+        )
     return sorted(chosen)

@@ -1,8 +1,10 @@
 """Summarize a dataset and its sampling.
 
-The command reads documents and shard records, not samples, so it is fast for large datasets and works for unfinished
-ones; 'cnpgen validate' verifies the samples. "accepts" is the share of candidates that pass a condition, "left" the
-share of all candidates that remain after it. The exit code is 1 if the dataset is damaged, 0 if it is unfinished.
+The command reads documents and shard records, not samples, so it is fast for large
+datasets and works for unfinished ones; 'cnpgen validate' verifies the samples.
+"accepts" is the share of candidates that pass a condition, "left" the share of all
+candidates that remain after it. The exit code is 1 if the dataset is damaged, 0 if it
+is unfinished.
 """
 
 import argparse
@@ -21,8 +23,18 @@ if TYPE_CHECKING:
 
 
 def add_options(parser: Parser) -> None:
-    parser.add_argument("folder", metavar="DIR", type=recipe_names.dataset, help="folder of a dataset, finished or not")
-    parser.add_argument("--plot", metavar="FILE", type=values.plot_file, help="also draw it: .png, .pdf or .svg")
+    parser.add_argument(
+        "folder",
+        metavar="DIR",
+        type=recipe_names.dataset,
+        help="folder of a dataset, finished or not",
+    )
+    parser.add_argument(
+        "--plot",
+        metavar="FILE",
+        type=values.plot_file,
+        help="also draw it: .png, .pdf or .svg",
+    )
     add_json(parser)
 
 
@@ -43,12 +55,23 @@ def run(arguments: argparse.Namespace) -> int:
 def inspection_text(found: "Inspection") -> str:
     """Lay out an inspection for people."""
     spec = found.spec
-    sections = [[f"{spec.name} {spec.version}  {spec.title}".rstrip(), *table(_facts(found), indent="  ")]]
+    sections = [
+        [
+            f"{spec.name} {spec.version}  {spec.title}".rstrip(),
+            *table(_facts(found), indent="  "),
+        ]
+    ]
     if found.sampling.tried:
         sections.append(_yield_lines(found.sampling))
     head = ("field", "column", "unit", "min", "mean", "max")
-    rows = [row for field in spec.fields for row in _field_rows(field, found.statistics.get(field.name))]
-    sections.append(table([(*row, "") for row in (head, *rows)], indent="  ", right=(3, 4, 5)))
+    rows = [
+        row
+        for field in spec.fields
+        for row in _field_rows(field, found.statistics.get(field.name))
+    ]
+    sections.append(
+        table([(*row, "") for row in (head, *rows)], indent="  ", right=(3, 4, 5))
+    )
     return "\n\n".join("\n".join(lines) for lines in sections)
 
 
@@ -57,11 +80,15 @@ def _facts(found: "Inspection") -> list[tuple[str, str]]:
 
     spec = found.spec
     splits = [
-        f"{split} {n:,}" + ("" if n == spec.splits[split] else f" of {spec.splits[split]:,}")
+        f"{split} {n:,}"
+        + ("" if n == spec.splits[split] else f" of {spec.splits[split]:,}")
         for split, n in found.rows.items()
     ]
     unread = "checksums of the shards were not checked, 'cnpgen validate' does"
-    versions = [", ".join(f"{name} {version}" for name, version in made.items()) for made in found.environments]
+    versions = [
+        ", ".join(f"{name} {version}" for name, version in made.items())
+        for made in found.environments
+    ]
     return [
         ("state", f"complete; {unread}" if found.complete else found.state),
         ("rows", f"{sum(found.rows.values()):,}: {', '.join(splits)}"),
@@ -76,26 +103,54 @@ def _facts(found: "Inspection") -> list[tuple[str, str]]:
 
 def _yield_lines(sampling: "SamplingStatistics") -> list[str]:
     """Lay out the sampling statistics of the draws, in pipeline order."""
-    rows = [("stage", "rejects because", "draws", "accepts", "left"), ("", "", f"{sampling.tried:,}", "", "100.00 %")]
+    rows = [
+        ("stage", "rejects because", "draws", "accepts", "left"),
+        ("", "", f"{sampling.tried:,}", "", "100.00 %"),
+    ]
     left, before = sampling.tried, ""
     for reason, count in sampling.rejections.items():
         stage = sampling.stages.get(reason, "")
         accepts = 100 * (1 - count / left) if left else 100.0
         left -= count
         label = stage if stage != before else ""
-        rows.append((label, reason, f"{count:,}", f"{accepts:.2f} %", f"{100 * left / sampling.tried:.2f} %"))
+        rows.append(
+            (
+                label,
+                reason,
+                f"{count:,}",
+                f"{accepts:.2f} %",
+                f"{100 * left / sampling.tried:.2f} %",
+            )
+        )
         before = stage
     share = f"{100 * sampling.accepted / sampling.tried:.2f} %"
     lines = table([(*row, "") for row in rows], indent="  ", right=(2, 3, 4))
-    return [f"  {sampling.accepted:,} of {sampling.tried:,} draws accepted, {share}", *lines]
+    return [
+        f"  {sampling.accepted:,} of {sampling.tried:,} draws accepted, {share}",
+        *lines,
+    ]
 
 
-def _field_rows(field: "Field", found: "FieldStatistics | None") -> list[tuple[str, ...]]:
-    """Return a row per column of a field; its name is on the first one, its unit where it is not that of the last."""
+def _field_rows(
+    field: "Field", found: "FieldStatistics | None"
+) -> list[tuple[str, ...]]:
+    """Return a row per column of a field.
+
+    Its name is on the first one, its unit where it is not that of the last.
+    """
     columns = field.names or ("",) * max(field.width, 1)
     rows, before = [], ""
     for index, (column, unit) in enumerate(zip(columns, field.units, strict=True)):
-        first, before = ("" if index else field.name, column, "" if unit == before else unit), unit
+        first, before = (
+            ("" if index else field.name, column, "" if unit == before else unit),
+            unit,
+        )
         numbers = (found.minimum, found.mean, found.maximum) if found else ()
-        rows.append((*first, *(f"{values[index]:.5g}" for values in numbers), *([] if found else ["-"] * 3)))
+        rows.append(
+            (
+                *first,
+                *(f"{values[index]:.5g}" for values in numbers),
+                *([] if found else ["-"] * 3),
+            )
+        )
     return rows

@@ -9,7 +9,10 @@ from pathlib import Path
 
 from cnpgen.machine.signals import signals_handled
 
-INTERRUPTED, TERMINATED = 130, 143  # exit codes: 128 + SIGINT, 128 + SIGTERM, as shells have it
+INTERRUPTED, TERMINATED = (
+    130,
+    143,
+)  # exit codes: 128 + SIGINT, 128 + SIGTERM, as shells have it
 
 _interruptions: list[int] = []  # the signal that came first, if any
 
@@ -35,7 +38,9 @@ def resumable(place: Path) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt as interruption:
-        kept = f"{place} keeps all finished problems; run the same command again to resume"
+        kept = (
+            f"{place} keeps all finished problems; run the same command again to resume"
+        )
         raise type(interruption)(kept) from interruption
 
 
@@ -48,8 +53,9 @@ def _interrupt(number: int) -> None:
 def interruptible() -> Iterator[None]:
     """Raise ``KeyboardInterrupt`` or ``Terminated`` in this block at the first signal; at a later one, end at once.
 
-    What was begun is tidied up after the first; workers end with their parent in either case. Once a signal came, the
-    handlers stay until the process ends, so that none interrupts its last steps with a traceback.
+    What was begun is tidied up after the first; workers end with their parent in either
+    case. Once a signal came, the handlers stay until the process ends, so that none
+    interrupts its last steps with a traceback.
     """
     if threading.current_thread() is threading.main_thread():
         _interruptions.clear()

@@ -23,15 +23,27 @@ WHAT = tuple(_HOW)
 
 
 def add_options(parser: Parser) -> None:
-    parser.add_argument("what", nargs="?", choices=WHAT, metavar="WHAT", help=f"one of {', '.join(WHAT)}; default all")
+    parser.add_argument(
+        "what",
+        nargs="?",
+        choices=WHAT,
+        metavar="WHAT",
+        help=f"one of {', '.join(WHAT)}; default all",
+    )
     add_json(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
     from cnpgen.store.files.documents import plain, render
 
-    found = {what: list_all(what) for what in ([arguments.what] if arguments.what else WHAT)}
-    print(render(plain(found)) if arguments.json else "\n\n".join(_section(*item) for item in found.items()))
+    found = {
+        what: list_all(what) for what in ([arguments.what] if arguments.what else WHAT)
+    }
+    print(
+        render(plain(found))
+        if arguments.json
+        else "\n\n".join(_section(*item) for item in found.items())
+    )
 
 
 def list_all(what: str) -> list[dict[str, Any]]:
@@ -40,14 +52,29 @@ def list_all(what: str) -> list[dict[str, Any]]:
 
     group = f"cnpgen.{what}"
     if group in registry.CONTRACTS:
-        return [{"name": name, "title": _summary(group, name)} for name in registry.names(group)]
+        return [
+            {"name": name, "title": _summary(group, name)}
+            for name in registry.names(group)
+        ]
     from cnpgen.planner.model_file import shipped_models
     from cnpgen.schema.catalogue import list_recipes
 
-    describe = {"datasets": _dataset, "models": _model, "pipelines": _pipeline, "problems": _problem}[what]
-    kinds: dict[str, Kind] = {"datasets": "dataset", "pipelines": "pipeline", "problems": "problem"}
+    describe = {
+        "datasets": _dataset,
+        "models": _model,
+        "pipelines": _pipeline,
+        "problems": _problem,
+    }[what]
+    kinds: dict[str, Kind] = {
+        "datasets": "dataset",
+        "pipelines": "pipeline",
+        "problems": "problem",
+    }
     files = list_recipes(kinds[what]) if what in kinds else shipped_models()
-    return [{"name": name, **describe(name, file), "file": file} for name, file in files.items()]
+    return [
+        {"name": name, **describe(name, file), "file": file}
+        for name, file in files.items()
+    ]
 
 
 def _dataset(name: str, _: Path) -> dict[str, Any]:
@@ -55,14 +82,25 @@ def _dataset(name: str, _: Path) -> dict[str, Any]:
 
     recipe = load_dataset_recipe(name)
     rows = sum(recipe.splits.values())
-    about = {"title": recipe.title, "version": recipe.version, "pipeline": recipe.pipeline.name}
+    about = {
+        "title": recipe.title,
+        "version": recipe.version,
+        "pipeline": recipe.pipeline.name,
+    }
     return about | {"size": f"{rows:,} rows", "rows": rows, "splits": recipe.splits}
 
 
 def _model(name: str, file: Path) -> dict[str, Any]:
-    """Describe a model by its name, which is that of its dataset; reading the file would load HDF5."""
+    """Describe a model by its name, which is that of its dataset.
+
+    Reading the file would load HDF5.
+    """
     count = file.stat().st_size
-    return {"title": f"planner trained on {name}", "size": f"{count / 1e6:.1f} MB", "bytes": count}
+    return {
+        "title": f"planner trained on {name}",
+        "size": f"{count / 1e6:.1f} MB",
+        "bytes": count,
+    }
 
 
 def _pipeline(name: str, _: Path) -> dict[str, Any]:
@@ -70,7 +108,12 @@ def _pipeline(name: str, _: Path) -> dict[str, Any]:
 
     recipe = load_pipeline(name)
     count = len(recipe.stage)
-    return {"title": recipe.title, "problem": recipe.problem.name, "size": f"{count} stages", "stages": count}
+    return {
+        "title": recipe.title,
+        "problem": recipe.problem.name,
+        "size": f"{count} stages",
+        "stages": count,
+    }
 
 
 def _problem(name: str, _: Path) -> dict[str, Any]:
@@ -94,5 +137,13 @@ def _summary(group: str, name: str) -> str:
 
 
 def _section(what: str, entries: list[dict[str, Any]]) -> str:
-    rows = [(entry["name"], *([entry["size"]] if "size" in entry else []), entry["title"]) for entry in entries]
-    return "\n".join([f"{what}  ({_HOW[what]})", *(table(rows, indent="  ", one_line=True) if rows else ["  none"])])
+    rows = [
+        (entry["name"], *([entry["size"]] if "size" in entry else []), entry["title"])
+        for entry in entries
+    ]
+    return "\n".join(
+        [
+            f"{what}  ({_HOW[what]})",
+            *(table(rows, indent="  ", one_line=True) if rows else ["  none"]),
+        ]
+    )

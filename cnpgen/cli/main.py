@@ -13,11 +13,22 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from cnpgen.cli import docs_command
-from cnpgen.cli.commands import command_names, is_command, load_alternatives, load_command
+from cnpgen.cli.commands import (
+    command_names,
+    is_command,
+    load_alternatives,
+    load_command,
+)
 from cnpgen.cli.interruption import Terminated, exit_code, interruptible
 from cnpgen.cli.parser import Parser, add_command, add_debug
 from cnpgen.cli.terminal import printing_safely
-from cnpgen.errors import CnpgenError, MachineError, RecipeError, Spelling, python_spelling
+from cnpgen.errors import (
+    CnpgenError,
+    MachineError,
+    RecipeError,
+    Spelling,
+    python_spelling,
+)
 from cnpgen.machine.threads import prefer_one_thread
 from cnpgen.machine.versions import DOCUMENTATION_URL, installed_version
 
@@ -59,7 +70,10 @@ stdout is data, stderr everything else. Exit codes:
 """
 
 BROKEN_PIPE = 141  # 128 + SIGPIPE, as shells have it
-_OPTIONS = {"discard": "force", "other": "other_rows"}  # arguments whose options have another name
+_OPTIONS = {
+    "discard": "force",
+    "other": "other_rows",
+}  # arguments whose options have another name
 
 
 class _LinkedParser(Parser):
@@ -69,7 +83,11 @@ class _LinkedParser(Parser):
         """Return the help."""
         text = super().format_help()
         addresses = docs_command.mentioned_addresses(text)
-        return "\n  ".join([f"{text}\non the site:", *addresses]) + "\n" if addresses else text
+        return (
+            "\n  ".join([f"{text}\non the site:", *addresses]) + "\n"
+            if addresses
+            else text
+        )
 
 
 class _Version(argparse.Action):
@@ -81,7 +99,10 @@ class _Version(argparse.Action):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line with arguments, by default those of the process; return the exit code."""
+    """Run the command line with arguments, by default those of the process.
+
+    Return the exit code.
+    """
     words, given = list(sys.argv[1:] if argv is None else argv), argparse.Namespace()
     prefer_one_thread()
     _prepare_streams()
@@ -105,7 +126,9 @@ def _run(words: list[str], given: argparse.Namespace) -> int:
     parser = build_parser([first] if first and is_command(first) else None)
     for before, word in zip(["cnpgen", *words], words, strict=False):
         if word == "" or re.fullmatch("--[a-z-]+=", word):
-            parser.error(f"the argument after {word or before!r} is empty: is it an unset variable of the shell?")
+            parser.error(
+                f"the argument after {word or before!r} is empty: is it an unset variable of the shell?"
+            )
     try:
         arguments, extras = parser.parse_known_args(words, given)
     except SystemExit:  # --help and --version have printed their text
@@ -124,32 +147,44 @@ def _run(words: list[str], given: argparse.Namespace) -> int:
 def build_parser(names: Sequence[str] | None = None) -> Parser:
     """Build the parser of some commands, by default of all; importing the modules of all commands takes time.
 
-    Raises:
-        MissingAddonError: A named command belongs to an add-on that this installation lacks.
+    Raises: MissingAddonError: A named command belongs to an add-on that this
+        installation lacks.
     """
     parser = _LinkedParser(prog="cnpgen", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version")
     add_debug(parser)
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=_LinkedParser)
+    commands = parser.add_subparsers(
+        title="commands", metavar="COMMAND", parser_class=_LinkedParser
+    )
     for name in command_names() if names is None else names:
         add_command(commands, name, load_command(name), load_alternatives(name))
     return parser
 
 
 def _report(error: BaseException, options: Container[str]) -> int:
-    """Print an error as one line per error, with the options of the command; return its exit code."""
+    """Print an error as one line per error, with the options of the command.
+
+    Return its exit code.
+    """
     if isinstance(error, KeyboardInterrupt):
         what = "terminated" if isinstance(error, Terminated) else "interrupted"
-        print(f"cnpgen: {what}: {error}" if str(error) else f"cnpgen: {what}", file=sys.stderr)
+        print(
+            f"cnpgen: {what}: {error}" if str(error) else f"cnpgen: {what}",
+            file=sys.stderr,
+        )
         return exit_code(error)
     lines, code = _explain(error, options)
     for line in lines:
-        addresses = "".join(f" ({address})" for address in docs_command.mentioned_addresses(line))
+        addresses = "".join(
+            f" ({address})" for address in docs_command.mentioned_addresses(line)
+        )
         print(f"cnpgen: error: {line}{addresses}", file=sys.stderr)
     return code
 
 
-def _explain(error: BaseException, options: Container[str]) -> tuple[Sequence[str], int]:
+def _explain(
+    error: BaseException, options: Container[str]
+) -> tuple[Sequence[str], int]:
     """Return the lines that describe an error, and the exit code."""
     if isinstance(error, RecipeError):
         return error.errors, error.exit_code
@@ -157,11 +192,15 @@ def _explain(error: BaseException, options: Container[str]) -> tuple[Sequence[st
         return [" ".join(error.text(shell_spelling(options)).split())], error.exit_code
     code = MachineError.exit_code
     if isinstance(error, ImportError):
-        return [f"{error}; 'cnpgen doctor' checks this installation, 'cnpgen docs troubleshooting' lists causes"], code
+        return [
+            f"{error}; 'cnpgen doctor' checks this installation, 'cnpgen docs troubleshooting' lists causes"
+        ], code
     if isinstance(error, MemoryError):
         return ["out of memory; fewer --workers need less"], code
     if isinstance(error, OSError) and error.strerror:
-        return [f"{error.filename}: {error.strerror}" if error.filename else error.strerror], code
+        return [
+            f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+        ], code
     return [_describe_bug(error)], code
 
 
@@ -178,7 +217,8 @@ def _describe_bug(error: BaseException) -> str:
 def shell_spelling(options: Container[str]) -> Spelling:
     """Return a spelling for ``CnpgenError.text``: ``force=True`` becomes ``--force``, ``workers=2`` ``--workers 2``.
 
-    Arguments that are no options of the command, as argparse names them, keep the Python spelling.
+    Arguments that are no options of the command, as argparse names them, keep the
+    Python spelling.
     """
 
     def spell(name: str, value: object) -> str:
@@ -193,10 +233,17 @@ def shell_spelling(options: Container[str]) -> Spelling:
 
 @contextmanager
 def notices(*, quiet: bool = False) -> Iterator[None]:
-    """Print the library's log messages of the block on stderr, each one once; with ``quiet`` only warnings."""
+    """Print the library's log messages of the block on stderr, each one once.
+
+    With ``quiet`` only warnings.
+    """
     import logging
 
-    logger, handler, seen = logging.getLogger("cnpgen"), logging.StreamHandler(sys.stderr), set[str]()
+    logger, handler, seen = (
+        logging.getLogger("cnpgen"),
+        logging.StreamHandler(sys.stderr),
+        set[str](),
+    )
     handler.setFormatter(logging.Formatter("cnpgen: %(message)s"))
 
     def is_new(record: logging.LogRecord) -> bool:
@@ -221,7 +268,9 @@ def _prepare_streams() -> None:
         if getattr(sys, name) is None:
             setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115 - open until the end
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # a title must not stop a terminal that cannot show it
+        sys.stdout.reconfigure(
+            errors="backslashreplace"
+        )  # a title must not stop a terminal that cannot show it
 
 
 def _leave_pipe() -> int:

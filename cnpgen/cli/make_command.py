@@ -1,14 +1,17 @@
 """Make a dataset, or resume one.
 
-The same recipe, seed and backend give the same samples. --workers, --shard-size and --part decide which process makes
-which samples, never their content; a smaller --n gives the first samples of each split. With --certify every sample is
-planned (about 30 ms each). Samples without a valid plan are rejected as "no plan found", and the control points of the
-plans are stored. With --model certification starts from a planner's plans, in half the time, with the same judge.
-The folder of the dataset is printed on stdout.
+The same recipe, seed and backend give the same samples. --workers, --shard-size and
+--part decide which process makes which samples, never their content; a smaller --n
+gives the first samples of each split. With --certify every sample is planned (about 30
+ms each). Samples without a valid plan are rejected as "no plan found", and the control
+points of the plans are stored. With --model certification starts from a planner's
+plans, in half the time, with the same judge. The folder of the dataset is printed on
+stdout.
 
-Shards of the same dataset in the folder are kept: they are compared with their recorded sha256 (at 0.3 to 1 GB/s per
-core), and damaged ones are made again. Another dataset is replaced only with --force, or if it has no shards. After
-Ctrl-C (exit code 130), SIGTERM (143), kill -9 or a full disk the same command resumes.
+Shards of the same dataset in the folder are kept: they are compared with their recorded
+sha256 (at 0.3 to 1 GB/s per core), and damaged ones are made again. Another dataset is
+replaced only with --force, or if it has no shards. After Ctrl-C (exit code 130),
+SIGTERM (143), kill -9 or a full disk the same command resumes.
 """
 
 import argparse
@@ -35,28 +38,72 @@ INTERRUPTED_TEXT = "finished shards are kept; run the same command again to resu
 
 def add_options(parser: Parser) -> None:
     option = parser.add_argument
-    option("recipe", metavar="NAME|FILE", help="a shipped dataset or pipeline (see 'cnpgen list'), or a recipe file")
-    option("--n", metavar="N", type=values.rows, help="total number of samples; default the recipe's")
-    option("--seed", metavar="S", type=values.seed, help="root seed; default the recipe's")
-    option("-o", "--out", metavar="DIR", help="folder of the dataset; default NAME-vMAJOR here")
+    option(
+        "recipe",
+        metavar="NAME|FILE",
+        help="a shipped dataset or pipeline (see 'cnpgen list'), or a recipe file",
+    )
+    option(
+        "--n",
+        metavar="N",
+        type=values.rows,
+        help="total number of samples; default the recipe's",
+    )
+    option(
+        "--seed", metavar="S", type=values.seed, help="root seed; default the recipe's"
+    )
+    option(
+        "-o",
+        "--out",
+        metavar="DIR",
+        help="folder of the dataset; default NAME-vMAJOR here",
+    )
     add_engine(parser)
     text = "rows per file; default 8192 to 65536, with --certify 64 to 1024"
     option("--shard-size", metavar="R", type=values.positive, help=text)
-    option("--dtype", choices=("float64", "float32"), default="float64", help="stored number type")
-    option("--backend", choices=("compiled", "numpy", "casadi"), help="kernel backend; default the fastest available")
-    option("--part", metavar="K/M", type=values.part, help="make only part K of M (0/M to M-1/M), for job arrays")
-    option("--certify", action="store_true", help="plan every sample, and store those with a valid plan")
-    text = "with --certify: start from the plans of this planner, a shipped one or a file"
+    option(
+        "--dtype",
+        choices=("float64", "float32"),
+        default="float64",
+        help="stored number type",
+    )
+    option(
+        "--backend",
+        choices=("compiled", "numpy", "casadi"),
+        help="kernel backend; default the fastest available",
+    )
+    option(
+        "--part",
+        metavar="K/M",
+        type=values.part,
+        help="make only part K of M (0/M to M-1/M), for job arrays",
+    )
+    option(
+        "--certify",
+        action="store_true",
+        help="plan every sample, and store those with a valid plan",
+    )
+    text = (
+        "with --certify: start from the plans of this planner, a shipped one or a file"
+    )
     option("--model", metavar="NAME|FILE", type=recipe_names.model, help=text)
-    option("--force", action="store_true", help="overwrite another dataset in the folder")
-    option("--dry-run", action="store_true", help="print the specification and write nothing")
+    option(
+        "--force", action="store_true", help="overwrite another dataset in the folder"
+    )
+    option(
+        "--dry-run",
+        action="store_true",
+        help="print the specification and write nothing",
+    )
     option("--quiet", action="store_true", help="no progress and no summary")
 
 
 def run(arguments: argparse.Namespace) -> None:
     from cnpgen.make.recipe import load_dataset_recipe
 
-    recipe_names.check_recipe(arguments.recipe, of_dataset="'cnpgen make-dataset NAME --out {0}' resumes it")
+    recipe_names.check_recipe(
+        arguments.recipe, of_dataset="'cnpgen make-dataset NAME --out {0}' resumes it"
+    )
     recipe = load_dataset_recipe(arguments.recipe)
     if arguments.model is not None and not arguments.certify:
         raise UsageError("--model needs --certify")
@@ -64,7 +111,9 @@ def run(arguments: argparse.Namespace) -> None:
         from cnpgen.make.certify import certified
 
         if arguments.dtype == "float32":
-            raise UsageError("--certify stores plans, which are exact in float64 only: leave out --dtype float32")
+            raise UsageError(
+                "--certify stores plans, which are exact in float64 only: leave out --dtype float32"
+            )
         recipe = certified(recipe, model=arguments.model)
     if arguments.dry_run:
         from cnpgen.cli.dry_run import spec_text
@@ -74,15 +123,24 @@ def run(arguments: argparse.Namespace) -> None:
     from cnpgen.make.make_dataset import make_dataset
 
     options = options_of(arguments, *_SETTINGS, *ENGINE, "part")
-    make_metered(partial(make_dataset, recipe, arguments.out, **options), quiet=arguments.quiet, part=arguments.part)
+    make_metered(
+        partial(make_dataset, recipe, arguments.out, **options),
+        quiet=arguments.quiet,
+        part=arguments.part,
+    )
 
 
 def make_metered(
-    make: "Callable[..., MadeDataset]", *, quiet: bool, part: tuple[int, int] | None = None, verb: str = "made"
+    make: "Callable[..., MadeDataset]",
+    *,
+    quiet: bool,
+    part: tuple[int, int] | None = None,
+    verb: str = "made",
 ) -> None:
     """Make a dataset with progress and a summary on stderr, and print its folder.
 
-    ``make`` takes ``begin`` and ``progress``, as ``make_dataset`` does; the verb of the summary is a past participle.
+    ``make`` takes ``begin`` and ``progress``, as ``make_dataset`` does; the verb of the
+    summary is a past participle.
     """
     meter = Meter(quiet=quiet)
 
@@ -108,22 +166,37 @@ def make_metered(
     print(made.folder)
 
 
-def _summary(made: "MadeDataset", meter: Meter, part: tuple[int, int] | None, verb: str) -> list[str]:
+def _summary(
+    made: "MadeDataset", meter: Meter, part: tuple[int, int] | None, verb: str
+) -> list[str]:
     """Summarize the run."""
     import textwrap
 
     wanted = sum(made.rows.values())
-    text, rest = _rows_text(made.rows), "" if made.complete else "; other parts are still to be made"
+    text, rest = (
+        _rows_text(made.rows),
+        "" if made.complete else "; other parts are still to be made",
+    )
     if part is not None:
         all_rows = counted(sum(made.spec.splits.values()), "row")
-        text, rest = f"{text}, part {part[0]}/{part[1]} of {all_rows},", rest or "; all parts are made"
+        text, rest = (
+            f"{text}, part {part[0]}/{part[1]} of {all_rows},",
+            rest or "; all parts are made",
+        )
     if not made.made:
         return [f"{_unmade(made, part)}: {text.rstrip(',')}{rest}"]
     share = "" if made.made == wanted else f"the missing {made.made:,} of "
     whole, making = meter.seconds, max(meter.running, 1e-9)
     times = f"in {whole:.1f} s: {whole - making:.1f} s to get ready, then {made.made / making:,.0f} rows/s"
-    lines = [f"{verb} {share}{text} {times}{rest}", *([_yield(meter.sampling)] if meter.sampling else [])]
-    return [row for line in lines for row in textwrap.wrap(line, 100, subsequent_indent="  ")]
+    lines = [
+        f"{verb} {share}{text} {times}{rest}",
+        *([_yield(meter.sampling)] if meter.sampling else []),
+    ]
+    return [
+        row
+        for line in lines
+        for row in textwrap.wrap(line, 100, subsequent_indent="  ")
+    ]
 
 
 def _unmade(made: "MadeDataset", part: tuple[int, int] | None) -> str:
@@ -135,7 +208,9 @@ def _unmade(made: "MadeDataset", part: tuple[int, int] | None) -> str:
 
 def _rows_text(rows: "Mapping[str, int]") -> str:
     """Format the number of samples in total and by split, without empty splits."""
-    splits = ", ".join(f"{split} {number:,}" for split, number in rows.items() if number)
+    splits = ", ".join(
+        f"{split} {number:,}" for split, number in rows.items() if number
+    )
     return counted(sum(rows.values()), "row") + (f" ({splits})" if splits else "")
 
 
@@ -143,6 +218,10 @@ def _yield(sampling: "SamplingStatistics") -> str:
     """Summarize accepted candidates and the most frequent rejection reasons."""
     tried = max(sampling.tried, 1)
     worst = sorted(sampling.rejections.items(), key=lambda item: -item[1])[:3]
-    reasons = ", ".join(f"{reason} {count / tried:.1%}" for reason, count in worst if count >= 5e-4 * tried)
+    reasons = ", ".join(
+        f"{reason} {count / tried:.1%}"
+        for reason, count in worst
+        if count >= 5e-4 * tried
+    )
     text = f"accepted {sampling.accepted / tried:.1%} of {sampling.tried:,} draws"
     return f"{text}; rejected: {reasons}" if reasons else text

@@ -1,8 +1,10 @@
 """Combine parts of a dataset.
 
-The parts are the output of 'cnpgen make-dataset --part K/M' on machines without a shared disk. They must have the same
-recipe, seed, size and type; missing and duplicate shards are refused. Every shard is compared with its recorded sha256
-and copied. The result equals a dataset that is made at once. After an interruption the same command resumes.
+The parts are the output of 'cnpgen make-dataset --part K/M' on machines without a
+shared disk. They must have the same recipe, seed, size and type; missing and duplicate
+shards are refused. Every shard is compared with its recorded sha256 and copied. The
+result equals a dataset that is made at once. After an interruption the same command
+resumes.
 """
 
 import argparse
@@ -15,8 +17,20 @@ from cnpgen.cli.parser import Parser
 
 def add_options(parser: Parser) -> None:
     option = parser.add_argument
-    option("parts", metavar="PART", nargs="+", type=recipe_names.dataset, help="folders of parts")
-    option("-o", "--out", metavar="DIR", required=True, help="folder of the dataset; may be one of the parts")
+    option(
+        "parts",
+        metavar="PART",
+        nargs="+",
+        type=recipe_names.dataset,
+        help="folders of parts",
+    )
+    option(
+        "-o",
+        "--out",
+        metavar="DIR",
+        required=True,
+        help="folder of the dataset; may be one of the parts",
+    )
     option("--quiet", action="store_true", help="no progress and no summary")
 
 

@@ -1,8 +1,8 @@
 """argparse with errors of one line that suggest the nearest known name.
 
-argparse has no public names for the error of a choice, the width of the command column, the known options and some
-types. Only this module uses the private ones; others import ``Options`` from here. Tests of the errors detect changes
-of argparse.
+argparse has no public names for the error of a choice, the width of the command column,
+the known options and some types. Only this module uses the private ones; others import
+``Options`` from here. Tests of the errors detect changes of argparse.
 """
 
 import argparse
@@ -14,11 +14,16 @@ from typing import Any, NoReturn, Protocol
 from cnpgen.cli import values
 from cnpgen.errors import UsageError, nearest
 
-_NEGATIVE = re.compile(r"-\.?[0-9]")  # how values begin: -5ms; before Python 3.14 argparse takes it for an option
+_NEGATIVE = re.compile(
+    r"-\.?[0-9]"
+)  # how values begin: -5ms; before Python 3.14 argparse takes it for an option
 
 
 class _Help(argparse.RawDescriptionHelpFormatter):
-    """Help with a column wide enough for all commands; argparse ignores their indentation."""
+    """Help with a column wide enough for all commands.
+
+    Argparse ignores their indentation.
+    """
 
     def __init__(self, prog: str, **options: Any) -> None:
         super().__init__(prog, **options)
@@ -38,7 +43,9 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Raise UsageError with the error and the help command on one line."""
-        raise UsageError(f"{message.removeprefix('argument ')}; see '{self.prog} --help'")
+        raise UsageError(
+            f"{message.removeprefix('argument ')}; see '{self.prog} --help'"
+        )
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is None or value in action.choices:
@@ -46,25 +53,38 @@ class Parser(argparse.ArgumentParser):
         known = list(action.choices)
         hint = nearest(str(value), known)
         if isinstance(action, argparse._SubParsersAction):
-            self.error(f"unknown command {value!r}{hint or ', expected one of ' + ', '.join(known)}")
-        raise argparse.ArgumentError(action, f"expected one of {', '.join(known)}, got {value!r}{hint}")
+            self.error(
+                f"unknown command {value!r}{hint or ', expected one of ' + ', '.join(known)}"
+            )
+        raise argparse.ArgumentError(
+            action, f"expected one of {', '.join(known)}, got {value!r}{hint}"
+        )
 
     def refuse(self, extras: Sequence[str]) -> NoReturn:
         """Raise UsageError for unknown arguments."""
-        option = next((text.partition("=")[0] for text in extras if text.startswith("-")), None)
+        option = next(
+            (text.partition("=")[0] for text in extras if text.startswith("-")), None
+        )
         if option is None:
             self.error(f"unexpected argument {extras[0]!r}")
-        self.error(f"unknown option {option!r}{nearest(option, self._option_string_actions)}")
+        self.error(
+            f"unknown option {option!r}{nearest(option, self._option_string_actions)}"
+        )
 
 
-Commands = argparse._SubParsersAction  # what ``add_subparsers`` returns: commands are added to it
-Options = argparse._ActionsContainer  # a parser or a group of its options: options are added to it
+Commands = (
+    argparse._SubParsersAction
+)  # what ``add_subparsers`` returns: commands are added to it
+Options = (
+    argparse._ActionsContainer
+)  # a parser or a group of its options: options are added to it
 
 
 class Alternative(Protocol):
     """A module with another kind of input of a command.
 
-    Its docstring is a title, which names its options, and the part of the help on this input.
+    Its docstring is a title, which names its options, and the part of the help on this
+    input.
     """
 
     __doc__: str | None
@@ -73,32 +93,48 @@ class Alternative(Protocol):
         """Add the options that only this input has."""
 
     def accepts(self, arguments: argparse.Namespace) -> bool:
-        """Return whether the arguments name this input; refuse its options if they name another one."""
+        """Return whether the arguments name this input.
+
+        Refuse its options if they name another one.
+        """
 
     def run(self, arguments: argparse.Namespace) -> int:
         """Run the command for this input and return the exit code."""
 
 
 def add_command(
-    commands: "Commands[Any]", name: str, module: ModuleType, alternatives: Sequence[Alternative] = ()
+    commands: "Commands[Any]",
+    name: str,
+    module: ModuleType,
+    alternatives: Sequence[Alternative] = (),
 ) -> None:
     """Add the command of a module, whose docstring is the help.
 
-    Its function ``add_options`` adds arguments and options to a parser. ``run`` runs the command with the parsed
-    arguments, and returns the exit code if it can be another one than 0. An alternative runs in its place where it
-    accepts the arguments.
+    Its function ``add_options`` adds arguments and options to a parser. ``run`` runs
+    the command with the parsed arguments, and returns the exit code if it can be
+    another one than 0. An alternative runs in its place where it accepts the arguments.
     """
     title, text = _title_and_text(module)
-    text = "\n".join([text, *(_title_and_text(alternative)[1] for alternative in alternatives)])
+    text = "\n".join(
+        [text, *(_title_and_text(alternative)[1] for alternative in alternatives)]
+    )
     summary = f"{title[:1].lower()}{title[1:]}".rstrip(".\n")
-    parser = commands.add_parser(name, help=summary, description=title, epilog=text or None)
+    parser = commands.add_parser(
+        name, help=summary, description=title, epilog=text or None
+    )
     add_debug(parser, default=argparse.SUPPRESS)  # keep an option before the command
     module.add_options(parser)
     for alternative in alternatives:
-        alternative.add_options(parser.add_argument_group(_title_and_text(alternative)[0].rstrip(".").lower()))
+        alternative.add_options(
+            parser.add_argument_group(
+                _title_and_text(alternative)[0].rstrip(".").lower()
+            )
+        )
 
     def run(arguments: argparse.Namespace) -> int | None:
-        chosen = next((item for item in alternatives if item.accepts(arguments)), module)
+        chosen = next(
+            (item for item in alternatives if item.accepts(arguments)), module
+        )
         code: int | None = chosen.run(arguments)
         return code
 
@@ -113,13 +149,20 @@ def _title_and_text(module: object) -> tuple[str, str]:
 
 def add_debug(parser: Parser, *, default: Any = False) -> None:
     """Add ``--debug``."""
-    parser.add_argument("--debug", action="store_true", default=default, help="show the traceback of an error")
+    parser.add_argument(
+        "--debug",
+        action="store_true",
+        default=default,
+        help="show the traceback of an error",
+    )
 
 
 ENGINE = ("workers", "engine", "address")
 
 
-def add_engine(parser: Options, workers: str = "processes; default one per available core") -> None:
+def add_engine(
+    parser: Options, workers: str = "processes; default one per available core"
+) -> None:
     """Add the options of ``ENGINE``, with a help for ``--workers``."""
     parser.add_argument("--workers", metavar="W", type=values.positive, help=workers)
     text = "engine of the workers: local processes (loky, default), or a cluster: dask or ray ('cnpgen docs scale')"

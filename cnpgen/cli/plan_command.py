@@ -1,12 +1,14 @@
 """Plan with a trained model.
 
-The problems are samples of a dataset, fresh draws of a recipe as 'cnpgen solve' makes them, scenes ('cnpgen docs
-scene-files') for a model that was trained on scenes, or boundary conditions in an HDF5 file (a shard, a plan file, or
-any other): start_q and goal_q of shape (N, joints), optionally start_dq, start_ddq and goal_dq, and goal_ddq for models
-that hold the goal's acceleration. Plans meet the boundary conditions to rounding; 'cnpgen evaluate' checks the
-constraints. With --refine the plans are optimized as by 'cnpgen refine', and the exit code is 1 if a plan is invalid in
-the end. Finished plans are kept in PLANS.part, and the same command resumes. The plan file is printed on stdout; an
-existing one is replaced only with --force.
+The problems are samples of a dataset, fresh draws of a recipe as 'cnpgen solve' makes
+them, scenes ('cnpgen docs scene-files') for a model that was trained on scenes, or
+boundary conditions in an HDF5 file (a shard, a plan file, or any other): start_q and
+goal_q of shape (N, joints), optionally start_dq, start_ddq and goal_dq, and goal_ddq
+for models that hold the goal's acceleration. Plans meet the boundary conditions to
+rounding; 'cnpgen evaluate' checks the constraints. With --refine the plans are
+optimized as by 'cnpgen refine', and the exit code is 1 if a plan is invalid in the end.
+Finished plans are kept in PLANS.part, and the same command resumes. The plan file is
+printed on stdout; an existing one is replaced only with --force.
 """
 
 import argparse
@@ -16,7 +18,14 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import ENGINE, Parser, add_engine, add_json, options_of, refuse
-from cnpgen.cli.refine_command import LARGE_ANGLES, REFINING, WORKERS, add_refining, check_place, refine_and_save
+from cnpgen.cli.refine_command import (
+    LARGE_ANGLES,
+    REFINING,
+    WORKERS,
+    add_refining,
+    check_place,
+    refine_and_save,
+)
 from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:
@@ -33,13 +42,38 @@ def add_options(parser: Parser) -> None:
     text = "plan file to write, .h5 (default for a recipe: NAME-plans.h5)"
     option("-o", "--out", metavar="PLANS", type=Path, help=text)
     option("--split", metavar="NAME", help="split of the dataset (default: validation)")
-    option("--first", metavar="I", type=values.natural, help="first sample of the split (default: 0)")
-    option("--n", metavar="K", type=values.rows, help="number of problems; for a folder by default all that follow")
-    option("--seed", metavar="S", type=values.seed, help="root seed of fresh problems; default the recipe's")
-    option("--other-rows", action="store_true", help="accept samples of another pipeline than the training data")
+    option(
+        "--first",
+        metavar="I",
+        type=values.natural,
+        help="first sample of the split (default: 0)",
+    )
+    option(
+        "--n",
+        metavar="K",
+        type=values.rows,
+        help="number of problems; for a folder by default all that follow",
+    )
+    option(
+        "--seed",
+        metavar="S",
+        type=values.seed,
+        help="root seed of fresh problems; default the recipe's",
+    )
+    option(
+        "--other-rows",
+        action="store_true",
+        help="accept samples of another pipeline than the training data",
+    )
     option("--allow-large-angles", action="store_true", help=LARGE_ANGLES)
-    option("--no-time-scaling", action="store_true", help="keep the rates of the network")
-    option("--force", action="store_true", help="replace PLANS, and discard another run's PLANS.part")
+    option(
+        "--no-time-scaling", action="store_true", help="keep the rates of the network"
+    )
+    option(
+        "--force",
+        action="store_true",
+        help="replace PLANS, and discard another run's PLANS.part",
+    )
     option("--quiet", action="store_true", help="no progress and no summary")
     add_json(parser)
     option("--refine", action="store_true", help="optimize the plans")
@@ -74,16 +108,29 @@ def run(arguments: argparse.Namespace) -> int:
             text += f", {1e6 * seconds / len(plans):.0f} us each, mean motion time {plans.duration.mean():.3f} s"
         print(text, file=sys.stderr)
     if arguments.refine:
-        return refine_and_save(arguments, plans, arguments.out, title=f"refining plans of {arguments.model}")
+        return refine_and_save(
+            arguments,
+            plans,
+            arguments.out,
+            title=f"refining plans of {arguments.model}",
+        )
     save_plans(arguments.out, plans)
     duration = float(plans.duration.mean()) if len(plans) else None
-    facts = {"file": str(arguments.out), "plans": len(plans), "seconds": seconds, "mean_duration_s": duration}
+    facts = {
+        "file": str(arguments.out),
+        "plans": len(plans),
+        "seconds": seconds,
+        "mean_duration_s": duration,
+    }
     print(json.dumps(facts, indent=2) if arguments.json else arguments.out)
     return 0
 
 
 def _complete(arguments: argparse.Namespace) -> None:
-    """Set the default model and output of a recipe; refuse contradictory arguments and existing output."""
+    """Set the default model and output of a recipe.
+
+    Refuse contradictory arguments and existing output.
+    """
     from cnpgen.planner.model_file import shipped_models
 
     name, recipe = arguments.problems, recipe_names.is_recipe(arguments.problems)
@@ -93,9 +140,15 @@ def _complete(arguments: argparse.Namespace) -> None:
         arguments.out = Path(f"{Path(name).stem}-plans.h5")
     for option, value in (("--model", arguments.model), ("-o/--out", arguments.out)):
         if value is None:
-            raise UsageError(f"the following arguments are required: {option}; see 'cnpgen plan --help'")
+            raise UsageError(
+                f"the following arguments are required: {option}; see 'cnpgen plan --help'"
+            )
     refining = options_of(arguments, *ENGINE, "explain", *REFINING)
-    lost = [name for name, value in refining.items() if value != arguments.parser.get_default(name)]
+    lost = [
+        name
+        for name, value in refining.items()
+        if value != arguments.parser.get_default(name)
+    ]
     if lost and not arguments.refine:
         raise UsageError(f"--{lost[0].replace('_', '-')} needs --refine")
     check_place(arguments.out, force=arguments.force)
@@ -107,7 +160,11 @@ def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
 
     if recipe_names.is_recipe(arguments.problems):
         return _draws(arguments, model)
-    refuse(arguments, ["seed"], f"--seed is for fresh draws of a recipe, got {arguments.problems}")
+    refuse(
+        arguments,
+        ["seed"],
+        f"--seed is for fresh draws of a recipe, got {arguments.problems}",
+    )
     problems = Path(arguments.problems)
     if problems.exists() and holds_scenes(problems):
         return _scenes(arguments, model)
@@ -120,8 +177,17 @@ def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
             n=arguments.n,
             other=arguments.other_rows,
         )
-    refuse(arguments, ["split", "first", "n"], "--split, --first and --n need the folder of a dataset, got a file")
-    return read_file(problems, model, other=arguments.other_rows, allow_large_angles=arguments.allow_large_angles)
+    refuse(
+        arguments,
+        ["split", "first", "n"],
+        "--split, --first and --n need the folder of a dataset, got a file",
+    )
+    return read_file(
+        problems,
+        model,
+        other=arguments.other_rows,
+        allow_large_angles=arguments.allow_large_angles,
+    )
 
 
 def _scenes(arguments: argparse.Namespace, model: "Model") -> "Requests":
@@ -130,15 +196,27 @@ def _scenes(arguments: argparse.Namespace, model: "Model") -> "Requests":
     from cnpgen.problems.scenes.scene_reader import read_scenes
 
     if arguments.split is not None or arguments.other_rows:
-        raise UsageError("--split and --other-rows are for datasets; scenes have --first and --n")
-    return scene_requests(model, read_scenes(Path(arguments.problems), start=arguments.first or 0, n=arguments.n))
+        raise UsageError(
+            "--split and --other-rows are for datasets; scenes have --first and --n"
+        )
+    return scene_requests(
+        model,
+        read_scenes(
+            Path(arguments.problems), start=arguments.first or 0, n=arguments.n
+        ),
+    )
 
 
 def _draws(arguments: argparse.Namespace, model: "Model") -> "Requests":
     """Draw fresh problems of a recipe."""
     from cnpgen.make.draw_boundary_problems import draw_boundary_problems
     from cnpgen.make.recipe import load_dataset_recipe
-    from cnpgen.planner.plan_requests import Requests, check_stages, checked_boundary, context_columns
+    from cnpgen.planner.plan_requests import (
+        Requests,
+        check_stages,
+        checked_boundary,
+        context_columns,
+    )
     from cnpgen.problems.problem import resolved
     from cnpgen.problems.problem_record import record_problem
     from cnpgen.store.files.documents import plain
@@ -147,10 +225,18 @@ def _draws(arguments: argparse.Namespace, model: "Model") -> "Requests":
     of_rows = "--split and --first need the folder of a dataset; samples drawn from a recipe have --seed"
     refuse(arguments, ["split", "first"], of_rows)
     if arguments.n is None:
-        raise UsageError(f"--n is required: the number of fresh problems of the recipe {name}")
+        raise UsageError(
+            f"--n is required: the number of fresh problems of the recipe {name}"
+        )
     recipe = load_dataset_recipe(name)
     stages = plain(resolved(recipe.pipeline))["stage"]
-    check_stages(name, record_problem(recipe.pipeline.problem), stages, model, other=arguments.other_rows)
+    check_stages(
+        name,
+        record_problem(recipe.pipeline.problem),
+        stages,
+        model,
+        other=arguments.other_rows,
+    )
     problems = draw_boundary_problems(recipe, arguments.n, seed=arguments.seed)
     boundary = checked_boundary(name, problems.boundary.arrays(), model)
     return Requests(boundary, problems.sample_id, context_columns(problems.columns))

@@ -1,4 +1,7 @@
-"""Arguments that name a recipe or a path; one that does not exist or is of another kind is refused."""
+"""Arguments that name a recipe or a path.
+
+One that does not exist or is of another kind is refused.
+"""
 
 import os
 from collections.abc import Iterable
@@ -35,21 +38,31 @@ def check_recipe(recipe: str, *, of_dataset: str = DATASET) -> None:
     check_readable(path)
     if path.is_dir():
         if recipe not in _shipped() and is_dataset(path):
-            raise UsageError(f"{recipe} is the folder of a dataset, expected a recipe: {of_dataset.format(recipe)}")
+            raise UsageError(
+                f"{recipe} is the folder of a dataset, expected a recipe: {of_dataset.format(recipe)}"
+            )
         return
     if path.suffix.lower() == ".csv" and path.is_file():
         hint = f"'cnpgen complete NAME {recipe} -o problems.h5' makes problems of tasks, which 'cnpgen solve' takes"
         raise UsageError(f"{recipe} is a table, expected a recipe: {hint}")
     if kind := file_kind(path):
-        what = kind if kind in {"an HDF5 file", "a journal of cnpgen"} else f"an HDF5 file, {kind}"
-        hint = _HINTS.get(kind, "'cnpgen list' names the recipes that there are").format(recipe)
+        what = (
+            kind
+            if kind in {"an HDF5 file", "a journal of cnpgen"}
+            else f"an HDF5 file, {kind}"
+        )
+        hint = _HINTS.get(
+            kind, "'cnpgen list' names the recipes that there are"
+        ).format(recipe)
         raise UsageError(f"{recipe} is {what}, expected a recipe: {hint}")
 
 
 def is_recipe(what: str) -> bool:
     """Return whether an argument is a recipe file, or the name of a shipped dataset or pipeline and no path."""
     path = Path(what)
-    return path.suffix == ".toml" or (not path.exists() and what in _shipped("dataset", "pipeline"))
+    return path.suffix == ".toml" or (
+        not path.exists() and what in _shipped("dataset", "pipeline")
+    )
 
 
 def _shipped(*kinds: str) -> list[str]:
@@ -57,7 +70,14 @@ def _shipped(*kinds: str) -> list[str]:
     from cnpgen.schema.catalogue import list_recipes
     from cnpgen.schema.toml import MARKS
 
-    return sorted({name for kind in MARKS if not kinds or kind in kinds for name in list_recipes(kind)})
+    return sorted(
+        {
+            name
+            for kind in MARKS
+            if not kinds or kind in kinds
+            for name in list_recipes(kind)
+        }
+    )
 
 
 # Types of arguments, which argparse reads before it reports missing options.
@@ -71,9 +91,15 @@ def _recipe_or_path(kinds: tuple[str, ...], text: str) -> str:
 
     names, path = _shipped(*kinds), Path(text)
     check_readable(path)
-    if path.suffix.lower() not in _TEXTS and path.is_file() and kind_of_content(path) == "a text file":
+    if (
+        path.suffix.lower() not in _TEXTS
+        and path.is_file()
+        and kind_of_content(path) == "a text file"
+    ):
         check_recipe(text)  # has a hint for tables
-        raise UsageError(f"{text} is a text file, expected a recipe (.toml) or an HDF5 file")
+        raise UsageError(
+            f"{text} is a text file, expected a recipe (.toml) or an HDF5 file"
+        )
     if path.exists() or text in names:
         return text
     hint = similar_path(path, names)
@@ -92,7 +118,9 @@ def shipped(text: str) -> str:
     """Read the name of a shipped dataset, pipeline or problem."""
     check_recipe(text)
     if os.path.exists(text) or text.endswith(".toml"):  # noqa: PTH110 - names may be too long
-        raise UsageError(f"expected the name of a shipped recipe, got the path {text}: copy your own files")
+        raise UsageError(
+            f"expected the name of a shipped recipe, got the path {text}: copy your own files"
+        )
     return viewed(text)
 
 
@@ -112,7 +140,9 @@ def _recipe(kinds: "tuple[Kind, ...]", text: str) -> str:
     return text
 
 
-problem = partial(_recipe, ("problem", "pipeline", "dataset"))  # or a recipe with the problem
+problem = partial(
+    _recipe, ("problem", "pipeline", "dataset")
+)  # or a recipe with the problem
 suite = partial(_recipe, ("suite", "dataset", "pipeline"))
 
 
@@ -142,7 +172,10 @@ def present(text: str) -> Path:
 
 
 def read_plans(path: Path, *, problem: str | None = None) -> "Plans":
-    """Read the plans of a file, as ``cnpgen.load_plans`` does; refuse files without plans."""
+    """Read the plans of a file, as ``cnpgen.load_plans`` does.
+
+    Refuse files without plans.
+    """
     from cnpgen.plans import load_plans
 
     plans = load_plans(path, problem=problem)
@@ -155,10 +188,14 @@ def check_absent(folder: Path, names: Iterable[str], *, force: bool) -> None:
     """Refuse files that exist in a folder, unless they may be replaced."""
     there = [str(folder / name) for name in names if (folder / name).exists()]
     if there and not force:
-        raise UsageError(f"{', '.join(there)} exist{'s' if len(there) == 1 else ''} already: --force writes over it")
+        raise UsageError(
+            f"{', '.join(there)} exist{'s' if len(there) == 1 else ''} already: --force writes over it"
+        )
 
 
 def _refuse_shipped(text: str) -> None:
     """Refuse the name of a shipped dataset where its folder is expected."""
     if not os.path.exists(text) and text in _shipped("dataset"):  # noqa: PTH110 - names may be too long
-        raise UsageError(f"{text} is a recipe, expected a path: 'cnpgen make-dataset {text}' makes the dataset")
+        raise UsageError(
+            f"{text} is a recipe, expected a path: 'cnpgen make-dataset {text}' makes the dataset"
+        )

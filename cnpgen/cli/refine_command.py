@@ -1,8 +1,9 @@
 """Optimize the plans of a file.
 
-The plans may come from any planner; 'cnpgen docs plan-format' shows how to write a plan file, and how trajectories
-that are sampled in time become plans. No plan comes back worse than it was given: violations count first, then the
-objective. Plans whose control points are no numbers, or that take longer than a minute, are made from nothing.
+The plans may come from any planner; 'cnpgen docs plan-format' shows how to write a plan
+file, and how trajectories that are sampled in time become plans. No plan comes back
+worse than it was given: violations count first, then the objective. Plans whose control
+points are no numbers, or that take longer than a minute, are made from nothing.
 """
 
 import argparse
@@ -27,8 +28,17 @@ if TYPE_CHECKING:
     from cnpgen.plans import Plans
     from cnpgen.refine.refinement import Refinement
 
-REFINING = ("objective", "weight", "max_iterations", "tolerance", "deadline", "stay_within")  # what add_refining adds
-LARGE_ANGLES = "accept boundary conditions in a file that are probably in degrees or millimetres"
+REFINING = (
+    "objective",
+    "weight",
+    "max_iterations",
+    "tolerance",
+    "deadline",
+    "stay_within",
+)  # what add_refining adds
+LARGE_ANGLES = (
+    "accept boundary conditions in a file that are probably in degrees or millimetres"
+)
 WORKERS = "processes; default one per available core, or one for up to 60 plans"
 LISTED = 10  # plans without success that are listed
 
@@ -47,7 +57,9 @@ def add_options(parser: Parser) -> None:
     text = "output file (default: FILE-refined.h5 beside it)"
     parser.add_argument("-o", "--out", metavar="OUT", type=Path, help=text)
     text = "the problem of the plans; its tolerances are used"
-    parser.add_argument("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
+    parser.add_argument(
+        "--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text
+    )
     add_refine_options(parser)
 
 
@@ -64,8 +76,14 @@ def add_refine_options(parser: Parser) -> None:
     parser.epilog = f"{parser.epilog or ''}{TEXT}"
     add_refining(parser)
     add_engine(parser, WORKERS)
-    parser.add_argument("--force", action="store_true", help="replace OUT, and discard another run's OUT.part")
-    parser.add_argument("--quiet", action="store_true", help="no progress and no summary")
+    parser.add_argument(
+        "--force",
+        action="store_true",
+        help="replace OUT, and discard another run's OUT.part",
+    )
+    parser.add_argument(
+        "--quiet", action="store_true", help="no progress and no summary"
+    )
     add_json(parser)
 
 
@@ -75,8 +93,18 @@ def add_refining(parser: Options) -> None:
     text = "objective: that of the problem file (time, default), or the duration with terms such as effort=0.5 or"
     text += " effort=1,jerk=0.1 ('cnpgen list objectives')"
     option("--objective", metavar="TERMS", default="time", help=text)
-    option("--weight", metavar="X", type=float, help="weight of these terms (default: as in the problem or 1)")
-    option("--max-iterations", metavar="I", type=values.natural, help="steps of the coarse level (default: 40)")
+    option(
+        "--weight",
+        metavar="X",
+        type=float,
+        help="weight of these terms (default: as in the problem or 1)",
+    )
+    option(
+        "--max-iterations",
+        metavar="I",
+        type=values.natural,
+        help="steps of the coarse level (default: 40)",
+    )
     text = "relative change of the objective at which the iteration converges (default: 1e-3; without an initial"
     text += " guess a tenth of it, among obstacles a twentieth)"
     option("--tolerance", metavar="X", type=float, help=text)
@@ -98,14 +126,17 @@ def refine_and_save(
 ) -> int:
     """Refine plans, save them, print a summary; return the exit code.
 
-    ``make`` is ``refine_plans`` by default, ``solve_plans``, or a function that solves scenes and has no plans.
+    ``make`` is ``refine_plans`` by default, ``solve_plans``, or a function that solves
+    scenes and has no plans.
     """
     from cnpgen.plans import save_plans
     from cnpgen.refine.options import RefineOptions
     from cnpgen.refine.refine_plans import refine_plans
 
     given = options_of(arguments, *REFINING)
-    options = RefineOptions(**{name: value for name, value in given.items() if value is not None})
+    options = RefineOptions(
+        **{name: value for name, value in given.items() if value is not None}
+    )
     check_place(out, force=arguments.force)
     journal = out.with_name(out.name + ".part")
     finished = [0, 0]
@@ -127,12 +158,16 @@ def refine_and_save(
             **options_of(arguments, *ENGINE),
         )
         facts = found.summary()
-        if arguments.explain and any("finding" not in failure for failure in facts["not_valid"]):
+        if arguments.explain and any(
+            "finding" not in failure for failure in facts["not_valid"]
+        ):
             _explain(facts, found, meter)
     save_plans(out, found.plans)
     journal.unlink(missing_ok=True)
     if not arguments.quiet:
-        lines = _summary(facts, found.times, listed=facts["plans"] if arguments.explain else LISTED)
+        lines = _summary(
+            facts, found.times, listed=facts["plans"] if arguments.explain else LISTED
+        )
         print("\n".join(lines), file=sys.stderr)
     print(json.dumps({"file": str(out), **facts}, indent=2) if arguments.json else out)
     return 0 if found.valid.all() else 1
@@ -144,14 +179,18 @@ def check_place(out: Path, *, force: bool) -> None:
     from cnpgen.store.files.atomic import check_writable
 
     if out.suffix != ".h5" or out.is_dir() or not out.parent.is_dir():
-        raise UsageError(f"{out} must be a file that ends in .h5, in a folder that exists")
+        raise UsageError(
+            f"{out} must be a file that ends in .h5, in a folder that exists"
+        )
     if out.exists() and not force:
         raise UsageError(f"{out} exists: --force replaces it, -o names another file")
     check_replaceable(out)
     check_writable(out)
 
 
-def _explain(facts: dict[str, Any], found: "Refinement | SolvedScenes", meter: Meter) -> None:
+def _explain(
+    facts: dict[str, Any], found: "Refinement | SolvedScenes", meter: Meter
+) -> None:
     """Add proofs of infeasibility to the results of invalid plans."""
     from cnpgen.refine.proof.explain import explain_plans
 
@@ -168,21 +207,38 @@ def _summary(facts: dict[str, Any], times: "Times", *, listed: int) -> list[str]
 
     mean = facts["mean_duration_s"]
     mean_text = "" if mean is None else f"; mean motion time {mean:.4f} s"
-    lines = [f"{facts['valid']:,} of {counted(facts['plans'], 'plan')} valid in {times}{mean_text}"]
-    lines += [f"  {count:,} {Outcome[name.upper()].text}" for name, count in facts["outcomes"].items()]
+    lines = [
+        f"{facts['valid']:,} of {counted(facts['plans'], 'plan')} valid in {times}{mean_text}"
+    ]
+    lines += [
+        f"  {count:,} {Outcome[name.upper()].text}"
+        for name, count in facts["outcomes"].items()
+    ]
     for failure in facts["not_valid"][:listed]:
         lines += textwrap.wrap(_failure_text(failure), 110, subsequent_indent="  ")
     if len(facts["not_valid"]) > listed:
-        lines.append(f"... and {len(facts['not_valid']) - listed} more: 'cnpgen evaluate' lists them with --list")
+        lines.append(
+            f"... and {len(facts['not_valid']) - listed} more: 'cnpgen evaluate' lists them with --list"
+        )
     if any("finding" not in failure for failure in facts["not_valid"]):
-        lines.append("--explain checks whether a problem is infeasible; 'cnpgen docs troubleshooting' lists causes")
+        lines.append(
+            "--explain checks whether a problem is infeasible; 'cnpgen docs troubleshooting' lists causes"
+        )
     return lines
 
 
 def _failure_text(failure: dict[str, Any]) -> str:
     """Describe why one plan is invalid, with the proof of its problem if requested."""
-    why = f"{failure['finding']}: {failure['explanation']}" if "finding" in failure else failure["outcome"]
+    why = (
+        f"{failure['finding']}: {failure['explanation']}"
+        if "finding" in failure
+        else failure["outcome"]
+    )
     if failure.get("finding") == "gave up":
         why = f"{why}; {failure['outcome']}"
-    name = f"scene {failure['scene']!r}" if "scene" in failure else f"sample {failure['sample_id']}"
+    name = (
+        f"scene {failure['scene']!r}"
+        if "scene" in failure
+        else f"sample {failure['sample_id']}"
+    )
     return f"plan {failure['plan']} ({name}): {failure['reason']}; {why}"

@@ -1,7 +1,8 @@
 """Describe a recipe, a kind of stage or constraint, or the keys of recipe files.
 
-A dataset is shown with its pipeline and its problem, a pipeline with its problem. Errors in a file are
-reported on stderr with file and key, one per line, and the exit code is 2.
+A dataset is shown with its pipeline and its problem, a pipeline with its problem.
+Errors in a file are reported on stderr with file and key, one per line, and the exit
+code is 2.
 """
 
 import argparse
@@ -15,18 +16,41 @@ from cnpgen.schema.toml import MARKS, Kind, kind_of_file
 if TYPE_CHECKING:
     from cnpgen.cli.describe import Recipe
 
-KINDS: tuple[Kind, ...] = ("dataset", "pipeline", "problem")  # a dataset includes the other two
+KINDS: tuple[Kind, ...] = (
+    "dataset",
+    "pipeline",
+    "problem",
+)  # a dataset includes the other two
 
 
 def add_options(parser: Parser) -> None:
     what = parser.add_mutually_exclusive_group(required=True)
-    text = "a shipped dataset, pipeline or problem (see 'cnpgen list'), or a recipe file"
+    text = (
+        "a shipped dataset, pipeline or problem (see 'cnpgen list'), or a recipe file"
+    )
     what.add_argument("recipe", metavar="NAME|FILE", nargs="?", help=text)
-    what.add_argument("--stage", metavar="KIND", help="describe a kind of stage and its keys")
-    what.add_argument("--constraint", metavar="KIND", help="describe a kind of constraint and its keys")
+    what.add_argument(
+        "--stage", metavar="KIND", help="describe a kind of stage and its keys"
+    )
+    what.add_argument(
+        "--constraint",
+        metavar="KIND",
+        help="describe a kind of constraint and its keys",
+    )
     text = "all keys of problem, pipeline, dataset and suite files, in Markdown ('cnpgen docs keys'); WHAT is one kind"
-    what.add_argument("--keys", metavar="WHAT", nargs="?", choices=("all", *MARKS), const="all", help=text)
-    parser.add_argument("--kind", choices=KINDS, help="kind of the recipe, if several have the same name")
+    what.add_argument(
+        "--keys",
+        metavar="WHAT",
+        nargs="?",
+        choices=("all", *MARKS),
+        const="all",
+        help=text,
+    )
+    parser.add_argument(
+        "--kind",
+        choices=KINDS,
+        help="kind of the recipe, if several have the same name",
+    )
     add_json(parser)
 
 
@@ -41,7 +65,11 @@ def run(arguments: argparse.Namespace) -> None:
         return
     check_recipe(arguments.recipe)
     recipe = load_any(arguments.recipe, arguments.kind)
-    print(render(plain(describe.recipe_to_dict(recipe))) if arguments.json else describe.describe(recipe))
+    print(
+        render(plain(describe.recipe_to_dict(recipe)))
+        if arguments.json
+        else describe.describe(recipe)
+    )
 
 
 def _about_kinds(arguments: argparse.Namespace) -> str:
@@ -52,16 +80,27 @@ def _about_kinds(arguments: argparse.Namespace) -> str:
 
     if arguments.keys:
         kinds = tuple(MARKS) if arguments.keys == "all" else (arguments.keys,)
-        found = describe_keys.keys_to_dict(kinds) if arguments.json else describe_keys.describe_keys(kinds)
+        found = (
+            describe_keys.keys_to_dict(kinds)
+            if arguments.json
+            else describe_keys.describe_keys(kinds)
+        )
     else:
         group = registry.STAGES if arguments.stage else registry.CONSTRAINTS
-        describe = describe_keys.kind_to_dict if arguments.json else describe_keys.describe_kind
+        describe = (
+            describe_keys.kind_to_dict
+            if arguments.json
+            else describe_keys.describe_kind
+        )
         found = describe(group, arguments.stage or arguments.constraint)
     return render(plain(found)) if arguments.json else str(found)
 
 
 def load_any(name_or_path: str, kind: Kind | None = None) -> "Recipe":
-    """Load a recipe of any kind; of several with the same name the one that includes the others."""
+    """Load a recipe of any kind.
+
+    Of several with the same name the one that includes the others.
+    """
     from cnpgen.make.recipe import load_dataset_recipe
     from cnpgen.pipelines.pipeline import load_pipeline
     from cnpgen.problems.problem_file import load_problem
@@ -70,4 +109,8 @@ def load_any(name_or_path: str, kind: Kind | None = None) -> "Recipe":
     kind = kind or kind_of_file(find_recipe(KINDS, name_or_path))
     if kind == "dataset":
         return load_dataset_recipe(name_or_path)
-    return load_pipeline(name_or_path) if kind == "pipeline" else load_problem(name_or_path)
+    return (
+        load_pipeline(name_or_path)
+        if kind == "pipeline"
+        else load_problem(name_or_path)
+    )

@@ -1,13 +1,16 @@
 """Plan without an initial guess.
 
-A folder of a dataset gives its rows, a recipe gives fresh draws, which no split of the dataset holds. Rows of a
-certified dataset have plans already: these are refined. An HDF5 file gives boundary conditions: a shard, a file of
-plans, whose plans are not looked at, or any other with start_q and goal_q of shape (N, joints), and start_dq,
-start_ddq and goal_dq where they are not zero. --problem names the problem if the file does not.
+A folder of a dataset gives its rows, a recipe gives fresh draws, which no split of the
+dataset holds. Rows of a certified dataset have plans already: these are refined. An
+HDF5 file gives boundary conditions: a shard, a file of plans, whose plans are not
+looked at, or any other with start_q and goal_q of shape (N, joints), and start_dq,
+start_ddq and goal_dq where they are not zero. --problem names the problem if the file
+does not.
 
-With --robot, files of scenes are solved: planning scenes and requests of MoveIt or robometrics in YAML, MPiNets or
-Avoid Everything in HDF5, or a folder of them ('cnpgen docs scene-files'). All plans of one call are written to one
-file; the column obstacle_poses contains the obstacles of each. Unsolved scenes are listed with a reason.
+With --robot, files of scenes are solved: planning scenes and requests of MoveIt or
+robometrics in YAML, MPiNets or Avoid Everything in HDF5, or a folder of them ('cnpgen
+docs scene-files'). All plans of one call are written to one file; the column
+obstacle_poses contains the obstacles of each. Unsolved scenes are listed with a reason.
 """
 
 import argparse
@@ -17,7 +20,12 @@ from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, refuse
-from cnpgen.cli.refine_command import LARGE_ANGLES, add_refine_options, check_place, refine_and_save
+from cnpgen.cli.refine_command import (
+    LARGE_ANGLES,
+    add_refine_options,
+    check_place,
+    refine_and_save,
+)
 from cnpgen.errors import DatasetError, UsageError
 
 if TYPE_CHECKING:
@@ -30,15 +38,36 @@ def add_options(parser: Parser) -> None:
     text = "a dataset's folder; a dataset or pipeline by name, or a recipe file; boundary conditions in HDF5;"
     text += " or, with --robot, scenes"
     option("what", metavar="DIR|NAME|FILE", type=recipe_names.problems, help=text)
-    option("--n", metavar="K", type=values.rows, help="number of problems; for a folder all of the split by default")
+    option(
+        "--n",
+        metavar="K",
+        type=values.rows,
+        help="number of problems; for a folder all of the split by default",
+    )
     option("--split", metavar="NAME", help="split of the folder (default: validation)")
-    option("--first", metavar="I", type=values.natural, help="first sample of the split (default: 0)")
-    option("--seed", metavar="S", type=values.seed, help="root seed of fresh problems; default the recipe's")
+    option(
+        "--first",
+        metavar="I",
+        type=values.natural,
+        help="first sample of the split (default: 0)",
+    )
+    option(
+        "--seed",
+        metavar="S",
+        type=values.seed,
+        help="root seed of fresh problems; default the recipe's",
+    )
     text = "the problem of boundary conditions in HDF5; its tolerances are used"
     option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     text = "solve scenes with this problem of a robot, such as panda"
     option("--robot", metavar="NAME|FILE", type=recipe_names.problem, help=text)
-    option("-o", "--out", metavar="OUT", type=Path, help="output file (default: DIR-plans.h5 or NAME-plans.h5)")
+    option(
+        "-o",
+        "--out",
+        metavar="OUT",
+        type=Path,
+        help="output file (default: DIR-plans.h5 or NAME-plans.h5)",
+    )
     option("--allow-large-angles", action="store_true", help=LARGE_ANGLES)
     parser.epilog = f"{parser.epilog or ''}\n"
     add_refine_options(parser)
@@ -48,13 +77,19 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.refine.refine_plans import refine_plans, solve_plans
 
     what = Path(arguments.what)
-    out = arguments.out or Path(f"{what.resolve().name if what.is_dir() else what.stem}-plans.h5")
+    out = arguments.out or Path(
+        f"{what.resolve().name if what.is_dir() else what.stem}-plans.h5"
+    )
     check_place(out, force=arguments.force)
     if arguments.robot is not None:
         return _solve_scenes(arguments, out)
     problems = _problems(arguments)
-    make = refine_plans if math.isfinite(problems.duration[0]) else solve_plans  # rows of certified datasets have plans
-    return refine_and_save(arguments, problems, out, title=f"solving {arguments.what}", make=make)
+    make = (
+        refine_plans if math.isfinite(problems.duration[0]) else solve_plans
+    )  # rows of certified datasets have plans
+    return refine_and_save(
+        arguments, problems, out, title=f"solving {arguments.what}", make=make
+    )
 
 
 def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
@@ -62,14 +97,22 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
     from cnpgen.problems.problem_record import as_problem
     from cnpgen.problems.scenes.scene_reader import read_scenes
 
-    refuse(arguments, ["split", "seed", "problem"], "--robot is for scenes, which have --first and --n")
-    scenes = read_scenes(Path(arguments.what), start=arguments.first or 0, n=arguments.n)
+    refuse(
+        arguments,
+        ["split", "seed", "problem"],
+        "--robot is for scenes, which have --first and --n",
+    )
+    scenes = read_scenes(
+        Path(arguments.what), start=arguments.first or 0, n=arguments.n
+    )
     problem = as_problem(arguments.robot)
 
     def solve(_: "Plans", **options: Any) -> "SolvedScenes":
         return solve_scenes(problem, scenes, **options)
 
-    return refine_and_save(arguments, None, out, title=f"solving {arguments.what}", make=solve)
+    return refine_and_save(
+        arguments, None, out, title=f"solving {arguments.what}", make=solve
+    )
 
 
 def _problems(arguments: argparse.Namespace) -> "Plans":
@@ -80,10 +123,16 @@ def _problems(arguments: argparse.Namespace) -> "Plans":
     what = Path(arguments.what)
     kind = file_kind(what)
     if what.exists() and holds_scenes(what):
-        raise UsageError(f"{what} holds scenes: --robot panda solves them, or another problem of a robot")
+        raise UsageError(
+            f"{what} holds scenes: --robot panda solves them, or another problem of a robot"
+        )
     if what.is_dir():
         return _rows(arguments)
-    if what.is_file() and (kind or what.suffix == ".h5") and not kind.endswith(" of cnpgen"):
+    if (
+        what.is_file()
+        and (kind or what.suffix == ".h5")
+        and not kind.endswith(" of cnpgen")
+    ):
         return _conditions(arguments)
     return _draws(arguments)
 
@@ -91,19 +140,39 @@ def _problems(arguments: argparse.Namespace) -> "Plans":
 def _rows(arguments: argparse.Namespace) -> "Plans":
     from cnpgen.plans.boundary_problems import load_boundary_problems
 
-    refuse(arguments, ["seed"], "--seed is for fresh draws of a recipe; rows of a folder have --split and --first")
-    refuse(arguments, ["problem"], "--problem is for boundary conditions in HDF5; a dataset contains its problem")
+    refuse(
+        arguments,
+        ["seed"],
+        "--seed is for fresh draws of a recipe; rows of a folder have --split and --first",
+    )
+    refuse(
+        arguments,
+        ["problem"],
+        "--problem is for boundary conditions in HDF5; a dataset contains its problem",
+    )
     split = arguments.split or "validation"
-    return load_boundary_problems(arguments.what, split=split, start=arguments.first, n=arguments.n)
+    return load_boundary_problems(
+        arguments.what, split=split, start=arguments.first, n=arguments.n
+    )
 
 
 def _conditions(arguments: argparse.Namespace) -> "Plans":
     from cnpgen.plans.boundary_problems import load_boundary_problems
 
-    refuse(arguments, ["split", "first", "n"], "--split, --first and --n need the folder of a dataset, got a file")
-    refuse(arguments, ["seed"], "--seed is for fresh draws of a recipe, got a file of boundary conditions")
+    refuse(
+        arguments,
+        ["split", "first", "n"],
+        "--split, --first and --n need the folder of a dataset, got a file",
+    )
+    refuse(
+        arguments,
+        ["seed"],
+        "--seed is for fresh draws of a recipe, got a file of boundary conditions",
+    )
     problems = load_boundary_problems(
-        arguments.what, problem=arguments.problem, allow_large_angles=arguments.allow_large_angles
+        arguments.what,
+        problem=arguments.problem,
+        allow_large_angles=arguments.allow_large_angles,
     )
     if not len(problems):
         raise DatasetError(f"no boundary conditions in {arguments.what}")
@@ -118,7 +187,13 @@ def _draws(arguments: argparse.Namespace) -> "Plans":
     recipe = load_dataset_recipe(arguments.what)
     of_rows = "--split and --first need the folder of a dataset; samples drawn from a recipe have --seed"
     refuse(arguments, ["split", "first"], of_rows)
-    refuse(arguments, ["problem"], "--problem is for boundary conditions in HDF5; a recipe contains its problem")
+    refuse(
+        arguments,
+        ["problem"],
+        "--problem is for boundary conditions in HDF5; a recipe contains its problem",
+    )
     if arguments.n is None:
-        raise UsageError(f"--n is required: the number of fresh problems of the recipe {arguments.what}")
+        raise UsageError(
+            f"--n is required: the number of fresh problems of the recipe {arguments.what}"
+        )
     return draw_boundary_problems(recipe, arguments.n, seed=arguments.seed)

@@ -1,7 +1,8 @@
 r"""The output streams of every command, progress and tables: untrusted text must not control a terminal.
 
-Titles, names and texts of files may hold control characters of terminals, or marks that turn the direction of writing.
-They are printed as ``\u001b``, as JSON has them, so that output which is JSON stays the same JSON.
+Titles, names and texts of files may hold control characters of terminals, or marks that
+turn the direction of writing. They are printed as ``\u001b``, as JSON has them, so that
+output which is JSON stays the same JSON.
 """
 
 import re
@@ -20,8 +21,11 @@ if TYPE_CHECKING:
 
 LINE_WIDTH = 100  # of tables and wrapped lines
 
-# What is not printed: control characters but newline and tab, and marks of direction (Unicode, bidirectional controls).
-_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+# What is not printed: control characters but newline and tab, and marks of direction
+# (Unicode, bidirectional controls).
+_CONTROL = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]"
+)
 
 
 def printable(text: str) -> str:
@@ -30,7 +34,10 @@ def printable(text: str) -> str:
 
 
 class Printable:
-    """A stream that prints what is printable; bars of progress, which move on a line, write to its ``terminal``."""
+    """A stream that prints what is printable.
+
+    Bars of progress, which move on a line, write to its ``terminal``.
+    """
 
     def __init__(self, stream: TextIO) -> None:
         self.terminal = stream
@@ -52,7 +59,9 @@ class Printable:
         try:
             yield
         except OSError as error:
-            error.filename = error.filename or str(getattr(self.terminal, "name", "")).strip("<>")
+            error.filename = error.filename or str(
+                getattr(self.terminal, "name", "")
+            ).strip("<>")
             raise
 
     def __getattr__(self, name: str) -> Any:
@@ -102,7 +111,11 @@ class Meter:
             )
         elif not self._quiet:
             there = f", {initial:,} exist already" if initial else ""
-            print(f"{title}: {counted(total, self._noun)}{there}", file=sys.stderr, flush=True)
+            print(
+                f"{title}: {counted(total, self._noun)}{there}",
+                file=sys.stderr,
+                flush=True,
+            )
 
     @property
     def seconds(self) -> float:
@@ -118,12 +131,16 @@ class Meter:
         """Count the rows of a shard."""
         self.rows += rows
         if sampling is not None:
-            self.sampling = sampling if self.sampling is None else self.sampling.merge(sampling)
+            self.sampling = (
+                sampling if self.sampling is None else self.sampling.merge(sampling)
+            )
         if self._bar is not None:
             if self.sampling is not None:
                 tried = self._bar.format_sizeof(self.sampling.tried)
                 share = self.sampling.accepted / max(self.sampling.tried, 1)
-                self._bar.set_postfix_str(f"{tried} tried, {share:.1%} accepted", refresh=False)
+                self._bar.set_postfix_str(
+                    f"{tried} tried, {share:.1%} accepted", refresh=False
+                )
             self._bar.update(rows)
 
     def note(self, text: str) -> None:
@@ -155,16 +172,31 @@ def table(
 ) -> list[str]:
     """Lay out rows of the same length as aligned columns, those in ``right`` to the right; return the lines.
 
-    The last column is wrapped to the width or, with ``one_line``, cut; a path in it stays in one piece, for scripts.
+    The last column is wrapped to the width or, with ``one_line``, cut; a path in it
+    stays in one piece, for scripts.
     """
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]) - 1)]
+    widths = [
+        max(len(row[column]) for row in rows) for column in range(len(rows[0]) - 1)
+    ]
     hanging = indent + " " * (sum(widths) + 2 * len(widths))
     space, count = max(width - len(hanging), 30), 1 if one_line else None
-    wrapper = TextWrapper(space, break_on_hyphens=False, break_long_words=one_line, max_lines=count, placeholder=" ...")
+    wrapper = TextWrapper(
+        space,
+        break_on_hyphens=False,
+        break_long_words=one_line,
+        max_lines=count,
+        placeholder=" ...",
+    )
     lines = []
     for *cells, last in rows:
         pairs = enumerate(zip(cells, widths, strict=True))
-        head = indent + "".join(f"{text.rjust(w) if i in right else text.ljust(w)}  " for i, (text, w) in pairs)
+        head = indent + "".join(
+            f"{text.rjust(w) if i in right else text.ljust(w)}  "
+            for i, (text, w) in pairs
+        )
         parts = [str(last)] if isinstance(last, Path) else wrapper.wrap(last)
-        lines += [(head + (parts[0] if parts else "")).rstrip(), *(hanging + part for part in parts[1:])]
+        lines += [
+            (head + (parts[0] if parts else "")).rstrip(),
+            *(hanging + part for part in parts[1:]),
+        ]
     return lines

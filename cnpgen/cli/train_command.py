@@ -1,10 +1,12 @@
 """Train a planner on a dataset.
 
-The loss is the problem's objective and constraints along every motion; no demonstrations are needed. The command also
-writes a log (.jsonl), a picture of it (.png, if matplotlib is installed) and, until the end, a checkpoint. After Ctrl-C
-(exit code 130), SIGTERM (143), kill -9 or a full disk the same command resumes from the checkpoint and gives the same
-parameters. The best of ten models on validation samples is kept; its score is measured on other samples. The model file
-is printed on stdout. 'cnpgen docs training' explains the options.
+The loss is the problem's objective and constraints along every motion; no
+demonstrations are needed. The command also writes a log (.jsonl), a picture of it
+(.png, if matplotlib is installed) and, until the end, a checkpoint. After Ctrl-C (exit
+code 130), SIGTERM (143), kill -9 or a full disk the same command resumes from the
+checkpoint and gives the same parameters. The best of ten models on validation samples
+is kept; its score is measured on other samples. The model file is printed on stdout.
+'cnpgen docs training' explains the options.
 """
 
 import argparse
@@ -40,22 +42,52 @@ _PRESET = (
 
 def add_options(parser: Parser) -> None:
     option = parser.add_argument
-    option("folder", metavar="DIR", type=recipe_names.present, help="the dataset; or, with --robot, scenes")
-    option("-o", "--out", metavar="MODEL", type=Path, required=True, help="model file to write, .h5")
+    option(
+        "folder",
+        metavar="DIR",
+        type=recipe_names.present,
+        help="the dataset; or, with --robot, scenes",
+    )
+    option(
+        "-o",
+        "--out",
+        metavar="MODEL",
+        type=Path,
+        required=True,
+        help="model file to write, .h5",
+    )
     length = parser.add_mutually_exclusive_group().add_argument
     length("--cpu-seconds", metavar="S", type=values.seconds, help=_SECONDS)
-    length("--steps", metavar="N", type=values.positive, help="length of the run in steps")
-    length("--epochs", metavar="E", type=values.positive, help="length of the run in passes over all samples")
+    length(
+        "--steps", metavar="N", type=values.positive, help="length of the run in steps"
+    )
+    length(
+        "--epochs",
+        metavar="E",
+        type=values.positive,
+        help="length of the run in passes over all samples",
+    )
     option("--preset", choices=("paper",), help=_PRESET)
     add_settings(parser)
     text = "start from the parameters of a model, by name or file; --hidden, --layers, --features and --expected-time"
     text += " must be those of the model"
-    option("--from", dest="start_from", metavar="MODEL", type=recipe_names.model, help=text)
+    option(
+        "--from", dest="start_from", metavar="MODEL", type=recipe_names.model, help=text
+    )
     option("--check", metavar="N", type=values.positive, default=200, help=_CHECK)
     text = "train on scenes with this problem of a robot, such as panda"
     option("--robot", metavar="NAME|FILE", type=recipe_names.problem, help=text)
-    option("--workers", metavar="W", type=values.positive, help="processes of the last validation, on up to 2,000 rows")
-    option("--force", action="store_true", help="replace MODEL, its log and another run's checkpoint")
+    option(
+        "--workers",
+        metavar="W",
+        type=values.positive,
+        help="processes of the last validation, on up to 2,000 rows",
+    )
+    option(
+        "--force",
+        action="store_true",
+        help="replace MODEL, its log and another run's checkpoint",
+    )
     option("--quiet", action="store_true", help="no progress and no summary")
 
 
@@ -72,13 +104,21 @@ class Watch:
         step, steps = state.adam.step, state.steps
         self._last = step
         parameters = run.learner.architecture.n_parameters
-        self._meter.begin(f"training {parameters:,} parameters on {len(run.rows):,} rows", steps, step)
+        self._meter.begin(
+            f"training {parameters:,} parameters on {len(run.rows):,} rows", steps, step
+        )
         wanted, taken = run.learner.settings.batch_size, run.order.batch_size
         if taken < wanted and not self._quiet:
-            print(f"every step takes all {taken:,} rows: there are no {wanted:,} for a batch", file=sys.stderr)
+            print(
+                f"every step takes all {taken:,} rows: there are no {wanted:,} for a batch",
+                file=sys.stderr,
+            )
         passes = steps * taken / len(run.rows)
         if passes > OFTEN and not self._quiet:
-            print(f"every row is seen {passes:,.0f} times: a planner from more rows is better", file=sys.stderr)
+            print(
+                f"every row is seen {passes:,.0f} times: a planner from more rows is better",
+                file=sys.stderr,
+            )
 
     def __call__(self, record: Mapping[str, Any]) -> None:
         """Show a line of the log."""
@@ -91,8 +131,14 @@ class Watch:
         if "loss" in record:
             self._seen = record
         if "validation" in record and not self._quiet:
-            text = _fitted(f"step {step:,}, {record['seconds']:.0f} s: {_words(record['validation'])}")
-            print("\n".join([text, *([_terms(self._seen)] if self._seen else [])]), file=sys.stderr, flush=True)
+            text = _fitted(
+                f"step {step:,}, {record['seconds']:.0f} s: {_words(record['validation'])}"
+            )
+            print(
+                "\n".join([text, *([_terms(self._seen)] if self._seen else [])]),
+                file=sys.stderr,
+                flush=True,
+            )
 
     def close(self) -> None:
         """Remove the bar."""
@@ -105,11 +151,17 @@ def run(arguments: argparse.Namespace) -> None:
         trained = _train(arguments, watch)
     except KeyboardInterrupt as interruption:
         checkpoint = arguments.out.with_suffix(".checkpoint")
-        kept = f"{checkpoint} keeps the run, run the same command again to go on" if checkpoint.exists() else ""
+        kept = (
+            f"{checkpoint} keeps the run, run the same command again to go on"
+            if checkpoint.exists()
+            else ""
+        )
         raise type(interruption)(kept) from interruption
     finally:
         watch.close()
-    if trained.made or not trained.path.with_suffix(".png").exists():  # a run may have ended just before it was drawn
+    if (
+        trained.made or not trained.path.with_suffix(".png").exists()
+    ):  # a run may have ended just before it was drawn
         _draw(trained)
     if not arguments.quiet:
         print(summary(trained), file=sys.stderr)
@@ -128,7 +180,9 @@ def _train(arguments: argparse.Namespace, watch: Watch) -> "Trained":
     return train_model(
         arguments.folder,
         arguments.out,
-        settings=changed_settings(TrainingSettings() if preset is None else preset.settings, arguments),
+        settings=changed_settings(
+            TrainingSettings() if preset is None else preset.settings, arguments
+        ),
         **length,
         check_rows=arguments.check,
         command=_command(arguments),
@@ -140,16 +194,25 @@ def _train(arguments: argparse.Namespace, watch: Watch) -> "Trained":
 
 def _command(arguments: argparse.Namespace) -> str:
     """Return the command that makes this model, without what changes nothing."""
-    given = [*options_of(arguments, "preset", *_LENGTHS).items(), *passed_settings(arguments)]
+    given = [
+        *options_of(arguments, "preset", *_LENGTHS).items(),
+        *passed_settings(arguments),
+    ]
     given.append(("check", arguments.check))
     if arguments.start_from is not None:
         given.insert(0, ("from", shlex.quote(Path(arguments.start_from).name)))
     if arguments.robot is not None:
         given.insert(0, ("robot", shlex.quote(Path(arguments.robot).name)))
     default = arguments.parser.get_default
-    options = [f"--{name.replace('_', '-')} {value!s}" for name, value in given if value not in {None, default(name)}]
+    options = [
+        f"--{name.replace('_', '-')} {value!s}"
+        for name, value in given
+        if value not in {None, default(name)}
+    ]
     options = [option.removesuffix(" True") for option in options]
-    places = [shlex.quote(path.resolve().name) for path in (arguments.folder, arguments.out)]
+    places = [
+        shlex.quote(path.resolve().name) for path in (arguments.folder, arguments.out)
+    ]
     return " ".join(["cnpgen train", places[0], "-o", places[1], *options])
 
 
@@ -170,7 +233,11 @@ def _words(found: Mapping[str, Any]) -> str:
     if "vertical_error_rad_s" in found:
         text += f", vertical error {found['vertical_error_rad_s']:.4f} rad s"
     broken = sorted(found["broken"].items(), key=lambda item: -item[1])[:3]
-    return text + (f"; broken: {', '.join(f'{name} {count}' for name, count in broken)}" if broken else "")
+    return text + (
+        f"; broken: {', '.join(f'{name} {count}' for name, count in broken)}"
+        if broken
+        else ""
+    )
 
 
 def _terms(record: Mapping[str, Any]) -> str:
@@ -187,9 +254,15 @@ def _terms(record: Mapping[str, Any]) -> str:
 def summary(trained: "Trained") -> str:
     """Say in a line what came of a run."""
     training = trained.model.training
-    steps, best, words = f"{training['steps']:,} steps", f"{training['best_step']:,}", _words(trained.score)
+    steps, best, words = (
+        f"{training['steps']:,} steps",
+        f"{training['best_step']:,}",
+        _words(trained.score),
+    )
     if not trained.made:
-        return _fitted(f"already trained: {steps}, of which that of step {best}: {words}")
+        return _fitted(
+            f"already trained: {steps}, of which that of step {best}: {words}"
+        )
     return _fitted(
         f"trained {steps} in {training['cpu_seconds']:.0f} s of CPU time and"
         f" {training['validation_cpu_seconds']:.0f} s for validations; this run took {trained.times};"
@@ -199,4 +272,8 @@ def summary(trained: "Trained") -> str:
 
 def _fitted(text: str) -> str:
     """Wrap a line to ``LINE_WIDTH``."""
-    return "\n".join(textwrap.wrap(text, LINE_WIDTH, subsequent_indent="    ", break_on_hyphens=False))
+    return "\n".join(
+        textwrap.wrap(
+            text, LINE_WIDTH, subsequent_indent="    ", break_on_hyphens=False
+        )
+    )

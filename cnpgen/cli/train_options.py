@@ -21,10 +21,13 @@ def _real(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"expected a number, inf or pi, got {text!r}") from None
+        raise argparse.ArgumentTypeError(
+            f"expected a number, inf or pi, got {text!r}"
+        ) from None
 
 
-# Options that set the field of the same name: reader of the value, choices, or None for a flag; placeholder; help.
+# Options that set the field of the same name: reader of the value, choices, or None for
+# a flag; placeholder; help.
 _OPTIONS: dict[str, tuple[Callable[[str], Any] | tuple[str, ...] | None, str | None, str]] = {
     "hidden": (values.positive, "W", "width of the network's layers (default: 128)"),
     "layers": (values.positive, "L", "depth of its trunk (default: 5)"),
@@ -99,28 +102,54 @@ def add_settings(parser: Parser) -> None:
         else:
             option(flag, metavar=metavar, type=read, help=text)
     metrics = ("ramped", "fixed", "learned", "bounded")
-    option("--metric", choices=metrics, help="weights of the constraints (default: ramped)")
+    option(
+        "--metric", choices=metrics, help="weights of the constraints (default: ramped)"
+    )
     for name, text in _METRIC.items():
         option(f"--{name.replace('_', '-')}", metavar="X", type=_real, help=text)
     text = "train with limits X times those of the problem, such as joint-acceleration=0.96 (default: 0.985; of"
     text += " joint-velocity 0.99); may be repeated"
     option("--margin", metavar="TERM=X", type=_margin, action="append", help=text)
-    option("--no-margins", action="store_true", default=None, help="tighten only the limits that --margin names")
+    option(
+        "--no-margins",
+        action="store_true",
+        default=None,
+        help="tighten only the limits that --margin names",
+    )
     text = "fraction of the steps, such as 0.1, that imitate the plans of a dataset made with --certify (default: 0)"
     option("--imitate", metavar="X", type=_real, help=text)
 
 
-def changed_settings(settings: "TrainingSettings", arguments: argparse.Namespace) -> "TrainingSettings":
-    """Return settings with the options that were passed; refuse those without effect on the metric."""
+def changed_settings(
+    settings: "TrainingSettings", arguments: argparse.Namespace
+) -> "TrainingSettings":
+    """Return settings with the options that were passed.
+
+    Refuse those without effect on the metric.
+    """
     from cnpgen.training.settings import METRICS
 
-    changes = {name: value for name, value in options_of(arguments, *_OPTIONS).items() if value is not None}
+    changes = {
+        name: value
+        for name, value in options_of(arguments, *_OPTIONS).items()
+        if value is not None
+    }
     metric = settings.metric if arguments.metric is None else METRICS[arguments.metric]
-    passed = {name: value for name, value in options_of(arguments, *_METRIC).items() if value is not None}
+    passed = {
+        name: value
+        for name, value in options_of(arguments, *_METRIC).items()
+        if value is not None
+    }
     for name in passed:
         if metric.kind == "fixed" or (metric.kind == "ramped" and name != "growth"):
-            reason = "whose weights do not grow" if name == "growth" else "which learns nothing"
-            raise UsageError(f"--{name.replace('_', '-')} changes nothing with --metric {metric.kind}, {reason}")
+            reason = (
+                "whose weights do not grow"
+                if name == "growth"
+                else "which learns nothing"
+            )
+            raise UsageError(
+                f"--{name.replace('_', '-')} changes nothing with --metric {metric.kind}, {reason}"
+            )
     changes["metric"] = replace(metric, **passed)
     if arguments.margin is not None:
         changes["margins"] = dict(arguments.margin)
@@ -147,5 +176,7 @@ def _margin(text: str) -> tuple[str, float]:
     except ValueError:
         number = -1.0
     if not sign or not term or not 0 < number <= 1:
-        raise argparse.ArgumentTypeError(f"expected TERM=X with X above 0 and at most 1, got {text!r}")
+        raise argparse.ArgumentTypeError(
+            f"expected TERM=X with X above 0 and at most 1, got {text!r}"
+        )
     return term, number

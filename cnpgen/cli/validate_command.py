@@ -1,16 +1,19 @@
 """Verify a dataset.
 
-The command always checks that every file exists and matches its sha256, the specification and the manifest. --deep
-checks every sample: constraints, positions, hits and their maximum speeds, torque ratios, clearances, ranges,
-statistics, counts and duplicates; of "attempts" only the sum per shard. It judges the plans of a certified dataset as
-'cnpgen evaluate' does. --regenerate makes blocks of 4096 samples again from the seed and checks everything else: the
-attempts of each sample, columns of plug-ins, and which candidates were accepted. With the same backend, kind of machine
-and versions every bit is equal; elsewhere samples must agree to 1e-9.
+The command always checks that every file exists and matches its sha256, the
+specification and the manifest. --deep checks every sample: constraints, positions, hits
+and their maximum speeds, torque ratios, clearances, ranges, statistics, counts and
+duplicates; of "attempts" only the sum per shard. It judges the plans of a certified
+dataset as 'cnpgen evaluate' does. --regenerate makes blocks of 4096 samples again from
+the seed and checks everything else: the attempts of each sample, columns of plug-ins,
+and which candidates were accepted. With the same backend, kind of machine and versions
+every bit is equal; elsewhere samples must agree to 1e-9.
 
-Findings are printed on stdout, one per line, as FILE: PROBLEM, followed by a summary of the checks; --quiet prints the
-findings only. A line that begins with "note:" is no finding. Exit codes: 0 no findings, 1 findings, 2 a wrong argument,
-3 this machine cannot check it: --regenerate of a compiled dataset needs a C compiler, and --deep and --regenerate need
-the plug-ins of the dataset.
+Findings are printed on stdout, one per line, as FILE: PROBLEM, followed by a summary of
+the checks; --quiet prints the findings only. A line that begins with "note:" is no
+finding. Exit codes: 0 no findings, 1 findings, 2 a wrong argument, 3 this machine
+cannot check it: --regenerate of a compiled dataset needs a C compiler, and --deep and
+--regenerate need the plug-ins of the dataset.
 """
 
 import argparse
@@ -24,8 +27,14 @@ from cnpgen.errors import DatasetError
 
 def add_options(parser: Parser) -> None:
     option = parser.add_argument
-    option("folder", metavar="DIR", type=recipe_names.dataset, help="folder of a dataset")
-    option("--deep", action="store_true", help="check every row, its constraints with Pinocchio and Coal")
+    option(
+        "folder", metavar="DIR", type=recipe_names.dataset, help="folder of a dataset"
+    )
+    option(
+        "--deep",
+        action="store_true",
+        help="check every row, its constraints with Pinocchio and Coal",
+    )
     text = "make K random blocks again from the seed and compare them"
     option("--regenerate", metavar="K", type=values.natural, default=0, help=text)
     add_engine(parser, "processes for --deep; default one per available core")
@@ -56,7 +65,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _rows(folder: Path) -> int:
-    """Return the number of samples to check; 0 if the specification is damaged, which validation reports."""
+    """Return the number of samples to check.
+
+    0 if the specification is damaged, which validation reports.
+    """
     from cnpgen.store.dataset_spec import load_dataset_spec, shards
     from cnpgen.store.shard_record import is_committed
 

@@ -14,13 +14,18 @@ from cnpgen.errors import either
 
 _WHOLE = re.compile(r"[+-]?[0-9]+(?:(?:_[0-9]+)*|(?:\.[0-9]+)?[eE]\+?[0-9]{1,2})")
 MAX_ROWS_ARGUMENT = 10**12  # make.MAX_ROWS
-_MAX_DIGITS = 30  # digits; no number here has more, and very long ones take long to read
+_MAX_DIGITS = (
+    30  # digits; no number here has more, and very long ones take long to read
+)
 MAX_ERROR = 1.0  # rad or m; larger ones are probably in degrees
 MAX_SELECTED = 10**7  # of the numbers in a range
 
 
 def whole(text: str) -> int:
-    """Read a whole number: ``120000``, ``120_000``, or ``1e6`` if it is exact; raise ValueError for other texts."""
+    """Read a whole number: ``120000``, ``120_000``, or ``1e6`` if it is exact.
+
+    Raise ValueError for other texts.
+    """
     if len(text) <= _MAX_DIGITS and _WHOLE.fullmatch(text):
         number = Decimal(text)
         if number == number.to_integral_value():
@@ -28,14 +33,21 @@ def whole(text: str) -> int:
     raise ValueError(f"no whole number: {text[:_MAX_DIGITS]!r}")
 
 
-def _whole_in_range(low: int, example: str, text: str, *, high: float = math.inf, expected: str = "") -> int:
-    """Read a whole number from ``low`` to ``high``; ``expected`` is the message for larger ones."""
+def _whole_in_range(
+    low: int, example: str, text: str, *, high: float = math.inf, expected: str = ""
+) -> int:
+    """Read a whole number from ``low`` to ``high``.
+
+    ``expected`` is the message for larger ones.
+    """
     try:
         number = whole(text)
     except ValueError:
         number = low - 1
     if number < low:
-        raise ArgumentTypeError(f"expected a whole number of at least {low}, such as {example}; got {text!r}")
+        raise ArgumentTypeError(
+            f"expected a whole number of at least {low}, such as {example}; got {text!r}"
+        )
     if number > high:
         raise ArgumentTypeError(f"expected {expected}, got {text!r}")
     return number
@@ -43,7 +55,13 @@ def _whole_in_range(low: int, example: str, text: str, *, high: float = math.inf
 
 positive = partial(_whole_in_range, 1, "4")
 natural = partial(_whole_in_range, 0, "7")
-rows = partial(_whole_in_range, 1, "120000, 120_000 or 1e6", high=MAX_ROWS_ARGUMENT, expected="at most 1e+12 rows")
+rows = partial(
+    _whole_in_range,
+    1,
+    "120000, 120_000 or 1e6",
+    high=MAX_ROWS_ARGUMENT,
+    expected="at most 1e+12 rows",
+)
 port = partial(natural, high=65535, expected="a port, 0 to 65535")  # 0 is any free port
 seed = partial(natural, high=2**63 - 1, expected="a seed below 2^63")
 
@@ -55,7 +73,9 @@ def part(text: str) -> tuple[int, int]:
     except ValueError:
         k, m = 0, 0
     if not 0 <= k < m:
-        raise ArgumentTypeError(f"expected K/M with 0 <= K < M, such as 0/8 for the first of eight; got {text!r}")
+        raise ArgumentTypeError(
+            f"expected K/M with 0 <= K < M, such as 0/8 for the first of eight; got {text!r}"
+        )
     return k, m
 
 
@@ -84,9 +104,13 @@ def file_in(*endings: str) -> Callable[[str], str]:
         from cnpgen.store.files.atomic import check_writable
 
         if not text.lower().endswith(endings):
-            raise ArgumentTypeError(f"expected a file that ends in {either(endings)}, got {text!r}")
+            raise ArgumentTypeError(
+                f"expected a file that ends in {either(endings)}, got {text!r}"
+            )
         if not Path(text).absolute().parent.is_dir():
-            raise ArgumentTypeError(f"expected a file in a folder that is there, got {text!r}")
+            raise ArgumentTypeError(
+                f"expected a file in a folder that is there, got {text!r}"
+            )
         check_writable(Path(text))
         return text
 
@@ -131,7 +155,9 @@ def numbers(text: str) -> tuple[int, ...]:
         ends = re.fullmatch(r"\s*(-?[0-9]+)\s*(?:-\s*([0-9]+))?\s*", item[:_MAX_DIGITS])
         low, high = (int(ends[1]), int(ends[2] or ends[1])) if ends else (1, 0)
         if not low <= high < low + MAX_SELECTED:
-            raise ArgumentTypeError(f"expected whole numbers such as 0,3,10-12; got {text[:60]!r}")
+            raise ArgumentTypeError(
+                f"expected whole numbers such as 0,3,10-12; got {text[:60]!r}"
+            )
         found += range(low, high + 1)
     return tuple(found)
 
@@ -140,7 +166,9 @@ def names(text: str) -> tuple[str, ...]:
     """Read names that are separated by commas: ``joint_1,joint_2``."""
     found = tuple(name.strip() for name in text.split(","))
     if not all(found):
-        raise ArgumentTypeError(f"expected names separated by commas, got {text[:60]!r}")
+        raise ArgumentTypeError(
+            f"expected names separated by commas, got {text[:60]!r}"
+        )
     return found
 
 
@@ -148,7 +176,9 @@ def _one_or_several(found: Sequence[float]) -> float | tuple[float, ...]:
     return found[0] if len(found) == 1 else tuple(found)
 
 
-def _real_numbers(text: str, expected: str, accepts: Callable[[tuple[float, ...]], bool]) -> tuple[float, ...]:
+def _real_numbers(
+    text: str, expected: str, accepts: Callable[[tuple[float, ...]], bool]
+) -> tuple[float, ...]:
     """Read numbers separated by commas that meet a condition."""
     try:
         found = tuple(float(part) for part in text.split(","))
@@ -179,10 +209,16 @@ def tracking_errors(text: str) -> float | tuple[float, ...]:
             with suppress(ValueError):
                 found.append(parse_number(part.strip(), unit))
                 break
-    if len(found) != text.count(",") + 1 or not all(0 <= value < math.inf for value in found):
-        raise ArgumentTypeError(f"expected angles of at least 0, such as 2deg or 1deg,1deg,0.01; got {text[:60]!r}")
+    if len(found) != text.count(",") + 1 or not all(
+        0 <= value < math.inf for value in found
+    ):
+        raise ArgumentTypeError(
+            f"expected angles of at least 0, such as 2deg or 1deg,1deg,0.01; got {text[:60]!r}"
+        )
     if max(found) > MAX_ERROR:
-        raise ArgumentTypeError(f"expected at most {MAX_ERROR:g} rad or m, such as 2deg; got {text[:60]!r}")
+        raise ArgumentTypeError(
+            f"expected at most {MAX_ERROR:g} rad or m, such as 2deg; got {text[:60]!r}"
+        )
     return _one_or_several(found)
 
 
@@ -195,7 +231,9 @@ def parameters(text: str) -> dict[str, float]:
     for part in text.split(","):
         name, _, value = (word.strip() for word in part.partition("="))
         if name not in PARAMETER_UNITS:
-            raise ArgumentTypeError(f"expected NAME=VALUE with one of {', '.join(PARAMETER_UNITS)}; got {part[:60]!r}")
+            raise ArgumentTypeError(
+                f"expected NAME=VALUE with one of {', '.join(PARAMETER_UNITS)}; got {part[:60]!r}"
+            )
         try:
             found[name] = parse_number(value, PARAMETER_UNITS[name])
         except ValueError as error:
@@ -209,7 +247,9 @@ def payload(text: str) -> tuple[float, ...]:
     def accepts(found: tuple[float, ...]) -> bool:
         return len(found) in {1, 4} and all(map(math.isfinite, found)) and found[0] > 0
 
-    expected = "a mass above 0, with or without the centre of mass, such as 2 or 2,0,0,0.1"
+    expected = (
+        "a mass above 0, with or without the centre of mass, such as 2 or 2,0,0,0.1"
+    )
     return _real_numbers(text, expected, accepts)
 
 
@@ -217,11 +257,17 @@ def angle(text: str) -> float:
     """Read an angle or a length above 0: ``2deg``, ``0.035`` or ``5mm``."""
     found = tracking_errors(text)
     if isinstance(found, tuple) or not found > 0:
-        raise ArgumentTypeError(f"expected one angle above 0, such as 2deg; got {text[:60]!r}")
+        raise ArgumentTypeError(
+            f"expected one angle above 0, such as 2deg; got {text[:60]!r}"
+        )
     return found
 
 
 def amounts(text: str) -> float | tuple[float, ...]:
     """Read positive numbers separated by commas: ``500`` or ``7500,3750,5000``."""
     expected = "numbers above 0, such as 500 or 7500,3750"
-    return _one_or_several(_real_numbers(text, expected, lambda found: all(0 < value < math.inf for value in found)))
+    return _one_or_several(
+        _real_numbers(
+            text, expected, lambda found: all(0 < value < math.inf for value in found)
+        )
+    )

@@ -1,4 +1,7 @@
-"""Output of ``cnpgen evaluate``: counts, reasons, statistics, margins, checksums; and the plans one by one."""
+"""Output of ``cnpgen evaluate``: counts, reasons, statistics, margins, checksums.
+
+And the plans one by one.
+"""
 
 import math
 import sys
@@ -39,25 +42,58 @@ def summary_text(file: Path, found: "Evaluation") -> str:
     if (found.plans.duration > MAX_TIME_SAMPLES * found.step).any():
         step += f" or of {MAX_TIME_SAMPLES:,} in all"
     head = f"{file}: {counted(count, 'plan')} of {found.plans.problem.name}, judged at steps of {step} and between them"
-    counts = {text: (summary[name], summary[f"{name}_ratio"]) for name, text in _TALLIES.items() if name in summary}
-    tallies = [(text, f"{number:,} of {count:,}", f"{share:.2%}", "") for text, (number, share) in counts.items()]
-    sections = [[head, checksum_text(found.plans), "", *table(tallies, indent="  ", right=(1, 2))]]
-    tables = (_reasons(found, summary), (1,)), (_figures(summary), range(1, 7)), (_margins(summary), (1, 2, 3, 5, 6))
-    sections += [table(rows, indent="  ", right=tuple(right)) for rows, right in tables if len(rows) > 1]
+    counts = {
+        text: (summary[name], summary[f"{name}_ratio"])
+        for name, text in _TALLIES.items()
+        if name in summary
+    }
+    tallies = [
+        (text, f"{number:,} of {count:,}", f"{share:.2%}", "")
+        for text, (number, share) in counts.items()
+    ]
+    sections = [
+        [
+            head,
+            checksum_text(found.plans),
+            "",
+            *table(tallies, indent="  ", right=(1, 2)),
+        ]
+    ]
+    tables = (
+        (_reasons(found, summary), (1,)),
+        (_figures(summary), range(1, 7)),
+        (_margins(summary), (1, 2, 3, 5, 6)),
+    )
+    sections += [
+        table(rows, indent="  ", right=tuple(right))
+        for rows, right in tables
+        if len(rows) > 1
+    ]
     return "\n\n".join("\n".join(lines) for lines in sections)
 
 
 def checksum_text(plans: "Plans") -> str:
     """Return whether the source of the plans has a checksum, as text."""
-    return "the file's checksum is right" if plans.has_checksum else "the file has no checksum"
+    return (
+        "the file's checksum is right"
+        if plans.has_checksum
+        else "the file has no checksum"
+    )
 
 
 def _reasons(found: "Evaluation", summary: dict[str, Any]) -> list[tuple[str, ...]]:
     """Say why plans are not valid, the most frequent reason first."""
     rows: list[tuple[str, ...]] = [("not valid because", "plans", "the worst of them")]
     for reason, number in summary["reasons"].items():
-        plans = [(index, verdict) for index, verdict in enumerate(found.verdicts) if str(verdict.reason) == reason]
-        index, worst = max(plans, key=lambda plan: plan[1].worst.severity if plan[1].worst else -math.inf)
+        plans = [
+            (index, verdict)
+            for index, verdict in enumerate(found.verdicts)
+            if str(verdict.reason) == reason
+        ]
+        index, worst = max(
+            plans,
+            key=lambda plan: plan[1].worst.severity if plan[1].worst else -math.inf,
+        )
         if not worst.valid:
             why = _why(worst)
             rows.append((reason, f"{number:,}", f"plan {index}{why and f': {why}'}"))
@@ -83,11 +119,31 @@ def _figures(summary: dict[str, Any]) -> list[tuple[str, ...]]:
     """Lay out the metrics: of valid plans, of those valid by the paper's rules, and of all."""
     columns = [("metrics_of_valid", name) for name in ("mean", "median", "p95", "max")]
     columns += [("metrics_of_paper_valid", "mean"), ("metrics_of_all", "mean")]
-    rows: list[tuple[str, ...]] = [("", "valid: mean", "median", "95 %", "largest", "paper's: mean", "all: mean", "")]
+    rows: list[tuple[str, ...]] = [
+        (
+            "",
+            "valid: mean",
+            "median",
+            "95 %",
+            "largest",
+            "paper's: mean",
+            "all: mean",
+            "",
+        )
+    ]
     for name, (text, _, form) in METRICS.items():
         values = [summary[group].get(name, {}).get(what) for group, what in columns]
         if any(value is not None for value in values):
-            rows.append((text, *("-" if value is None else _figure(form, value) for value in values), ""))
+            rows.append(
+                (
+                    text,
+                    *(
+                        "-" if value is None else _figure(form, value)
+                        for value in values
+                    ),
+                    "",
+                )
+            )
     return rows
 
 
@@ -95,7 +151,13 @@ def _margins(summary: dict[str, Any]) -> list[tuple[str, ...]]:
     """Format per condition the number of violating plans and the plan with the smallest margin."""
     rows = [margin_head("condition", "violated by", item="plan")]
     for name, worst in summary["conditions"].items():
-        rows.append((name, f"{worst['violating_plans']:,}", *margin_cells(worst, worst["worst_plan"])))
+        rows.append(
+            (
+                name,
+                f"{worst['violating_plans']:,}",
+                *margin_cells(worst, worst["worst_plan"]),
+            )
+        )
     return rows
 
 
@@ -108,21 +170,38 @@ def margin_cells(margin: Mapping[str, Any], index: int) -> tuple[str, ...]:
     """Format the violation, tolerance, unit, plan or trajectory, time and place of a margin as cells of a table."""
     violation = "-" if margin["violation"] is None else f"{margin['violation']:.2e}"
     at = "-" if margin["time"] is None else f"{margin['time']:.4f}"
-    return violation, f"{margin['tolerance']:.1e}", margin["unit"], str(index), at, margin["part"]
+    return (
+        violation,
+        f"{margin['tolerance']:.1e}",
+        margin["unit"],
+        str(index),
+        at,
+        margin["part"],
+    )
 
 
 def listing_text(found: "Evaluation") -> str:
     """List the plans, those that are not valid first."""
-    order = sorted(range(len(found.verdicts)), key=lambda index: found.verdicts[index].valid)
+    order = sorted(
+        range(len(found.verdicts)), key=lambda index: found.verdicts[index].valid
+    )
     metrics = {index: found.verdicts[index].metrics.to_dict() for index in order}
-    shown = [name for name in METRICS if any(name in values for values in metrics.values())]
+    shown = [
+        name for name in METRICS if any(name in values for values in metrics.values())
+    ]
     names = [METRICS[name][1] for name in shown]
-    rows = [("plan", "sample", "verdict", *names, "smallest margin, or largest violation")]
+    rows = [
+        ("plan", "sample", "verdict", *names, "smallest margin, or largest violation")
+    ]
     for index in order:
         values = [(METRICS[name][2], metrics[index].get(name)) for name in shown]
-        figures = ["-" if value is None else _figure(form, value) for form, value in values]
+        figures = [
+            "-" if value is None else _figure(form, value) for form, value in values
+        ]
         verdict, sample = found.verdicts[index], int(found.plans.sample_id[index])
         why = _why(verdict) or "-"
         rows.append((str(index), str(sample), str(verdict.reason), *figures, why))
     right = [column for column in range(len(rows[0])) if column != 2]
-    return "\n".join(table(rows, right=right, width=sys.maxsize))  # one plan is one line, for grep and sort
+    return "\n".join(
+        table(rows, right=right, width=sys.maxsize)
+    )  # one plan is one line, for grep and sort

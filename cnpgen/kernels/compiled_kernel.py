@@ -13,7 +13,13 @@ from typing import Any
 import numpy as np
 
 from cnpgen.errors import MachineError
-from cnpgen.kernels.compiler import compiler_version, flags_of, require_compiler, run_compiler, target
+from cnpgen.kernels.compiler import (
+    compiler_version,
+    flags_of,
+    require_compiler,
+    run_compiler,
+    target,
+)
 from cnpgen.kernels.emit import VECTORS, emit, prelude
 from cnpgen.kernels.kernel import Array, GridKernel, Kernel, check_arguments, check_grid
 from cnpgen.kernels.tape import Tape
@@ -45,14 +51,20 @@ class _Callee(ctypes.Structure):
 
 
 class CompiledKernel(Kernel):
-    """A tape as machine code of its library; the cache folder also has the library of call.c."""
+    """A tape as machine code of its library.
+
+    The cache folder also has the library of call.c.
+    """
 
     def __init__(self, tape: Tape, library: Path, cache_folder: Path) -> None:
         super().__init__(tape)
         self._address = ctypes.cast(_load(library), ctypes.c_void_p).value
         sizes = len(tape.inputs), len(tape.outputs)
         widths = (ctypes.c_long * sum(sizes))(*tape.inputs, *tape.outputs)
-        self._callee, self._call = _Callee(self._address, *sizes, widths), _load_call(cache_folder)
+        self._callee, self._call = (
+            _Callee(self._address, *sizes, widths),
+            _load_call(cache_folder),
+        )
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate the batch; see ``Kernel``."""
@@ -81,14 +93,22 @@ class CompiledGridKernel(GridKernel):
         nodes, lanes = check_grid(self.tape, self.grid, arguments, out)
         if nodes and lanes:
             size = ctypes.c_long(nodes), ctypes.c_long(lanes)
-            self._function(*size, _pointers(arguments), _strides(arguments), _pointers(out), _strides(out))
+            self._function(
+                *size,
+                _pointers(arguments),
+                _strides(arguments),
+                _pointers(out),
+                _strides(out),
+            )
 
 
 def _load(library: Path) -> Any:
     try:
         function = ctypes.CDLL(str(library)).kernel
     except (OSError, AttributeError) as error:
-        raise MachineError(f"cannot load the compiled kernel {library}: {error}; delete it and run again") from error
+        raise MachineError(
+            f"cannot load the compiled kernel {library}: {error}; delete it and run again"
+        ) from error
     function.restype = None
     return function
 
@@ -100,26 +120,42 @@ def _load_call(cache_folder: Path) -> Any:
     try:
         function = ctypes.PyDLL(str(library)).call
     except OSError as error:
-        raise MachineError(f"cannot load the library that calls compiled kernels, {library}: {error}") from error
+        raise MachineError(
+            f"cannot load the library that calls compiled kernels, {library}: {error}"
+        ) from error
     function.argtypes = (ctypes.POINTER(_Callee), ctypes.py_object, ctypes.py_object)
     return function
 
 
 def _strides(arrays: Sequence[Array]) -> "ctypes.Array[ctypes.c_long]":
-    """Return strides between components and between nodes, in elements; 0 without a node axis."""
-    flat = (stride // array.itemsize for array in arrays for stride in (*array.strides, 0)[:2])
-    strides: ctypes.Array[ctypes.c_long] = _array_type(ctypes.c_long, 2 * len(arrays))(*flat)
+    """Return strides between components and between nodes, in elements.
+
+    0 without a node axis.
+    """
+    flat = (
+        stride // array.itemsize
+        for array in arrays
+        for stride in (*array.strides, 0)[:2]
+    )
+    strides: ctypes.Array[ctypes.c_long] = _array_type(ctypes.c_long, 2 * len(arrays))(
+        *flat
+    )
     return strides
 
 
 def _pointers(arrays: Sequence[Array]) -> "ctypes.Array[ctypes.c_void_p]":
-    pointers: ctypes.Array[ctypes.c_void_p] = _array_type(ctypes.c_void_p, len(arrays))(*map(address_of, arrays))
+    pointers: ctypes.Array[ctypes.c_void_p] = _array_type(ctypes.c_void_p, len(arrays))(
+        *map(address_of, arrays)
+    )
     return pointers
 
 
 @cache
 def _array_type(kind: Any, count: int) -> Any:
-    """Return ``kind * count``; without the cache ctypes creates the type again, which takes several microseconds."""
+    """Return ``kind * count``.
+
+    Without the cache ctypes creates the type again, which takes several microseconds.
+    """
     return kind * count
 
 
@@ -132,7 +168,9 @@ def aligned_array(count: int) -> Array:
 def address_of(array: Any) -> int:
     """Return the address of the first element of an array."""
     try:
-        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # a third of the time of the array interface
+        return ctypes.addressof(
+            ctypes.c_char.from_buffer(array)
+        )  # a third of the time of the array interface
     except (TypeError, ValueError):  # read-only, strided, or empty
         return int(array.__array_interface__["data"][0])
 
@@ -167,7 +205,10 @@ def find_library(folder: Path, stem: str) -> Path | None:
     Loading a damaged library would crash the process.
     """
     libraries = (path for path in folder.glob(f"{stem}-*.so") if is_trusted(path))
-    return next((path for path in libraries if path.stem == f"{stem}-{_content_digest(path)}"), None)
+    return next(
+        (path for path in libraries if path.stem == f"{stem}-{_content_digest(path)}"),
+        None,
+    )
 
 
 def _content_digest(path: Path) -> str:
@@ -177,15 +218,18 @@ def _content_digest(path: Path) -> str:
 def find_compiled(tape: Tape, cache_folder: Path) -> Path | None:
     """Return the library of a tape if it is in the cache.
 
-    Raises:
-        MachineError: There is no working compiler, or the cache folder is unreadable or writable for other users.
+    Raises: MachineError: There is no working compiler, or the cache folder is
+        unreadable or writable for other users.
     """
     return _find(library_file_stem(tape, require_compiler()), cache_folder)
 
 
 def _find(stem: str, cache_folder: Path) -> Path | None:
     try:
-        libraries = (find_library(folder / LIBRARIES, stem) for folder in require_trusted(cache_folder))
+        libraries = (
+            find_library(folder / LIBRARIES, stem)
+            for folder in require_trusted(cache_folder)
+        )
         return next((library for library in libraries if library), None)
     except OSError as error:
         raise _unusable(cache_folder, error) from error
@@ -194,8 +238,8 @@ def _find(stem: str, cache_folder: Path) -> Path | None:
 def compile_tape(tape: Tape, cache_folder: Path) -> Path:
     """Return the library of a tape; compile it if the cache lacks it or its copy is damaged.
 
-    Raises:
-        MachineError: There is no working compiler, or the cache folder is not writable or writable for other users.
+    Raises: MachineError: There is no working compiler, or the cache folder is not
+        writable or writable for other users.
     """
     stem = library_file_stem(tape, require_compiler())
     return _compile(stem, lambda: emit(tape), optimization_level(tape), cache_folder)
@@ -209,12 +253,19 @@ def compile_source(paths: Sequence[Path], cache_folder: Path) -> Path:
     Raises:
         MachineError: See ``compile_tape``.
     """
-    text, level = "".join([prelude("float64"), *(path.read_text(encoding="utf-8") for path in paths)]), "-O3"
+    text, level = (
+        "".join(
+            [prelude("float64"), *(path.read_text(encoding="utf-8") for path in paths)]
+        ),
+        "-O3",
+    )
     stem = _stem(paths[-1].stem, text.encode(), level, require_compiler())
     return _compile(stem, lambda: text, level, cache_folder)
 
 
-def _compile(stem: str, source: Callable[[], str], level: str, cache_folder: Path) -> Path:
+def _compile(
+    stem: str, source: Callable[[], str], level: str, cache_folder: Path
+) -> Path:
     """Compile C source unless its library is cached, also by another process while this one waited for the lock."""
     if library := _find(stem, cache_folder):
         return library
@@ -223,19 +274,29 @@ def _compile(stem: str, source: Callable[[], str], level: str, cache_folder: Pat
         make_private_folder(libraries)
         require_trusted(cache_folder)
         with exclusive_lock(libraries / f".{stem}.lock"):
-            return find_library(libraries, stem) or _build(stem, source, level, cache_folder)
+            return find_library(libraries, stem) or _build(
+                stem, source, level, cache_folder
+            )
     except OSError as error:
         raise _unusable(cache_folder, error) from error
 
 
-def _build(stem: str, source: Callable[[], str], level: str, cache_folder: Path) -> Path:
+def _build(
+    stem: str, source: Callable[[], str], level: str, cache_folder: Path
+) -> Path:
     libraries = cache_folder / LIBRARIES
     if linked := read_only_cache(cache_folder):
-        _LOG.info("compiling kernels for this run only: the cache %s lacks them and is not writable", linked)
+        _LOG.info(
+            "compiling kernels for this run only: the cache %s lacks them and is not writable",
+            linked,
+        )
     else:
         _LOG.info("compiling kernels, once per problem and machine")
     with tempfile.TemporaryDirectory(dir=libraries, prefix=".build-") as folder:
-        source_file, built = Path(folder) / f"{stem.rpartition('-')[0]}.c", Path(folder) / "kernel.so"
+        source_file, built = (
+            Path(folder) / f"{stem.rpartition('-')[0]}.c",
+            Path(folder) / "kernel.so",
+        )
         source_file.write_text(source(), encoding="utf-8")
         run_compiler(require_compiler(), level, source_file, built)
         make_read_only_for_others(built)
@@ -243,4 +304,6 @@ def _build(stem: str, source: Callable[[], str], level: str, cache_folder: Path)
 
 
 def _unusable(cache_folder: Path, error: OSError) -> MachineError:
-    return MachineError(f"cannot use the kernel cache {cache_folder / LIBRARIES}: {error.strerror or error}")
+    return MachineError(
+        f"cannot use the kernel cache {cache_folder / LIBRARIES}: {error.strerror or error}"
+    )

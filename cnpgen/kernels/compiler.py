@@ -19,13 +19,19 @@ from cnpgen.errors import MachineError
 from cnpgen.machine.versions import processor_entry
 from cnpgen.store.files.cache_folder import default_cache_folder, temporary_folder
 
-_LINKER_FLAGS = ("-Wl,-undefined,dynamic_lookup",) if platform.system() == "Darwin" else ()  # for Python's C API
+_LINKER_FLAGS = (
+    ("-Wl,-undefined,dynamic_lookup",) if platform.system() == "Darwin" else ()
+)  # for Python's C API
 COMPILER_FLAGS = (
     "-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-w",
     *_LINKER_FLAGS,
 )  # fmt: skip
-MAX_COMPILE_TIME_S = 3600  # the largest kernels, of some MB of source, take minutes on a busy machine
-MIN_COMPILE_LIMIT_S = 120  # the limit for the smallest kernels, which take less than 1 s
+MAX_COMPILE_TIME_S = (
+    3600  # the largest kernels, of some MB of source, take minutes on a busy machine
+)
+MIN_COMPILE_LIMIT_S = (
+    120  # the limit for the smallest kernels, which take less than 1 s
+)
 LIMIT_S_PER_BYTE = 3e-3  # of source
 MAX_VERSION_TIME_S = 10
 NOTICE_AFTER_S = 60  # a user hears of a compiler that takes longer
@@ -37,13 +43,18 @@ _running: set["subprocess.Popen[str]"] = set()  # compilers of all threads
 def find_compiler() -> str | None:
     """Return the command of the C compiler: ``$CC``, else cc, gcc, clang or that of ziglang; None if there is none.
 
-    It is quoted for a shell: CC may be a path with spaces, or a program with options ("ccache gcc").
+    It is quoted for a shell: CC may be a path with spaces, or a program with options
+    ("ccache gcc").
     """
     if configured := os.environ.get("CC"):
         return _command([configured]) or _command(_words(configured))
     if path := next(filter(None, map(shutil.which, ["cc", "gcc", "clang"])), None):
         return path
-    return shlex.join([sys.executable, "-m", "ziglang", "cc"]) if sys.executable and find_spec("ziglang") else None
+    return (
+        shlex.join([sys.executable, "-m", "ziglang", "cc"])
+        if sys.executable and find_spec("ziglang")
+        else None
+    )
 
 
 def _words(command: str) -> list[str]:
@@ -68,8 +79,12 @@ def require_compiler() -> str:
     if compiler := find_compiler():
         return compiler
     if configured := os.environ.get("CC"):
-        raise MachineError(f"no C compiler found: CC is {configured!r}, which names no program here (set or unset it)")
-    raise MachineError("no C compiler found (no cc, gcc or clang): install one, or pip install 'cnpgen[compiler]'")
+        raise MachineError(
+            f"no C compiler found: CC is {configured!r}, which names no program here (set or unset it)"
+        )
+    raise MachineError(
+        "no C compiler found (no cc, gcc or clang): install one, or pip install 'cnpgen[compiler]'"
+    )
 
 
 @cache
@@ -79,7 +94,9 @@ def compiler_version(compiler: str) -> str:
     Raises:
         MachineError: The compiler does not run.
     """
-    completed = _run(compiler, ["--version"], MAX_VERSION_TIME_S, "to print its version")
+    completed = _run(
+        compiler, ["--version"], MAX_VERSION_TIME_S, "to print its version"
+    )
     if completed.returncode != 0:
         raise MachineError(
             f"the C compiler {compiler} does not run: --version ends with exit code {completed.returncode}"
@@ -98,7 +115,9 @@ def _temporary_folder() -> Path:
     return temporary_folder()
 
 
-def _run(compiler: str, options: list[str], seconds: float, purpose: str) -> "subprocess.CompletedProcess[str]":
+def _run(
+    compiler: str, options: list[str], seconds: float, purpose: str
+) -> "subprocess.CompletedProcess[str]":
     """Run a compiler; at the time limit, or if this process is interrupted, kill it and its child processes.
 
     Raises:
@@ -108,11 +127,20 @@ def _run(compiler: str, options: list[str], seconds: float, purpose: str) -> "su
     variables = dict(os.environ)
     if "ziglang" in command:
         variables.setdefault("ZIG_GLOBAL_CACHE_DIR", str(_zig_folder()))
-    texts: dict[str, Any] = {"stdout": pipe, "stderr": pipe, "text": True, "errors": "replace"}
+    texts: dict[str, Any] = {
+        "stdout": pipe,
+        "stderr": pipe,
+        "text": True,
+        "errors": "replace",
+    }
     try:  # a compiler that reads a terminal would be stopped
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, process_group=0, env=variables, **texts)
+        process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, process_group=0, env=variables, **texts
+        )
     except OSError as error:
-        raise MachineError(f"the C compiler {compiler} does not run: {error}") from error
+        raise MachineError(
+            f"the C compiler {compiler} does not run: {error}"
+        ) from error
     with process:
         _running.add(process)
         try:
@@ -130,14 +158,22 @@ def _run(compiler: str, options: list[str], seconds: float, purpose: str) -> "su
     return subprocess.CompletedProcess(command, process.returncode, out, errors)
 
 
-def _outputs(process: "subprocess.Popen[str]", name: str, seconds: float, purpose: str) -> tuple[str, str]:
+def _outputs(
+    process: "subprocess.Popen[str]", name: str, seconds: float, purpose: str
+) -> tuple[str, str]:
     """Wait for a compiler and return its output; log a notice if it takes long."""
     try:
         return process.communicate(timeout=min(NOTICE_AFTER_S, seconds))
     except subprocess.TimeoutExpired:
         if seconds <= NOTICE_AFTER_S:
             raise
-    _LOG.info("the C compiler %s has taken %g s %s; it is ended after %g s", name, NOTICE_AFTER_S, purpose, seconds)
+    _LOG.info(
+        "the C compiler %s has taken %g s %s; it is ended after %g s",
+        name,
+        NOTICE_AFTER_S,
+        purpose,
+        seconds,
+    )
     return process.communicate(timeout=seconds - NOTICE_AFTER_S)
 
 
@@ -147,7 +183,10 @@ def _kill(process: "subprocess.Popen[str]") -> None:
 
 
 def kill_compilers() -> None:
-    """Kill the compilers that other threads of this process wait for; their compilation fails."""
+    """Kill the compilers that other threads of this process wait for.
+
+    Their compilation fails.
+    """
     for process in tuple(_running):
         _kill(process)
 
@@ -161,7 +200,11 @@ def target() -> str:
 
 def vector_flags() -> tuple[str, ...]:
     """Return the flags for the vector instructions of this machine."""
-    return ("-mcpu=native" if platform.machine() in ("arm64", "aarch64") else "-march=native",)
+    return (
+        "-mcpu=native"
+        if platform.machine() in ("arm64", "aarch64")
+        else "-march=native",
+    )
 
 
 def flags_of(level: str) -> tuple[str, ...]:
@@ -176,9 +219,17 @@ def run_compiler(compiler: str, level: str, source: Path, built: Path) -> None:
         MachineError: The compiler fails, or takes too long for the size of the source.
     """
     options = [*flags_of(level), str(source), "-o", str(built), "-lm"]
-    seconds = min(MIN_COMPILE_LIMIT_S + round(LIMIT_S_PER_BYTE * source.stat().st_size), MAX_COMPILE_TIME_S)
+    seconds = min(
+        MIN_COMPILE_LIMIT_S + round(LIMIT_S_PER_BYTE * source.stat().st_size),
+        MAX_COMPILE_TIME_S,
+    )
     completed = _run(compiler, options, seconds, f"for {source.name}")
     if completed.returncode != 0 or not built.exists():
         errors = completed.stderr
-        first = next((line for line in errors.splitlines() if "error" in line), errors.strip()[:200])
-        raise MachineError(f"{compiler} failed with exit code {completed.returncode}: {first or 'no message'}")
+        first = next(
+            (line for line in errors.splitlines() if "error" in line),
+            errors.strip()[:200],
+        )
+        raise MachineError(
+            f"{compiler} failed with exit code {completed.returncode}: {first or 'no message'}"
+        )

@@ -16,31 +16,48 @@ _EXPRESSIONS = {  # of one operand or two
     "LT": "vlt({},{})", "LE": "vle({},{})", "EQ": "veq({},{})", "NE": "vne({},{})", "AND": "vand({},{})",
     "OR": "vor({},{})", "IF_ELSE_ZERO": "vsel({},{})",
 }  # fmt: skip
-_WITHOUT_NAN = {"FMIN": "lesser({},{})", "FMAX": "larger({},{})"}  # one instruction if the second is not nan
+_WITHOUT_NAN = {
+    "FMIN": "lesser({},{})",
+    "FMAX": "larger({},{})",
+}  # one instruction if the second is not nan
 
 
 def prelude(dtype: str) -> str:
     """Return the C source that defines vectors of ``dtype`` and their functions."""
-    return ("#define SINGLE\n" if dtype == "float32" else "") + VECTORS.read_text(encoding="utf-8")
+    return ("#define SINGLE\n" if dtype == "float32" else "") + VECTORS.read_text(
+        encoding="utf-8"
+    )
 
 
 def emit(tape: Tape) -> str:
     """Return the C source of a kernel.
 
-    Without a grid the function is ``void kernel(long n, const real *const *in, const long *ld, real *const *out)``: n
-    lanes, one pointer and one row stride per argument, one pointer per result of contiguous rows. With a grid it is
-    ``void kernel(long nodes, long n, const real *const *in, const long *ld, real *const *out, const long *lo)``: two
-    strides per argument and result, between components and between nodes. Sums are added to the values in ``out``.
+    Without a grid the function is ``void kernel(long n, const real *const *in, const
+    long *ld, real *const *out)``: n lanes, one pointer and one row stride per argument,
+    one pointer per result of contiguous rows. With a grid it is ``void kernel(long
+    nodes, long n, const real *const *in, const long *ld, real *const *out, const long
+    *lo)``: two strides per argument and result, between components and between nodes.
+    Sums are added to the values in ``out``.
     """
-    body = _emit_loop(tape) if tape.loop else _emit_grid(tape, tape.grid) if tape.grid else _emit_once(tape)
+    body = (
+        _emit_loop(tape)
+        if tape.loop
+        else _emit_grid(tape, tape.grid)
+        if tape.grid
+        else _emit_once(tape)
+    )
     return prelude(tape.dtype) + body
 
 
 def _emit_once(tape: Tape) -> str:
     body = statements(
         tape,
-        read=lambda argument, component: f"load(in[{argument}]+{component}*ld[{argument}],k,n)",
-        write=lambda result, component, value: f"store(out[{result}]+{component}*n,k,n,{value});",
+        read=lambda argument, component: (
+            f"load(in[{argument}]+{component}*ld[{argument}],k,n)"
+        ),
+        write=lambda result, component, value: (
+            f"store(out[{result}]+{component}*n,k,n,{value});"
+        ),
     )
     return f"""void kernel(long n,const real*const*in,const long*ld,real*const*out){{
 const v one=K(1);
@@ -51,7 +68,10 @@ for(long k=0;k<n;k+=W){{
 
 
 def _emit_loop(tape: Tape) -> str:
-    """Return the source of an iteration: state and parameters are local arrays; converged lanes keep their values."""
+    """Return the source of an iteration: state and parameters are local arrays.
+
+    Converged lanes keep their values.
+    """
     assert tape.loop is not None
     first = [sum(tape.inputs[:index]) for index in range(len(tape.inputs))]
     width, total = tape.inputs[0], sum(tape.inputs)
@@ -62,7 +82,9 @@ def _emit_loop(tape: Tape) -> str:
     body = statements(
         tape,
         read=lambda argument, component: f"x[{first[argument] + component}]",
-        write=lambda result, component, value: f"y[{component}]={value};" if result == 0 else f"e={value};",
+        write=lambda result, component, value: (
+            f"y[{component}]={value};" if result == 0 else f"e={value};"
+        ),
     )
     return f"""void kernel(long n,const real*const*in,const long*ld,real*const*out){{
 const v one=K(1);
@@ -99,7 +121,9 @@ def _emit_grid(tape: Tape, grid: GridSpec) -> str:
             return f"store({row},i,n,load({row},i,n)+{value});"
         return f"store({row}+k*lo[{2 * result + 1}],i,n,{value});"
 
-    uniform = {index for index, axes in enumerate(grid.arguments) if axes in ("node", "fixed")}
+    uniform = {
+        index for index, axes in enumerate(grid.arguments) if axes in ("node", "fixed")
+    }
     body = statements(tape, read=read, write=write, numbers=uniform)
     return f"""void kernel(long nodes,long n,const real*const*in,const long*ld,real*const*out,const long*lo){{
 const v one=K(1);
@@ -118,14 +142,19 @@ def statements(
 ) -> str:
     """Return C statements in single-assignment form; sine and cosine of one angle are computed together.
 
-    ``read`` and ``write`` return C code for a component of an argument or result; ``numbers`` are arguments that are
-    never nan.
+    ``read`` and ``write`` return C code for a component of an argument or result;
+    ``numbers`` are arguments that are never nan.
     """
     lines: list[str] = []
     names: dict[int, str] = {}
     angles: set[int] = set()
     never_nan: set[int] = set()
-    columns = (tape.operation.tolist(), tape.a.tolist(), tape.b.tolist(), tape.constant.tolist())
+    columns = (
+        tape.operation.tolist(),
+        tape.a.tolist(),
+        tape.b.tolist(),
+        tape.constant.tolist(),
+    )
     for k, (code, a, b, constant) in enumerate(zip(*columns, strict=True)):
         name = NAMES[code]
         if name == "CONST":
@@ -145,7 +174,11 @@ def statements(
             expression = read(a, b)
             never_nan |= {k} if a in numbers else set()
         else:
-            templates = _WITHOUT_NAN if name in _WITHOUT_NAN and b in never_nan else _EXPRESSIONS
+            templates = (
+                _WITHOUT_NAN
+                if name in _WITHOUT_NAN and b in never_nan
+                else _EXPRESSIONS
+            )
             expression = templates[name].format(names[a], names[b])
             never_nan |= {k} if name in _WITHOUT_NAN and never_nan & {a, b} else set()
         names[k] = f"t{k}"
@@ -157,4 +190,8 @@ def _literal(constant: float) -> str:
     """Return a number as a C literal."""
     if np.isnan(constant):
         return "NAN"
-    return repr(constant) if np.isfinite(constant) else f"{'-' if constant < 0 else ''}INFINITY"
+    return (
+        repr(constant)
+        if np.isfinite(constant)
+        else f"{'-' if constant < 0 else ''}INFINITY"
+    )

@@ -9,14 +9,23 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.kernels.kernel import Array, GridKernel, Kernel, axis_names, check_grid, evaluate_lanes
+from cnpgen.kernels.kernel import (
+    Array,
+    GridKernel,
+    Kernel,
+    axis_names,
+    check_grid,
+    evaluate_lanes,
+)
 from cnpgen.kernels.tape import NAMES, OPERATIONS, Axes, GridSpec, Tape
 
 POINTS_PER_BLOCK = 8192  # lanes or points; smaller blocks cost more interpreter time, larger ones exceed the cache
 
 
 def _if_else_zero(condition: Any, value: Any, out: Array) -> None:
-    out[...] = np.where(np.not_equal(condition, 0.0), value, 0.0)  # a product would turn 0 * inf into nan
+    out[...] = np.where(
+        np.not_equal(condition, 0.0), value, 0.0
+    )  # a product would turn 0 * inf into nan
 
 
 _APPLY: dict[str, Callable[..., Any]] = {
@@ -33,7 +42,9 @@ Read = Callable[[int, int], Any]  # component of an argument, for the lanes of a
 Write = Callable[[int, int, Any], None]  # stores a component of a result
 
 
-Step = tuple[str, int, tuple[Any, ...]]  # operation; row of its result; rows of its operands, or numbers
+Step = tuple[
+    str, int, tuple[Any, ...]
+]  # operation; row of its result; rows of its operands, or numbers
 
 
 class _LaneBlock:
@@ -46,7 +57,9 @@ class _LaneBlock:
         self.rows = rows
         self._steps = [self._bound(*step) for step in program]
 
-    def _bound(self, name: str, row: int, operands: tuple[Any, ...]) -> Callable[[], Any]:
+    def _bound(
+        self, name: str, row: int, operands: tuple[Any, ...]
+    ) -> Callable[[], Any]:
         if name == "INPUT":
             return partial(self._load, row, *operands)
         if name == "OUTPUT":
@@ -70,41 +83,66 @@ class _LaneBlock:
 
 
 class _BlockProgram:
-    """A tape with a grid, run by NumPy on blocks of points; work rows have shape (nodes, lanes)."""
+    """A tape with a grid, run by NumPy on blocks of points.
+
+    Work rows have shape (nodes, lanes).
+    """
 
     def __init__(self, tape: Tape, grid: GridSpec) -> None:
         self._grid, self._dtype = grid, tape.dtype
         self._slots, self._program = _allocate(tape)
 
-    def run(self, arguments: Sequence[Array], out: Sequence[Array], k: int, n: int) -> None:
+    def run(
+        self, arguments: Sequence[Array], out: Sequence[Array], k: int, n: int
+    ) -> None:
         """Evaluate all points of K nodes and N lanes, a few nodes at a time."""
         count = max(POINTS_PER_BLOCK // max(n, 1), 1)
-        work = np.empty((self._slots, min(count, k), min(n, POINTS_PER_BLOCK)), self._dtype)
+        work = np.empty(
+            (self._slots, min(count, k), min(n, POINTS_PER_BLOCK)), self._dtype
+        )
         block = _LaneBlock(self._program, list(work))
         with np.errstate(all="ignore"):
             for node in range(0, k, count):
                 for lane in range(0, n, POINTS_PER_BLOCK):
-                    nodes, lanes = slice(node, min(node + count, k)), slice(lane, min(lane + POINTS_PER_BLOCK, n))
+                    nodes, lanes = (
+                        slice(node, min(node + count, k)),
+                        slice(lane, min(lane + POINTS_PER_BLOCK, n)),
+                    )
                     shape = nodes.stop - node, lanes.stop - lane
                     if shape != block.rows[0].shape:
-                        block = _LaneBlock(self._program, [row[: shape[0], : shape[1]] for row in work])
+                        block = _LaneBlock(
+                            self._program, [row[: shape[0], : shape[1]] for row in work]
+                        )
                     block.run(*self._points(arguments, out, nodes, lanes))
 
     def _points(
-        self, arguments: Sequence[Array], out: Sequence[Array], nodes: slice, lanes: slice
+        self,
+        arguments: Sequence[Array],
+        out: Sequence[Array],
+        nodes: slice,
+        lanes: slice,
     ) -> tuple[Read, Write]:
         """Return the functions that read and write a block of points."""
-        part: dict[str, Any] = {"point": (nodes, lanes), "lane": (None, lanes), "node": (nodes, None), "fixed": ()}
+        part: dict[str, Any] = {
+            "point": (nodes, lanes),
+            "lane": (None, lanes),
+            "node": (nodes, None),
+            "fixed": (),
+        }
 
         def read(argument: int, component: int) -> Any:
-            return arguments[argument][(component, *part[self._grid.arguments[argument]])]
+            return arguments[argument][
+                (component, *part[self._grid.arguments[argument]])
+            ]
 
         def write(result: int, component: int, value: Any) -> None:
             if self._grid.results[result] == "point":
                 out[result][component, nodes, lanes] = value
             else:
                 shape = (nodes.stop - nodes.start, lanes.stop - lanes.start)
-                out[result][component, lanes] += np.broadcast_to(value, shape).sum(axis=0)
+                out[result][component, lanes] += np.broadcast_to(value, shape).sum(
+                    axis=0
+                )
 
         return read, write
 
@@ -115,7 +153,9 @@ class InterpretedKernel(Kernel):
     def __init__(self, tape: Tape) -> None:
         super().__init__(tape)
         every: Axes = "point"
-        self._program = _BlockProgram(tape, GridSpec((every,) * len(tape.inputs), (every,) * len(tape.outputs)))
+        self._program = _BlockProgram(
+            tape, GridSpec((every,) * len(tape.inputs), (every,) * len(tape.outputs))
+        )
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate the batch; see ``Kernel``."""
@@ -136,12 +176,22 @@ class InterpretedGridKernel(GridKernel):
 
     def __call__(self, *arguments: Array, out: Sequence[Array]) -> None:
         """Evaluate the grid; see ``GridKernel``."""
-        self._program.run(arguments, out, *check_grid(self.tape, self.grid, arguments, out))
+        self._program.run(
+            arguments, out, *check_grid(self.tape, self.grid, arguments, out)
+        )
 
 
 def _allocate(tape: Tape) -> tuple[int, list[Step]]:
-    """Assign a work row to every value, reusing rows of dead values; return the number of rows and the program."""
-    columns = tape.operation.tolist(), tape.a.tolist(), tape.b.tolist(), tape.constant.tolist()
+    """Assign a work row to every value, reusing rows of dead values.
+
+    Return the number of rows and the program.
+    """
+    columns = (
+        tape.operation.tolist(),
+        tape.a.tolist(),
+        tape.b.tolist(),
+        tape.constant.tolist(),
+    )
     last = np.zeros(len(tape), int)
     for k, (code, a, b, _) in enumerate(zip(*columns, strict=True)):
         last[[a, b][: OPERATIONS[NAMES[code]]]] = k
@@ -157,7 +207,9 @@ def _allocate(tape: Tape) -> tuple[int, list[Step]]:
         operands = (a, b)[: OPERATIONS[name]]
         places = tuple(place[operand] for operand in operands)
         dying = {operand for operand in operands if last[operand] == k}
-        free.extend(place[operand] for operand in dying if isinstance(place[operand], int))
+        free.extend(
+            place[operand] for operand in dying if isinstance(place[operand], int)
+        )
         if name == "OUTPUT":
             program.append((name, -1, (b, int(constant), *places)))
             continue
@@ -179,7 +231,11 @@ class MappedKernel(Kernel):
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate the batch; see ``Kernel``."""
         widths = self.tape.outputs
-        return evaluate_lanes(self.tape, arguments, lambda inputs, n: _map(self._function, inputs, n, widths))
+        return evaluate_lanes(
+            self.tape,
+            arguments,
+            lambda inputs, n: _map(self._function, inputs, n, widths),
+        )
 
 
 class MappedGridKernel(GridKernel):
@@ -195,8 +251,14 @@ class MappedGridKernel(GridKernel):
         points = []
         for argument, axes in zip(arguments, self.grid.arguments, strict=True):
             names = axis_names(axes)
-            shape = len(argument), nodes if "nodes" in names else 1, lanes if "lanes" in names else 1
-            spread = np.broadcast_to(argument.reshape(shape), (len(argument), nodes, lanes))
+            shape = (
+                len(argument),
+                nodes if "nodes" in names else 1,
+                lanes if "lanes" in names else 1,
+            )
+            spread = np.broadcast_to(
+                argument.reshape(shape), (len(argument), nodes, lanes)
+            )
             points.append(spread.reshape(len(argument), nodes * lanes))
         results = _map(self._function, points, nodes * lanes, self.tape.outputs)
         for result, values, axes in zip(out, results, self.grid.results, strict=True):
@@ -204,7 +266,9 @@ class MappedGridKernel(GridKernel):
             result[...] = grid if axes == "point" else result + grid.sum(axis=1)
 
 
-def _map(function: Any, arguments: Sequence[Array], n: int, widths: Sequence[int]) -> list[Array]:
+def _map(
+    function: Any, arguments: Sequence[Array], n: int, widths: Sequence[int]
+) -> list[Array]:
     if n == 0:
         return [np.empty((width, 0)) for width in widths]
     results = function.map(n)(*arguments)

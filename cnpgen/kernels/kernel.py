@@ -24,19 +24,22 @@ class Kernel(ABC):
 
     @property
     def address(self) -> int | None:
-        """Address of the machine code, for other compiled code; None if there is none."""
+        """Address of the machine code, for other compiled code.
+
+        None if there is none.
+        """
         return None
 
     @abstractmethod
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate every lane.
 
-        Args:
-            arguments: One float64 array of shape (width, N) per input of the tape, rows contiguous.
+        Args: arguments: One float64 array of shape (width, N) per input of the tape,
+            rows contiguous.
 
-        Returns:
-            One new array of shape (width, N) per output. For a tape with a loop: the final state and the error of the
-            state before the last step, shape (1, N).
+        Returns: One new array of shape (width, N) per output. For a tape with a loop:
+            the final state and the error of the state before the last step, shape (1,
+            N).
 
         Raises:
             ValueError: A shape or type does not match the tape.
@@ -44,7 +47,9 @@ class Kernel(ABC):
 
 
 def evaluate_lanes(
-    tape: Tape, arguments: Sequence[Array], evaluate: Callable[[Sequence[Array], int], list[Array]]
+    tape: Tape,
+    arguments: Sequence[Array],
+    evaluate: Callable[[Sequence[Array], int], list[Array]],
 ) -> list[Array]:
     """Evaluate a batch, or step its lanes until they have converged, by a function that evaluates N lanes once."""
     n = check_arguments(tape, arguments)
@@ -64,9 +69,14 @@ def evaluate_lanes(
 
 
 def check_arguments(tape: Tape, arguments: Sequence[Array]) -> int:
-    """Return the number of lanes N; raise ValueError if arguments do not match the tape."""
+    """Return the number of lanes N.
+
+    Raise ValueError if arguments do not match the tape.
+    """
     if len(arguments) != len(tape.inputs):
-        raise ValueError(f"kernel {tape.name}: expected {len(tape.inputs)} arguments, got {len(arguments)}")
+        raise ValueError(
+            f"kernel {tape.name}: expected {len(tape.inputs)} arguments, got {len(arguments)}"
+        )
     n = int(arguments[0].shape[-1])
     for index, (argument, width) in enumerate(zip(arguments, tape.inputs, strict=True)):
         if (
@@ -98,10 +108,12 @@ class GridKernel(ABC):
     def __call__(self, *arguments: NDArray[Any], out: Sequence[NDArray[Any]]) -> None:
         """Evaluate the grid and write into ``out``.
 
-        Args:
-            arguments: One array of the tape's type per input: (width, K, N) for axes "point", (width, N) for "lane",
-                (width, K) for "node", (width,) for "fixed". Rows of lanes are contiguous.
-            out: One array per output: (width, K, N), or (width, N), to which the sum over the nodes is added.
+        Args: arguments: One array of the tape's type per input: (width, K, N) for axes
+            "point", (width, N) for "lane",
+                (width, K) for "node", (width,) for "fixed". Rows of lanes are
+                contiguous.
+            out: One array per output: (width, K, N), or (width, N), to which the sum
+                over the nodes is added.
 
         Raises:
             ValueError: A shape or type does not match the tape.
@@ -109,7 +121,10 @@ class GridKernel(ABC):
 
 
 def check_grid(
-    tape: Tape, grid: GridSpec, arguments: Sequence[NDArray[Any]], out: Sequence[NDArray[Any]]
+    tape: Tape,
+    grid: GridSpec,
+    arguments: Sequence[NDArray[Any]],
+    out: Sequence[NDArray[Any]],
 ) -> tuple[int, int]:
     """Return K and N; raise ValueError if arguments or results do not match the tape."""
     if (len(arguments), len(out)) != (len(tape.inputs), len(tape.outputs)):
@@ -125,9 +140,18 @@ def check_grid(
         zip(arrays, (*tape.inputs, *tape.outputs), map(axis_names, axes), strict=True)
     ):
         shape = (width, *(size[name] for name in names))
-        rows = "lanes" not in names or size["lanes"] == 1 or array.size == 0 or array.strides[-1] == array.itemsize
+        rows = (
+            "lanes" not in names
+            or size["lanes"] == 1
+            or array.size == 0
+            or array.strides[-1] == array.itemsize
+        )
         if array.shape != shape or array.dtype != np.dtype(tape.dtype) or not rows:
-            label = f"argument {index}" if index < len(arguments) else f"result {index - len(arguments)}"
+            label = (
+                f"argument {index}"
+                if index < len(arguments)
+                else f"result {index - len(arguments)}"
+            )
             raise ValueError(
                 f"kernel {tape.name}: {label} must be {tape.dtype} of shape {shape} with contiguous rows,"
                 f" got {array.dtype} of shape {array.shape}"
@@ -137,4 +161,9 @@ def check_grid(
 
 def axis_names(axes: Axes) -> tuple[str, ...]:
     """Return the names of all axes of an argument or result but the first."""
-    return {"point": ("nodes", "lanes"), "lane": ("lanes",), "node": ("nodes",), "fixed": ()}[axes]
+    return {
+        "point": ("nodes", "lanes"),
+        "lane": ("lanes",),
+        "node": ("nodes",),
+        "fixed": (),
+    }[axes]

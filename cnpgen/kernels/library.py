@@ -15,9 +15,19 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from cnpgen.errors import MachineError, UsageError
-from cnpgen.kernels.compiled_kernel import CompiledGridKernel, CompiledKernel, compile_source, compile_tape
+from cnpgen.kernels.compiled_kernel import (
+    CompiledGridKernel,
+    CompiledKernel,
+    compile_source,
+    compile_tape,
+)
 from cnpgen.kernels.compiler import require_compiler
-from cnpgen.kernels.interpreted_kernel import InterpretedGridKernel, InterpretedKernel, MappedGridKernel, MappedKernel
+from cnpgen.kernels.interpreted_kernel import (
+    InterpretedGridKernel,
+    InterpretedKernel,
+    MappedGridKernel,
+    MappedKernel,
+)
 from cnpgen.kernels.kernel import GridKernel, Kernel
 from cnpgen.kernels.parallel_compilation import CompilerPool
 from cnpgen.kernels.tape import CODES, Dtype, GridSpec, Loop, Tape, tape_from_function
@@ -37,21 +47,28 @@ Backend = Literal["compiled", "numpy", "casadi"]
 BACKENDS: tuple[Backend, ...] = ("compiled", "numpy", "casadi")
 PACKAGE_FOLDER = Path(__file__).parents[1]
 ARRAYS = Path(__file__).with_name("arrays.h")
-BUILDER_PACKAGES = ("robots", "kernels", "problems", "trajectory")  # imported by builders of any package
-NUMPY_SLOWDOWN = "10 to 20 times slower than compiled code"  # benchmarks/generator.py: 9 to 24
+BUILDER_PACKAGES = (
+    "robots",
+    "kernels",
+    "problems",
+    "trajectory",
+)  # imported by builders of any package
+NUMPY_SLOWDOWN = (
+    "10 to 20 times slower than compiled code"  # benchmarks/generator.py: 9 to 24
+)
 
 
 @dataclass
 class KernelLibrary:
     """Loader of kernels for one robot and problem, which builds those that are not cached.
 
-    Attributes:
-        backend: "compiled", "numpy" (interpreted tape) or "casadi" (CasADi's map; slow, for reference).
-        cache_folder: Folder of cached tapes and libraries.
-        identity: Digest of all ``arguments``.
-        arguments: Objects passed to builders that have a parameter of that name (robot, problem).
-        structure: Digest of the arguments without the poses and sizes of obstacles, or None; see ``load_by_structure``.
-        compiler_pool: Pool that compiles kernels, inside ``compile_in_parallel``.
+    Attributes: backend: "compiled", "numpy" (interpreted tape) or "casadi" (CasADi's
+        map; slow, for reference). cache_folder: Folder of cached tapes and libraries.
+        identity: Digest of all ``arguments``. arguments: Objects passed to builders
+        that have a parameter of that name (robot, problem). structure: Digest of the
+        arguments without the poses and sizes of obstacles, or None; see
+        ``load_by_structure``. compiler_pool: Pool that compiles kernels, inside
+        ``compile_in_parallel``.
     """
 
     backend: Backend
@@ -61,21 +78,28 @@ class KernelLibrary:
     structure: str | None = None
     compiler_pool: CompilerPool | None = field(default=None, repr=False)
 
-    def load_by_structure(self, builder: Callable[..., Any], **parameters: Any) -> Kernel:
+    def load_by_structure(
+        self, builder: Callable[..., Any], **parameters: Any
+    ) -> Kernel:
         """Return the kernel of an SX function that reads poses and sizes of obstacles from its arguments only.
 
         Problems that differ only in these numbers share its tape; see ``load``.
         """
-        return replace(self, identity=self.structure or self.identity).load(builder, **parameters)
+        return replace(self, identity=self.structure or self.identity).load(
+            builder, **parameters
+        )
 
-    def load(self, builder: Callable[..., Any], loop: Loop | None = None, **parameters: Any) -> Kernel:
+    def load(
+        self, builder: Callable[..., Any], loop: Loop | None = None, **parameters: Any
+    ) -> Kernel:
         """Return the kernel of an SX function.
 
-        Args:
-            builder: A module-level function that returns a ``casadi.Function``. Parameters named like entries of
+        Args: builder: A module-level function that returns a ``casadi.Function``.
+            Parameters named like entries of
                 ``arguments`` are filled from there.
             loop: The iteration of the function, or None.
-            parameters: Further JSON-able keyword arguments of the builder; part of the cache key.
+            parameters: Further JSON-able keyword arguments of the builder; part of the
+                cache key.
         """
         if self.backend == "casadi":
             function = self._build(builder, parameters)
@@ -85,7 +109,9 @@ class KernelLibrary:
             return InterpretedKernel(tape)
         if self.compiler_pool is not None:
             return self.compiler_pool.kernel(tape)
-        return CompiledKernel(tape, compile_tape(tape, self.cache_folder), self.cache_folder)
+        return CompiledKernel(
+            tape, compile_tape(tape, self.cache_folder), self.cache_folder
+        )
 
     @contextmanager
     def compile_in_parallel(self) -> Iterator[None]:
@@ -102,11 +128,20 @@ class KernelLibrary:
             self.compiler_pool = None
             pool.close()
 
-    def load_grid(self, builder: Callable[..., Any], grid: GridSpec, *, dtype: Dtype, **parameters: Any) -> GridKernel:
+    def load_grid(
+        self,
+        builder: Callable[..., Any],
+        grid: GridSpec,
+        *,
+        dtype: Dtype,
+        **parameters: Any,
+    ) -> GridKernel:
         """Return the kernel that evaluates an SX function on a grid of nodes and lanes, in a type; see ``load``."""
         if self.backend == "casadi":
             function = self._build(builder, parameters)
-            return MappedGridKernel(tape_from_function(function, grid=grid, dtype=dtype), function)
+            return MappedGridKernel(
+                tape_from_function(function, grid=grid, dtype=dtype), function
+            )
         tape = self._tape(builder, parameters, grid=grid, dtype=dtype)
         if self.backend == "numpy":
             return InterpretedGridKernel(tape)
@@ -125,7 +160,14 @@ class KernelLibrary:
     def _build(self, builder: Callable[..., Any], parameters: Mapping[str, Any]) -> Any:
         """Return the SX function."""
         expected = inspect.signature(builder).parameters
-        return builder(**{name: value for name, value in self.arguments.items() if name in expected}, **parameters)
+        return builder(
+            **{
+                name: value
+                for name, value in self.arguments.items()
+                if name in expected
+            },
+            **parameters,
+        )
 
     def _tape(
         self,
@@ -146,15 +188,22 @@ class KernelLibrary:
             "dtype": dtype,
             "parameters": parameters,
         }
-        digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
+        digest = hashlib.sha256(
+            json.dumps(identity, sort_keys=True).encode()
+        ).hexdigest()
         name = f"{builder.__name__}-{digest[:24]}.npy"
         if (tape := self._cached(name)) is None:
-            tape = tape_from_function(self._build(builder, parameters), loop, grid=grid, dtype=dtype)
+            tape = tape_from_function(
+                self._build(builder, parameters), loop, grid=grid, dtype=dtype
+            )
             self._store(name, tape)
         return tape
 
     def _cached(self, name: str) -> Tape | None:
-        """Return a tape from the cache, or None; damaged and untrusted files are ignored."""
+        """Return a tape from the cache, or None.
+
+        Damaged and untrusted files are ignored.
+        """
         for folder in require_trusted(self.cache_folder):
             path = folder / TAPES / name
             with suppress(OSError, ValueError):
@@ -163,7 +212,10 @@ class KernelLibrary:
         return None
 
     def _store(self, name: str, tape: Tape) -> None:
-        """Write a tape to the cache; a failure is ignored, because it only costs time."""
+        """Write a tape to the cache.
+
+        A failure is ignored, because it only costs time.
+        """
         path = self.cache_folder / TAPES / name
         with suppress(MachineError, OSError):
             make_private_folder(path.parent)
@@ -181,7 +233,8 @@ def _versions() -> list[str]:
 def _source_digests(builder: Callable[..., Any]) -> list[str]:
     """Return digests of the sources that a builder may use; kernels are rebuilt when one of them changes.
 
-    In this package these are ``BUILDER_PACKAGES`` and the builder's own subpackage. A plug-in's builder may import
+    In this package these are ``BUILDER_PACKAGES`` and the builder's own subpackage. A
+    plug-in's builder may import
     anything: the digests cover this package and the plug-in's.
     """
     package, _, module = builder.__module__.partition(".")
@@ -196,7 +249,11 @@ def _digest_of(*folders: Path) -> str:
     """Return the digest of all Python files below the folders; 40 files take 2 ms."""
     digest = hashlib.sha256()
     for path in (path for folder in folders for path in sorted(folder.rglob("*.py"))):
-        digest.update(path.relative_to(PACKAGE_FOLDER).as_posix().encode() + b"\0" + path.read_bytes())
+        digest.update(
+            path.relative_to(PACKAGE_FOLDER).as_posix().encode()
+            + b"\0"
+            + path.read_bytes()
+        )
     return digest.hexdigest()
 
 
@@ -212,10 +269,14 @@ class Identified(Protocol):
         """Digest of the same without poses and sizes of obstacles, or None if kernels may depend on those."""
 
 
-def problem_kernels(problem: Identified, robot: object, backend: Backend, cache_folder: Path) -> KernelLibrary:
+def problem_kernels(
+    problem: Identified, robot: object, backend: Backend, cache_folder: Path
+) -> KernelLibrary:
     """Return the kernel library of a problem and its robot, cached under the problem's identity."""
     arguments = {"robot": robot, "problem": problem}
-    return KernelLibrary(backend, cache_folder, problem.identity, arguments, problem.structure)
+    return KernelLibrary(
+        backend, cache_folder, problem.identity, arguments, problem.structure
+    )
 
 
 def choose_backend(requested: str | None = None) -> tuple[Backend, Path]:
@@ -233,7 +294,8 @@ def choose_backend(requested: str | None = None) -> tuple[Backend, Path]:
     """
     if requested is not None and requested not in BACKENDS:
         raise UsageError(
-            f"backend {requested!r} does not exist: expected one of {', '.join(BACKENDS)}", concerns="backend"
+            f"backend {requested!r} does not exist: expected one of {', '.join(BACKENDS)}",
+            concerns="backend",
         )
     folder = usable_cache_folder(default_cache_folder())
     if requested in {"numpy", "casadi"}:
@@ -254,8 +316,12 @@ def _try_compiler(folder: Path) -> None:
     require_compiler()
     codes = np.array([CODES["INPUT"], CODES["TWICE"], CODES["OUTPUT"]], np.int16)
     operands = np.array([0, 0, 1], np.int32)
-    tape = Tape("selftest", (1,), (1,), codes, operands, np.zeros(3, np.int32), np.zeros(3))
+    tape = Tape(
+        "selftest", (1,), (1,), codes, operands, np.zeros(3, np.int32), np.zeros(3)
+    )
     kernel = CompiledKernel(tape, compile_tape(tape, folder), folder)
     (result,) = kernel(np.arange(5.0)[None])
     if not np.array_equal(result[0], 2 * np.arange(5.0)):
-        raise MachineError("the C compiler generates wrong code: 2 x differs from x + x")
+        raise MachineError(
+            "the C compiler generates wrong code: 2 x differs from x + x"
+        )

@@ -13,7 +13,9 @@ from cnpgen.kernels.tape import Tape
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
-_KILL_INTERVAL_S = 0.05  # a thread may start its compiler just after the others were killed
+_KILL_INTERVAL_S = (
+    0.05  # a thread may start its compiler just after the others were killed
+)
 MAX_COMPILERS = 8  # compilers at the same time: each takes some 100 MB
 
 
@@ -45,7 +47,9 @@ class CompilerPool:
         from concurrent.futures import ThreadPoolExecutor
 
         self._folder, self._jobs = cache_folder, dict[bytes, "Future[Path]"]()
-        self._pool = ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_COMPILERS))  # it starts threads on use
+        self._pool = ThreadPoolExecutor(
+            min(os.cpu_count() or 1, MAX_COMPILERS)
+        )  # it starts threads on use
 
     def kernel(self, tape: Tape) -> Kernel:
         """Return the kernel of a tape; its compilation may still be pending.
@@ -74,6 +78,8 @@ class CompilerPool:
         from concurrent.futures import wait
 
         self._pool.shutdown(wait=False, cancel_futures=True)
-        while running := [job for job in self._jobs.values() if not job.done()]:  # canceled jobs are done
+        while running := [
+            job for job in self._jobs.values() if not job.done()
+        ]:  # canceled jobs are done
             kill_compilers()
             wait(running, timeout=_KILL_INTERVAL_S)

@@ -8,7 +8,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-# Operations of a tape: name -> number of operands. The names are those of CasADi's OP_* constants.
+# Operations of a tape: name -> number of operands. The names are those of CasADi's OP_*
+# constants.
 OPERATIONS = {
     "CONST": 0, "INPUT": 0, "OUTPUT": 1,
     "ADD": 2, "SUB": 2, "MUL": 2, "DIV": 2, "NEG": 1, "SQ": 1, "TWICE": 1, "INV": 1, "SQRT": 1, "FABS": 1, "SIGN": 1,
@@ -23,8 +24,9 @@ CODES = {name: code for code, name in enumerate(NAMES)}
 class Loop:
     """A fixed-point iteration of the tape on each lane: ``x, error = tape(x, parameters...)``.
 
-    The first input of the tape is the state. Its outputs are the next state and the error of the input state. A lane
-    whose error is below ``tolerance`` takes that last step and then stays constant.
+    The first input of the tape is the state. Its outputs are the next state and the
+    error of the input state. A lane whose error is below ``tolerance`` takes that last
+    step and then stays constant.
 
     Attributes:
         tolerance: Error below which a lane has converged.
@@ -38,17 +40,23 @@ class Loop:
 Axes = Literal["point", "lane", "node", "fixed"]
 Dtype = Literal["float64", "float32"]
 DTYPES: tuple[Dtype, ...] = ("float64", "float32")
-STORED_TYPES = {"constant": "<f8", "a": "<i4", "b": "<i4", "operation": "<i2"}  # widest first, so that all are aligned
+STORED_TYPES = {
+    "constant": "<f8",
+    "a": "<i4",
+    "b": "<i4",
+    "operation": "<i2",
+}  # widest first, so that all are aligned
 
 
 @dataclass(frozen=True)
 class GridSpec:
     """Evaluation of the tape at K nodes of every lane, with results per point or summed over the nodes of a lane.
 
-    Attributes:
-        arguments: Axes of each argument: "point" (nodes and lanes), "lane", "node" or "fixed" (neither). Arguments
+    Attributes: arguments: Axes of each argument: "point" (nodes and lanes), "lane",
+        "node" or "fixed" (neither). Arguments
             without a lane axis ("node", "fixed") must not be nan.
-        results: Axes of each result: "point" or "lane"; "lane" is the sum over the nodes.
+        results: Axes of each result: "point" or "lane"; "lane" is the sum over the
+            nodes.
     """
 
     arguments: tuple[Axes, ...]
@@ -59,8 +67,9 @@ class GridSpec:
 class Tape:
     """A straight-line program on scalars.
 
-    Instruction k computes value k. ``INPUT`` has a = argument, b = component; ``OUTPUT`` has a = value, b = argument
-    and ``constant`` = component; every other operation has a, b = operand values.
+    Instruction k computes value k. ``INPUT`` has a = argument, b = component;
+    ``OUTPUT`` has a = value, b = argument and ``constant`` = component; every other
+    operation has a, b = operand values.
 
     Attributes:
         name: A C identifier.
@@ -91,9 +100,17 @@ class Tape:
 
     def to_bytes(self) -> bytes:
         """Serialize with a checksum; equal tapes have equal bytes."""
-        header = {name: getattr(self, name) for name in ("name", "inputs", "outputs", "loop", "grid", "dtype")}
-        columns = [getattr(self, name).astype(kind).tobytes() for name, kind in STORED_TYPES.items()]
-        content = b"".join([json.dumps(header, default=astuple).encode(), b"\n", *columns])
+        header = {
+            name: getattr(self, name)
+            for name in ("name", "inputs", "outputs", "loop", "grid", "dtype")
+        }
+        columns = [
+            getattr(self, name).astype(kind).tobytes()
+            for name, kind in STORED_TYPES.items()
+        ]
+        content = b"".join(
+            [json.dumps(header, default=astuple).encode(), b"\n", *columns]
+        )
         return hashlib.sha256(content).digest() + content
 
     @classmethod
@@ -125,25 +142,41 @@ class Tape:
 
 
 def tape_from_function(
-    function: Any, loop: Loop | None = None, *, grid: GridSpec | None = None, dtype: Dtype = "float64"
+    function: Any,
+    loop: Loop | None = None,
+    *,
+    grid: GridSpec | None = None,
+    dtype: Dtype = "float64",
 ) -> Tape:
     """Flatten a CasADi SX function, whose arguments and results are columns.
 
-    Raises:
-        ValueError: The function uses an unsupported operation, or the grid does not match it.
+    Raises: ValueError: The function uses an unsupported operation, or the grid does not
+        match it.
     """
     import casadi as ca
 
     known = {getattr(ca, f"OP_{name}"): name for name in OPERATIONS}
     count = function.n_instructions()
-    operation, a, b = np.zeros(count, np.int16), np.zeros(count, np.int32), np.zeros(count, np.int32)
+    operation, a, b = (
+        np.zeros(count, np.int16),
+        np.zeros(count, np.int32),
+        np.zeros(count, np.int32),
+    )
     constant = np.zeros(count)
-    contents: dict[int, int] = {}  # slot of the work vector -> index of its present value
+    contents: dict[
+        int, int
+    ] = {}  # slot of the work vector -> index of its present value
     for k in range(count):
-        code, out, operands = function.instruction_id(k), function.instruction_output(k), function.instruction_input(k)
+        code, out, operands = (
+            function.instruction_id(k),
+            function.instruction_output(k),
+            function.instruction_input(k),
+        )
         name = known.get(code)
         if name is None:
-            raise ValueError(f"{function.name()}: operation {code} is not supported in kernels")
+            raise ValueError(
+                f"{function.name()}: operation {code} is not supported in kernels"
+            )
         operation[k] = CODES[name]
         if name == "CONST":
             constant[k] = function.instruction_constant(k)
@@ -160,13 +193,32 @@ def tape_from_function(
     widths_out = tuple(function.nnz_out(i) for i in range(function.n_out()))
     _check_dense(function)
     _check_grid(function, grid)
-    return Tape(function.name(), widths_in, widths_out, operation, a, b, constant, loop=loop, grid=grid, dtype=dtype)
+    return Tape(
+        function.name(),
+        widths_in,
+        widths_out,
+        operation,
+        a,
+        b,
+        constant,
+        loop=loop,
+        grid=grid,
+        dtype=dtype,
+    )
 
 
 def _check_dense(function: Any) -> None:
     """Raise ValueError for sparse arguments and results, whose components have no fixed position."""
-    sparse = [f"argument {i}" for i in range(function.n_in()) if not function.sparsity_in(i).is_dense()]
-    sparse += [f"result {i}" for i in range(function.n_out()) if not function.sparsity_out(i).is_dense()]
+    sparse = [
+        f"argument {i}"
+        for i in range(function.n_in())
+        if not function.sparsity_in(i).is_dense()
+    ]
+    sparse += [
+        f"result {i}"
+        for i in range(function.n_out())
+        if not function.sparsity_out(i).is_dense()
+    ]
     if sparse:
         raise ValueError(f"{function.name()}: {sparse[0]} is sparse; densify it")
 
@@ -181,4 +233,6 @@ def _check_grid(function: Any, grid: GridSpec | None) -> None:
             f" got {len(grid.arguments)} and {len(grid.results)}"
         )
     if not {"point", "lane"} >= set(grid.results):
-        raise ValueError(f"{function.name()}: results of a grid are per point or per lane, got {grid.results}")
+        raise ValueError(
+            f"{function.name()}: results of a grid are per point or per lane, got {grid.results}"
+        )

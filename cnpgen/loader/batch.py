@@ -27,15 +27,15 @@ from cnpgen.store.scene_table import OBSTACLE_POSES
 class Batch(Mapping[str, NDArray[Any]]):
     """B rows. The arrays belong to the batch alone and may be changed.
 
-    ``batch["start_q"]`` has shape (B, width), or (B,) for a scalar field. Float fields are views of ``table``.
-    ``dict(batch)`` is a plain dict of all fields and observations.
+    ``batch["start_q"]`` has shape (B, width), or (B,) for a scalar field. Float fields
+    are views of ``table``. ``dict(batch)`` is a plain dict of all fields and
+    observations.
 
-    Attributes:
-        table: Float fields side by side, C-contiguous, shape (B, D).
-        layout: Fields and their columns in the table.
-        integers: Integer fields, int64, shape (B, width) or (B,).
-        normalization: Normalization of the float fields; None if they are in their units.
-        observations: Results of ``observe`` of :meth:`Dataset.batches`, with a first axis of length B.
+    Attributes: table: Float fields side by side, C-contiguous, shape (B, D). layout:
+        Fields and their columns in the table. integers: Integer fields, int64, shape
+        (B, width) or (B,). normalization: Normalization of the float fields; None if
+        they are in their units. observations: Results of ``observe`` of
+        :meth:`Dataset.batches`, with a first axis of length B.
     """
 
     table: NDArray[Any]
@@ -76,10 +76,9 @@ class Batch(Mapping[str, NDArray[Any]]):
 class BatchObserver:
     """Observer of the scenes of batches, for ``dataset.batches(256, observe=...)``.
 
-    Attributes:
-        kind: See ``cnpgen.scenes.observe``.
-        scenes: Function that returns the scenes of the rows of a batch, as ``observe`` takes them.
-        seed: Seed of the points of clouds, which also depend on the rows of the batch.
+    Attributes: kind: See ``cnpgen.scenes.observe``. scenes: Function that returns the
+        scenes of the rows of a batch, as ``observe`` takes them. seed: Seed of the
+        points of clouds, which also depend on the rows of the batch.
     """
 
     kind: str | Observation
@@ -92,7 +91,9 @@ class BatchObserver:
         return observe(self.scenes(batch), self.kind, seed=seed)
 
 
-def observer_of(spec: DatasetSpec, kind: str | Observation, *, seed: int) -> BatchObserver:
+def observer_of(
+    spec: DatasetSpec, kind: str | Observation, *, seed: int
+) -> BatchObserver:
     """Return the observer of the scenes of a dataset, for batches with the field ``obstacle_poses``."""
     if not spec.scene_obstacles:
         text = f"{spec.name} has no scenes to observe: expected a dataset such as panda-scenes, or a BatchObserver"

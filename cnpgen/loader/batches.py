@@ -25,8 +25,8 @@ Observe = Callable[[Batch], Mapping[str, NDArray[Any]]]
 class BatchPartition:
     """Batches of a fixed number of rows over all ranks; the rows of a batch are distributed over the ranks.
 
-    A rank reads the rows ``rank::world`` of every batch, one of its workers the batches ``worker::workers``. An
-    incomplete last batch of an epoch is omitted by default.
+    A rank reads the rows ``rank::world`` of every batch, one of its workers the batches
+    ``worker::workers``. An incomplete last batch of an epoch is omitted by default.
     """
 
     batch_size: int
@@ -37,12 +37,25 @@ class BatchPartition:
     workers: int = 1
 
     def __post_init__(self) -> None:
-        for name, minimum in (("batch_size", 1), ("world", 1), ("rank", 0), ("workers", 1), ("worker", 0)):
-            object.__setattr__(self, name, integer(name, getattr(self, name), least=minimum))
+        for name, minimum in (
+            ("batch_size", 1),
+            ("world", 1),
+            ("rank", 0),
+            ("workers", 1),
+            ("worker", 0),
+        ):
+            object.__setattr__(
+                self, name, integer(name, getattr(self, name), least=minimum)
+            )
         object.__setattr__(self, "drop_last", flag("drop_last", self.drop_last))
-        for name, value, count in (("rank", self.rank, self.world), ("worker", self.worker, self.workers)):
+        for name, value, count in (
+            ("rank", self.rank, self.world),
+            ("worker", self.worker, self.workers),
+        ):
             if value >= count:
-                raise UsageError(f"must be one of 0 to {count - 1}, got {value}", argument=name)
+                raise UsageError(
+                    f"must be one of 0 to {count - 1}, got {value}", argument=name
+                )
         if self.batch_size % self.world:
             raise UsageError(
                 f"batch_size counts the rows of all ranks together and must be a multiple of world ({self.world}),"
@@ -87,35 +100,45 @@ def checked_position(*, seed: Any, shuffle: Any, epoch: Any, row: Any = 0) -> Po
     """Make a position of unchecked arguments."""
     numbers = {"seed": seed, "epoch": epoch, "row": row}
     return Position(
-        shuffle=flag("shuffle", shuffle), **{name: integer(name, value, least=0) for name, value in numbers.items()}
+        shuffle=flag("shuffle", shuffle),
+        **{name: integer(name, value, least=0) for name, value in numbers.items()},
     )
 
 
 def position_from_json(state: Mapping[str, Any], source: SplitShards) -> Position:
     """Rebuild a position; raise an error if it is not of these rows."""
     if not isinstance(state, Mapping) or state.get("format") != LOADER_STATE_FORMAT:
-        raise UsageError(f"a loader's state must be what state() returned, got {state!r:.100}")
+        raise UsageError(
+            f"a loader's state must be what state() returned, got {state!r:.100}"
+        )
     if state.get("format_version") != LOADER_STATE_VERSION:
         version = state.get("format_version")
         text = f"the loader's state has format version {version!r}, this cnpgen reads {LOADER_STATE_VERSION}"
         raise DatasetError(text)
     for name, value in (("fingerprint", source.fingerprint), ("split", source.split)):
         if state.get(name) != value:
-            raise DatasetError(f"the loader's state is of another dataset: {name} {state.get(name)!r}, here {value!r}")
+            raise DatasetError(
+                f"the loader's state is of another dataset: {name} {state.get(name)!r}, here {value!r}"
+            )
     try:
-        position = checked_position(**{name: state[name] for name in Position.__dataclass_fields__})
+        position = checked_position(
+            **{name: state[name] for name in Position.__dataclass_fields__}
+        )
     except KeyError as error:
         raise UsageError(f"the loader's state lacks {error}") from error
     if position.row > source.rows:
-        raise DatasetError(f"the loader's state is at row {position.row}; split {source.split!r} has {source.rows}")
+        raise DatasetError(
+            f"the loader's state is at row {position.row}; split {source.split!r} has {source.rows}"
+        )
     return position
 
 
 class Batches:
     """Iterable over batches: every loop yields the remaining batches of an epoch; then the next epoch begins.
 
-    The order is a function of seed, epoch and shards alone. A split of at most 256 MiB stays in memory after its rows
-    have been read; of a larger split, two windows do. It can be forked, and pickled without rows.
+    The order is a function of seed, epoch and shards alone. A split of at most 256 MiB
+    stays in memory after its rows have been read; of a larger split, two windows do. It
+    can be forked, and pickled without rows.
 
     Args:
         source: Shards of the split.
@@ -124,13 +147,13 @@ class Batches:
         position: Initial position.
         observe: Function that returns observations of a batch, which are added to it.
 
-    Attributes:
-        times_set: Number of times that ``epoch`` or ``load_state`` set the position.
-        worker_positions: Shared memory in which workers of other processes store their positions, shape (workers, 2):
+    Attributes: times_set: Number of times that ``epoch`` or ``load_state`` set the
+        position. worker_positions: Shared memory in which workers of other processes
+        store their positions, shape (workers, 2):
             the next epoch and ``times_set``; None without workers.
 
-    Raises:
-        UsageError: There are fewer rows than in one batch, or fewer in the last batch than ranks.
+    Raises: UsageError: There are fewer rows than in one batch, or fewer in the last
+        batch than ranks.
     """
 
     def __init__(
@@ -148,7 +171,12 @@ class Batches:
                 concerns="batch_size",
             )
         partition.check_ranks(source.rows, first=position.row)
-        self._source, self._row_format, self._partition, self._position = source, row_format, partition, position
+        self._source, self._row_format, self._partition, self._position = (
+            source,
+            row_format,
+            partition,
+            position,
+        )
         self._in_memory: InMemoryRows | None = None
         self._observe = observe
         self.times_set = 0
@@ -170,14 +198,19 @@ class Batches:
 
     @epoch.setter
     def epoch(self, epoch: int) -> None:
-        self._position = replace(self._position, epoch=integer("epoch", epoch, least=0), row=0)
+        self._position = replace(
+            self._position, epoch=integer("epoch", epoch, least=0), row=0
+        )
         self.times_set += 1
 
     @property
     def signature(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
         """Field name -> shape in one row and type."""
         types = {"float": self._row_format.dtype, "int64": np.dtype(np.int64)}
-        return {field.name: (field.shape(0)[1:], types[field.dtype]) for field in self._row_format.layout.fields}
+        return {
+            field.name: (field.shape(0)[1:], types[field.dtype])
+            for field in self._row_format.layout.fields
+        }
 
     def __len__(self) -> int:
         """Return the number of batches per epoch."""
@@ -194,36 +227,58 @@ class Batches:
         begin = position = self._position = self._forward(self._position)
         rows = tuple(shard.rows for shard in source.shards)
         order = Order(source.split, rows, begin.seed, begin.epoch, begin.shuffle)
-        self._in_memory = self._in_memory or make_in_memory_rows(source, self._row_format)
+        self._in_memory = self._in_memory or make_in_memory_rows(
+            source, self._row_format
+        )
         windows = Windows(source, self._row_format, order, self._in_memory)
         row, end = begin.row, partition.end(source.rows, first=begin.row)
         while (first := row + partition.worker * partition.batch_size) < end:
             batch = windows.batch(
-                first, min(first + partition.batch_size, end), rank=partition.rank, world=partition.world
+                first,
+                min(first + partition.batch_size, end),
+                rank=partition.rank,
+                world=partition.world,
             )
             row = min(row + partition.workers * partition.batch_size, end)
-            self._position = position = self._forward(Position(begin.seed, begin.shuffle, begin.epoch, row))
-            yield batch if self._observe is None else replace(batch, observations=self._observe(batch))
+            self._position = position = self._forward(
+                Position(begin.seed, begin.shuffle, begin.epoch, row)
+            )
+            yield (
+                batch
+                if self._observe is None
+                else replace(batch, observations=self._observe(batch))
+            )
             if self._position is not position:
-                raise UsageError("within this loop, another loop over the same batches ran or load_state was called")
+                raise UsageError(
+                    "within this loop, another loop over the same batches ran or load_state was called"
+                )
 
     def _forward(self, position: Position) -> Position:
         """Return the first position of the next epoch if no batch remains in this one, otherwise the position."""
-        has_batches = self._partition.end(self._source.rows, first=position.row) > position.row
-        return position if has_batches or not position.row else replace(position, epoch=position.epoch + 1, row=0)
+        has_batches = (
+            self._partition.end(self._source.rows, first=position.row) > position.row
+        )
+        return (
+            position
+            if has_batches or not position.row
+            else replace(position, epoch=position.epoch + 1, row=0)
+        )
 
-    def state(self, *, epoch: int | None = None, batch: int | None = None) -> dict[str, Any]:
+    def state(
+        self, *, epoch: int | None = None, batch: int | None = None
+    ) -> dict[str, Any]:
         """Return the position as a small JSON-able dict, equal on every rank.
 
-        By default, this is the position after the last returned batch. If workers or a prefetch read batches ahead, the
-        user must pass the number of batches that were used.
+        By default, this is the position after the last returned batch. If workers or a
+        prefetch read batches ahead, the user must pass the number of batches that were
+        used.
 
         Args:
             epoch: The epoch; the current one by default.
             batch: Number of batches of that epoch that were used.
 
-        Raises:
-            UsageError: The epoch has fewer batches; or workers read batches and ``batch`` is missing.
+        Raises: UsageError: The epoch has fewer batches; or workers read batches and
+            ``batch`` is missing.
         """
         position = self._position
         if epoch is not None or batch is not None:
@@ -232,33 +287,51 @@ class Batches:
                 text = f"must be at most {len(self)}, the number of batches of an epoch, got {used}"
                 raise UsageError(text, argument="batch")
             row = min(used * self._partition.batch_size, self._source.rows)
-            epoch = position.epoch if epoch is None else integer("epoch", epoch, least=0)
+            epoch = (
+                position.epoch if epoch is None else integer("epoch", epoch, least=0)
+            )
             position = self._forward(replace(position, epoch=epoch, row=row))
-        elif self.worker_positions is not None and (self.worker_positions[:, 1] == self.times_set).any():
+        elif (
+            self.worker_positions is not None
+            and (self.worker_positions[:, 1] == self.times_set).any()
+        ):
             raise UsageError(
                 "the workers of a DataLoader read batches ahead, so the number of used batches is unknown: pass it with"
                 " state(epoch=..., batch=...), or set num_workers=0"
             )
         head = {"format": LOADER_STATE_FORMAT, "format_version": LOADER_STATE_VERSION}
-        return head | {"fingerprint": self._source.fingerprint, "split": self._source.split, **asdict(position)}
+        return head | {
+            "fingerprint": self._source.fingerprint,
+            "split": self._source.split,
+            **asdict(position),
+        }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore the position of ``state()``: the next loop continues with the following batch.
 
-        The state contains seed, epoch and shuffling. Batch size, ranks and fields are those of this object: a state
-        counts rows, so the batch size and the number of ranks may differ.
+        The state contains seed, epoch and shuffling. Batch size, ranks and fields are
+        those of this object: a state counts rows, so the batch size and the number of
+        ranks may differ.
 
-        Raises:
-            UsageError: The argument is not the state of a loader, or the last batch would have fewer rows than ranks.
-            DatasetError: The state is of another dataset, split or format version.
+        Raises: UsageError: The argument is not the state of a loader, or the last batch
+            would have fewer rows than ranks. DatasetError: The state is of another
+            dataset, split or format version.
         """
         position = self._forward(position_from_json(state, self._source))
         self._partition.check_ranks(self._source.rows, first=position.row)
         self._position = position
         self.times_set += 1
 
-    def for_worker(self, worker: int, workers: int, *, epoch: int | None = None) -> Batches:
+    def for_worker(
+        self, worker: int, workers: int, *, epoch: int | None = None
+    ) -> Batches:
         """Return the batches of one of several workers, which share the remaining batches or those of an epoch."""
         partition = replace(self._partition, worker=worker, workers=workers)
-        position = self._position if epoch is None else replace(self._position, epoch=epoch, row=0)
-        return Batches(self._source, self._row_format, partition, position, self._observe)
+        position = (
+            self._position
+            if epoch is None
+            else replace(self._position, epoch=epoch, row=0)
+        )
+        return Batches(
+            self._source, self._row_format, partition, position, self._observe
+        )

@@ -29,11 +29,16 @@ def gather(source: SplitShards, indices: ArrayLike, layout: Columns) -> Rows:
     Values are as stored, shape (k, width) or (k,).
     """
     rows = _checked(indices, source)
-    columns = {f.name: np.empty(f.shape(len(rows)), storage_dtype(f, source.stored)) for f in layout.fields}
+    columns = {
+        f.name: np.empty(f.shape(len(rows)), storage_dtype(f, source.stored))
+        for f in layout.fields
+    }
     for shard, positions, local in _by_shard(rows, source):
         file = source.shards[shard]
         dense = MAX_READ_ROWS_PER_ROW * len(local) >= file.rows
-        stored = (source.reader.read if dense else source.reader.map)(file, layout.fields)
+        stored = (source.reader.read if dense else source.reader.map)(
+            file, layout.fields
+        )
         for name, values in columns.items():
             values[positions] = stored[name][local]
     return columns
@@ -45,11 +50,16 @@ def _checked(indices: ArrayLike, source: SplitShards) -> Indices:
     try:
         rows = np.asarray(indices)
     except ValueError as error:
-        raise UsageError(f"must be a list of integers, got {error}", argument="indices") from error
+        raise UsageError(
+            f"must be a list of integers, got {error}", argument="indices"
+        ) from error
     if rows.size == 0:
         return np.empty(0, np.int64)
     if rows.ndim != 1 or rows.dtype.kind not in "iu":
-        raise UsageError(f"must be a list of integers, got {rows.dtype} of shape {rows.shape}", argument="indices")
+        raise UsageError(
+            f"must be a list of integers, got {rows.dtype} of shape {rows.shape}",
+            argument="indices",
+        )
     wrong = (rows < -source.rows) | (rows >= source.rows)
     if wrong.any():
         text = f"split {source.split!r} has {source.rows} rows, there is no row {rows[wrong][0]}"
@@ -57,7 +67,9 @@ def _checked(indices: ArrayLike, source: SplitShards) -> Indices:
     return np.where(rows < 0, rows + source.rows, rows).astype(np.int64)
 
 
-def _by_shard(rows: Indices, source: SplitShards) -> Iterator[tuple[int, Indices, Indices]]:
+def _by_shard(
+    rows: Indices, source: SplitShards
+) -> Iterator[tuple[int, Indices, Indices]]:
     """Yield every required shard: its index, the positions of its rows in the result, and the rows within it."""
     ends = np.cumsum([shard.rows for shard in source.shards])
     shards = np.searchsorted(ends, rows, side="right")
@@ -65,14 +77,19 @@ def _by_shard(rows: Indices, source: SplitShards) -> Iterator[tuple[int, Indices
     for positions in np.split(order, np.flatnonzero(np.diff(shards[order])) + 1):
         if len(positions):
             shard = int(shards[positions[0]])
-            yield shard, positions, rows[positions] - (ends[shard] - source.shards[shard].rows)
+            yield (
+                shard,
+                positions,
+                rows[positions] - (ends[shard] - source.shards[shard].rows),
+            )
 
 
 @dataclass(frozen=True, eq=False)
 class Split:
     """The rows of a split: ``split[i]`` is one row, ``split[a:b]`` and ``split[[i, j]]`` are several rows.
 
-    A row contains all float fields except for diagnostics, in their units and stored type.
+    A row contains all float fields except for diagnostics, in their units and stored
+    type.
 
     Attributes:
         source: Shards of the split.
@@ -96,4 +113,8 @@ class Split:
             return self.__getitem__(np.arange(*index.indices(len(self))))
         indices = np.asarray(index)
         rows = gather(self.source, np.atleast_1d(indices), self.row_format.layout)
-        return {name: values[0] for name, values in rows.items()} if indices.ndim == 0 else rows
+        return (
+            {name: values[0] for name, values in rows.items()}
+            if indices.ndim == 0
+            else rows
+        )

@@ -23,35 +23,46 @@ Statistics = dict[str, dict[str, FieldStatistics]]
 
 
 @checked_arguments
-def load_dataset(folder: str | Path, *, allow_incomplete: bool = False, verify: bool = True) -> Dataset:
+def load_dataset(
+    folder: str | Path, *, allow_incomplete: bool = False, verify: bool = True
+) -> Dataset:
     """Open a dataset: its rows as batches for training, arrays, tables or one by one.
 
-    Existence and sizes of all shards are checked now, header and sha256 of each when it is read for the first time.
+    Existence and sizes of all shards are checked now, header and sha256 of each when it
+    is read for the first time.
 
-    Args:
-        folder: Folder of the dataset.
-        allow_incomplete: Whether to open the existing shards of a dataset that is unfinished or has missing shards.
-        verify: Whether to verify the sha256 of every shard when it is read for the first time.
+    Args: folder: Folder of the dataset. allow_incomplete: Whether to open the existing
+        shards of a dataset that is unfinished or has missing shards. verify: Whether to
+        verify the sha256 of every shard when it is read for the first time.
 
-    Raises:
-        UsageError: The folder does not exist or contains no dataset, or an option is not a bool.
-        DatasetError: The dataset is unfinished, or a part is missing or damaged.
-        MachineError: A file cannot be read.
+    Raises: UsageError: The folder does not exist or contains no dataset, or an option
+        is not a bool. DatasetError: The dataset is unfinished, or a part is missing or
+        damaged. MachineError: A file cannot be read.
     """
     folder, verify = Path(folder), flag("verify", verify)
-    stored = open_dataset(folder, allow_incomplete=flag("allow_incomplete", allow_incomplete))
+    stored = open_dataset(
+        folder, allow_incomplete=flag("allow_incomplete", allow_incomplete)
+    )
     if stored.manifest is None:
         summary = summarize_dataset(folder, stored.spec, allow_incomplete=True)
         statistics, made = summary.statistics, summary.records
-        recorded = [Shard(folder, stored.spec, task, record.bytes, record.sha256) for task, record in made]
+        recorded = [
+            Shard(folder, stored.spec, task, record.bytes, record.sha256)
+            for task, record in made
+        ]
     else:
         statistics = _load_statistics(folder, stored.spec)
         recorded = [stored.shard(task) for task in shards(stored.spec)]
-    listed = {split: [shard for shard in recorded if shard.task.split == split] for split in stored.spec.splits}
+    listed = {
+        split: [shard for shard in recorded if shard.task.split == split]
+        for split in stored.spec.splits
+    }
     _check_rows(stored.spec, recorded)
     present = _present(folder, listed, allow_incomplete=allow_incomplete)
     fingerprint = data_fingerprint(
-        (shard.path.relative_to(folder).as_posix(), shard.sha256) for part in present.values() for shard in part
+        (shard.path.relative_to(folder).as_posix(), shard.sha256)
+        for part in present.values()
+        for shard in part
     )
     reader = ShardReader(verify=verify, obstacles=problem_obstacles(stored.spec))
     return Dataset(folder, stored.spec, fingerprint, present, statistics, reader)
@@ -61,24 +72,35 @@ def _load_statistics(folder: Path, spec: DatasetSpec) -> Statistics:
     """Read the statistics of a finished dataset."""
     path, document = folder / STATS, load_stats_document(folder)
     if document["specification_fingerprint"] != spec.fingerprint:
-        raise DatasetError(f"{path} is of another specification than {SPECIFICATION}; {RERUN_HINT}")
+        raise DatasetError(
+            f"{path} is of another specification than {SPECIFICATION}; {RERUN_HINT}"
+        )
     try:
         statistics = {
-            split: {name: statistics_from_json(content) for name, content in fields.items()}
+            split: {
+                name: statistics_from_json(content) for name, content in fields.items()
+            }
             for split, fields in document["splits"].items()
         }
     except ValueError as error:
         raise DatasetError(f"{path} is damaged: {error}; {RERUN_HINT}") from error
     if not all(are_of(items, spec.fields) for items in statistics.values()):
-        raise DatasetError(f"{path} is of other fields than {SPECIFICATION}; {RERUN_HINT}")
+        raise DatasetError(
+            f"{path} is of other fields than {SPECIFICATION}; {RERUN_HINT}"
+        )
     return statistics
 
 
 def _check_rows(spec: DatasetSpec, shards: Iterable[Shard]) -> None:
     """Raise an error, before memory is allocated, if shards are too small for their recorded number of rows."""
-    width = sum(max(field.width, 1) * storage_dtype(field, spec.dtype).itemsize for field in spec.fields)
+    width = sum(
+        max(field.width, 1) * storage_dtype(field, spec.dtype).itemsize
+        for field in spec.fields
+    )
     for shard in shards:
-        if shard.rows * width > max(MAX_EXPANSION * shard.size, MIN_EXPANSION_LIMIT_BYTES):
+        if shard.rows * width > max(
+            MAX_EXPANSION * shard.size, MIN_EXPANSION_LIMIT_BYTES
+        ):
             text = f"{shard.path} has {shard.size:,} bytes, too few for the {shard.rows:,} rows of {SPECIFICATION}"
             raise DatasetError(text)
 
@@ -86,10 +108,21 @@ def _check_rows(spec: DatasetSpec, shards: Iterable[Shard]) -> None:
 def _present(
     folder: Path, shards: Mapping[str, list[Shard]], *, allow_incomplete: bool
 ) -> dict[str, tuple[Shard, ...]]:
-    """Return the existing shards; raise an error if others are missing, unless this is allowed."""
-    problems = [problem for part in shards.values() for shard in part if (problem := shard.problem())]
+    """Return the existing shards.
+
+    Raise an error if others are missing, unless this is allowed.
+    """
+    problems = [
+        problem
+        for part in shards.values()
+        for shard in part
+        if (problem := shard.problem())
+    ]
     if problems and not allow_incomplete:
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         text = f"{folder} is damaged: {problems[0]}{more}; {RERUN_HINT}, or omit the shard with allow_incomplete=True"
         raise DatasetError(text)
-    return {split: tuple(shard for shard in part if not shard.problem()) for split, part in shards.items()}
+    return {
+        split: tuple(shard for shard in part if not shard.problem())
+        for split, part in shards.items()
+    }

@@ -25,9 +25,9 @@ DTYPES = ("float32", "float64")
 class Normalization:
     """Means and standard deviations of the columns of fields.
 
-    Attributes:
-        mean: Field name -> mean of its c columns, in the unit of the field, shape (c,); c is 1 for a scalar field.
-        std: Field name -> standard deviation of its c columns, in the unit of the field, shape (c,). It is 0 for a
+    Attributes: mean: Field name -> mean of its c columns, in the unit of the field,
+        shape (c,); c is 1 for a scalar field. std: Field name -> standard deviation of
+        its c columns, in the unit of the field, shape (c,). It is 0 for a
             constant column, which is normalized to 0.
     """
 
@@ -40,16 +40,23 @@ class Normalization:
     @cached_property
     def scale(self) -> dict[str, Floats]:
         """Field name -> 1 / std, 0 for constant columns, shape (c,)."""
-        return {name: np.divide(1.0, std, out=np.zeros_like(std), where=std > 0) for name, std in self.std.items()}
+        return {
+            name: np.divide(1.0, std, out=np.zeros_like(std), where=std > 0)
+            for name, std in self.std.items()
+        }
 
     def normalize(self, rows: Mapping[str, Any]) -> dict[str, Any]:
         """Return (x - mean) / std of the fields with statistics; other fields are unchanged.
 
-        Args:
-            rows: Field name -> values in the unit of the field, shape (..., width), or (...) for a scalar field. They
-                may be arrays of NumPy or JAX or tensors of torch; gradients are propagated.
+        Args: rows: Field name -> values in the unit of the field, shape (..., width),
+            or (...) for a scalar field. They
+                may be arrays of NumPy or JAX or tensors of torch; gradients are
+                propagated.
         """
-        return {name: self._scaled(name, values) if name in self.mean else values for name, values in rows.items()}
+        return {
+            name: self._scaled(name, values) if name in self.mean else values
+            for name, values in rows.items()
+        }
 
     def denormalize(self, rows: Mapping[str, Any]) -> dict[str, Any]:
         """Return mean + std x, the inverse of :meth:`normalize`; a constant column returns to its value.
@@ -57,14 +64,23 @@ class Normalization:
         Args:
             rows: Field name -> normalized values, otherwise as for :meth:`normalize`.
         """
-        return {name: self._unscaled(name, values) if name in self.mean else values for name, values in rows.items()}
+        return {
+            name: self._unscaled(name, values) if name in self.mean else values
+            for name, values in rows.items()
+        }
 
     def _scaled(self, name: str, values: Any) -> Any:
-        mean, scale = _as_type_of(values, self.mean[name]), _as_type_of(values, self.scale[name])
+        mean, scale = (
+            _as_type_of(values, self.mean[name]),
+            _as_type_of(values, self.scale[name]),
+        )
         return _with_type_of(values, (values - mean) * scale)
 
     def _unscaled(self, name: str, values: Any) -> Any:
-        mean, std = _as_type_of(values, self.mean[name]), _as_type_of(values, self.std[name])
+        mean, std = (
+            _as_type_of(values, self.mean[name]),
+            _as_type_of(values, self.std[name]),
+        )
         return _with_type_of(values, values * std + mean)
 
     def side_by_side(self, fields: Sequence[Field]) -> tuple[Floats, Floats]:
@@ -73,13 +89,21 @@ class Normalization:
         Raises:
             DatasetError: A field has no statistics here.
         """
-        of_scenes = {OBSTACLE_POSES, *(item.name for item in SCENE_ARRAYS)}  # never normalized
-        missing = [field.name for field in fields if field.name not in {*self.mean, *of_scenes}]
+        of_scenes = {
+            OBSTACLE_POSES,
+            *(item.name for item in SCENE_ARRAYS),
+        }  # never normalized
+        missing = [
+            field.name for field in fields if field.name not in {*self.mean, *of_scenes}
+        ]
         if missing:
             raise DatasetError(
                 f"there are no statistics to normalize {', '.join(missing)} with, only those of {', '.join(self.mean)}"
             )
-        empty, width = np.empty(0), {field.name: max(field.width, 1) for field in fields}
+        empty, width = (
+            np.empty(0),
+            {field.name: max(field.width, 1) for field in fields},
+        )
         mean = [self.mean.get(name, np.zeros(count)) for name, count in width.items()]
         scale = [self.scale.get(name, np.ones(count)) for name, count in width.items()]
         return np.concatenate([empty, *mean]), np.concatenate([empty, *scale])
@@ -92,14 +116,19 @@ def _as_type_of(values: Any, numbers: Floats) -> Any:
 
 def _with_type_of(values: Any, result: Any) -> Any:
     """Return a result with the shape and dtype of ``values``."""
-    return (result if result.dtype == values.dtype else result.astype(values.dtype)).reshape(values.shape)
+    return (
+        result if result.dtype == values.dtype else result.astype(values.dtype)
+    ).reshape(values.shape)
 
 
-def make_normalization(statistics: Mapping[str, FieldStatistics], fields: Sequence[Field]) -> Normalization:
+def make_normalization(
+    statistics: Mapping[str, FieldStatistics], fields: Sequence[Field]
+) -> Normalization:
     """Make the normalization of the float fields from statistics of the training rows.
 
-    A column counts as constant if its standard deviation is below the float32 resolution of its largest value.
-    Otherwise its rounding errors would be scaled to size 1, such as those of the height of a tip on a table.
+    A column counts as constant if its standard deviation is below the float32
+    resolution of its largest value. Otherwise its rounding errors would be scaled to
+    size 1, such as those of the height of a tip on a table.
     """
     mean, std = {}, {}
     for field in fields:
@@ -107,13 +136,18 @@ def make_normalization(statistics: Mapping[str, FieldStatistics], fields: Sequen
             item = statistics[field.name]
             largest = np.maximum(np.abs(item.minimum), np.abs(item.maximum))
             mean[field.name] = item.mean
-            std[field.name] = np.where(item.std > np.finfo(np.float32).eps * largest, item.std, 0.0)
+            std[field.name] = np.where(
+                item.std > np.finfo(np.float32).eps * largest, item.std, 0.0
+            )
     return Normalization(mean, std)
 
 
 @dataclass(frozen=True)
 class Columns:
-    """The fields to load, in order. Float fields share a table; integer fields are separate arrays."""
+    """The fields to load, in order. Float fields share a table.
+
+    Integer fields are separate arrays.
+    """
 
     fields: tuple[Field, ...]
 
@@ -144,7 +178,10 @@ class Columns:
     @property
     def summary(self) -> str:
         """The fields with their widths: ``"start_q[6], hit_speed"``."""
-        return ", ".join(f"{field.name}[{field.width}]" if field.width else field.name for field in self.fields)
+        return ", ".join(
+            f"{field.name}[{field.width}]" if field.width else field.name
+            for field in self.fields
+        )
 
     @property
     def width(self) -> int:
@@ -155,27 +192,46 @@ class Columns:
 def select_columns(spec: DatasetSpec, names: Iterable[str] | None) -> Columns:
     """Select fields by name, in the requested order.
 
-    By default these are all float fields except for diagnostics, in the order of the specification. Fields of scenes
-    have to be named.
+    By default these are all float fields except for diagnostics, in the order of the
+    specification. Fields of scenes have to be named.
     """
     if names is None:
-        return Columns(tuple(field for field in spec.fields if field.dtype == "float" and field.role != "diagnostic"))
+        return Columns(
+            tuple(
+                field
+                for field in spec.fields
+                if field.dtype == "float" and field.role != "diagnostic"
+            )
+        )
     if isinstance(names, str):
-        raise UsageError(f"must be a list of names, got the text {names!r}: write [{names!r}]", argument="fields")
+        raise UsageError(
+            f"must be a list of names, got the text {names!r}: write [{names!r}]",
+            argument="fields",
+        )
     given: Any = names
     if isinstance(given, bytes) or getattr(given, "ndim", 1) != 1:
-        raise UsageError(f"must be a list of names, got {names!r:.100}", argument="fields")
+        raise UsageError(
+            f"must be a list of names, got {names!r:.100}", argument="fields"
+        )
     selected: Sequence[str] = tuple(names)
     texts = all(isinstance(name, str) for name in selected)
     if not selected or not texts or len(set(selected)) != len(selected):
-        raise UsageError(f"must be one or more different names, got {list(selected)!s:.200}", argument="fields")
+        raise UsageError(
+            f"must be one or more different names, got {list(selected)!s:.200}",
+            argument="fields",
+        )
     of_scenes = {field.name: field for field in scene_fields(spec)}
-    return Columns(tuple(of_scenes.get(name) or spec.field_named(name) for name in selected))
+    return Columns(
+        tuple(of_scenes.get(name) or spec.field_named(name) for name in selected)
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class RowFormat:
-    """The format of loaded rows; without a normalization, float fields keep their units."""
+    """The format of loaded rows.
+
+    Without a normalization, float fields keep their units.
+    """
 
     layout: Columns
     normalization: Normalization | None
@@ -185,9 +241,15 @@ class RowFormat:
         """Convert stored rows, of shape (k, width) or (k,) each, to this format."""
         values = dict(rows)
         if self.normalization is not None:  # in float64, as for batches
-            values |= {name: values[name].astype(np.float64, copy=False) for name in self.layout.slices}
+            values |= {
+                name: values[name].astype(np.float64, copy=False)
+                for name in self.layout.slices
+            }
             values = self.normalization.normalize(values)
-        return values | {name: values[name].astype(self.dtype, copy=False) for name in self.layout.slices}
+        return values | {
+            name: values[name].astype(self.dtype, copy=False)
+            for name in self.layout.slices
+        }
 
 
 def make_row_format(
@@ -200,17 +262,27 @@ def make_row_format(
 ) -> RowFormat:
     """Make the format of loaded rows from the options of a user.
 
-    ``own`` is the normalization of the dataset, None without training rows. By default, rows have all float fields
-    except for diagnostics, in the stored type.
+    ``own`` is the normalization of the dataset, None without training rows. By default,
+    rows have all float fields except for diagnostics, in the stored type.
     """
-    normalization = normalize if isinstance(normalize, Normalization) else _own(spec, own, normalize)
+    normalization = (
+        normalize
+        if isinstance(normalize, Normalization)
+        else _own(spec, own, normalize)
+    )
     layout = select_columns(spec, fields)
     if normalization is not None:
-        normalization.side_by_side(layout.floats)  # raises the error for a missing field here, and not in a thread
-    return RowFormat(layout, normalization, _float_dtype(spec.dtype if dtype is None else dtype))
+        normalization.side_by_side(
+            layout.floats
+        )  # raises the error for a missing field here, and not in a thread
+    return RowFormat(
+        layout, normalization, _float_dtype(spec.dtype if dtype is None else dtype)
+    )
 
 
-def _own(spec: DatasetSpec, own: Normalization | None, normalize: object) -> Normalization | None:
+def _own(
+    spec: DatasetSpec, own: Normalization | None, normalize: object
+) -> Normalization | None:
     if not isinstance(normalize, bool | np.bool_):
         text = f"must be True, False or the normalization of a dataset, got {normalize!r:.100}"
         raise UsageError(text, argument="normalize")
@@ -228,5 +300,7 @@ def _float_dtype(dtype: DTypeLike) -> np.dtype[Any]:
     except TypeError:
         float_type = None
     if float_type is None or float_type.name not in DTYPES:
-        raise UsageError(f"must be one of {', '.join(DTYPES)}, got {dtype!r}", argument="dtype")
+        raise UsageError(
+            f"must be one of {', '.join(DTYPES)}, got {dtype!r}", argument="dtype"
+        )
     return float_type

@@ -18,7 +18,14 @@ from cnpgen.robots.scene import scene_poses
 from cnpgen.robots.solid import pose_width
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import parse, stored_values
-from cnpgen.store.checked_shard import Shard, check_field, check_header, check_values, read_columns, read_scenes
+from cnpgen.store.checked_shard import (
+    Shard,
+    check_field,
+    check_header,
+    check_values,
+    read_columns,
+    read_scenes,
+)
 from cnpgen.store.dataset_spec import DatasetSpec
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import file_sha256
@@ -35,23 +42,33 @@ def problem_obstacles(spec: DatasetSpec) -> tuple[Obstacle, ...]:
     if not spec.scene_obstacles:
         return ()
     tables = spec.recipe["pipeline"]["problem"]["obstacle"]
-    given = [{key: value for key, value in table.items() if value is not None} for table in tables]
+    given = [
+        {key: value for key, value in table.items() if value is not None}
+        for table in tables
+    ]
     with stored_values():
-        parsed = [parse(Obstacle, table, where=RecipeLocation("obstacle"), errors=[]) for table in given]
+        parsed = [
+            parse(Obstacle, table, where=RecipeLocation("obstacle"), errors=[])
+            for table in given
+        ]
     return tuple(obstacle for obstacle in parsed if obstacle is not None)
 
 
 def scene_fields(spec: DatasetSpec) -> tuple[Field, ...]:
     """Return the fields of the scene of each sample; empty for a dataset without scenes.
 
-    ``obstacle_poses`` has the layout of the problem's obstacles (``cnpgen.robots.solid``). The others are the arrays of
-    the shards, flattened: ``obstacle_position`` has shape (N, 3 O).
+    ``obstacle_poses`` has the layout of the problem's obstacles
+    (``cnpgen.robots.solid``). The others are the arrays of the shards, flattened:
+    ``obstacle_position`` has shape (N, 3 O).
     """
     if not spec.scene_obstacles:
         return ()
     text = "poses and sizes of the problem's obstacles in the scene"
     width = pose_width(problem_obstacles(spec))
-    return (Field(OBSTACLE_POSES, "m", text, width, role="context", frame="world"), *spec.scene_fields)
+    return (
+        Field(OBSTACLE_POSES, "m", text, width, role="context", frame="world"),
+        *spec.scene_fields,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,15 +98,22 @@ class SceneColumn:
 class ShardReader:
     """Reader of fields of shards; every shard and every field is checked when it is read for the first time.
 
-    Its only open files are the memory maps of the last shards. It can be used by several threads, forked, and pickled
-    without its maps. Without ``verify``, size, header and values of a shard are checked, but not its sha256.
+    Its only open files are the memory maps of the last shards. It can be used by
+    several threads, forked, and pickled without its maps. Without ``verify``, size,
+    header and values of a shard are checked, but not its sha256.
     """
 
     def __init__(self, *, verify: bool, obstacles: Sequence[Obstacle] = ()) -> None:
         self._verify, self._obstacles = verify, tuple(obstacles)
-        self._scenes: tuple[Path, SceneTable] | None = None  # of the last shard whose scenes were read
-        self._placements: dict[Path, dict[str, StoredField]] = {}  # of the checked shards
-        self._checked: dict[Path, dict[str, Field]] = {}  # name -> field whose shape, type and values are checked
+        self._scenes: tuple[Path, SceneTable] | None = (
+            None  # of the last shard whose scenes were read
+        )
+        self._placements: dict[
+            Path, dict[str, StoredField]
+        ] = {}  # of the checked shards
+        self._checked: dict[
+            Path, dict[str, Field]
+        ] = {}  # name -> field whose shape, type and values are checked
         self._maps: dict[Path, mmap.mmap] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -100,18 +124,24 @@ class ShardReader:
         fields, of_scenes = self._split(shard, fields)
         placements = self._header(shard, fields)
         columns = read_columns(shard, placements, [field.name for field in fields])
-        columns |= {name: column[:] for name, column in self._scene_columns(shard, of_scenes).items()}
+        columns |= {
+            name: column[:]
+            for name, column in self._scene_columns(shard, of_scenes).items()
+        }
         checked = self._checked.setdefault(shard.path, {})
         stored = {field.name for field in fields} - checked.keys()
         check_values(shard, {name: columns[name] for name in stored})
         checked.update((field.name, field) for field in fields)
         return columns
 
-    def map(self, shard: Shard, fields: Sequence[Field]) -> dict[str, NDArray[Any] | SceneColumn]:
+    def map(
+        self, shard: Shard, fields: Sequence[Field]
+    ) -> dict[str, NDArray[Any] | SceneColumn]:
         """Map fields of a shard into memory, to use some of their rows; they are read the first time.
 
-        Mapped values are read-only; fields of scenes are computed for the rows that are used. The system ends a process
-        that uses a part of a map after the file was cut off there.
+        Mapped values are read-only; fields of scenes are computed for the rows that are
+        used. The system ends a process that uses a part of a map after the file was cut
+        off there.
         """
         fields, of_scenes = self._split(shard, fields)
         scenes = self._scene_columns(shard, of_scenes)
@@ -119,21 +149,33 @@ class ShardReader:
         selected = {field.name: placements[field.name] for field in fields}
         mapped = None
         checked = self._checked.get(shard.path, {}).keys() >= selected.keys()
-        if checked and all(place.offset is not None and place.dtype.isnative for place in selected.values()):
+        if checked and all(
+            place.offset is not None and place.dtype.isnative
+            for place in selected.values()
+        ):
             mapped = self._map(shard)
         if mapped is None:
             return {**self.read(shard, fields), **scenes}
-        return {name: np.ndarray(p.shape, p.dtype, mapped, p.offset or 0) for name, p in selected.items()} | scenes
+        return {
+            name: np.ndarray(p.shape, p.dtype, mapped, p.offset or 0)
+            for name, p in selected.items()
+        } | scenes
 
     @staticmethod
-    def _split(shard: Shard, fields: Sequence[Field]) -> tuple[list[Field], list[Field]]:
+    def _split(
+        shard: Shard, fields: Sequence[Field]
+    ) -> tuple[list[Field], list[Field]]:
         """Separate the fields of rows from those of scenes."""
         if not shard.spec.scene_obstacles:
             return list(fields), []
         stored = {field.name for field in shard.spec.fields}
-        return [f for f in fields if f.name in stored], [f for f in fields if f.name not in stored]
+        return [f for f in fields if f.name in stored], [
+            f for f in fields if f.name not in stored
+        ]
 
-    def _scene_columns(self, shard: Shard, fields: Sequence[Field]) -> dict[str, SceneColumn]:
+    def _scene_columns(
+        self, shard: Shard, fields: Sequence[Field]
+    ) -> dict[str, SceneColumn]:
         """Return fields of the scenes of a shard."""
         if not fields:
             return {}
@@ -141,11 +183,19 @@ class ShardReader:
         index = self.read(shard, [scene_id])[SCENE_ID]
         last = self._scenes  # other threads may replace it
         if last is None or last[0] != shard.path:
-            last = self._scenes = shard.path, read_scenes(shard, self._placements[shard.path])
+            last = self._scenes = (
+                shard.path,
+                read_scenes(shard, self._placements[shard.path]),
+            )
         table = last[1]
         rows = table.rows_of(index)
-        dtypes = {field.name: storage_dtype(field, shard.spec.dtype) for field in fields}
-        return {name: SceneColumn(name, table, rows, self._obstacles, dtype) for name, dtype in dtypes.items()}
+        dtypes = {
+            field.name: storage_dtype(field, shard.spec.dtype) for field in fields
+        }
+        return {
+            name: SceneColumn(name, table, rows, self._obstacles, dtype)
+            for name, dtype in dtypes.items()
+        }
 
     def _header(self, shard: Shard, fields: Sequence[Field]) -> dict[str, StoredField]:
         """Check a shard; return the locations of its fields."""
@@ -172,14 +222,19 @@ class ShardReader:
         except (OSError, ValueError):  # the file is then read without mapping
             return None
         for oldest in list(self._maps)[: max(len(self._maps) - MAX_MEMORY_MAPS + 1, 0)]:
-            self._maps.pop(oldest, None)  # stays mapped as long as arrays of it are in use
+            self._maps.pop(
+                oldest, None
+            )  # stays mapped as long as arrays of it are in use
         self._maps[shard.path] = mapped
         return mapped
 
 
 @dataclass(frozen=True, eq=False)
 class SplitShards:
-    """The existing shards of a split, in order; the fingerprint is that of the whole dataset."""
+    """The existing shards of a split, in order.
+
+    The fingerprint is that of the whole dataset.
+    """
 
     split: str
     shards: tuple[Shard, ...]

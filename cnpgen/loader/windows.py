@@ -1,9 +1,11 @@
 """The order of the rows of a split in one epoch, and its windows: shards that are packed and shuffled together.
 
-The order is computed from seed, epoch and shard sizes; nothing is stored. In every epoch, the shards are permuted and
-distributed over windows of about 2^18 rows. Within a window, the rows of all its shards are permuted together. A split
-of less than 1.5 windows is therefore shuffled uniformly. In larger splits, the rows of a shard stay within one window
-per epoch. Small splits stay in memory; otherwise a thread packs one window ahead.
+The order is computed from seed, epoch and shard sizes; nothing is stored. In every
+epoch, the shards are permuted and distributed over windows of about 2^18 rows. Within a
+window, the rows of all its shards are permuted together. A split of less than 1.5
+windows is therefore shuffled uniformly. In larger splits, the rows of a shard stay
+within one window per epoch. Small splits stay in memory; otherwise a thread packs one
+window ahead.
 """
 
 import hashlib
@@ -42,7 +44,10 @@ class Window:
 
 @dataclass(frozen=True)
 class Order:
-    """The order of one epoch of a split with shards of some rows; splits are shuffled independently."""
+    """The order of one epoch of a split with shards of some rows.
+
+    Splits are shuffled independently.
+    """
 
     split: str
     shard_rows: tuple[int, ...]
@@ -54,7 +59,9 @@ class Order:
     def windows(self) -> tuple[Window, ...]:
         """The windows of the epoch, in order."""
         shards = self._permuted(len(self.shard_rows), stage=0)
-        count = min(max(round(sum(self.shard_rows) / WINDOW_ROWS), 1), max(len(shards), 1))
+        count = min(
+            max(round(sum(self.shard_rows) / WINDOW_ROWS), 1), max(len(shards), 1)
+        )
         windows, first = [], 0
         for members in np.array_split(shards, count):
             rows = sum(self.shard_rows[shard] for shard in members)
@@ -69,16 +76,19 @@ class Order:
     def _permuted(self, size: int, *, stage: int) -> NDArray[np.int64]:
         if not self.shuffle:
             return np.arange(size)
-        words = np.frombuffer(hashlib.sha256(self.split.encode()).digest(), "<u4").tolist()
+        words = np.frombuffer(
+            hashlib.sha256(self.split.encode()).digest(), "<u4"
+        ).tolist()
         return permutation(size, seed=self.seed, key=(*words, self.epoch, stage))
 
 
 def permutation(size: int, *, seed: int, key: tuple[int, ...]) -> NDArray[np.int64]:
     """Return a uniformly random permutation, shape (size,), that does not depend on the version of NumPy.
 
-    NumPy guarantees the raw output of bit generators, but not that of ``Generator.permutation``. The rows are sorted by
-    raw random numbers, the last bits of which are replaced by the row index. For up to 2^20 rows, 44 bits remain
-    random, so ties are negligible. Seed and key are not negative.
+    NumPy guarantees the raw output of bit generators, but not that of
+    ``Generator.permutation``. The rows are sorted by raw random numbers, the last bits
+    of which are replaced by the row index. For up to 2^20 rows, 44 bits remain random,
+    so ties are negligible. Seed and key are not negative.
     """
     raw = np.random.SFC64(np.random.SeedSequence(seed, spawn_key=key)).random_raw(size)
     mask = np.uint64((1 << max(size - 1, 1).bit_length()) - 1)
@@ -96,7 +106,10 @@ class Packed:
 
     def part(self, first: int, last: int) -> "Packed":
         """Return the rows from ``first`` to ``last`` as views."""
-        return Packed(self.table[first:last], {name: values[first:last] for name, values in self.integers.items()})
+        return Packed(
+            self.table[first:last],
+            {name: values[first:last] for name, values in self.integers.items()},
+        )
 
 
 Loaded = tuple[Packed, NDArray[np.int64]]
@@ -105,22 +118,33 @@ Loaded = tuple[Packed, NDArray[np.int64]]
 def row_bytes(row_format: RowFormat) -> int:
     """Return the size of a packed row [bytes]."""
     layout = row_format.layout
-    return layout.width * row_format.dtype.itemsize + sum(8 * max(field.width, 1) for field in layout.integers)
+    return layout.width * row_format.dtype.itemsize + sum(
+        8 * max(field.width, 1) for field in layout.integers
+    )
 
 
 def empty_packed(rows: int, row_format: RowFormat) -> Packed:
     """Allocate memory for rows."""
     layout = row_format.layout
-    integers = {field.name: np.empty(field.shape(rows), np.int64) for field in layout.integers}
+    integers = {
+        field.name: np.empty(field.shape(rows), np.int64) for field in layout.integers
+    }
     return Packed(np.empty((rows, layout.width), row_format.dtype), integers)
 
 
-def pack(shards: Sequence[Shard], row_format: RowFormat, reader: ShardReader, *, out: Packed) -> None:
+def pack(
+    shards: Sequence[Shard], row_format: RowFormat, reader: ShardReader, *, out: Packed
+) -> None:
     """Read whole shards into ``out``, one after the other."""
     layout, first, normalization = row_format.layout, 0, row_format.normalization
-    scaling = None if normalization is None else normalization.side_by_side(layout.floats)
+    scaling = (
+        None if normalization is None else normalization.side_by_side(layout.floats)
+    )
     for shard in shards:
-        columns, part = reader.read(shard, layout.fields), out.part(first, first + shard.rows)
+        columns, part = (
+            reader.read(shard, layout.fields),
+            out.part(first, first + shard.rows),
+        )
         if layout.floats:
             _fill(part.table, {name: columns[name] for name in layout.slices}, scaling)
         for name, values in part.integers.items():
@@ -137,8 +161,13 @@ def _fill(
     rows, width = table.shape
     step = min(max(_CHUNK_VALUES // width, 1), rows)
     buffer = np.empty((step, width))
-    scales: Sequence[NDArray[np.float64]] = () if scaling is None else [np.tile(part, (step, 1)) for part in scaling]
-    copies = [(target, _opaque_rows(columns[name])) for name, target in _targets(buffer, columns).items()]
+    scales: Sequence[NDArray[np.float64]] = (
+        () if scaling is None else [np.tile(part, (step, 1)) for part in scaling]
+    )
+    copies = [
+        (target, _opaque_rows(columns[name]))
+        for name, target in _targets(buffer, columns).items()
+    ]
     for first in range(0, rows, step):
         last = min(first + step, rows)
         if last - first < step:
@@ -158,12 +187,16 @@ def _opaque_rows(values: NDArray[Any]) -> NDArray[Any]:
     return rows.view(f"V{8 * rows.shape[1]}")[:, 0]
 
 
-def _targets(buffer: NDArray[np.float64], columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+def _targets(
+    buffer: NDArray[np.float64], columns: Mapping[str, NDArray[Any]]
+) -> dict[str, NDArray[Any]]:
     """View the part of the buffer for every column as one opaque item per row."""
     targets, start = {}, 0
     for name, values in columns.items():
         size = 8 * math.prod(values.shape[1:])
-        targets[name] = np.ndarray(len(buffer), f"V{size}", buffer, start, buffer.strides[:1])
+        targets[name] = np.ndarray(
+            len(buffer), f"V{size}", buffer, start, buffer.strides[:1]
+        )
         start += size
     return targets
 
@@ -183,7 +216,8 @@ class InMemoryRows:
     def load(self, shards: Sequence[int]) -> NDArray[np.int64]:
         """Load shards, by their indices within the split, that are not in memory yet.
 
-        Return the positions of their rows in ``packed``, in the order of the shards, shape (rows,).
+        Return the positions of their rows in ``packed``, in the order of the shards,
+        shape (rows,).
         """
         positions = [np.empty(0, np.int64)]
         for index in shards:
@@ -196,13 +230,25 @@ class InMemoryRows:
         return np.concatenate(positions)
 
 
-def make_in_memory_rows(source: SplitShards, row_format: RowFormat) -> InMemoryRows | None:
-    """Allocate memory for a whole split if it needs at most 256 MiB; otherwise return None."""
-    return InMemoryRows(source, row_format) if source.rows * row_bytes(row_format) <= MAX_IN_MEMORY_BYTES else None
+def make_in_memory_rows(
+    source: SplitShards, row_format: RowFormat
+) -> InMemoryRows | None:
+    """Allocate memory for a whole split if it needs at most 256 MiB.
+
+    Otherwise return None.
+    """
+    return (
+        InMemoryRows(source, row_format)
+        if source.rows * row_bytes(row_format) <= MAX_IN_MEMORY_BYTES
+        else None
+    )
 
 
 def start(task: Callable[[], T]) -> "Future[T]":
-    """Run a task in a new thread. Unlike a pool, the thread ends with its task and does not disturb forks or exits."""
+    """Run a task in a new thread.
+
+    Unlike a pool, the thread ends with its task and does not disturb forks or exits.
+    """
     future: Future[T] = Future()
 
     def run() -> None:
@@ -216,15 +262,28 @@ def start(task: Callable[[], T]) -> "Future[T]":
 
 
 class Windows:
-    """Access to the rows of an epoch by position. At most two windows are in memory, unless the whole split is."""
+    """Access to the rows of an epoch by position.
+
+    At most two windows are in memory, unless the whole split is.
+    """
 
     def __init__(
-        self, source: SplitShards, row_format: RowFormat, order: Order, in_memory: InMemoryRows | None
+        self,
+        source: SplitShards,
+        row_format: RowFormat,
+        order: Order,
+        in_memory: InMemoryRows | None,
     ) -> None:
-        self._source, self._row_format, self._order, self._in_memory = source, row_format, order, in_memory
+        self._source, self._row_format, self._order, self._in_memory = (
+            source,
+            row_format,
+            order,
+            in_memory,
+        )
         self._firsts = [window.first for window in order.windows]
         self._futures: dict[int, Future[Loaded]] = {}
-        # Memory of two windows, reused in turn, because allocating it takes as long as packing.
+        # Memory of two windows, reused in turn, because allocating it takes as long as
+        # packing.
         self._memory: dict[int, Packed] = {}
         self._process = os.getpid()
 
@@ -233,11 +292,29 @@ class Windows:
         tables, integers = [], []
         for packed, rows in self._rows_by_window(first + rank, last, world):
             tables.append(packed.table.take(rows, axis=0))
-            integers.append({name: values.take(rows, axis=0) for name, values in packed.integers.items()})
+            integers.append(
+                {
+                    name: values.take(rows, axis=0)
+                    for name, values in packed.integers.items()
+                }
+            )
         if len(tables) == 1:
-            return Batch(tables[0], self._row_format.layout, integers[0], self._row_format.normalization)
-        joined = {name: np.concatenate([part[name] for part in integers]) for name in integers[0]}
-        return Batch(np.concatenate(tables), self._row_format.layout, joined, self._row_format.normalization)
+            return Batch(
+                tables[0],
+                self._row_format.layout,
+                integers[0],
+                self._row_format.normalization,
+            )
+        joined = {
+            name: np.concatenate([part[name] for part in integers])
+            for name in integers[0]
+        }
+        return Batch(
+            np.concatenate(tables),
+            self._row_format.layout,
+            joined,
+            self._row_format.normalization,
+        )
 
     def _rows_by_window(self, first: int, last: int, step: int) -> Iterator[Loaded]:
         """Yield every window of the positions ``range(first, last, step)`` with the indices of the rows in it."""
@@ -245,16 +322,27 @@ class Windows:
         while index < len(self._firsts) and self._firsts[index] < last:
             window = self._order.windows[index]
             packed, rows = self._load(index)
-            skipped = max(-((first - window.first) // step), 0) * step  # positions in previous windows
-            yield packed, rows[first - window.first + skipped : last - window.first : step]
+            skipped = (
+                max(-((first - window.first) // step), 0) * step
+            )  # positions in previous windows
+            yield (
+                packed,
+                rows[first - window.first + skipped : last - window.first : step],
+            )
             index += 1
 
     def _load(self, index: int) -> Loaded:
         """Wait for a window, start loading the next one and release the previous ones."""
-        if self._process != os.getpid():  # threads do not survive a fork, so their results would never arrive
+        if (
+            self._process != os.getpid()
+        ):  # threads do not survive a fork, so their results would never arrive
             self._process, self._futures, self._memory = os.getpid(), {}, {}
         if index + 1 not in self._futures:
-            self._futures = {other: future for other, future in self._futures.items() if other == index}
+            self._futures = {
+                other: future
+                for other, future in self._futures.items()
+                if other == index
+            }
             self._start(index).result()
             if index + 1 < len(self._firsts):
                 self._start(index + 1)
@@ -270,7 +358,14 @@ class Windows:
         if self._in_memory is not None:
             return self._in_memory.packed, self._in_memory.load(window.shards)[rows]
         if index % 2 not in self._memory:
-            self._memory[index % 2] = empty_packed(max(other.rows for other in self._order.windows), self._row_format)
+            self._memory[index % 2] = empty_packed(
+                max(other.rows for other in self._order.windows), self._row_format
+            )
         packed = self._memory[index % 2]
-        pack([self._source.shards[shard] for shard in window.shards], self._row_format, self._source.reader, out=packed)
+        pack(
+            [self._source.shards[shard] for shard in window.shards],
+            self._row_format,
+            self._source.reader,
+            out=packed,
+        )
         return packed, rows

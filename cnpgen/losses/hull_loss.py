@@ -20,8 +20,13 @@ from cnpgen.robots.scene import Scene
 
 Array = NDArray[Any]
 
-NODE_STRIDE, SHIFTS = 4, 16  # every fourth node; which ones depends on 16ths of the shift
-TRAINING_DISTANCE_M = 0.02  # in addition to the required one, so that plans keep it after training
+NODE_STRIDE, SHIFTS = (
+    4,
+    16,
+)  # every fourth node; which ones depends on 16ths of the shift
+TRAINING_DISTANCE_M = (
+    0.02  # in addition to the required one, so that plans keep it after training
+)
 
 
 class HullLoss:
@@ -29,14 +34,19 @@ class HullLoss:
 
     ``tightening`` has the factors, then the insets of all constraints, shape (2 m,).
 
-    Raises:
-        UsageError: The problem has no constraint ``robot-clearance``, or its robot no link geometry.
+    Raises: UsageError: The problem has no constraint ``robot-clearance``, or its robot
+        no link geometry.
     """
 
-    def __init__(self, problem: Problem, robot: Robot, kernels: KernelLibrary, tightening: Array) -> None:
+    def __init__(
+        self, problem: Problem, robot: Robot, kernels: KernelLibrary, tightening: Array
+    ) -> None:
         constraint = problem.first(RobotClearance)
         if constraint is None:
-            raise UsageError(f"the problem {problem.name!r} has no constraint robot-clearance", concerns="problem")
+            raise UsageError(
+                f"the problem {problem.name!r} has no constraint robot-clearance",
+                concerns="problem",
+            )
         index = problem.constraint.index(constraint)
         inset = float(tightening[len(problem.constraint) + index])
         self._problem, self._losses = problem, load_clearance_loss(kernels, robot)
@@ -44,26 +54,42 @@ class HullLoss:
         self._required = constraint.distance + TRAINING_DISTANCE_M + inset  # m
 
     def add(
-        self, results: tuple[Array, Array, Array], batch: PlanBatch, weights: Array, table: BasisTable, *, shift: float
+        self,
+        results: tuple[Array, Array, Array],
+        batch: PlanBatch,
+        weights: Array,
+        table: BasisTable,
+        *,
+        shift: float,
     ) -> None:
         """Add the loss to the results of a block, and its weighted gradients if there are any.
 
-        The results are changed in place: terms, shape (1 + m, lanes), and gradients, samples last. The batch has the N
-        plans of the block, and constraints have weights of shape (m,).
+        The results are changed in place: terms, shape (1 + m, lanes), and gradients,
+        samples last. The batch has the N plans of the block, and constraints have
+        weights of shape (m,).
         """
         terms, by_path, by_rate = results
         nodes, count, stride = len(table.s), len(batch), min(NODE_STRIDE, len(table.s))
-        chosen = slice(int(shift * SHIFTS) % stride, nodes, stride)  # distances take most of the time of a step
+        chosen = slice(
+            int(shift * SHIFTS) % stride, nodes, stride
+        )  # distances take most of the time of a step
         path = np.where(batch.valid[:, None, None], batch.path, np.nan)
-        values, rates = table.path[:nodes][chosen].astype(float), table.rate[:nodes][chosen].astype(float)
+        values, rates = (
+            table.path[:nodes][chosen].astype(float),
+            table.rate[:nodes][chosen].astype(float),
+        )
         node_weights = table.weights[0, chosen].astype(float)
         node_weights /= node_weights.sum()
         q = np.moveaxis(values @ path, 0, -1)
         r = rates @ batch.rate.T
-        bodies = scene_primitives(Scene(self._problem.obstacle, batch.obstacle_poses.astype(float)))
+        bodies = scene_primitives(
+            Scene(self._problem.obstacle, batch.obstacle_poses.astype(float))
+        )
         losses, gradients = self._losses(q, bodies, self._required)
         step, weight = node_weights[:, None] / r, float(weights[self._term - 1])
         terms[self._term, :count] += (step * losses).sum(axis=0)
         if by_path.size:
-            by_path[..., :count] += weight * np.einsum("kc,kjs->cjs", values, step[:, None] * gradients)
+            by_path[..., :count] += weight * np.einsum(
+                "kc,kjs->cjs", values, step[:, None] * gradients
+            )
             by_rate[..., :count] -= weight * (rates.T @ (step / r * losses))

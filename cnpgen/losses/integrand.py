@@ -1,8 +1,9 @@
 """The integrand: the step losses of one phase of one plan and their gradient, as SX.
 
-Terms are the task loss and one per constraint of the problem, all times ``dt/ds = 1 / r`` (paper, section on loss
-functions) and the quadrature weight of the node. A condition ``lower <= g <= upper`` has the violation
-``e = g - min(max(g, lower), upper)``. ``Huber(e)`` is the paper's ``Huber(ReLU(.))`` of an inequality and its
+Terms are the task loss and one per constraint of the problem, all times ``dt/ds = 1 /
+r`` (paper, section on loss functions) and the quadrature weight of the node. A
+condition ``lower <= g <= upper`` has the violation ``e = g - min(max(g, lower),
+upper)``. ``Huber(e)`` is the paper's ``Huber(ReLU(.))`` of an inequality and its
 ``Huber(d)`` of an equality. Its derivative is e clipped to [-1, 1].
 """
 
@@ -15,7 +16,11 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.kernels.symbolic.linalg import dot
-from cnpgen.kernels.symbolic.symbolic_state import FrozenState, SymbolicState, time_derivatives
+from cnpgen.kernels.symbolic.symbolic_state import (
+    FrozenState,
+    SymbolicState,
+    time_derivatives,
+)
 from cnpgen.kernels.tape import Axes, GridSpec
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.objectives import ObjectiveTerm
@@ -31,18 +36,27 @@ class Term:
     """A step loss."""
 
     value: Any  # an SX scalar
-    parts: list[tuple[Any, Any]]  # SX scalars with the derivatives of the loss with respect to them
+    parts: list[
+        tuple[Any, Any]
+    ]  # SX scalars with the derivatives of the loss with respect to them
 
 
 def task_term(state: SymbolicState, objective: Sequence[ObjectiveTerm]) -> Term:
-    """Return the step loss of the objective: ``1 + sum of weight_i size_i``; ``1 + eta kappa v^2`` in the paper."""
+    """Return the step loss of the objective: ``1 + sum of weight_i size_i``.
+
+    ``1 + eta kappa v^2`` in the paper.
+    """
     import casadi as ca
 
     value, parts = ca.SX(1), []
     for term in objective:
         residuals = term.training_residuals(state)
         squares = dot(residuals, residuals)
-        smoothing = term.smoothing if term.training_smoothing is None else term.training_smoothing
+        smoothing = (
+            term.smoothing
+            if term.training_smoothing is None
+            else term.training_smoothing
+        )
         if smoothing > 0:
             size = ca.sqrt(squares + smoothing**2) - smoothing
             parts.append((size, term.weight))
@@ -53,16 +67,21 @@ def task_term(state: SymbolicState, objective: Sequence[ObjectiveTerm]) -> Term:
     return Term(value, parts)
 
 
-def constraint_term(conditions: Sequence[Condition], factor: Any, inset: Any, relaxation: Sequence[Any]) -> Term:
+def constraint_term(
+    conditions: Sequence[Condition], factor: Any, inset: Any, relaxation: Sequence[Any]
+) -> Term:
     """Return the sum of Huber's losses of all conditions of a constraint.
 
-    Limits shrink by a factor, toward their center if they are not symmetric to zero. Other bounds are moved inwards by
-    an inset; equalities are unchanged. The bounds of every value are moved outwards by its relaxation, or None.
+    Limits shrink by a factor, toward their center if they are not symmetric to zero.
+    Other bounds are moved inwards by an inset; equalities are unchanged. The bounds of
+    every value are moved outwards by its relaxation, or None.
     """
     import casadi as ca
 
     value, parts = ca.SX(0), []
-    for (g, lower, upper), width in zip(_bounded(conditions, factor, inset), relaxation, strict=True):
+    for (g, lower, upper), width in zip(
+        _bounded(conditions, factor, inset), relaxation, strict=True
+    ):
         nearest = g
         if lower is not None:
             nearest = ca.fmax(nearest, lower if width is None else lower - width)
@@ -74,14 +93,22 @@ def constraint_term(conditions: Sequence[Condition], factor: Any, inset: Any, re
     return Term(value, parts)
 
 
-def _bounded(conditions: Sequence[Condition], factor: Any, inset: Any) -> Iterator[tuple[Any, Any, Any]]:
+def _bounded(
+    conditions: Sequence[Condition], factor: Any, inset: Any
+) -> Iterator[tuple[Any, Any, Any]]:
     """Yield values with their tightened bounds, None for a missing bound."""
     for condition in conditions:
-        for g, low, high in zip(condition.g, condition.lower.tolist(), condition.upper.tolist(), strict=True):
+        for g, low, high in zip(
+            condition.g, condition.lower.tolist(), condition.upper.tolist(), strict=True
+        ):
             if low == high:
                 yield g, low, high
             elif condition.tolerance_kind != "limit":
-                yield g, low + inset if np.isfinite(low) else None, high - inset if np.isfinite(high) else None
+                yield (
+                    g,
+                    low + inset if np.isfinite(low) else None,
+                    high - inset if np.isfinite(high) else None,
+                )
             elif np.isfinite(low) and np.isfinite(high):
                 center, half = (low + high) / 2, (high - low) / 2
                 yield g, center - half * factor, center + half * factor
@@ -114,10 +141,14 @@ def relaxation_argument(problem: Problem) -> int:
 class Inputs:
     """The arguments of the kernels as SX columns, in order, with the axes of ``grid_specs``."""
 
-    path: tuple[Any, ...]  # p, p' and p'' [rad], n each, and p''' if the jerk is constrained
+    path: tuple[
+        Any, ...
+    ]  # p, p' and p'' [rad], n each, and p''' if the jerk is constrained
     rate: Any  # r and r' [1/s], and r'' if the jerk is constrained
     obstacle_poses: Any  # poses and sizes of the obstacles
-    relaxation: Any  # relaxation of the conditions with time-varying bounds, in their units
+    relaxation: (
+        Any  # relaxation of the conditions with time-varying bounds, in their units
+    )
     node: Any  # quadrature weight
     tightening: Any  # factors of the limits of all constraints, then insets of the other bounds of all constraints
     weights: Any  # weight of every constraint (the paper's e^alpha)
@@ -125,7 +156,10 @@ class Inputs:
     @property
     def columns(self) -> list[Any]:
         """All arguments."""
-        return [*self.path, *(column for name, column in vars(self).items() if name != "path")]
+        return [
+            *self.path,
+            *(column for name, column in vars(self).items() if name != "path"),
+        ]
 
 
 def loss_values(robot: Robot, problem: Problem, *, form: str) -> Any:
@@ -133,7 +167,9 @@ def loss_values(robot: Robot, problem: Problem, *, form: str) -> Any:
     import casadi as ca
 
     inputs, state, terms = _stage(robot, problem, form)
-    return ca.Function("loss_values", inputs.columns, ca.cse(state.unfrozen([_stacked(inputs, terms)])))
+    return ca.Function(
+        "loss_values", inputs.columns, ca.cse(state.unfrozen([_stacked(inputs, terms)]))
+    )
 
 
 def loss_gradient(robot: Robot, problem: Problem, *, form: str) -> Any:
@@ -141,12 +177,22 @@ def loss_gradient(robot: Robot, problem: Problem, *, form: str) -> Any:
     import casadi as ca
 
     inputs, state, terms = _stage(robot, problem, form)
-    n, step, weights = robot.n, inputs.node / inputs.rate[0], [1.0, *ca.vertsplit(inputs.weights)]
+    n, step, weights = (
+        robot.n,
+        inputs.node / inputs.rate[0],
+        [1.0, *ca.vertsplit(inputs.weights)],
+    )
     g = [part for term in terms for part, _ in term.parts]
-    seeds = [step * weight * partial for weight, term in zip(weights, terms, strict=True) for _, partial in term.parts]
+    seeds = [
+        step * weight * partial
+        for weight, term in zip(weights, terms, strict=True)
+        for _, partial in term.parts
+    ]
     states, width = ca.vertcat(*inputs.path, inputs.rate), len(inputs.path) * n
     gradient = ca.densify(ca.jtimes(ca.vertcat(*g), states, ca.vertcat(*seeds), True))
-    total = sum(weight * term.value for weight, term in zip(weights, terms, strict=True))
+    total = sum(
+        weight * term.value for weight, term in zip(weights, terms, strict=True)
+    )
     gradient[width] -= step / inputs.rate[0] * total  # the factor 1 / r
     parts = [gradient[first : first + n] for first in range(0, width, n)]
     results = state.unfrozen([_stacked(inputs, terms), *parts, gradient[width:]])
@@ -159,7 +205,10 @@ def penalized_conditions(
     """Return every constraint with the conditions that the loss penalizes."""
     if form == "paper":
         rules = load_rules(form)
-        return [(constraint, rules.conditions(constraint, state)) for constraint in constraints]
+        return [
+            (constraint, rules.conditions(constraint, state))
+            for constraint in constraints
+        ]
     return [(constraint, constraint.penalized(state)) for constraint in constraints]
 
 
@@ -168,23 +217,35 @@ def has_time_varying_bound(constraint: Constraint) -> bool:
     return type(constraint).bound_relaxation is not Constraint.bound_relaxation
 
 
-def time_varying_conditions(problem: Problem, robot: Robot, form: str) -> list[tuple[Constraint, Condition]]:
+def time_varying_conditions(
+    problem: Problem, robot: Robot, form: str
+) -> list[tuple[Constraint, Condition]]:
     """Return the conditions with time-varying bounds, in the order of the kernel argument, with their constraints."""
-    _, state = SymbolicState.of_symbols(robot, problem.obstacle, problem.object_size, problem.scene_width)
-    pairs = penalized_conditions(filter(has_time_varying_bound, problem.constraint), state, form)
-    return [(constraint, condition) for constraint, conditions in pairs for condition in conditions]
+    _, state = SymbolicState.of_symbols(
+        robot, problem.obstacle, problem.object_size, problem.scene_width
+    )
+    pairs = penalized_conditions(
+        filter(has_time_varying_bound, problem.constraint), state, form
+    )
+    return [
+        (constraint, condition)
+        for constraint, conditions in pairs
+        for condition in conditions
+    ]
 
 
 def relaxation_of(
-    time_varying: Sequence[tuple[Constraint, Condition]], s: NDArray[np.float64], start_tip: Array
+    time_varying: Sequence[tuple[Constraint, Condition]],
+    s: NDArray[np.float64],
+    start_tip: Array,
 ) -> Array:
     """Return the relaxation of the conditions of ``time_varying_conditions``, each in its unit, shape (values, K, N).
 
-    It is that of motions that may start outside a constraint: at phases s, shape (K,), with positions of the tip at the
-    start [m], shape (N, 3).
+    It is that of motions that may start outside a constraint: at phases s, shape (K,),
+    with positions of the tip at the start [m], shape (N, 3).
 
-    Raises:
-        UsageError: ``bound_relaxation`` of a constraint returns another shape than its contract states.
+    Raises: UsageError: ``bound_relaxation`` of a constraint returns another shape than
+        its contract states.
     """
     rows = []
     for constraint, condition in time_varying:
@@ -198,7 +259,9 @@ def relaxation_of(
     return np.stack(rows)
 
 
-def _stage(robot: Robot, problem: Problem, form: str) -> tuple[Inputs, FrozenState, list[Term]]:
+def _stage(
+    robot: Robot, problem: Problem, form: str
+) -> tuple[Inputs, FrozenState, list[Term]]:
     """Return the inputs, the state as a function of them, and the terms of the task and the constraints."""
     import casadi as ca
 
@@ -206,21 +269,43 @@ def _stage(robot: Robot, problem: Problem, form: str) -> tuple[Inputs, FrozenSta
     orders = problem.path_orders
     path = tuple(sym("d" * order + "p", n) for order in range(orders))
     rate = sym("rate", orders - 1)
-    obstacle_poses, size = sym("obstacle_poses", problem.scene_width), problem.object_size
+    obstacle_poses, size = (
+        sym("obstacle_poses", problem.scene_width),
+        problem.object_size,
+    )
     q, *derivatives = (ca.vertsplit(column) for column in path)
     dq, ddq, jerk = time_derivatives(derivatives, ca.vertsplit(rate))
-    state = FrozenState(robot, q, dq, ddq, ca.vertsplit(obstacle_poses), problem.obstacle, size, jerk)
+    state = FrozenState(
+        robot, q, dq, ddq, ca.vertsplit(obstacle_poses), problem.obstacle, size, jerk
+    )
     pairs = penalized_conditions(problem.constraint, state, form)
-    sizes = [sum(len(condition.g) for condition in conditions) for _, conditions in pairs]
+    sizes = [
+        sum(len(condition.g) for condition in conditions) for _, conditions in pairs
+    ]
     varying = [has_time_varying_bound(constraint) for constraint, _ in pairs]
-    relaxation = sym("relaxation", sum(size for size, varies in zip(sizes, varying, strict=True) if varies))
+    relaxation = sym(
+        "relaxation",
+        sum(size for size, varies in zip(sizes, varying, strict=True) if varies),
+    )
     tightening = sym("tightening", 2 * m)
-    inputs = Inputs(path, rate, obstacle_poses, relaxation, sym("node"), tightening, sym("weights", m))
+    inputs = Inputs(
+        path,
+        rate,
+        obstacle_poses,
+        relaxation,
+        sym("node"),
+        tightening,
+        sym("weights", m),
+    )
     unused = iter(ca.vertsplit(relaxation))
     terms = [task_term(state, problem.objective.terms)]
     for index, (_, conditions) in enumerate(pairs):
         values = [next(unused) if varying[index] else None for _ in range(sizes[index])]
-        terms.append(constraint_term(conditions, tightening[index], tightening[m + index], values))
+        terms.append(
+            constraint_term(
+                conditions, tightening[index], tightening[m + index], values
+            )
+        )
     return inputs, state, terms
 
 

@@ -18,12 +18,13 @@ from cnpgen.schema.argument_types import check_fields, checked_arguments
 class Margins:
     """Tightened bounds of terms; equalities are never tightened.
 
-    A penalty leaves a violation of the order of 1 / weight, and a network errs by a percent. With limits that are a
-    few tenths of a percent smaller, plans meet the true limits.
+    A penalty leaves a violation of the order of 1 / weight, and a network errs by a
+    percent. With limits that are a few tenths of a percent smaller, plans meet the true
+    limits.
 
-    Attributes:
-        factors: Term -> factor of its limits (of joints), in (0, 1].
-        insets: Term -> distance by which its other bounds are moved inwards, in SI units, e.g. the table's edges [m].
+    Attributes: factors: Term -> factor of its limits (of joints), in (0, 1]. insets:
+        Term -> distance by which its other bounds are moved inwards, in SI units, e.g.
+        the table's edges [m].
     """
 
     factors: Mapping[str, float] = field(default_factory=dict)
@@ -33,8 +34,12 @@ class Margins:
         check_fields(self)
         for name in ("factors", "insets"):
             for value in getattr(self, name).values():
-                if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-                    raise UsageError(f"must be numbers by name, got {value!r:.100}", argument=name)
+                if isinstance(value, bool) or not isinstance(
+                    value, int | float | np.number
+                ):
+                    raise UsageError(
+                        f"must be numbers by name, got {value!r:.100}", argument=name
+                    )
 
     @checked_arguments
     def tightening(self, terms: Sequence[str]) -> NDArray[np.float64]:
@@ -43,15 +48,20 @@ class Margins:
         Args:
             terms: Names of the m constraint terms.
 
-        Raises:
-            UsageError: A name is not a term, a factor is not in (0, 1] or an inset is not a number.
+        Raises: UsageError: A name is not a term, a factor is not in (0, 1] or an inset
+            is not a number.
         """
         if not all(isinstance(term, str) for term in terms):
-            raise UsageError(f"must be names of constraint terms, got {terms!r:.100}", argument="terms")
+            raise UsageError(
+                f"must be names of constraint terms, got {terms!r:.100}",
+                argument="terms",
+            )
         for error in self._errors(terms):
             raise UsageError(error, concerns="terms")
         return np.array(
-            [self.factors.get(term, 1.0) for term in terms] + [self.insets.get(term, 0.0) for term in terms], float
+            [self.factors.get(term, 1.0) for term in terms]
+            + [self.insets.get(term, 0.0) for term in terms],
+            float,
         )
 
     def _errors(self, terms: Sequence[str]) -> Iterator[str]:
@@ -70,8 +80,12 @@ class Margins:
 def suggested_margins(problem: Problem) -> Margins:
     """Return the margins that the constraint classes suggest: ``training_factor`` and ``training_inset``."""
     constraints = dict(zip(constraint_terms(problem), problem.constraint, strict=True))
-    factors = {name: constraint.training_factor for name, constraint in constraints.items()}
-    insets = {name: constraint.training_inset for name, constraint in constraints.items()}
+    factors = {
+        name: constraint.training_factor for name, constraint in constraints.items()
+    }
+    insets = {
+        name: constraint.training_inset for name, constraint in constraints.items()
+    }
     return Margins(
         {name: factor for name, factor in factors.items() if factor != 1},
         {name: inset for name, inset in insets.items() if inset != 0},
@@ -83,6 +97,9 @@ def constraint_terms(problem: Problem) -> list[str]:
     names: list[str] = []
     for constraint in problem.constraint:
         kind = registry.name_of(registry.CONSTRAINTS, type(constraint))
-        count = 1 + sum(type(other) is type(constraint) for other in problem.constraint[: len(names)])
+        count = 1 + sum(
+            type(other) is type(constraint)
+            for other in problem.constraint[: len(names)]
+        )
         names.append(kind if count == 1 else f"{kind}-{count}")
     return names

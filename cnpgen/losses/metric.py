@@ -1,8 +1,9 @@
 """The metric of the constraint manifold: the weight e^alpha of every term (paper, section on loss function learning).
 
-The published metric is learned: after every epoch each alpha takes a step toward the value at which its term equals its
-budget, ``alpha += gamma log(mean L_i / C_i)``. This is slow in short runs, and it winds up if budgets cannot be met.
-The default is therefore a metric whose weights grow with the progress of a run.
+The published metric is learned: after every epoch each alpha takes a step toward the
+value at which its term equals its budget, ``alpha += gamma log(mean L_i / C_i)``. This
+is slow in short runs, and it winds up if budgets cannot be met. The default is
+therefore a metric whose weights grow with the progress of a run.
 """
 
 from __future__ import annotations
@@ -25,25 +26,26 @@ Kind = Literal["fixed", "ramped", "learned"]
 Average = Literal["mean", "median", "trimmed"]
 
 WEIGHT_FACTOR = 100.0  # of the weight in the problem file, for constraint classes without ``training_weight``
-TRIMMED_FRACTION = 0.1  # of the plans, those with the largest losses, excluded from a trimmed mean
+TRIMMED_FRACTION = (
+    0.1  # of the plans, those with the largest losses, excluded from a trimmed mean
+)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MetricSettings:
     """The dependence of weights on the progress of a run (0 at its start, 1 at its end) and on the losses of plans.
 
-    Attributes:
-        kind: "fixed": the first weights; "ramped": growing weights; "learned": the published rule.
-        growth: Factor by which ramped weights grow, and budgets of the learned metric shrink, during the ramp.
-        ramp: Progress at the start and the end of the ramp, which is geometric.
-        gamma: Step size of the learned metric.
-        every: Interval of its steps: "epoch", as published, or "batch".
-        largest_log: Bound on ``|log(mean L_i / C_i)|`` in a step, from the authors' implementation.
-        lowest: Lower bound of a learned weight; without it the weight of a term without violations decreases forever.
-        highest: Upper bound of a learned weight.
-        budget_factor: Factor of all budgets of the learned metric.
-        average: Average over the plans of a batch: "mean" as published, "median" or "trimmed".
-        frozen: Progress after which a learned metric is constant.
+    Attributes: kind: "fixed": the first weights; "ramped": growing weights; "learned":
+        the published rule. growth: Factor by which ramped weights grow, and budgets of
+        the learned metric shrink, during the ramp. ramp: Progress at the start and the
+        end of the ramp, which is geometric. gamma: Step size of the learned metric.
+        every: Interval of its steps: "epoch", as published, or "batch". largest_log:
+        Bound on ``|log(mean L_i / C_i)|`` in a step, from the authors' implementation.
+        lowest: Lower bound of a learned weight; without it the weight of a term without
+        violations decreases forever. highest: Upper bound of a learned weight.
+        budget_factor: Factor of all budgets of the learned metric. average: Average
+        over the plans of a batch: "mean" as published, "median" or "trimmed". frozen:
+        Progress after which a learned metric is constant.
     """
 
     kind: Kind = "ramped"
@@ -62,9 +64,15 @@ class MetricSettings:
         check_fields(self)
         for name in ("growth", "gamma", "largest_log", "highest", "budget_factor"):
             if not getattr(self, name) > 0:
-                raise UsageError(f"{name} of a metric must be above 0, got {getattr(self, name)}", concerns=name)
+                raise UsageError(
+                    f"{name} of a metric must be above 0, got {getattr(self, name)}",
+                    concerns=name,
+                )
         if not self.lowest <= self.highest:
-            raise UsageError(f"must be at most highest = {self.highest}, got {self.lowest}", argument="lowest")
+            raise UsageError(
+                f"must be at most highest = {self.highest}, got {self.lowest}",
+                argument="lowest",
+            )
         ramp = numbers("ramp", self.ramp)
         if ramp.shape != (2,) or not 0 <= ramp[0] < ramp[1]:
             raise UsageError(
@@ -76,12 +84,16 @@ class MetricSettings:
     def grown(self, progress: float) -> float:
         """Return the factor of the ramp."""
         begin, end = self.ramp
-        return float(self.growth ** min(max((progress - begin) / (end - begin), 0.0), 1.0))
+        return float(
+            self.growth ** min(max((progress - begin) / (end - begin), 0.0), 1.0)
+        )
 
 
-# The paper's rule with the authors' bound of the logarithm; the paper's budgets belong to PlanLoss(..., form="paper").
+# The paper's rule with the authors' bound of the logarithm; the paper's budgets belong
+# to PlanLoss(..., form="paper").
 PUBLISHED = MetricSettings(kind="learned", growth=1.0)
-# The same rule for short runs: steps per batch, decreasing budgets, bounds, and a mean that is robust to outliers.
+# The same rule for short runs: steps per batch, decreasing budgets, bounds, and a mean
+# that is robust to outliers.
 BOUNDED = MetricSettings(
     kind="learned",
     growth=400.0,
@@ -96,13 +108,19 @@ BOUNDED = MetricSettings(
 
 
 def alpha_step(
-    alpha: ArrayLike, losses: ArrayLike, budgets: ArrayLike, *, gamma: float, largest_log: float = 10.0
+    alpha: ArrayLike,
+    losses: ArrayLike,
+    budgets: ArrayLike,
+    *,
+    gamma: float,
+    largest_log: float = 10.0,
 ) -> Array:
     """Take one step of the metric, ``alpha_i + gamma log(L_i / C_i)`` (paper, update rule of alpha), shape (m,).
 
-    ``alpha`` are the logarithms of the weights, ``losses`` the mean of every term, and ``gamma`` is the step size. The
-    logarithm is at most ``largest_log`` in absolute value. A mean that is not finite, or a budget (the paper's
-    C-bar^2) of 0, leaves its weight unchanged.
+    ``alpha`` are the logarithms of the weights, ``losses`` the mean of every term, and
+    ``gamma`` is the step size. The logarithm is at most ``largest_log`` in absolute
+    value. A mean that is not finite, or a budget (the paper's C-bar^2) of 0, leaves its
+    weight unchanged.
     """
     before, mean, budget = (np.asarray(x, float) for x in (alpha, losses, budgets))
     learned = (budget > 0) & np.isfinite(mean)
@@ -122,24 +140,30 @@ def average_loss(terms: ArrayLike, average: Average) -> Array:
     if average == "median":
         return np.asarray(np.median(values, axis=0))
     if average == "trimmed":
-        values = np.sort(values, axis=0)[: len(values) - int(TRIMMED_FRACTION * len(values))]
+        values = np.sort(values, axis=0)[
+            : len(values) - int(TRIMMED_FRACTION * len(values))
+        ]
     return np.asarray(values.mean(axis=0))
 
 
 class Metric:
     """The weights of one training run.
 
-    Args:
-        weights: First weights (e^alpha), shape (m,); a term of weight 0 is omitted and keeps this weight.
-        budgets: Acceptable value of every term (the paper's C-bar^2), shape (m,); 0 where there is none.
-        settings: Settings of the metric.
+    Args: weights: First weights (e^alpha), shape (m,); a term of weight 0 is omitted
+        and keeps this weight. budgets: Acceptable value of every term (the paper's
+        C-bar^2), shape (m,); 0 where there is none. settings: Settings of the metric.
 
     Attributes:
         alpha: Logarithms of the present weights, shape (m,).
     """
 
     @checked_arguments
-    def __init__(self, weights: ArrayLike, budgets: ArrayLike, settings: MetricSettings | None = None) -> None:
+    def __init__(
+        self,
+        weights: ArrayLike,
+        budgets: ArrayLike,
+        settings: MetricSettings | None = None,
+    ) -> None:
         first, self._budgets = numbers("weights", weights), numbers("budgets", budgets)
         if first.ndim != 1 or first.shape != self._budgets.shape:
             raise UsageError(
@@ -148,11 +172,13 @@ class Metric:
             )
         if not (np.isfinite(first).all() and (first >= 0).all()):
             raise UsageError(
-                f"first weights must be finite and not negative, got {first.tolist()!s:.200}", concerns="weights"
+                f"first weights must be finite and not negative, got {first.tolist()!s:.200}",
+                concerns="weights",
             )
         if not (np.isfinite(self._budgets).all() and (self._budgets >= 0).all()):
             raise UsageError(
-                f"must be finite and not negative, got {self._budgets.tolist()!s:.200}", argument="budgets"
+                f"must be finite and not negative, got {self._budgets.tolist()!s:.200}",
+                argument="budgets",
             )
         self.settings = settings or MetricSettings()
         with np.errstate(divide="ignore"):
@@ -166,7 +192,9 @@ class Metric:
         Args:
             progress: Completed fraction of the run, in [0, 1].
         """
-        growth = self.settings.grown(progress) if self.settings.kind == "ramped" else 1.0
+        growth = (
+            self.settings.grown(progress) if self.settings.kind == "ramped" else 1.0
+        )
         return np.asarray(np.exp(self.alpha) * growth)
 
     @checked_arguments
@@ -181,7 +209,9 @@ class Metric:
             return
         values, count = numbers("terms", terms), 1 + len(self.alpha)
         if values.ndim != 2 or values.shape[1] != count:
-            raise UsageError(f"must have shape (N, {count}), got {values.shape}", argument="terms")
+            raise UsageError(
+                f"must have shape (N, {count}), got {values.shape}", argument="terms"
+            )
         mean = average_loss(values[:, 1:], self.settings.average)
         if np.isfinite(mean).all():
             self._sum, self._count = self._sum + mean, self._count + 1
@@ -197,19 +227,29 @@ class Metric:
     def _learn(self, progress: float) -> None:
         settings, count = self.settings, self._count
         if count and progress < settings.frozen:
-            budgets = np.where(np.isfinite(self.alpha), self._budgets, 0.0)  # an omitted term learns nothing
+            budgets = np.where(
+                np.isfinite(self.alpha), self._budgets, 0.0
+            )  # an omitted term learns nothing
             budgets = budgets * settings.budget_factor / settings.grown(progress)
             alpha = alpha_step(
-                self.alpha, self._sum / count, budgets, gamma=settings.gamma, largest_log=settings.largest_log
+                self.alpha,
+                self._sum / count,
+                budgets,
+                gamma=settings.gamma,
+                largest_log=settings.largest_log,
             )
             with np.errstate(divide="ignore"):
-                bounded = np.clip(alpha, np.log(settings.lowest), np.log(settings.highest))
+                bounded = np.clip(
+                    alpha, np.log(settings.lowest), np.log(settings.highest)
+                )
             self.alpha = np.where(np.isfinite(self.alpha), bounded, self.alpha)
         self._sum, self._count = np.zeros(len(self.alpha)), 0
 
     def state(self) -> dict[str, Any]:
         """Return the learned state, JSON-able."""
-        alpha = [value if np.isfinite(value) else None for value in self.alpha.tolist()]  # None: an omitted term
+        alpha = [
+            value if np.isfinite(value) else None for value in self.alpha.tolist()
+        ]  # None: an omitted term
         return {"alpha": alpha, "sum": self._sum.tolist(), "count": self._count}
 
     @checked_arguments
@@ -221,12 +261,19 @@ class Metric:
         """
         try:
             values = [-np.inf if value is None else value for value in state["alpha"]]
-            alpha, total, count = np.array(values, float), np.array(state["sum"], float), int(state["count"])
+            alpha, total, count = (
+                np.array(values, float),
+                np.array(state["sum"], float),
+                int(state["count"]),
+            )
         except (KeyError, TypeError, ValueError) as error:
-            raise UsageError(f"not the state of a metric: {error}", concerns="state") from error
+            raise UsageError(
+                f"not the state of a metric: {error}", concerns="state"
+            ) from error
         if alpha.shape != self.alpha.shape or total.shape != self.alpha.shape:
             raise UsageError(
-                f"the state is that of a metric of {alpha.size} terms, expected {self.alpha.size}", concerns="state"
+                f"the state is that of a metric of {alpha.size} terms, expected {self.alpha.size}",
+                concerns="state",
             )
         self.alpha, self._sum, self._count = alpha, total, count
 
@@ -235,8 +282,8 @@ class Metric:
 def suggested_weights(problem: Problem, weights0: ArrayLike) -> Array:
     """Return first weights: ``training_weight`` of the constraint classes, else 100 times those of the problem file.
 
-    With the weights of the shipped classes, planners of the shipped problems became valid within minutes. They are the
-    base of the fixed and ramped metrics.
+    With the weights of the shipped classes, planners of the shipped problems became
+    valid within minutes. They are the base of the fixed and ramped metrics.
 
     Args:
         problem: The problem.
@@ -245,10 +292,14 @@ def suggested_weights(problem: Problem, weights0: ArrayLike) -> Array:
     weights = numbers("weights0", weights0)
     if weights.shape != (len(problem.constraint),):
         expected = f"({len(problem.constraint)},), one weight per constraint"
-        raise UsageError(f"must have shape {expected}, got {weights.shape}", argument="weights0")
+        raise UsageError(
+            f"must have shape {expected}, got {weights.shape}", argument="weights0"
+        )
     pairs = zip(problem.constraint, weights.tolist(), strict=True)
     suggested = [
-        WEIGHT_FACTOR * weight if constraint.training_weight is None else constraint.training_weight
+        WEIGHT_FACTOR * weight
+        if constraint.training_weight is None
+        else constraint.training_weight
         for constraint, weight in pairs
     ]
     return np.array(suggested)

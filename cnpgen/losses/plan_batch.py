@@ -23,20 +23,33 @@ class PlanBatch:
     path: Array  # path control points [rad], shape (N, C, n)
     rate: Array  # rate control points [1/s], shape (N, R)
     obstacle_poses: Array  # poses and sizes of the obstacles, shape (N, width)
-    start_tip: Array | None  # positions of the tip at the start [m], shape (N, 3), float64, or None
-    valid: NDArray[np.bool_]  # mask of the plans that are finite with positive rate control points, shape (N,)
+    start_tip: (
+        Array | None
+    )  # positions of the tip at the start [m], shape (N, 3), float64, or None
+    valid: NDArray[
+        np.bool_
+    ]  # mask of the plans that are finite with positive rate control points, shape (N,)
 
     def __len__(self) -> int:
         return len(self.rate)
 
     def __getitem__(self, rows: slice) -> "PlanBatch":
         start_tip = None if self.start_tip is None else self.start_tip[rows]
-        return PlanBatch(self.path[rows], self.rate[rows], self.obstacle_poses[rows], start_tip, self.valid[rows])
+        return PlanBatch(
+            self.path[rows],
+            self.rate[rows],
+            self.obstacle_poses[rows],
+            start_tip,
+            self.valid[rows],
+        )
 
     def lanes(self, values: Array) -> Array:
         """Return values of shape (N, ...) as (..., lanes), with ones for invalid plans and padding."""
         n = len(values)
-        out = np.empty((*values.shape[1:], -(-n // MAX_VECTOR_LANES) * MAX_VECTOR_LANES), values.dtype)
+        out = np.empty(
+            (*values.shape[1:], -(-n // MAX_VECTOR_LANES) * MAX_VECTOR_LANES),
+            values.dtype,
+        )
         out[..., :n] = np.moveaxis(values, 0, -1)
         out[..., n:] = 1
         if not self.valid.all():
@@ -62,8 +75,8 @@ def check_batch(
 ) -> PlanBatch:
     """Check the caller's arguments and make a batch of them.
 
-    Raises:
-        UsageError: A shape is wrong, the obstacle poses are missing, or a value is not a real number.
+    Raises: UsageError: A shape is wrong, the obstacle poses are missing, or a value is
+        not a real number.
     """
     arguments = {
         "path": (path, dtype),
@@ -81,7 +94,9 @@ def check_batch(
     for array in arrays.values():
         valid &= np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
     poses = arrays.get("obstacle_poses", np.zeros((len(valid), 0), dtype))
-    return PlanBatch(arrays["path"], arrays["rate"], poses, arrays.get("start_tip"), valid)
+    return PlanBatch(
+        arrays["path"], arrays["rate"], poses, arrays.get("start_tip"), valid
+    )
 
 
 def check_shapes(problem: Problem, shapes: Mapping[str, tuple[int, ...]]) -> None:
@@ -107,5 +122,9 @@ def check_shapes(problem: Problem, shapes: Mapping[str, tuple[int, ...]]) -> Non
     }
     for name, tail in tails.items():
         if name in shapes and shapes[name] != (count, *tail):
-            expected = ", ".join(str(size) for size in ("N" if name == "path" else count, *tail))
-            raise UsageError(f"must have shape ({expected}), got {shapes[name]}", argument=name)
+            expected = ", ".join(
+                str(size) for size in ("N" if name == "path" else count, *tail)
+            )
+            raise UsageError(
+                f"must have shape ({expected}), got {shapes[name]}", argument=name
+            )

@@ -26,7 +26,13 @@ from cnpgen.losses.integrand import (
     time_varying_conditions,
 )
 from cnpgen.losses.margins import Margins, constraint_terms
-from cnpgen.losses.plan_batch import MAX_VECTOR_LANES, PLANS_PER_BLOCK, PlanBatch, check_batch, check_shapes
+from cnpgen.losses.plan_batch import (
+    MAX_VECTOR_LANES,
+    PLANS_PER_BLOCK,
+    PlanBatch,
+    check_batch,
+    check_shapes,
+)
 from cnpgen.losses.quadrature import BasisTable, basis_table, check_quadrature
 from cnpgen.machine.threads import one_thread
 from cnpgen.problems.constraints.constraint import Condition, Constraint
@@ -47,14 +53,15 @@ _BUILT = {"_gradient", "_values", "_time_varying", "_hulls"}
 class LossValue:
     """The losses of N plans; that of an invalid plan is nan and does not affect other plans.
 
-    A plan is invalid if a control point is not finite or a rate control point is not positive. Positive rate control
-    points are sufficient, but not necessary, for r(s) > 0.
+    A plan is invalid if a control point is not finite or a rate control point is not
+    positive. Positive rate control points are sufficient, but not necessary, for r(s) >
+    0.
 
-    Attributes:
-        total: Task loss plus the weighted constraint terms, shape (N,).
-        terms: The integrals without weights, the task loss first, shape (N, 1 + m).
-        path_gradient: Gradient of every plan's total with respect to its path control points, shape (N, C, n).
-        rate_gradient: Gradient of every plan's total with respect to its rate control points, shape (N, R).
+    Attributes: total: Task loss plus the weighted constraint terms, shape (N,). terms:
+        The integrals without weights, the task loss first, shape (N, 1 + m).
+        path_gradient: Gradient of every plan's total with respect to its path control
+        points, shape (N, C, n). rate_gradient: Gradient of every plan's total with
+        respect to its rate control points, shape (N, R).
     """
 
     total: Array
@@ -69,25 +76,29 @@ class LossValue:
 class PlanLoss:
     """``integral of (task loss + sum of weight_i Huber(violation_i)) dt`` of plans of one problem, and its gradient.
 
-    If samples place the obstacles, their distances are those of the links' hulls, at every fourth node (``HullLoss``).
+    If samples place the obstacles, their distances are those of the links' hulls, at
+    every fourth node (``HullLoss``).
 
-    Args:
-        problem: The problem, its record (``plans.problem``, ``dataset.problem``), or the name or the file of a problem,
+    Args: problem: The problem, its record (``plans.problem``, ``dataset.problem``), or
+        the name or the file of a problem,
             a pipeline or a dataset.
         dtype: Precision of the arithmetic: "float32" or "float64".
         nodes: Number of quadrature nodes.
         rule: Quadrature rule: "cosine" or "gauss".
-        form: "signed": every violation has a gradient; "paper": orientation and collisions as published.
+        form: "signed": every violation has a gradient; "paper": orientation and
+            collisions as published.
         margins: Tightening of the bounds.
-        backend: Backend of the kernels; by default the fastest that works on this machine.
+        backend: Backend of the kernels; by default the fastest that works on this
+            machine.
         cache_folder: Cache of kernels; by default that of the user.
         threads: Number of threads that share the plans of a call.
 
-    Attributes:
-        terms: Names of the columns of ``LossValue.terms``: "time", then the kinds of the constraints.
-        budgets: Acceptable violations from the problem file (the paper's C-bar^2), shape (m,); 0 for none.
-        weights0: First weights from the problem file (the paper's e^alpha), shape (m,).
-        tightening: Factors of the limits of all terms, then insets of their other bounds (``Margins``), shape (2 m,).
+    Attributes: terms: Names of the columns of ``LossValue.terms``: "time", then the
+        kinds of the constraints. budgets: Acceptable violations from the problem file
+        (the paper's C-bar^2), shape (m,); 0 for none. weights0: First weights from the
+        problem file (the paper's e^alpha), shape (m,). tightening: Factors of the
+        limits of all terms, then insets of their other bounds (``Margins``), shape (2
+        m,).
 
     Raises:
         UsageError: An argument has an unsupported value.
@@ -113,15 +124,29 @@ class PlanLoss:
         _check_choice("form", form, FORMS)
         check_quadrature(rule, nodes)
         check_memory("nodes", nodes, nodes)
-        self.problem, self.dtype, self.nodes, self.rule, self.form = as_problem(problem), dtype, nodes, rule, form
+        self.problem, self.dtype, self.nodes, self.rule, self.form = (
+            as_problem(problem),
+            dtype,
+            nodes,
+            rule,
+            form,
+        )
         self.terms = ("time", *constraint_terms(self.problem))
-        self.budgets = np.array([constraint.budget for constraint in self.problem.constraint])
-        self.weights0 = np.array([constraint.weight for constraint in self.problem.constraint])
-        self.tightening = _checked_margins(margins).tightening(self.terms[1:]).astype(dtype)
+        self.budgets = np.array(
+            [constraint.budget for constraint in self.problem.constraint]
+        )
+        self.weights0 = np.array(
+            [constraint.weight for constraint in self.problem.constraint]
+        )
+        self.tightening = (
+            _checked_margins(margins).tightening(self.terms[1:]).astype(dtype)
+        )
         self._robot = load_robot(self.problem)
         chosen, folder = choose_backend(backend)
         folder = folder if cache_folder is None else Path(cache_folder)
-        self._kernels = problem_kernels(self.problem.for_planning, self._robot, chosen, folder)
+        self._kernels = problem_kernels(
+            self.problem.for_planning, self._robot, chosen, folder
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without the kernels, which are loaded again when needed."""
@@ -142,41 +167,63 @@ class PlanLoss:
     ) -> LossValue:
         """Evaluate N plans.
 
-        Args:
-            path: Path control points [rad], shape (N, C, n).
-            rate: Rate control points [1/s], shape (N, R), positive.
-            weights: Weight of every constraint term (e^alpha), shape (m,); or term -> weight, with ``weights0`` for
+        Args: path: Path control points [rad], shape (N, C, n). rate: Rate control
+            points [1/s], shape (N, R), positive. weights: Weight of every constraint
+            term (e^alpha), shape (m,); or term -> weight, with ``weights0`` for
                 missing terms.
-            obstacle_poses: Poses and sizes of the obstacles, shape (N, width); required if the problem has obstacles.
-            start_tip: Positions of the tip at the start [m], shape (N, 3), for the time-varying bounds of motions that
-                start off the table (``Constraint.bound_relaxation``). By default bounds are constant.
+            obstacle_poses: Poses and sizes of the obstacles, shape (N, width); required
+                if the problem has obstacles.
+            start_tip: Positions of the tip at the start [m], shape (N, 3), for the
+                time-varying bounds of motions that start off the table
+                (``Constraint.bound_relaxation``). By default bounds are constant.
             shift: Shift of the quadrature nodes, see ``quadrature``.
-            gradient: Whether to compute gradients; without, they have shape (0, C, n) and (0, R).
+            gradient: Whether to compute gradients; without, they have shape (0, C, n)
+                and (0, R).
 
-        Raises:
-            UsageError: A shape is wrong, a value is not a real number, or a weight is negative, infinite or of an
+        Raises: UsageError: A shape is wrong, a value is not a real number, or a weight
+            is negative, infinite or of an
                 unknown term.
         """
         gradient, shift = flag("gradient", gradient), number("shift", shift)
-        batch = check_batch(self.problem, path, rate, obstacle_poses, start_tip, dtype=self.dtype)
+        batch = check_batch(
+            self.problem, path, rate, obstacle_poses, start_tip, dtype=self.dtype
+        )
         checked = self.checked_weights(weights)
         orders = self.problem.path_orders
-        table = basis_table(self.problem.trajectory, self.rule, self.nodes, shift, self.dtype, orders=orders)
+        table = basis_table(
+            self.problem.trajectory,
+            self.rule,
+            self.nodes,
+            shift,
+            self.dtype,
+            orders=orders,
+        )
         n, selected = len(batch), slice(None) if gradient else slice(0)
         terms = np.empty((n, len(self.terms)), self.dtype)
-        path_gradient, rate_gradient = np.empty_like(batch.path[selected]), np.empty_like(batch.rate[selected])
+        path_gradient, rate_gradient = (
+            np.empty_like(batch.path[selected]),
+            np.empty_like(batch.rate[selected]),
+        )
 
         def evaluate_block(rows: slice) -> None:
             part = batch[rows]
-            with one_thread(), np.errstate(all="ignore"):  # an overflow affects its own plan only
+            with (
+                one_thread(),
+                np.errstate(all="ignore"),
+            ):  # an overflow affects its own plan only
                 results = self._integrate(part, checked, table, gradient=gradient)
                 if self._hulls is not None:
                     self._hulls.add(results, part, checked, table, shift=shift)
-                terms[rows], path_gradient[rows], rate_gradient[rows] = (part.samples(values) for values in results)
+                terms[rows], path_gradient[rows], rate_gradient[rows] = (
+                    part.samples(values) for values in results
+                )
 
         self._hulls  # noqa: B018 - a cached property, loaded before threads start, as are the kernel and the bound
         kernel = self._gradient if gradient else self._values
-        if kernel.tape.inputs[relaxation_argument(self.problem)] and batch.start_tip is not None:
+        if (
+            kernel.tape.inputs[relaxation_argument(self.problem)]
+            and batch.start_tip is not None
+        ):
             self._time_varying  # noqa: B018 - a cached property
         self._run(evaluate_block, n)
         with np.errstate(all="ignore"):
@@ -184,9 +231,18 @@ class PlanLoss:
         return LossValue(total, terms, path_gradient, rate_gradient)
 
     def _run(self, evaluate_block: Callable[[slice], None], n: int) -> None:
-        """Evaluate blocks of plans; compiled kernels release Python's lock, so that threads run in parallel."""
-        share = -(-n // (self._threads * MAX_VECTOR_LANES)) * MAX_VECTOR_LANES  # whole vectors
-        size = PLANS_PER_BLOCK if self._threads == 1 else max(min(share, PLANS_PER_BLOCK), MAX_VECTOR_LANES)
+        """Evaluate blocks of plans.
+
+        Compiled kernels release Python's lock, so that threads run in parallel.
+        """
+        share = (
+            -(-n // (self._threads * MAX_VECTOR_LANES)) * MAX_VECTOR_LANES
+        )  # whole vectors
+        size = (
+            PLANS_PER_BLOCK
+            if self._threads == 1
+            else max(min(share, PLANS_PER_BLOCK), MAX_VECTOR_LANES)
+        )
         blocks = [slice(first, first + size) for first in range(0, n, size)]
         if self._threads == 1 or len(blocks) < 2:
             for block in blocks:
@@ -196,17 +252,32 @@ class PlanLoss:
             list(pool.map(evaluate_block, blocks))
 
     def load_kernels(self) -> None:
-        """Load the kernel of gradients, compiling it if it is not cached; otherwise the first call does."""
+        """Load the kernel of gradients, compiling it if it is not cached.
+
+        Otherwise the first call does.
+        """
         self._gradient  # noqa: B018 - a cached property
 
     def _integrate(
         self, batch: PlanBatch, weights: Array, table: BasisTable, *, gradient: bool
     ) -> tuple[Array, Array, Array]:
-        """Return terms and gradients of a block, samples last; the gradients are empty if they are not requested."""
-        nodes, orders, (points, n) = len(table.s), self.problem.path_orders, batch.path.shape[1:]
-        rates, poses = batch.lanes(batch.rate), batch.obstacle_poses[:, : self.problem.for_planning.scene_width]
+        """Return terms and gradients of a block, samples last.
+
+        The gradients are empty if they are not requested.
+        """
+        nodes, orders, (points, n) = (
+            len(table.s),
+            self.problem.path_orders,
+            batch.path.shape[1:],
+        )
+        rates, poses = (
+            batch.lanes(batch.rate),
+            batch.obstacle_poses[:, : self.problem.for_planning.scene_width],
+        )
         lanes = rates.shape[1]
-        path = (table.path @ batch.lanes(batch.path).reshape(points, -1)).reshape(orders, nodes, n, lanes)
+        path = (table.path @ batch.lanes(batch.path).reshape(points, -1)).reshape(
+            orders, nodes, n, lanes
+        )
         rate = (table.rate @ rates).reshape(orders - 1, nodes, lanes)
         terms = np.zeros((len(self.terms), lanes), self.dtype)
         arguments = (
@@ -215,33 +286,56 @@ class PlanLoss:
         )  # fmt: skip
         if not gradient:
             self._values(*arguments, out=[terms])
-            return terms, np.empty((points, n, 0), self.dtype), np.empty((len(batch.rate[0]), 0), self.dtype)
+            return (
+                terms,
+                np.empty((points, n, 0), self.dtype),
+                np.empty((len(batch.rate[0]), 0), self.dtype),
+            )
         by_path, by_rate = np.empty_like(path), np.empty_like(rate)
         self._gradient(*arguments, out=[terms, *by_path.swapaxes(1, 2), by_rate])
         by_points = table.path.T @ by_path.reshape(orders * nodes, -1)
-        return terms, by_points.reshape(points, n, lanes), table.rate.T @ by_rate.reshape((orders - 1) * nodes, -1)
+        return (
+            terms,
+            by_points.reshape(points, n, lanes),
+            table.rate.T @ by_rate.reshape((orders - 1) * nodes, -1),
+        )
 
-    def _relaxation(self, batch: PlanBatch, table: BasisTable, lanes: int, *, gradient: bool) -> Array:
+    def _relaxation(
+        self, batch: PlanBatch, table: BasisTable, lanes: int, *, gradient: bool
+    ) -> Array:
         """Return the relaxation of the conditions with time-varying bounds, shape (values, K, lanes)."""
         kernel = self._gradient if gradient else self._values
-        out = np.zeros((kernel.tape.inputs[relaxation_argument(self.problem)], len(table.s), lanes), self.dtype)
+        out = np.zeros(
+            (
+                kernel.tape.inputs[relaxation_argument(self.problem)],
+                len(table.s),
+                lanes,
+            ),
+            self.dtype,
+        )
         if batch.start_tip is not None and len(out):
-            out[..., : len(batch)] = relaxation_of(self._time_varying, table.s, batch.start_tip)
+            out[..., : len(batch)] = relaxation_of(
+                self._time_varying, table.s, batch.start_tip
+            )
         return out
 
     def check_shapes(self, **shapes: tuple[int, ...]) -> None:
         """Check the shapes of arguments, for traced functions whose values are unknown.
 
-        Args:
-            shapes: Shapes of ``path``, ``rate``, ``weights`` and, if present, ``obstacle_poses`` and ``start_tip``.
+        Args: shapes: Shapes of ``path``, ``rate``, ``weights`` and, if present,
+            ``obstacle_poses`` and ``start_tip``.
 
         Raises:
             UsageError: A shape is wrong, or the obstacle poses are missing.
         """
         missing = [name for name in ("path", "rate", "weights") if name not in shapes]
         if missing or not all(isinstance(shape, tuple) for shape in shapes.values()):
-            wrong = missing or [name for name, shape in shapes.items() if not isinstance(shape, tuple)]
-            raise UsageError("must be the shape of an array, a tuple", argument=wrong[0])
+            wrong = missing or [
+                name for name, shape in shapes.items() if not isinstance(shape, tuple)
+            ]
+            raise UsageError(
+                "must be the shape of an array, a tuple", argument=wrong[0]
+            )
         self._check_count(shapes.pop("weights"))
         check_shapes(self.problem, shapes)
 
@@ -258,38 +352,52 @@ class PlanLoss:
         if unknown is not None:
             hint = nearest(str(unknown), names)
             raise UsageError(
-                f"there is no constraint {unknown!r}{hint}, expected some of {', '.join(names)}", concerns="weights"
+                f"there is no constraint {unknown!r}{hint}, expected some of {', '.join(names)}",
+                concerns="weights",
             )
         values = {name: _weight(name, weight) for name, weight in weights.items()}
-        return np.array([values.get(name, default) for name, default in zip(names, self.weights0, strict=True)])
+        return np.array(
+            [
+                values.get(name, default)
+                for name, default in zip(names, self.weights0, strict=True)
+            ]
+        )
 
     def checked_weights(self, weights: ArrayLike | Mapping[str, float]) -> Array:
         """Return weights in the order of the terms and in the loss's precision.
 
-        Raises:
-            UsageError: The shape is wrong, a weight is negative or not finite, or there is no such term.
+        Raises: UsageError: The shape is wrong, a weight is negative or not finite, or
+            there is no such term.
         """
         ordered = numbers("weights", self.ordered_weights(weights), differentiable=True)
         self._check_count(ordered.shape)
         for name, weight in zip(self.terms[1:], ordered.tolist(), strict=True):
             if not 0 <= weight < np.finfo(self.dtype).max:
                 raise UsageError(
-                    f"the weight of {name!r} must be a number that is not negative, got {weight}", concerns="weights"
+                    f"the weight of {name!r} must be a number that is not negative, got {weight}",
+                    concerns="weights",
                 )
         return ordered.astype(self.dtype)
 
     def _check_count(self, shape: tuple[int, ...]) -> None:
         names = self.terms[1:]
         if shape != (len(names),):
-            raise UsageError(f"must have shape ({len(names)},) for {', '.join(names)}, got {shape}", argument="weights")
+            raise UsageError(
+                f"must have shape ({len(names)},) for {', '.join(names)}, got {shape}",
+                argument="weights",
+            )
 
     @cached_property
     def _gradient(self) -> GridKernel:
-        return self._kernels.load_grid(loss_gradient, grid_specs(self.problem)[1], dtype=self.dtype, form=self.form)
+        return self._kernels.load_grid(
+            loss_gradient, grid_specs(self.problem)[1], dtype=self.dtype, form=self.form
+        )
 
     @cached_property
     def _values(self) -> GridKernel:
-        return self._kernels.load_grid(loss_values, grid_specs(self.problem)[0], dtype=self.dtype, form=self.form)
+        return self._kernels.load_grid(
+            loss_values, grid_specs(self.problem)[0], dtype=self.dtype, form=self.form
+        )
 
     @cached_property
     def _hulls(self) -> HullLoss | None:
@@ -304,7 +412,10 @@ class PlanLoss:
 
 def _check_choice(name: str, value: object, known: Sequence[str]) -> None:
     if value not in known:
-        raise UsageError(f"must be one of {', '.join(known)}, got {value!r}{nearest(str(value), known)}", argument=name)
+        raise UsageError(
+            f"must be one of {', '.join(known)}, got {value!r}{nearest(str(value), known)}",
+            argument=name,
+        )
 
 
 def _weight(name: str, value: Any) -> float:
@@ -312,11 +423,14 @@ def _weight(name: str, value: Any) -> float:
         return number(name, value)
     except UsageError as error:
         raise UsageError(
-            f"the weight of {name!r} must be a finite number, got {value!r:.100}", concerns="weights"
+            f"the weight of {name!r} must be a finite number, got {value!r:.100}",
+            concerns="weights",
         ) from error
 
 
 def _checked_margins(margins: object) -> Margins:
     if not isinstance(margins, Margins | None):
-        raise UsageError(f"must be a Margins or None, got {margins!r:.100}", argument="margins")
+        raise UsageError(
+            f"must be a Margins or None, got {margins!r:.100}", argument="margins"
+        )
     return margins or Margins()

@@ -1,8 +1,9 @@
 """Quadrature rules over the phase with nodes that are dense at both ends.
 
-The first and last basis functions of r are about 0.01 wide. Between uniform nodes a plan can have an acceleration of a
-hundred times the limit there, and training finds such plans. The nodes of Gauss and those of the midpoint rule in the
-angle of ``s = (1 - cos theta) / 2`` are dense at the ends: 64 of them are as accurate as 1024 uniform ones.
+The first and last basis functions of r are about 0.01 wide. Between uniform nodes a
+plan can have an acceleration of a hundred times the limit there, and training finds
+such plans. The nodes of Gauss and those of the midpoint rule in the angle of ``s = (1 -
+cos theta) / 2`` are dense at the ends: 64 of them are as accurate as 1024 uniform ones.
 """
 
 from dataclasses import dataclass
@@ -25,12 +26,12 @@ RULES = ("cosine", "gauss")
 def quadrature(rule: str, nodes: int, shift: float = 0.0) -> tuple[Array, Array]:
     """Return K nodes and weights on [0, 1], shape (K,) each; the weights sum to 1.
 
-    The rule is "cosine", the midpoint rule in theta, or "gauss", Gauss-Legendre. The nodes of the cosine rule are
-    offset by a fraction of their spacing in theta, in [0, 1). The average over shifts covers the intervals between
-    nodes.
+    The rule is "cosine", the midpoint rule in theta, or "gauss", Gauss-Legendre. The
+    nodes of the cosine rule are offset by a fraction of their spacing in theta, in [0,
+    1). The average over shifts covers the intervals between nodes.
 
-    Raises:
-        UsageError: The rule does not exist, the number of nodes is no positive integer, or the shift is not in [0, 1).
+    Raises: UsageError: The rule does not exist, the number of nodes is no positive
+        integer, or the shift is not in [0, 1).
     """
     check_quadrature(rule, nodes, shift)
     if rule == "gauss":
@@ -45,14 +46,22 @@ def check_quadrature(rule: str, nodes: int, shift: float = 0.0) -> None:
     """Raise UsageError for arguments that :func:`quadrature` does not accept."""
     if rule not in RULES:
         uniform = rule == "uniform"
-        reason = "; between uniform nodes the ends of r hide violations" if uniform else nearest(str(rule), RULES)
+        reason = (
+            "; between uniform nodes the ends of r hide violations"
+            if uniform
+            else nearest(str(rule), RULES)
+        )
         raise UsageError(
-            f"quadrature rule {rule!r} does not exist: expected one of {', '.join(RULES)}{reason}", concerns="rule"
+            f"quadrature rule {rule!r} does not exist: expected one of {', '.join(RULES)}{reason}",
+            concerns="rule",
         )
     integer("nodes", nodes, least=1)
     if not 0 <= shift < 1 or (rule == "gauss" and shift != 0):
         expected = "0, Gauss nodes cannot be moved" if rule == "gauss" else "in [0, 1)"
-        raise UsageError(f"the shift of the quadrature nodes must be {expected}, got {shift}", concerns="shift")
+        raise UsageError(
+            f"the shift of the quadrature nodes must be {expected}, got {shift}",
+            concerns="shift",
+        )
 
 
 @checked_arguments
@@ -74,15 +83,34 @@ class BasisTable:
     s: Array  # phases, shape (K,), float64
     weights: NDArray[Any]  # quadrature weights, shape (1, K)
     path: NDArray[Any]  # basis functions of p and its derivatives, shape (orders K, C)
-    rate: NDArray[Any]  # basis functions of r and its derivatives, shape ((orders - 1) K, R)
+    rate: NDArray[
+        Any
+    ]  # basis functions of r and its derivatives, shape ((orders - 1) K, R)
 
 
 @lru_cache(maxsize=64)
 def basis_table(
-    spec: TrajectorySpec, rule: str, nodes: int, shift: float, dtype: str, *, orders: int = 3
+    spec: TrajectorySpec,
+    rule: str,
+    nodes: int,
+    shift: float,
+    dtype: str,
+    *,
+    orders: int = 3,
 ) -> BasisTable:
     """Tabulate the basis of both splines at the nodes of ``quadrature``, with ``orders`` orders of p."""
     s, weights = quadrature(rule, nodes, shift)
-    path = [basis(s, spec.path_control_points, spec.degree, order) for order in range(orders)]
-    rate = [basis(s, spec.rate_control_points, spec.degree, order) for order in range(orders - 1)]
-    return BasisTable(s, weights[None].astype(dtype), np.vstack(path).astype(dtype), np.vstack(rate).astype(dtype))
+    path = [
+        basis(s, spec.path_control_points, spec.degree, order)
+        for order in range(orders)
+    ]
+    rate = [
+        basis(s, spec.rate_control_points, spec.degree, order)
+        for order in range(orders - 1)
+    ]
+    return BasisTable(
+        s,
+        weights[None].astype(dtype),
+        np.vstack(path).astype(dtype),
+        np.vstack(rate).astype(dtype),
+    )

@@ -29,20 +29,33 @@ class WorkerPool(Protocol):
         """Whether workers may be on other machines, with other working directories and caches."""
 
     def distribute(
-        self, function: Callable[[T], R], tasks: Iterable[T], *, ordered: bool = False, hint: str = ""
+        self,
+        function: Callable[[T], R],
+        tasks: Iterable[T],
+        *,
+        ordered: bool = False,
+        hint: str = "",
     ) -> Generator[R, None, None]:
-        """Run a function on every task and yield the results; see ``cnpgen.machine.workers.distribute``."""
+        """Run a function on every task and yield the results.
+
+        See ``cnpgen.machine.workers.distribute``.
+        """
 
 
 class ClusterEngine(ABC):
-    """Contract of an engine that runs tasks on a cluster; packages register them in the group ``cnpgen.engines``."""
+    """Contract of an engine that runs tasks on a cluster.
+
+    Packages register them in the group ``cnpgen.engines``.
+    """
 
     @abstractmethod
     def check_address(self, address: str) -> None:
         """Raise UsageError if a text cannot be the address of a cluster of this engine."""
 
     @abstractmethod
-    def joined(self, address: str | None, workers: int | None) -> AbstractContextManager[WorkerPool]:
+    def joined(
+        self, address: str | None, workers: int | None
+    ) -> AbstractContextManager[WorkerPool]:
         """Connect to a cluster for a block; without an address, start one on this machine.
 
         Raises:
@@ -52,7 +65,10 @@ class ClusterEngine(ABC):
 
 
 def cluster_engine(name: str) -> ClusterEngine:
-    """Load an installed engine by its name; raise MissingAddonError if its add-on is missing."""
+    """Load an installed engine by its name.
+
+    Raise MissingAddonError if its add-on is missing.
+    """
     engine: ClusterEngine = registry.load(registry.ENGINES, name)()
     return engine
 
@@ -61,15 +77,15 @@ def cluster_engine(name: str) -> ClusterEngine:
 class Engine:
     """User's choice of the engine.
 
-    Attributes:
-        name: "loky" for processes of this machine, which end with this one, or a cluster engine, such as "dask" or
+    Attributes: name: "loky" for processes of this machine, which end with this one, or
+        a cluster engine, such as "dask" or
             "ray". None for loky, or the backend of ``joblib.parallel_config``.
-        address: Address of dask's scheduler ("tcp://host:8786") or ray's head ("host:6379", "auto"). None for a
-            temporary cluster on this machine.
+        address: Address of dask's scheduler ("tcp://host:8786") or ray's head
+            ("host:6379", "auto"). None for a temporary cluster on this machine.
         workers: Number of tasks that run at once; None for one per available core.
 
-    Raises:
-        UsageError: The engine does not exist or has no address, or there is less than one worker.
+    Raises: UsageError: The engine does not exist or has no address, or there is less
+        than one worker.
     """
 
     name: str | None = None
@@ -99,7 +115,10 @@ class Engine:
 
 
 def check_engine_name(name: object) -> None:
-    """Raise UsageError if no package registers an engine of this name; engines of missing add-ons have names, too."""
+    """Raise UsageError if no package registers an engine of this name.
+
+    Engines of missing add-ons have names, too.
+    """
     if isinstance(name, str) and (name == LOKY or addons.find(registry.ENGINES, name)):
         return
     known = (LOKY, *registry.names(registry.ENGINES))
@@ -111,29 +130,37 @@ def check_engine_name(name: object) -> None:
 class LocalPool:
     """Processes of this machine, or a backend of joblib.
 
-    Attributes:
-        size: Number of tasks that run at once.
-        is_remote: Whether workers may be on other machines, with other working directories and caches.
+    Attributes: size: Number of tasks that run at once. is_remote: Whether workers may
+        be on other machines, with other working directories and caches.
     """
 
     size: int
     is_remote: bool = False
 
     def distribute(
-        self, function: Callable[[T], R], tasks: Iterable[T], *, ordered: bool = False, hint: str = ""
+        self,
+        function: Callable[[T], R],
+        tasks: Iterable[T],
+        *,
+        ordered: bool = False,
+        hint: str = "",
     ) -> Generator[R, None, None]:
-        """Run a function on every task and yield the results; see ``cnpgen.machine.workers.distribute``."""
+        """Run a function on every task and yield the results.
+
+        See ``cnpgen.machine.workers.distribute``.
+        """
         return distribute(function, tasks, self.size, ordered=ordered, hint=hint)
 
 
 @contextmanager
-def assembled(engine: Engine, tasks: int, *, quick: bool = False) -> Iterator[WorkerPool]:
+def assembled(
+    engine: Engine, tasks: int, *, quick: bool = False
+) -> Iterator[WorkerPool]:
     """Provide a worker pool for the block: start processes or connect to a cluster.
 
-    Args:
-        engine: Choice of the engine.
-        tasks: Number of tasks, the maximum number of local workers.
-        quick: Whether one process finishes before a second one has started; ignored if the user chose a number of
+    Args: engine: Choice of the engine. tasks: Number of tasks, the maximum number of
+        local workers. quick: Whether one process finishes before a second one has
+        started; ignored if the user chose a number of
             workers or a cluster.
 
     Raises:
@@ -141,7 +168,9 @@ def assembled(engine: Engine, tasks: int, *, quick: bool = False) -> Iterator[Wo
         MachineError: The cluster cannot be reached.
     """
     if engine.name is not None and engine.is_cluster:
-        with cluster_engine(engine.name).joined(engine.address, engine.workers) as cluster:
+        with cluster_engine(engine.name).joined(
+            engine.address, engine.workers
+        ) as cluster:
             yield cluster
         return
     backend: AbstractContextManager[object] = nullcontext()
@@ -150,4 +179,8 @@ def assembled(engine: Engine, tasks: int, *, quick: bool = False) -> Iterator[Wo
 
         backend = parallel_config(backend="loky")
     with backend:
-        yield LocalPool(worker_count(1 if quick and engine.workers is None else engine.workers, tasks))
+        yield LocalPool(
+            worker_count(
+                1 if quick and engine.workers is None else engine.workers, tasks
+            )
+        )

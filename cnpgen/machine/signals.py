@@ -10,7 +10,9 @@ from types import FrameType
 from typing import Any
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM)
-MIN_REPEAT_INTERVAL_S = 1.0  # a terminal and a wrapper such as ``uv run`` forward the same Ctrl-C twice
+MIN_REPEAT_INTERVAL_S = (
+    1.0  # a terminal and a wrapper such as ``uv run`` forward the same Ctrl-C twice
+)
 
 SignalHandler = Callable[[int], object]
 
@@ -34,15 +36,17 @@ class Received:
 
 
 @contextmanager
-def signals_handled(first: SignalHandler, again: SignalHandler, *, stay: bool = False) -> Iterator[Received]:
+def signals_handled(
+    first: SignalHandler, again: SignalHandler, *, stay: bool = False
+) -> Iterator[Received]:
     """Call ``first`` for the first signal in the block, and ``again`` after ``MIN_REPEAT_INTERVAL_S`` or more.
 
-    Ignored signals stay ignored. Outside the main thread, which alone may set handlers, nothing changes.
+    Ignored signals stay ignored. Outside the main thread, which alone may set handlers,
+    nothing changes.
 
-    Args:
-        first: Called with the number of the first signal.
-        again: Called with the number of a later signal.
-        stay: Whether the handlers stay after the block once a signal was received; otherwise the previous ones are
+    Args: first: Called with the number of the first signal. again: Called with the
+        number of a later signal. stay: Whether the handlers stay after the block once a
+        signal was received; otherwise the previous ones are
             restored.
     """
     received, before = Received(), _handlers()
@@ -66,7 +70,10 @@ def signals_handled(first: SignalHandler, again: SignalHandler, *, stay: bool = 
 
 @contextmanager
 def signals_deferred() -> Iterator[Received]:
-    """Defer the first signal to the end of the block; a repeated signal takes effect at once."""
+    """Defer the first signal to the end of the block.
+
+    A repeated signal takes effect at once.
+    """
     before, waiting = _handlers(), Received()
 
     def effect(number: int) -> None:
@@ -87,4 +94,8 @@ def _handlers() -> dict[int, Any]:
     if threading.current_thread() is not threading.main_thread():
         return {}
     found = {int(number): signal.getsignal(number) for number in NUMBERS}
-    return {number: handler for number, handler in found.items() if handler not in (signal.SIG_IGN, None)}
+    return {
+        number: handler
+        for number, handler in found.items()
+        if handler not in (signal.SIG_IGN, None)
+    }

@@ -7,10 +7,17 @@ from contextlib import ContextDecorator
 from functools import cache
 from typing import Any
 
-VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+VARIABLES = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+)
 
 
-_preferred: dict[str, str] = {}  # variables that this process has added to its environment
+_preferred: dict[
+    str, str
+] = {}  # variables that this process has added to its environment
 
 
 def prefer_one_thread() -> None:
@@ -22,7 +29,11 @@ def prefer_one_thread() -> None:
 
 def users_environment() -> dict[str, str]:
     """Return the environment without the variables that ``prefer_one_thread`` has added."""
-    return {name: value for name, value in os.environ.items() if _preferred.get(name) != value}
+    return {
+        name: value
+        for name, value in os.environ.items()
+        if _preferred.get(name) != value
+    }
 
 
 class _Limit:
@@ -54,7 +65,10 @@ class _OwnLimit(threading.local, _Limit):
 
 
 class OneThread(ContextDecorator):
-    """Context of one BLAS thread for the process while any Python thread is inside; it is reentrant."""
+    """Context of one BLAS thread for the process while any Python thread is inside.
+
+    It is reentrant.
+    """
 
     def __init__(self) -> None:
         self._lock, self._limit, self._own = threading.Lock(), _Limit(), _OwnLimit()
@@ -89,13 +103,24 @@ def _libraries() -> tuple[list[Any], list[Any]]:
     import scipy.linalg  # noqa: F401
     from threadpoolctl import ThreadpoolController
 
-    found = [library for library in ThreadpoolController().lib_controllers if library.user_api == "blas"]
-    own = [library for library in found if getattr(library, "threading_layer", "") == "openmp"]
+    found = [
+        library
+        for library in ThreadpoolController().lib_controllers
+        if library.user_api == "blas"
+    ]
+    own = [
+        library
+        for library in found
+        if getattr(library, "threading_layer", "") == "openmp"
+    ]
     return [library for library in found if library not in own], own
 
 
 def _set_threads(library: Any, count: int) -> None:
-    """Set the threads of a library from any Python thread; newer threadpoolctl accepts only one controlling thread."""
+    """Set the threads of a library from any Python thread.
+
+    Newer threadpoolctl accepts only one controlling thread.
+    """
     release = getattr(library, "clear_controlling_thread", None)
     if release is not None:
         release(force=True)

@@ -10,10 +10,9 @@ from dataclasses import asdict, dataclass, field
 class Times:
     """Elapsed time of a run, in parts [s].
 
-    Attributes:
-        preparing: Time of the preparation, mainly of kernels that are not cached.
-        computing: CPU time after the preparation, per process.
-        waiting: Remaining time: waiting for the processor, the disk or the last process.
+    Attributes: preparing: Time of the preparation, mainly of kernels that are not
+        cached. computing: CPU time after the preparation, per process. waiting:
+        Remaining time: waiting for the processor, the disk or the last process.
     """
 
     preparing: float = 0.0
@@ -26,7 +25,11 @@ class Times:
         return self.preparing + self.computing + self.waiting
 
     def __add__(self, other: Times) -> Times:
-        return Times(self.preparing + other.preparing, self.computing + other.computing, self.waiting + other.waiting)
+        return Times(
+            self.preparing + other.preparing,
+            self.computing + other.computing,
+            self.waiting + other.waiting,
+        )
 
     def __str__(self) -> str:
         return (
@@ -46,10 +49,9 @@ NO_TIME = Times()
 class Stopwatch:
     """Stopwatch of a run, started at construction.
 
-    Attributes:
-        begun: Start time [s].
-        preparing: Duration of the preparation [s].
-        computing: CPU time per process after the preparation [s]; callers add the time of other processes.
+    Attributes: begun: Start time [s]. preparing: Duration of the preparation [s].
+        computing: CPU time per process after the preparation [s]; callers add the time
+        of other processes.
     """
 
     begun: float = field(default_factory=time.perf_counter)
@@ -59,7 +61,10 @@ class Stopwatch:
 
     def prepared(self) -> None:
         """Record the end of the preparation."""
-        self.preparing, self._cpu = time.perf_counter() - self.begun, time.process_time()
+        self.preparing, self._cpu = (
+            time.perf_counter() - self.begun,
+            time.process_time(),
+        )
 
     def computed_here(self) -> None:
         """Record the CPU time of this process as the computing time."""

@@ -15,7 +15,11 @@ def versions() -> dict[str, str]:
 
     names = ("numpy", "casadi", "pin", "coal", "h5py", "joblib")
     machine = f"{platform.system()} {platform.machine()}"
-    found = {"cnpgen": __version__, "python": platform.python_version(), "platform": machine}
+    found = {
+        "cnpgen": __version__,
+        "python": platform.python_version(),
+        "platform": machine,
+    }
     return found | {name: installed_version(name) or "not installed" for name in names}
 
 
@@ -32,7 +36,13 @@ def installed_version(project: str) -> str:
 def processor_entry(*names: str) -> str:
     """Return the first entry of the processor with one of the lower-case names in Linux, or an empty text."""
     try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = (
+            Path("/proc/cpuinfo")
+            .read_text(encoding="utf-8", errors="replace")
+            .splitlines()
+        )
     except OSError:
         return ""
-    return next((line.partition(":")[2] for line in lines if line.lower().startswith(names)), "")
+    return next(
+        (line.partition(":")[2] for line in lines if line.lower().startswith(names)), ""
+    )

@@ -24,9 +24,13 @@ from cnpgen.machine.signals import NUMBERS, signals_deferred
 from cnpgen.schema.arguments import integer
 from cnpgen.store.files.atomic import machine_errors
 
-_IGNORED_WARNING = "ignore:resource_tracker:UserWarning"  # in the format of the option -W
+_IGNORED_WARNING = (
+    "ignore:resource_tracker:UserWarning"  # in the format of the option -W
+)
 DIED = "a worker died (killed, or out of memory)"
-MAX_PIPE_BYTES = 2048  # plus the overhead of joblib; writes of up to 4096 bytes to a pipe are atomic
+MAX_PIPE_BYTES = (
+    2048  # plus the overhead of joblib; writes of up to 4096 bytes to a pipe are atomic
+)
 TASKS_PER_WORKER = 4  # per batch, for backends that accept only lists of tasks
 PARENT_POLL_INTERVAL_S = 0.5  # of the check of a worker for its parent process
 
@@ -43,17 +47,24 @@ def worker_count(workers: int | None, tasks: int) -> int:
     if workers is None:
         from joblib import effective_n_jobs
 
-        return max(1, min(int(effective_n_jobs(-1)), tasks))  # of the backend of parallel_config, if any
+        return max(
+            1, min(int(effective_n_jobs(-1)), tasks)
+        )  # of the backend of parallel_config, if any
     return max(1, min(integer("workers", workers, least=1), tasks))
 
 
 def distribute(
-    function: Callable[[T], R], tasks: Iterable[T], workers: int, *, ordered: bool = False, hint: str = ""
+    function: Callable[[T], R],
+    tasks: Iterable[T],
+    workers: int,
+    *,
+    ordered: bool = False,
+    hint: str = "",
 ) -> Generator[R, None, None]:
     """Run a function on every task in other processes, or in this one for one worker, and yield the results.
 
-    Function and tasks must be picklable. Results are yielded in the order of the tasks, or when they are ready. A hint
-    is appended to the error message.
+    Function and tasks must be picklable. Results are yielded in the order of the tasks,
+    or when they are ready. A hint is appended to the error message.
 
     Raises:
         MachineError: A worker died.
@@ -77,13 +88,24 @@ def distribute(
 
 
 def _generated(
-    function: Callable[[T], R], tasks: Iterable[T], workers: int, *, ordered: bool, **options: Any
+    function: Callable[[T], R],
+    tasks: Iterable[T],
+    workers: int,
+    *,
+    ordered: bool,
+    **options: Any,
 ) -> Generator[R, None, None]:
     """Yield the results of joblib with the backend of ``parallel_config``."""
     from joblib import Parallel, delayed
 
     order, results = "generator" if ordered else "generator_unordered", None
-    run = Parallel(n_jobs=workers, return_as=order, pre_dispatch="2*n_jobs", batch_size=1, **options)
+    run = Parallel(
+        n_jobs=workers,
+        return_as=order,
+        pre_dispatch="2*n_jobs",
+        batch_size=1,
+        **options,
+    )
     try:
         with signals_blocked():
             results = run(delayed(function)(task) for task in tasks)
@@ -96,7 +118,9 @@ def _generated(
                 results.close()
 
 
-def _in_batches(function: Callable[[T], R], tasks: Iterable[T], workers: int) -> Iterator[R]:
+def _in_batches(
+    function: Callable[[T], R], tasks: Iterable[T], workers: int
+) -> Iterator[R]:
     """Yield the results in batches, for backends such as ray and multiprocessing that accept only lists of tasks."""
     from joblib import Parallel, delayed
 
@@ -106,19 +130,24 @@ def _in_batches(function: Callable[[T], R], tasks: Iterable[T], workers: int) ->
             yield from run(delayed(function)(task) for task in batch)
 
 
-def _on_processes(function: Callable[[T], R], tasks: Iterable[T], workers: int, *, ordered: bool) -> Iterator[R]:
+def _on_processes(
+    function: Callable[[T], R], tasks: Iterable[T], workers: int, *, ordered: bool
+) -> Iterator[R]:
     """Yield the results of loky processes that end with this one.
 
-    All processes write to one pipe, and messages of more than 4096 bytes are not atomic. If a process is killed during
-    such a write, this process waits forever for the rest, since the others keep the pipe open. Longer messages are
-    therefore written to a file, and only the file name goes through the pipe.
+    All processes write to one pipe, and messages of more than 4096 bytes are not
+    atomic. If a process is killed during such a write, this process waits forever for
+    the rest, since the others keep the pipe open. Longer messages are therefore written
+    to a file, and only the file name goes through the pipe.
     """
     _start_helpers()
     _tolerate_aborts()
     ours: dict[str, Any] = {"initializer": _end_with, "initargs": (os.getpid(),)}
     with _shared_folder() as folder:
         pack = partial(_packed, function, folder)
-        with closing(_generated(pack, tasks, workers, ordered=ordered, **ours)) as packed:
+        with closing(
+            _generated(pack, tasks, workers, ordered=ordered, **ours)
+        ) as packed:
             yield from map(_unpacked, packed)
 
 
@@ -171,8 +200,9 @@ def _shared_folder() -> Iterator[str]:
 def signals_blocked() -> Iterator[None]:
     """Block signals, so that processes started in the block ignore the Ctrl-C that a terminal sends to all.
 
-    A process inherits the blocked signals of its parent. Only this process handles them, at the end of the block, and
-    ends the others. Signals that reach another thread of this process are deferred, too.
+    A process inherits the blocked signals of its parent. Only this process handles
+    them, at the end of the block, and ends the others. Signals that reach another
+    thread of this process are deferred, too.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
@@ -189,7 +219,8 @@ def signals_blocked() -> Iterator[None]:
 def _start_helpers() -> None:
     """Start joblib's helper processes, which would otherwise start later and unblock the signals.
 
-    They clean up after killed processes. Their warnings on stderr are suppressed by the inherited interpreter options.
+    They clean up after killed processes. Their warnings on stderr are suppressed by the
+    inherited interpreter options.
     """
     sys.warnoptions.append(_IGNORED_WARNING)
     try:
@@ -207,7 +238,8 @@ def _start_helpers() -> None:
 def _tolerate_aborts() -> None:
     """Let loky's manager thread survive an abort that removes a task between its submission and its dispatch.
 
-    The thread of joblib 1.6 looks up such a task and ends with a KeyError. This process would then hang at its exit.
+    The thread of joblib 1.6 looks up such a task and ends with a KeyError. This process
+    would then hang at its exit.
     """
     from joblib.externals.loky import process_executor
 

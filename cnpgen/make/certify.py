@@ -11,9 +11,20 @@ from numpy.typing import NDArray
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.library import problem_kernels
 from cnpgen.machine.threads import one_thread
-from cnpgen.make.on_plan import SHA256, load_stage_planner, model_sha256, planner_boundary
+from cnpgen.make.on_plan import (
+    SHA256,
+    load_stage_planner,
+    model_sha256,
+    planner_boundary,
+)
 from cnpgen.make.recipe import DatasetRecipe
-from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction
+from cnpgen.pipelines.stages.stage import (
+    Array,
+    CandidateBatch,
+    Context,
+    Stage,
+    StageFunction,
+)
 from cnpgen.plans.format import BOUNDARY
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.refine_engine import Solver, load_solver
@@ -25,7 +36,9 @@ from cnpgen.trajectory.spline_motion import Motion
 
 Counts = tuple[int, ...]  # obstacles of each kind
 
-PLACES_PER_STEP = 2  # numbers of places are multiples of it, so that scenes share solvers
+PLACES_PER_STEP = (
+    2  # numbers of places are multiples of it, so that scenes share solvers
+)
 
 NO_PLAN = "no plan found"
 
@@ -42,7 +55,10 @@ class CertifiedPlan(Stage):
         since_version=2,
     )
     sha256: str = field(
-        "sha256 of the model file; another file gives other plans", default="", pattern=SHA256, since_version=2
+        "sha256 of the model file; another file gives other plans",
+        default="",
+        pattern=SHA256,
+        since_version=2,
     )
 
     def describe(self) -> str:
@@ -55,13 +71,32 @@ class CertifiedPlan(Stage):
     def outputs(self, context: Context) -> tuple[Field, ...]:
         spec, joints = context.problem.trajectory, context.robot.joint_names
         points, rates = spec.path_control_points, spec.rate_control_points
-        path_names = tuple(f"C{point}.{joint}" for point in range(points) for joint in joints)
+        path_names = tuple(
+            f"C{point}.{joint}" for point in range(points) for joint in joints
+        )
         rate_names = tuple(f"R{point}" for point in range(rates))
         text = f"control points of the path p(s) of a valid plan, reshape to ({points}, {len(joints)})"
-        units, rate_text = context.robot.units("rad"), "control points of its rate r(s) = ds/dt"
+        units, rate_text = (
+            context.robot.units("rad"),
+            "control points of its rate r(s) = ds/dt",
+        )
         return (
-            Field("path_control_points", units, text, points * len(joints), path_names, role="target"),
-            Field("rate_control_points", "1/s", rate_text, rates, rate_names, role="target"),
+            Field(
+                "path_control_points",
+                units,
+                text,
+                points * len(joints),
+                path_names,
+                role="target",
+            ),
+            Field(
+                "rate_control_points",
+                "1/s",
+                rate_text,
+                rates,
+                rate_names,
+                role="target",
+            ),
             Field("duration", "s", "its motion time", role="target"),
         )
 
@@ -70,24 +105,41 @@ class CertifiedPlan(Stage):
 
     def prepare(self, context: Context) -> StageFunction:
         if context.dtype != "float64":
-            raise RecipeError([f"plans meet their boundary conditions in float64 only: needs it, got {context.dtype}"])
+            raise RecipeError(
+                [
+                    f"plans meet their boundary conditions in float64 only: needs it, got {context.dtype}"
+                ]
+            )
         solver = load_solver(context.problem, context.robot, context.kernels)
         solver_of_scenes = SceneSolver(context)
-        planner = load_stage_planner(self.model, self.sha256, context) if self.model else None
+        planner = (
+            load_stage_planner(self.model, self.sha256, context) if self.model else None
+        )
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
-            columns = {name: np.ascontiguousarray(values.T) for name, values in candidates.columns.items()}
+            columns = {
+                name: np.ascontiguousarray(values.T)
+                for name, values in candidates.columns.items()
+            }
             scenes, poses = None, dict[str, Array]()
             if candidates.scenes is not None:
                 scenes = candidates.scenes.table[candidates.scene]
                 poses = {OBSTACLE_POSES: scene_poses(context.problem.obstacle, scenes)}
             guess = None
             if planner is not None:
-                guess = planner.plan_batch(planner_boundary(columns, planner), columns=poses).motion
+                guess = planner.plan_batch(
+                    planner_boundary(columns, planner), columns=poses
+                ).motion
             with one_thread():
-                motion, valid = solver(columns, guess) if scenes is None else solver_of_scenes(columns, scenes, guess)
+                motion, valid = (
+                    solver(columns, guess)
+                    if scenes is None
+                    else solver_of_scenes(columns, scenes, guess)
+                )
             count, points, joints = motion.path.shape
-            candidates["path_control_points"] = np.ascontiguousarray(motion.path.reshape(count, points * joints).T)
+            candidates["path_control_points"] = np.ascontiguousarray(
+                motion.path.reshape(count, points * joints).T
+            )
             candidates["rate_control_points"] = np.ascontiguousarray(motion.rate.T)
             candidates["duration"] = motion.duration()[None]
             candidates.reject(valid, NO_PLAN)
@@ -95,14 +147,21 @@ class CertifiedPlan(Stage):
         return work
 
 
-def certified(recipe: DatasetRecipe, *, model: str | Path | None = None) -> DatasetRecipe:
+def certified(
+    recipe: DatasetRecipe, *, model: str | Path | None = None
+) -> DatasetRecipe:
     """Return the recipe of the certified dataset, with one more stage and the name ``NAME-certified``.
 
-    The model plans the initial guesses. The recipe of a certified dataset is returned unchanged.
+    The model plans the initial guesses. The recipe of a certified dataset is returned
+    unchanged.
     """
     if any(isinstance(stage, CertifiedPlan) for stage in recipe.pipeline.stage):
         return recipe
-    stage = CertifiedPlan() if model is None else CertifiedPlan(model=str(model), sha256=model_sha256(str(model)))
+    stage = (
+        CertifiedPlan()
+        if model is None
+        else CertifiedPlan(model=str(model), sha256=model_sha256(str(model)))
+    )
     pipeline = replace(recipe.pipeline, stage=(*recipe.pipeline.stage, stage))
     return replace(recipe, name=f"{recipe.name}-certified", pipeline=pipeline)
 
@@ -116,18 +175,36 @@ class SceneSolver:
     def __init__(self, context: Context) -> None:
         self._context = context
         self._solvers: dict[Counts, tuple[Problem, Solver]] = {}
-        capacity = {kind: len(places) for kind, places in sample_obstacles(context.problem.obstacle).items()}
+        capacity = {
+            kind: len(places)
+            for kind, places in sample_obstacles(context.problem.obstacle).items()
+        }
         self._capacity = np.array([capacity[kind] for kind in OBSTACLE_KINDS])
 
     def __call__(
-        self, columns: Mapping[str, Array], scenes: SceneTable, guess: Motion | None = None
+        self,
+        columns: Mapping[str, Array],
+        scenes: SceneTable,
+        guess: Motion | None = None,
     ) -> tuple[Motion, NDArray[np.bool_]]:
         """Plan N rows with columns of shape (N, width), N scenes and N initial guesses; see ``load_solver``."""
-        spec, robot, count = self._context.problem.trajectory, self._context.robot, len(scenes)
+        spec, robot, count = (
+            self._context.problem.trajectory,
+            self._context.robot,
+            len(scenes),
+        )
         path = np.empty((count, spec.path_control_points, robot.n))
         rate, valid = np.empty((count, spec.rate_control_points)), np.zeros(count, bool)
-        numbers = np.stack([(scenes.obstacle_kind == code).sum(axis=1) for code in range(len(OBSTACLE_KINDS))], axis=1)
-        numbers = np.minimum(-(-numbers // PLACES_PER_STEP) * PLACES_PER_STEP, self._capacity)
+        numbers = np.stack(
+            [
+                (scenes.obstacle_kind == code).sum(axis=1)
+                for code in range(len(OBSTACLE_KINDS))
+            ],
+            axis=1,
+        )
+        numbers = np.minimum(
+            -(-numbers // PLACES_PER_STEP) * PLACES_PER_STEP, self._capacity
+        )
         groups, group_of = np.unique(numbers, axis=0, return_inverse=True)
         for index, group in enumerate(groups.tolist()):
             rows = np.flatnonzero(group_of.ravel() == index)
@@ -141,11 +218,26 @@ class SceneSolver:
     def _solver(self, counts: Counts) -> tuple[Problem, Solver]:
         """Return the problem with places for some numbers of obstacles, and its solver."""
         if counts not in self._solvers:
-            context, places = self._context, sample_obstacles(self._context.problem.obstacle)
+            context, places = (
+                self._context,
+                sample_obstacles(self._context.problem.obstacle),
+            )
             kept = zip(OBSTACLE_KINDS, counts, strict=True)
             removed = {index for kind, count in kept for index in places[kind][count:]}
-            obstacles = [each for index, each in enumerate(context.problem.obstacle) if index not in removed]
+            obstacles = [
+                each
+                for index, each in enumerate(context.problem.obstacle)
+                if index not in removed
+            ]
             problem = context.problem.with_obstacles(obstacles)
-            kernels = problem_kernels(problem, context.robot, context.kernels.backend, context.kernels.cache_folder)
-            self._solvers[counts] = problem, load_solver(problem, context.robot, kernels)
+            kernels = problem_kernels(
+                problem,
+                context.robot,
+                context.kernels.backend,
+                context.kernels.cache_folder,
+            )
+            self._solvers[counts] = (
+                problem,
+                load_solver(problem, context.robot, kernels),
+            )
         return self._solvers[counts]

@@ -16,17 +16,17 @@ SPLIT = "(fresh draws)"  # an invalid name of a split: no dataset contains these
 
 
 @checked_arguments
-def draw_boundary_problems(recipe: str | Path | DatasetRecipe, n: int, *, seed: int | None = None) -> Plans:
+def draw_boundary_problems(
+    recipe: str | Path | DatasetRecipe, n: int, *, seed: int | None = None
+) -> Plans:
     """Draw fresh boundary problems of a recipe, as plans without motions for ``solve_plans``.
 
-    Args:
-        recipe: Name of a shipped dataset or pipeline, path of a recipe file, or a loaded recipe.
-        n: Number of boundary problems.
-        seed: Root seed; by default the recipe's. Equal seeds give equal problems.
+    Args: recipe: Name of a shipped dataset or pipeline, path of a recipe file, or a
+        loaded recipe. n: Number of boundary problems. seed: Root seed; by default the
+        recipe's. Equal seeds give equal problems.
 
-    Raises:
-        RecipeError: The recipe has errors.
-        UsageError: ``n`` is not a positive integer, ``seed`` is not an integer from 0 to 2^63 - 1, or ``recipe`` is
+    Raises: RecipeError: The recipe has errors. UsageError: ``n`` is not a positive
+        integer, ``seed`` is not an integer from 0 to 2^63 - 1, or ``recipe`` is
             not a recipe.
         MachineError: No backend works.
     """
@@ -37,12 +37,15 @@ def draw_boundary_problems(recipe: str | Path | DatasetRecipe, n: int, *, seed: 
     root = None if seed is None else integer("seed", seed, least=0, most=MAX_SEED)
     loaded = as_dataset_recipe(recipe)
     backend, cache_folder = choose_backend(None)
-    prepared = PreparedPipeline(loaded.pipeline, backend=backend, cache_folder=cache_folder, dtype="float64")
+    prepared = PreparedPipeline(
+        loaded.pipeline, backend=backend, cache_folder=cache_folder, dtype="float64"
+    )
     rows = prepared.block_rows
     check_memory("n", n, n * sum(max(field.width, 1) for field in prepared.fields))
     root = loaded.seed if root is None else root
     blocks = [
-        prepared.block(root, SPLIT, index, first=0, stop=min(n - index * rows, rows)) for index in range(-(-n // rows))
+        prepared.block(root, SPLIT, index, first=0, stop=min(n - index * rows, rows))
+        for index in range(-(-n // rows))
     ]
     columns = stored_columns(blocks, prepared.fields, "float64")
     if tables := [block.scenes for block in blocks if block.scenes is not None]:
@@ -50,4 +53,6 @@ def draw_boundary_problems(recipe: str | Path | DatasetRecipe, n: int, *, seed: 
         table = scenes[scenes.rows_of(columns[SCENE_ID])]
         columns[OBSTACLE_POSES] = scene_poses(loaded.pipeline.problem.obstacle, table)
     source = f"fresh draws of {loaded.name}, seed {root}"
-    return plans_of_rows(record_problem(loaded.pipeline.problem), columns, source=source)
+    return plans_of_rows(
+        record_problem(loaded.pipeline.problem), columns, source=source
+    )

@@ -40,25 +40,25 @@ def extend_dataset(
 ) -> MadeDataset:
     """Add rows to a dataset, or continue an interrupted extension.
 
-    Every split grows in the proportion of the recipe; the rows are those of a dataset of ``n`` rows. Existing shards
-    stay unchanged, including a short last one. Documents and statistics cover all rows afterwards. Until then the
-    dataset is unfinished and has no manifest.
+    Every split grows in the proportion of the recipe; the rows are those of a dataset
+    of ``n`` rows. Existing shards stay unchanged, including a short last one. Documents
+    and statistics cover all rows afterwards. Until then the dataset is unfinished and
+    has no manifest.
 
-    Args:
-        folder: Folder of the dataset.
-        n: Final number of rows over all splits.
-        workers: Number of processes; this and the following arguments as for ``make_dataset``.
-        engine: Engine that runs the workers.
-        address: Address of a cluster.
-        begin: Callback before rows are compared and before they are generated.
+    Args: folder: Folder of the dataset. n: Final number of rows over all splits.
+        workers: Number of processes; this and the following arguments as for
+        ``make_dataset``. engine: Engine that runs the workers. address: Address of a
+        cluster. begin: Callback before rows are compared and before they are generated.
         progress: Callback with the rows of every shard.
 
-    Raises:
-        UsageError: The folder does not exist or contains no dataset, the dataset has more rows or is unfinished, or
+    Raises: UsageError: The folder does not exist or contains no dataset, the dataset
+        has more rows or is unfinished, or
             this version of cnpgen or of its plug-ins generates other rows.
         DatasetError: The specification.json of the dataset is damaged.
-        RecipeError: This version of cnpgen does not support the recipe in the specification.
-        MachineError: The backend of the dataset does not work here, the disk is full, or a worker died.
+        RecipeError: This version of cnpgen does not support the recipe in the
+            specification.
+        MachineError: The backend of the dataset does not work here, the disk is full,
+            or a worker died.
     """
     where, n = Engine(engine, address, workers), integer("n", n, least=1, most=MAX_ROWS)
     folder = require_dataset(folder)
@@ -86,7 +86,9 @@ def _begun(folder: Path) -> DatasetSpec:
     return workspace.spec
 
 
-def _extended(folder: Path, begun: DatasetSpec, recipe: DatasetRecipe, n: int) -> DatasetSpec:
+def _extended(
+    folder: Path, begun: DatasetSpec, recipe: DatasetRecipe, n: int
+) -> DatasetSpec:
     """Return the specification of the extended dataset, or the present one if the rows are equal."""
     splits = split_rows(recipe, n)
     if splits == begun.splits:
@@ -99,15 +101,21 @@ def _extended(folder: Path, begun: DatasetSpec, recipe: DatasetRecipe, n: int) -
             f"{folder} was made by another version of cnpgen or of its plug-ins, and this version generates other rows"
         )
     if missing := pending(folder, begun):
-        raise UsageError(f"{folder} is unfinished, it lacks {missing[0].file}: {RERUN_HINT}, then extend it")
-    return replace(begun, splits=splits, previous_splits=(*begun.previous_splits, begun.splits))
+        raise UsageError(
+            f"{folder} is unfinished, it lacks {missing[0].file}: {RERUN_HINT}, then extend it"
+        )
+    return replace(
+        begun, splits=splits, previous_splits=(*begun.previous_splits, begun.splits)
+    )
 
 
 def _notes(folder: Path) -> str:
     """Read the notes from the card, their only copy in a dataset."""
     for document in dataset_documents():
         with suppress(OSError, ValueError):  # a missing card has no notes
-            text = utf8_text(read_own(folder / document.file, folder / SPECIFICATION, "a card"))
+            text = utf8_text(
+                read_own(folder / document.file, folder / SPECIFICATION, "a card")
+            )
             if notes := document.notes(text):
                 return notes
     return ""

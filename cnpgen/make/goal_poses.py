@@ -37,7 +37,9 @@ Array = NDArray[np.float64]
 MAX_GOAL_STATES = 5  # of one task that are tried, the nearest first
 POSE_REASON = "no inverse kinematics of the goal"
 POSE_SEEDS = 128  # of the inverse kinematics of a goal pose
-MIN_DIFFERENCE_RAD = 0.3  # rad or m, of two goal states with one pose in their farthest joint
+MIN_DIFFERENCE_RAD = (
+    0.3  # rad or m, of two goal states with one pose in their farthest joint
+)
 START_REASON = "start in collision, outside its limits or off a constraint"
 GOAL_REASON = "all goal states in collision or off a constraint"
 
@@ -45,12 +47,24 @@ GOAL_REASON = "all goal states in collision or off a constraint"
 class EndConditions:
     """Conditions of a problem on states at rest, except for distances of links, which ``RestingStates`` checks."""
 
-    def __init__(self, problem: Problem, robot: Robot, obstacles: Sequence[Obstacle] = ()) -> None:
-        placed = problem.with_obstacles((*problem.obstacle, *obstacles)) if obstacles else problem
+    def __init__(
+        self, problem: Problem, robot: Robot, obstacles: Sequence[Obstacle] = ()
+    ) -> None:
+        placed = (
+            problem.with_obstacles((*problem.obstacle, *obstacles))
+            if obstacles
+            else problem
+        )
         others = RobotClearance | SelfClearance
-        if any(obstacle.below for obstacle in placed.obstacle):  # their places depend on both ends
+        if any(
+            obstacle.below for obstacle in placed.obstacle
+        ):  # their places depend on both ends
             others |= ObjectContact
-        self._constraints = [constraint for constraint in placed.constraint if not isinstance(constraint, others)]
+        self._constraints = [
+            constraint
+            for constraint in placed.constraint
+            if not isinstance(constraint, others)
+        ]
         self._world = World(robot, placed.obstacle, placed.object_size)
         zero = np.zeros((1, 3))
         self._poses = scene_of(placed, zero, zero, zero).poses[0]
@@ -63,7 +77,9 @@ class EndConditions:
         self._world.set_state(q, np.zeros_like(q), np.zeros_like(q), self._poses)
         for constraint in self._constraints:
             for condition in constraint.measured(self._world):
-                violation = np.maximum(condition.lower - condition.g, condition.g - condition.upper)
+                violation = np.maximum(
+                    condition.lower - condition.g, condition.g - condition.upper
+                )
                 if (violation > constraint.allowed(condition)).any():
                     return False
         return True
@@ -80,38 +96,54 @@ def states_of_pose(
 ) -> tuple[Array, Array]:
     """Return joint positions [rad] that can end a motion, nearest to the start (n,) first, and all with a goal pose.
 
-    The shapes are (G, n) and (H, n). Robots without link geometry have no ``states`` of rest in a scene. ``random``
-    draws the seeds.
+    The shapes are (G, n) and (H, n). Robots without link geometry have no ``states`` of
+    rest in a scene. ``random`` draws the seeds.
     """
-    positions, rotations = np.tile(pose.position, (POSE_SEEDS, 1)), np.tile(pose.rotation, (POSE_SEEDS, 1, 1))
-    tolerances = [np.tile(np.broadcast_to(each, 3), (POSE_SEEDS, 1)) for each in pose.tolerances]
-    tolerance = PoseTolerance(*tolerances) if any(each.any() for each in tolerances) else None
+    positions, rotations = (
+        np.tile(pose.position, (POSE_SEEDS, 1)),
+        np.tile(pose.rotation, (POSE_SEEDS, 1, 1)),
+    )
+    tolerances = [
+        np.tile(np.broadcast_to(each, 3), (POSE_SEEDS, 1)) for each in pose.tolerances
+    ]
+    tolerance = (
+        PoseTolerance(*tolerances) if any(each.any() for each in tolerances) else None
+    )
     seeds = seeds_of(kinematics.robot, POSE_SEEDS, random)
     q, met = solve_pose_ik(kinematics, positions, rotations, seeds, tolerance=tolerance)
     found = q[:, met]
     valid = found if states is None else found[:, states.are_ends(found)]
     valid = valid[:, conditions.met(valid)]
-    return nearest_states(valid.T, start, kinematics.robot, min_difference=MIN_DIFFERENCE_RAD), found.T.copy()
+    return nearest_states(
+        valid.T, start, kinematics.robot, min_difference=MIN_DIFFERENCE_RAD
+    ), found.T.copy()
 
 
-def nearest_states(states: Array, start: Array, robot: Robot, *, min_difference: float = 0.0) -> Array:
+def nearest_states(
+    states: Array, start: Array, robot: Robot, *, min_difference: float = 0.0
+) -> Array:
     """Return at most ``MAX_GOAL_STATES`` states [rad], shape (G, n), the nearest to the start, shape (n,), first.
 
-    The distance is the duration of the straight line at full speed. A state is left out if its farthest joint differs
-    less than ``min_difference`` from a nearer state.
+    The distance is the duration of the straight line at full speed. A state is left out
+    if its farthest joint differs less than ``min_difference`` from a nearer state.
     """
     duration = (np.abs(states - start) / robot.velocity_limit).max(axis=1)
     chosen = list[Array]()
     for index in np.argsort(duration, kind="stable"):
         if len(chosen) == MAX_GOAL_STATES:
             break
-        if all(np.abs(states[index] - other).max() >= min_difference for other in chosen):
+        if all(
+            np.abs(states[index] - other).max() >= min_difference for other in chosen
+        ):
             chosen.append(states[index])
     return np.array(chosen).reshape(-1, states.shape[1])
 
 
 def problem_of_poses(recipe: object) -> Problem | None:
-    """Return the problem if an argument is one, or the name or the file of one; otherwise None."""
+    """Return the problem if an argument is one, or the name or the file of one.
+
+    Otherwise None.
+    """
     if isinstance(recipe, Problem):
         return recipe
     if not isinstance(recipe, str | Path):
@@ -119,7 +151,11 @@ def problem_of_poses(recipe: object) -> Problem | None:
     if Path(recipe).is_file():
         return load_problem(recipe) if kind_of_file(Path(recipe)) == "problem" else None
     others = {**list_recipes("dataset"), **list_recipes("pipeline")}
-    return load_problem(recipe) if str(recipe) in list_recipes("problem").keys() - others.keys() else None
+    return (
+        load_problem(recipe)
+        if str(recipe) in list_recipes("problem").keys() - others.keys()
+        else None
+    )
 
 
 class PoseTasks:
@@ -135,44 +171,95 @@ class PoseTasks:
         joints, axes = self.robot.joint_names, ("x", "y", "z")
         unit = self.robot.units("rad")
         fields = (
-            Field("start_q", unit, "joint positions at the start, at rest", len(joints), joints),
+            Field(
+                "start_q",
+                unit,
+                "joint positions at the start, at rest",
+                len(joints),
+                joints,
+            ),
             Field("goal_xyz", "m", "position of the tip at the goal", 3, axes),
-            Field("goal_wxyz", "1", "quaternion of the tip's axes at the goal", 4, ("w", *axes)),
-            Field("goal_xyz_tolerance", "m", "accepted displacements along the axes of the goal pose", 3, axes),
-            Field("goal_rotation_tolerance", "1", "accepted rotation vector in these axes [rad]", 3, axes),
+            Field(
+                "goal_wxyz",
+                "1",
+                "quaternion of the tip's axes at the goal",
+                4,
+                ("w", *axes),
+            ),
+            Field(
+                "goal_xyz_tolerance",
+                "m",
+                "accepted displacements along the axes of the goal pose",
+                3,
+                axes,
+            ),
+            Field(
+                "goal_rotation_tolerance",
+                "1",
+                "accepted rotation vector in these axes [rad]",
+                3,
+                axes,
+            ),
         )
         self.fields = {field.name: field for field in fields}
         self._kinematics = PoseKinematics(self.robot)
         self._conditions = EndConditions(problem, self.robot)
-        self._states = None if self.robot.shape is None else RestingStates(problem, self.robot)
+        self._states = (
+            None if self.robot.shape is None else RestingStates(problem, self.robot)
+        )
 
     def check(self, names: Mapping[str, object]) -> None:
         """Raise UsageError for a column that tasks cannot have, or without goal positions."""
         for name in names:
             if name not in self.fields:
                 what = lacks("column to give", name, self.fields)
-                raise UsageError(f"the problem {self._problem.name!r} {what}", concerns=name)
+                raise UsageError(
+                    f"the problem {self._problem.name!r} {what}", concerns=name
+                )
         if "goal_xyz" not in names:
-            raise UsageError("tasks must give goal_xyz, the tip position of the goal", concerns="goal_xyz")
+            raise UsageError(
+                "tasks must give goal_xyz, the tip position of the goal",
+                concerns="goal_xyz",
+            )
 
     def complete(self, columns: Mapping[str, Array]) -> tuple[Plans, tuple[str, ...]]:
         """Compute goal states of N tasks, columns of shape (N, width) or (1, width), independently of each other.
 
-        The goal states of all tasks are boundary problems, at most ``MAX_GOAL_STATES`` for each, the nearest first.
-        Tasks without any have a reason.
+        The goal states of all tasks are boundary problems, at most ``MAX_GOAL_STATES``
+        for each, the nearest first. Tasks without any have a reason.
         """
         count = max(map(len, columns.values()))
-        given = {name: np.broadcast_to(values, (count, values.shape[1])) for name, values in columns.items()}
-        given.setdefault("start_q", np.broadcast_to(self.robot.home, (count, self.robot.n)))
+        given = {
+            name: np.broadcast_to(values, (count, values.shape[1]))
+            for name, values in columns.items()
+        }
+        given.setdefault(
+            "start_q", np.broadcast_to(self.robot.home, (count, self.robot.n))
+        )
         found = [self._goals(task, given) for task in range(count)]
         reasons = tuple(goals if isinstance(goals, str) else "" for goals in found)
-        states = [np.empty((0, self.robot.n)) if isinstance(goals, str) else goals for goals in found]
-        goal, tasks = np.concatenate(states), np.repeat(np.arange(count), [len(each) for each in states])
+        states = [
+            np.empty((0, self.robot.n)) if isinstance(goals, str) else goals
+            for goals in found
+        ]
+        goal, tasks = (
+            np.concatenate(states),
+            np.repeat(np.arange(count), [len(each) for each in states]),
+        )
         numbers = np.concatenate([np.arange(len(each), dtype=float) for each in states])
-        rows: dict[str, NDArray[Any]] = {name: np.zeros_like(goal) for name in ("start_dq", "start_ddq", "goal_dq")}
-        rows |= {"start_q": given["start_q"][tasks], "goal_q": goal, GOAL_OPTION: numbers, "sample_id": tasks}
+        rows: dict[str, NDArray[Any]] = {
+            name: np.zeros_like(goal) for name in ("start_dq", "start_ddq", "goal_dq")
+        }
+        rows |= {
+            "start_q": given["start_q"][tasks],
+            "goal_q": goal,
+            GOAL_OPTION: numbers,
+            "sample_id": tasks,
+        }
         source = f"goal poses of {self._problem.name}"
-        return plans_of_rows(record_problem(self._problem), rows, source=source), reasons
+        return plans_of_rows(
+            record_problem(self._problem), rows, source=source
+        ), reasons
 
     def _goals(self, task: int, given: Mapping[str, Array]) -> Array | str:
         """Return the goal states of a task, shape (G, n), or the reason why there are none."""
@@ -182,25 +269,41 @@ class PoseTasks:
             return START_REASON
         random = np.random.default_rng(POSE_SEEDS)
         checks = self._states, self._conditions
-        goals, found = states_of_pose(self._kinematics, *checks, pose, start=start, random=random)
+        goals, found = states_of_pose(
+            self._kinematics, *checks, pose, start=start, random=random
+        )
         if not len(found):
             return POSE_REASON
         return goals if len(goals) else GOAL_REASON
 
     def _pose(self, task: int, given: Mapping[str, Array]) -> GoalPose:
         """Return the goal pose of a task; without an orientation, any is accepted."""
-        wxyz = given["goal_wxyz"][task] if "goal_wxyz" in given else np.array([1.0, 0.0, 0.0, 0.0])
+        wxyz = (
+            given["goal_wxyz"][task]
+            if "goal_wxyz" in given
+            else np.array([1.0, 0.0, 0.0, 0.0])
+        )
         if text := quaternion_error(wxyz):
             raise UsageError(f"{text} in task {task}", argument="goal_wxyz")
         free = np.zeros(3) if "goal_wxyz" in given else np.full(3, np.pi)
-        tolerances = {"goal_xyz_tolerance": np.zeros(3), "goal_rotation_tolerance": free}
+        tolerances = {
+            "goal_xyz_tolerance": np.zeros(3),
+            "goal_rotation_tolerance": free,
+        }
         for name in tolerances.keys() & given.keys():
             tolerances[name] = given[name][task]
             unit = "m" if name == "goal_xyz_tolerance" else "rad"
-            if (largest := float(tolerances[name].max())) > (limit := PLAUSIBLE_MAX[unit]):
+            if (largest := float(tolerances[name].max())) > (
+                limit := PLAUSIBLE_MAX[unit]
+            ):
                 hint = suggested_unit(largest, unit, high=limit)
                 text = f"must be at most {limit:.4g} {unit}, got {tolerances[name]} in task {task}{hint}"
                 raise UsageError(text, argument=name)
             if (tolerances[name] < 0).any():
-                raise UsageError(f"must not be negative, got {tolerances[name]} in task {task}", argument=name)
-        return GoalPose("", given["goal_xyz"][task], rotation_matrix(wxyz), *tolerances.values())
+                raise UsageError(
+                    f"must not be negative, got {tolerances[name]} in task {task}",
+                    argument=name,
+                )
+        return GoalPose(
+            "", given["goal_xyz"][task], rotation_matrix(wxyz), *tolerances.values()
+        )

@@ -24,25 +24,31 @@ from cnpgen.store.dataset_spec import DatasetSpec, ShardTask
 from cnpgen.store.field import Field
 from cnpgen.store.manifest import source_date
 from cnpgen.store.sampling_statistics import SamplingStatistics, merge_sampling
-from cnpgen.store.scene_table import OBSTACLE_POSES, SCENE_ID, SceneTable, concatenate_scenes
+from cnpgen.store.scene_table import (
+    OBSTACLE_POSES,
+    SCENE_ID,
+    SceneTable,
+    concatenate_scenes,
+)
 from cnpgen.store.shard import storage_dtype
 from cnpgen.store.shard_record import commit_shard
 from cnpgen.store.workspace import require_dataset_spec
 
-MAX_SPOT_CHECK_ROWS = 32  # per shard, recomputed by Pinocchio and Coal before the commit
+MAX_SPOT_CHECK_ROWS = (
+    32  # per shard, recomputed by Pinocchio and Coal before the commit
+)
 
 
 @dataclass(frozen=True)
 class Job:
     """Picklable input of a worker.
 
-    Attributes:
-        folder: Folder of the dataset.
-        spec: Specification of the dataset.
-        pipeline: Pipeline of the dataset; None to rebuild it from the specification, for workers without its files.
-        backend: Backend of the kernels.
-        cache_folder: Folder of compiled kernels; None for the default folder of the worker's machine.
-        date: Date of all records, from SOURCE_DATE_EPOCH; None for the current time and durations.
+    Attributes: folder: Folder of the dataset. spec: Specification of the dataset.
+        pipeline: Pipeline of the dataset; None to rebuild it from the specification,
+        for workers without its files. backend: Backend of the kernels. cache_folder:
+        Folder of compiled kernels; None for the default folder of the worker's machine.
+        date: Date of all records, from SOURCE_DATE_EPOCH; None for the current time and
+        durations.
     """
 
     folder: Path
@@ -54,9 +60,19 @@ class Job:
 
 
 def prepare(job: Job) -> PreparedPipeline:
-    """Prepare the pipeline of a job; raise MachineError if this version of cnpgen generates other rows."""
-    cache_folder = choose_backend(job.backend)[1] if job.cache_folder is None else job.cache_folder
-    load = partial(PreparedPipeline, backend=job.backend, cache_folder=cache_folder, dtype=job.spec.dtype)
+    """Prepare the pipeline of a job.
+
+    Raise MachineError if this version of cnpgen generates other rows.
+    """
+    cache_folder = (
+        choose_backend(job.backend)[1] if job.cache_folder is None else job.cache_folder
+    )
+    load = partial(
+        PreparedPipeline,
+        backend=job.backend,
+        cache_folder=cache_folder,
+        dtype=job.spec.dtype,
+    )
     if job.pipeline is not None:
         return load(job.pipeline)
     with restored(job.spec) as recipe:
@@ -68,15 +84,21 @@ def prepare(job: Job) -> PreparedPipeline:
         return load(recipe.pipeline)
 
 
-def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, SamplingStatistics]]:
+def make_shards(
+    job: Job, tasks: Sequence[ShardTask]
+) -> Iterator[tuple[int, SamplingStatistics]]:
     """Generate, check and commit shards of one split, in order; yield rows and sampling statistics of each.
 
     The operation is idempotent.
     """
     started, clock = _now(job), time.perf_counter()
     prepared = _prepared(job)
-    for task, (columns, sampling, scenes) in zip(tasks, shard_columns(prepared, job.spec, tasks), strict=True):
-        checked = replace(sampling, verification=spot_check(prepared, columns, job.spec, task, scenes))
+    for task, (columns, sampling, scenes) in zip(
+        tasks, shard_columns(prepared, job.spec, tasks), strict=True
+    ):
+        checked = replace(
+            sampling, verification=spot_check(prepared, columns, job.spec, task, scenes)
+        )
         require_dataset_spec(job.folder, job.spec)
         seconds = 0.0 if job.date else round(time.perf_counter() - clock, 3)
         commit_shard(
@@ -104,7 +126,8 @@ def shard_columns(
 ) -> Iterator[tuple[dict[str, NDArray[Any]], SamplingStatistics, SceneTable | None]]:
     """Compute the rows of shards of one split; every block is computed once.
 
-    Yield the columns as stored, shape (rows, width) or (rows,), the sampling statistics, and the scenes or None.
+    Yield the columns as stored, shape (rows, width) or (rows,), the sampling
+    statistics, and the scenes or None.
     """
     chunks = _chunks(prepared, spec.seed, tasks)
     for task in tasks:
@@ -112,19 +135,26 @@ def shard_columns(
         while sum(part.columns["sample_id"].shape[1] for part in parts) < task.rows:
             parts.append(next(chunks))
         columns = stored_columns(parts, spec.fields, spec.dtype)
-        tables = [part.scenes.astype(spec.dtype) for part in parts if part.scenes is not None]
+        tables = [
+            part.scenes.astype(spec.dtype) for part in parts if part.scenes is not None
+        ]
         scenes = concatenate_scenes(tables) if tables else None
         yield columns, merge_sampling([part.sampling for part in parts]), scenes
 
 
-def _chunks(prepared: PreparedPipeline, seed: int, tasks: Sequence[ShardTask]) -> Iterator[Block]:
+def _chunks(
+    prepared: PreparedPipeline, seed: int, tasks: Sequence[ShardTask]
+) -> Iterator[Block]:
     """Compute the blocks of shards in chunks of one shard each."""
     size = prepared.block_rows
     blocks = {index for task in tasks for index in blocks_of(task, size)}
     for index in sorted(blocks):
         begin = index * size
         ranges = [
-            (max(task.first_row - begin, 0), min(task.first_row + task.rows - begin, size))
+            (
+                max(task.first_row - begin, 0),
+                min(task.first_row + task.rows - begin, size),
+            )
             for task in tasks
             if index in blocks_of(task, size)
         ]
@@ -136,12 +166,16 @@ def blocks_of(task: ShardTask, size: int) -> range:
     return range(task.first_row // size, (task.first_row + task.rows - 1) // size + 1)
 
 
-def stored_columns(parts: Sequence[Block], fields: Sequence[Field], dtype: str) -> dict[str, NDArray[Any]]:
+def stored_columns(
+    parts: Sequence[Block], fields: Sequence[Field], dtype: str
+) -> dict[str, NDArray[Any]]:
     """Concatenate chunks to the stored values of their fields, shape (rows, width) or (rows,) each."""
     columns = {}
     for item in fields:
         rows = np.concatenate([part.columns[item.name] for part in parts], axis=1).T
-        columns[item.name] = np.ascontiguousarray(rows if item.width else rows[:, 0], storage_dtype(item, dtype))
+        columns[item.name] = np.ascontiguousarray(
+            rows if item.width else rows[:, 0], storage_dtype(item, dtype)
+        )
     return columns
 
 
@@ -154,7 +188,8 @@ def spot_check(
 ) -> dict[str, float]:
     """Recompute some rows of a shard with Pinocchio and Coal, to detect errors of the compiler or backend.
 
-    Return the largest violation of every check, in its unit; raise MachineError if a row fails a check.
+    Return the largest violation of every check, in its unit; raise MachineError if a
+    row fails a check.
     """
     from cnpgen.judges.rows.verify import verify_rows
 
@@ -163,12 +198,22 @@ def spot_check(
     if scenes is not None:
         table = scenes[scenes.rows_of(some[SCENE_ID])]
         some[OBSTACLE_POSES] = scene_poses(prepared.context.problem.obstacle, table)
-    report = verify_rows(prepared.context.problem, prepared.context.robot, some, dtype=spec.dtype)
+    report = verify_rows(
+        prepared.context.problem, prepared.context.robot, some, dtype=spec.dtype
+    )
     if len(report.failed_rows):
-        wrong = ", ".join(f"{check.name} {check.worst:.3g} {check.unit}" for check in report.failed)
+        wrong = ", ".join(
+            f"{check.name} {check.worst:.3g} {check.unit}" for check in report.failed
+        )
         kinds = (*prepared.context.problem.constraint, *prepared.pipeline.stage)
-        packages = sorted({package_of(group_of(type(kind)), type(kind)) for kind in kinds} - {""})
-        plug_ins = f"what {', '.join(packages)} samples or solves is not what it measures, or " if packages else ""
+        packages = sorted(
+            {package_of(group_of(type(kind)), type(kind)) for kind in kinds} - {""}
+        )
+        plug_ins = (
+            f"what {', '.join(packages)} samples or solves is not what it measures, or "
+            if packages
+            else ""
+        )
         raise MachineError(
             f"row {task.first_row + rows[report.failed_rows[0]]} of split {task.split!r} fails Pinocchio's check"
             f" ({wrong}): {plug_ins}"

@@ -21,35 +21,46 @@ from cnpgen.store.layout import DOCUMENTS, WORK
 from cnpgen.store.manifest import source_date
 from cnpgen.store.paths import require_dataset
 from cnpgen.store.shard_record import is_committed, load_committed
-from cnpgen.store.workspace import changed_settings, check_place, find_workspace, open_workspace
+from cnpgen.store.workspace import (
+    changed_settings,
+    check_place,
+    find_workspace,
+    open_workspace,
+)
 
 MAX_LISTED_SHARDS = 3  # in an error message
 
 
 @checked_arguments
 def merge_datasets(
-    parts: Sequence[str | Path], out: str | Path, *, begin: Begin | None = None, progress: Progress | None = None
+    parts: Sequence[str | Path],
+    out: str | Path,
+    *,
+    begin: Begin | None = None,
+    progress: Progress | None = None,
 ) -> MadeDataset:
     """Merge parts that ``make_dataset(..., part=(k, m))`` generated in separate folders, or continue a merge.
 
-    Shards and their records are copied after a comparison with their recorded sha256. The rows are therefore identical
-    to those of a dataset generated at once. The parts stay unchanged.
+    Shards and their records are copied after a comparison with their recorded sha256.
+    The rows are therefore identical to those of a dataset generated at once. The parts
+    stay unchanged.
 
-    Args:
-        parts: Folders of the parts.
-        out: Folder of the dataset; it may be one of the parts.
-        begin: Called with ("merging", folder, rows, existing rows) before shards are copied.
-        progress: Called with (rows, None) of every copied shard.
+    Args: parts: Folders of the parts. out: Folder of the dataset; it may be one of the
+        parts. begin: Called with ("merging", folder, rows, existing rows) before shards
+        are copied. progress: Called with (rows, None) of every copied shard.
 
-    Raises:
-        UsageError: A folder does not exist, a part belongs to another dataset, two parts have the same shard, or
+    Raises: UsageError: A folder does not exist, a part belongs to another dataset, two
+        parts have the same shard, or
             ``out`` holds other content.
         DatasetError: A folder holds no dataset, or a shard is damaged or missing.
         MachineError: The disk is full or a file operation failed.
     """
     source_date()
     if not parts or not all(isinstance(part, str | Path) for part in parts):
-        raise UsageError(f"must name at least one folder, and only folders, got {parts!r:.100}", argument="parts")
+        raise UsageError(
+            f"must name at least one folder, and only folders, got {parts!r:.100}",
+            argument="parts",
+        )
     out, folders = Path(out), [Path(part) for part in parts]
     spec = _common_spec(folders)
     others = [folder for folder in folders if folder.resolve() != out.resolve()]
@@ -65,7 +76,9 @@ def merge_datasets(
         if progress is not None:
             progress(task.rows, None)
     made = sum(task.rows for task in owners)
-    complete, documents = finish(out, spec, _shipped_notes(spec), made=made, exclusive=True)
+    complete, documents = finish(
+        out, spec, _shipped_notes(spec), made=made, exclusive=True
+    )
     return MadeDataset(out, spec, made, complete, dict(spec.splits), tuple(documents))
 
 
@@ -79,7 +92,10 @@ def _common_spec(folders: Sequence[Path]) -> DatasetSpec:
     for folder in rest:
         other = load_dataset_spec(folder)
         if other.fingerprint != spec.fingerprint:
-            changed = changed_settings(other, spec) or f"{dict(other.splits)} rows instead of {spec.splits}"
+            changed = (
+                changed_settings(other, spec)
+                or f"{dict(other.splits)} rows instead of {spec.splits}"
+            )
             raise UsageError(f"{folder} is of another dataset than {first}: {changed}")
     return spec
 
@@ -90,24 +106,37 @@ def _require_inside(folder: Path, names: Sequence[str] = (*DOCUMENTS, WORK)) -> 
         raise DatasetError(f"{folder / links[0]} {OUTSIDE}; {COPY_HINT}")
 
 
-def _owners(folders: Sequence[Path], out: Path, spec: DatasetSpec) -> dict[ShardTask, Path]:
-    """Return the folder of each shard to copy; raise an error for a shard in two folders or in none."""
+def _owners(
+    folders: Sequence[Path], out: Path, spec: DatasetSpec
+) -> dict[ShardTask, Path]:
+    """Return the folder of each shard to copy.
+
+    Raise an error for a shard in two folders or in none.
+    """
     owners: dict[ShardTask, Path] = {}
     missing = []
     for task in shards(spec):
         holders = [folder for folder in folders if (folder / task.sidecar).exists()]
         if len(holders) > 1:
-            raise UsageError(f"{holders[0]} and {holders[1]} both have {task.file}: parts must not overlap")
+            raise UsageError(
+                f"{holders[0]} and {holders[1]} both have {task.file}: parts must not overlap"
+            )
         if is_committed(out, spec, task):
-            if holders and read_file(holders[0] / task.sidecar) != read_file(out / task.sidecar):
-                raise UsageError(f"{holders[0]} and {out} both have {task.file}: parts must not overlap")
+            if holders and read_file(holders[0] / task.sidecar) != read_file(
+                out / task.sidecar
+            ):
+                raise UsageError(
+                    f"{holders[0]} and {out} both have {task.file}: parts must not overlap"
+                )
         elif holders:
             _require_inside(holders[0], (task.file, task.sidecar))
             owners[task] = holders[0]
         else:
             missing.append(task.file)
     if missing:
-        raise DatasetError(f"no part has {listed(missing, MAX_LISTED_SHARDS)}: make the missing shards first")
+        raise DatasetError(
+            f"no part has {listed(missing, MAX_LISTED_SHARDS)}: make the missing shards first"
+        )
     return owners
 
 
@@ -117,18 +146,26 @@ def _copy(folder: Path, out: Path, task: ShardTask, spec: DatasetSpec) -> None:
     with committing(out / task.file, out / WORK) as temporary:
         shutil.copyfile(folder / task.file, temporary)
         if file_sha256(temporary) != record.sha256:
-            raise DatasetError(f"{folder / task.file} was changed: its sha256 is not the recorded one")
+            raise DatasetError(
+                f"{folder / task.file} was changed: its sha256 is not the recorded one"
+            )
         read_rows(Shard(folder, spec, task))
     write_file(out / task.sidecar, read_file(folder / task.sidecar), work=out / WORK)
 
 
 def _shipped_notes(spec: DatasetSpec) -> str:
-    """Return the data card of a shipped recipe with the same rows; empty for other recipes."""
+    """Return the data card of a shipped recipe with the same rows.
+
+    Empty for other recipes.
+    """
     model = spec.stages[-1].get("model")
     for name in list_recipes("dataset"):
         with suppress(RecipeError, UsageError):
             recipe = load_dataset_recipe(name)
             for variant in (recipe, certified(recipe, model=model)):
-                if variant.name == spec.name and recipe_digest(variant) == spec.recipe_sha256:
+                if (
+                    variant.name == spec.name
+                    and recipe_digest(variant) == spec.recipe_sha256
+                ):
                     return load_notes(variant)
     return ""

@@ -12,7 +12,15 @@ from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.machine.threads import one_thread
 from cnpgen.pipelines.stages.boundary_motion import onto_table, velocity_of_tip
 from cnpgen.pipelines.stages.draw import position_field
-from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction, fraction, leave
+from cnpgen.pipelines.stages.stage import (
+    Array,
+    CandidateBatch,
+    Context,
+    Stage,
+    StageFunction,
+    fraction,
+    leave,
+)
 from cnpgen.plans.format import BOUNDARY, CONDITIONS
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem_record import record_problem
@@ -29,7 +37,15 @@ if TYPE_CHECKING:
 SHA256 = "^([0-9a-f]{64})?$"
 STATES_PER_REFINED_PLAN = 40  # a refined plan takes about 20 ms, a state on it is cheap
 START = ("start_q", "start_dq", "start_ddq")
-GOAL = ("goal_q", "goal_dq", "goal_xyz", "hit_angle", "hit_speed", "hit_speed_max", "home_q")
+GOAL = (
+    "goal_q",
+    "goal_dq",
+    "goal_xyz",
+    "hit_angle",
+    "hit_speed",
+    "hit_speed_max",
+    "home_q",
+)
 
 
 def model_sha256(model: str) -> str:
@@ -42,18 +58,25 @@ def model_sha256(model: str) -> str:
 def load_stage_planner(model: str, sha256: str, context: Context) -> "Planner":
     """Load the planner of a stage, a shipped model or a model file with the digest ``sha256``.
 
-    Raise RecipeError if the file has another sha256, or the model is for another problem.
+    Raise RecipeError if the file has another sha256, or the model is for another
+    problem.
     """
     from cnpgen.planner.model_file import load_model
     from cnpgen.planner.planner import Planner
 
     digest = model_sha256(model)
     if digest != sha256:
-        raise RecipeError([f"sha256: the file of model {model!r} has {digest}, expected {sha256}"])
+        raise RecipeError(
+            [f"sha256: the file of model {model!r} has {digest}, expected {sha256}"]
+        )
     loaded, problem = load_model(model), record_problem(context.problem)
     if loaded.problem.comparable_sha256 != problem.comparable_sha256:
         differs = ", ".join(problem.differences(loaded.problem)[:4])
-        raise RecipeError([f"model: {model!r} plans for another problem, they differ in {differs}; leave it out"])
+        raise RecipeError(
+            [
+                f"model: {model!r} plans for another problem, they differ in {differs}; leave it out"
+            ]
+        )
     return Planner(loaded, backend=context.kernels.backend)
 
 
@@ -62,7 +85,11 @@ def planner_boundary(columns: Mapping[str, Array], planner: "Planner") -> Bounda
 
     Goal accelerations are omitted if the planner leaves them free.
     """
-    names = [name for name in CONDITIONS if name != "goal_ddq" or planner.model.fixed_at_goal == 3]
+    names = [
+        name
+        for name in CONDITIONS
+        if name != "goal_ddq" or planner.model.fixed_at_goal == 3
+    ]
     return Boundary(**{name: columns[name] for name in names if name in columns})
 
 
@@ -73,10 +100,13 @@ class StartOnPlan(Stage):
     inputs = (*BOUNDARY, "start_xyz", *GOAL[2:-1])
     replaces = ("goal_q", "goal_dq")
     model: str = field("planner: name of a shipped model, or path of a model file")
-    sha256: str = field("sha256 of the model file; another file gives other samples", pattern=SHA256)
+    sha256: str = field(
+        "sha256 of the model file; another file gives other samples", pattern=SHA256
+    )
     moved: float = fraction("fraction of the starts that are moved onto plans")
     refined: float = fraction(
-        f"fraction of the moved ones that are on refined plans, up to {STATES_PER_REFINED_PLAN} on each", default=0.0
+        f"fraction of the moved ones that are on refined plans, up to {STATES_PER_REFINED_PLAN} on each",
+        default=0.0,
     )
     times: Range = field("time on the plan as a fraction of its duration")
 
@@ -88,22 +118,37 @@ class StartOnPlan(Stage):
         )
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        quantities = (("rad", "positions"), ("rad/s", "velocities"), ("rad/s^2", "accelerations"))
+        quantities = (
+            ("rad", "positions"),
+            ("rad/s", "velocities"),
+            ("rad/s^2", "accelerations"),
+        )
         states = (
             context.joint_field(name, unit, f"joint {quantity} at the start")
             for name, (unit, quantity) in zip(START, quantities, strict=True)
         )
         table = context.constraint(Table)
-        low, high = ([getattr(axis, end) for axis in (table.x, table.y)] for end in ("low", "high"))
+        low, high = (
+            [getattr(axis, end) for axis in (table.x, table.y)]
+            for end in ("low", "high")
+        )
         return (*states, position_field("start", [*low, table.z], [*high, table.z]))
 
     def writes(self, context: Context) -> tuple[str, ...]:
-        return (*(field.name for field in self.outputs(context)), "start_tip_velocity", *map(of_plan, GOAL))
+        return (
+            *(field.name for field in self.outputs(context)),
+            "start_tip_velocity",
+            *map(of_plan, GOAL),
+        )
 
     def prepare(self, context: Context) -> StageFunction:
         height = context.constraint(Table).z
         load = context.kernels.load
-        exact, tip, speed = load(onto_table, height=height), load(tip_position), load(velocity_of_tip)
+        exact, tip, speed = (
+            load(onto_table, height=height),
+            load(tip_position),
+            load(velocity_of_tip),
+        )
         make = self._maker(context)
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
@@ -111,14 +156,18 @@ class StartOnPlan(Stage):
             moved = moves < self.moved
             owner, motion = make(candidates, moved & (refines < self.refined))
             for name in GOAL:
-                candidates[of_plan(name)] = np.take(candidates["start_q" if name == "home_q" else name], owner, axis=1)
+                candidates[of_plan(name)] = np.take(
+                    candidates["start_q" if name == "home_q" else name], owner, axis=1
+                )
             phase = self.times.low + (self.times.high - self.times.low) * times
             states = states_at_times(motion, phase * motion.duration())
             projected = exact(*(np.ascontiguousarray(state.T) for state in states))
             for name, values in zip(START, projected, strict=True):
                 candidates[name] = np.where(moved, values, candidates[name])
             (candidates["start_xyz"],) = tip(candidates["start_q"])
-            (candidates["start_tip_velocity"],) = speed(candidates["start_q"], candidates["start_dq"])
+            (candidates["start_tip_velocity"],) = speed(
+                candidates["start_q"], candidates["start_dq"]
+            )
 
         return work
 
@@ -134,15 +183,23 @@ class StartOnPlan(Stage):
         planner = load_stage_planner(self.model, self.sha256, context)
         solve = load_solver(context.problem, context.robot, context.kernels)
 
-        def make(candidates: CandidateBatch, refined: NDArray[np.bool_]) -> tuple[NDArray[np.intp], Motion]:
-            columns = {name: np.ascontiguousarray(values.T) for name, values in candidates.columns.items()}
+        def make(
+            candidates: CandidateBatch, refined: NDArray[np.bool_]
+        ) -> tuple[NDArray[np.intp], Motion]:
+            columns = {
+                name: np.ascontiguousarray(values.T)
+                for name, values in candidates.columns.items()
+            }
             motion = planner.plan_batch(planner_boundary(columns, planner)).motion
             owner, some = np.arange(len(motion)), np.flatnonzero(refined)
             few = some[::STATES_PER_REFINED_PLAN]
             owner[some] = np.repeat(few, STATES_PER_REFINED_PLAN)[: len(some)]
             path, rate = motion.path.copy(), motion.rate.copy()
             with one_thread():
-                better, _ = solve({name: values[few] for name, values in columns.items()}, initial_guess=motion[few])
+                better, _ = solve(
+                    {name: values[few] for name, values in columns.items()},
+                    initial_guess=motion[few],
+                )
             path[few], rate[few] = better.path, better.rate
             return owner, Motion(path[owner], rate[owner], motion.degree)
 
@@ -154,7 +211,9 @@ class GoalOfPlan(Stage):
     """Stage: keep the goal of the motion that contains the start, in a fraction of the cases."""
 
     inputs = tuple(f"planned_{name}" for name in GOAL)
-    share: float = fraction("fraction of the samples with the goal of the motion that they start on")
+    share: float = fraction(
+        "fraction of the samples with the goal of the motion that they start on"
+    )
 
     def describe(self) -> str:
         return f"in {100 * self.share:.4g} % of the cases take the goal of the motion that the start is on"
@@ -164,7 +223,9 @@ class GoalOfPlan(Stage):
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             same = candidates.draw(random, 1)[0] < self.share
             for name in GOAL:
-                candidates[name] = np.where(same, candidates[of_plan(name)], candidates[name])
+                candidates[name] = np.where(
+                    same, candidates[of_plan(name)], candidates[name]
+                )
 
         return work
 

@@ -24,14 +24,22 @@ MAX_ROWS = 10**12
 def dataset_folder(recipe: DatasetRecipe, out: str | Path | None) -> Path:
     """Return the folder of a dataset, by default ``NAME-vMAJOR`` in the current folder.
 
-    A path with ".." after a missing folder is resolved, since creating that folder could change its target.
+    A path with ".." after a missing folder is resolved, since creating that folder
+    could change its target.
     """
     if out is None:
         return Path(f"{recipe.name}-v{recipe.version.split('.')[0]}")
     if not isinstance(out, str | Path) or not str(out).strip():
-        raise UsageError(f"must name a folder, got {str(out) if isinstance(out, Path) else out!r}", argument="out")
+        raise UsageError(
+            f"must name a folder, got {str(out) if isinstance(out, Path) else out!r}",
+            argument="out",
+        )
     folder = Path(out)
-    return folder.resolve() if ".." in folder.parts and not folder.parent.exists() else folder
+    return (
+        folder.resolve()
+        if ".." in folder.parts and not folder.parent.exists()
+        else folder
+    )
 
 
 def resolve(
@@ -47,8 +55,8 @@ def resolve(
 ) -> Job:
     """Resolve the job of ``make_dataset``, whose arguments these are; build its kernels but write no file.
 
-    An unfinished dataset of the recipe in the folder determines the default backend and shard size, unless ``force``
-    deletes it.
+    An unfinished dataset of the recipe in the folder determines the default backend and
+    shard size, unless ``force`` deletes it.
     """
     total, root, shard_size = _check(recipe, n, seed, shard_size)
     digest, begun = recipe_digest(recipe), workspace.spec
@@ -58,11 +66,17 @@ def resolve(
         backend = begun.backend if backend is None else backend
         shard_size = begun.shard_size if shard_size is None else shard_size
     chosen, cache_folder = choose_backend(backend)
-    prepared = PreparedPipeline(recipe.pipeline, backend=chosen, cache_folder=cache_folder, dtype=dtype)
+    prepared = PreparedPipeline(
+        recipe.pipeline, backend=chosen, cache_folder=cache_folder, dtype=dtype
+    )
     if prepared.tasks is not None:
         total = _solved_tasks(prepared, recipe, root, n)
     rows = shard_size or default_shard_size(total, prepared.block_rows)
-    check_memory("shard_size", rows, min(rows, total) * sum(max(field.width, 1) for field in prepared.fields))
+    check_memory(
+        "shard_size",
+        rows,
+        min(rows, total) * sum(max(field.width, 1) for field in prepared.fields),
+    )
     splits = split_rows(recipe, total)
     spec = DatasetSpec(
         name=recipe.name,
@@ -80,8 +94,12 @@ def resolve(
         fields=prepared.fields,
         robot=_robot_record(prepared),
         versions=versions(),
-        previous_splits=begun.previous_splits if begun is not None and begun.splits == splits else (),
-        scene_obstacles=scene_capacity(recipe.pipeline.problem.obstacle) if prepared.families else 0,
+        previous_splits=begun.previous_splits
+        if begun is not None and begun.splits == splits
+        else (),
+        scene_obstacles=scene_capacity(recipe.pipeline.problem.obstacle)
+        if prepared.families
+        else 0,
         scene_families=prepared.families,
     )
     return Job(workspace.folder, spec, recipe.pipeline, chosen, cache_folder)
@@ -90,30 +108,60 @@ def resolve(
 def _check(
     recipe: DatasetRecipe, n: int | None, seed: int | None, shard_size: int | None
 ) -> tuple[int, int, int | None]:
-    """Return rows, seed and shard size; raise UsageError for values that only recipes built in Python can have."""
+    """Return rows, seed and shard size.
+
+    Raise UsageError for values that only recipes built in Python can have.
+    """
     for split, rows in recipe.splits.items():
         integer(f"the rows of split {split!r}", rows, least=1)
     if not recipe.splits:
-        raise UsageError(f"{recipe.name} has no splits: expected rows of at least one, such as {{'train': 1000}}")
-    total = integer("n", sum(recipe.splits.values()) if n is None else n, least=1, most=MAX_ROWS)
-    root = integer("seed", recipe.seed if seed is None else seed, least=0, most=MAX_SEED)
-    return total, root, None if shard_size is None else integer("shard_size", shard_size, least=1)
+        raise UsageError(
+            f"{recipe.name} has no splits: expected rows of at least one, such as {{'train': 1000}}"
+        )
+    total = integer(
+        "n", sum(recipe.splits.values()) if n is None else n, least=1, most=MAX_ROWS
+    )
+    root = integer(
+        "seed", recipe.seed if seed is None else seed, least=0, most=MAX_SEED
+    )
+    return (
+        total,
+        root,
+        None if shard_size is None else integer("shard_size", shard_size, least=1),
+    )
 
 
-def _solved_tasks(prepared: PreparedPipeline, recipe: DatasetRecipe, seed: int, n: int | None) -> int:
+def _solved_tasks(
+    prepared: PreparedPipeline, recipe: DatasetRecipe, seed: int, n: int | None
+) -> int:
     """Return the number of rows of a dataset of listed tasks, at most one per solved task.
 
-    Raise UsageError if more rows are requested, no task is solved, or the recipe has several splits.
+    Raise UsageError if more rows are requested, no task is solved, or the recipe has
+    several splits.
     """
     if len(recipe.splits) > 1:
         splits = ", ".join(recipe.splits)
-        raise UsageError(f"{recipe.name} lists its tasks: they would be the same in its splits {splits}, expected one")
-    tasks, requested = prepared.complete_listed_tasks(seed), sum(recipe.splits.values()) if n is None else n
+        raise UsageError(
+            f"{recipe.name} lists its tasks: they would be the same in its splits {splits}, expected one"
+        )
+    tasks, requested = (
+        prepared.complete_listed_tasks(seed),
+        sum(recipe.splits.values()) if n is None else n,
+    )
     rows = len(tasks.alive)
     if not rows or (n is not None and n > rows):
-        counts = zip(tasks.reasons, np.bincount(tasks.outcome, minlength=1 + len(tasks.reasons))[1:], strict=True)
-        why = ", ".join(f"{count} {reason}" for reason, count in counts if count) or "it lists no more"
-        raise UsageError(f"{recipe.name} has {rows} rows, of {prepared.tasks} tasks ({why}): got n = {requested}")
+        counts = zip(
+            tasks.reasons,
+            np.bincount(tasks.outcome, minlength=1 + len(tasks.reasons))[1:],
+            strict=True,
+        )
+        why = (
+            ", ".join(f"{count} {reason}" for reason, count in counts if count)
+            or "it lists no more"
+        )
+        raise UsageError(
+            f"{recipe.name} has {rows} rows, of {prepared.tasks} tasks ({why}): got n = {requested}"
+        )
     return min(rows, requested)
 
 
@@ -121,7 +169,13 @@ def _robot_record(prepared: PreparedPipeline) -> dict[str, Any]:
     robot = prepared.context.robot
     limits = {
         name: [float(x) for x in getattr(robot, name)]
-        for name in ("position_lower", "position_upper", "velocity_limit", "acceleration_limit", "torque_limit")
+        for name in (
+            "position_lower",
+            "position_upper",
+            "velocity_limit",
+            "acceleration_limit",
+            "torque_limit",
+        )
     }
     return {
         "name": robot.urdf.stem,

@@ -23,12 +23,24 @@ from cnpgen.pipelines.resting_states import RestingStates
 from cnpgen.plans.format import GOAL_OPTION
 from cnpgen.plans.join import concatenate
 from cnpgen.plans.plans import Plans
-from cnpgen.plans.scene_plans import capacity_of, goal_states, joint_order, scene_plans, with_wider_capacity
+from cnpgen.plans.scene_plans import (
+    capacity_of,
+    goal_states,
+    joint_order,
+    scene_plans,
+    with_wider_capacity,
+)
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.obstacles import Capacity
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem, open_problem
-from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError, SceneProblem, check_scenes, checked_scene
+from cnpgen.problems.scenes.scene_problem import (
+    GoalPose,
+    SceneError,
+    SceneProblem,
+    check_scenes,
+    checked_scene,
+)
 from cnpgen.refine.goal_options import Progress
 from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
 from cnpgen.refine.proof.explain import Explanation, Feasibility, explain_failure
@@ -51,11 +63,9 @@ POSE_EXPLANATION = f"{POSE_SEEDS} searches from random joint positions found non
 class SolvedScenes:
     """Plans for the problems of N scenes.
 
-    Attributes:
-        scenes: The scenes.
-        plans: The plans in the same order, all of one problem; ``obstacle_poses`` has the obstacles of each.
-        results: Best attempt at every plan with its verdict.
-        times: Times of the run.
+    Attributes: scenes: The scenes. plans: The plans in the same order, all of one
+        problem; ``obstacle_poses`` has the obstacles of each. results: Best attempt at
+        every plan with its verdict. times: Times of the run.
     """
 
     scenes: tuple[SceneProblem, ...]
@@ -72,28 +82,44 @@ class SolvedScenes:
         return np.array([result.valid for result in self.results], bool)
 
     def summary(self) -> dict[str, Any]:
-        """Return a summary for JSON; unsolved scenes have a name, a reason and an explanation."""
+        """Return a summary for JSON.
+
+        Unsolved scenes have a name, a reason and an explanation.
+        """
         facts = Refinement(self.plans, self.plans, self.results, self.times).summary()
         for failure in facts["not_valid"]:
-            scene, explanation = self.scenes[failure["plan"]], Explanation(Feasibility.UNKNOWN, POSE_EXPLANATION)
+            scene, explanation = (
+                self.scenes[failure["plan"]],
+                Explanation(Feasibility.UNKNOWN, POSE_EXPLANATION),
+            )
             if failure["reason"] != POSE_REASON:
                 explanation = self._explain(failure["plan"])
             failure |= {"scene": scene.name, "file": scene.source}
-            failure |= {"finding": str(explanation.kind), "explanation": explanation.text}
+            failure |= {
+                "finding": str(explanation.kind),
+                "explanation": explanation.text,
+            }
         return facts
 
     def _explain(self, index: int) -> Explanation:
-        """Explain why a scene is not solved; obstacles have the names of the scene, not those of the plans' problem."""
+        """Explain why a scene is not solved.
+
+        Obstacles have the names of the scene, not those of the plans' problem.
+        """
         problem, robot = open_problem(self.plans.problem)
         obstacles = self.scenes[index].obstacles
         names = {obstacle.name for obstacle in obstacles}
         own = (
-            replace(each, name=f"{each.name} of the problem") if each.name in names else each
+            replace(each, name=f"{each.name} of the problem")
+            if each.name in names
+            else each
             for each in problem.own_obstacles
         )
         problem = replace(problem, obstacle=(*own, *obstacles))
         scene = Scene(problem.obstacle, place_obstacles(problem.obstacle)[None])
-        return explain_failure(problem, robot, self.plans.boundary[index : index + 1], scene)
+        return explain_failure(
+            problem, robot, self.plans.boundary[index : index + 1], scene
+        )
 
 
 @checked_arguments
@@ -112,18 +138,20 @@ def solve_scenes(
 ) -> SolvedScenes:
     """Plan the problems of scenes, from rest to rest, with the limits and constraints of a robot's problem.
 
-    Scenes with equal numbers of obstacles of each kind, rounded up to multiples of four, share compiled kernels. Of
-    several goal states, the ``MAX_GOAL_STATES`` collision-free ones with the fastest straight lines are tried, and the
-    result is the best valid motion to any of them. A goal pose without goal states gets some by inverse kinematics; a
-    scene for which it finds none is not solved, with the reason "no inverse kinematics of the goal".
+    Scenes with equal numbers of obstacles of each kind, rounded up to multiples of
+    four, share compiled kernels. Of several goal states, the ``MAX_GOAL_STATES``
+    collision-free ones with the fastest straight lines are tried, and the result is the
+    best valid motion to any of them. A goal pose without goal states gets some by
+    inverse kinematics; a scene for which it finds none is not solved, with the reason
+    "no inverse kinematics of the goal".
 
-    ``problem`` is the robot's problem, such as "panda"; obstacles of the scenes are added to its own. The other
-    arguments are those of ``refine_plans``. The names of the journals are that of ``journal`` with a number.
+    ``problem`` is the robot's problem, such as "panda"; obstacles of the scenes are
+    added to its own. The other arguments are those of ``refine_plans``. The names of
+    the journals are that of ``journal`` with a number.
 
-    Raises:
-        SceneError: A scene does not fit the robot.
-        UsageError: There are no scenes, or the problem has no constraint ``robot-clearance``.
-        MachineError: See ``refine_plans``.
+    Raises: SceneError: A scene does not fit the robot. UsageError: There are no scenes,
+        or the problem has no constraint ``robot-clearance``. MachineError: See
+        ``refine_plans``.
     """
     check_scenes(scenes)
     loaded, scenes = as_problem(problem), [checked_scene(scene) for scene in scenes]
@@ -142,7 +170,9 @@ def solve_scenes(
         file = None if journal is None else Path(f"{journal}.{len(journals)}")
         journals += [] if file is None else [file]
         refinement = solve_plans(
-            _plans_of(loaded, scenes, [(index, goals[index]) for index in indices], own),
+            _plans_of(
+                loaded, scenes, [(index, goals[index]) for index in indices], own
+            ),
             options=options,
             workers=workers,
             engine=engine,
@@ -153,12 +183,21 @@ def solve_scenes(
             progress=report,
         )
         times += refinement.times
-        columns = {name: values for name, values in refinement.plans.columns.items() if name != GOAL_OPTION}
+        columns = {
+            name: values
+            for name, values in refinement.plans.columns.items()
+            if name != GOAL_OPTION
+        }
         chosen = replace(refinement.plans, columns=columns)
         wide = with_wider_capacity(chosen, loaded, own, capacity)
-        for row, (index, attempt) in enumerate(zip(indices, refinement.results, strict=True)):
+        for row, (index, attempt) in enumerate(
+            zip(indices, refinement.results, strict=True)
+        ):
             without_goal = np.isnan(goals[index]).all()
-            found[index] = wide[row], replace(attempt, reason=POSE_REASON) if without_goal else attempt
+            found[index] = (
+                wide[row],
+                replace(attempt, reason=POSE_REASON) if without_goal else attempt,
+            )
     every, results = zip(*(found[index] for index in range(len(scenes))), strict=True)
     solved = SolvedScenes(tuple(scenes), concatenate(every), results, times)
     for file in journals:
@@ -175,13 +214,30 @@ def _groups(scenes: Sequence[SceneProblem]) -> list[tuple[dict[str, int], list[i
 
 
 def _plans_of(
-    problem: Problem, scenes: Sequence[SceneProblem], goals: Sequence[tuple[int, Array]], capacity: Capacity
+    problem: Problem,
+    scenes: Sequence[SceneProblem],
+    goals: Sequence[tuple[int, Array]],
+    capacity: Capacity,
 ) -> Plans:
     """Return boundary problems of scenes of one capacity, by index, one for each goal state, shape (G, n) each."""
-    options = [(index, option, goal) for index, states in goals for option, goal in enumerate(states)]
+    options = [
+        (index, option, goal)
+        for index, states in goals
+        for option, goal in enumerate(states)
+    ]
     rows, numbers, states = zip(*options, strict=True)
-    plans = scene_plans(problem, [scenes[i] for i in rows], goals=states, capacity=capacity, sample_id=rows)
-    return replace(plans, columns={**plans.columns, GOAL_OPTION: np.array(numbers, float)}) if any(numbers) else plans
+    plans = scene_plans(
+        problem,
+        [scenes[i] for i in rows],
+        goals=states,
+        capacity=capacity,
+        sample_id=rows,
+    )
+    return (
+        replace(plans, columns={**plans.columns, GOAL_OPTION: np.array(numbers, float)})
+        if any(numbers)
+        else plans
+    )
 
 
 def _goals(problem: Problem, robot: Robot, scene: SceneProblem, index: int) -> Array:
@@ -191,15 +247,21 @@ def _goals(problem: Problem, robot: Robot, scene: SceneProblem, index: int) -> A
     states = goal_states(scene, robot)
     if len(states) == 1 or robot.shape is None:
         return states[:MAX_GOAL_STATES]
-    valid = states[RestingStates(problem, robot, scene.obstacles).are_ends(states.T.copy())]
-    return nearest_states(valid, _start(scene, robot), robot) if len(valid) else states[:1]
+    valid = states[
+        RestingStates(problem, robot, scene.obstacles).are_ends(states.T.copy())
+    ]
+    return (
+        nearest_states(valid, _start(scene, robot), robot) if len(valid) else states[:1]
+    )
 
 
 def _start(scene: SceneProblem, robot: Robot) -> Array:
     return np.asarray(joint_order(scene, robot, scene.start_q[None], "start")[0])
 
 
-def _states_of_pose(problem: Problem, robot: Robot, scene: SceneProblem, index: int) -> Array:
+def _states_of_pose(
+    problem: Problem, robot: Robot, scene: SceneProblem, index: int
+) -> Array:
     """Return collision-free joint positions with the goal pose of a scene, shape (G, n), G > 0; nan without any."""
     pose = scene.goal_pose
     if pose is None:
@@ -209,10 +271,14 @@ def _states_of_pose(problem: Problem, robot: Robot, scene: SceneProblem, index: 
     conditions = EndConditions(problem, robot, scene.obstacles)
     random = np.random.default_rng([index, POSE_SEEDS])
     start = _start(scene, robot)
-    goals, found = states_of_pose(kinematics, states, conditions, pose, start=start, random=random)
+    goals, found = states_of_pose(
+        kinematics, states, conditions, pose, start=start, random=random
+    )
     if not len(found):
         return np.full((1, robot.n), np.nan)
-    return goals if len(goals) else found[:1]  # in collision: the explanation of the unsolved scene names it
+    return (
+        goals if len(goals) else found[:1]
+    )  # in collision: the explanation of the unsolved scene names it
 
 
 def _frame_of(robot: Robot, scene: SceneProblem, pose: GoalPose) -> int | None:
@@ -220,5 +286,7 @@ def _frame_of(robot: Robot, scene: SceneProblem, pose: GoalPose) -> int | None:
     if not pose.frame:
         return None
     if not robot.model.existFrame(pose.frame):
-        raise SceneError(f"{scene.place}: the robot has no frame {pose.frame!r}, which its goal pose names")
+        raise SceneError(
+            f"{scene.place}: the robot has no frame {pose.frame!r}, which its goal pose names"
+        )
     return int(robot.model.getFrameId(pose.frame))

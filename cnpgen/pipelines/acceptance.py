@@ -1,8 +1,10 @@
 """Acceptance: the last check of every pipeline evaluates the problem's constraints on the values as stored.
 
-The check is independent of the stages: it makes no assumption about their convergence, order or tolerances. States that
-conservative conditions do not accept go to a narrow phase: exact checks with Pinocchio and Coal. A capsule contains its
-link: if the capsule has clearance, so has the link. Otherwise the convex parts of the link are checked.
+The check is independent of the stages: it makes no assumption about their convergence,
+order or tolerances. States that conservative conditions do not accept go to a narrow
+phase: exact checks with Pinocchio and Coal. A capsule contains its
+link: if the capsule has clearance, so has the link. Otherwise the convex parts of the
+    link are checked.
 """
 
 from collections.abc import Callable, Collection
@@ -18,7 +20,12 @@ from cnpgen.pipelines.stages.scene_clearance import SceneClearance
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, StageFunction
 from cnpgen.problems.conditions import symbolic_needs
 from cnpgen.problems.constraints.clearance import RobotClearance
-from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, Condition, Constraint, End
+from cnpgen.problems.constraints.constraint import (
+    BOUNDARY_TOLERANCES,
+    Condition,
+    Constraint,
+    End,
+)
 from cnpgen.problems.constraints.link_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
@@ -32,18 +39,28 @@ States = tuple[Array, Array, Array]
 Decide = Callable[[States, Array, Mask, CandidateBatch | None], Mask]
 """Function of the narrow phase, see ``narrow_phase_of``."""
 
-MIN_SCENE_MARGIN_M = 1e-6  # of distances in compiled code, above which Coal does not measure them again
-ZERO_VELOCITY_ROUNDING_M_S = 1e-14  # rounding error of a velocity that is zero in exact arithmetic
+MIN_SCENE_MARGIN_M = (
+    1e-6  # of distances in compiled code, above which Coal does not measure them again
+)
+ZERO_VELOCITY_ROUNDING_M_S = (
+    1e-14  # rounding error of a velocity that is zero in exact arithmetic
+)
 
 
-def acceptance(context: Context, written: set[str], *, given: Collection[End] = ()) -> StageFunction:
+def acceptance(
+    context: Context, written: set[str], *, given: Collection[End] = ()
+) -> StageFunction:
     """Prepare the check of the columns that the stages write, which rejects under the first violated constraint.
 
-    Accelerations and torques of the goal are checked if ``goal_ddq`` is among them. The tolerances of motions apply to
-    ``given`` ends, whose state is from the user, for example a measurement; to others those of boundary states.
+    Accelerations and torques of the goal are checked if ``goal_ddq`` is among them. The
+    tolerances of motions apply to ``given`` ends, whose state is from the user, for
+    example a measurement; to others those of boundary states.
     """
     ends: tuple[End, ...] = ("start", "goal")
-    hit = {"start": (), "goal": ("hit_angle", "hit_speed") if "hit_angle" in written else ()}
+    hit = {
+        "start": (),
+        "goal": ("hit_angle", "hit_speed") if "hit_angle" in written else (),
+    }
     kernels = {
         end: context.kernels.load_by_structure(
             boundary_unmet,
@@ -55,11 +72,18 @@ def acceptance(context: Context, written: set[str], *, given: Collection[End] = 
         )
         for end in ends
     }
-    has_scenes = bool(scene_capacity(context.problem.obstacle)) and context.robot.shape is not None
+    has_scenes = (
+        bool(scene_capacity(context.problem.obstacle))
+        and context.robot.shape is not None
+    )
     narrow_phase = narrow_phase_of_scenes if has_scenes else narrow_phase_of
-    decisions = {end: narrow_phase(context, end, exact=end not in given) for end in ends}
+    decisions = {
+        end: narrow_phase(context, end, exact=end not in given) for end in ends
+    }
     n, constraints = context.robot.n, len(context.problem.constraint)
-    reasons = [each.boundary_reason or each.reason for each in context.problem.constraint]
+    reasons = [
+        each.boundary_reason or each.reason for each in context.problem.constraint
+    ]
     reasons.append("tip not at its position")
     reasons += ["hit not along its direction"] if hit["goal"] else []
 
@@ -72,11 +96,16 @@ def acceptance(context: Context, written: set[str], *, given: Collection[End] = 
                 acceleration = np.zeros((n, len(candidates.alive)))
             state = candidates[f"{end}_q"], candidates[f"{end}_dq"], acceleration
             (count,) = kernels[end](
-                *state, obstacle_poses, candidates[f"{end}_xyz"], *(candidates[name] for name in hit[end])
+                *state,
+                obstacle_poses,
+                candidates[f"{end}_xyz"],
+                *(candidates[name] for name in hit[end]),
             )
             if decide := decisions[end]:
                 remaining = count[: constraints + 1].max(axis=0) <= 0
-                count[:constraints] += decide(state, obstacle_poses, remaining, candidates)
+                count[:constraints] += decide(
+                    state, obstacle_poses, remaining, candidates
+                )
             counts.append(count)
         start, goal = counts
         np.maximum(start, goal[: len(start)], out=goal[: len(start)])
@@ -86,39 +115,65 @@ def acceptance(context: Context, written: set[str], *, given: Collection[End] = 
 
 
 def boundary_unmet(
-    robot: Robot, problem: Problem, *, end: End, needs: int, dtype: str, exact: bool = True, hitting: bool = False
+    robot: Robot,
+    problem: Problem,
+    *,
+    end: End,
+    needs: int,
+    dtype: str,
+    exact: bool = True,
+    hitting: bool = False,
 ) -> Any:
     """Build ``(q, dq, ddq, obstacle_poses, position) -> unmet``, positive for violations above tolerance and for nan.
 
-    For a hit it is ``(q, dq, ddq, obstacle_poses, position, angle, speed) -> unmet``: the tip velocity must be
-    horizontal, along the angle, at the speed. Conditions on derivatives of q higher than ``needs`` are omitted. Unless
-    the state is ``exact``, the tolerances of motions apply, and conditions for boundary states only are omitted. The
-    narrow phase checks conservative conditions. There is a row per constraint, for the tip position, and for a hit.
+    For a hit it is ``(q, dq, ddq, obstacle_poses, position, angle, speed) -> unmet``:
+    the tip velocity must be horizontal, along the angle, at the speed. Conditions on
+    derivatives of q higher than ``needs`` are omitted. Unless the state is ``exact``,
+    the tolerances of motions apply, and conditions for boundary states only are
+    omitted. The narrow phase checks conservative conditions. There is a row per
+    constraint, for the tip position, and for a hit.
     """
     import casadi as ca
 
-    columns, state = SymbolicState.of_symbols(robot, problem.obstacle, problem.object_size, problem.scene_width)
+    columns, state = SymbolicState.of_symbols(
+        robot, problem.obstacle, problem.object_size, problem.scene_width
+    )
     p_sx, p = symbols("p", 3)
     rows: list[Scalar] = []
     for constraint in problem.constraint:
         count: Scalar = ca.SX(0)
-        along = {condition.name: constraint.allowed(condition) for condition in constraint.symbolic(state)}
+        along = {
+            condition.name: constraint.allowed(condition)
+            for condition in constraint.symbolic(state)
+        }
         for condition in constraint.symbolic_at(state, end):
             if condition.sufficient:
                 continue
-            if symbolic_needs(condition, *columns[1:3]) <= needs and (exact or condition.name in along):
+            if symbolic_needs(condition, *columns[1:3]) <= needs and (
+                exact or condition.name in along
+            ):
                 tolerance = condition.tolerance(dtype)
-                tolerance = tolerance if exact else np.maximum(along[condition.name], tolerance)
+                tolerance = (
+                    tolerance if exact else np.maximum(along[condition.name], tolerance)
+                )
                 count = count + unmet(condition, tolerance)
         rows.append(count)
     miss = subtract(p, state.kinematics.tip)
-    rows.append(ca.logic_not(ca.sqrt(dot(miss, miss)) <= BOUNDARY_TOLERANCES[dtype]["position"]))
+    rows.append(
+        ca.logic_not(ca.sqrt(dot(miss, miss)) <= BOUNDARY_TOLERANCES[dtype]["position"])
+    )
     hit = [ca.SX.sym("angle"), ca.SX.sym("speed")] if hitting else []
-    rows += [_direction_unmet(state.along_table(state.tip_velocity), *hit, dtype=dtype)] if hit else []
+    rows += (
+        [_direction_unmet(state.along_table(state.tip_velocity), *hit, dtype=dtype)]
+        if hit
+        else []
+    )
     return ca.Function(f"boundary_{end}", [*columns, p_sx, *hit], [ca.vertcat(*rows)])
 
 
-def _direction_unmet(velocity: Vec, angle: Scalar, speed: Scalar, *, dtype: str) -> Scalar:
+def _direction_unmet(
+    velocity: Vec, angle: Scalar, speed: Scalar, *, dtype: str
+) -> Scalar:
     """Build a flag that is 1 unless the tip velocity on the table is along the angle, at the speed."""
     import casadi as ca
 
@@ -127,7 +182,8 @@ def _direction_unmet(velocity: Vec, angle: Scalar, speed: Scalar, *, dtype: str)
     along = cosine * velocity[0] + sine * velocity[1] - speed
     exact = BOUNDARY_TOLERANCES[dtype]
     met = ca.logic_and(
-        across <= exact["direction"] * speed + ZERO_VELOCITY_ROUNDING_M_S, ca.fabs(along) <= exact["velocity"]
+        across <= exact["direction"] * speed + ZERO_VELOCITY_ROUNDING_M_S,
+        ca.fabs(along) <= exact["velocity"],
     )
     return ca.logic_not(met)
 
@@ -135,21 +191,36 @@ def _direction_unmet(velocity: Vec, angle: Scalar, speed: Scalar, *, dtype: str)
 def narrow_phase_of(context: Context, end: End, *, exact: bool = True) -> Decide | None:
     """Prepare the narrow phase of one end; return None if the problem never needs it.
 
-    The tolerances of boundary states apply if it is ``exact``, otherwise those of motions.
+    The tolerances of boundary states apply if it is ``exact``, otherwise those of
+    motions.
 
-    Returns:
-        A function of states ``(q, dq, ddq)``, shape (n, N) each, obstacle poses, shape (width, N), a mask of the states
-        to check, shape (N,), and the candidates. It returns a mask of the violated constraints, shape (constraints, N).
+    Returns: A function of states ``(q, dq, ddq)``, shape (n, N) each, obstacle poses,
+        shape (width, N), a mask of the states to check, shape (N,), and the candidates.
+        It returns a mask of the violated constraints, shape (constraints, N).
     """
     problem, robot = context.problem, context.robot
-    if robot.shape is None and robot.held_shape is None and all(obstacle.upright for obstacle in problem.obstacle):
+    if (
+        robot.shape is None
+        and robot.held_shape is None
+        and all(obstacle.upright for obstacle in problem.obstacle)
+    ):
         return None
-    kernel = context.kernels.load_by_structure(narrow_phase, end=end, dtype=context.dtype)
+    kernel = context.kernels.load_by_structure(
+        narrow_phase, end=end, dtype=context.dtype
+    )
     path = PathWorld(robot, problem.obstacle, problem.object_size)
 
-    def decide_states(state: States, obstacle_poses: Array, mask: Mask, _candidates: CandidateBatch | None) -> Mask:
+    def decide_states(
+        state: States,
+        obstacle_poses: Array,
+        mask: Mask,
+        _candidates: CandidateBatch | None,
+    ) -> Mask:
         (unmet_counts,) = kernel(*state, obstacle_poses)
-        remaining, violated = (unmet_counts > 0) & mask, np.zeros(unmet_counts.shape, bool)
+        remaining, violated = (
+            (unmet_counts > 0) & mask,
+            np.zeros(unmet_counts.shape, bool),
+        )
         one_scene = bool(np.all(obstacle_poses == obstacle_poses[:, :1]))
         for row in np.flatnonzero(remaining.any(axis=1)):
             if problem.constraint[row].uses_obstacles and not one_scene:
@@ -158,7 +229,9 @@ def narrow_phase_of(context: Context, end: End, *, exact: bool = True) -> Decide
             tolerance = BOUNDARY_TOLERANCES[context.dtype]["position"]
             if not exact:
                 tolerance = max(tolerance, problem.constraint[row].effective_tolerance)
-            q, dq, ddq = (np.ascontiguousarray(values[:, candidates], float) for values in state)
+            q, dq, ddq = (
+                np.ascontiguousarray(values[:, candidates], float) for values in state
+            )
             path.set_path(q, dq, ddq, obstacle_poses[:, 0])
             met = problem.constraint[row].met(path, tolerance)
             if met is not None:
@@ -172,24 +245,46 @@ def narrow_phase_of(context: Context, end: End, *, exact: bool = True) -> Decide
 def narrow_phase_of_scenes(context: Context, end: End, *, exact: bool = True) -> Decide:
     """Prepare the narrow phase of one end among the obstacles of scenes, see ``narrow_phase_of``.
 
-    Compiled collision checks accept states whose distances are more than ``MIN_SCENE_MARGIN_M`` above the required
-    ones; Coal measures the others.
+    Compiled collision checks accept states whose distances are more than
+    ``MIN_SCENE_MARGIN_M`` above the required ones; Coal measures the others.
     """
     problem, clearance = context.problem, SceneClearance(context)
-    by_distance = np.array([isinstance(each, RobotClearance | SelfClearance) for each in problem.constraint], bool)
+    by_distance = np.array(
+        [
+            isinstance(each, RobotClearance | SelfClearance)
+            for each in problem.constraint
+        ],
+        bool,
+    )
     measure_one_by_one = _one_by_one(context, end, exact=exact)
     obstacles, width = problem.obstacle, problem.scene_width
-    _, symbolic_state = SymbolicState.of_symbols(context.robot, obstacles, problem.object_size, width)
+    _, symbolic_state = SymbolicState.of_symbols(
+        context.robot, obstacles, problem.object_size, width
+    )
     conservative = ~by_distance  # the constraints with conservative conditions
     for row in np.flatnonzero(conservative):
         conditions = problem.constraint[row].symbolic_at(symbolic_state, end)
         conservative[row] = any(condition.sufficient for condition in conditions)
 
-    def decide_states(state: States, obstacle_poses: Array, mask: Mask, candidates: CandidateBatch | None) -> Mask:
-        q, remaining = np.ascontiguousarray(state[0], float), np.zeros((len(by_distance), len(mask)), bool)
+    def decide_states(
+        state: States,
+        obstacle_poses: Array,
+        mask: Mask,
+        candidates: CandidateBatch | None,
+    ) -> Mask:
+        q, remaining = (
+            np.ascontiguousarray(state[0], float),
+            np.zeros((len(by_distance), len(mask)), bool),
+        )
         clear = np.zeros(len(mask), bool)
         if candidates is not None and candidates.scenes is not None:
-            clear = clearance.are_clear(q, candidates.scene, candidates.scenes, MIN_SCENE_MARGIN_M, MIN_SCENE_MARGIN_M)
+            clear = clearance.are_clear(
+                q,
+                candidates.scene,
+                candidates.scenes,
+                MIN_SCENE_MARGIN_M,
+                MIN_SCENE_MARGIN_M,
+            )
         remaining[by_distance] = ~clear & mask
         remaining[conservative] = mask
         return measure_one_by_one(state, obstacle_poses, remaining)
@@ -197,7 +292,9 @@ def narrow_phase_of_scenes(context: Context, end: End, *, exact: bool = True) ->
     return decide_states
 
 
-def _one_by_one(context: Context, end: End, *, exact: bool) -> Callable[[States, Array, Mask], Mask]:
+def _one_by_one(
+    context: Context, end: End, *, exact: bool
+) -> Callable[[States, Array, Mask], Mask]:
     """Return a function that measures chosen constraints of states, one by one, with Pinocchio and Coal."""
     problem = context.problem
     world = World(context.robot, problem.obstacle, problem.object_size)
@@ -205,21 +302,31 @@ def _one_by_one(context: Context, end: End, *, exact: bool) -> Callable[[States,
     def measure(state: States, obstacle_poses: Array, remaining: Mask) -> Mask:
         violated = np.zeros(remaining.shape, bool)
         for candidate in np.flatnonzero(remaining.any(axis=0)):
-            q, dq, ddq = (np.ascontiguousarray(values[:, candidate]) for values in state)
+            q, dq, ddq = (
+                np.ascontiguousarray(values[:, candidate]) for values in state
+            )
             world.set_state(q, dq, ddq, obstacle_poses[:, candidate])
             for row in np.flatnonzero(remaining[:, candidate]):
-                violated[row, candidate] = _violates(problem.constraint[row], world, end, context.dtype, exact=exact)
+                violated[row, candidate] = _violates(
+                    problem.constraint[row], world, end, context.dtype, exact=exact
+                )
         return violated
 
     return measure
 
 
-def _violates(constraint: Constraint, world: World, end: End, dtype: str, *, exact: bool) -> bool:
+def _violates(
+    constraint: Constraint, world: World, end: End, dtype: str, *, exact: bool
+) -> bool:
     """Return whether the measured form of a constraint is violated by more than the tolerance of a boundary state."""
     for condition in constraint.measured_at(world, end):
         g, tolerance = np.array(condition.g, float), condition.tolerance(dtype)
-        tolerance = tolerance if exact else np.maximum(tolerance, constraint.allowed(condition))
-        if not ((g >= condition.lower - tolerance) & (g <= condition.upper + tolerance)).all():
+        tolerance = (
+            tolerance if exact else np.maximum(tolerance, constraint.allowed(condition))
+        )
+        if not (
+            (g >= condition.lower - tolerance) & (g <= condition.upper + tolerance)
+        ).all():
             return True
     return False
 
@@ -228,11 +335,25 @@ def narrow_phase(robot: Robot, problem: Problem, *, end: End, dtype: str) -> Any
     """Build ``(q, dq, ddq, obstacle_poses) -> unmet``: number of unmet conservative values of every constraint."""
     import casadi as ca
 
-    columns, state = SymbolicState.of_symbols(robot, problem.obstacle, problem.object_size, problem.scene_width)
+    columns, state = SymbolicState.of_symbols(
+        robot, problem.obstacle, problem.object_size, problem.scene_width
+    )
     rows: list[Scalar] = []
     for constraint in problem.constraint:
-        conditions = [condition for condition in constraint.symbolic_at(state, end) if condition.sufficient]
-        rows.append(sum((unmet(condition, condition.tolerance(dtype)) for condition in conditions), ca.SX(0)))
+        conditions = [
+            condition
+            for condition in constraint.symbolic_at(state, end)
+            if condition.sufficient
+        ]
+        rows.append(
+            sum(
+                (
+                    unmet(condition, condition.tolerance(dtype))
+                    for condition in conditions
+                ),
+                ca.SX(0),
+            )
+        )
     return ca.Function(f"narrow_phase_{end}", columns, [ca.vertcat(*rows)])
 
 
@@ -241,7 +362,9 @@ def unmet(condition: Condition, tolerance: Array) -> Scalar:
     import casadi as ca
 
     count: Scalar = ca.SX(0)
-    for value, low, high, allowed in zip(condition.g, condition.lower, condition.upper, tolerance, strict=True):
+    for value, low, high, allowed in zip(
+        condition.g, condition.lower, condition.upper, tolerance, strict=True
+    ):
         if np.isfinite(low):
             count = count + ca.logic_not(value >= float(low - allowed))
         if np.isfinite(high):

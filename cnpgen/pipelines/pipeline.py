@@ -22,13 +22,23 @@ from cnpgen.store.field import Field
 from cnpgen.store.scene_table import SCENE_ID
 
 MAX_STAGES = 100
-REQUIRED_COLUMNS = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "start_xyz", "goal_xyz")  # of every sample
-# Stored order of the fields of the shipped stages; other fields follow in the order of their stages.
+REQUIRED_COLUMNS = (
+    "start_q",
+    "start_dq",
+    "start_ddq",
+    "goal_q",
+    "goal_dq",
+    "start_xyz",
+    "goal_xyz",
+)  # of every sample
+# Stored order of the fields of the shipped stages; other fields follow in the order of
+# their stages.
 FIELD_ORDER = (
     "start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "goal_ddq", "start_xyz", "goal_xyz",
     "parameters", "hit_angle", "hit_speed", "hit_speed_max",
 )  # fmt: skip
-# Attributes that every stage must declare equally for a field; a later stage may change the role and the limits.
+# Attributes that every stage must declare equally for a field; a later stage may change
+# the role and the limits.
 _CONFIG = ("unit", "width", "dtype", "names", "frame")
 
 
@@ -36,10 +46,13 @@ _CONFIG = ("unit", "width", "dtype", "names", "frame")
 class Pipeline:
     """Stages that sample the boundary conditions of a problem."""
 
-    name: str = field("name of the pipeline: lower-case letters, digits and hyphens", pattern=NAME)
+    name: str = field(
+        "name of the pipeline: lower-case letters, digits and hyphens", pattern=NAME
+    )
     title: str = field("title in one line", default="")
     problem: Problem = field(
-        "name of a shipped problem, or path of a problem file relative to this one", form="a name or a path"
+        "name of a shipped problem, or path of a problem file relative to this one",
+        form="a name or a path",
     )
     stage: tuple[Stage, ...] = field("stages, in order", form="[[stage]] tables")
     path: Path = Path()
@@ -57,26 +70,35 @@ def listed_tasks(pipeline: Pipeline) -> int | None:
     """
     listed = [stage.tasks for stage in pipeline.stage if stage.tasks is not None]
     if len(listed) > 1:
-        raise RecipeError([f"{pipeline.path}: {len(listed)} stages list positions, expected one at most"])
+        raise RecipeError(
+            [
+                f"{pipeline.path}: {len(listed)} stages list positions, expected one at most"
+            ]
+        )
     return listed[0] if listed else None
 
 
 @checked_arguments
-def load_pipeline(name_or_path: str | Path, *, relative_to: Path | None = None) -> Pipeline:
+def load_pipeline(
+    name_or_path: str | Path, *, relative_to: Path | None = None
+) -> Pipeline:
     """Load a pipeline and its problem.
 
     Args:
         name_or_path: Name of a shipped pipeline, or path of a pipeline file.
         relative_to: Base folder of a relative path; by default the working directory.
 
-    Raises:
-        RecipeError: The pipeline or problem file has errors; the error lists all of them.
+    Raises: RecipeError: The pipeline or problem file has errors; the error lists all of
+        them.
     """
     return load_recipe(("pipeline",), name_or_path, relative_to, read_pipeline)
 
 
 def read_pipeline(path: Path, errors: list[str]) -> Pipeline | None:
-    """Read a pipeline file and append its errors to ``errors``; return None if it is unusable."""
+    """Read a pipeline file and append its errors to ``errors``.
+
+    Return None if it is unusable.
+    """
     table = read_table(path, ("pipeline",), errors)
     if table is None:
         return None
@@ -88,22 +110,40 @@ def read_pipeline(path: Path, errors: list[str]) -> Pipeline | None:
     pipeline = parse(Pipeline, table, where=where, errors=errors, readers=readers)
     if pipeline is None:
         return None
-    return replace(pipeline, path=path.absolute(), problem=_with_places(pipeline, where, errors))
+    return replace(
+        pipeline, path=path.absolute(), problem=_with_places(pipeline, where, errors)
+    )
 
 
-def _with_places(pipeline: Pipeline, where: RecipeLocation, errors: list[str]) -> Problem:
+def _with_places(
+    pipeline: Pipeline, where: RecipeLocation, errors: list[str]
+) -> Problem:
     """Return the problem with places for the obstacles of scenes that a stage draws."""
-    drawn = [(index, stage) for index, stage in enumerate(pipeline.stage) if isinstance(stage, DrawScenes)]
+    drawn = [
+        (index, stage)
+        for index, stage in enumerate(pipeline.stage)
+        if isinstance(stage, DrawScenes)
+    ]
     if len(drawn) > 1:
-        errors.append((where / "stage" / drawn[1][0]).message("a second stage draws scenes, expected one"))
+        errors.append(
+            (where / "stage" / drawn[1][0]).message(
+                "a second stage draws scenes, expected one"
+            )
+        )
     try:
-        return with_capacity(pipeline.problem, drawn[0][1].capacity) if drawn else pipeline.problem
+        return (
+            with_capacity(pipeline.problem, drawn[0][1].capacity)
+            if drawn
+            else pipeline.problem
+        )
     except UsageError as error:
         errors.append((where / "problem").message(str(error)))
         return pipeline.problem
 
 
-def restore_pipeline(name: str, stages: Sequence[Mapping[str, Any]], problem: Problem) -> Pipeline:
+def restore_pipeline(
+    name: str, stages: Sequence[Mapping[str, Any]], problem: Problem
+) -> Pipeline:
     """Rebuild a pipeline from the resolved stages of a dataset or model specification."""
     tables = [dict(stage) for stage in stages]
     if missing := missing_kinds(registry.STAGES, list(enumerate(tables))):
@@ -117,7 +157,9 @@ def restore_pipeline(name: str, stages: Sequence[Mapping[str, Any]], problem: Pr
         ]
     if errors:
         raise RecipeError(errors)
-    return Pipeline(name=name, problem=problem, stage=tuple(read_stages), path=Path(name))
+    return Pipeline(
+        name=name, problem=problem, stage=tuple(read_stages), path=Path(name)
+    )
 
 
 @dataclass(frozen=True)
@@ -142,19 +184,27 @@ class PipelineStep:
 def steps_of(pipeline: Pipeline) -> list[PipelineStep]:
     """List the stages of a pipeline with their positions and names."""
     return [
-        PipelineStep(pipeline.path, number, registry.name_of(registry.STAGES, type(stage)), stage)
+        PipelineStep(
+            pipeline.path, number, registry.name_of(registry.STAGES, type(stage)), stage
+        )
         for number, stage in enumerate(pipeline.stage, start=1)
     ]
 
 
 def stored_fields(steps: Sequence[PipelineStep], context: Context) -> tuple[Field, ...]:
-    """Merge the outputs of the stages, in stored order; raise RecipeError if two stages declare a field differently."""
+    """Merge the outputs of the stages, in stored order.
+
+    Raise RecipeError if two stages declare a field differently.
+    """
     fields: dict[str, Field] = {}
     first: dict[str, PipelineStep] = {}
     errors = []
     for step in steps:
         for item in step.stage.outputs(context):
-            before, origin = fields.setdefault(item.name, item), first.setdefault(item.name, step)
+            before, origin = (
+                fields.setdefault(item.name, item),
+                first.setdefault(item.name, step),
+            )
             if _definition(item) != _definition(before):
                 text = f"declares {item.name} as {_declared(item, before)}, but stage {origin.number} ({origin.kind})"
                 text += f" before it as {_declared(before, item)}: a stage may not redefine a field"
@@ -163,16 +213,36 @@ def stored_fields(steps: Sequence[PipelineStep], context: Context) -> tuple[Fiel
     if errors:
         raise RecipeError(errors)
     known = [fields.pop(name) for name in FIELD_ORDER if name in fields]
-    return (*known, *fields.values(), *bookkeeping_fields(scenes=any(step.stage.draws_scenes for step in steps)))
+    return (
+        *known,
+        *fields.values(),
+        *bookkeeping_fields(scenes=any(step.stage.draws_scenes for step in steps)),
+    )
 
 
 def bookkeeping_fields(*, scenes: bool = False) -> tuple[Field, ...]:
     """Return the bookkeeping fields of every dataset, and with ``scenes`` that of the scene of a row."""
     text = "sample_id of the first row in the same scene"
     return (
-        *((Field(SCENE_ID, "1", text, role="context", dtype="int64"),) if scenes else ()),
-        Field("attempts", "1", "candidates per accepted row, including this row", role="diagnostic", dtype="int64"),
-        Field("sample_id", "1", "index of the row in its split", role="diagnostic", dtype="int64"),
+        *(
+            (Field(SCENE_ID, "1", text, role="context", dtype="int64"),)
+            if scenes
+            else ()
+        ),
+        Field(
+            "attempts",
+            "1",
+            "candidates per accepted row, including this row",
+            role="diagnostic",
+            dtype="int64",
+        ),
+        Field(
+            "sample_id",
+            "1",
+            "index of the row in its split",
+            role="diagnostic",
+            dtype="int64",
+        ),
     )
 
 
@@ -183,19 +253,28 @@ def _definition(field: Field) -> dict[str, object]:
 def _declared(field: Field, other: Field) -> str:
     """Return the attributes of a field that differ from another declaration of it, as text."""
     ours, theirs = _definition(field), _definition(other)
-    return ", ".join(f"{key} {value!r}" for key, value in ours.items() if value != theirs[key])
+    return ", ".join(
+        f"{key} {value!r}" for key, value in ours.items() if value != theirs[key]
+    )
 
 
-def written_columns(path: Path, steps: Sequence[PipelineStep], context: Context) -> set[str]:
+def written_columns(
+    path: Path, steps: Sequence[PipelineStep], context: Context
+) -> set[str]:
     """Return the columns that the stages of a pipeline write.
 
-    Raise RecipeError if no earlier stage writes an input of a stage, or no stage writes a required column.
+    Raise RecipeError if no earlier stage writes an input of a stage, or no stage writes
+    a required column.
     """
     written: set[str] = set()
     errors = []
     for step in steps:
         if missing := [name for name in step.stage.inputs if name not in written]:
-            errors.append(step.error(f"needs {', '.join(missing)}, which no stage before it writes"))
+            errors.append(
+                step.error(
+                    f"needs {', '.join(missing)}, which no stage before it writes"
+                )
+            )
         written.update(step.stage.writes(context))
     errors += [
         f"{path}: no stage writes {name}, which every sample must have"
@@ -210,7 +289,10 @@ def written_columns(path: Path, steps: Sequence[PipelineStep], context: Context)
 def prepare_steps(
     steps: Sequence[PipelineStep], prepare: Callable[[Stage], StageFunction]
 ) -> list[tuple[str, StageFunction]]:
-    """Prepare and label every stage; raise RecipeError with all errors, each with file and stage."""
+    """Prepare and label every stage.
+
+    Raise RecipeError with all errors, each with file and stage.
+    """
     functions, errors = [], []
     for step in steps:
         try:

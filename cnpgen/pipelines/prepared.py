@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.kernels.library import Backend
 from cnpgen.pipelines.acceptance import acceptance
-from cnpgen.pipelines.pipeline import Pipeline, listed_tasks, prepare_steps, steps_of, stored_fields, written_columns
+from cnpgen.pipelines.pipeline import (
+    Pipeline,
+    listed_tasks,
+    prepare_steps,
+    steps_of,
+    stored_fields,
+    written_columns,
+)
 from cnpgen.pipelines.stages.draw_scenes import DrawScenes
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, load_context
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES
@@ -22,7 +29,9 @@ from cnpgen.store.sampling_statistics import DensityMap, SamplingStatistics
 from cnpgen.store.scene_table import SCENE_ID, SceneTable, concatenate_scenes
 
 MIN_ACCEPTANCE = 1e-4  # accepted fraction below which a pipeline raises an error
-MIN_CANDIDATES_BEFORE_ERROR = 100_000  # candidates before the accepted fraction is checked
+MIN_CANDIDATES_BEFORE_ERROR = (
+    100_000  # candidates before the accepted fraction is checked
+)
 DENSITY_CELLS = 24  # along each side of a density map
 BOOKKEEPING = (SCENE_ID, "attempts", "sample_id")  # fields that no stage writes
 
@@ -31,10 +40,10 @@ BOOKKEEPING = (SCENE_ID, "attempts", "sample_id")  # fields that no stage writes
 class Block:
     """Accepted rows in sampling order, and the statistics of all candidates up to the last row.
 
-    Attributes:
-        columns: Field name -> values, shape (width, rows); (1, rows) for scalars.
-        sampling: Counts of candidates and rejections, and density maps.
-        scenes: Scenes of the rows, whose IDs are those of the column ``scene_id``; None without scenes.
+    Attributes: columns: Field name -> values, shape (width, rows); (1, rows) for
+        scalars. sampling: Counts of candidates and rejections, and density maps.
+        scenes: Scenes of the rows, whose IDs are those of the column ``scene_id``; None
+        without scenes.
     """
 
     columns: dict[str, NDArray[Any]]
@@ -53,12 +62,26 @@ class PreparedPipeline:
         families: Names of the families of scenes; empty without scenes.
     """
 
-    def __init__(self, pipeline: Pipeline, *, backend: Backend, cache_folder: Path, dtype: str = "float64") -> None:
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        *,
+        backend: Backend,
+        cache_folder: Path,
+        dtype: str = "float64",
+    ) -> None:
         if dtype not in list(BOUNDARY_TOLERANCES):
-            raise UsageError(f"must be {' or '.join(map(repr, BOUNDARY_TOLERANCES))}, got {dtype!r}", argument="dtype")
+            raise UsageError(
+                f"must be {' or '.join(map(repr, BOUNDARY_TOLERANCES))}, got {dtype!r}",
+                argument="dtype",
+            )
         self.pipeline = pipeline
         self.tasks = listed_tasks(pipeline)
-        self.block_rows = min(stage.block_rows for stage in pipeline.stage) if self.tasks is None else self.tasks
+        self.block_rows = (
+            min(stage.block_rows for stage in pipeline.stage)
+            if self.tasks is None
+            else self.tasks
+        )
         self.context = load_context(pipeline.problem, backend, cache_folder, dtype)
         steps = steps_of(pipeline)
         drawn = [stage for stage in pipeline.stage if isinstance(stage, DrawScenes)]
@@ -66,18 +89,36 @@ class PreparedPipeline:
         self.fields = stored_fields(steps, self.context)
         written = written_columns(pipeline.path, steps, self.context)
         with self.context.kernels.compile_in_parallel():
-            self._stages = prepare_steps(steps, lambda stage: stage.prepare(self.context))
+            self._stages = prepare_steps(
+                steps, lambda stage: stage.prepare(self.context)
+            )
             self._accept = acceptance(self.context, written)
 
-    def block(self, seed: int, split: str, index: int, *, first: int = 0, stop: int | None = None) -> Block:
-        """Compute rows ``first`` to ``stop``, exclusive, of a block of a split; all rows by default."""
-        (block,) = self.chunks(seed, split, index, [(first, self.block_rows if stop is None else stop)])
+    def block(
+        self,
+        seed: int,
+        split: str,
+        index: int,
+        *,
+        first: int = 0,
+        stop: int | None = None,
+    ) -> Block:
+        """Compute rows ``first`` to ``stop``, exclusive, of a block of a split.
+
+        All rows by default.
+        """
+        (block,) = self.chunks(
+            seed, split, index, [(first, self.block_rows if stop is None else stop)]
+        )
         return block
 
-    def chunks(self, seed: int, split: str, index: int, ranges: Sequence[tuple[int, int]]) -> Iterator[Block]:
+    def chunks(
+        self, seed: int, split: str, index: int, ranges: Sequence[tuple[int, int]]
+    ) -> Iterator[Block]:
         """Compute several ranges of rows of one block, sampled only once, and yield each as soon as it is complete.
 
-        The ranges (first, exclusive end) ascend without overlap. Raise RecipeError if too few candidates are accepted.
+        The ranges (first, exclusive end) ascend without overlap. Raise RecipeError if
+        too few candidates are accepted.
         """
         random = random_generator(seed, split, index)
         waiting = deque(BlockChunk(self.fields, first, stop) for first, stop in ranges)
@@ -125,20 +166,36 @@ class PreparedPipeline:
         assert self.tasks is not None
         return self._sample_batch(random_generator(seed, "", 0), self.tasks)
 
-    def _check_listed_tasks(self, tried: int, accepted: int, rows: int, index: int) -> None:
+    def _check_listed_tasks(
+        self, tried: int, accepted: int, rows: int, index: int
+    ) -> None:
         """Raise UsageError if more rows are requested than listed tasks have solutions."""
         if self.tasks is not None and (tried or index):
             available = (
-                f"{accepted} of its {self.tasks} tasks have a solution" if tried else f"it lists {self.tasks} tasks"
+                f"{accepted} of its {self.tasks} tasks have a solution"
+                if tried
+                else f"it lists {self.tasks} tasks"
             )
-            raise UsageError(f"{self.pipeline.name}: {available}, {index * self.block_rows + rows} rows are requested")
+            raise UsageError(
+                f"{self.pipeline.name}: {available}, {index * self.block_rows + rows} rows are requested"
+            )
 
-    def _check_acceptance(self, candidates: CandidateBatch, accepted: int, tried: int) -> None:
+    def _check_acceptance(
+        self, candidates: CandidateBatch, accepted: int, tried: int
+    ) -> None:
         """Raise RecipeError if the accepted fraction is below ``MIN_ACCEPTANCE``."""
         if tried >= MIN_CANDIDATES_BEFORE_ERROR and accepted < MIN_ACCEPTANCE * tried:
-            counts = np.bincount(candidates.outcome, minlength=1 + len(candidates.reasons))[1:]
-            worst = sorted(zip(counts.tolist(), candidates.reasons, strict=True), reverse=True)[:3]
-            reasons = ", ".join(f"{reason} ({count / candidates.size:.1%})" for count, reason in worst if count)
+            counts = np.bincount(
+                candidates.outcome, minlength=1 + len(candidates.reasons)
+            )[1:]
+            worst = sorted(
+                zip(counts.tolist(), candidates.reasons, strict=True), reverse=True
+            )[:3]
+            reasons = ", ".join(
+                f"{reason} ({count / candidates.size:.1%})"
+                for count, reason in worst
+                if count
+            )
             text = f"{accepted} of {tried:,} candidates were accepted"
             text += f"; of the last {candidates.size:,}, rejected for {reasons}"
             raise RecipeError([f"{self.pipeline.path}: {text}"])
@@ -152,11 +209,17 @@ class BlockChunk:
         self._fields = [field for field in fields if field.name not in BOOKKEEPING]
         self._parts: list[dict[str, NDArray[Any]]] = []
         self._scenes: list[SceneTable] = []
-        self._tried, self._waiting = 0, 0  # candidates, and those since the last accepted one
+        self._tried, self._waiting = (
+            0,
+            0,
+        )  # candidates, and those since the last accepted one
         self._rejections: dict[str, int] = {}
         self._stages: dict[str, str] = {}
         self._maps = [field for field in fields if field.name.endswith("_xyz")]
-        self._cells = {field.name: np.zeros((2, DENSITY_CELLS**2), np.int64) for field in self._maps}
+        self._cells = {
+            field.name: np.zeros((2, DENSITY_CELLS**2), np.int64)
+            for field in self._maps
+        }
 
     def take(self, candidates: CandidateBatch, accepted: int) -> bool:
         """Append the rows of a batch, after ``accepted`` rows of the block; return whether the chunk is complete.
@@ -170,52 +233,93 @@ class BlockChunk:
         skip = min(max(self.first - accepted, 0), len(taken))
         # No later chunk counts the candidates after the last row.
         final = candidates.last and end == accepted + len(candidates.alive)
-        attempts = self._count(candidates, taken, first=skip, last=end == self.stop and not final)
+        attempts = self._count(
+            candidates, taken, first=skip, last=end == self.stop and not final
+        )
         if final:
             attempts[-1:] += self._waiting
-        part = {field.name: candidates[field.name][:, skip : len(taken)] for field in self._fields}
+        part = {
+            field.name: candidates[field.name][:, skip : len(taken)]
+            for field in self._fields
+        }
         self._parts.append({**part, "attempts": attempts[None]})
         if candidates.scenes is not None:
-            self._take_scenes(candidates.scenes.table, candidates.scene, slice(skip, len(taken)), accepted)
+            self._take_scenes(
+                candidates.scenes.table,
+                candidates.scene,
+                slice(skip, len(taken)),
+                accepted,
+            )
         return end == self.stop
 
-    def _take_scenes(self, table: SceneTable, scene: NDArray[np.int64], rows: slice, accepted: int) -> None:
+    def _take_scenes(
+        self, table: SceneTable, scene: NDArray[np.int64], rows: slice, accepted: int
+    ) -> None:
         """Append the scenes of some rows of a batch; IDs are rows of the block."""
-        first_rows = accepted + np.searchsorted(scene, scene)  # of the scene of each row
+        first_rows = accepted + np.searchsorted(
+            scene, scene
+        )  # of the scene of each row
         ids, index = np.unique(first_rows[rows], return_index=True)
         self._parts[-1][SCENE_ID] = first_rows[rows][None]
         self._scenes.append(replace(table[scene[rows][index]], scene_ids=ids))
 
     def _count(
-        self, candidates: CandidateBatch, taken: NDArray[np.intp], *, first: int, last: bool
+        self,
+        candidates: CandidateBatch,
+        taken: NDArray[np.intp],
+        *,
+        first: int,
+        last: bool,
     ) -> NDArray[np.int64]:
-        """Count the candidates after the ``first`` rows, up to the last row or all; return the candidates per row."""
+        """Count the candidates after the ``first`` rows, up to the last row or all.
+
+        Return the candidates per row.
+        """
         rows = taken[first:]
         start = int(taken[first - 1]) + 1 if first else 0
         stop = int(taken[-1]) + 1 if last else candidates.size
         if first:
             self._waiting = 0
-        outcomes = np.bincount(candidates.outcome[start:stop], minlength=1 + len(candidates.reasons))
-        for reason, number in zip(candidates.reasons, outcomes[1:].tolist(), strict=True):
+        outcomes = np.bincount(
+            candidates.outcome[start:stop], minlength=1 + len(candidates.reasons)
+        )
+        for reason, number in zip(
+            candidates.reasons, outcomes[1:].tolist(), strict=True
+        ):
             self._rejections[reason] = self._rejections.get(reason, 0) + number
         self._stages.update(candidates.origins)
         self._tried += stop - start
-        self._maps = [field for field in self._maps if field.name in candidates.drawn]  # not those of scenes
+        self._maps = [
+            field for field in self._maps if field.name in candidates.drawn
+        ]  # not those of scenes
         for field in self._maps:
             cells = _cells(candidates.drawn[field.name][:, start:stop], field)
-            counts = (np.bincount(x, minlength=DENSITY_CELLS**2) for x in (cells, cells[rows - start]))
+            counts = (
+                np.bincount(x, minlength=DENSITY_CELLS**2)
+                for x in (cells, cells[rows - start])
+            )
             self._cells[field.name] += np.stack(list(counts))
         attempts = np.diff(rows, prepend=start - 1 - self._waiting).astype(np.int64)
-        self._waiting = stop - 1 - int(rows[-1]) if len(rows) else self._waiting + stop - start
+        self._waiting = (
+            stop - 1 - int(rows[-1]) if len(rows) else self._waiting + stop - start
+        )
         return attempts
 
     def block(self, first_row: int) -> Block:
         """Return the rows of a complete chunk of a block whose first row has the index ``first_row`` in the split."""
-        columns = {name: np.concatenate([part[name] for part in self._parts], axis=1) for name in self._parts[0]}
-        columns["sample_id"] = first_row + np.arange(self.first, self.stop, dtype=np.int64)[None]
+        columns = {
+            name: np.concatenate([part[name] for part in self._parts], axis=1)
+            for name in self._parts[0]
+        }
+        columns["sample_id"] = (
+            first_row + np.arange(self.first, self.stop, dtype=np.int64)[None]
+        )
         shape = (2, DENSITY_CELLS, DENSITY_CELLS)
         maps = {
-            field.name: DensityMap(*_extent(field), *self._cells[field.name].reshape(shape)) for field in self._maps
+            field.name: DensityMap(
+                *_extent(field), *self._cells[field.name].reshape(shape)
+            )
+            for field in self._maps
         }
         sampling = SamplingStatistics(
             tried=self._tried,
@@ -228,13 +332,20 @@ class BlockChunk:
             return Block(columns, sampling)
         columns[SCENE_ID] = first_row + columns[SCENE_ID]
         scenes = concatenate_scenes(self._scenes)
-        return Block(columns, sampling, replace(scenes, scene_ids=(first_row + scenes.scene_ids).astype(np.int64)))
+        return Block(
+            columns,
+            sampling,
+            replace(scenes, scene_ids=(first_row + scenes.scene_ids).astype(np.int64)),
+        )
 
 
 def _extent(field: Field) -> tuple[tuple[float, float], tuple[float, float]]:
     assert field.valid_min is not None
     assert field.valid_max is not None
-    return (field.valid_min[0], field.valid_max[0]), (field.valid_min[1], field.valid_max[1])
+    return (field.valid_min[0], field.valid_max[0]), (
+        field.valid_min[1],
+        field.valid_max[1],
+    )
 
 
 def _cells(position: Array, field: Field) -> NDArray[np.intp]:
@@ -242,24 +353,41 @@ def _cells(position: Array, field: Field) -> NDArray[np.intp]:
     index = np.zeros(position.shape[1], np.intp)
     for axis, (low, high) in enumerate(_extent(field)):
         fraction = (position[axis] - low) / max(high - low, 1e-300)
-        index = index * DENSITY_CELLS + np.clip((fraction * DENSITY_CELLS).astype(np.intp), 0, DENSITY_CELLS - 1)
+        index = index * DENSITY_CELLS + np.clip(
+            (fraction * DENSITY_CELLS).astype(np.intp), 0, DENSITY_CELLS - 1
+        )
     return index
 
 
 def random_generator(seed: int, split: str, index: int) -> np.random.Generator:
-    """Return the generator of one block: SFC64 seeded by a SeedSequence of (seed; sha256 of the split, block)."""
+    """Return the generator of one block: SFC64 seeded by a SeedSequence of (seed.
+
+    Sha256 of the split, block).
+    """
     words = np.frombuffer(hashlib.sha256(split.encode()).digest(), "<u4").tolist()
     sequence = np.random.SeedSequence(seed, spawn_key=(*words, index))
     return np.random.Generator(np.random.SFC64(sequence))
 
 
 def as_stored(values: Array, field: Field) -> Array:
-    """Round values to float32 and back; round towards the inside where rounding would violate a limit of the field."""
+    """Round values to float32 and back.
+
+    Round towards the inside where rounding would violate a limit of the field.
+    """
     rounded = values.astype(np.float32)
-    for bound, inwards, violates in ((field.valid_min, np.inf, np.less), (field.valid_max, -np.inf, np.greater)):
+    for bound, inwards, violates in (
+        (field.valid_min, np.inf, np.less),
+        (field.valid_max, -np.inf, np.greater),
+    ):
         if bound is not None:
             limit = np.array(bound)[:, None]
             stored = limit.astype(np.float32)
-            stored = np.where(violates(stored, limit), np.nextafter(stored, np.float32(inwards)), stored)
-            rounded = np.where(violates(rounded, limit) & ~violates(values, limit), stored, rounded)
+            stored = np.where(
+                violates(stored, limit),
+                np.nextafter(stored, np.float32(inwards)),
+                stored,
+            )
+            rounded = np.where(
+                violates(rounded, limit) & ~violates(values, limit), stored, rounded
+            )
     return rounded.astype(np.float64)

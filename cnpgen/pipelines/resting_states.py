@@ -31,7 +31,9 @@ class RestingStates:
         UsageError: The robot has no link geometry.
     """
 
-    def __init__(self, problem: Problem, robot: Robot, obstacles: Sequence[Obstacle] = ()) -> None:
+    def __init__(
+        self, problem: Problem, robot: Robot, obstacles: Sequence[Obstacle] = ()
+    ) -> None:
         if robot.shape is None:
             raise UsageError(
                 f'the problem {problem.name!r} needs geometry = "urdf" in [robot] for collision checks in scenes',
@@ -39,7 +41,9 @@ class RestingStates:
             )
         self._robot, self._data = robot, robot.model.createData()
         self._kinematics = ForwardKinematics(robot.model)
-        self._bodies = RigidBodies(robot.shape, len(problem.obstacle) + len(obstacles), robot.n)
+        self._bodies = RigidBodies(
+            robot.shape, len(problem.obstacle) + len(obstacles), robot.n
+        )
         clearance, own = problem.first(RobotClearance), problem.first(SelfClearance)
         self._clearance = 0.0 if clearance is None else clearance.distance
         self._self_clearance = None if own is None else own.distance
@@ -59,22 +63,37 @@ class RestingStates:
             return np.zeros(0, bool)
         bodies = self._bodies
         bodies.place(*self._kinematics.poses(q), self._solids)
-        clear = bodies.pair_distances(bodies.obstacle_pairs).clear_states(self._clearance + margin)
+        clear = bodies.pair_distances(bodies.obstacle_pairs).clear_states(
+            self._clearance + margin
+        )
         if self._self_clearance is not None:
-            clear &= bodies.pair_distances(bodies.link_pairs).clear_states(self._self_clearance)
+            clear &= bodies.pair_distances(bodies.link_pairs).clear_states(
+                self._self_clearance
+            )
         return clear
 
     def can_hold(self, q: Array) -> NDArray[np.bool_]:
         """Return whether the holding torques are within their limits at each state, shape (K,)."""
         import pinocchio as pin
 
-        torques = [pin.computeGeneralizedGravity(self._robot.model, self._data, state) for state in q.T]
-        return np.array([bool((np.abs(torque) <= self._robot.torque_limit).all()) for torque in torques], bool)
+        torques = [
+            pin.computeGeneralizedGravity(self._robot.model, self._data, state)
+            for state in q.T
+        ]
+        return np.array(
+            [
+                bool((np.abs(torque) <= self._robot.torque_limit).all())
+                for torque in torques
+            ],
+            bool,
+        )
 
     def are_ends(self, q: Array, *, margin: float = 0.0) -> NDArray[np.bool_]:
         """Return which states can start or end a motion: within limits, clear, and with feasible torques."""
         robot = self._robot
-        inside = (q >= robot.position_lower[:, None]) & (q <= robot.position_upper[:, None])
+        inside = (q >= robot.position_lower[:, None]) & (
+            q <= robot.position_upper[:, None]
+        )
         valid = np.array(np.logical_and.reduce(inside))
         valid[valid] = self.can_hold(q[:, valid])
         valid[valid] = self.are_clear(q[:, valid], margin=margin)

@@ -61,13 +61,22 @@ def angle(doc: str, default: Range) -> Any:
 class SceneFamily(ABC):
     """Family of scenes: a frozen dataclass whose fields are the ranges of its random numbers.
 
-    The furniture stands around the base of an arm with a reach of about 0.85 m, which is the origin of the world.
+    The furniture stands around the base of an arm with a reach of about 0.85 m, which
+    is the origin of the world.
     """
 
-    distance: Range = length("distance of the furniture's front from the base", Range(0.42, 0.6), low=0.1)
+    distance: Range = length(
+        "distance of the furniture's front from the base", Range(0.42, 0.6), low=0.1
+    )
     bearing: Range = angle("direction of the furniture from the base", Range(-0.7, 0.7))
-    turn: Range = angle("rotation of the furniture against its direction", Range(-0.3, 0.3))
-    share: float = field("share of the family among the scenes of a pipeline, relative to others", default=1.0, low=0.0)
+    turn: Range = angle(
+        "rotation of the furniture against its direction", Range(-0.3, 0.3)
+    )
+    share: float = field(
+        "share of the family among the scenes of a pipeline, relative to others",
+        default=1.0,
+        low=0.0,
+    )
 
     @classmethod
     def describe(cls) -> str:

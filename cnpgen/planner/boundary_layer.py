@@ -1,6 +1,7 @@
 """The paper's Omega block of one problem, for networks of any framework.
 
-It combines boundary conditions, line, expected time and network outputs on the CPU, in float64.
+It combines boundary conditions, line, expected time and network outputs on the CPU, in
+float64.
 """
 
 from __future__ import annotations
@@ -33,24 +34,30 @@ from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
 
-FIXED_AT_GOAL = {"free": 2, "given": 3}  # number of path control points that the goal fixes
+FIXED_AT_GOAL = {
+    "free": 2,
+    "given": 3,
+}  # number of path control points that the goal fixes
 
 
 class BoundaryLayer:
     """The paper's Omega block: control points that meet boundary conditions exactly, from network outputs.
 
-    Interior path control points are those of the line from start to goal plus ``path_scale`` times the network's
-    ``phi``. Rates are ``exp(log_rate)`` over the expected time. The boundary control points follow (paper, Appendix A).
-    If a problem has equalities, line and path are projected onto them; the paper uses zero steps.
+    Interior path control points are those of the line from start to goal plus
+    ``path_scale`` times the network's ``phi``. Rates are ``exp(log_rate)`` over the
+    expected time. The boundary control points follow (paper, Appendix A). If a problem
+    has equalities, line and path are projected onto them; the paper uses zero steps.
 
-    Args:
-        problem: The problem, its record (``plans.problem``, ``dataset.problem``), or the name or the file of a problem,
+    Args: problem: The problem, its record (``plans.problem``, ``dataset.problem``), or
+        the name or the file of a problem,
             a pipeline or a dataset.
         path_scale: Factor of phi [rad]; pi in the paper.
         line_projection_steps: Number of Gauss-Newton steps that project the line.
         projection_steps: Number of Gauss-Newton steps that project the path.
-        expected_time: Unit of durations: "distance", "reach" or "travel" (``ModelConfig``).
-        goal_acceleration: "free", or "given" if boundary conditions include goal accelerations, as in panda-cup.
+        expected_time: Unit of durations: "distance", "reach" or "travel"
+            (``ModelConfig``).
+        goal_acceleration: "free", or "given" if boundary conditions include goal
+            accelerations, as in panda-cup.
         backend: Backend of the kernels; by default the fastest available.
         cache_folder: Folder of compiled kernels; by default the shared cache.
 
@@ -80,16 +87,21 @@ class BoundaryLayer:
         backend: Backend | None = None,
         cache_folder: str | Path | None = None,
     ) -> None:
-        self.problem, self.path_scale = as_problem(problem), number("path_scale", path_scale)
+        self.problem, self.path_scale = (
+            as_problem(problem),
+            number("path_scale", path_scale),
+        )
         line_steps = integer("line_projection_steps", line_projection_steps, least=0)
         self.projection_steps = integer("projection_steps", projection_steps, least=0)
         if expected_time not in EXPECTED_TIMES:
             raise UsageError(
-                f"must be one of {', '.join(EXPECTED_TIMES)}, got {expected_time!r}", argument="expected_time"
+                f"must be one of {', '.join(EXPECTED_TIMES)}, got {expected_time!r}",
+                argument="expected_time",
             )
         if goal_acceleration not in FIXED_AT_GOAL:
             raise UsageError(
-                f"must be one of {', '.join(FIXED_AT_GOAL)}, got {goal_acceleration!r}", argument="goal_acceleration"
+                f"must be one of {', '.join(FIXED_AT_GOAL)}, got {goal_acceleration!r}",
+                argument="goal_acceleration",
             )
         self._config = ModelConfig(
             path_scale=self.path_scale,
@@ -100,39 +112,68 @@ class BoundaryLayer:
         self.goal_acceleration = goal_acceleration
         self._fixed_at_goal = FIXED_AT_GOAL[goal_acceleration]
         spec = self.problem.trajectory
-        self.path_outputs = (spec.path_control_points - 3 - self._fixed_at_goal) * len(self.problem.robot.joints)
+        self.path_outputs = (spec.path_control_points - 3 - self._fixed_at_goal) * len(
+            self.problem.robot.joints
+        )
         self.rate_outputs = spec.rate_control_points
         chosen_backend, folder = choose_backend(backend)
         folder = folder if cache_folder is None else Path(cache_folder)
-        self._kernels = problem_kernels(self.problem.for_planning, load_robot(self.problem), chosen_backend, folder)
+        self._kernels = problem_kernels(
+            self.problem.for_planning, load_robot(self.problem), chosen_backend, folder
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         """Omit the loaded kernels, which are loaded again on first use."""
-        return {name: part for name, part in vars(self).items() if name != "_preprocessor_and_projection"}
+        return {
+            name: part
+            for name, part in vars(self).items()
+            if name != "_preprocessor_and_projection"
+        }
 
     @cached_property
-    def _preprocessor_and_projection(self) -> tuple[TaskPreprocessor, Projection | None]:
-        robot, problem, kernels = self._kernels.arguments["robot"], self.problem.for_planning, self._kernels
+    def _preprocessor_and_projection(
+        self,
+    ) -> tuple[TaskPreprocessor, Projection | None]:
+        robot, problem, kernels = (
+            self._kernels.arguments["robot"],
+            self.problem.for_planning,
+            self._kernels,
+        )
         fixed, placed = self._fixed_at_goal, self.problem.sample_obstacles
         with kernels.compile_in_parallel():
-            prepare = make_task_preprocessor(problem, robot, kernels, self._config, fixed_at_goal=fixed, placed=placed)
-            return prepare, make_projection(problem, kernels, steps=self.projection_steps, fixed_at_goal=fixed)
+            prepare = make_task_preprocessor(
+                problem,
+                robot,
+                kernels,
+                self._config,
+                fixed_at_goal=fixed,
+                placed=placed,
+            )
+            return prepare, make_projection(
+                problem, kernels, steps=self.projection_steps, fixed_at_goal=fixed
+            )
 
     @checked_arguments
     @one_thread()
     def tasks(
-        self, boundary: Boundary, *, obstacle_poses: ArrayLike | None = None, allow_large_angles: bool = False
+        self,
+        boundary: Boundary,
+        *,
+        obstacle_poses: ArrayLike | None = None,
+        allow_large_angles: bool = False,
     ) -> Tasks:
         """Prepare N tasks: compute everything that the network needs from boundary conditions.
 
-        Args:
-            boundary: Boundary conditions, shape (N, n) each: arrays, or tensors on the CPU.
-            obstacle_poses: Poses and sizes of obstacles that samples place, shape (N, width), as
-                ``dataset.scenes(split, rows).poses`` has them; needed if the problem has such obstacles.
-            allow_large_angles: Whether to accept values that are probably in degrees or millimetres, with a warning.
+        Args: boundary: Boundary conditions, shape (N, n) each: arrays, or tensors on
+            the CPU. obstacle_poses: Poses and sizes of obstacles that samples place,
+            shape (N, width), as
+                ``dataset.scenes(split, rows).poses`` has them; needed if the problem
+                has such obstacles.
+            allow_large_angles: Whether to accept values that are probably in degrees or
+                millimetres, with a warning.
 
-        Raises:
-            UsageError: A shape is wrong, a value is no real number, poses are missing, or the presence of goal
+        Raises: UsageError: A shape is wrong, a value is no real number, poses are
+            missing, or the presence of goal
                 accelerations does not match ``goal_acceleration``.
             UnitError: A value is probably in degrees or millimetres.
         """
@@ -142,65 +183,113 @@ class BoundaryLayer:
                 concerns="boundary",
             )
         if boundary.fixed_at_goal < self._fixed_at_goal:
-            raise UsageError('goal_ddq is missing: goal_acceleration is "given"', concerns="boundary")
-        arrays = {name: numbers(name, values, differentiable=True) for name, values in boundary.arrays().items()}
-        count, joints = len(np.atleast_1d(arrays["start_q"])), len(self.problem.robot.joints)
+            raise UsageError(
+                'goal_ddq is missing: goal_acceleration is "given"', concerns="boundary"
+            )
+        arrays = {
+            name: numbers(name, values, differentiable=True)
+            for name, values in boundary.arrays().items()
+        }
+        count, joints = (
+            len(np.atleast_1d(arrays["start_q"])),
+            len(self.problem.robot.joints),
+        )
         for name, array in arrays.items():
-            shape = count, len(self.problem.parameters) if name == "parameters" else joints
+            shape = (
+                count,
+                len(self.problem.parameters) if name == "parameters" else joints,
+            )
             if array.shape != shape:
-                raise UsageError(f"must have shape (N, {shape[1]}), N = {shape[0]}, got {array.shape}", argument=name)
+                raise UsageError(
+                    f"must have shape (N, {shape[1]}), N = {shape[0]}, got {array.shape}",
+                    argument=name,
+                )
         checked = Boundary(**arrays)
         robot = self._kernels.arguments["robot"]
-        check_boundary_units(robot, checked, argument="boundary", allow_large_angles=allow_large_angles)
-        poses = None if obstacle_poses is None else numbers("obstacle_poses", obstacle_poses)
+        check_boundary_units(
+            robot, checked, argument="boundary", allow_large_angles=allow_large_angles
+        )
+        poses = (
+            None
+            if obstacle_poses is None
+            else numbers("obstacle_poses", obstacle_poses)
+        )
         return self._preprocessor_and_projection[0](checked, obstacle_poses=poses)
 
     @checked_arguments
     @one_thread()
-    def __call__(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike) -> ControlPoints:
+    def __call__(
+        self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike
+    ) -> ControlPoints:
         """Compute control points, in float64.
 
-        Args:
-            tasks: N tasks.
-            phi: Output of the configuration head, shape (N, path_outputs); shipped networks end in tanh.
-            log_rate: Output of the time head, shape (N, rate_outputs).
+        Args: tasks: N tasks. phi: Output of the configuration head, shape (N,
+            path_outputs); shipped networks end in tanh. log_rate: Output of the time
+            head, shape (N, rate_outputs).
 
         Raises:
             UsageError: A shape is wrong, or a value is no real number.
         """
-        points, projection = self._before_projection(tasks, phi, log_rate), self._preprocessor_and_projection[1]
+        points, projection = (
+            self._before_projection(tasks, phi, log_rate),
+            self._preprocessor_and_projection[1],
+        )
         if projection is None:
             return points
         with np.errstate(all="ignore"):  # an overflow affects its own row only
-            return replace(points, path=projection.project(points.path, tasks.scene.poses))
+            return replace(
+                points, path=projection.project(points.path, tasks.scene.poses)
+            )
 
     @checked_arguments
     @one_thread()
     def vjp(
-        self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike, *, path_gradient: Array, rate_gradient: Array
+        self,
+        tasks: Tasks,
+        phi: ArrayLike,
+        log_rate: ArrayLike,
+        *,
+        path_gradient: Array,
+        rate_gradient: Array,
     ) -> tuple[Array, Array]:
         """Convert gradients with respect to control points to gradients with respect to the network's outputs.
 
-        If control points overflowed, the gradient of that plan is 0; other plans are not affected.
+        If control points overflowed, the gradient of that plan is 0; other plans are
+        not affected.
 
-        Args:
-            tasks: N tasks.
-            phi: Output of the configuration head, shape (N, path_outputs).
-            log_rate: Output of the time head, shape (N, rate_outputs).
-            path_gradient: Gradient with respect to the path control points, shape (N, C, n).
-            rate_gradient: Gradient with respect to the rate control points, shape (N, R).
+        Args: tasks: N tasks. phi: Output of the configuration head, shape (N,
+            path_outputs). log_rate: Output of the time head, shape (N, rate_outputs).
+            path_gradient: Gradient with respect to the path control points, shape (N,
+            C, n). rate_gradient: Gradient with respect to the rate control points,
+            shape (N, R).
 
         Returns:
             Gradients with respect to phi and log_rate.
         """
-        points, projection = self._before_projection(tasks, phi, log_rate), self._preprocessor_and_projection[1]
-        path_gradient = _checked_gradient("path_gradient", path_gradient, points.path.shape)
-        rate_gradient = _checked_gradient("rate_gradient", rate_gradient, points.rate.shape)
+        points, projection = (
+            self._before_projection(tasks, phi, log_rate),
+            self._preprocessor_and_projection[1],
+        )
+        path_gradient = _checked_gradient(
+            "path_gradient", path_gradient, points.path.shape
+        )
+        rate_gradient = _checked_gradient(
+            "rate_gradient", rate_gradient, points.rate.shape
+        )
         with np.errstate(all="ignore"):
-            by_path = projection.vjp(points.path, tasks.scene.poses, path_gradient) if projection else path_gradient
+            by_path = (
+                projection.vjp(points.path, tasks.scene.poses, path_gradient)
+                if projection
+                else path_gradient
+            )
             spec = self.problem.trajectory
             gradients = control_points.vjp(
-                tasks, points, path_gradient=by_path, rate_gradient=rate_gradient, scale=self.path_scale, spec=spec
+                tasks,
+                points,
+                path_gradient=by_path,
+                rate_gradient=rate_gradient,
+                scale=self.path_scale,
+                spec=spec,
             )
         overflowed = _finite(path_gradient, rate_gradient) & ~_finite(*gradients)
         for gradient in gradients:
@@ -208,14 +297,20 @@ class BoundaryLayer:
         return gradients
 
     @checked_arguments
-    def plans(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike, *, sample_id: ArrayLike | None = None) -> Plans:
+    def plans(
+        self,
+        tasks: Tasks,
+        phi: ArrayLike,
+        log_rate: ArrayLike,
+        *,
+        sample_id: ArrayLike | None = None,
+    ) -> Plans:
         """Make plans from network outputs, to be evaluated, refined or saved.
 
-        Args:
-            tasks: N tasks.
-            phi: Output of the configuration head, shape (N, path_outputs).
-            log_rate: Output of the time head, shape (N, rate_outputs).
-            sample_id: Dataset rows of the tasks, shape (N,), such as ``batch["sample_id"]``, also after shuffling;
+        Args: tasks: N tasks. phi: Output of the configuration head, shape (N,
+            path_outputs). log_rate: Output of the time head, shape (N, rate_outputs).
+            sample_id: Dataset rows of the tasks, shape (N,), such as
+            ``batch["sample_id"]``, also after shuffling;
                 0, 1, ... by default.
 
         Raises:
@@ -233,34 +328,56 @@ class BoundaryLayer:
         )
 
     @checked_arguments
-    def check_shapes(self, tasks: Tasks, phi: tuple[int, ...], log_rate: tuple[int, ...]) -> None:
+    def check_shapes(
+        self, tasks: Tasks, phi: tuple[int, ...], log_rate: tuple[int, ...]
+    ) -> None:
         """Check the shapes of network outputs.
 
         Raises:
             UsageError: A shape is wrong.
         """
-        for name, shape, width in (("phi", phi, self.path_outputs), ("log_rate", log_rate, self.rate_outputs)):
+        for name, shape, width in (
+            ("phi", phi, self.path_outputs),
+            ("log_rate", log_rate, self.rate_outputs),
+        ):
             if shape != (len(tasks), width):
-                raise UsageError(f"must have shape ({len(tasks)}, {width}), got {shape}", argument=name)
+                raise UsageError(
+                    f"must have shape ({len(tasks)}, {width}), got {shape}",
+                    argument=name,
+                )
 
-    def _before_projection(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike) -> ControlPoints:
+    def _before_projection(
+        self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike
+    ) -> ControlPoints:
         phi = numbers("phi", phi, differentiable=True)
         log_rate = numbers("log_rate", log_rate, differentiable=True)
         self.check_shapes(tasks, phi.shape, log_rate.shape)
         with np.errstate(all="ignore"):
             return control_points.control_points(
-                tasks, phi, log_rate, scale=self.path_scale, spec=self.problem.trajectory
+                tasks,
+                phi,
+                log_rate,
+                scale=self.path_scale,
+                spec=self.problem.trajectory,
             )
 
 
 def _checked_gradient(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
-    gradient = values if isinstance(values, np.ndarray) and values.dtype.kind == "f" else numbers(name, values)
+    gradient = (
+        values
+        if isinstance(values, np.ndarray) and values.dtype.kind == "f"
+        else numbers(name, values)
+    )
     if gradient.shape != shape:
-        raise UsageError(f"must have shape {shape}, got {gradient.shape}", argument=name)
+        raise UsageError(
+            f"must have shape {shape}, got {gradient.shape}", argument=name
+        )
     return gradient
 
 
 def _finite(*arrays: NDArray[Any]) -> NDArray[np.bool_]:
     """Return a mask of the rows whose values are all finite, shape (N,)."""
-    masks = [np.isfinite(array).all(axis=tuple(range(1, array.ndim))) for array in arrays]
+    masks = [
+        np.isfinite(array).all(axis=tuple(range(1, array.ndim))) for array in arrays
+    ]
     return np.asarray(np.all(masks, axis=0))

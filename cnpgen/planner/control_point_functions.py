@@ -1,14 +1,17 @@
 """Build control points as CasADi SX functions: the projected line, and whole paths projected onto the manifold.
 
-The straight line in joint space is far off the manifold: a heavy object tilts by about 10 degrees. One Gauss-Newton
-step removes most of this error before the network runs, and another step the error that the network adds. The planner
-uses ``line_change`` and ``projected_path``, which take less time for one plan than a few NumPy operations. Training
-uses ``control_points``, in float32 and with gradients, followed by ``path_change``. Boundary conditions are one column:
-start_q, start_dq, start_ddq, goal_q, goal_dq, and goal_ddq if the goal fixes three control points.
+The straight line in joint space is far off the manifold: a heavy object tilts by about
+10 degrees. One Gauss-Newton step removes most of this error before the network runs,
+and another step the error that the network adds. The planner uses ``line_change`` and
+``projected_path``, which take less time for one plan than a few NumPy operations.
+Training uses ``control_points``, in float32 and with gradients, followed by
+``path_change``. Boundary conditions are one column: start_q, start_dq, start_ddq,
+goal_q, goal_dq, and goal_ddq if the goal fixes three control points.
 
-The equalities are evaluated at one phase per interior control point, where that point has the largest effect, and at
-one more phase before the goal, where fast arrivals leave the manifold most. Among all steps that cancel the residuals
-to first order, the one with the smallest second differences is taken, so that motions stay smooth.
+The equalities are evaluated at one phase per interior control point, where that point
+has the largest effect, and at one more phase before the goal, where fast arrivals leave
+the manifold most. Among all steps that cancel the residuals to first order, the one
+with the smallest second differences is taken, so that motions stay smooth.
 """
 
 from typing import Any
@@ -37,7 +40,9 @@ def tips_at_ends(robot: Robot, problem: Problem, *, fixed_at_goal: int) -> Any:
 
     ends_sx, ends = symbols("ends", (3 + fixed_at_goal) * robot.n)
     q, _, _, goal_q, goal_dq, *_ = _split(ends, robot.n)
-    start, goal = (forward_kinematics(robot.chain, position) for position in (q, goal_q))
+    start, goal = (
+        forward_kinematics(robot.chain, position) for position in (q, goal_q)
+    )
     tips = [ca.vertcat(*kinematics.tip) for kinematics in (start, goal)]
     if problem.scene_constraint is not None:
         tips.append(ca.vertcat(*tip_velocity(goal, goal_dq)))
@@ -45,34 +50,61 @@ def tips_at_ends(robot: Robot, problem: Problem, *, fixed_at_goal: int) -> Any:
 
 
 def line_change(
-    robot: Robot, problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool, with_offsets: bool
+    robot: Robot,
+    problem: Problem,
+    *,
+    steps: int,
+    fixed_at_goal: int,
+    within_limits: bool,
+    with_offsets: bool,
 ) -> Any:
     """Build ``(ends, rate, obstacle_poses) -> change`` of the line's interior points at a constant rate [1/s].
 
-    With offsets [rad] from the line it is ``(ends, offsets, rate, obstacle_poses) -> offsets + change``.
+    With offsets [rad] from the line it is ``(ends, offsets, rate, obstacle_poses) ->
+    offsets + change``.
     """
     import casadi as ca
 
-    (ends_sx, ends), rate, spec = symbols("ends", (3 + fixed_at_goal) * robot.n), ca.SX.sym("rate"), problem.trajectory
+    (ends_sx, ends), rate, spec = (
+        symbols("ends", (3 + fixed_at_goal) * robot.n),
+        ca.SX.sym("rate"),
+        problem.trajectory,
+    )
     poses_sx, obstacle_poses = symbols("obstacle_poses", problem.scene_width)
     points = _points(_split(ends, robot.n), [rate] * spec.rate_control_points, spec)
     interior = slice(3, -fixed_at_goal)
-    offsets_sx, scalars = symbols("offsets", len(points[interior]) * robot.n if with_offsets else 0)
+    offsets_sx, scalars = symbols(
+        "offsets", len(points[interior]) * robot.n if with_offsets else 0
+    )
     offsets = _split(scalars, robot.n)
     if with_offsets:
         points[interior] = _sums(points[interior], offsets)
     change = projection_change(
-        robot, problem, points, obstacle_poses, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits
+        robot,
+        problem,
+        points,
+        obstacle_poses,
+        steps=steps,
+        fixed_at_goal=fixed_at_goal,
+        within_limits=within_limits,
     )
     change = _sums(offsets, change) if with_offsets else change
     columns = [ends_sx, *([offsets_sx] if with_offsets else []), rate, poses_sx]
     return ca.Function("line_change", columns, [ca.cse(_column(change))])
 
 
-def projected_path(robot: Robot, problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
+def projected_path(
+    robot: Robot,
+    problem: Problem,
+    *,
+    steps: int,
+    fixed_at_goal: int,
+    within_limits: bool,
+) -> Any:
     """Build ``(ends, offsets, rates, obstacle_poses) -> path``: line plus offsets [rad], projected.
 
-    Without steps, control points are clipped once to the joint limits if they must be within them.
+    Without steps, control points are clipped once to the joint limits if they must be
+    within them.
     """
     import casadi as ca
 
@@ -80,17 +112,29 @@ def projected_path(robot: Robot, problem: Problem, *, steps: int, fixed_at_goal:
     ends_sx, ends = symbols("ends", (3 + fixed_at_goal) * n)
     poses_sx, obstacle_poses = symbols("obstacle_poses", problem.scene_width)
     rates_sx, rates = symbols("rates", spec.rate_control_points)
-    offsets_sx, offsets = symbols("offsets", (spec.path_control_points - 3 - fixed_at_goal) * n)
+    offsets_sx, offsets = symbols(
+        "offsets", (spec.path_control_points - 3 - fixed_at_goal) * n
+    )
     points, interior = _points(_split(ends, n), rates, spec), slice(3, -fixed_at_goal)
     points[interior] = _sums(points[interior], _split(offsets, n))
     if steps:
-        options: dict[str, Any] = {"steps": steps, "fixed_at_goal": fixed_at_goal, "within_limits": within_limits}
+        options: dict[str, Any] = {
+            "steps": steps,
+            "fixed_at_goal": fixed_at_goal,
+            "within_limits": within_limits,
+        }
         change = projection_change(robot, problem, points, obstacle_poses, **options)
         points[interior] = _sums(points[interior], change)
     elif within_limits:
-        change = [clipped_to_limits(robot, point, [0.0] * n) for point in points[interior]]
+        change = [
+            clipped_to_limits(robot, point, [0.0] * n) for point in points[interior]
+        ]
         points[interior] = _sums(points[interior], change)
-    return ca.Function("projected_path", [ends_sx, offsets_sx, rates_sx, poses_sx], [ca.cse(_column(points))])
+    return ca.Function(
+        "projected_path",
+        [ends_sx, offsets_sx, rates_sx, poses_sx],
+        [ca.cse(_column(points))],
+    )
 
 
 def path_change(robot: Robot, problem: Problem, **options: Any) -> Any:
@@ -102,43 +146,69 @@ def path_change(robot: Robot, problem: Problem, **options: Any) -> Any:
 
 
 def path_change_adjoint(robot: Robot, problem: Problem, **options: Any) -> Any:
-    """Build ``(path, obstacle_poses, seed) -> gradient`` of ``seed . change`` by the path, in reverse mode."""
+    """Build ``(path, obstacle_poses, seed) -> gradient`` of ``seed .
+
+    Change`` by the path, in reverse mode.
+    """
     import casadi as ca
 
     path, obstacle_poses, change = _path_change(robot, problem, options)
     seed = ca.SX.sym("seed", change.numel())
     gradient = ca.densify(ca.jtimes(change, path, seed, True))
-    return ca.Function("path_change_adjoint", [path, obstacle_poses, seed], [ca.cse(gradient)])
+    return ca.Function(
+        "path_change_adjoint", [path, obstacle_poses, seed], [ca.cse(gradient)]
+    )
 
 
-def _path_change(robot: Robot, problem: Problem, options: dict[str, Any]) -> tuple[Any, Any, Any]:
+def _path_change(
+    robot: Robot, problem: Problem, options: dict[str, Any]
+) -> tuple[Any, Any, Any]:
     path_sx, path = symbols("path", problem.trajectory.path_control_points * robot.n)
     poses_sx, obstacle_poses = symbols("obstacle_poses", problem.scene_width)
-    change = projection_change(robot, problem, _split(path, robot.n), obstacle_poses, **options)
+    change = projection_change(
+        robot, problem, _split(path, robot.n), obstacle_poses, **options
+    )
     return path_sx, poses_sx, _column(change)
 
 
 def _points(ends: list[Vec], rates: Vec, spec: TrajectorySpec) -> list[Vec]:
-    """Return all control points of the line (paper, Appendix A; ``trajectory.boundary``)."""
+    """Return all control points of the line (paper, Appendix A.
+
+    ``trajectory.boundary``).
+    """
     q, dq, ddq, goal_q, goal_dq, *goal_ddq = ends
     first = _end_points(q, dq, ddq, rates[:2], spec)
-    arrival = [-v for v in goal_dq]  # in reversed phase r' and p' change sign: the goal is a start with -dq
-    last = _end_points(goal_q, arrival, goal_ddq[0] if goal_ddq else None, rates[:-3:-1], spec)[::-1]
+    arrival = [
+        -v for v in goal_dq
+    ]  # in reversed phase r' and p' change sign: the goal is a start with -dq
+    last = _end_points(
+        goal_q, arrival, goal_ddq[0] if goal_ddq else None, rates[:-3:-1], spec
+    )[::-1]
     count = spec.path_control_points - len(first) - len(last)
     along = [i / max(count - 1, 1) for i in range(count)]
-    line = [[a + (b - a) * t for a, b in zip(first[-1], last[0], strict=True)] for t in along]
+    line = [
+        [a + (b - a) * t for a, b in zip(first[-1], last[0], strict=True)]
+        for t in along
+    ]
     return [*first, *line, *last]
 
 
-def _end_points(q: Vec, dq: Vec, ddq: Vec | None, rates: Vec, spec: TrajectorySpec) -> list[Vec]:
+def _end_points(
+    q: Vec, dq: Vec, ddq: Vec | None, rates: Vec, spec: TrajectorySpec
+) -> list[Vec]:
     """Return the control points that an end fixes, from the outermost one: two if its acceleration is free."""
     path = end_derivatives(spec.path_control_points, spec.degree)
-    gradient = end_derivatives(spec.rate_control_points, spec.degree).eta * (rates[1] - rates[0])
+    gradient = end_derivatives(spec.rate_control_points, spec.degree).eta * (
+        rates[1] - rates[0]
+    )
     first = [v / rates[0] for v in dq]
     c1 = [x + v / path.eta for x, v in zip(q, first, strict=True)]
     if ddq is None:
         return [q, c1]
-    second = [(a - v * gradient * rates[0]) / rates[0] ** 2 for a, v in zip(ddq, first, strict=True)]
+    second = [
+        (a - v * gradient * rates[0]) / rates[0] ** 2
+        for a, v in zip(ddq, first, strict=True)
+    ]
     c2 = [a / path.beta - 2 * x + 3 * c for a, x, c in zip(second, q, c1, strict=True)]
     return [q, c1, c2]
 
@@ -169,36 +239,58 @@ def projection_change(
 ) -> list[Vec]:
     """Return the change of a path's interior control points [rad] by Gauss-Newton steps onto the equalities.
 
-    ``control`` has all control points, and ``within_limits`` clips the interior ones to the limits after every step.
+    ``control`` has all control points, and ``within_limits`` clips the interior ones to
+    the limits after every step.
     """
     control, interior = list(control), slice(3, len(control) - fixed_at_goal)
     table, response = collocation(problem.trajectory.degree, len(control), interior)
-    equality, total = equality_residuals(robot, problem), [[0.0] * robot.n for _ in response]
+    equality, total = (
+        equality_residuals(robot, problem),
+        [[0.0] * robot.n for _ in response],
+    )
     for _ in range(steps):
         q = [_combined(row, control) for row in table]
         step = _gauss_newton(equality, q, obstacle_poses, table[:, interior], response)
         if within_limits:
-            step = [clipped_to_limits(robot, *pair) for pair in zip(control[interior], step, strict=True)]
+            step = [
+                clipped_to_limits(robot, *pair)
+                for pair in zip(control[interior], step, strict=True)
+            ]
         control[interior] = _sums(control[interior], step)
         total = _sums(total, step)
     return total
 
 
 def clipped_to_limits(robot: Robot, point: Vec, step: Vec) -> Vec:
-    """Change a step so that its end is within the joint limits; then the whole path is, too."""
+    """Change a step so that its end is within the joint limits.
+
+    Then the whole path is, too.
+    """
     import casadi as ca
 
-    ends = zip(robot.position_lower.tolist(), robot.position_upper.tolist(), add(point, step), strict=True)
-    return [ca.fmin(ca.fmax(end, low), high) - start for (low, high, end), start in zip(ends, point, strict=True)]
+    ends = zip(
+        robot.position_lower.tolist(),
+        robot.position_upper.tolist(),
+        add(point, step),
+        strict=True,
+    )
+    return [
+        ca.fmin(ca.fmax(end, low), high) - start
+        for (low, high, end), start in zip(ends, point, strict=True)
+    ]
 
 
-def _gauss_newton(equality: Any, q: list[Vec], obstacle_poses: Vec, inner: Array, response: Array) -> list[Vec]:
+def _gauss_newton(
+    equality: Any, q: list[Vec], obstacle_poses: Vec, inner: Array, response: Array
+) -> list[Vec]:
     """Return the change of the interior control points that cancels the residuals at the phases to first order."""
     import casadi as ca
 
     residuals, rows, phases = [], [], []
     for phase, position in enumerate(q):
-        residual, jacobian = equality(ca.vertcat(*position), ca.vertcat(*obstacle_poses))
+        residual, jacobian = equality(
+            ca.vertcat(*position), ca.vertcat(*obstacle_poses)
+        )
         columns = ca.reshape(jacobian, residual.numel(), len(position))
         for equation in range(residual.numel()):
             residuals.append(residual[equation])
@@ -206,21 +298,41 @@ def _gauss_newton(equality: Any, q: list[Vec], obstacle_poses: Vec, inner: Array
             phases.append(phase)
     coupling = inner @ response
     lower = [
-        [dot(rows[i], rows[j]) * float(coupling[phases[i], phases[j]]) for j in range(i + 1)] for i in range(len(rows))
+        [
+            dot(rows[i], rows[j]) * float(coupling[phases[i], phases[j]])
+            for j in range(i + 1)
+        ]
+        for i in range(len(rows))
     ]
     for i, entries in enumerate(lower):
         entries[i] += PROJECTION_DAMPING
     force = solve(lower, residuals)
     forces: list[Vec] = [[0.0] * len(q[0]) for _ in q]
     for strength, row, phase in zip(force, rows, phases, strict=True):
-        forces[phase] = [total + strength * gradient for total, gradient in zip(forces[phase], row, strict=True)]
-    return [[ca.fmin(ca.fmax(-x, -MAX_STEP_RAD), MAX_STEP_RAD) for x in _combined(row, forces)] for row in response]
+        forces[phase] = [
+            total + strength * gradient
+            for total, gradient in zip(forces[phase], row, strict=True)
+        ]
+    return [
+        [
+            ca.fmin(ca.fmax(-x, -MAX_STEP_RAD), MAX_STEP_RAD)
+            for x in _combined(row, forces)
+        ]
+        for row in response
+    ]
 
 
 def _combined(factors: Array, points: list[Vec]) -> Vec:
     """Return the sum of points times factors; zero factors are skipped."""
-    used = [(float(factor), point) for factor, point in zip(factors, points, strict=True) if factor]
-    return [sum(factor * point[joint] for factor, point in used) for joint in range(len(points[0]))]
+    used = [
+        (float(factor), point)
+        for factor, point in zip(factors, points, strict=True)
+        if factor
+    ]
+    return [
+        sum(factor * point[joint] for factor, point in used)
+        for joint in range(len(points[0]))
+    ]
 
 
 def collocation(degree: int, points: int, interior: slice) -> tuple[Array, Array]:

@@ -1,12 +1,13 @@
 """The paper's Omega block: control points from network outputs, and the vector-Jacobian product back.
 
-``C_{3+i} = line_i + correction_i + scale phi_i`` with the line from C_2 to C_{C-N_d}, and ``rate = e^o / T_expected``.
-The boundary control points follow from the rates, so that boundary conditions hold by construction. The line depends
-on two of them, so gradients of the path reach the rates both directly and through the line.
+``C_{3+i} = line_i + correction_i + scale phi_i`` with the line from C_2 to C_{C-N_d},
+and ``rate = e^o / T_expected``. The boundary control points follow from the rates, so
+that boundary conditions hold by construction. The line depends on two of them, so
+gradients of the path reach the rates both directly and through the line.
 
-During training, a ``Projection`` moves paths onto the manifold's equalities, so that the network need not trade them
-against other terms of the loss. Paths meet the equalities at eleven phases to second order, and between them as well as
-the spline can.
+During training, a ``Projection`` moves paths onto the manifold's equalities, so that
+the network need not trade them against other terms of the loss. Paths meet the
+equalities at eleven phases to second order, and between them as well as the spline can.
 """
 
 from __future__ import annotations
@@ -25,7 +26,12 @@ from cnpgen.planner.control_point_functions import path_change, path_change_adjo
 from cnpgen.planner.expressions import effective_steps
 from cnpgen.planner.tasks import Tasks, lanes
 from cnpgen.problems.problem import Problem
-from cnpgen.trajectory.boundary import Boundary, boundary_derivatives, goal_points, start_points
+from cnpgen.trajectory.boundary import (
+    Boundary,
+    boundary_derivatives,
+    goal_points,
+    start_points,
+)
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Array = NDArray[Any]
@@ -44,13 +50,18 @@ class ControlPoints:
     rate: Array
 
     def __repr__(self) -> str:
-        return f"<ControlPoints: path {np.shape(self.path)}, rate {np.shape(self.rate)}>"
+        return (
+            f"<ControlPoints: path {np.shape(self.path)}, rate {np.shape(self.rate)}>"
+        )
 
 
-def control_points(tasks: Tasks, phi: Array, log_rate: Array, *, scale: float, spec: TrajectorySpec) -> ControlPoints:
+def control_points(
+    tasks: Tasks, phi: Array, log_rate: Array, *, scale: float, spec: TrajectorySpec
+) -> ControlPoints:
     """Compute control points in the dtype of the arguments; ``scale`` is the factor of phi [rad], the paper's pi.
 
-    The outputs of the configuration head, phi in (-1, 1), have shape (N, m n), those of the time head (N, R).
+    The outputs of the configuration head, phi in (-1, 1), have shape (N, m n), those of
+    the time head (N, R).
     """
     boundary = tasks.boundary
     rate = np.exp(log_rate)
@@ -59,7 +70,9 @@ def control_points(tasks: Tasks, phi: Array, log_rate: Array, *, scale: float, s
     n = boundary.start_q.shape[1]
     interior = (scale * phi).reshape(len(phi), phi.shape[1] // n, n)
     begin = first[:, 2:3]
-    interior += begin + (last[:, :1] - begin) * along_line(interior.shape[1], interior.dtype.name)
+    interior += begin + (last[:, :1] - begin) * along_line(
+        interior.shape[1], interior.dtype.name
+    )
     if tasks.correction is not None:
         interior += tasks.correction
     return ControlPoints(np.concatenate([first, interior, last], axis=1), rate)
@@ -76,17 +89,24 @@ def vjp(
 ) -> tuple[Array, Array]:
     """Convert gradients with respect to the control points to gradients with respect to the network's outputs.
 
-    The gradients of ``points``, the result of ``control_points``, have shapes (N, C, n) and (N, R). Those of phi and of
-    the logarithms of the rates have shapes (N, m n) and (N, R).
+    The gradients of ``points``, the result of ``control_points``, have shapes (N, C, n)
+    and (N, R). Those of phi and of the logarithms of the rates have shapes (N, m n) and
+    (N, R).
     """
-    interior = path_gradient[:, 3 : spec.path_control_points - tasks.boundary.fixed_at_goal]
+    interior = path_gradient[
+        :, 3 : spec.path_control_points - tasks.boundary.fixed_at_goal
+    ]
     along = along_line(interior.shape[1], interior.dtype.name)[:, 0]
     total = path_gradient.copy()
     total[:, 2] += (1 - along) @ interior
-    total[:, spec.path_control_points - tasks.boundary.fixed_at_goal] += along @ interior
+    total[:, spec.path_control_points - tasks.boundary.fixed_at_goal] += (
+        along @ interior
+    )
     rates = rate_gradient.copy()
     for effect in boundary_derivatives(tasks.boundary, points.rate, spec):
-        rates[:, effect.variable] += np.einsum("ij,ij->i", total[:, effect.point], effect.derivative)
+        rates[:, effect.variable] += np.einsum(
+            "ij,ij->i", total[:, effect.point], effect.derivative
+        )
     rates *= points.rate
     return scale * interior.reshape(len(interior), math.prod(interior.shape[1:])), rates
 
@@ -120,7 +140,10 @@ class Projection:
     interior: slice
 
     def project(self, path: Array, obstacle_poses: Array) -> Array:
-        """Return projected control points of paths [rad], shape (N, C, n); boundary control points stay."""
+        """Return projected control points of paths [rad], shape (N, C, n).
+
+        Boundary control points stay.
+        """
         (change,) = self.change(lanes(path), lanes(obstacle_poses))
         projected = path.copy()
         inner = projected[:, self.interior]
@@ -129,17 +152,34 @@ class Projection:
 
     def vjp(self, path: Array, obstacle_poses: Array, gradient: Array) -> Array:
         """Convert the gradient with respect to the result of ``project`` to that with respect to its argument."""
-        (through_change,) = self.adjoint(lanes(path), lanes(obstacle_poses), lanes(gradient[:, self.interior]))
-        total: Array = gradient + through_change.T.reshape(path.shape).astype(gradient.dtype, copy=False)
+        (through_change,) = self.adjoint(
+            lanes(path), lanes(obstacle_poses), lanes(gradient[:, self.interior])
+        )
+        total: Array = gradient + through_change.T.reshape(path.shape).astype(
+            gradient.dtype, copy=False
+        )
         return total
 
 
 def make_projection(
-    problem: Problem, kernels: KernelLibrary, *, steps: int, fixed_at_goal: int = 2, within_limits: bool = False
+    problem: Problem,
+    kernels: KernelLibrary,
+    *,
+    steps: int,
+    fixed_at_goal: int = 2,
+    within_limits: bool = False,
 ) -> Projection | None:
-    """Load the projection of a problem by Gauss-Newton steps; None if there are no steps or no equalities."""
+    """Load the projection of a problem by Gauss-Newton steps.
+
+    None if there are no steps or no equalities.
+    """
     if not effective_steps(kernels, steps):
         return None
     interior = slice(3, problem.trajectory.path_control_points - fixed_at_goal)
-    load = partial(kernels.load, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits)
+    load = partial(
+        kernels.load,
+        steps=steps,
+        fixed_at_goal=fixed_at_goal,
+        within_limits=within_limits,
+    )
     return Projection(load(path_change), load(path_change_adjoint), interior)

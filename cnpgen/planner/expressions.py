@@ -10,7 +10,11 @@ from numpy.typing import NDArray
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.symbolic.linalg import Vec, symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState, time_derivatives
-from cnpgen.problems.conditions import conditions_with_needs, equality_residuals, state_of_symbols
+from cnpgen.problems.conditions import (
+    conditions_with_needs,
+    equality_residuals,
+    state_of_symbols,
+)
 from cnpgen.problems.constraints.constraint import MIN_TOLERANCE, Condition
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
@@ -35,18 +39,25 @@ def speed_residuals(robot: Robot, problem: Problem) -> Any:
 def speed_violation(robot: Robot, problem: Problem) -> Any:
     """Build ``(p, p', p'', r, r', obstacle_poses, in one column) -> e``, the largest violation.
 
-    The violation is that of ``speed_residuals``. With jerk constraints the column has p''' after p'' and r'' after r'.
+    The violation is that of ``speed_residuals``. With jerk constraints the column has
+    p''' after p'' and r'' after r'.
 
-    The value is negative if all residuals are within their bounds. The arguments form one column because passing five
-    arguments takes longer than one evaluation of one plan.
+    The value is negative if all residuals are within their bounds. The arguments form
+    one column because passing five arguments takes longer than one evaluation of one
+    plan.
     """
     import casadi as ca
 
     columns, (p, *path, rate, obstacle_poses) = _on_path(robot, problem)
     orders = problem.path_orders
-    moving = [ca.vertcat(columns[order], columns[orders][order - 1]) for order in range(1, orders)]
+    moving = [
+        ca.vertcat(columns[order], columns[orders][order - 1])
+        for order in range(1, orders)
+    ]
     dq, ddq, jerk = time_derivatives(path, rate)
-    state = SymbolicState(robot, p, dq, ddq, obstacle_poses, problem.obstacle, problem.object_size, jerk)
+    state = SymbolicState(
+        robot, p, dq, ddq, obstacle_poses, problem.obstacle, problem.object_size, jerk
+    )
     violations: list[Any] = []
     for condition, needs in conditions_with_needs(problem, state, moving):
         if needs:
@@ -58,15 +69,23 @@ def speed_violation(robot: Robot, problem: Problem) -> Any:
 def speed_coefficients(robot: Robot, problem: Problem) -> Any:
     """Build ``(the column of speed_violation) -> constant, square, mixed``: coefficients of the rate's bounds.
 
-    Values of ``speed_residuals`` that are quadratic in dq, without a linear part, and linear in ddq are ``constant +
-    square r^2 + mixed r r'``. Values proportional to dq are combined in the last row: the square of the largest
-    fraction of a bound. The bounds are those of ``coefficient_bounds``.
+    Values of ``speed_residuals`` that are quadratic in dq, without a linear part, and
+    linear in ddq are ``constant + square r^2 + mixed r r'``. Values proportional to dq
+    are combined in the last row: the square of the largest fraction of a bound. The
+    bounds are those of ``coefficient_bounds``.
     """
     import casadi as ca
 
-    columns, values, zero = _on_path(robot, problem)[0], speed_residuals(robot, problem), ca.SX.zeros(robot.n)
+    columns, values, zero = (
+        _on_path(robot, problem)[0],
+        speed_residuals(robot, problem),
+        ca.SX.zeros(robot.n),
+    )
     p, p1, p2, _, obstacle_poses = columns
-    at_rest, fast, rising = (values(p, *moving, obstacle_poses) for moving in ((zero, zero), (p1, p2), (zero, p1)))
+    at_rest, fast, rising = (
+        values(p, *moving, obstacle_poses)
+        for moving in ((zero, zero), (p1, p2), (zero, p1))
+    )
     bounds = speed_bounds(robot, problem)
     others, fractions = np.flatnonzero(~bounds.proportional).tolist(), []
     for bound in (bounds.lower, bounds.upper):
@@ -74,15 +93,24 @@ def speed_coefficients(robot: Robot, problem: Problem) -> Any:
         fractions += [fast[row] * float(1 / bound[row]) for row in rows]
     largest = [reduce(ca.fmax, fractions, ca.SX(0)) ** 2] if fractions else []
     none = [ca.SX.zeros(len(largest))]
-    coefficients = [(at_rest, none), (fast - at_rest, largest), (rising - at_rest, none)]
-    outputs = [ca.densify(ca.vertcat(values_of_rows[others], *last)) for values_of_rows, last in coefficients]
+    coefficients = [
+        (at_rest, none),
+        (fast - at_rest, largest),
+        (rising - at_rest, none),
+    ]
+    outputs = [
+        ca.densify(ca.vertcat(values_of_rows[others], *last))
+        for values_of_rows, last in coefficients
+    ]
     return ca.Function("speed_coefficients", [ca.vertcat(*columns)], ca.cse(outputs))
 
 
 def coefficient_bounds(bounds: "SpeedBounds") -> tuple[Array, Array]:
     """Return lower and upper bounds of the rows of ``speed_coefficients`` from those of ``speed_residuals``."""
     others, count = ~bounds.proportional, int(bounds.proportional.any())
-    return np.append(bounds.lower[others], [-np.inf] * count), np.append(bounds.upper[others], [1.0] * count)
+    return np.append(bounds.lower[others], [-np.inf] * count), np.append(
+        bounds.upper[others], [1.0] * count
+    )
 
 
 def static_violation(robot: Robot, problem: Problem) -> Any:
@@ -95,14 +123,22 @@ def static_violation(robot: Robot, problem: Problem) -> Any:
     violations: list[Any] = []
     for constraint in problem.constraint:
         for condition in constraint.symbolic(rest):
-            violations += _violations(condition, np.maximum(constraint.allowed(condition), MIN_TOLERANCE))
-    return ca.Function("static_violation", [columns[0], columns[-1]], [reduce(ca.fmax, violations, ca.SX(-1))])
+            violations += _violations(
+                condition, np.maximum(constraint.allowed(condition), MIN_TOLERANCE)
+            )
+    return ca.Function(
+        "static_violation",
+        [columns[0], columns[-1]],
+        [reduce(ca.fmax, violations, ca.SX(-1))],
+    )
 
 
 def _violations(condition: Condition, units: Array) -> list[Any]:
     """Return the violations of a condition's finite bounds, in the given units, shape (m,)."""
     violations = []
-    for value, low, high, unit in zip(condition.g, condition.lower, condition.upper, units.tolist(), strict=True):
+    for value, low, high, unit in zip(
+        condition.g, condition.lower, condition.upper, units.tolist(), strict=True
+    ):
         violations += [(float(low) - value) / unit] if np.isfinite(low) else []
         violations += [(value - float(high)) / unit] if np.isfinite(high) else []
     return violations
@@ -134,10 +170,17 @@ def speed_bounds(robot: Robot, problem: Problem) -> SpeedBounds:
     """Return the bounds of the rows of ``speed_residuals``."""
     columns, state = state_of_symbols(robot, problem)
     rows = [
-        (low, high, needs == 3, needs == 1 and _is_proportional(value, columns[1], low, high))
+        (
+            low,
+            high,
+            needs == 3,
+            needs == 1 and _is_proportional(value, columns[1], low, high),
+        )
         for condition, needs in conditions_with_needs(problem, state, columns[1:-1])
         if needs
-        for value, low, high in zip(condition.g, condition.lower, condition.upper, strict=True)
+        for value, low, high in zip(
+            condition.g, condition.lower, condition.upper, strict=True
+        )
     ]
     lower, upper, cubic, proportional = np.array(rows, float).reshape(-1, 4).T
     return SpeedBounds(lower, upper, cubic.astype(bool), proportional.astype(bool))
@@ -146,12 +189,18 @@ def speed_bounds(robot: Robot, problem: Problem) -> SpeedBounds:
 def _is_proportional(value: Any, dq: Any, low: float, high: float) -> bool:
     import casadi as ca
 
-    linear = ca.is_linear(value, dq) and ca.substitute(value, dq, ca.SX.zeros(dq.shape)).is_zero()
+    linear = (
+        ca.is_linear(value, dq)
+        and ca.substitute(value, dq, ca.SX.zeros(dq.shape)).is_zero()
+    )
     return bool(linear and low < 0 < high and np.isfinite([low, high]).any())
 
 
 def _on_path(robot: Robot, problem: Problem) -> tuple[list[Any], list[Vec]]:
-    """Return p, p', p'', ..., r, r', ... and obstacle poses, as SX columns and as lists of their scalars."""
+    """Return p, p', p'', ..., r, r', .
+
+    And obstacle poses, as SX columns and as lists of their scalars.
+    """
     orders = problem.path_orders
     names = (*(f"p{order}" for order in range(orders)), "rates", "obstacle_poses")
     widths = (*[robot.n] * orders, orders - 1, problem.scene_width)

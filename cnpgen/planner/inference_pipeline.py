@@ -1,6 +1,7 @@
 """Run the steps before and after the network: prepare tasks, project paths and fit rates to the limits.
 
-Plans that violate static conditions are planned again along alternative lines through via points of the model.
+Plans that violate static conditions are planned again along alternative lines through
+via points of the model.
 """
 
 from collections.abc import Iterator, Mapping
@@ -19,8 +20,15 @@ from cnpgen.planner.expressions import effective_steps, static_violation
 from cnpgen.planner.model import Model, ModelConfig, Outputs
 from cnpgen.planner.task_preprocessor import TaskPreprocessor, make_task_preprocessor
 from cnpgen.planner.tasks import Tasks, ends_of, lanes, rows
-from cnpgen.planner.time_parametrization import TimeParametrization, make_time_parametrization
-from cnpgen.planner.time_scaling import TimeScaling, blocks_of_motions, make_time_scaling
+from cnpgen.planner.time_parametrization import (
+    TimeParametrization,
+    make_time_parametrization,
+)
+from cnpgen.planner.time_scaling import (
+    TimeScaling,
+    blocks_of_motions,
+    make_time_scaling,
+)
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
@@ -45,9 +53,8 @@ MAX_LINES = 4  # that motions are planned along
 class ViaPoints:
     """Via points of one problem's model, and the check of static conditions; made by ``make_via_points``.
 
-    Attributes:
-        via_points: Configurations [rad], shape (M, n).
-        static_violation: Kernel of ``expressions.static_violation`` at phases of motions, in single precision.
+    Attributes: via_points: Configurations [rad], shape (M, n). static_violation: Kernel
+        of ``expressions.static_violation`` at phases of motions, in single precision.
         path: Basis of p at K phases, shape (K, C), float32.
     """
 
@@ -58,7 +65,8 @@ class ViaPoints:
     def violation(self, motion: Motion, obstacle_poses: Array) -> Array:
         """Return the largest violation of conditions on positions and holding torques by N motions, in tolerances.
 
-        It is at most 1 if all conditions hold at the phases, and inf if a position is not finite.
+        It is at most 1 if all conditions hold at the phases, and inf if a position is
+        not finite.
         """
         return self._violation_at(self.path, motion.path, obstacle_poses)
 
@@ -67,15 +75,21 @@ class ViaPoints:
 
         Motions with a violation at one of a few phases are not checked at the others.
         """
-        bound = self._violation_at(self.path[COARSE_PHASES], motion.path, obstacle_poses)
+        bound = self._violation_at(
+            self.path[COARSE_PHASES], motion.path, obstacle_poses
+        )
         unclear = np.flatnonzero(bound <= 1)
         bound[unclear] = self.violation(motion[unclear], obstacle_poses[unclear])
         return bound
 
-    def _violation_at(self, basis_of_p: NDArray[np.float32], path: Array, obstacle_poses: Array) -> Array:
+    def _violation_at(
+        self, basis_of_p: NDArray[np.float32], path: Array, obstacle_poses: Array
+    ) -> Array:
         values = np.empty((1, len(basis_of_p), len(path)), np.float32)
         for block in blocks_of_motions(len(path), MOTIONS_PER_CALL):
-            q = np.matmul(basis_of_p, path[block].transpose(2, 1, 0).astype(np.float32, order="C"))
+            q = np.matmul(
+                basis_of_p, path[block].transpose(2, 1, 0).astype(np.float32, order="C")
+            )
             poses = obstacle_poses[block].T.astype(np.float32, order="C")
             self.static_violation(q, poses, out=[values[..., block]])
         worst: Array = values[0].max(axis=0).astype(np.float64)
@@ -88,26 +102,37 @@ class ViaPoints:
         """
         assert lines.correction is not None
         path = lines_at_rest(lines.boundary, lines.correction)
-        violation = self._violation_at(self.path[COARSE_PHASES], path, lines.scene.poses)
-        order = violation.reshape(-1, len(self.via_points)).argsort(axis=1, kind="stable")[:, :count]
-        return np.asarray((order + len(self.via_points) * np.arange(len(order))[:, None]).ravel())
+        violation = self._violation_at(
+            self.path[COARSE_PHASES], path, lines.scene.poses
+        )
+        order = violation.reshape(-1, len(self.via_points)).argsort(
+            axis=1, kind="stable"
+        )[:, :count]
+        return np.asarray(
+            (order + len(self.via_points) * np.arange(len(order))[:, None]).ravel()
+        )
 
     @staticmethod
     def candidates(violation: Array, count: int) -> NDArray[np.intp]:
         """Return rows of motions: for every task those without violation, or else the one with the smallest.
 
-        Violations, shape (N count,), are those along ``count`` lines of the first task, then of the next one.
+        Violations, shape (N count,), are those along ``count`` lines of the first task,
+        then of the next one.
         """
         of_task = violation.reshape(-1, count)
         least = of_task.min(axis=1, keepdims=True)
         return np.flatnonzero(of_task <= np.maximum(least, 1))
 
 
-def make_via_points(problem: Problem, kernels: KernelLibrary, via_points: Array) -> ViaPoints:
+def make_via_points(
+    problem: Problem, kernels: KernelLibrary, via_points: Array
+) -> ViaPoints:
     """Load the check of via points [rad], shape (M, n), for one problem."""
     spec = problem.trajectory
     path = basis(chebyshev(STATIC_INTERVALS), spec.path_control_points, spec.degree)
-    kernel = kernels.load_grid(static_violation, GridSpec(("point", "lane"), ("point",)), dtype="float32")
+    kernel = kernels.load_grid(
+        static_violation, GridSpec(("point", "lane"), ("point",)), dtype="float32"
+    )
     return ViaPoints(via_points, kernel, path.astype(np.float32))
 
 
@@ -125,16 +150,23 @@ class LoadedProblem:
 
 
 @contextmanager
-def loaded_problem(record: ProblemRecord, backend: str | None = None) -> Iterator[LoadedProblem]:
+def loaded_problem(
+    record: ProblemRecord, backend: str | None = None
+) -> Iterator[LoadedProblem]:
     """Load a problem from its record, with its URDF file until the context is left, and the fastest backend by default.
 
-    Raises:
-        CnpgenError: The record does not fit this version of cnpgen, or a dependency is missing.
+    Raises: CnpgenError: The record does not fit this version of cnpgen, or a dependency
+        is missing.
     """
     chosen, folder = choose_backend(backend)
     with record.restored() as problem:
         robot = load_robot(problem)
-        yield LoadedProblem(record, problem, robot, problem_kernels(problem.for_planning, robot, chosen, folder))
+        yield LoadedProblem(
+            record,
+            problem,
+            robot,
+            problem_kernels(problem.for_planning, robot, chosen, folder),
+        )
 
 
 @dataclass(frozen=True)
@@ -159,19 +191,27 @@ class InferencePipeline:
         columns: Mapping[str, Array] | None = None,
     ) -> Plans:
         """Plan N motions; see ``Planner.plan_batch``."""
-        tasks, motion = self.planned(model, boundary, (columns or {}).get(OBSTACLE_POSES))
+        tasks, motion = self.planned(
+            model, boundary, (columns or {}).get(OBSTACLE_POSES)
+        )
         return Plans(
             problem=model.problem,
             boundary=boundary,
             path_control_points=motion.path,
             rate_control_points=motion.rate,
             degree=motion.degree,
-            columns={**(columns or {}), "start_xyz": tasks.start_xyz, "goal_xyz": tasks.goal_xyz},
+            columns={
+                **(columns or {}),
+                "start_xyz": tasks.start_xyz,
+                "goal_xyz": tasks.goal_xyz,
+            },
             sample_id=np.arange(len(boundary)) if sample_id is None else sample_id,
             status=np.zeros(len(boundary), np.uint8),  # unknown
         )
 
-    def planned(self, model: Model, boundary: Boundary, obstacle_poses: Array | None = None) -> tuple[Tasks, Motion]:
+    def planned(
+        self, model: Model, boundary: Boundary, obstacle_poses: Array | None = None
+    ) -> tuple[Tasks, Motion]:
         """Plan N motions; return the tasks with the selected lines, and the motions."""
         ends = ends_of(boundary)
         tasks = self.prepare(boundary, ends=ends, obstacle_poses=obstacle_poses)
@@ -182,7 +222,9 @@ class InferencePipeline:
 
     def motion(self, model: Model, tasks: Tasks) -> Motion:
         """Evaluate the network, project its paths onto the equalities, and fit the rates to the limits."""
-        return self._fitted(self._projected(model, tasks, ends_of(tasks.boundary)), tasks.scene.poses)
+        return self._fitted(
+            self._projected(model, tasks, ends_of(tasks.boundary)), tasks.scene.poses
+        )
 
     def _projected(self, model: Model, tasks: Tasks, ends: Array) -> Motion:
         outputs, path = self._outputs(model, tasks, ends)
@@ -190,60 +232,106 @@ class InferencePipeline:
             outputs, path = self._outputs(model, self.prepare.along(tasks, path), ends)
         return Motion(path, outputs.rate, model.problem.trajectory.degree)
 
-    def _outputs(self, model: Model, tasks: Tasks, ends: Array) -> tuple[Outputs, Array]:
+    def _outputs(
+        self, model: Model, tasks: Tasks, ends: Array
+    ) -> tuple[Outputs, Array]:
         """Evaluate the network; return its outputs, and the projected path, shape (N, C, n)."""
         outputs = model.outputs(tasks)
-        (path,) = self.path(ends, lanes(outputs.offsets), lanes(outputs.rate), tasks.scene.lanes)
+        (path,) = self.path(
+            ends, lanes(outputs.offsets), lanes(outputs.rate), tasks.scene.lanes
+        )
         return outputs, rows(path, tasks.boundary.start_q.shape[1])
 
     def _fitted(self, motion: Motion, obstacle_poses: Array) -> Motion:
         violating = np.arange(len(motion))
         if self.time_parametrization is not None:
-            motion, meets_limits = self.time_parametrization.parametrize(motion, obstacle_poses)
+            motion, meets_limits = self.time_parametrization.parametrize(
+                motion, obstacle_poses
+            )
             violating = np.flatnonzero(~meets_limits)
         if self.time_scaling is None or not len(violating):
             return motion
         factor = np.ones(len(motion))
-        factor[violating] = self.time_scaling.factor(motion[violating], obstacle_poses[violating])
+        factor[violating] = self.time_scaling.factor(
+            motion[violating], obstacle_poses[violating]
+        )
         return motion if factor.max() <= 1 else motion.time_scaled(factor)
 
     def _with_via_points(
         self, via_points: ViaPoints, model: Model, tasks: Tasks, motion: Motion
     ) -> tuple[Tasks, Motion]:
-        """Fit the rates of motions; replace violating and slow ones by better ones through via points or straighter."""
-        path, rate, violation = motion.path.copy(), motion.rate.copy(), via_points.violation(motion, tasks.scene.poses)
+        """Fit the rates of motions.
+
+        Replace violating and slow ones by better ones through via points or straighter.
+        """
+        path, rate, violation = (
+            motion.path.copy(),
+            motion.rate.copy(),
+            via_points.violation(motion, tasks.scene.poses),
+        )
         fitted, kept = np.empty_like(rate), np.ones(len(path), bool)
         correction = np.zeros_like(path[:, self._interior(tasks.boundary)])
         correction += 0.0 if tasks.correction is None else tasks.correction
-        violating, count = np.flatnonzero(violation > 1), min(MAX_LINES, len(via_points.via_points))
+        violating, count = (
+            np.flatnonzero(violation > 1),
+            min(MAX_LINES, len(via_points.via_points)),
+        )
         for some in (violating[block] for block in blocks_of_motions(len(violating))):
             repeated = np.repeat(some, len(via_points.via_points))
-            lines = self.prepare(tasks.boundary[repeated], np.tile(via_points.via_points, (len(some), 1)))
+            lines = self.prepare(
+                tasks.boundary[repeated], np.tile(via_points.via_points, (len(some), 1))
+            )
             alternatives = lines.take(via_points.best_lines(lines, count))
             assert alternatives.correction is not None
-            motions = self._projected(model, alternatives, ends_of(alternatives.boundary))
+            motions = self._projected(
+                model, alternatives, ends_of(alternatives.boundary)
+            )
             poses = alternatives.scene.poses
             after = via_points.lower_bound(motions, poses)
             candidates = via_points.candidates(after, count)
-            others, time = self._fitted(motions[candidates], poses[candidates]), np.full(len(motions), np.inf)
+            others, time = (
+                self._fitted(motions[candidates], poses[candidates]),
+                np.full(len(motions), np.inf),
+            )
             time[candidates] = others.duration_bound()
-            fastest = time.reshape(len(some), -1).argmin(axis=1) + count * np.arange(len(some))
+            fastest = time.reshape(len(some), -1).argmin(axis=1) + count * np.arange(
+                len(some)
+            )
             unclear = fastest[after[fastest] > 1]  # lower bounds
             after[unclear] = via_points.violation(motions[unclear], poses[unclear])
             better = after[fastest] < violation[some]
             replaced, fastest = some[better], fastest[better]
-            path[replaced], rate[replaced] = motions.path[fastest], motions.rate[fastest]
+            path[replaced], rate[replaced] = (
+                motions.path[fastest],
+                motions.rate[fastest],
+            )
             fitted[replaced] = others.rate[np.searchsorted(candidates, fastest)]
-            violation[replaced], correction[replaced] = after[fastest], alternatives.correction[fastest]
+            violation[replaced], correction[replaced] = (
+                after[fastest],
+                alternatives.correction[fastest],
+            )
             kept[replaced] = False
         fitted[kept] = self._fitted(motion[kept], tasks.scene.poses[kept]).rate
-        self._shorten(via_points, tasks, Motion(path, rate, motion.degree), fitted, violation)
-        return replace(tasks, correction=correction), Motion(path, fitted, motion.degree)
+        self._shorten(
+            via_points, tasks, Motion(path, rate, motion.degree), fitted, violation
+        )
+        return replace(tasks, correction=correction), Motion(
+            path, fitted, motion.degree
+        )
 
-    def _shorten(self, via_points: ViaPoints, tasks: Tasks, motion: Motion, fitted: Array, violation: Array) -> None:
+    def _shorten(
+        self,
+        via_points: ViaPoints,
+        tasks: Tasks,
+        motion: Motion,
+        fitted: Array,
+        violation: Array,
+    ) -> None:
         """Move slow motions without violation nearer to the straight line in place, if they become faster."""
         bound = replace(motion, rate=fitted).duration_bound()
-        slow = np.flatnonzero((violation <= 1) & (bound > SLOW_DURATION * tasks.expected_time))
+        slow = np.flatnonzero(
+            (violation <= 1) & (bound > SLOW_DURATION * tasks.expected_time)
+        )
         if not len(slow):
             return
         some, rate = tasks.take(slow), lanes(motion.rate[slow])
@@ -251,7 +339,10 @@ class InferencePipeline:
         offsets = interior - anchor_line(some.boundary, motion.rate[slow], motion.spec)
         part = lanes((OFFSET_FRACTION * offsets).reshape(len(slow), -1))
         (path,) = self.path(ends_of(some.boundary), part, rate, some.scene.lanes)
-        other, poses = Motion(rows(path, motion.path.shape[2]), motion.rate[slow], motion.degree), some.scene.poses
+        other, poses = (
+            Motion(rows(path, motion.path.shape[2]), motion.rate[slow], motion.degree),
+            some.scene.poses,
+        )
         free = np.flatnonzero(via_points.lower_bound(other, poses) <= 1)
         other = self._fitted(other[free], poses[free])
         faster = other.duration_bound() < bound[slow[free]]
@@ -272,12 +363,21 @@ def make_inference_pipeline(
     fixed_at_goal: int = 2,
     observed: bool = True,
 ) -> InferencePipeline:
-    """Load the inference pipeline of a problem; ``scale_time`` is for motions from rest to rest only."""
+    """Load the inference pipeline of a problem.
+
+    ``scale_time`` is for motions from rest to rest only.
+    """
     problem, robot, kernels = loaded.problem.for_planning, loaded.robot, loaded.kernels
     with kernels.compile_in_parallel():
         placed = loaded.problem.sample_obstacles
         prepare = make_task_preprocessor(
-            problem, robot, kernels, config, fixed_at_goal=fixed_at_goal, placed=placed, observed=observed
+            problem,
+            robot,
+            kernels,
+            config,
+            fixed_at_goal=fixed_at_goal,
+            placed=placed,
+            observed=observed,
         )
         path = kernels.load(
             projected_path,
@@ -285,9 +385,19 @@ def make_inference_pipeline(
             fixed_at_goal=fixed_at_goal,
             within_limits=config.within_limits,
         )
-        time_scaling = make_time_scaling(problem, robot, kernels) if scale_time else None
-        time_parametrization = (
-            make_time_parametrization(problem, robot, kernels, at_rest=scale_time) if config.time_parametrized else None
+        time_scaling = (
+            make_time_scaling(problem, robot, kernels) if scale_time else None
         )
-        via_points = make_via_points(problem, kernels, np.array(config.via_points)) if config.via_points else None
-    return InferencePipeline(prepare, path, time_scaling, time_parametrization, via_points)
+        time_parametrization = (
+            make_time_parametrization(problem, robot, kernels, at_rest=scale_time)
+            if config.time_parametrized
+            else None
+        )
+        via_points = (
+            make_via_points(problem, kernels, np.array(config.via_points))
+            if config.via_points
+            else None
+        )
+    return InferencePipeline(
+        prepare, path, time_scaling, time_parametrization, via_points
+    )

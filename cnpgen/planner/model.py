@@ -25,18 +25,22 @@ MAX_NETWORK_ITERATIONS = 20
 class ModelConfig:
     """Definition of the network's outputs.
 
-    Attributes:
-        path_scale: Factor of the configuration head's output [rad]; pi in the paper.
-        line_projection_steps: Gauss-Newton steps that project the line onto the equalities; 0 in the paper.
-        projection_steps: Gauss-Newton steps that project the path onto the equalities.
-        expected_time: Unit of durations: "distance", the time of the distance at the velocity limits, at least 0.2 s;
-            "travel", the same without a lower bound, as in the authors' implementation; or "reach", the minimum time
-            in which every joint could reach its goal state.
-        within_limits: Whether control points are clipped to the joint limits after each of these steps, and without any
-            of them once.
-        time_parametrized: Whether rates are fitted to the limits after the network (``time_parametrization``).
-        via_points: Via points of alternative lines for plans with violations [rad], n numbers each (``ViaPoints``).
-        iterations: Number of evaluations of the network; each one after the first corrects the path of the one before.
+    Attributes: path_scale: Factor of the configuration head's output [rad]; pi in the
+        paper. line_projection_steps: Gauss-Newton steps that project the line onto the
+        equalities; 0 in the paper. projection_steps: Gauss-Newton steps that project
+        the path onto the equalities. expected_time: Unit of durations: "distance", the
+        time of the distance at the velocity limits, at least 0.2 s;
+            "travel", the same without a lower bound, as in the authors' implementation;
+            or "reach", the minimum time in which every joint could reach its goal
+            state.
+        within_limits: Whether control points are clipped to the joint limits after each
+            of these steps, and without any of them once.
+        time_parametrized: Whether rates are fitted to the limits after the network
+            (``time_parametrization``).
+        via_points: Via points of alternative lines for plans with violations [rad], n
+            numbers each (``ViaPoints``).
+        iterations: Number of evaluations of the network; each one after the first
+            corrects the path of the one before.
     """
 
     path_scale: float
@@ -53,9 +57,8 @@ class ModelConfig:
 class Outputs:
     """Network outputs of N tasks.
 
-    Attributes:
-        offsets: Offsets of interior path control points from the line [rad], shape (N, interior points x n).
-        rate: Rate control points [1/s], shape (N, R).
+    Attributes: offsets: Offsets of interior path control points from the line [rad],
+        shape (N, interior points x n). rate: Rate control points [1/s], shape (N, R).
     """
 
     offsets: NDArray[np.float64]
@@ -66,15 +69,13 @@ class Outputs:
 class Model:
     """A trained model.
 
-    Attributes:
-        problem: The problem that it plans for, with its URDF.
-        architecture: The network's architecture.
-        parameters: All parameters, float32, shape (architecture.n_parameters,).
-        features: Definition of its inputs.
-        config: Definition of its outputs.
-        zero_conditions: Names of the boundary conditions that were zero in all training rows.
-        training: Training metadata: command, seed, dataset, steps, seconds, score; JSON-able.
-        log: Its training log, one JSON object per line.
+    Attributes: problem: The problem that it plans for, with its URDF. architecture: The
+        network's architecture. parameters: All parameters, float32, shape
+        (architecture.n_parameters,). features: Definition of its inputs. config:
+        Definition of its outputs. zero_conditions: Names of the boundary conditions
+        that were zero in all training rows. training: Training metadata: command, seed,
+        dataset, steps, seconds, score; JSON-able. log: Its training log, one JSON
+        object per line.
     """
 
     problem: ProblemRecord
@@ -91,12 +92,19 @@ class Model:
 
     @checked_arguments
     def outputs(self, tasks: Tasks) -> Outputs:
-        """Evaluate the network for N tasks, in float32; sums and the exponential are in float64."""
+        """Evaluate the network for N tasks, in float32.
+
+        Sums and the exponential are in float64.
+        """
         activations = forward(self._weights, self.features.of(tasks))
         offsets = self.config.path_scale * activations.path.astype(np.float64)
         if tasks.correction is not None:
             offsets += tasks.correction.reshape(offsets.shape)
-        return Outputs(offsets, np.exp(activations.log_rate.astype(np.float64)) / tasks.expected_time[:, None])
+        return Outputs(
+            offsets,
+            np.exp(activations.log_rate.astype(np.float64))
+            / tasks.expected_time[:, None],
+        )
 
     @cached_property
     def _weights(self) -> Weights:
@@ -115,6 +123,11 @@ class Model:
 
 
 def is_rest_to_rest(zero_conditions: Iterable[str], fixed_at_goal: int) -> bool:
-    """Return whether motions with these zero conditions begin and end at rest; a free condition need not be zero."""
-    moving = {"start_dq", "start_ddq", "goal_dq"} | ({"goal_ddq"} if fixed_at_goal == 3 else set())
+    """Return whether motions with these zero conditions begin and end at rest.
+
+    A free condition need not be zero.
+    """
+    moving = {"start_dq", "start_ddq", "goal_dq"} | (
+        {"goal_ddq"} if fixed_at_goal == 3 else set()
+    )
     return moving <= set(zero_conditions)

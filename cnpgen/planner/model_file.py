@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
 from cnpgen.planner.model import MAX_NETWORK_ITERATIONS, Model, ModelConfig
 from cnpgen.planner.network.architecture import Architecture
-from cnpgen.planner.network.features import ARRIVAL, BLOCKS, LINE, Features, count_features
+from cnpgen.planner.network.features import (
+    ARRIVAL,
+    BLOCKS,
+    LINE,
+    Features,
+    count_features,
+)
 from cnpgen.planner.tasks import EXPECTED_TIMES
 from cnpgen.plans.format import CONDITIONS
 from cnpgen.problems.problem import Problem
@@ -22,22 +28,42 @@ from cnpgen.problems.problem_record import ProblemRecord, as_record
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.catalogue import recipes_root
 from cnpgen.store.dataset_spec import StoredProblem
-from cnpgen.store.files.checksum_file import Content, read_with_checksum, write_with_checksum
-from cnpgen.store.files.document_structure import ANY_KEY, ANYTHING, NUMBER, TEXT, WHOLE, check_structure
+from cnpgen.store.files.checksum_file import (
+    Content,
+    read_with_checksum,
+    write_with_checksum,
+)
+from cnpgen.store.files.document_structure import (
+    ANY_KEY,
+    ANYTHING,
+    NUMBER,
+    TEXT,
+    WHOLE,
+    check_structure,
+)
 from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.kind import kind_name
 from cnpgen.store.paths import ANY_HDF5, require_file
 
 MODEL_KIND, MODEL_VERSION = "cnpgen-model", 2
 MAX_PROJECTION_STEPS = 20  # Gauss-Newton steps; each makes a kernel larger
-_DEFAULTS = {field.name: field.default for field in fields(ModelConfig)}  # values that files omit
+_DEFAULTS = {
+    field.name: field.default for field in fields(ModelConfig)
+}  # values that files omit
 _STRUCTURE = {
     "architecture": {field.name: WHOLE for field in fields(Architecture)},
     "features": [TEXT],
-    "config": {"path_scale": NUMBER, "line_projection_steps": WHOLE, "projection_steps": WHOLE},
+    "config": {
+        "path_scale": NUMBER,
+        "line_projection_steps": WHOLE,
+        "projection_steps": WHOLE,
+    },
     "zero_conditions": [TEXT],
 }
-_TRAINING_STRUCTURE = {"dataset": {ANY_KEY: ANYTHING}, "stages": [{ANY_KEY: ANYTHING}]}  # of the optional keys read
+_TRAINING_STRUCTURE = {
+    "dataset": {ANY_KEY: ANYTHING},
+    "stages": [{ANY_KEY: ANYTHING}],
+}  # of the optional keys read
 
 
 @checked_arguments
@@ -51,7 +77,9 @@ def save_model(path: str | Path, model: Model) -> None:
     Raises:
         MachineError: The disk is full or read-only.
     """
-    write_with_checksum(Path(path), model_content(model), kind=MODEL_KIND, version=MODEL_VERSION)
+    write_with_checksum(
+        Path(path), model_content(model), kind=MODEL_KIND, version=MODEL_VERSION
+    )
 
 
 @checked_arguments
@@ -61,24 +89,37 @@ def load_model(name_or_path: str | Path) -> Model:
     Args:
         name_or_path: Name of a shipped model, or path of a model file.
 
-    Raises:
-        UsageError: There is no such file, it is of another kind, or there is no shipped model of this name.
-        DatasetError: The file is damaged or of another format version.
-        MachineError: The operating system denies reading it.
+    Raises: UsageError: There is no such file, it is of another kind, or there is no
+        shipped model of this name. DatasetError: The file is damaged or of another
+        format version. MachineError: The operating system denies reading it.
     """
     path = find_model(name_or_path)
-    return model_from_content(path, read_with_checksum(path, kind=MODEL_KIND, version=MODEL_VERSION))
+    return model_from_content(
+        path, read_with_checksum(path, kind=MODEL_KIND, version=MODEL_VERSION)
+    )
 
 
 def model_for(problem: Problem | StoredProblem) -> Model:
-    """Read the shipped model of a problem; raise UsageError if there is none, or several."""
+    """Read the shipped model of a problem.
+
+    Raise UsageError if there is none, or several.
+    """
     record = as_record(problem)
     models = {name: load_model(path) for name, path in shipped_models().items()}
-    matches = [name for name, model in models.items() if model.problem.comparable_sha256 == record.comparable_sha256]
+    matches = [
+        name
+        for name, model in models.items()
+        if model.problem.comparable_sha256 == record.comparable_sha256
+    ]
     if len(matches) != 1:
-        subject = f"several shipped models ({', '.join(matches)})" if matches else "no shipped model"
+        subject = (
+            f"several shipped models ({', '.join(matches)})"
+            if matches
+            else "no shipped model"
+        )
         raise UsageError(
-            f"{subject} for the problem {record.name!r}: pass the name or the file of a model", concerns="model"
+            f"{subject} for the problem {record.name!r}: pass the name or the file of a model",
+            concerns="model",
         )
     return models[matches[0]]
 
@@ -92,16 +133,26 @@ def shipped_models() -> dict[str, Path]:
 def find_model(name_or_path: str | Path) -> Path:
     """Return the file of a model: a path if it ends in ``.h5``, has a separator or is a file; else a shipped model.
 
-    Raises:
-        UsageError: There is no such file, it is of another kind, or there is no shipped model of this name.
-        MachineError: The operating system denies reading it.
+    Raises: UsageError: There is no such file, it is of another kind, or there is no
+        shipped model of this name. MachineError: The operating system denies reading
+        it.
     """
     if not isinstance(name_or_path, str | Path):
-        raise UsageError(f"a model must be a name or a path, got {name_or_path!r}", concerns="name_or_path")
+        raise UsageError(
+            f"a model must be a name or a path, got {name_or_path!r}",
+            concerns="name_or_path",
+        )
     text, known = os.fspath(name_or_path), shipped_models()
-    if isinstance(name_or_path, Path) or text.endswith(".h5") or os.sep in text or Path(text).is_file():
+    if (
+        isinstance(name_or_path, Path)
+        or text.endswith(".h5")
+        or os.sep in text
+        or Path(text).is_file()
+    ):
         expected = kind_name("model")
-        require_file(Path(text), expected, kinds=(expected, ANY_HDF5), argument="name_or_path")
+        require_file(
+            Path(text), expected, kinds=(expected, ANY_HDF5), argument="name_or_path"
+        )
         return Path(text)
     if text not in known:
         raise UsageError(
@@ -117,11 +168,18 @@ def model_content(model: Model) -> Content:
     for layer in model.architecture.all_layers:
         arrays[f"{layer.name}_weight"] = layer.weight(model.parameters)
         arrays[f"{layer.name}_bias"] = layer.bias(model.parameters)
-    arrays["feature_mean"], arrays["feature_scale"] = model.features.mean, model.features.scale
+    arrays["feature_mean"], arrays["feature_scale"] = (
+        model.features.mean,
+        model.features.scale,
+    )
     description = {
         "architecture": asdict(model.architecture),
         "features": list(model.features.blocks),
-        "config": {name: value for name, value in asdict(model.config).items() if value != _DEFAULTS.get(name)},
+        "config": {
+            name: value
+            for name, value in asdict(model.config).items()
+            if value != _DEFAULTS.get(name)
+        },
         "zero_conditions": list(model.zero_conditions),
         "problem_sha256": model.problem.comparable_sha256,
     }
@@ -144,45 +202,77 @@ def model_from_content(path: Path, content: Content) -> Model:
     try:
         return _assembled(content)
     except KeyError as error:
-        raise DatasetError(f"{path} does not fit this version of cnpgen: it has no {error}") from error
+        raise DatasetError(
+            f"{path} does not fit this version of cnpgen: it has no {error}"
+        ) from error
     except (TypeError, ValueError, UsageError, RecipeError) as error:
-        raise DatasetError(f"{path} does not fit this version of cnpgen: {error}") from error
+        raise DatasetError(
+            f"{path} does not fit this version of cnpgen: {error}"
+        ) from error
 
 
 def _assembled(content: Content) -> Model:
     """Make a model; check its description against its arrays first."""
-    description, training = (parse_json(content.texts[name]) for name in ("description", "training"))
+    description, training = (
+        parse_json(content.texts[name]) for name in ("description", "training")
+    )
     check_structure(description, _STRUCTURE)
     check_structure(training, {ANY_KEY: ANYTHING})
-    check_structure(training, {key: form for key, form in _TRAINING_STRUCTURE.items() if key in training})
-    problem = ProblemRecord(content.texts["problem_recipe"], content.texts["problem_urdf"])
+    check_structure(
+        training,
+        {key: form for key, form in _TRAINING_STRUCTURE.items() if key in training},
+    )
+    problem = ProblemRecord(
+        content.texts["problem_recipe"], content.texts["problem_urdf"]
+    )
     architecture = Architecture(**description["architecture"])
-    features = Features(tuple(description["features"]), content.arrays["feature_mean"], content.arrays["feature_scale"])
+    features = Features(
+        tuple(description["features"]),
+        content.arrays["feature_mean"],
+        content.arrays["feature_scale"],
+    )
     stored = description["config"]
     via_points = tuple(tuple(map(float, each)) for each in stored.get("via_points", ()))
     config = ModelConfig(**{**stored, "via_points": via_points})
     _check_sizes(problem, architecture, features)
     joints = len(problem.joint_names)
-    if not all(len(each) == joints and np.isfinite(each).all() for each in config.via_points):
-        raise ValueError(f"via points must be {joints} numbers each, got {config.via_points}")
+    if not all(
+        len(each) == joints and np.isfinite(each).all() for each in config.via_points
+    ):
+        raise ValueError(
+            f"via points must be {joints} numbers each, got {config.via_points}"
+        )
     if unknown := set(description["zero_conditions"]) - set(CONDITIONS):
         raise ValueError(f"unknown boundary conditions {', '.join(sorted(unknown))}")
     if positions := {"start_q", "goal_q"} & set(description["zero_conditions"]):
-        raise ValueError(f"{', '.join(sorted(positions))}: only velocities and accelerations are zero in every row")
+        raise ValueError(
+            f"{', '.join(sorted(positions))}: only velocities and accelerations are zero in every row"
+        )
     steps = max(config.line_projection_steps, config.projection_steps)
     if steps > MAX_PROJECTION_STEPS or not math.isfinite(float(config.path_scale)):
         raise ValueError(
             f"{config} is invalid: there are at most {MAX_PROJECTION_STEPS} steps, and path_scale is finite"
         )
-    if not (type(config.iterations) is int and 1 <= config.iterations <= MAX_NETWORK_ITERATIONS):
-        raise ValueError(f"iterations must be an integer from 1 to {MAX_NETWORK_ITERATIONS}, got {config.iterations!r}")
+    if not (
+        type(config.iterations) is int
+        and 1 <= config.iterations <= MAX_NETWORK_ITERATIONS
+    ):
+        raise ValueError(
+            f"iterations must be an integer from 1 to {MAX_NETWORK_ITERATIONS}, got {config.iterations!r}"
+        )
     if (config.iterations > 1) != (LINE in features.blocks):
-        raise ValueError(f"{config.iterations} iterations do not fit the features {', '.join(features.blocks)}")
+        raise ValueError(
+            f"{config.iterations} iterations do not fit the features {', '.join(features.blocks)}"
+        )
     if config.expected_time not in EXPECTED_TIMES:
-        raise ValueError(f"expected_time must be one of {', '.join(EXPECTED_TIMES)}, got {config.expected_time!r}")
+        raise ValueError(
+            f"expected_time must be one of {', '.join(EXPECTED_TIMES)}, got {config.expected_time!r}"
+        )
     for name in ("within_limits", "time_parametrized"):
         if getattr(config, name) not in {True, False}:
-            raise ValueError(f"{name} must be true or false, got {getattr(config, name)!r}")
+            raise ValueError(
+                f"{name} must be true or false, got {getattr(config, name)!r}"
+            )
     return Model(
         problem=problem,
         architecture=architecture,
@@ -195,35 +285,54 @@ def _assembled(content: Content) -> Model:
     )
 
 
-def _check_sizes(problem: ProblemRecord, architecture: Architecture, features: Features) -> None:
+def _check_sizes(
+    problem: ProblemRecord, architecture: Architecture, features: Features
+) -> None:
     """Check that the network's inputs and outputs fit its features and its problem."""
     if unknown := set(features.blocks) - set(BLOCKS):
         raise ValueError(f"unknown features {', '.join(sorted(unknown))}")
     joints, spec = len(problem.joint_names), problem.trajectory
-    inputs = count_features(features.blocks, joints, len(problem.parameters), line=architecture.path_outputs)
+    inputs = count_features(
+        features.blocks, joints, len(problem.parameters), line=architecture.path_outputs
+    )
     rates = spec.rate_control_points
     interior = [(spec.path_control_points - 3 - fixed) * joints for fixed in (2, 3)]
     widths = (architecture.inputs, architecture.path_outputs, architecture.rate_outputs)
     if widths not in [(inputs, outputs, rates) for outputs in interior]:
         expected = f"{(inputs, interior[0], rates)}, or {interior[1]} path outputs if goal accelerations are given"
-        raise ValueError(f"the network has {widths} inputs, path outputs and rate outputs, expected {expected}")
+        raise ValueError(
+            f"the network has {widths} inputs, path outputs and rate outputs, expected {expected}"
+        )
     if ARRIVAL in features.blocks and architecture.path_outputs == interior[0]:
-        raise ValueError(f"its features include {ARRIVAL}, but its outputs leave goal accelerations free")
+        raise ValueError(
+            f"its features include {ARRIVAL}, but its outputs leave goal accelerations free"
+        )
     for name in ("mean", "scale"):
         shape = getattr(features, name).shape
         if shape != (architecture.inputs,):
-            raise ValueError(f"feature_{name} must have shape ({architecture.inputs},), got {shape}")
+            raise ValueError(
+                f"feature_{name} must have shape ({architecture.inputs},), got {shape}"
+            )
 
 
-def _parameters(architecture: Architecture, arrays: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
+def _parameters(
+    architecture: Architecture, arrays: Mapping[str, NDArray[Any]]
+) -> NDArray[np.float32]:
     """Concatenate the arrays of all layers; check their shapes."""
     if architecture.layers > len(arrays):
-        raise ValueError(f"{architecture.layers} layers cannot be in {len(arrays)} arrays")
+        raise ValueError(
+            f"{architecture.layers} layers cannot be in {len(arrays)} arrays"
+        )
     parts = []
     for layer in architecture.all_layers:
-        for name, shape in (("weight", (layer.inputs, layer.outputs)), ("bias", (layer.outputs,))):
+        for name, shape in (
+            ("weight", (layer.inputs, layer.outputs)),
+            ("bias", (layer.outputs,)),
+        ):
             values = arrays[f"{layer.name}_{name}"]
             if values.shape != shape:
-                raise ValueError(f"{layer.name}_{name} must have shape {shape}, got {values.shape}")
+                raise ValueError(
+                    f"{layer.name}_{name} must have shape {shape}, got {values.shape}"
+                )
             parts.append(values.ravel())
     return np.concatenate(parts).astype(np.float32)

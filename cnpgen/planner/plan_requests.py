@@ -49,18 +49,30 @@ class Requests:
 
 
 def read_rows(
-    folder: Path, model: Model, *, split: str = "validation", first: int = 0, n: int | None = None, other: bool = False
+    folder: Path,
+    model: Model,
+    *,
+    split: str = "validation",
+    first: int = 0,
+    n: int | None = None,
+    other: bool = False,
 ) -> Requests:
     """Read n rows of a dataset, by default all from the first one on, for a model that will plan.
 
-    Rows drawn by another recipe than the training rows are accepted if ``other`` is set.
+    Rows drawn by another recipe than the training rows are accepted if ``other`` is
+    set.
 
-    Raises:
-        DatasetError: The dataset is damaged, of another problem, or drawn by another recipe.
-        UsageError: There are no such rows.
+    Raises: DatasetError: The dataset is damaged, of another problem, or drawn by
+        another recipe. UsageError: There are no such rows.
     """
     dataset = open_dataset(folder)
-    check_stages(str(folder), as_record(dataset.spec.problem), dataset.spec.stages, model, other=other)
+    check_stages(
+        str(folder),
+        as_record(dataset.spec.problem),
+        dataset.spec.stages,
+        model,
+        other=other,
+    )
     rows = chosen_rows(folder, dataset.spec, split=split, start=first, n=n)
     stored = {column.name for column in dataset.spec.fields}
     names = [name for name in (*ASKED, SCENE_ID) if name in stored]
@@ -70,15 +82,18 @@ def read_rows(
     return Requests(boundary, arrays.get("sample_id", np.array(rows)), columns)
 
 
-def read_file(path: Path, model: Model, *, other: bool = False, allow_large_angles: bool = False) -> Requests:
+def read_file(
+    path: Path, model: Model, *, other: bool = False, allow_large_angles: bool = False
+) -> Requests:
     """Read boundary conditions from an HDF5 file: a shard, a plan file, or boundary conditions alone.
 
-    Rows of a shard drawn by another recipe than the training rows are accepted if ``other`` is set.
+    Rows of a shard drawn by another recipe than the training rows are accepted if
+    ``other`` is set.
 
-    Raises:
-        UnitError: Boundary conditions are probably in degrees or millimetres.
+    Raises: UnitError: Boundary conditions are probably in degrees or millimetres.
         UsageError: There is no such file, or ``other`` is set and the file is no shard.
-        DatasetError: The file is damaged, incomplete, of another problem, of a shard of other rows, or prescribes goal
+        DatasetError: The file is damaged, incomplete, of another problem, of a shard of
+        other rows, or prescribes goal
             accelerations that the model leaves free.
     """
     file = read_boundary_file(path)
@@ -95,34 +110,43 @@ def read_file(path: Path, model: Model, *, other: bool = False, allow_large_angl
     if not allow_large_angles:
         check_boundary_units(open_problem(model.problem)[1], boundary, where=str(path))
     file.check_obstacles(model.problem)
-    return Requests(boundary, file.sample_id(len(boundary)), context_columns(file.columns))
+    return Requests(
+        boundary, file.sample_id(len(boundary)), context_columns(file.columns)
+    )
 
 
 def plan_scenes(
-    planner: Planner, scenes: Sequence[SceneProblem], *, goals: Sequence[NDArray[np.float64]] | None = None
+    planner: Planner,
+    scenes: Sequence[SceneProblem],
+    *,
+    goals: Sequence[NDArray[np.float64]] | None = None,
 ) -> Plans:
     """Plan the problems of scenes, from rest to rest.
 
-    Args:
-        planner: Planner of a model that was trained on scenes.
-        scenes: The scenes.
-        goals: Joint positions at the goals in the order of the planned joints [rad], shape (n,) each; by default the
+    Args: planner: Planner of a model that was trained on scenes. scenes: The scenes.
+        goals: Joint positions at the goals in the order of the planned joints [rad],
+        shape (n,) each; by default the
             first goal state of each scene.
 
     Returns:
         A plan per scene, not checked yet (status UNKNOWN).
 
-    Raises:
-        SceneError: A scene does not fit the robot.
-        UsageError: The model is for other problems, there are no scenes, or a scene has more obstacles of a kind than
+    Raises: SceneError: A scene does not fit the robot. UsageError: The model is for
+        other problems, there are no scenes, or a scene has more obstacles of a kind
+        than
             the model's problem.
     """
     requests = scene_requests(planner.model, scenes, goals=goals)
-    return planner.plan_batch(requests.boundary, sample_id=requests.sample_id, columns=requests.columns)
+    return planner.plan_batch(
+        requests.boundary, sample_id=requests.sample_id, columns=requests.columns
+    )
 
 
 def scene_requests(
-    model: Model, scenes: Sequence[SceneProblem], *, goals: Sequence[NDArray[np.float64]] | None = None
+    model: Model,
+    scenes: Sequence[SceneProblem],
+    *,
+    goals: Sequence[NDArray[np.float64]] | None = None,
 ) -> Requests:
     """Return the tasks of scenes; see ``plan_scenes``."""
     if len(scenes) == 0:
@@ -134,23 +158,40 @@ def scene_requests(
             " that was trained on scenes",
             concerns="model",
         )
-    parked = Counter(shape_of(obstacle) for obstacle in problem.obstacle if obstacle.position == PARKED_POSITION_M)
+    parked = Counter(
+        shape_of(obstacle)
+        for obstacle in problem.obstacle
+        if obstacle.position == PARKED_POSITION_M
+    )
     checked = [checked_scene(scene) for scene in scenes]
-    plans = scene_plans(problem.with_obstacles(problem.own_obstacles), checked, goals=goals, capacity=parked)
+    plans = scene_plans(
+        problem.with_obstacles(problem.own_obstacles),
+        checked,
+        goals=goals,
+        capacity=parked,
+    )
     return Requests(plans.boundary, plans.sample_id, context_columns(plans.columns))
 
 
 def context_columns(columns: Mapping[str, NDArray[Any]]) -> dict[str, Array]:
     """Return the columns of tasks that plans keep: those of hits, and the obstacles of samples."""
-    return {name: np.asarray(columns[name], np.float64) for name in (*CONTEXT, OBSTACLE_POSES) if name in columns}
+    return {
+        name: np.asarray(columns[name], np.float64)
+        for name in (*CONTEXT, OBSTACLE_POSES)
+        if name in columns
+    }
 
 
 def _check_shard(file: BoundaryFile, model: Model, *, other: bool) -> None:
     """Check a shard by its dataset's specification, or by its recipe's digest if it lies outside its dataset."""
     spec = file.spec()
     if spec is not None:
-        check_stages(str(file.path), as_record(spec.problem), spec.stages, model, other=other)
-    elif not other and file.text("recipe_sha256") != model.training.get("dataset", {}).get("recipe_sha256", ""):
+        check_stages(
+            str(file.path), as_record(spec.problem), spec.stages, model, other=other
+        )
+    elif not other and file.text("recipe_sha256") != model.training.get(
+        "dataset", {}
+    ).get("recipe_sha256", ""):
         raise DatasetError(
             f"{file.path} is a shard outside its dataset, drawn by another recipe than the model's training rows;"
             " pass {other} to plan for it",
@@ -159,18 +200,30 @@ def _check_shard(file: BoundaryFile, model: Model, *, other: bool) -> None:
 
 
 def _check_recorded_problem(file: BoundaryFile, model: Model) -> None:
-    """Raise an error if a file records another problem than the model's; a file without a record is accepted."""
+    """Raise an error if a file records another problem than the model's.
+
+    A file without a record is accepted.
+    """
     record = file.problem()
     if record is not None:
         check_problem(str(file.path), record, model)
     elif file.text("problem_sha256") not in {"", model.problem.comparable_sha256}:
-        raise DatasetError(f"{file.path} is of another problem than the model, which plans for {model.problem.name!r}")
+        raise DatasetError(
+            f"{file.path} is of another problem than the model, which plans for {model.problem.name!r}"
+        )
 
 
-def checked_boundary(where: str, columns: Mapping[str, NDArray[Any]], model: Model) -> Boundary:
-    """Return the boundary conditions of ``boundary_in``; raise DatasetError for goal accelerations if they are free."""
+def checked_boundary(
+    where: str, columns: Mapping[str, NDArray[Any]], model: Model
+) -> Boundary:
+    """Return the boundary conditions of ``boundary_in``.
+
+    Raise DatasetError for goal accelerations if they are free.
+    """
     if "goal_ddq" in columns and model.fixed_at_goal == 2:
-        raise DatasetError(f"{where} prescribes goal accelerations (goal_ddq), and the model leaves them free")
+        raise DatasetError(
+            f"{where} prescribes goal accelerations (goal_ddq), and the model leaves them free"
+        )
     return boundary_in(where, columns, len(model.problem.joint_names))
 
 
@@ -190,7 +243,12 @@ def drawing_stages(stages: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any
 
 
 def check_stages(
-    where: str, record: ProblemRecord, drawn_by: Iterable[Mapping[str, Any]], model: Model, *, other: bool
+    where: str,
+    record: ProblemRecord,
+    drawn_by: Iterable[Mapping[str, Any]],
+    model: Model,
+    *,
+    other: bool,
 ) -> None:
     """Raise an error for rows of another problem, and unless ``other`` for rows drawn by other resolved stages."""
     check_problem(where, record, model)

@@ -39,17 +39,16 @@ Array = NDArray[np.float64]
 class TaskPreprocessor:
     """Preprocessor of one problem's tasks; made by ``make_task_preprocessor``.
 
-    Attributes:
-        problem: The problem, ``Problem.for_planning``.
-        velocity_limit: Planning limits [rad/s], shape (n,).
-        tips: Kernel of ``control_point_functions.tips_at_ends``.
-        line: Kernel of ``control_point_functions.line_change``; None if the line is not projected.
-        reaching_time: Kernel of ``tasks.reaching_time``; None if the expected time is that of the distance.
-        via_line: The same kernel with offsets; None if there are no via points, or no projection.
-        least_time: Lower bound of the expected time of the distance [s].
-        placed: Obstacles that samples place.
-        scene_features: Features of these obstacles; None if the model has none.
-        iterated: Whether the network corrects its own path.
+    Attributes: problem: The problem, ``Problem.for_planning``. velocity_limit: Planning
+        limits [rad/s], shape (n,). tips: Kernel of
+        ``control_point_functions.tips_at_ends``. line: Kernel of
+        ``control_point_functions.line_change``; None if the line is not projected.
+        reaching_time: Kernel of ``tasks.reaching_time``; None if the expected time is
+        that of the distance. via_line: The same kernel with offsets; None if there are
+        no via points, or no projection. least_time: Lower bound of the expected time of
+        the distance [s]. placed: Obstacles that samples place. scene_features: Features
+        of these obstacles; None if the model has none. iterated: Whether the network
+        corrects its own path.
     """
 
     problem: Problem
@@ -73,24 +72,43 @@ class TaskPreprocessor:
     ) -> Tasks:
         """Prepare N tasks, in float64, with lines through via points [rad], shape (N, n), at half their length.
 
-        ``ends`` is the result of ``ends_of``, if already computed. Poses are those of obstacles that samples place.
+        ``ends`` is the result of ``ends_of``, if already computed. Poses are those of
+        obstacles that samples place.
 
-        Raises:
-            UsageError: Obstacle poses are missing, have a wrong shape or are not finite, or the problem places them.
+        Raises: UsageError: Obstacle poses are missing, have a wrong shape or are not
+            finite, or the problem places them.
         """
         ends = ends_of(boundary) if ends is None else ends
         start_xyz, goal_xyz, *velocity = (tip.T for tip in self.tips(ends))
         parameters = self._parameters(boundary)
-        scene = scene_of(self.problem, start_xyz, goal_xyz, velocity[0] if velocity else None, parameters)
+        scene = scene_of(
+            self.problem,
+            start_xyz,
+            goal_xyz,
+            velocity[0] if velocity else None,
+            parameters,
+        )
         reaching = self.reaching_time
         if reaching is None:
             factor = self._factor(parameters)
-            time = expected_time(boundary, self.velocity_limit * factor, least=self.least_time)
+            time = expected_time(
+                boundary, self.velocity_limit * factor, least=self.least_time
+            )
         else:
             time = reaching(ends)[0][0]
-        correction = None if via_point is None else self._via_offsets(boundary, via_point)
-        shape = len(boundary), self._interior_points(boundary), boundary.start_q.shape[1]
-        kernel, offsets = (self.line, []) if correction is None else (self.via_line, [lanes(correction)])
+        correction = (
+            None if via_point is None else self._via_offsets(boundary, via_point)
+        )
+        shape = (
+            len(boundary),
+            self._interior_points(boundary),
+            boundary.start_q.shape[1],
+        )
+        kernel, offsets = (
+            (self.line, [])
+            if correction is None
+            else (self.via_line, [lanes(correction)])
+        )
         if kernel is not None:
             (change,) = kernel(ends, *offsets, 1 / time[None], scene.lanes)
             correction = rows(change, shape[2])
@@ -100,14 +118,21 @@ class TaskPreprocessor:
         tasks = Tasks(boundary, start_xyz, goal_xyz, time, scene, correction, placed)
         if self.scene_features is None:
             return tasks
-        return self._observed(tasks, lines_at_rest(boundary, np.zeros(shape) if correction is None else correction))
+        return self._observed(
+            tasks,
+            lines_at_rest(
+                boundary, np.zeros(shape) if correction is None else correction
+            ),
+        )
 
     def along(self, tasks: Tasks, path: Array) -> Tasks:
         """Return tasks whose lines are the paths of other plans for them: control points [rad], shape (N, C, n)."""
         fixed = tasks.boundary.fixed_at_goal
         first, last, interior = path[:, 2:3], path[:, -fixed, None], path[:, 3:-fixed]
         along = along_line(interior.shape[1], path.dtype.name)
-        return self._observed(replace(tasks, correction=interior - first - (last - first) * along), path)
+        return self._observed(
+            replace(tasks, correction=interior - first - (last - first) * along), path
+        )
 
     def _interior_points(self, boundary: Boundary) -> int:
         return self.problem.trajectory.path_control_points - 3 - boundary.fixed_at_goal
@@ -116,7 +141,12 @@ class TaskPreprocessor:
         """Return tasks with features of the placed obstacles along paths, if the model has such features."""
         if tasks.placed is None or self.scene_features is None:
             return tasks
-        return replace(tasks, observation=self.scene_features(path.astype(float), tasks.placed.astype("float64")))
+        return replace(
+            tasks,
+            observation=self.scene_features(
+                path.astype(float), tasks.placed.astype("float64")
+            ),
+        )
 
     def _placed_scene(self, count: int, obstacle_poses: Array | None) -> Scene | None:
         if not self.placed:
@@ -131,14 +161,23 @@ class TaskPreprocessor:
         return scene.with_poses(np.asarray(obstacle_poses, np.float64))
 
     def _parameters(self, boundary: Boundary) -> Array | None:
-        """Return the parameters of the tasks, shape (N, width), or None without any; check their shape and ranges."""
+        """Return the parameters of the tasks, shape (N, width), or None without any.
+
+        Check their shape and ranges.
+        """
         ranges, values = self.problem.parameters, boundary.parameters
         if values is None:
             if ranges:
-                raise UsageError(f"is missing: tasks have {', '.join(ranges.names)}", argument="parameters")
+                raise UsageError(
+                    f"is missing: tasks have {', '.join(ranges.names)}",
+                    argument="parameters",
+                )
             return None
         if not ranges:
-            raise UsageError(f"must be None: {self.problem.name!r} has no parameters", argument="parameters")
+            raise UsageError(
+                f"must be None: {self.problem.name!r} has no parameters",
+                argument="parameters",
+            )
         return ranges.checked(np.asarray(values, np.float64))
 
     def _factor(self, parameters: Array | None) -> Array | float:
@@ -165,14 +204,43 @@ def make_task_preprocessor(
     placed: tuple[Obstacle, ...],
     observed: bool = False,
 ) -> TaskPreprocessor:
-    """Load the preprocessor of a problem's tasks; ``observed`` is whether it computes features of placed obstacles."""
+    """Load the preprocessor of a problem's tasks.
+
+    ``observed`` is whether it computes features of placed obstacles.
+    """
     steps = effective_steps(kernels, config.line_projection_steps)
-    load = partial(kernels.load, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=config.within_limits)
+    load = partial(
+        kernels.load,
+        steps=steps,
+        fixed_at_goal=fixed_at_goal,
+        within_limits=config.within_limits,
+    )
     line = load(line_change, with_offsets=False) if steps else None
     tips = kernels.load(tips_at_ends, fixed_at_goal=fixed_at_goal)
-    time = kernels.load(reaching_time, fixed_at_goal=fixed_at_goal) if config.expected_time == "reach" else None
-    via_line = load(line_change, with_offsets=True) if steps and config.via_points else None
-    least_time = MIN_TRAVEL_TIME_S if config.expected_time == "travel" else MIN_EXPECTED_TIME_S
-    features = make_scene_features(robot, problem.trajectory, kernels) if placed and observed else None
-    parts = tips, line, time, via_line, least_time, placed, features, config.iterations > 1
+    time = (
+        kernels.load(reaching_time, fixed_at_goal=fixed_at_goal)
+        if config.expected_time == "reach"
+        else None
+    )
+    via_line = (
+        load(line_change, with_offsets=True) if steps and config.via_points else None
+    )
+    least_time = (
+        MIN_TRAVEL_TIME_S if config.expected_time == "travel" else MIN_EXPECTED_TIME_S
+    )
+    features = (
+        make_scene_features(robot, problem.trajectory, kernels)
+        if placed and observed
+        else None
+    )
+    parts = (
+        tips,
+        line,
+        time,
+        via_line,
+        least_time,
+        placed,
+        features,
+        config.iterations > 1,
+    )
     return TaskPreprocessor(problem, robot.velocity_limit, *parts)

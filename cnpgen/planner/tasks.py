@@ -19,22 +19,27 @@ Array = NDArray[Any]
 
 MIN_EXPECTED_TIME_S = 0.2  # lower bound of ``expected_time``
 MIN_REACH_TIME_S = 0.03  # lower bound of ``reaching_time``
-MIN_TRAVEL_TIME_S = 1e-6  # lower bound without effect on moving joints: avoids a division by zero
-EXPECTED_TIMES = ("distance", "reach", "travel")  # ``expected_time``, ``reaching_time``, ``expected_time`` unbounded
+MIN_TRAVEL_TIME_S = (
+    1e-6  # lower bound without effect on moving joints: avoids a division by zero
+)
+EXPECTED_TIMES = (
+    "distance",
+    "reach",
+    "travel",
+)  # ``expected_time``, ``reaching_time``, ``expected_time`` unbounded
 
 
 @dataclass(frozen=True)
 class Tasks:
     """N planning tasks of one problem with n joints.
 
-    Attributes:
-        boundary: Boundary conditions, shape (N, n) each.
-        start_xyz: Tip positions at the start, world frame [m], shape (N, 3).
-        goal_xyz: Tip positions at the goal, world frame [m], shape (N, 3).
-        expected_time: Unit of durations [s], shape (N,): network outputs are rates times this.
-        scene: Obstacles of the tasks.
-        correction: Offsets of the projected line from the straight one [rad], shape (N, m, n); None if it is straight.
-        placed: Obstacles of a problem whose samples place them; ``scene`` has none then. None for other problems.
+    Attributes: boundary: Boundary conditions, shape (N, n) each. start_xyz: Tip
+        positions at the start, world frame [m], shape (N, 3). goal_xyz: Tip positions
+        at the goal, world frame [m], shape (N, 3). expected_time: Unit of durations
+        [s], shape (N,): network outputs are rates times this. scene: Obstacles of the
+        tasks. correction: Offsets of the projected line from the straight one [rad],
+        shape (N, m, n); None if it is straight. placed: Obstacles of a problem whose
+        samples place them; ``scene`` has none then. None for other problems.
         observation: Features of the placed obstacles, shape (N, F), or None.
     """
 
@@ -67,29 +72,41 @@ class Tasks:
         return self._converted(lambda part: part.astype(dtype))
 
     def _converted(self, convert: Callable[[Any], Any]) -> Tasks:
-        parts: dict[str, Any] = {name: None if part is None else convert(part) for name, part in vars(self).items()}
+        parts: dict[str, Any] = {
+            name: None if part is None else convert(part)
+            for name, part in vars(self).items()
+        }
         return Tasks(**parts)
 
 
 def lanes(values: NDArray[Any]) -> NDArray[np.float64]:
     """Reshape (N, ...) to (width, N), float64."""
-    return np.ascontiguousarray(values.reshape(len(values), math.prod(values.shape[1:])).T, np.float64)
+    return np.ascontiguousarray(
+        values.reshape(len(values), math.prod(values.shape[1:])).T, np.float64
+    )
 
 
 def rows(values: Array, n: int) -> Array:
     """Reshape (points n, N) to (N, points, n)."""
-    return np.ascontiguousarray(values.T).reshape(values.shape[1], values.shape[0] // n, n)
+    return np.ascontiguousarray(values.T).reshape(
+        values.shape[1], values.shape[0] // n, n
+    )
 
 
 def ends_of(boundary: Boundary) -> Array:
     """Return boundary conditions of N motions, shape (5 n, N), or (6 n, N) with goal_ddq."""
-    return np.ascontiguousarray(np.concatenate(list(boundary.conditions().values()), axis=1).T)
+    return np.ascontiguousarray(
+        np.concatenate(list(boundary.conditions().values()), axis=1).T
+    )
 
 
-def expected_time(boundary: Boundary, velocity_limit: Array, *, least: float = MIN_EXPECTED_TIME_S) -> Array:
+def expected_time(
+    boundary: Boundary, velocity_limit: Array, *, least: float = MIN_EXPECTED_TIME_S
+) -> Array:
     """Return the largest time that a joint needs at its velocity limit (authors' implementation, expected time) [s].
 
-    Velocity limits [rad/s] have shape (n,) or (N, n), times shape (N,) and the lower bound ``least`` [s].
+    Velocity limits [rad/s] have shape (n,) or (N, n), times shape (N,) and the lower
+    bound ``least`` [s].
     """
     joint_times: Array = np.abs(boundary.goal_q - boundary.start_q) / velocity_limit
     time: Array = joint_times.max(axis=1, initial=least)
@@ -99,15 +116,19 @@ def expected_time(boundary: Boundary, velocity_limit: Array, *, least: float = M
 def reaching_time(robot: Robot, *, fixed_at_goal: int) -> Any:
     """Build ``ends -> time``: the minimum time in which every joint alone could reach its goal state [s].
 
-    Each joint accelerates at its limit in either direction, and cruises at its velocity limit if it would exceed it.
-    This is a lower bound of the motion time if it exceeds ``MIN_REACH_TIME_S``. Ends are those of
-    ``control_point_functions``. The kernel takes an eighth of the time of NumPy for one task.
+    Each joint accelerates at its limit in either direction, and cruises at its velocity
+    limit if it would exceed it. This is a lower bound of the motion time if it exceeds
+    ``MIN_REACH_TIME_S``. Ends are those of ``control_point_functions``. The kernel
+    takes an eighth of the time of NumPy for one task.
     """
     import casadi as ca
 
     ends = ca.SX.sym("ends", (3 + fixed_at_goal) * robot.n)
     q, dq, _, goal_q, goal_dq, *_ = ca.vertsplit(ends, robot.n)
-    velocity, acceleration = ca.SX(robot.velocity_limit), ca.SX(robot.acceleration_limit)
+    velocity, acceleration = (
+        ca.SX(robot.velocity_limit),
+        ca.SX(robot.acceleration_limit),
+    )
     direct = (
         (dq + goal_dq) * ca.fabs(goal_dq - dq) / (2 * acceleration)
     )  # distance at constant acceleration from dq to goal_dq
@@ -117,6 +138,8 @@ def reaching_time(robot: Robot, *, fixed_at_goal: int) -> Any:
     peak = ca.sqrt(ca.fmax(acceleration * distance + squares, 0.0))
     fastest = ca.fmax(velocity, ca.fmax(first, last))
     cruise = ca.fmax(distance - (fastest**2 - squares) / acceleration, 0.0) / fastest
-    joint_times = (2 * ca.fmin(peak, fastest) - first - last) / acceleration + ca.if_else(peak > fastest, cruise, 0.0)
+    joint_times = (
+        2 * ca.fmin(peak, fastest) - first - last
+    ) / acceleration + ca.if_else(peak > fastest, cruise, 0.0)
     time = reduce(ca.fmax, ca.vertsplit(joint_times), ca.SX(MIN_REACH_TIME_S))
     return ca.Function("reaching_time", [ends], [time])

@@ -1,13 +1,16 @@
 """Fit the rates after the network to the limits: as large as allowed, and smaller if limits are violated.
 
-The path stays. So do the two control points of the rate at either end that determine velocities and accelerations
-there; at rest they have no effect, and move. On a fixed path a bounded value is ``g = constant + square r^2 + mixed r
-r'`` with coefficients that depend on the phase alone: squares of velocities, accelerations and torques, as in
-time-optimal path parametrization (Bobrow, Dubowsky and Gibson, 1985). So it is a quadratic of each control point of the
-rate, or of a factor of them all, and the largest step up to the first bound follows in closed form. Every second
-control point takes a fraction of its step, one after the other, then those between them a larger fraction; finally all
-of them are scaled together. From rest to rest the control points move twice if one of them has become much larger, and
-motions keep a margin of the limits between the phases.
+The path stays. So do the two control points of the rate at either end that determine
+velocities and accelerations there; at rest they have no effect, and move. On a fixed
+path a bounded value is ``g = constant + square r^2 + mixed r r'`` with coefficients
+that depend on the phase alone: squares of velocities, accelerations and torques, as in
+time-optimal path parametrization (Bobrow, Dubowsky and Gibson, 1985). So it is a
+quadratic of each control point of the rate, or of a factor of them all, and the largest
+step up to the first bound follows in closed form. Every second control point takes a
+fraction of its step, one after the other, then those between them a larger fraction;
+finally all of them are scaled together. From rest to rest the control points move twice
+if one of them has become much larger, and motions keep a margin of the limits between
+the phases.
 """
 
 import ctypes
@@ -24,7 +27,11 @@ from cnpgen.errors import UsageError
 from cnpgen.kernels.compiled_kernel import address_of, aligned_array
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
-from cnpgen.planner.expressions import coefficient_bounds, speed_bounds, speed_coefficients
+from cnpgen.planner.expressions import (
+    coefficient_bounds,
+    speed_bounds,
+    speed_coefficients,
+)
 from cnpgen.planner.time_scaling import PhaseGrid, blocks_of_motions, make_phase_grid
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
@@ -33,14 +40,26 @@ from cnpgen.trajectory.spline_motion import Motion
 Array = NDArray[np.float64]
 
 SOURCE = Path(__file__).with_name("time_parametrization.c")
-PARAMETRIZATION_INTERVALS = 79  # between phases; the 80 phases fill vectors of any width
-INTERVALS_AT_REST = 63  # from rest to rest, where RATE_MARGIN covers excesses between the phases
+PARAMETRIZATION_INTERVALS = (
+    79  # between phases; the 80 phases fill vectors of any width
+)
+INTERVALS_AT_REST = (
+    63  # from rest to rest, where RATE_MARGIN covers excesses between the phases
+)
 FIXED_RATE_POINTS = 2  # at either end of motions that are not at rest there
 RATE_MARGIN = 3e-3  # relative decrease of the rates from rest to rest, for excesses between the phases
-STEP_FRACTIONS = 0.65, 0.9  # of the step to the first bound: of every second control point, then of those between
-MAX_RATE_INCREASE, MAX_RATE_DECREASE = 1.0, -0.3  # of a control point in one step, relative
+STEP_FRACTIONS = (
+    0.65,
+    0.9,
+)  # of the step to the first bound: of every second control point, then of those between
+MAX_RATE_INCREASE, MAX_RATE_DECREASE = (
+    1.0,
+    -0.3,
+)  # of a control point in one step, relative
 BOUND_ROUNDING = 1e-9  # fraction of a limit by which boundary conditions may exceed it
-MIN_INCREASE_TO_REPEAT = 0.4  # of a control point in a sweep from rest to rest, after which all move again
+MIN_INCREASE_TO_REPEAT = (
+    0.4  # of a control point in a sweep from rest to rest, after which all move again
+)
 MAX_VECTOR_WIDTH = 8  # float64 values
 
 
@@ -50,9 +69,24 @@ class _TimeParametrization(ctypes.Structure):
     _fields_ = (
         *((name, c_long) for name in ("joints", "pose_width", "path_points", "points")),
         *((name, c_long) for name in ("phases", "rows", "first", "last", "moves")),
-        *((name, c_void_p) for name in ("path", "rate", "lower", "upper", "path_span", "span")),
-        *((name, c_void_p) for name in ("order", "step_fractions", "coefficients", "violation")),
-        *((name, c_double) for name in ("max_increase", "max_decrease", "margin", "min_increase", "tolerance")),
+        *(
+            (name, c_void_p)
+            for name in ("path", "rate", "lower", "upper", "path_span", "span")
+        ),
+        *(
+            (name, c_void_p)
+            for name in ("order", "step_fractions", "coefficients", "violation")
+        ),
+        *(
+            (name, c_double)
+            for name in (
+                "max_increase",
+                "max_decrease",
+                "margin",
+                "min_increase",
+                "tolerance",
+            )
+        ),
     )
 
 
@@ -60,15 +94,13 @@ class _TimeParametrization(ctypes.Structure):
 class TimeParametrization(PhaseGrid):
     """Time parametrization of one problem's motions; made by ``make_time_parametrization``.
 
-    Attributes:
-        coefficients: Kernel of ``expressions.speed_coefficients``.
-        lower: Lower bounds of its rows, shape (m,).
-        upper: Upper bounds of its rows, shape (m,).
-        joints: Number of joints.
-        fixed: Number of control points of the rate at either end that stay; 0 from rest to rest.
-        margin: Relative decrease of the rates after the last step.
-        min_increase: Largest increase of a control point in a sweep above which all control points move again.
-        library: Library of time_parametrization.c; None if kernels are not compiled.
+    Attributes: coefficients: Kernel of ``expressions.speed_coefficients``. lower: Lower
+        bounds of its rows, shape (m,). upper: Upper bounds of its rows, shape (m,).
+        joints: Number of joints. fixed: Number of control points of the rate at either
+        end that stay; 0 from rest to rest. margin: Relative decrease of the rates after
+        the last step. min_increase: Largest increase of a control point in a sweep
+        above which all control points move again. library: Library of
+        time_parametrization.c; None if kernels are not compiled.
     """
 
     coefficients: Kernel
@@ -80,43 +112,72 @@ class TimeParametrization(PhaseGrid):
     min_increase: float
     library: ctypes.CDLL | None
 
-    def parametrize(self, motion: Motion, obstacle_poses: Array) -> tuple[Motion, NDArray[np.bool_]]:
+    def parametrize(
+        self, motion: Motion, obstacle_poses: Array
+    ) -> tuple[Motion, NDArray[np.bool_]]:
         """Fit the rates of N motions to the limits; their paths and boundary conditions stay.
 
-        A motion stays as it is if its largest violation would grow, because its bounded values are not such
-        quadratics. For the same reason motions may be slower than necessary.
+        A motion stays as it is if its largest violation would grow, because its bounded
+        values are not such quadratics. For the same reason motions may be slower than
+        necessary.
 
-        The mask of motions that meet the limits, shape (N,), is False also for motions whose control points moved
+        The mask of motions that meet the limits, shape (N,), is False also for motions
+        whose control points moved
         twice: they exceed the limits more between the phases.
         """
-        rate, violation = np.array(motion.rate, np.float64, order="C"), np.empty(len(motion))
+        rate, violation = (
+            np.array(motion.rate, np.float64, order="C"),
+            np.empty(len(motion)),
+        )
         if self.library is not None:
             self._parametrize_compiled(motion.path, obstacle_poses, rate, violation)
         else:
             for block in blocks_of_motions(len(motion)):
-                rate[block], violation[block] = self._parametrize_interpreted(motion[block], obstacle_poses[block])
+                rate[block], violation[block] = self._parametrize_interpreted(
+                    motion[block], obstacle_poses[block]
+                )
         return Motion(motion.path, rate, motion.degree), violation <= self._tolerance
 
-    def _parametrize_interpreted(self, motion: Motion, obstacle_poses: Array) -> tuple[Array, Array]:
-        """Return the rates and the largest violations; inf for motions whose control points moved twice."""
+    def _parametrize_interpreted(
+        self, motion: Motion, obstacle_poses: Array
+    ) -> tuple[Array, Array]:
+        """Return the rates and the largest violations.
+
+        Inf for motions whose control points moved twice.
+        """
         rate, column = motion.rate.copy(), self.column(motion, obstacle_poses)
         twice = self._fit(rate, self.coefficients(column))
-        new_column = self.column(Motion(motion.path, rate, motion.degree), obstacle_poses)
+        new_column = self.column(
+            Motion(motion.path, rate, motion.degree), obstacle_poses
+        )
         before, after = (
-            self.violation(states)[0].reshape(len(motion), -1).max(axis=1) for states in (column, new_column)
+            self.violation(states)[0].reshape(len(motion), -1).max(axis=1)
+            for states in (column, new_column)
         )
         better = after <= np.maximum(before, self._tolerance)
         violation = np.where(twice, np.inf, np.where(better, after, before))
         return np.where(better[:, None], rate, motion.rate), violation
 
     def _fit(self, rate: Array, coefficients: list[Array]) -> NDArray[np.bool_]:
-        """Fit the rates of N motions in place as time_parametrization.c does; return which of them moved twice."""
-        shaped = [coefficient.reshape(len(coefficient), len(rate), -1) for coefficient in coefficients]
+        """Fit the rates of N motions in place as time_parametrization.c does.
+
+        Return which of them moved twice.
+        """
+        shaped = [
+            coefficient.reshape(len(coefficient), len(rate), -1)
+            for coefficient in coefficients
+        ]
         table, movable = self.rate, slice(self.fixed, rate.shape[1] - self.fixed)
         increase = _sweep(rate, shaped, self._bounds, table, self.fixed)
         again = increase > self.min_increase
         some = rate[again]
-        _sweep(some, [coefficient[:, again] for coefficient in shaped], self._bounds, table, self.fixed)
+        _sweep(
+            some,
+            [coefficient[:, again] for coefficient in shaped],
+            self._bounds,
+            table,
+            self.fixed,
+        )
         rate[again] = some
         along = rate[:, movable] @ table[:, :, movable].swapaxes(1, 2)
         step = advance(shaped, self._bounds, rate @ table.swapaxes(1, 2), along)
@@ -126,7 +187,9 @@ class TimeParametrization(PhaseGrid):
     @cached_property
     def _bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds, relaxed by rounding errors."""
-        return self.lower - BOUND_ROUNDING * np.abs(self.lower), self.upper + BOUND_ROUNDING * np.abs(self.upper)
+        return self.lower - BOUND_ROUNDING * np.abs(
+            self.lower
+        ), self.upper + BOUND_ROUNDING * np.abs(self.upper)
 
     @cached_property
     def _tolerance(self) -> float:
@@ -137,23 +200,56 @@ class TimeParametrization(PhaseGrid):
     @cached_property
     def _c_arguments(self) -> tuple[_TimeParametrization, list[NDArray[Any]]]:
         """Arguments of time_parametrization.c for the problem, and the arrays that they point to."""
-        lower, upper, order, fractions = *self._bounds, *moves_of(self.rate.shape[2], self.fixed)
+        lower, upper, order, fractions = (
+            *self._bounds,
+            *moves_of(self.rate.shape[2], self.fixed),
+        )
         tables, spans = [[of(self.path), of(self.rate)] for of in (_by_point, _span_of)]
         arrays = [*tables, lower, upper, *spans, order, fractions]
         (phases, path_points), points = self.path.shape[1:], self.rate.shape[2]
-        counts = self.joints, self.coefficients.tape.inputs[0] - 3 * self.joints - 2, path_points, points
+        counts = (
+            self.joints,
+            self.coefficients.tape.inputs[0] - 3 * self.joints - 2,
+            path_points,
+            points,
+        )
         moves = phases, len(lower), self.fixed, points - self.fixed, len(order)
-        addresses = *map(address_of, arrays), self.coefficients.address, self.violation.address
-        bounds = MAX_RATE_INCREASE, MAX_RATE_DECREASE, self.margin, self.min_increase, self._tolerance
+        addresses = (
+            *map(address_of, arrays),
+            self.coefficients.address,
+            self.violation.address,
+        )
+        bounds = (
+            MAX_RATE_INCREASE,
+            MAX_RATE_DECREASE,
+            self.margin,
+            self.min_increase,
+            self._tolerance,
+        )
         return _TimeParametrization(*counts, *moves, *addresses, *bounds), arrays
 
-    def _parametrize_compiled(self, path: Array, obstacle_poses: Array, rate: Array, violation: Array) -> None:
+    def _parametrize_compiled(
+        self, path: Array, obstacle_poses: Array, rate: Array, violation: Array
+    ) -> None:
         assert self.library is not None
-        rows, phases = self.coefficients.tape.inputs[0] + 3 * len(self.lower) + 3, self.path.shape[1]
-        memory = np.empty(MAX_VECTOR_WIDTH * (1 + len(self.lower)) + rows * phases + rate.shape[1])
-        inputs = [np.ascontiguousarray(array, np.float64) if array.size else None for array in (path, obstacle_poses)]
-        addresses = (None if array is None else address_of(array) for array in (*inputs, rate, violation, memory))
-        self.library.parametrize_rates(ctypes.byref(self._c_arguments[0]), len(rate), *addresses)
+        rows, phases = (
+            self.coefficients.tape.inputs[0] + 3 * len(self.lower) + 3,
+            self.path.shape[1],
+        )
+        memory = np.empty(
+            MAX_VECTOR_WIDTH * (1 + len(self.lower)) + rows * phases + rate.shape[1]
+        )
+        inputs = [
+            np.ascontiguousarray(array, np.float64) if array.size else None
+            for array in (path, obstacle_poses)
+        ]
+        addresses = (
+            None if array is None else address_of(array)
+            for array in (*inputs, rate, violation, memory)
+        )
+        self.library.parametrize_rates(
+            ctypes.byref(self._c_arguments[0]), len(rate), *addresses
+        )
 
 
 def make_time_parametrization(
@@ -161,25 +257,42 @@ def make_time_parametrization(
 ) -> TimeParametrization:
     """Load the time parametrization of one problem; ``at_rest`` is whether motions begin and end at rest.
 
-    A problem that bounds the jerk, which is no quadratic of the rate, raises UsageError.
+    A problem that bounds the jerk, which is no quadratic of the rate, raises
+    UsageError.
     """
     if problem.path_orders > 3:
-        raise UsageError(f"plans of {problem.name!r} cannot be time-parametrized: it bounds the jerk")
+        raise UsageError(
+            f"plans of {problem.name!r} cannot be time-parametrized: it bounds the jerk"
+        )
     intervals = INTERVALS_AT_REST if at_rest else PARAMETRIZATION_INTERVALS
-    library, speeds = kernels.load_source(SOURCE), make_phase_grid(problem, kernels, intervals)
+    library, speeds = (
+        kernels.load_source(SOURCE),
+        make_phase_grid(problem, kernels, intervals),
+    )
     if library is not None:
         function = library.parametrize_rates
         function.argtypes, function.restype = (c_void_p, c_long, *[c_void_p] * 5), None
-    rows = kernels.load(speed_coefficients), *coefficient_bounds(speed_bounds(robot, problem))
-    moves = (0, RATE_MARGIN, MIN_INCREASE_TO_REPEAT) if at_rest else (FIXED_RATE_POINTS, 0.0, np.inf)
-    return TimeParametrization(speeds.violation, speeds.path, speeds.rate, *rows, robot.n, *moves, library)
+    rows = (
+        kernels.load(speed_coefficients),
+        *coefficient_bounds(speed_bounds(robot, problem)),
+    )
+    moves = (
+        (0, RATE_MARGIN, MIN_INCREASE_TO_REPEAT)
+        if at_rest
+        else (FIXED_RATE_POINTS, 0.0, np.inf)
+    )
+    return TimeParametrization(
+        speeds.violation, speeds.path, speeds.rate, *rows, robot.n, *moves, library
+    )
 
 
 def _span_of(table: Array) -> NDArray[np.int64]:
     """Return first and last phase, in whole vectors, at which each control point has an effect, shape (points, 2)."""
     nonzero = (table != 0).any(axis=0)
     first, last = nonzero.argmax(axis=0), len(nonzero) - nonzero[::-1].argmax(axis=0)
-    return np.stack([first - first % MAX_VECTOR_WIDTH, last + -last % MAX_VECTOR_WIDTH], axis=1).astype(np.int64)
+    return np.stack(
+        [first - first % MAX_VECTOR_WIDTH, last + -last % MAX_VECTOR_WIDTH], axis=1
+    ).astype(np.int64)
 
 
 def _by_point(table: Array) -> Array:
@@ -193,11 +306,22 @@ def moves_of(points: int, fixed: int) -> tuple[NDArray[np.int64], Array]:
     """Return the order in which control points of the rate move, and the fractions of their steps."""
     movable = np.arange(fixed, points - fixed)
     first, second = movable[1::2], movable[::2]
-    return np.concatenate([first, second]), np.repeat(STEP_FRACTIONS, [len(first), len(second)])
+    return np.concatenate([first, second]), np.repeat(
+        STEP_FRACTIONS, [len(first), len(second)]
+    )
 
 
-def _sweep(rate: Array, coefficients: list[Array], bounds: tuple[Array, Array], table: Array, fixed: int) -> Array:
-    """Move the control points of N rates in their order, in place; return their largest relative increases."""
+def _sweep(
+    rate: Array,
+    coefficients: list[Array],
+    bounds: tuple[Array, Array],
+    table: Array,
+    fixed: int,
+) -> Array:
+    """Move the control points of N rates in their order, in place.
+
+    Return their largest relative increases.
+    """
     largest = np.zeros(len(rate))
     for point, fraction in zip(*moves_of(rate.shape[1], fixed), strict=True):
         along = rate[:, point, None] * table[:, None, :, point]
@@ -208,11 +332,13 @@ def _sweep(rate: Array, coefficients: list[Array], bounds: tuple[Array, Array], 
     return largest
 
 
-def advance(coefficients: list[Array], bounds: tuple[Array, Array], rates: Array, along: Array) -> Array:
+def advance(
+    coefficients: list[Array], bounds: tuple[Array, Array], rates: Array, along: Array
+) -> Array:
     """Return the largest steps of N rates within the bounds, or the required steps back if one is violated.
 
-    Coefficients (constant, square, mixed) have shape (m, N, K) each, bounds (m,) each, r with r' and their directions
-    (2, N, K).
+    Coefficients (constant, square, mixed) have shape (m, N, K) each, bounds (m,) each,
+    r with r' and their directions (2, N, K).
     """
     (constant, square, mixed), (r, r1), (b, b1) = coefficients, rates, along
     value = constant + (square * r + mixed * r1) * r
@@ -226,12 +352,19 @@ def advance(coefficients: list[Array], bounds: tuple[Array, Array], rates: Array
     forwards = np.where(violated, np.inf, distance).min(axis=(0, 1, 3))
     back = np.where(violated & np.isfinite(distance), distance, 0.0).max(axis=(0, 1, 3))
     goes_back = (violated & depends).any(axis=(0, 1, 3))
-    step: Array = np.where(goes_back, np.maximum(-back, MAX_RATE_DECREASE), np.minimum(forwards, MAX_RATE_INCREASE))
+    step: Array = np.where(
+        goes_back,
+        np.maximum(-back, MAX_RATE_DECREASE),
+        np.minimum(forwards, MAX_RATE_INCREASE),
+    )
     return step
 
 
 def smallest(margin: Array, linear: Array, square: Array) -> Array:
-    """Return the smallest x > 0 with ``square x^2 + linear x = margin``, elementwise; infinite if there is none."""
+    """Return the smallest x > 0 with ``square x^2 + linear x = margin``, elementwise.
+
+    Infinite if there is none.
+    """
     with np.errstate(all="ignore"):
         below = linear + np.sqrt(linear**2 + 4 * square * margin)
         x: Array = np.where(below > 0, 2 * margin / below, np.inf)

@@ -1,9 +1,10 @@
 """Scale motions from rest to rest uniformly in time until the limits hold; the path stays the same.
 
-At ``r / k`` velocities are 1/k and accelerations 1/k^2 of their values at r. A bounded value g(q, dq, ddq) is then
-``g0 + b / k + c / k^2``, exactly so for velocities, accelerations and torques. Values of g at k = 1, at k = 2 and at
-rest determine b and c, and the smallest k at which all g are within their bounds follows in closed form. Values that
-depend on the jerk are ``g0 + d / k^3``.
+At ``r / k`` velocities are 1/k and accelerations 1/k^2 of their values at r. A bounded
+value g(q, dq, ddq) is then ``g0 + b / k + c / k^2``, exactly so for velocities,
+accelerations and torques. Values of g at k = 1, at k = 2 and at rest determine b and c,
+and the smallest k at which all g are within their bounds follows in closed form. Values
+that depend on the jerk are ``g0 + d / k^3``.
 """
 
 from dataclasses import dataclass
@@ -13,7 +14,12 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
-from cnpgen.planner.expressions import SpeedBounds, speed_bounds, speed_residuals, speed_violation
+from cnpgen.planner.expressions import (
+    SpeedBounds,
+    speed_bounds,
+    speed_residuals,
+    speed_violation,
+)
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.spline import basis, chebyshev
@@ -23,7 +29,9 @@ Array = NDArray[np.float64]
 
 MAX_TIME_SCALE = 3.0  # motions that need more are not usable plans
 SCALING_INTERVALS = 128  # between phases
-TIME_SCALE_MARGIN = 2e-4  # relative; limits may be exceeded by about this between two phases
+TIME_SCALE_MARGIN = (
+    2e-4  # relative; limits may be exceeded by about this between two phases
+)
 MOTIONS_PER_BLOCK = 64  # small enough for arrays to stay in the CPU cache
 
 
@@ -47,22 +55,45 @@ class PhaseGrid:
     rate: Array
 
     def column(self, motion: Motion, obstacle_poses: Array) -> Array:
-        """Return p, p', ..., r, r', ... and obstacle poses at all phases of N motions, shape (width, N K)."""
+        """Return p, p', ..., r, r', .
+
+        And obstacle poses at all phases of N motions, shape (width, N K).
+        """
         (orders, phases, points), (count, _, n) = self.path.shape, motion.path.shape
         first, last = orders * n, orders * n + orders - 1
         out = np.empty((last + obstacle_poses.shape[1], count * phases))
         path = motion.path.transpose(2, 0, 1).reshape(n * count, points)
-        np.matmul(path, self.path.swapaxes(1, 2), out=out[:first].reshape(orders, n * count, phases))
-        np.matmul(motion.rate, self.rate.swapaxes(1, 2), out=out[first:last].reshape(orders - 1, count, phases))
+        np.matmul(
+            path,
+            self.path.swapaxes(1, 2),
+            out=out[:first].reshape(orders, n * count, phases),
+        )
+        np.matmul(
+            motion.rate,
+            self.rate.swapaxes(1, 2),
+            out=out[first:last].reshape(orders - 1, count, phases),
+        )
         out[last:].reshape(-1, count, phases)[:] = obstacle_poses.T[..., None]
         return out
 
 
-def make_phase_grid(problem: Problem, kernels: KernelLibrary, intervals: int) -> PhaseGrid:
+def make_phase_grid(
+    problem: Problem, kernels: KernelLibrary, intervals: int
+) -> PhaseGrid:
     """Make the grid of one problem, with K - 1 intervals between its phases."""
     spec, s, orders = problem.trajectory, chebyshev(intervals), problem.path_orders
-    path = np.stack([basis(s, spec.path_control_points, spec.degree, order) for order in range(orders)])
-    rate = np.stack([basis(s, spec.rate_control_points, spec.degree, order) for order in range(orders - 1)])
+    path = np.stack(
+        [
+            basis(s, spec.path_control_points, spec.degree, order)
+            for order in range(orders)
+        ]
+    )
+    rate = np.stack(
+        [
+            basis(s, spec.rate_control_points, spec.degree, order)
+            for order in range(orders - 1)
+        ]
+    )
     return PhaseGrid(kernels.load(speed_violation), path, rate)
 
 
@@ -76,8 +107,8 @@ class TimeScaling(PhaseGrid):
     def factor(self, motion: Motion, obstacle_poses: Array) -> Array:
         """Return the smallest time scale, at least 1, at which each of N motions from rest to rest meets its limits.
 
-        Violations that do not depend on time are ignored, such as a torque exceeded by gravity alone. Obstacle poses
-        have shape (N, width), the scales (N,).
+        Violations that do not depend on time are ignored, such as a torque exceeded by
+        gravity alone. Obstacle poses have shape (N, width), the scales (N,).
         """
         factor, phases = np.ones(len(motion)), self.path.shape[1]
         columns, motions = [], []  # of phases with a violation: few
@@ -89,25 +120,45 @@ class TimeScaling(PhaseGrid):
             motions.append(block.start + violating // phases)
         if not any(map(len, motions)):
             return factor
-        np.maximum.at(factor, np.concatenate(motions), self._required_scale(np.concatenate(columns, axis=1)))
-        return np.where(factor > 1, np.minimum(factor * (1 + TIME_SCALE_MARGIN), MAX_TIME_SCALE), 1.0)
+        np.maximum.at(
+            factor,
+            np.concatenate(motions),
+            self._required_scale(np.concatenate(columns, axis=1)),
+        )
+        return np.where(
+            factor > 1,
+            np.minimum(factor * (1 + TIME_SCALE_MARGIN), MAX_TIME_SCALE),
+            1.0,
+        )
 
     def _required_scale(self, column: Array) -> Array:
         """Return the smallest time scales of L columns, shape (L,)."""
         n, orders = self.residuals.tape.inputs[0], len(self.path)
         p, p1, p2, *third = column[: orders * n].reshape(orders, n, -1)
-        (r, r1, *second), obstacle_poses = column[orders * n :][: orders - 1], column[orders * n + orders - 1 :]
+        (r, r1, *second), obstacle_poses = (
+            column[orders * n :][: orders - 1],
+            column[orders * n + orders - 1 :],
+        )
         _, *moving = time_derivatives([p, p1, p2, *third], [r, r1, *second])
         fast, slow, static = (
-            self.residuals(p, *(term / k**order for order, term in enumerate(moving, 1)), obstacle_poses)[0]
+            self.residuals(
+                p,
+                *(term / k**order for order, term in enumerate(moving, 1)),
+                obstacle_poses,
+            )[0]
             for k in (1.0, 2.0, np.inf)
         )
         needed = np.ones(fast.shape[1])
         for sign, bounds in ((1.0, self.bounds.upper), (-1.0, self.bounds.lower)):
             row, phase = np.nonzero(sign * fast > sign * bounds[:, None])  # few
             at_rest = static[row, phase]
-            margin, change, half = (sign * (x - at_rest) for x in (bounds[row], fast[row, phase], slow[row, phase]))
-            quadratic = 2 * (change - 2 * half)  # c, from g(1) = static + b + c and g(2) = static + b / 2 + c / 4
+            margin, change, half = (
+                sign * (x - at_rest)
+                for x in (bounds[row], fast[row, phase], slow[row, phase])
+            )
+            quadratic = 2 * (
+                change - 2 * half
+            )  # c, from g(1) = static + b + c and g(2) = static + b / 2 + c / 4
             scale = _smallest_scale(margin, change - quadratic, quadratic)
             cubic = self.bounds.cubic[row]
             scale[cubic] = _smallest_scale_cubic(margin[cubic], change[cubic])
@@ -115,14 +166,28 @@ class TimeScaling(PhaseGrid):
         return needed
 
 
-def make_time_scaling(problem: Problem, robot: Robot, kernels: KernelLibrary) -> TimeScaling:
+def make_time_scaling(
+    problem: Problem, robot: Robot, kernels: KernelLibrary
+) -> TimeScaling:
     """Load the time scaling of one problem."""
-    speeds, residuals = make_phase_grid(problem, kernels, SCALING_INTERVALS), kernels.load(speed_residuals)
-    return TimeScaling(speeds.violation, speeds.path, speeds.rate, residuals, speed_bounds(robot, problem))
+    speeds, residuals = (
+        make_phase_grid(problem, kernels, SCALING_INTERVALS),
+        kernels.load(speed_residuals),
+    )
+    return TimeScaling(
+        speeds.violation,
+        speeds.path,
+        speeds.rate,
+        residuals,
+        speed_bounds(robot, problem),
+    )
 
 
 def _smallest_scale(margin: Array, linear: Array, quadratic: Array) -> Array:
-    """Return the smallest k >= 1 with ``linear / k + quadratic / k^2 <= margin``; 1 if there is no margin at rest."""
+    """Return the smallest k >= 1 with ``linear / k + quadratic / k^2 <= margin``.
+
+    1 if there is no margin at rest.
+    """
     with np.errstate(all="ignore"):
         root = np.sqrt(np.maximum(linear**2 + 4 * quadratic * margin, 0.0))
         k = (linear + root) / (2 * margin)  # of margin k^2 - linear k - quadratic = 0
@@ -131,7 +196,10 @@ def _smallest_scale(margin: Array, linear: Array, quadratic: Array) -> Array:
 
 
 def _smallest_scale_cubic(margin: Array, change: Array) -> Array:
-    """Return the smallest k >= 1 with ``change / k^3 <= margin``; 1 if there is no margin at rest."""
+    """Return the smallest k >= 1 with ``change / k^3 <= margin``.
+
+    1 if there is no margin at rest.
+    """
     with np.errstate(all="ignore"):
         k = np.cbrt(change / margin)
     return np.where((change > margin) & (margin > 0) & np.isfinite(k), k, 1.0)

@@ -1,4 +1,7 @@
-"""Boundary problems of a dataset or file, as plans without motions; rows of a certified dataset have motions."""
+"""Boundary problems of a dataset or file, as plans without motions.
+
+Rows of a certified dataset have motions.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, UsageError, lacks
-from cnpgen.plans.format import ATTRIBUTES, CONDITIONS, FORMAT, GOAL_OPTION, PLAN_FILE_VERSION, refuse_misspelt
+from cnpgen.plans.format import (
+    ATTRIBUTES,
+    CONDITIONS,
+    FORMAT,
+    GOAL_OPTION,
+    PLAN_FILE_VERSION,
+    refuse_misspelt,
+)
 from cnpgen.plans.plan_file import agreed_problem, stored_problem
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.plausible import check_boundary_units
@@ -22,7 +32,12 @@ from cnpgen.robots.scene import scene_poses
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.store.checked_shard import Shard, read_rows
-from cnpgen.store.dataset_spec import DatasetSpec, StoredProblem, load_dataset_spec, shards
+from cnpgen.store.dataset_spec import (
+    DatasetSpec,
+    StoredProblem,
+    load_dataset_spec,
+    shards,
+)
 from cnpgen.store.files.checksum_file import verify_checksum
 from cnpgen.store.files.hdf5 import open_hdf5
 from cnpgen.store.paths import HDF5_KINDS, require_file, require_folder
@@ -57,10 +72,15 @@ class BoundaryFile:
     def text(self, name: str) -> str:
         """Return an attribute as text; empty if it is missing."""
         value = self.attributes.get(name, "")
-        return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
+        return (
+            value.decode(errors="replace") if isinstance(value, bytes) else str(value)
+        )
 
     def spec(self) -> DatasetSpec | None:
-        """Return the specification of the dataset that contains a shard; None for separate shards and other files."""
+        """Return the specification of the dataset that contains a shard.
+
+        None for separate shards and other files.
+        """
         if not self.is_shard:
             return None
         try:
@@ -68,51 +88,89 @@ class BoundaryFile:
         except (DatasetError, IndexError):
             return None
         mine = self.text("specification_fingerprint")
-        return spec if any(each.fingerprint == mine for each in spec.spec_versions) else None
+        return (
+            spec
+            if any(each.fingerprint == mine for each in spec.spec_versions)
+            else None
+        )
 
     def check_shard(self) -> None:
         """Raise DatasetError for a shard that differs from its dataset's specification; see ``read_rows``."""
         if spec := self.spec():
-            folder, name = self.path.absolute().parents[1], "/".join(self.path.absolute().parts[-2:])
+            folder, name = (
+                self.path.absolute().parents[1],
+                "/".join(self.path.absolute().parts[-2:]),
+            )
             for task in shards(spec):
                 if task.file == name:
                     read_rows(Shard(folder, spec, task))
 
     def problem(self, *, required: bool = True) -> ProblemRecord | None:
-        """Return the problem named by the file or by its dataset; None if neither names one; see ``stored_problem``."""
+        """Return the problem named by the file or by its dataset.
+
+        None if neither names one; see ``stored_problem``.
+        """
         spec = self.spec()
         return (
-            stored_problem(self.path, self.attributes, required=required) if spec is None else as_record(spec.problem)
+            stored_problem(self.path, self.attributes, required=required)
+            if spec is None
+            else as_record(spec.problem)
         )
 
     def check_obstacles(self, problem: ProblemRecord) -> None:
         """Raise DatasetError if the file lacks the obstacles of its samples, and they place those of the problem."""
-        if OBSTACLE_POSES not in self.columns and open_problem(problem)[0].has_sample_obstacles:
-            remedy = "give the folder of its dataset" if self.is_shard else f"expected {OBSTACLE_POSES}"
-            raise DatasetError(f"{self.path} lacks the obstacles of its samples: {remedy}")
+        if (
+            OBSTACLE_POSES not in self.columns
+            and open_problem(problem)[0].has_sample_obstacles
+        ):
+            remedy = (
+                "give the folder of its dataset"
+                if self.is_shard
+                else f"expected {OBSTACLE_POSES}"
+            )
+            raise DatasetError(
+                f"{self.path} lacks the obstacles of its samples: {remedy}"
+            )
 
     def boundary(self, robot: Robot, *, allow_large_angles: bool = False) -> Boundary:
-        """Return the boundary conditions of a robot's motions, shape (N, n) each; raise DatasetError or UnitError."""
+        """Return the boundary conditions of a robot's motions, shape (N, n) each.
+
+        Raise DatasetError or UnitError.
+        """
         boundary = boundary_in(str(self.path), self.columns, robot.n)
         if not allow_large_angles:
             check_boundary_units(robot, boundary, where=str(self.path))
         return boundary
 
     def sample_id(self, rows: int) -> NDArray[np.int64]:
-        """Return N sample IDs, 0, 1, ... by default; raise DatasetError for others than integers or a shard's rows."""
+        """Return N sample IDs, 0, 1, ... by default.
+
+        Raise DatasetError for others than integers or a shard's rows.
+        """
         ids = self.columns.get("sample_id", np.arange(rows))
         if ids.shape != (rows,) or ids.dtype.kind not in "iu":
-            raise DatasetError(f"{self.path}: sample_id must hold {rows} integers, got {ids.dtype} of {ids.shape}")
+            raise DatasetError(
+                f"{self.path}: sample_id must hold {rows} integers, got {ids.dtype} of {ids.shape}"
+            )
         if self.is_shard and not self._has_indices(ids):
-            raise DatasetError(f"{self.path}: sample_id is not the index of the row in the split")
+            raise DatasetError(
+                f"{self.path}: sample_id is not the index of the row in the split"
+            )
         return ids.astype(np.int64)
 
     def _has_indices(self, ids: NDArray[Any]) -> bool:
         """Return whether sample IDs are the indices of all rows of a shard, by its attributes."""
-        first, rows = (self.attributes.get(name) for name in ("first_sample_id", "rows"))
-        if not isinstance(first, int | np.integer) or not isinstance(rows, int | np.integer):
+        first, rows = (
+            self.attributes.get(name) for name in ("first_sample_id", "rows")
+        )
+        if not isinstance(first, int | np.integer) or not isinstance(
+            rows, int | np.integer
+        ):
             return False
-        return len(ids) == rows and ("sample_id" not in self.columns or np.array_equal(ids, first + np.arange(rows)))
+        return len(ids) == rows and (
+            "sample_id" not in self.columns
+            or np.array_equal(ids, first + np.arange(rows))
+        )
 
 
 def read_boundary_file(path: Path) -> BoundaryFile:
@@ -123,7 +181,9 @@ def read_boundary_file(path: Path) -> BoundaryFile:
         DatasetError: The file is damaged, or a required name is missing or misspelled.
         MachineError: The file cannot be read.
     """
-    require_file(path, "a dataset or an HDF5 file of boundary conditions", kinds=HDF5_KINDS)
+    require_file(
+        path, "a dataset or an HDF5 file of boundary conditions", kinds=HDF5_KINDS
+    )
     has_checksum = verify_checksum(path, kind=FORMAT, version=PLAN_FILE_VERSION)
     with open_hdf5(path) as file:
         attributes = file.attributes.some(SAID)
@@ -136,15 +196,20 @@ def read_boundary_file(path: Path) -> BoundaryFile:
     missing = [name for name in ("start_q", "goal_q") if name not in columns]
     if missing:
         tasks = any(name.startswith("goal_xyz") for name in names)
-        hint = "; of tasks in the workspace 'cnpgen complete' makes them" if tasks else ""
-        raise DatasetError(f"{path} lacks {' and '.join(missing)}: boundary conditions are needed to plan{hint}")
+        hint = (
+            "; of tasks in the workspace 'cnpgen complete' makes them" if tasks else ""
+        )
+        raise DatasetError(
+            f"{path} lacks {' and '.join(missing)}: boundary conditions are needed to plan{hint}"
+        )
     return found
 
 
 def boundary_in(where: str, columns: Mapping[str, NDArray[Any]], n: int) -> Boundary:
     """Read boundary conditions of n joints from columns; missing ones are zero, missing goal accelerations are free.
 
-    Wrong shapes of columns, name -> values of shape (N, n), and values that are not finite raise DatasetError.
+    Wrong shapes of columns, name -> values of shape (N, n), and values that are not
+    finite raise DatasetError.
     """
     given = {name: columns[name] for name in CONDITIONS if name in columns}
     try:
@@ -154,7 +219,9 @@ def boundary_in(where: str, columns: Mapping[str, NDArray[Any]], n: int) -> Boun
     for name, values in given.items():  # in files, one row does not broadcast to all
         width = values.shape[-1] if name == "parameters" else n
         if values.size != len(boundary) * width:
-            raise DatasetError(f"{where}: {name} has shape {values.shape}, expected ({len(boundary)}, {width})")
+            raise DatasetError(
+                f"{where}: {name} has shape {values.shape}, expected ({len(boundary)}, {width})"
+            )
     return boundary
 
 
@@ -170,32 +237,39 @@ def load_boundary_problems(
 ) -> Plans:
     """Read boundary problems as plans without motions for ``solve_plans``: their control points are nan.
 
-    Rows of a certified dataset have the stored plans. From a file, only the boundary conditions are read;
-    ``load_plans`` reads its plans.
+    Rows of a certified dataset have the stored plans. From a file, only the boundary
+    conditions are read; ``load_plans`` reads its plans.
 
-    Args:
-        path: Folder of a dataset, or an HDF5 file of boundary conditions: a shard, a file of plans, or any other
-            with ``start_q`` and ``goal_q`` of shape (N, joints), and ``start_dq``, ``start_ddq`` and ``goal_dq`` unless
-            they are zero, and ``goal_ddq`` unless goal accelerations are free.
+    Args: path: Folder of a dataset, or an HDF5 file of boundary conditions: a shard, a
+        file of plans, or any other
+            with ``start_q`` and ``goal_q`` of shape (N, joints), and ``start_dq``,
+            ``start_ddq`` and ``goal_dq`` unless they are zero, and ``goal_ddq`` unless
+            goal accelerations are free.
         split: Split of the dataset; "train" by default.
         start: First row of the split; 0 by default.
         n: Number of rows; by default all that follow.
-        allow_large_angles: Whether to accept boundary conditions in a file that are probably in degrees or millimetres.
-        problem: Required problem of a file: name, path, problem or record. Its tolerances replace those in the file.
+        allow_large_angles: Whether to accept boundary conditions in a file that are
+            probably in degrees or millimetres.
+        problem: Required problem of a file: name, path, problem or record. Its
+            tolerances replace those in the file.
 
-    Raises:
-        DatasetError: The dataset or the file cannot be read, is incomplete or is of another problem.
-        UsageError: The folder, file, split or rows do not exist, or rows of a file are requested.
-        UnitError: Boundary conditions of a file are probably in degrees or millimetres.
-        RecipeError: ``problem`` has errors.
+    Raises: DatasetError: The dataset or the file cannot be read, is incomplete or is of
+        another problem. UsageError: The folder, file, split or rows do not exist, or
+        rows of a file are requested. UnitError: Boundary conditions of a file are
+        probably in degrees or millimetres. RecipeError: ``problem`` has errors.
     """
     path = Path(path)
     if path.is_file() or (path.suffix == ".h5" and not path.is_dir()):
         if (split, start, n) != (None, None, None):
             raise UsageError(
-                f"split, start and n choose rows of the folder of a dataset, {path} is a file", concerns="split"
+                f"split, start and n choose rows of the folder of a dataset, {path} is a file",
+                concerns="split",
             )
-        return _of_file(path, None if problem is None else as_record(problem), allow_large_angles=allow_large_angles)
+        return _of_file(
+            path,
+            None if problem is None else as_record(problem),
+            allow_large_angles=allow_large_angles,
+        )
     require_folder(path, argument="path")
     if problem is not None:
         raise UsageError(
@@ -218,56 +292,97 @@ def _of_folder(folder: Path, split: str, start: int, n: int | None) -> Plans:
 def scene_columns(
     dataset: StoredDataset, split: str, rows: range, columns: Mapping[str, NDArray[Any]]
 ) -> dict[str, NDArray[Any]]:
-    """Return the column with the obstacles of rows of a dataset, by ``scene_id``; none if samples have no scenes."""
+    """Return the column with the obstacles of rows of a dataset, by ``scene_id``.
+
+    None if samples have no scenes.
+    """
     if not dataset.spec.scene_obstacles:
         return {}
     scenes = dataset.read_scenes(split, start=rows.start, stop=rows.stop)
     obstacles = open_problem(as_record(dataset.spec.problem))[0].obstacle
-    return {OBSTACLE_POSES: scene_poses(obstacles, scenes[scenes.rows_of(columns[SCENE_ID])])}
+    return {
+        OBSTACLE_POSES: scene_poses(
+            obstacles, scenes[scenes.rows_of(columns[SCENE_ID])]
+        )
+    }
 
 
-def chosen_rows(folder: Path, spec: DatasetSpec, *, split: str, start: int, n: int | None) -> range:
-    """Return n rows of a split from ``start`` on, by default all remaining ones; raise UsageError for others."""
+def chosen_rows(
+    folder: Path, spec: DatasetSpec, *, split: str, start: int, n: int | None
+) -> range:
+    """Return n rows of a split from ``start`` on, by default all remaining ones.
+
+    Raise UsageError for others.
+    """
     start = integer("start", start, least=0)
     if split not in spec.splits:
-        raise UsageError(f"{folder} {lacks('split', split, spec.splits)}", concerns="split")
+        raise UsageError(
+            f"{folder} {lacks('split', split, spec.splits)}", concerns="split"
+        )
     rows = spec.splits[split]
     stop = rows if n is None else start + integer("n", n, least=1)
     if not start < stop <= rows:
         wanted = f"{max(stop - start, 1)} from row {start} on"
-        raise UsageError(f"split {split!r} of {folder} has {rows} rows, got {wanted}", concerns="n")
+        raise UsageError(
+            f"split {split!r} of {folder} has {rows} rows, got {wanted}", concerns="n"
+        )
     return range(start, stop)
 
 
-def _of_file(path: Path, wanted: ProblemRecord | None, *, allow_large_angles: bool) -> Plans:
+def _of_file(
+    path: Path, wanted: ProblemRecord | None, *, allow_large_angles: bool
+) -> Plans:
     """Return the boundary problems of a file."""
     file = read_boundary_file(path)
     problem = agreed_problem(
-        path, file.problem(required=wanted is None), wanted, content="boundary problems", command="solve"
+        path,
+        file.problem(required=wanted is None),
+        wanted,
+        content="boundary problems",
+        command="solve",
     )
-    if (recorded := file.text("problem_sha256")) and recorded != problem.comparable_sha256:
-        raise DatasetError(f"{path} is of another problem than {problem.name!r}: its problem_sha256 is not this one's")
+    if (
+        recorded := file.text("problem_sha256")
+    ) and recorded != problem.comparable_sha256:
+        raise DatasetError(
+            f"{path} is of another problem than {problem.name!r}: its problem_sha256 is not this one's"
+        )
     file.check_obstacles(problem)
-    boundary = file.boundary(open_problem(problem)[1], allow_large_angles=allow_large_angles)
-    columns = {**file.columns, **boundary.arrays(), "sample_id": file.sample_id(len(boundary))}
+    boundary = file.boundary(
+        open_problem(problem)[1], allow_large_angles=allow_large_angles
+    )
+    columns = {
+        **file.columns,
+        **boundary.arrays(),
+        "sample_id": file.sample_id(len(boundary)),
+    }
     try:
-        plans = plans_of_rows(problem, columns, source=f"boundary conditions in {path.name}")
+        plans = plans_of_rows(
+            problem, columns, source=f"boundary conditions in {path.name}"
+        )
     except UsageError as error:
         raise DatasetError(f"{path}: {error}") from error
     return replace(plans, has_checksum=file.has_checksum)
 
 
-def plans_of_rows(problem: ProblemRecord, columns: Mapping[str, NDArray[Any]], *, source: str = "") -> Plans:
+def plans_of_rows(
+    problem: ProblemRecord, columns: Mapping[str, NDArray[Any]], *, source: str = ""
+) -> Plans:
     """Return rows of a dataset, columns as in shards, as plans: those of a certified dataset, or of nan."""
     spec = problem.trajectory
     rows, n = columns["start_q"].shape
     kept = ("start_xyz", "goal_xyz", OBSTACLE_POSES, GOAL_OPTION, *CONTEXT)
     points, rates = spec.path_control_points, spec.rate_control_points
-    path, rate = (columns.get(f"{part}_control_points", np.array(np.nan)) for part in ("path", "rate"))
+    path, rate = (
+        columns.get(f"{part}_control_points", np.array(np.nan))
+        for part in ("path", "rate")
+    )
     return make_plans(
         problem,
         Boundary.from_batch(columns, None),
-        path_control_points=np.array(np.broadcast_to(path, (rows, points * n))).reshape(rows, points, n),
+        path_control_points=np.array(np.broadcast_to(path, (rows, points * n))).reshape(
+            rows, points, n
+        ),
         rate_control_points=np.array(np.broadcast_to(rate, (rows, rates))),
         columns={name: columns[name] for name in kept if name in columns},
         sample_id=columns.get("sample_id"),

@@ -41,11 +41,10 @@ _STATUS: dict[str, PlanStatus] = {
 class Evaluation:
     """Verdicts of N plans.
 
-    Attributes:
-        plans: Plans, with tip positions consistent with the joints.
-        verdicts: Verdicts, in the same order.
-        step: Maximum distance of checked times [s].
-        tracking_error: Largest tracking error of every joint [rad], or one for all; empty for exact tracking.
+    Attributes: plans: Plans, with tip positions consistent with the joints. verdicts:
+        Verdicts, in the same order. step: Maximum distance of checked times [s].
+        tracking_error: Largest tracking error of every joint [rad], or one for all;
+        empty for exact tracking.
     """
 
     plans: Plans
@@ -65,7 +64,13 @@ class Evaluation:
     @property
     def status(self) -> NDArray[np.uint8]:
         """Status of each plan after the verdict, values of ``PlanStatus``, shape (N,)."""
-        return np.array([_STATUS.get(verdict.reason, PlanStatus.INVALID) for verdict in self.verdicts], np.uint8)
+        return np.array(
+            [
+                _STATUS.get(verdict.reason, PlanStatus.INVALID)
+                for verdict in self.verdicts
+            ],
+            np.uint8,
+        )
 
     def summary(self) -> dict[str, Any]:
         """Return the summary of all plans for JSON ('cnpgen docs verdict')."""
@@ -77,13 +82,19 @@ class Evaluation:
             "problem_sha256": record.comparable_sha256,
             "checksum": self.plans.checksum,
             "step_s": self.step,
-            **({"tracking_error_rad": list(self.tracking_error)} if self.tracking_error else {}),
+            **(
+                {"tracking_error_rad": list(self.tracking_error)}
+                if self.tracking_error
+                else {}
+            ),
             **summarize_verdicts(self.verdicts),
         }
 
     def rows(self) -> Iterator[dict[str, Any]]:
         """Yield the result of each plan for JSON ('cnpgen docs verdict')."""
-        for index, (sample, verdict) in enumerate(zip(self.plans.sample_id.tolist(), self.verdicts, strict=True)):
+        for index, (sample, verdict) in enumerate(
+            zip(self.plans.sample_id.tolist(), self.verdicts, strict=True)
+        ):
             yield {"plan": index, "sample_id": sample, **verdict.to_dict()}
 
 
@@ -98,32 +109,43 @@ def evaluate_plans(
 ) -> Evaluation:
     """Judge plans with Pinocchio and Coal, on a fine time grid and between its times.
 
-    Every verdict is independent of the other plans and of the number of processes. Plans that cannot be evaluated get a
-    verdict with that status. If ``start_xyz`` or ``goal_xyz`` differ from the tip positions of the joints, the joints
-    are used, after a warning.
+    Every verdict is independent of the other plans and of the number of processes.
+    Plans that cannot be evaluated get a verdict with that status. If ``start_xyz`` or
+    ``goal_xyz`` differ from the tip positions of the joints, the joints are used, after
+    a warning.
 
-    Args:
-        plans: Plans to judge.
-        step: Maximum distance of checked times [s].
-        tracking_error: Largest tracking error of the joints [rad], one number or one per joint. Limits of positions,
+    Args: plans: Plans to judge. step: Maximum distance of checked times [s].
+        tracking_error: Largest tracking error of the joints [rad], one number or one
+        per joint. Limits of positions,
             clearances and the manifold must then hold for every state within it.
-        workers: Number of processes; default one per available core, or one for few plans.
+        workers: Number of processes; default one per available core, or one for few
+            plans.
         progress: Called with the number of plans that were judged since the last call.
 
-    Raises:
-        UsageError: There are no plans, the step is not positive, there is less than one worker, or a tracking error is
+    Raises: UsageError: There are no plans, the step is not positive, there is less than
+        one worker, or a tracking error is
             negative.
         RecipeError: A required plug-in is not installed.
         MachineError: A worker died.
     """
     check_step(step := number("step", step))
     if isinstance(tracking_error, bool | np.bool_):
-        raise UsageError(f"must be angles [rad], got {tracking_error}", argument="tracking_error")
-    error = () if tracking_error is None else tuple(np.atleast_1d(numbers("tracking_error", tracking_error)).tolist())
+        raise UsageError(
+            f"must be angles [rad], got {tracking_error}", argument="tracking_error"
+        )
+    error = (
+        ()
+        if tracking_error is None
+        else tuple(np.atleast_1d(numbers("tracking_error", tracking_error)).tolist())
+    )
     plans = correct_tips(plans)
-    workers = 1 if workers is None and len(plans) <= MAX_PLANS_OF_ONE_PROCESS else workers
+    workers = (
+        1 if workers is None and len(plans) <= MAX_PLANS_OF_ONE_PROCESS else workers
+    )
     task = partial(_judge, step=step, error=error)
-    verdicts = judged_in_parts(task, plans, size=PLANS_PER_VERDICT_TASK, workers=workers, progress=progress)
+    verdicts = judged_in_parts(
+        task, plans, size=PLANS_PER_VERDICT_TASK, workers=workers, progress=progress
+    )
     return Evaluation(plans, tuple(verdicts), step, error)
 
 
@@ -135,10 +157,15 @@ def judged_in_parts(
     workers: int | None,
     progress: Callable[[int], None] | None,
 ) -> list[T]:
-    """Judge a sequence in parts of a size in several processes; return the results in order."""
+    """Judge a sequence in parts of a size in several processes.
+
+    Return the results in order.
+    """
     parts = [items[first : first + size] for first in range(0, len(items), size)]
     results: list[T] = []
-    with closing(distribute(judge_part, parts, worker_count(workers, len(parts)), ordered=True)) as judged:
+    with closing(
+        distribute(judge_part, parts, worker_count(workers, len(parts)), ordered=True)
+    ) as judged:
         for found in judged:
             results += found
             if progress is not None:

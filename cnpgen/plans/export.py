@@ -28,12 +28,11 @@ MAX_RATE_HZ = 1e6  # steps of 1 us; ROS stamps resolve 1 ns
 class Exported:
     """Result of ``export_plans``.
 
-    Attributes:
-        files: Written files, in the order of the plans.
-        count: Number of exported plans.
-        refused: Index of each plan that could not be exported -> message.
-        invalid: Indices of exported plans with a status other than valid or unknown.
-        held_joints: File with the positions of unplanned movable joints, for formats with one file per plan, if the
+    Attributes: files: Written files, in the order of the plans. count: Number of
+        exported plans. refused: Index of each plan that could not be exported ->
+        message. invalid: Indices of exported plans with a status other than valid or
+        unknown. held_joints: File with the positions of unplanned movable joints, for
+        formats with one file per plan, if the
             robot has such joints.
     """
 
@@ -45,34 +44,46 @@ class Exported:
 
 
 def load_exporter(name: str) -> Exporter:
-    """Load an export format by its registered name; raise UsageError for an unknown or invalid one."""
+    """Load an export format by its registered name.
+
+    Raise UsageError for an unknown or invalid one.
+    """
     try:
         kind: type[Exporter] = registry.load(registry.EXPORTERS, name)
     except RecipeError as error:
         raise UsageError(f"{error}", concerns="to") from error
     if fields(kind) or not getattr(kind, "suffix", ""):
-        raise UsageError(f"exporter {name!r}: {kind.__name__} must have a suffix and no fields", concerns="to")
+        raise UsageError(
+            f"exporter {name!r}: {kind.__name__} must have a suffix and no fields",
+            concerns="to",
+        )
     return kind()
 
 
 @checked_arguments
 def export_plans(
-    plans: Plans | JoinedPlans, out: str | Path, *, to: str, rate: float = 1000.0, only: Sequence[int] | None = None
+    plans: Plans | JoinedPlans,
+    out: str | Path,
+    *,
+    to: str,
+    rate: float = 1000.0,
+    only: Sequence[int] | None = None,
 ) -> Exported:
     """Sample plans in time and write them; existing files are replaced.
 
-    Formats are "npz", "parquet" and "mpd" (one file), "csv", "joint-trajectory" and "ros2-control" (a folder with one
-    file per plan, ``plan_00000.csv``), "lerobot" (a dataset in a folder), and those of installed packages; 'cnpgen docs
-    plan-format' has their content. Folders do not contain unplanned
-    joints. If the robot has movable ones, ``held_joints.yaml`` contains their positions. Plans that cannot be sampled
+    Formats are "npz", "parquet" and "mpd" (one file), "csv", "joint-trajectory" and
+    "ros2-control" (a folder with one file per plan, ``plan_00000.csv``), "lerobot" (a
+    dataset in a folder), and those of installed packages; 'cnpgen docs plan-format' has
+    their content. Folders do not contain unplanned joints. If the robot has movable
+    ones, ``held_joints.yaml`` contains their positions. Plans that cannot be sampled
     are omitted and reported.
 
-    Args:
-        plans: Plans, or joined plans of ``join_plans``.
-        out: File for formats with a single file (in an existing folder: ``plans.npz``), otherwise a folder, which is
+    Args: plans: Plans, or joined plans of ``join_plans``. out: File for formats with a
+        single file (in an existing folder: ``plans.npz``), otherwise a folder, which is
             created.
         to: Name of the format.
-        rate: Samples per second [Hz]; the last instant of a plan is always one of its samples.
+        rate: Samples per second [Hz]; the last instant of a plan is always one of its
+            samples.
         only: Indices of the plans to export; all by default.
 
     Raises:
@@ -82,15 +93,23 @@ def export_plans(
     """
     exporter = load_exporter(to)
     if not 0 < rate <= MAX_RATE_HZ:
-        raise UsageError(f"the rate must be above 0 and at most {MAX_RATE_HZ:g} Hz, got {rate}", concerns="rate")
+        raise UsageError(
+            f"the rate must be above 0 and at most {MAX_RATE_HZ:g} Hz, got {rate}",
+            concerns="rate",
+        )
     chosen = _chosen(plans, only)
     out, refused = Path(out), _refused(plans, rate, chosen)
     kept = [index for index in chosen if index not in refused]
     if not kept:
         reasons = "; ".join(list(refused.values())[:3])
-        raise DatasetError(f"none of the {len(chosen)} plans can be exported{': ' if reasons else ''}{reasons}")
+        raise DatasetError(
+            f"none of the {len(chosen)} plans can be exported{': ' if reasons else ''}{reasons}"
+        )
     if not exporter.single_file and out.exists() and not out.is_dir():
-        raise UsageError(f"{out} is a file, but {to!r} makes one file per plan: give a folder", concerns="out")
+        raise UsageError(
+            f"{out} is a file, but {to!r} makes one file per plan: give a folder",
+            concerns="out",
+        )
     problem, sampled = plans.problem, _sampled(plans, rate, kept)
     exported = ExportedSet(
         np.array(kept),
@@ -109,61 +128,109 @@ def export_plans(
     with machine_errors("write", folder):
         folder.mkdir(parents=True, exist_ok=True)
     if exporter.single_file:
-        files = [out / f"plans{exporter.suffix}" if out.is_dir() and not exporter.is_folder else out]
+        files = [
+            out / f"plans{exporter.suffix}"
+            if out.is_dir() and not exporter.is_folder
+            else out
+        ]
         exporter.write(files[0], sampled, exported)
     else:
         files = [out / f"plan_{index:05d}{exporter.suffix}" for index in kept]
         for path, plan in zip(files, sampled, strict=True):
             exporter.write(path, [plan], exported)
         held = _write_held_joints(out, problem.held_joints)
-    invalid = tuple(index for index in kept if plans.status[index] == PlanStatus.INVALID)
+    invalid = tuple(
+        index for index in kept if plans.status[index] == PlanStatus.INVALID
+    )
     return Exported(tuple(files), len(kept), refused, invalid, held)
 
 
-def _environment(plans: Plans | JoinedPlans, kept: list[int]) -> dict[str, NDArray[np.float64]]:
+def _environment(
+    plans: Plans | JoinedPlans, kept: list[int]
+) -> dict[str, NDArray[np.float64]]:
     """Return goals, columns of the tasks and scenes of chosen plans, shape (N, w) each; of the last if joined."""
     last = _last(plans)
-    columns = {"goal_q": last.boundary.goal_q, "goal_dq": last.boundary.goal_dq, **last.columns}
+    columns = {
+        "goal_q": last.boundary.goal_q,
+        "goal_dq": last.boundary.goal_dq,
+        **last.columns,
+    }
     if last.boundary.parameters is not None:
-        columns |= zip(plans.problem.parameters.names, last.boundary.parameters.T, strict=True)
+        columns |= zip(
+            plans.problem.parameters.names, last.boundary.parameters.T, strict=True
+        )
     scene = last.scene.poses
     if scene.shape[1]:
         columns["scene"] = scene
-    numbers = {name: np.asarray(values, np.float64) for name, values in columns.items() if values.dtype.kind in "fiu"}
-    return {name: values[kept].reshape(len(kept), -1) for name, values in numbers.items()}
+    numbers = {
+        name: np.asarray(values, np.float64)
+        for name, values in columns.items()
+        if values.dtype.kind in "fiu"
+    }
+    return {
+        name: values[kept].reshape(len(kept), -1) for name, values in numbers.items()
+    }
 
 
 def _chosen(plans: Plans | JoinedPlans, only: Sequence[int] | None) -> list[int]:
     """Return the indices of the requested plans, ascending."""
-    chosen = sorted(set(range(len(plans)) if only is None else (integer("only", index) for index in only)))
+    chosen = sorted(
+        set(
+            range(len(plans))
+            if only is None
+            else (integer("only", index) for index in only)
+        )
+    )
     for index in chosen:
         if not 0 <= index < len(plans):
-            raise UsageError(f"there is no plan {index}: {len(plans)} plans are numbered from 0", concerns="only")
+            raise UsageError(
+                f"there is no plan {index}: {len(plans)} plans are numbered from 0",
+                concerns="only",
+            )
     return chosen
 
 
-def _refused(plans: Plans | JoinedPlans, rate: float, chosen: list[int]) -> dict[int, str]:
+def _refused(
+    plans: Plans | JoinedPlans, rate: float, chosen: list[int]
+) -> dict[int, str]:
     """Return the plans that cannot be sampled: index -> message."""
-    unknown = np.full(len(plans), PlanStatus.UNKNOWN, np.uint8)  # joined plans have only plans that can be evaluated
+    unknown = np.full(
+        len(plans), PlanStatus.UNKNOWN, np.uint8
+    )  # joined plans have only plans that can be evaluated
     statuses = unknown if isinstance(plans, JoinedPlans) else screen(plans)
-    reasons = {index: _why_not(plans, index, PlanStatus(statuses[index]), rate) for index in chosen}
-    return {index: f"plan {index} (sample {plans.sample_id[index]}): {why}" for index, why in reasons.items() if why}
+    reasons = {
+        index: _why_not(plans, index, PlanStatus(statuses[index]), rate)
+        for index in chosen
+    }
+    return {
+        index: f"plan {index} (sample {plans.sample_id[index]}): {why}"
+        for index, why in reasons.items()
+        if why
+    }
 
 
-def _why_not(plans: Plans | JoinedPlans, index: int, status: PlanStatus, rate: float) -> str:
+def _why_not(
+    plans: Plans | JoinedPlans, index: int, status: PlanStatus, rate: float
+) -> str:
     duration = plans.duration[index]
     if status != PlanStatus.UNKNOWN:
         return status.text
     if duration < 1e-9:
         return f"it lasts {duration:.3g} s, less than a nanosecond"
     if duration * rate > MAX_SAMPLES:
-        return f"it lasts {duration:.3g} s: more than {MAX_SAMPLES} samples at {rate:g} Hz"
-    if not np.isfinite(plans.motion[[index]].at_times(np.linspace(0, duration, 101)[None]).jerk).all():
+        return (
+            f"it lasts {duration:.3g} s: more than {MAX_SAMPLES} samples at {rate:g} Hz"
+        )
+    if not np.isfinite(
+        plans.motion[[index]].at_times(np.linspace(0, duration, 101)[None]).jerk
+    ).all():
         return "its derivatives are too large to compute with"
     return ""
 
 
-def _sampled(plans: Plans | JoinedPlans, rate: float, kept: list[int]) -> Iterator[SampledPlan]:
+def _sampled(
+    plans: Plans | JoinedPlans, rate: float, kept: list[int]
+) -> Iterator[SampledPlan]:
     motion, parameters = plans.motion, _last(plans).boundary.parameters
     for index in kept:
         values = () if parameters is None else tuple(parameters[index].tolist())
@@ -180,5 +247,8 @@ def _write_held_joints(folder: Path, held: dict[str, float]) -> Path | None:
     if not held:
         return None
     path = folder / "held_joints.yaml"
-    write_file(path, "".join(f"{json.dumps(name)}: {position}\n" for name, position in held.items()))
+    write_file(
+        path,
+        "".join(f"{json.dumps(name)}: {position}\n" for name, position in held.items()),
+    )
     return path

@@ -14,39 +14,95 @@ FORMAT = "cnpgen-plans"
 PLAN_FILE_VERSION = 1
 
 BOUNDARY = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
-CONDITIONS = (*BOUNDARY, "goal_ddq", "parameters")  # only for given goal accelerations, and problems with parameters
+CONDITIONS = (
+    *BOUNDARY,
+    "goal_ddq",
+    "parameters",
+)  # only for given goal accelerations, and problems with parameters
 REQUIRED = (*BOUNDARY, "path_control_points", "rate_control_points")
 
 FLOATS = (*REQUIRED, "goal_ddq", "parameters", "duration")
 INTEGERS = ("sample_id", "status")
 NOTES = ("source", "refined_with")
-ATTRIBUTES = ("format", "format_version", "degree", "problem", "problem_recipe", "problem_urdf", "problem_sha256")
+ATTRIBUTES = (
+    "format",
+    "format_version",
+    "degree",
+    "problem",
+    "problem_recipe",
+    "problem_urdf",
+    "problem_sha256",
+)
 
-JOINT_NAMES_KEY = b"cnpgen_joint_names"  # of the metadata of exported Parquet tables, as JSON
+JOINT_NAMES_KEY = (
+    b"cnpgen_joint_names"  # of the metadata of exported Parquet tables, as JSON
+)
 PLAN_COLUMN = "plan"  # of exported tables with several plans: the index of the plan
 PHASE_COLUMN = "path_phase"  # of exported tables: the phase of each sample
 
 GOAL_OPTION = "goal_option"  # column with the number of a goal state among those of one sample_id, the nearest first
 
-UNITS = {"q": "rad", "dq": "rad/s", "ddq": "rad/s^2", "jerk": "rad/s^3"}  # for revolute joints
+UNITS = {
+    "q": "rad",
+    "dq": "rad/s",
+    "ddq": "rad/s^2",
+    "jerk": "rad/s^3",
+}  # for revolute joints
 MIN_SIMILARITY = 0.8  # similarity ratio of names from which one is treated as a misspelling of the other
-_DESCRIPTIONS = {"q": "joint positions", "dq": "joint velocities", "ddq": "joint accelerations", "xyz": "tip position"}
+_DESCRIPTIONS = {
+    "q": "joint positions",
+    "dq": "joint velocities",
+    "ddq": "joint accelerations",
+    "xyz": "tip position",
+}
 _OTHERS = (
     Field("rate_control_points", "1/s", "control points of the rate r(s) = ds/dt"),
     Field("duration", "s", "integral of 1 / r(s)", role="diagnostic"),
     Field("sample_id", "1", "index of the sample in its split", role="diagnostic"),
     Field("status", "1", "what is known of the plan", role="diagnostic"),
     Field("refine_outcome", "1", "how refining ended", role="diagnostic"),
-    Field("refine_iterations", "1", "steps of all attempts together", role="diagnostic"),
-    Field("refine_objective", "s", "what was minimised: time and what is added to it", role="diagnostic"),
-    Field("hit_angle", "rad", "direction of the hit about world z, from world x", role="context", frame="world"),
-    Field(OBSTACLE_POSES, "m", "poses and sizes of the obstacles", role="context", frame="world"),
-    Field(GOAL_OPTION, "1", "number of the goal state among those of its task", role="context"),
-    Field("hit_speed", "m/s", "speed of the tip along the hit at the goal", role="context", frame="world"),
+    Field(
+        "refine_iterations", "1", "steps of all attempts together", role="diagnostic"
+    ),
+    Field(
+        "refine_objective",
+        "s",
+        "what was minimised: time and what is added to it",
+        role="diagnostic",
+    ),
+    Field(
+        "hit_angle",
+        "rad",
+        "direction of the hit about world z, from world x",
+        role="context",
+        frame="world",
+    ),
+    Field(
+        OBSTACLE_POSES,
+        "m",
+        "poses and sizes of the obstacles",
+        role="context",
+        frame="world",
+    ),
+    Field(
+        GOAL_OPTION,
+        "1",
+        "number of the goal state among those of its task",
+        role="context",
+    ),
+    Field(
+        "hit_speed",
+        "m/s",
+        "speed of the tip along the hit at the goal",
+        role="context",
+        frame="world",
+    ),
 )
 
 
-def plan_fields(joints: tuple[str, ...], prismatic: tuple[bool, ...]) -> dict[str, Field]:
+def plan_fields(
+    joints: tuple[str, ...], prismatic: tuple[bool, ...]
+) -> dict[str, Field]:
     """Describe the datasets that have a fixed definition, for planned joints that are prismatic or not."""
     fields = {item.name: item for item in _OTHERS}
     for end, goal in (("start", "the start"), ("goal", "the goal")):
@@ -54,7 +110,9 @@ def plan_fields(joints: tuple[str, ...], prismatic: tuple[bool, ...]) -> dict[st
             axes, frame = (("x", "y", "z"), "world") if what == "xyz" else (joints, "")
             unit = "m" if what == "xyz" else units_of_joints(UNITS[what], prismatic)
             name = f"{end}_{what}"
-            fields[name] = Field(name, unit, f"{text} at {goal}", len(axes), axes, frame=frame)
+            fields[name] = Field(
+                name, unit, f"{text} at {goal}", len(axes), axes, frame=frame
+            )
     name, unit = "path_control_points", units_of_joints(UNITS["q"], prismatic)
     fields[name] = Field(name, unit, "control points of the path p(s)", names=joints)
     return fields
@@ -67,9 +125,13 @@ def refuse_misspelt(path: Path, names: Collection[str], asked: Collection[str]) 
     """Raise DatasetError for a misspelled name of a missing optional dataset among names, which would be ignored."""
     missing = [name for name in asked if name not in names]
     for name in names:
-        meant = difflib.get_close_matches(name.lower(), missing, n=1, cutoff=MIN_SIMILARITY)
+        meant = difflib.get_close_matches(
+            name.lower(), missing, n=1, cutoff=MIN_SIMILARITY
+        )
         if meant and name not in KNOWN:
-            raise DatasetError(f"{path}: {name!r} is almost {meant[0]!r}, which the file lacks: rename or remove it")
+            raise DatasetError(
+                f"{path}: {name!r} is almost {meant[0]!r}, which the file lacks: rename or remove it"
+            )
 
 
 class PlanStatus(IntEnum):

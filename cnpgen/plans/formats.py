@@ -22,7 +22,8 @@ from cnpgen.store.joint_units import unit_of, units_of_joints
 from cnpgen.trajectory.spline_motion import Motion
 
 PATH_WAYPOINTS = 128  # of a path spline, equidistant in phase
-# YAML 1.1, which ROS's tools read, parses 1e-05 as text: a number needs a point before its exponent.
+# YAML 1.1, which ROS's tools read, parses 1e-05 as text: a number needs a point before
+# its exponent.
 _WITHOUT_POINT = re.compile(r"(?<![\d.])(\d+)(?=e[+-])")
 
 
@@ -36,7 +37,9 @@ class NumpyArchive(Exporter):
     suffix = ".npz"
     single_file = True
 
-    def write(self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet) -> None:
+    def write(
+        self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet
+    ) -> None:
         """Write the archive plan by plan, since ``numpy.savez`` requires all in memory; see ``Exporter.write``."""
         held = exported.held_joints
         common = {
@@ -54,7 +57,9 @@ class NumpyArchive(Exporter):
                     _add(archive, f"plan_{plan.index:05d}_{name}", getattr(plan, name))
                 if plan.phase is not None:
                     _add(archive, f"plan_{plan.index:05d}_{PHASE_COLUMN}", plan.phase)
-                for name, value in zip(exported.parameters, plan.parameters, strict=True):
+                for name, value in zip(
+                    exported.parameters, plan.parameters, strict=True
+                ):
                     _add(archive, f"plan_{plan.index:05d}_{name}", np.array(value))
 
 
@@ -67,16 +72,32 @@ class CsvTables(Exporter):
 
     suffix = ".csv"
 
-    def write(self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet) -> None:
+    def write(
+        self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet
+    ) -> None:
         """Write a table with names and units as header; see ``Exporter.write``."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
-        units = {name: units_of_joints(unit, exported.prismatic) for name, unit in UNITS.items()}
+        units = {
+            name: units_of_joints(unit, exported.prismatic)
+            for name, unit in UNITS.items()
+        }
         joints = list(enumerate(exported.joint_names))
-        heads = [f"{name} {joint} [{unit_of(units[name], i)}]" for name in UNITS for i, joint in joints]
+        heads = [
+            f"{name} {joint} [{unit_of(units[name], i)}]"
+            for name in UNITS
+            for i, joint in joints
+        ]
         (plan,) = plans
         phase = [] if plan.phase is None else [plan.phase]
-        writer.writerow(["t [s]", *heads, *[PHASE_COLUMN] * len(phase), *parameter_columns(exported.parameters)])
+        writer.writerow(
+            [
+                "t [s]",
+                *heads,
+                *[PHASE_COLUMN] * len(phase),
+                *parameter_columns(exported.parameters),
+            ]
+        )
         columns = [getattr(plan, name) for name in UNITS]
         columns += [*phase, *(np.full(len(plan.t), value) for value in plan.parameters)]
         writer.writerows(np.column_stack([plan.t, *columns]).tolist())
@@ -87,35 +108,64 @@ class CsvTables(Exporter):
 class ParquetTable(Exporter):
     """One Parquet file with all plans, one row per sample.
 
-    Every plan is a row group ('cnpgen docs plan-format'). The metadata have the names of the joints and the units.
+    Every plan is a row group ('cnpgen docs plan-format'). The metadata have the names
+    of the joints and the units.
     """
 
     suffix = ".parquet"
     single_file = True
 
-    def write(self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet) -> None:
+    def write(
+        self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet
+    ) -> None:
         """Write the table plan by plan; see ``Exporter.write``."""
         with requires_extra("parquet", "pyarrow"):
             import pyarrow
             import pyarrow.parquet
 
-        units = {"t": "s"} | {name: units_of_joints(unit, exported.prismatic) for name, unit in UNITS.items()}
+        units = {"t": "s"} | {
+            name: units_of_joints(unit, exported.prismatic)
+            for name, unit in UNITS.items()
+        }
         held = json.dumps(exported.held_joints)
-        metadata = {JOINT_NAMES_KEY: json.dumps(exported.joint_names), "units": json.dumps(units), "held_joints": held}
-        lists = {name: pyarrow.list_(pyarrow.float64(), len(exported.joint_names)) for name in UNITS}
+        metadata = {
+            JOINT_NAMES_KEY: json.dumps(exported.joint_names),
+            "units": json.dumps(units),
+            "held_joints": held,
+        }
+        lists = {
+            name: pyarrow.list_(pyarrow.float64(), len(exported.joint_names))
+            for name in UNITS
+        }
         whole = {PLAN_COLUMN: pyarrow.int64(), "sample_id": pyarrow.int64()}
-        parameters = dict.fromkeys(parameter_columns(exported.parameters), pyarrow.float64())
+        parameters = dict.fromkeys(
+            parameter_columns(exported.parameters), pyarrow.float64()
+        )
         phase = {} if exported.motion is None else {PHASE_COLUMN: pyarrow.float64()}
-        schema = pyarrow.schema({**whole, "t": pyarrow.float64(), **lists, **phase, **parameters}, metadata=metadata)
-        samples = dict(zip(exported.index.tolist(), exported.sample_id.tolist(), strict=True))
-        with committing(path) as temporary, pyarrow.parquet.ParquetWriter(temporary, schema) as writer:
+        schema = pyarrow.schema(
+            {**whole, "t": pyarrow.float64(), **lists, **phase, **parameters},
+            metadata=metadata,
+        )
+        samples = dict(
+            zip(exported.index.tolist(), exported.sample_id.tolist(), strict=True)
+        )
+        with (
+            committing(path) as temporary,
+            pyarrow.parquet.ParquetWriter(temporary, schema) as writer,
+        ):
             for plan in plans:
                 count = len(plan.t)
-                whole_values = [np.full(count, plan.index), np.full(count, samples[plan.index]), plan.t]
+                whole_values = [
+                    np.full(count, plan.index),
+                    np.full(count, samples[plan.index]),
+                    plan.t,
+                ]
                 columns = [pyarrow.array(values) for values in whole_values]
                 columns += [fixed_lists(getattr(plan, name)) for name in UNITS]
                 columns += [pyarrow.array(plan.phase)] if phase else []
-                columns += [pyarrow.array(np.full(count, value)) for value in plan.parameters]
+                columns += [
+                    pyarrow.array(np.full(count, value)) for value in plan.parameters
+                ]
                 writer.write_table(pyarrow.table(columns, schema=schema))
 
 
@@ -123,12 +173,15 @@ class ParquetTable(Exporter):
 class JointTrajectory(Exporter):
     """A folder with one message of ROS 2 per plan, ``trajectory_msgs/JointTrajectory`` as JSON, one point per line.
 
-    Positions, velocities and accelerations are included, efforts are not. The header time is 0: start immediately.
+    Positions, velocities and accelerations are included, efforts are not. The header
+    time is 0: start immediately.
     """
 
     suffix = ".json"
 
-    def write(self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet) -> None:
+    def write(
+        self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet
+    ) -> None:
         """Write a message; see ``Exporter.write``."""
         (plan,) = plans
         points = ",\n    ".join(_point_text(plan, k) for k in range(len(plan.t)))
@@ -147,14 +200,19 @@ class TrajectoryControllerGoal(Exporter):
 
     suffix = ".yaml"
 
-    def write(self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet) -> None:
+    def write(
+        self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet
+    ) -> None:
         """Write a goal; see ``Exporter.write``."""
         (plan,) = plans
         lines = [
             "trajectory:",
             f"  joint_names: {json.dumps(exported.joint_names)}",
             "  points:",
-            *(f"    - {_point_text(plan, k, effort=False)}" for k in range(len(plan.t))),
+            *(
+                f"    - {_point_text(plan, k, effort=False)}"
+                for k in range(len(plan.t))
+            ),
         ]
         write_file(path, "\n".join(lines) + "\n")
 
@@ -165,20 +223,26 @@ class PathSplines(Exporter):
 
     Motion Planning Diffusion trains on it (Carvalho et al. 2025).
 
-    For N paths with C control points: ``bspline_params_tt`` (N, C + d + 1), ``bspline_params_cc`` (N, n, C),
-    ``bspline_params_k`` (N,), ``sol_path`` (N, 128, n) [rad], ``task_id`` (N,), ``q_start`` and ``q_goal`` (N, n), and
-    ``duration`` (N,) [s].
+    For N paths with C control points: ``bspline_params_tt`` (N, C + d + 1),
+    ``bspline_params_cc`` (N, n, C), ``bspline_params_k`` (N,), ``sol_path`` (N, 128, n)
+    [rad], ``task_id`` (N,), ``q_start`` and ``q_goal`` (N, n), and ``duration`` (N,)
+    [s].
     """
 
     suffix = ".hdf5"
     single_file = True
 
-    def write(self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet) -> None:
+    def write(
+        self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet
+    ) -> None:
         """Write the file; see ``Exporter.write``."""
         del plans  # splines are not sampled in time
         motion = exported.motion
         if motion is None:
-            raise UsageError("joined plans have no single spline: choose another format", concerns="to")
+            raise UsageError(
+                "joined plans have no single spline: choose another format",
+                concerns="to",
+            )
         import h5py
 
         buffer = io.BytesIO()
@@ -207,7 +271,9 @@ def _add(archive: zipfile.ZipFile, name: str, values: NDArray[Any]) -> None:
         np.lib.format.write_array(member, values, allow_pickle=False)
 
 
-def _spline_columns(motion: Motion, exported: ExportedSet) -> dict[str, NDArray[np.float64] | NDArray[np.int64]]:
+def _spline_columns(
+    motion: Motion, exported: ExportedSet
+) -> dict[str, NDArray[np.float64] | NDArray[np.int64]]:
     """Return the datasets of the file."""
     from scipy.interpolate import BSpline
 
@@ -215,7 +281,9 @@ def _spline_columns(motion: Motion, exported: ExportedSet) -> dict[str, NDArray[
     inner = np.linspace(0, 1, points - degree + 1)
     knots = np.concatenate([np.zeros(degree), inner, np.ones(degree)])
     control = motion.path.transpose(1, 0, 2)
-    waypoints = BSpline(knots, control, degree)(np.linspace(0, 1, PATH_WAYPOINTS)).transpose(1, 0, 2)
+    waypoints = BSpline(knots, control, degree)(
+        np.linspace(0, 1, PATH_WAYPOINTS)
+    ).transpose(1, 0, 2)
     return {
         "bspline_params_tt": np.tile(knots, (count, 1)),
         "bspline_params_cc": np.ascontiguousarray(motion.path.transpose(0, 2, 1)),

@@ -26,9 +26,8 @@ Array = NDArray[np.float64]
 class JoinedPlans:
     """N sequences of plans in the order of execution; ``export_plans`` accepts them.
 
-    Attributes:
-        parts: Plans, N each, in the order of execution.
-        begins: Start time of each part, since the start of the first [s], shape (parts, N).
+    Attributes: parts: Plans, N each, in the order of execution. begins: Start time of
+        each part, since the start of the first [s], shape (parts, N).
     """
 
     parts: tuple[Plans, ...]
@@ -54,8 +53,14 @@ class JoinedPlans:
     def status(self) -> NDArray[np.uint8]:
         """Status of each sequence, shape (N,): valid if all plans are valid, not valid if one plan is not valid."""
         status = np.array([part.status for part in self.parts])
-        known = np.where((status == PlanStatus.VALID).all(axis=0), PlanStatus.VALID, PlanStatus.UNKNOWN)
-        return np.where((status == PlanStatus.INVALID).any(axis=0), PlanStatus.INVALID, known).astype(np.uint8)
+        known = np.where(
+            (status == PlanStatus.VALID).all(axis=0),
+            PlanStatus.VALID,
+            PlanStatus.UNKNOWN,
+        )
+        return np.where(
+            (status == PlanStatus.INVALID).any(axis=0), PlanStatus.INVALID, known
+        ).astype(np.uint8)
 
     @cached_property
     def motion(self) -> JoinedMotion:
@@ -69,20 +74,22 @@ class JoinedPlans:
 
 
 @checked_arguments
-def join_plans(first: Plans | JoinedPlans, following: Plans, *, at: ArrayLike | None = None) -> JoinedPlans:
+def join_plans(
+    first: Plans | JoinedPlans, following: Plans, *, at: ArrayLike | None = None
+) -> JoinedPlans:
     """Cut each of N plans at a time and join it with the plan that follows it.
 
-    Positions, velocities and accelerations must be continuous up to 1e-9 in SI units, as for plans from the state at
-    that time (``Planner.replan``, ``plan_hits``, ``refine_plans``). The tolerance includes rounding errors of control
-    points for plans of a few milliseconds.
+    Positions, velocities and accelerations must be continuous up to 1e-9 in SI units,
+    as for plans from the state at that time (``Planner.replan``, ``plan_hits``,
+    ``refine_plans``). The tolerance includes rounding errors of control points for
+    plans of a few milliseconds.
 
-    Args:
-        first: N plans, or joined plans.
-        following: N plans, each starting at the cut of a plan.
-        at: Times of the cuts, since the start of the first [s], one number or shape (N,); by default at the end.
+    Args: first: N plans, or joined plans. following: N plans, each starting at the cut
+        of a plan. at: Times of the cuts, since the start of the first [s], one number
+        or shape (N,); by default at the end.
 
-    Raises:
-        UsageError: The numbers of plans or times or the problems differ, a time is outside its plan, a plan has no
+    Raises: UsageError: The numbers of plans or times or the problems differ, a time is
+        outside its plan, a plan has no
             motion, or there is a discontinuity.
     """
     if isinstance(first, JoinedPlans):
@@ -92,21 +99,30 @@ def join_plans(first: Plans | JoinedPlans, following: Plans, *, at: ArrayLike | 
         joined = JoinedPlans((first,), np.zeros((1, len(first))))
     if len(following) != len(joined):
         raise UsageError(
-            f"{len(joined)} plans are followed by {len(following)}, expected one for each", concerns="following"
+            f"{len(joined)} plans are followed by {len(following)}, expected one for each",
+            concerns="following",
         )
     if following.problem.comparable_sha256 != joined.problem.comparable_sha256:
         differs = ", ".join(following.problem.differences(joined.problem)[:4])
         raise UsageError(
-            f"plans of {joined.problem.name!r} and {following.problem.name!r} differ in {differs}", concerns="following"
+            f"plans of {joined.problem.name!r} and {following.problem.name!r} differ in {differs}",
+            concerns="following",
         )
     check_made(following)
     try:
-        begins = joined.duration if at is None else np.broadcast_to(numbers("at", at), (len(joined),))
+        begins = (
+            joined.duration
+            if at is None
+            else np.broadcast_to(numbers("at", at), (len(joined),))
+        )
     except ValueError as error:
         raise UsageError(
-            f"must be one number or one for each of {len(joined)} plans, got {at!r:.60}", argument="at"
+            f"must be one number or one for each of {len(joined)} plans, got {at!r:.60}",
+            argument="at",
         ) from error
-    found = JoinedPlans((*joined.parts, following), np.concatenate([joined.begins, begins[None]]))
+    found = JoinedPlans(
+        (*joined.parts, following), np.concatenate([joined.begins, begins[None]])
+    )
     _ = found.motion  # raises an error for discontinuities
     return found
 
@@ -123,16 +139,27 @@ def concatenate(parts: Sequence[Plans]) -> Plans:
     for index, other in enumerate(parts[1:], 1):
         for what, mine, its in _kinds(first, other):
             if mine != its:
-                raise UsageError(f"plans cannot be joined: {what} is {its} in part {index}, but {mine} in part 0")
-    sources, options = (list(dict.fromkeys(getattr(part, name) for part in parts)) for name in NOTES)
+                raise UsageError(
+                    f"plans cannot be joined: {what} is {its} in part {index}, but {mine} in part 0"
+                )
+    sources, options = (
+        list(dict.fromkeys(getattr(part, name) for part in parts)) for name in NOTES
+    )
     return replace(
         first,
         source="; ".join(filter(None, sources)),
         refined_with=options[0] if len(options) == 1 else "",
         boundary=join_boundaries([part.boundary for part in parts]),
-        path_control_points=np.concatenate([part.path_control_points for part in parts]),
-        rate_control_points=np.concatenate([part.rate_control_points for part in parts]),
-        columns={name: np.concatenate([part.columns[name] for part in parts]) for name in first.columns},
+        path_control_points=np.concatenate(
+            [part.path_control_points for part in parts]
+        ),
+        rate_control_points=np.concatenate(
+            [part.rate_control_points for part in parts]
+        ),
+        columns={
+            name: np.concatenate([part.columns[name] for part in parts])
+            for name in first.columns
+        },
         sample_id=np.concatenate([part.sample_id for part in parts]),
         status=np.concatenate([part.status for part in parts]),
     )
@@ -140,11 +167,27 @@ def concatenate(parts: Sequence[Plans]) -> Plans:
 
 def _kinds(first: Plans, other: Plans) -> Iterator[tuple[str, Any, Any]]:
     """Yield the properties that concatenated plans must share."""
-    yield "the problem", first.problem.comparable_sha256, other.problem.comparable_sha256
+    yield (
+        "the problem",
+        first.problem.comparable_sha256,
+        other.problem.comparable_sha256,
+    )
     yield "the degree", first.degree, other.degree
     for name in ("path_control_points", "rate_control_points"):
-        yield f"the shape of a plan's {name}", getattr(first, name).shape[1:], getattr(other, name).shape[1:]
-    yield "goal_ddq", first.boundary.goal_ddq is not None, other.boundary.goal_ddq is not None
+        yield (
+            f"the shape of a plan's {name}",
+            getattr(first, name).shape[1:],
+            getattr(other, name).shape[1:],
+        )
+    yield (
+        "goal_ddq",
+        first.boundary.goal_ddq is not None,
+        other.boundary.goal_ddq is not None,
+    )
     yield "the set of columns", sorted(first.columns), sorted(other.columns)
     for name, values in first.columns.items():
-        yield f"the shape of column {name!r}", values.shape[1:], other.columns[name].shape[1:]
+        yield (
+            f"the shape of column {name!r}",
+            values.shape[1:],
+            other.columns[name].shape[1:],
+        )

@@ -38,7 +38,11 @@ from cnpgen.problems.problem_record import ProblemRecord, as_record, record_prob
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.files.atomic import write_file
-from cnpgen.store.files.checksum_file import HEADER_BYTES, verify_checksum, with_checksum
+from cnpgen.store.files.checksum_file import (
+    HEADER_BYTES,
+    verify_checksum,
+    with_checksum,
+)
 from cnpgen.store.files.hdf5 import Column, Hdf5, create_hdf5, open_hdf5
 from cnpgen.store.files.kind import PLANS
 from cnpgen.store.paths import ANY_HDF5, file_kind, require_file
@@ -47,15 +51,17 @@ from cnpgen.trajectory.boundary import Boundary
 
 
 @checked_arguments
-def load_plans(path: str | Path, *, problem: Problem | StoredProblem | str | Path | None = None) -> Plans:
+def load_plans(
+    path: str | Path, *, problem: Problem | StoredProblem | str | Path | None = None
+) -> Plans:
     """Read plans from a file of cnpgen or of other software.
 
-    Names, shapes and types must be correct. Values are not checked; the verdict judges every plan later. The checksum
-    of files of cnpgen is verified; other files have none, and ``has_checksum`` of the plans is False.
+    Names, shapes and types must be correct. Values are not checked; the verdict judges
+    every plan later. The checksum of files of cnpgen is verified; other files have
+    none, and ``has_checksum`` of the plans is False.
 
-    Args:
-        path: Path of the file.
-        problem: Required problem: a problem, a record, or the name or path of a problem, pipeline or dataset. Its
+    Args: path: Path of the file. problem: Required problem: a problem, a record, or the
+        name or path of a problem, pipeline or dataset. Its
             tolerances replace those in the file.
 
     Raises:
@@ -67,7 +73,9 @@ def load_plans(path: str | Path, *, problem: Problem | StoredProblem | str | Pat
     path = Path(path)
     wanted = None if problem is None else as_record(problem)
     of_dataset = "'cnpgen solve' and 'cnpgen plan' make plans for its rows"
-    require_file(path, "a file of plans", kinds=(PLANS, ANY_HDF5), of_dataset=of_dataset)
+    require_file(
+        path, "a file of plans", kinds=(PLANS, ANY_HDF5), of_dataset=of_dataset
+    )
     has_checksum = verify_checksum(path, kind=FORMAT, version=PLAN_FILE_VERSION)
     with open_hdf5(path) as file:
         attributes = file.attributes.some((*ATTRIBUTES, *NOTES))
@@ -76,7 +84,11 @@ def load_plans(path: str | Path, *, problem: Problem | StoredProblem | str | Pat
     if not has_checksum:
         refuse_misspelt(path, columns, CONDITIONS)
     record = agreed_problem(
-        path, stored_problem(path, attributes, required=wanted is None), wanted, content="plans", command="evaluate"
+        path,
+        stored_problem(path, attributes, required=wanted is None),
+        wanted,
+        content="plans",
+        command="evaluate",
     )
     try:
         plans = _assembled(path, record, columns, attributes)
@@ -88,9 +100,15 @@ def load_plans(path: str | Path, *, problem: Problem | StoredProblem | str | Pat
 def _columns(path: Path, file: Hdf5) -> dict[str, NDArray[Any]]:
     """Read the datasets of a file."""
     columns = {name: _read(path, name, item) for name, item in file.columns().items()}
-    missing = [name + nearest(name, columns.keys() - KNOWN) for name in REQUIRED if name not in columns]
+    missing = [
+        name + nearest(name, columns.keys() - KNOWN)
+        for name in REQUIRED
+        if name not in columns
+    ]
     if missing:
-        raise DatasetError(f"{path} lacks {', '.join(missing)}: plans need {', '.join(REQUIRED)}")
+        raise DatasetError(
+            f"{path} lacks {', '.join(missing)}: plans need {', '.join(REQUIRED)}"
+        )
     if "status" in columns:
         named = file["status"].attributes.some(("flag_values", "flag_meanings"))
         columns["status"] = _statuses(path, columns["status"], named)
@@ -99,21 +117,31 @@ def _columns(path: Path, file: Hdf5) -> dict[str, NDArray[Any]]:
 
 def _read(path: Path, name: str, dataset: Column) -> NDArray[Any]:
     """Read a dataset in its required type."""
-    what, kinds = ("integers", "iu") if name in INTEGERS else ("floats", "f") if name in FLOATS else ("numbers", "fiu")
+    what, kinds = (
+        ("integers", "iu")
+        if name in INTEGERS
+        else ("floats", "f")
+        if name in FLOATS
+        else ("numbers", "fiu")
+    )
     if dataset.dtype.kind not in kinds:
         raise DatasetError(f"{path}: {name} must hold {what}, got {dataset.dtype}")
     values = dataset.read()
     if name not in INTEGERS:
         return np.asarray(values, np.float64)
     if values.size and values.max() > np.iinfo(np.int64).max:
-        raise DatasetError(f"{path}: {name} must hold integers below 2^63, got {values.max()}")
+        raise DatasetError(
+            f"{path}: {name} must hold integers below 2^63, got {values.max()}"
+        )
     return np.asarray(values, np.int64)
 
 
 def _check_format(path: Path, attributes: Mapping[str, Any]) -> None:
     """Raise DatasetError for files of another kind."""
     if "format" in attributes and _text(path, attributes, "format") != FORMAT:
-        raise DatasetError(f"{path} is a {_text(path, attributes, 'format')} file, not one of plans ({FORMAT})")
+        raise DatasetError(
+            f"{path} is a {_text(path, attributes, 'format')} file, not one of plans ({FORMAT})"
+        )
     version = _number(path, attributes, "format_version", PLAN_FILE_VERSION)
     if version > PLAN_FILE_VERSION:
         raise DatasetError(
@@ -127,31 +155,44 @@ def _text(path: Path, attributes: Mapping[str, Any], name: str) -> str:
         try:
             return value.decode()
         except UnicodeDecodeError as error:
-            raise DatasetError(f"{path} is damaged: its attribute {name!r} is no text") from error
+            raise DatasetError(
+                f"{path} is damaged: its attribute {name!r} is no text"
+            ) from error
     if not isinstance(value, str):
-        raise DatasetError(f"{path}: the attribute {name!r} must be a text, got {value!r}")
+        raise DatasetError(
+            f"{path}: the attribute {name!r} must be a text, got {value!r}"
+        )
     return value
 
 
 def _number(path: Path, attributes: Mapping[str, Any], name: str, default: int) -> int:
     value = attributes.get(name, default)
     if np.ndim(value) or not np.issubdtype(np.asarray(value).dtype, np.integer):
-        raise DatasetError(f"{path}: the attribute {name!r} must be an integer, got {value!r}")
+        raise DatasetError(
+            f"{path}: the attribute {name!r} must be an integer, got {value!r}"
+        )
     return int(value)
 
 
 def agreed_problem(
-    path: Path, stored: ProblemRecord | None, wanted: ProblemRecord | None, *, content: str, command: str
+    path: Path,
+    stored: ProblemRecord | None,
+    wanted: ProblemRecord | None,
+    *,
+    content: str,
+    command: str,
 ) -> ProblemRecord:
     """Return the problem of a file: the required one if it is consistent, or the file's own.
 
-    Content and command, which has the option ``--problem``, are for messages: DatasetError for another problem, and
-    UsageError without one.
+    Content and command, which has the option ``--problem``, are for messages:
+    DatasetError for another problem, and UsageError without one.
     """
     found = stored or wanted
     if found is None:
         help_ = f"set its attribute 'problem' to a name or a file, or pass {{problem}} ('cnpgen {command}' takes it)"
-        raise UsageError(f"{path} does not name its problem: {help_}", remedies={"problem": None})
+        raise UsageError(
+            f"{path} does not name its problem: {help_}", remedies={"problem": None}
+        )
     if wanted is not None and found.comparable_sha256 != wanted.comparable_sha256:
         where = ", ".join(found.differences(wanted)[:4])
         raise DatasetError(
@@ -160,13 +201,16 @@ def agreed_problem(
     return wanted or found
 
 
-def stored_problem(path: Path, attributes: Mapping[str, Any], *, required: bool = True) -> ProblemRecord | None:
+def stored_problem(
+    path: Path, attributes: Mapping[str, Any], *, required: bool = True
+) -> ProblemRecord | None:
     """Return the problem named by the attributes of a file; None if they name none.
 
-    A problem in another folder, which is not opened, is an error if it is required, otherwise ignored.
+    A problem in another folder, which is not opened, is an error if it is required,
+    otherwise ignored.
 
-    Raises:
-        DatasetError: The named problem is damaged, cannot be found or is in another folder than the file.
+    Raises: DatasetError: The named problem is damaged, cannot be found or is in another
+        folder than the file.
     """
     if "problem_recipe" in attributes:
         return _stored_record(path, attributes)
@@ -185,16 +229,24 @@ def stored_problem(path: Path, attributes: Mapping[str, Any], *, required: bool 
         record = record_problem(load_problem(name, relative_to=path.parent))
     except RecipeError as error:
         raise DatasetError(f"{path}: the attribute 'problem': {error}") from error
-    if "problem_sha256" in attributes and _text(path, attributes, "problem_sha256") != record.comparable_sha256:
+    if (
+        "problem_sha256" in attributes
+        and _text(path, attributes, "problem_sha256") != record.comparable_sha256
+    ):
         ours = record.comparable_sha256
-        raise DatasetError(f"{path} is of another {name!r}: its problem_sha256 is not this one's, {ours}")
+        raise DatasetError(
+            f"{path} is of another {name!r}: its problem_sha256 is not this one's, {ours}"
+        )
     return record
 
 
 def _is_beside(path: Path, problem: str) -> bool:
     """Return whether a problem is a name, or a path in the folder of the file that names it, links resolved."""
     try:
-        folder, file = os.path.realpath(path.parent), os.path.realpath(path.parent / problem)
+        folder, file = (
+            os.path.realpath(path.parent),
+            os.path.realpath(path.parent / problem),
+        )
     except ValueError:  # a zero byte
         return False
     is_name = not {"/", os.sep} & set(problem) and not os.path.isfile(file)  # noqa: PTH113 - as in find_file
@@ -203,21 +255,36 @@ def _is_beside(path: Path, problem: str) -> bool:
 
 def _stored_record(path: Path, attributes: Mapping[str, Any]) -> ProblemRecord:
     """Return the problem stored as text in the file."""
-    missing = [name for name in ("problem_urdf", "problem_sha256") if name not in attributes]
+    missing = [
+        name for name in ("problem_urdf", "problem_sha256") if name not in attributes
+    ]
     if missing:
-        raise DatasetError(f"{path} has an attribute 'problem_recipe' but no {' and no '.join(missing)}")
-    record = ProblemRecord(_text(path, attributes, "problem_recipe"), _text(path, attributes, "problem_urdf"))
+        raise DatasetError(
+            f"{path} has an attribute 'problem_recipe' but no {' and no '.join(missing)}"
+        )
+    record = ProblemRecord(
+        _text(path, attributes, "problem_recipe"),
+        _text(path, attributes, "problem_urdf"),
+    )
     try:
-        same = record.comparable_sha256 == _text(path, attributes, "problem_sha256") and record.trajectory.degree > 0
+        same = (
+            record.comparable_sha256 == _text(path, attributes, "problem_sha256")
+            and record.trajectory.degree > 0
+        )
     except RecipeError as error:
         raise DatasetError(f"{path} is damaged: its {error}") from error
     if not same:
-        raise DatasetError(f"{path} is damaged: its problem was changed after it was written")
+        raise DatasetError(
+            f"{path} is damaged: its problem was changed after it was written"
+        )
     return record
 
 
 def _assembled(
-    path: Path, record: ProblemRecord, columns: dict[str, NDArray[Any]], attributes: Mapping[str, Any]
+    path: Path,
+    record: ProblemRecord,
+    columns: dict[str, NDArray[Any]],
+    attributes: Mapping[str, Any],
 ) -> Plans:
     """Build the plans from the contents of the file."""
     boundary = [columns.pop(name, None) for name in CONDITIONS]
@@ -235,19 +302,32 @@ def _assembled(
         allow_large_angles=True,  # the verdict reports them
     )
     if duration is not None and duration.shape != (len(plans),):
-        raise UsageError(f"must have shape {(len(plans),)}, got {duration.shape}", argument="duration")
-    source, options = (_text(path, attributes, name) if name in attributes else "" for name in NOTES)
+        raise UsageError(
+            f"must have shape {(len(plans),)}, got {duration.shape}",
+            argument="duration",
+        )
+    source, options = (
+        _text(path, attributes, name) if name in attributes else "" for name in NOTES
+    )
     return replace(plans, source=source, refined_with=options)
 
 
-def _statuses(path: Path, stored: NDArray[np.int64], attributes: Mapping[str, Any]) -> NDArray[np.uint8]:
-    """Translate status values by their names in the file; unknown names become UNKNOWN."""
+def _statuses(
+    path: Path, stored: NDArray[np.int64], attributes: Mapping[str, Any]
+) -> NDArray[np.uint8]:
+    """Translate status values by their names in the file.
+
+    Unknown names become UNKNOWN.
+    """
     known = {int(status): status for status in PlanStatus}
     if "flag_values" in attributes and "flag_meanings" in attributes:
         names = {status.name.lower(): status for status in PlanStatus}
         words = _text(path, attributes, "flag_meanings").split()
         values = np.ravel(attributes["flag_values"]).tolist()
-        known = {value: names.get(word, PlanStatus.UNKNOWN) for value, word in zip(values, words, strict=False)}
+        known = {
+            value: names.get(word, PlanStatus.UNKNOWN)
+            for value, word in zip(values, words, strict=False)
+        }
     found = [known.get(value, PlanStatus.UNKNOWN) for value in stored.ravel().tolist()]
     return np.array(found, np.uint8).reshape(stored.shape)
 
@@ -256,9 +336,8 @@ def _statuses(path: Path, stored: NDArray[np.int64], attributes: Mapping[str, An
 def save_plans(path: str | Path, plans: Plans) -> None:
     """Write plans to a file with a checksum, atomically; equal plans give equal bytes.
 
-    Args:
-        path: Path of the file. An existing plan file is replaced, and missing folders are created (unlike by commands).
-        plans: Plans to write.
+    Args: path: Path of the file. An existing plan file is replaced, and missing folders
+        are created (unlike by commands). plans: Plans to write.
 
     Raises:
         UsageError: The path holds another file, or ``plans`` has another type.
@@ -272,32 +351,53 @@ def save_plans(path: str | Path, plans: Plans) -> None:
     with h5py.File(create_hdf5(buffer, userblock=HEADER_BYTES)) as file:
         for name, values in _datasets(plans).items():
             dataset = file.create_dataset(name, data=values, track_times=False)
-            _write_attributes(dataset, field_attributes(fields[name]) if name in fields else {})
+            _write_attributes(
+                dataset, field_attributes(fields[name]) if name in fields else {}
+            )
         file["status"].attrs["flag_values"] = np.array(list(PlanStatus), np.uint8)
-        _write_attributes(file["status"], {"flag_meanings": " ".join(status.name.lower() for status in PlanStatus)})
+        _write_attributes(
+            file["status"],
+            {"flag_meanings": " ".join(status.name.lower() for status in PlanStatus)},
+        )
         _write_attributes(file, _attributes(plans))
-    write_file(Path(path), with_checksum(buffer.getvalue(), kind=FORMAT, version=PLAN_FILE_VERSION))
+    write_file(
+        Path(path),
+        with_checksum(buffer.getvalue(), kind=FORMAT, version=PLAN_FILE_VERSION),
+    )
 
 
 def check_replaceable(path: Path) -> None:
     """Raise UsageError unless a path is free, or holds an older plan file or an empty file."""
     if path.is_dir():
-        raise UsageError(f"{path} is a folder, expected a file for plans", concerns="path")
+        raise UsageError(
+            f"{path} is a folder, expected a file for plans", concerns="path"
+        )
     if not path.exists() or (path.is_file() and path.stat().st_size == 0):
         return
     kind = file_kind(path)
     if kind != PLANS:
         what = f"{kind}, not one of plans" if kind else "not a file of plans"
-        raise UsageError(f"{path} is {what}: it is not replaced; remove it, or choose another file", concerns="path")
+        raise UsageError(
+            f"{path} is {what}: it is not replaced; remove it, or choose another file",
+            concerns="path",
+        )
 
 
 def _datasets(plans: Plans) -> dict[str, NDArray[Any]]:
     """Return the stored datasets, in order and in their stored types."""
     floats = plans.boundary.arrays() | dict(sorted(plans.columns.items()))
-    floats |= {"path_control_points": plans.path_control_points, "rate_control_points": plans.rate_control_points}
+    floats |= {
+        "path_control_points": plans.path_control_points,
+        "rate_control_points": plans.rate_control_points,
+    }
     floats["duration"] = plans.duration
-    stored: dict[str, NDArray[Any]] = {name: np.ascontiguousarray(values, "<f8") for name, values in floats.items()}
-    return stored | {"sample_id": plans.sample_id.astype("<i8"), "status": plans.status.astype("u1")}
+    stored: dict[str, NDArray[Any]] = {
+        name: np.ascontiguousarray(values, "<f8") for name, values in floats.items()
+    }
+    return stored | {
+        "sample_id": plans.sample_id.astype("<i8"),
+        "status": plans.status.astype("u1"),
+    }
 
 
 def _attributes(plans: Plans) -> dict[str, str | int]:

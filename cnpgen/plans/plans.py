@@ -36,16 +36,15 @@ _NO_COLUMNS = {*FLOATS, *INTEGERS, "", "."}  # invalid names of columns
 class Plans:
     """N plans of one problem with n planned joints. Values may be invalid (nan, negative rates); shapes are valid.
 
-    Attributes:
-        problem: Record of the problem.
-        boundary: Boundary conditions, shape (N, n) each.
-        path_control_points: Control points of p(s) [rad], shape (N, C, n).
-        rate_control_points: Control points of r(s) = ds/dt [1/s], shape (N, R).
-        degree: Degree of both splines.
-        columns: Further columns of the tasks: name -> values in SI units, shape (N,) or (N, w). ``start_xyz`` and
-            ``goal_xyz``, the tip's positions in the world frame [m], shape (N, 3), are always there after
-            ``make_plans`` and ``load_plans``. ``obstacle_poses``, shape (N, width), replaces the poses and sizes of the
-            problem's obstacles (``cnpgen.robots.solid``), so that every plan has its own scene.
+    Attributes: problem: Record of the problem. boundary: Boundary conditions, shape (N,
+        n) each. path_control_points: Control points of p(s) [rad], shape (N, C, n).
+        rate_control_points: Control points of r(s) = ds/dt [1/s], shape (N, R). degree:
+        Degree of both splines. columns: Further columns of the tasks: name -> values in
+        SI units, shape (N,) or (N, w). ``start_xyz`` and
+            ``goal_xyz``, the tip's positions in the world frame [m], shape (N, 3), are
+            always there after ``make_plans`` and ``load_plans``. ``obstacle_poses``,
+            shape (N, width), replaces the poses and sizes of the problem's obstacles
+            (``cnpgen.robots.solid``), so that every plan has its own scene.
         sample_id: Sample ID of every plan in a dataset, shape (N,).
         status: Status of every plan, values of ``PlanStatus``, shape (N,).
         source: Source of the plans, a line of text, or empty.
@@ -88,7 +87,11 @@ class Plans:
         name = message.split(maxsplit=1)[0]
         if name in vars(self.boundary):
             return "boundary"
-        holder = "columns" if name in self.columns or message.startswith("a column") else "path_control_points"
+        holder = (
+            "columns"
+            if name in self.columns or message.startswith("a column")
+            else "path_control_points"
+        )
         return name if name in vars(self) else holder
 
     def __len__(self) -> int:
@@ -114,10 +117,16 @@ class Plans:
             UsageError: The column ``obstacle_poses`` does not fit the problem.
         """
         problem, robot = open_problem(self.problem)
-        velocity = goal_velocities(problem, robot, self.boundary.goal_q, self.boundary.goal_dq)
+        velocity = goal_velocities(
+            problem, robot, self.boundary.goal_q, self.boundary.goal_dq
+        )
         ends = self.columns["start_xyz"], self.columns["goal_xyz"]
         scene = scene_of(problem, *ends, velocity, self.boundary.parameters)
-        return scene.with_poses(self.columns[OBSTACLE_POSES]) if OBSTACLE_POSES in self.columns else scene
+        return (
+            scene.with_poses(self.columns[OBSTACLE_POSES])
+            if OBSTACLE_POSES in self.columns
+            else scene
+        )
 
     @cached_property
     def duration(self) -> Array:
@@ -130,17 +139,18 @@ class Plans:
         Args:
             time: Time since the start of each plan [s], one number or shape (N,).
 
-        Returns:
-            Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (N, n) each.
+        Returns: Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape
+            (N, n) each.
 
-        Raises:
-            UsageError: The number of times differs from that of plans, or a time is outside its plan.
+        Raises: UsageError: The number of times differs from that of plans, or a time is
+            outside its plan.
         """
         try:
             times = np.broadcast_to(numbers("time", time), (len(self),))
         except (UsageError, ValueError) as error:
             raise UsageError(
-                f"must be one number or one for each of {len(self)} plans, got {time!r}", argument="time"
+                f"must be one number or one for each of {len(self)} plans, got {time!r}",
+                argument="time",
             ) from error
         outside = ~((times >= 0) & (times <= self.duration))
         if outside.any():
@@ -155,11 +165,11 @@ class Plans:
     def __getitem__(self, which: int | slice | Sequence[int] | NDArray[Any]) -> Plans:
         """Return a selection of the plans, as Plans also for a single plan.
 
-        Args:
-            which: An index, several indices in any order, a mask of shape (N,), or a slice.
+        Args: which: An index, several indices in any order, a mask of shape (N,), or a
+            slice.
 
-        Raises:
-            PlanIndexError: The mask has another length, or an index is out of range; a subclass of IndexError.
+        Raises: PlanIndexError: The mask has another length, or an index is out of
+            range; a subclass of IndexError.
         """
         which = _checked(which, len(self))
         if isinstance(which, np.ndarray):
@@ -199,21 +209,21 @@ def make_plans(
 ) -> Plans:
     """Build plans; missing data is computed.
 
-    Values may be arrays of NumPy or JAX, or tensors of torch on the CPU, which are detached.
+    Values may be arrays of NumPy or JAX, or tensors of torch on the CPU, which are
+    detached.
 
-    Args:
-        problem: Problem, record, or name or path of a problem, pipeline or dataset.
-        boundary: Boundary conditions, shape (N, n) each.
-        path_control_points: Control points of p(s) [rad], shape (N, C, n).
-        rate_control_points: Control points of r(s) [1/s], shape (N, R).
-        degree: Degree of both splines; the problem's by default.
-        columns: Name -> values, shape (N,) or (N, w); ``start_xyz`` and ``goal_xyz`` [m] by forward kinematics by
+    Args: problem: Problem, record, or name or path of a problem, pipeline or dataset.
+        boundary: Boundary conditions, shape (N, n) each. path_control_points: Control
+        points of p(s) [rad], shape (N, C, n). rate_control_points: Control points of
+        r(s) [1/s], shape (N, R). degree: Degree of both splines; the problem's by
+        default. columns: Name -> values, shape (N,) or (N, w); ``start_xyz`` and
+        ``goal_xyz`` [m] by forward kinematics by
             default; given values must be consistent with it.
         sample_id: Sample IDs, shape (N,); 0, 1, ... by default.
         status: Values of ``PlanStatus``, shape (N,); unknown by default.
         source: Source of the plans, a line of text.
-        allow_large_angles: Whether to accept boundary conditions that are probably in degrees or millimetres, with a
-            warning.
+        allow_large_angles: Whether to accept boundary conditions that are probably in
+            degrees or millimetres, with a warning.
 
     Raises:
         UsageError: An array has the wrong shape.
@@ -221,7 +231,10 @@ def make_plans(
     """
     record = as_record(problem)
     path = numbers("path_control_points", path_control_points)
-    parts = {name: None if part is None else numbers(name, part) for name, part in vars(boundary).items()}
+    parts = {
+        name: None if part is None else numbers(name, part)
+        for name, part in vars(boundary).items()
+    }
     rows = path.shape[0] if path.ndim else 0
     plans = Plans(
         problem=record,
@@ -229,15 +242,30 @@ def make_plans(
         path_control_points=path,
         rate_control_points=numbers("rate_control_points", rate_control_points),
         degree=record.trajectory.degree if degree is None else degree,
-        columns={name: numbers(name, values) for name, values in (columns or {}).items()},
-        sample_id=np.arange(rows) if sample_id is None else _integers("sample_id", sample_id, np.int64),
-        status=np.zeros(rows, np.uint8) if status is None else _integers("status", status, np.uint8),
+        columns={
+            name: numbers(name, values) for name, values in (columns or {}).items()
+        },
+        sample_id=np.arange(rows)
+        if sample_id is None
+        else _integers("sample_id", sample_id, np.int64),
+        status=np.zeros(rows, np.uint8)
+        if status is None
+        else _integers("status", status, np.uint8),
         source=source,
     )
     robot = open_problem(record)[1]
-    check_boundary_units(robot, plans.boundary, argument="boundary", allow_large_angles=allow_large_angles)
+    check_boundary_units(
+        robot,
+        plans.boundary,
+        argument="boundary",
+        allow_large_angles=allow_large_angles,
+    )
     ends = {"start_xyz": plans.boundary.start_q, "goal_xyz": plans.boundary.goal_q}
-    missing = {name: record.tip_positions(q) for name, q in ends.items() if name not in plans.columns}
+    missing = {
+        name: record.tip_positions(q)
+        for name, q in ends.items()
+        if name not in plans.columns
+    }
     return replace(plans, columns={**plans.columns, **missing})
 
 
@@ -246,34 +274,46 @@ def check_made(plans: Plans) -> None:
     waiting = np.isnan(plans.path_control_points).all(axis=(1, 2))
     if waiting.any():
         raise UsageError(
-            f"plan {int(waiting.argmax())} has no control points yet: solve_plans(plans) makes them", concerns="plans"
+            f"plan {int(waiting.argmax())} has no control points yet: solve_plans(plans) makes them",
+            concerns="plans",
         )
 
 
 def screen(plans: Plans) -> NDArray[np.uint8]:
     """Find the plans that cannot be evaluated.
 
-    Returns:
-        Status, shape (N,): NOT_FINITE, NOT_FORWARD, or UNKNOWN for plans that can be evaluated.
+    Returns: Status, shape (N,): NOT_FINITE, NOT_FORWARD, or UNKNOWN for plans that can
+        be evaluated.
     """
     parts = [*plans.boundary.arrays().values(), plans.rate_control_points]
     finite = np.isfinite(plans.path_control_points).all(axis=(1, 2))
     finite &= np.all([np.isfinite(part).all(axis=1) for part in parts], axis=0)
-    found = np.where(np.isfinite(plans.duration), PlanStatus.UNKNOWN, PlanStatus.NOT_FORWARD)
+    found = np.where(
+        np.isfinite(plans.duration), PlanStatus.UNKNOWN, PlanStatus.NOT_FORWARD
+    )
     return np.where(finite, found, PlanStatus.NOT_FINITE).astype(np.uint8)
 
 
-def _integers(name: str, values: ArrayLike, kind: type[np.integer[Any]]) -> NDArray[Any]:
+def _integers(
+    name: str, values: ArrayLike, kind: type[np.integer[Any]]
+) -> NDArray[Any]:
     """Return values as an integer array of a type; raise an error for other values."""
     try:
         reject_masked(name, values)
         found = np.asarray(values)
         whole = found.astype(kind)
     except (TypeError, ValueError, OverflowError) as error:
-        raise UsageError(f"must be an array of integers: {error}", argument=name) from error
+        raise UsageError(
+            f"must be an array of integers: {error}", argument=name
+        ) from error
     low, high = np.iinfo(kind).min, np.iinfo(kind).max
-    if found.size and not (found.dtype.kind in "iu" and low <= found.min() and found.max() <= high):
-        raise UsageError(f"must hold integers from {low} to {high}, got {found.dtype} {found!s:.60}", argument=name)
+    if found.size and not (
+        found.dtype.kind in "iu" and low <= found.min() and found.max() <= high
+    ):
+        raise UsageError(
+            f"must hold integers from {low} to {high}, got {found.dtype} {found!s:.60}",
+            argument=name,
+        )
     return whole
 
 
@@ -284,25 +324,47 @@ def _checked(which: Any, plans: int) -> slice | NDArray[Any]:
     try:
         found = np.asarray(which)
     except ValueError as error:
-        raise PlanIndexError(f"plans are selected by numbers or a mask: {error}", concerns="which") from error
-    found = found.astype(np.int64) if found.size == 0 and found.dtype.kind == "f" else found  # an empty list
-    if found.ndim > 1 or found.dtype.kind not in "biu" or (found.ndim == 0 and found.dtype.kind == "b"):
+        raise PlanIndexError(
+            f"plans are selected by numbers or a mask: {error}", concerns="which"
+        ) from error
+    found = (
+        found.astype(np.int64) if found.size == 0 and found.dtype.kind == "f" else found
+    )  # an empty list
+    if (
+        found.ndim > 1
+        or found.dtype.kind not in "biu"
+        or (found.ndim == 0 and found.dtype.kind == "b")
+    ):
         got = f"{found.dtype} of shape {found.shape}"
-        raise PlanIndexError(f"plans are selected by a number, numbers, a mask or a slice, got {got}", concerns="which")
+        raise PlanIndexError(
+            f"plans are selected by a number, numbers, a mask or a slice, got {got}",
+            concerns="which",
+        )
     if found.dtype.kind == "b":
         if len(found) != plans:
             raise PlanIndexError(
-                f"a mask must have shape ({plans},) as there are {plans} plans, got {found.shape}", concerns="which"
+                f"a mask must have shape ({plans},) as there are {plans} plans, got {found.shape}",
+                concerns="which",
             )
     elif found.size and not -plans <= int(found.min()) <= int(found.max()) < plans:
         wrong = int(found.max() if found.max() >= plans else found.min())
-        raise PlanIndexError(f"there is no plan {wrong}: {plans} plans are numbered from 0", concerns="which")
+        raise PlanIndexError(
+            f"there is no plan {wrong}: {plans} plans are numbered from 0",
+            concerns="which",
+        )
     return np.atleast_1d(found)
 
 
 def _errors(plans: Plans, rows: int | None = None) -> Iterator[str]:
-    """Yield error messages about shapes; the default number of plans is that of the paths."""
-    path, rate, degree = plans.path_control_points, plans.rate_control_points, plans.degree
+    """Yield error messages about shapes.
+
+    The default number of plans is that of the paths.
+    """
+    path, rate, degree = (
+        plans.path_control_points,
+        plans.rate_control_points,
+        plans.degree,
+    )
     if path.ndim != 3:
         yield f"path_control_points must have shape (N, C, n), got {path.shape}"
         return
@@ -346,9 +408,16 @@ def _parameter_errors(plans: Plans, rows: int) -> Iterator[str]:
 def _rows(plans: Plans) -> int:
     """Return the most frequent number of plans among the fields."""
     fields: list[NDArray[Any]] = [*plans.boundary.arrays().values()]
-    fields += [plans.path_control_points, plans.rate_control_points, plans.sample_id, plans.status]
+    fields += [
+        plans.path_control_points,
+        plans.rate_control_points,
+        plans.sample_id,
+        plans.status,
+    ]
     fields += plans.columns.values()
-    return Counter(len(field) if getattr(field, "ndim", 0) else 0 for field in fields).most_common(1)[0][0]
+    return Counter(
+        len(field) if getattr(field, "ndim", 0) else 0 for field in fields
+    ).most_common(1)[0][0]
 
 
 def _column_errors(plans: Plans, rows: int) -> Iterator[str]:

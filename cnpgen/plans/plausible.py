@@ -15,18 +15,25 @@ from cnpgen.trajectory.boundary import Boundary
 
 
 def check_boundary_units(
-    robot: Robot, boundary: Boundary, *, where: str = "", argument: str | None = None, allow_large_angles: bool = False
+    robot: Robot,
+    boundary: Boundary,
+    *,
+    where: str = "",
+    argument: str | None = None,
+    allow_large_angles: bool = False,
 ) -> None:
     """Raise an error for boundary conditions so far outside of their limits that their unit is probably wrong.
 
-    Other violations of limits are no errors: the verdict reports them. Values that are not finite are ignored. Messages
-    begin with their source and concern the caller's argument, by default the condition. ``allow_large_angles`` issues a
-    warning instead.
+    Other violations of limits are no errors: the verdict reports them. Values that are
+    not finite are ignored. Messages begin with their source and concern the caller's
+    argument, by default the condition. ``allow_large_angles`` issues a warning instead.
 
     Raises:
         UnitError: A value is probably in another unit.
     """
-    columns = {name: np.asarray(values) for name, values in boundary.conditions().items()}
+    columns = {
+        name: np.asarray(values) for name, values in boundary.conditions().items()
+    }
     try:
         check_units_of_states(robot, columns, noun="plan")
     except UnitError as error:
@@ -41,7 +48,9 @@ def check_boundary_units(
         ) from error
 
 
-def check_units_of_states(robot: Robot, columns: Mapping[str, NDArray[Any]], *, noun: str) -> None:
+def check_units_of_states(
+    robot: Robot, columns: Mapping[str, NDArray[Any]], *, noun: str
+) -> None:
     """Raise UnitError for columns such as ``start_dq``, shape (N, n) each, that are probably in another unit."""
     if not _are_usual(robot, list(columns.values())):
         units = {name: robot.units(UNITS[name.rpartition("_")[2]]) for name in columns}
@@ -51,8 +60,8 @@ def check_units_of_states(robot: Robot, columns: Mapping[str, NDArray[Any]], *, 
 def _are_usual(robot: Robot, states: Sequence[NDArray[Any]]) -> bool:
     """Return whether states are within the limits of the joints: a fast check.
 
-    The states are positions, velocities and accelerations of one state, or of two without or with the last
-    accelerations; shape (N, n) each.
+    The states are positions, velocities and accelerations of one state, or of two
+    without or with the last accelerations; shape (N, n) each.
     """
     shape = (len(states[0]), robot.n)
     if any(values.shape != shape for values in states):
@@ -67,6 +76,8 @@ def _are_usual(robot: Robot, states: Sequence[NDArray[Any]]) -> bool:
 def _users_level() -> int:
     """Return the ``stacklevel`` with which a warning refers to the user's line, not to this package."""
     level, frame = 0, inspect.currentframe()
-    while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] in {"cnpgen", "contextlib"}:
+    while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[
+        0
+    ] in {"cnpgen", "contextlib"}:
         level, frame = level + 1, frame.f_back
     return max(level, 1)

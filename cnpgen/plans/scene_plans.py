@@ -27,20 +27,32 @@ from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
 
-OBSTACLES_PER_STEP = 4  # capacities are multiples of it, so that scenes share compiled kernels
-JOINT_TOLERANCE_RAD = 1e-3  # outside a limit, which rounding of files to float32 may cause
+OBSTACLES_PER_STEP = (
+    4  # capacities are multiples of it, so that scenes share compiled kernels
+)
+JOINT_TOLERANCE_RAD = (
+    1e-3  # outside a limit, which rounding of files to float32 may cause
+)
 
 
 def capacity_of(scenes: Sequence[SceneProblem]) -> dict[str, int]:
     """Return the numbers of obstacles of each shape that hold every scene.
 
-    The shape is a kind, or the corners of a mesh. Numbers of kinds are rounded up to ``OBSTACLES_PER_STEP``.
+    The shape is a kind, or the corners of a mesh. Numbers of kinds are rounded up to
+    ``OBSTACLES_PER_STEP``.
     """
     counts = [Counter(map(shape_of, scene.obstacles)) for scene in scenes]
     meshes = sorted({shape for count in counts for shape in count} - set(KINDS))
-    most = {shape: max((count[shape] for count in counts), default=0) for shape in (*KINDS, *meshes)}
+    most = {
+        shape: max((count[shape] for count in counts), default=0)
+        for shape in (*KINDS, *meshes)
+    }
     steps = {shape: OBSTACLES_PER_STEP if shape in KINDS else 1 for shape in most}
-    return {shape: -(-count // steps[shape]) * steps[shape] for shape, count in most.items() if count}
+    return {
+        shape: -(-count // steps[shape]) * steps[shape]
+        for shape, count in most.items()
+        if count
+    }
 
 
 def shape_of(obstacle: Obstacle) -> str:
@@ -59,30 +71,35 @@ def scene_plans(
 ) -> Plans:
     """Return the boundary problems of scenes, from rest to rest, as plans without motions.
 
-    Args:
-        problem: The robot's problem. Obstacles of the scenes are added to its own.
-        scenes: The scenes.
-        goals: Joint positions at the goals in the order of the planned joints, shape (n,) each; by default the first
+    Args: problem: The robot's problem. Obstacles of the scenes are added to its own.
+        scenes: The scenes. goals: Joint positions at the goals in the order of the
+        planned joints, shape (n,) each; by default the first
             goal state of each scene.
         capacity: Numbers of obstacles, see ``capacity_of``.
         sample_id: Sample IDs; by default the indices of the scenes.
 
-    Raises:
-        SceneError: A scene lacks a planned joint or a goal state, or a position is outside its limits.
+    Raises: SceneError: A scene lacks a planned joint or a goal state, or a position is
+        outside its limits.
     """
     check_scenes(scenes)
     problem.urdf_text  # noqa: B018 - read once for all capacities
     full = with_capacity(problem, capacity_of(scenes) if capacity is None else capacity)
     record = record_problem(full)
     robot = open_problem(record)[1]
-    start = np.array([joint_order(scene, robot, scene.start_q[None], "start")[0] for scene in scenes])
+    start = np.array(
+        [joint_order(scene, robot, scene.start_q[None], "start")[0] for scene in scenes]
+    )
     if goals is None:
         goals = [goal_states(scene, robot)[0] for scene in scenes]
     goal_q = numbers("goals", goals)
     if goal_q.shape != start.shape:
-        raise UsageError(f"must have shape {start.shape}, got {goal_q.shape}", argument="goals")
+        raise UsageError(
+            f"must have shape {start.shape}, got {goal_q.shape}", argument="goals"
+        )
     zero, spec, count = np.zeros_like(start), problem.trajectory, len(scenes)
-    poses = np.array([_obstacle_poses(full, len(problem.obstacle), scene) for scene in scenes])
+    poses = np.array(
+        [_obstacle_poses(full, len(problem.obstacle), scene) for scene in scenes]
+    )
     files = list(dict.fromkeys(scene.source for scene in scenes if scene.source))
     others = f" and {len(files) - 1} other files" if len(files) > 1 else ""
     return make_plans(
@@ -91,13 +108,18 @@ def scene_plans(
         path_control_points=np.full((count, spec.path_control_points, robot.n), np.nan),
         rate_control_points=np.full((count, spec.rate_control_points), np.nan),
         columns={OBSTACLE_POSES: poses},
-        sample_id=np.arange(count) if sample_id is None else numbers("sample_id", sample_id, "int64"),
+        sample_id=np.arange(count)
+        if sample_id is None
+        else numbers("sample_id", sample_id, "int64"),
         source=f"scenes of {files[0]}{others}" if files else "",
     )
 
 
 def goal_states(scene: SceneProblem, robot: Robot) -> Array:
-    """Return the goal states of a scene by ``joint_order``, shape (G, n); raise SceneError for a scene without any."""
+    """Return the goal states of a scene by ``joint_order``, shape (G, n).
+
+    Raise SceneError for a scene without any.
+    """
     if not len(scene.goal_q):
         raise SceneError(f"{scene.place} has no goal state")
     return joint_order(scene, robot, scene.goal_q, "goal")
@@ -106,20 +128,30 @@ def goal_states(scene: SceneProblem, robot: Robot) -> Array:
 def joint_order(scene: SceneProblem, robot: Robot, states: Array, end: str) -> Array:
     """Return states of a scene in the order of the planned joints [rad], shape (G, n), clipped to the limits.
 
-    A missing joint, or a position outside of its limits by more than 1e-3 rad, raises SceneError.
+    A missing joint, or a position outside of its limits by more than 1e-3 rad, raises
+    SceneError.
     """
     if scene.joint_names:
         missing = [name for name in robot.joint_names if name not in scene.joint_names]
         if missing:
-            raise SceneError(f"{scene.place} has no joint {missing[0]!r}, only {', '.join(scene.joint_names)}")
-        states = states[:, [scene.joint_names.index(name) for name in robot.joint_names]]
+            raise SceneError(
+                f"{scene.place} has no joint {missing[0]!r}, only {', '.join(scene.joint_names)}"
+            )
+        states = states[
+            :, [scene.joint_names.index(name) for name in robot.joint_names]
+        ]
     if states.shape[1] != robot.n:
-        raise SceneError(f"{scene.place} has {states.shape[1]} joint positions at the {end}, the robot has {robot.n}")
+        raise SceneError(
+            f"{scene.place} has {states.shape[1]} joint positions at the {end}, the robot has {robot.n}"
+        )
     violation = np.maximum(robot.position_lower - states, states - robot.position_upper)
     if violation.size and violation.max() > JOINT_TOLERANCE_RAD:
         goal, joint = np.unravel_index(violation.argmax(), violation.shape)
         low, high = robot.position_lower[joint], robot.position_upper[joint]
-        value, unit = float(states[goal, joint]), "m" if robot.prismatic[joint] else "rad"
+        value, unit = (
+            float(states[goal, joint]),
+            "m" if robot.prismatic[joint] else "rad",
+        )
         raise SceneError(
             f"{scene.place}: {robot.joint_names[joint]} is {value:.4f} {unit} at the {end}, outside of its limits"
             f" [{low:.4f}, {high:.4f}] {unit}{suggested_unit(value, unit, low, high)}"
@@ -140,19 +172,33 @@ def _obstacle_poses(problem: Problem, fixed: int, scene: SceneProblem) -> Array:
         own, part = place_obstacles([obstacle]), slices[free[shape_of(obstacle)].pop(0)]
         if obstacle.kind == "box":
             box = primitives_of([obstacle], own)
-            own = np.concatenate([box.centers[0], box.sizes[0], box.rotations[0].ravel()])
+            own = np.concatenate(
+                [box.centers[0], box.sizes[0], box.rotations[0].ravel()]
+            )
         numbers[part] = own
     return numbers
 
 
-def with_wider_capacity(plans: Plans, problem: Problem, own: Capacity, capacity: Capacity) -> Plans:
+def with_wider_capacity(
+    plans: Plans, problem: Problem, own: Capacity, capacity: Capacity
+) -> Plans:
     """Return plans of a problem's own capacity with parked obstacles up to another one, so that they fit one file."""
-    before, after = with_capacity(problem, own).obstacle, with_capacity(problem, capacity)
+    before, after = (
+        with_capacity(problem, own).obstacle,
+        with_capacity(problem, capacity),
+    )
     poses = np.tile(place_obstacles(after.obstacle), (len(plans), 1))
     positions = {
-        obstacle.name: part for obstacle, part in zip(after.obstacle, number_slices(after.obstacle), strict=True)
+        obstacle.name: part
+        for obstacle, part in zip(
+            after.obstacle, number_slices(after.obstacle), strict=True
+        )
     }
     for obstacle, part in zip(before, number_slices(before), strict=True):
         poses[:, positions[obstacle.name]] = plans.columns[OBSTACLE_POSES][:, part]
     assert poses.shape[1] == pose_width(after.obstacle)
-    return replace(plans, problem=record_problem(after), columns={**plans.columns, OBSTACLE_POSES: poses})
+    return replace(
+        plans,
+        problem=record_problem(after),
+        columns={**plans.columns, OBSTACLE_POSES: poses},
+    )

@@ -14,8 +14,9 @@ TIP_TOLERANCE_M = 1e-5  # maximum deviation of a tip position from forward kinem
 def correct_tips(plans: Plans, *, where: str = "") -> Plans:
     """Replace tip positions that are inconsistent with the joints, with a warning that begins with ``where``.
 
-    Tip positions define the ends of the tip and the obstacles below the object. The joints have priority, since plans
-    are executed with them and control points match them.
+    Tip positions define the ends of the tip and the obstacles below the object. The
+    joints have priority, since plans are executed with them and control points match
+    them.
     """
     found = {}
     for end in ("start", "goal"):
@@ -27,6 +28,10 @@ def correct_tips(plans: Plans, *, where: str = "") -> Plans:
             first = int(np.argmax(wrong))
             text = f"{where}{name} of {counted(int(wrong.sum()), 'plan')} is not where {end}_q puts the tip"
             detail = f"the first is plan {first}, {off[first]:.3g} m off"
-            warnings.warn(f"{text} ({detail}): the joint positions are used", RuntimeWarning, stacklevel=3)
+            warnings.warn(
+                f"{text} ({detail}): the joint positions are used",
+                RuntimeWarning,
+                stacklevel=3,
+            )
             found[name] = np.where(wrong[:, None], tip, recorded)
     return replace(plans, columns={**plans.columns, **found}) if found else plans

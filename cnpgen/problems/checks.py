@@ -13,7 +13,11 @@ from cnpgen.errors import PluginError, RecipeError, listed, nearest
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.link_clearance import ObjectClearance
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.plausible_values import MAX_LIMIT_RATIO, MAX_RANGE_RATIO, ImplausibleValue
+from cnpgen.robots.plausible_values import (
+    MAX_LIMIT_RATIO,
+    MAX_RANGE_RATIO,
+    ImplausibleValue,
+)
 from cnpgen.robots.robot_spec import LimitSpec
 from cnpgen.robots.shape.mesh_files import find_named_file, find_urdf
 from cnpgen.robots.urdf import number_in, read_urdf, urdf_tree
@@ -29,7 +33,10 @@ _NAME_IT = 'name geometry = "paper-capsules" in [robot] for a robot that is a li
 
 @dataclass(frozen=True)
 class ProblemTables:
-    """Raw tables of a problem file, its location and its folder; the URDF is read once."""
+    """Raw tables of a problem file, its location and its folder.
+
+    The URDF is read once.
+    """
 
     table: dict[str, Any]
     where: RecipeLocation
@@ -45,21 +52,31 @@ class ProblemTables:
     def packages(self) -> list[Path]:
         """Folders in ``packages`` of the table [robot]."""
         named = self.robot.get("packages", [])
-        return [self.folder / each for each in named if isinstance(each, str)] if isinstance(named, list) else []
+        return (
+            [self.folder / each for each in named if isinstance(each, str)]
+            if isinstance(named, list)
+            else []
+        )
 
     @cached_property
     def urdf_path(self) -> Path | None:
         """The URDF; None if it is not named, or in a package that is not installed, which loading the robot reports."""
         urdf = self.robot.get("urdf")
         with suppress(PluginError):
-            return find_urdf(urdf, self.folder / "problem.toml", self.packages) if isinstance(urdf, str) else None
+            return (
+                find_urdf(urdf, self.folder / "problem.toml", self.packages)
+                if isinstance(urdf, str)
+                else None
+            )
         return None
 
     @cached_property
     def urdf(self) -> ElementTree.Element | None:
         """The tree of the URDF; None if it cannot be read, which is reported elsewhere."""
         with suppress(RecipeError, ValueError):
-            return None if self.urdf_path is None else urdf_tree(read_urdf(self.urdf_path))
+            return (
+                None if self.urdf_path is None else urdf_tree(read_urdf(self.urdf_path))
+            )
         return None
 
     @cached_property
@@ -73,16 +90,31 @@ class ProblemTables:
         named = self.robot.get("geometry")
         if isinstance(named, str):
             return named
-        something_to_hit = bool(tables(self.table, "obstacle") or self.constraints("self-clearance"))
-        return "urdf" if something_to_hit and self.collision_elements else "paper-capsules"
+        something_to_hit = bool(
+            tables(self.table, "obstacle") or self.constraints("self-clearance")
+        )
+        return (
+            "urdf" if something_to_hit and self.collision_elements else "paper-capsules"
+        )
 
     def constraints(self, use: str) -> list[tuple[int, dict[str, Any]]]:
         """Return the tables of the constraints of a kind, with their indices."""
-        return [(place, each) for place, each in tables(self.table, "constraint") if each.get("use") == use]
+        return [
+            (place, each)
+            for place, each in tables(self.table, "constraint")
+            if each.get("use") == use
+        ]
 
     def with_object_clearance(self, problem: Problem) -> tuple[Constraint, ...]:
-        """Return all constraints; by default, a held object stays clear of links that have geometry."""
-        if problem.object is None or problem.first(ObjectClearance) or not self.collision_elements:
+        """Return all constraints.
+
+        By default, a held object stays clear of links that have geometry.
+        """
+        if (
+            problem.object is None
+            or problem.first(ObjectClearance)
+            or not self.collision_elements
+        ):
             return problem.constraint
         return (*problem.constraint, ObjectClearance())
 
@@ -94,18 +126,30 @@ def problem_errors(raw: ProblemTables) -> Iterator[str]:
     yield from _repeated(raw, "constraint", "use")
     yield from _repeated(raw, "obstacle", "name")
     uses = {str(each.get("use")) for _, each in tables(table, "constraint")}
-    using = {"robot-clearance", "object-contact"} if "object" in table else {"robot-clearance"}
+    using = (
+        {"robot-clearance", "object-contact"}
+        if "object" in table
+        else {"robot-clearance"}
+    )
     for index, obstacle in tables(table, "obstacle"):
-        if index == 0 and uses <= BUILT_IN[CONSTRAINTS].keys() - using:  # plug-ins may use them
+        if (
+            index == 0 and uses <= BUILT_IN[CONSTRAINTS].keys() - using
+        ):  # plug-ins may use them
             text = 'no constraint uses it: add a [[constraint]] with use = "robot-clearance" and a tolerance'
             yield (where / "obstacle" / index).message(text)
         if obstacle.get("below") and "object" not in table:
-            yield (where / "obstacle" / index / "below").message("nothing stands on the obstacle: there is no [object]")
+            yield (where / "obstacle" / index / "below").message(
+                "nothing stands on the obstacle: there is no [object]"
+            )
     for place, _ in raw.constraints("object-clearance"):
         if "object" not in table:
-            yield (where / "constraint" / place).message("object-clearance needs [object], the held object")
+            yield (where / "constraint" / place).message(
+                "object-clearance needs [object], the held object"
+            )
         elif raw.collision_elements == []:
-            yield (where / "constraint" / place).message("object-clearance needs <collision> elements in the URDF")
+            yield (where / "constraint" / place).message(
+                "object-clearance needs <collision> elements in the URDF"
+            )
     if raw.geometry != "urdf":
         yield from _paper_errors(raw)
     elif raw.collision_elements is not None:
@@ -113,26 +157,43 @@ def problem_errors(raw: ProblemTables) -> Iterator[str]:
 
 
 def _robot_errors(raw: ProblemTables) -> Iterator[str]:
-    """Check that the URDF exists and has the joints and the tip; Pinocchio checks the rest."""
-    joints, tip, where = raw.robot.get("joints"), raw.robot.get("tip"), raw.where / "robot"
+    """Check that the URDF exists and has the joints and the tip.
+
+    Pinocchio checks the rest.
+    """
+    joints, tip, where = (
+        raw.robot.get("joints"),
+        raw.robot.get("tip"),
+        raw.where / "robot",
+    )
     planned: list[Any] = joints if isinstance(joints, list) else []
     path = raw.urdf_path
     if path is None:
         return
     if not os.path.isfile(path):  # noqa: PTH113 - Path.is_file raises where a name is too long
-        hint = nearest(raw.robot["urdf"], [file.name for file in raw.folder.glob("*.urdf")])
+        hint = nearest(
+            raw.robot["urdf"], [file.name for file in raw.folder.glob("*.urdf")]
+        )
         there = os.path.exists(path)  # noqa: PTH110 - os.path does not raise for odd names
-        yield (where / "urdf").message(f"not a file: {path}" if there else f"no such file: {path}{hint}")
+        yield (where / "urdf").message(
+            f"not a file: {path}" if there else f"no such file: {path}{hint}"
+        )
         return
     if raw.urdf is None:  # loading the robot raises the error
         return
     if text := unread_xacro(raw.urdf, path):
         yield (where / "urdf").message(text)
         return
-    moving = [joint.get("name", "") for joint in raw.urdf.iter("joint") if joint.get("type", "fixed") != "fixed"]
+    moving = [
+        joint.get("name", "")
+        for joint in raw.urdf.iter("joint")
+        if joint.get("type", "fixed") != "fixed"
+    ]
     for name in planned:
         if isinstance(name, str) and name not in moving:
-            yield (where / "joints").message(f"{path.name} has no joint {name!r} that moves{nearest(name, moving)}")
+            yield (where / "joints").message(
+                f"{path.name} has no joint {name!r} that moves{nearest(name, moving)}"
+            )
     if isinstance(tip, str) and (text := missing_frame(raw.urdf, path, tip)):
         yield (where / "tip").message(text)
     for name, low, high in _locked_outside(raw.urdf.iter("joint"), planned):
@@ -140,12 +201,16 @@ def _robot_errors(raw: ProblemTables) -> Iterator[str]:
         yield (where / "joints").message(text)
 
 
-def _shape_errors(raw: ProblemTables, elements: list[ElementTree.Element]) -> Iterator[str]:
+def _shape_errors(
+    raw: ProblemTables, elements: list[ElementTree.Element]
+) -> Iterator[str]:
     """Check a robot whose shape is that of the collision elements of its URDF."""
     robot, where = raw.robot, raw.where / "robot"
     if not elements:
         text = "its links have no <collision> elements, so that it has no shape"
-        yield (where / "geometry").message(f"the URDF gives no shape: {text}; {_NAME_IT}")
+        yield (where / "geometry").message(
+            f"the URDF gives no shape: {text}; {_NAME_IT}"
+        )
     for place, constraint in raw.constraints("robot-clearance"):
         if "radius" in constraint:
             text = f"the robot has the shape that its URDF gives it, and no radius: leave it out, or {_NAME_IT}"
@@ -153,7 +218,9 @@ def _shape_errors(raw: ProblemTables, elements: list[ElementTree.Element]) -> It
     for package in raw.packages:
         if not package.is_dir():
             yield (where / "packages").message(f"no such folder: {package}")
-    meshes = dict.fromkeys(mesh.get("filename", "") for each in elements for mesh in each.iter("mesh"))
+    meshes = dict.fromkeys(
+        mesh.get("filename", "") for each in elements for mesh in each.iter("mesh")
+    )
     for name in (each for each in meshes if not each.startswith("data:")):
         try:
             find_named_file(name, raw.urdf_path or raw.folder, raw.packages)
@@ -175,44 +242,76 @@ def _paper_errors(raw: ProblemTables) -> Iterator[str]:
         text = 'self-clearance needs geometry = "urdf" in [robot], and <collision> elements'
         yield (where / "constraint" / place).message(text)
     if robot.get("convex_parts", 1) != 1:
-        yield (where / "robot" / "convex_parts").message('meshes matter with geometry = "urdf" only')
+        yield (where / "robot" / "convex_parts").message(
+            'meshes matter with geometry = "urdf" only'
+        )
     payload = raw.table.get("payload")
     if isinstance(payload, dict) and payload.get("touch_links"):
         text = 'a payload is a body with geometry = "urdf" in [robot] only'
         yield (where / "payload" / "touch_links").message(text)
     for key in ("srdf", "ignored_pairs"):
         if robot.get(key):
-            yield (where / "robot" / key).message('pairs of links matter with geometry = "urdf" only')
+            yield (where / "robot" / key).message(
+                'pairs of links matter with geometry = "urdf" only'
+            )
 
 
 def limit_errors(problem: Problem, raw: ProblemTables) -> Iterator[str]:
     """Check that no limit exceeds that of the URDF so far that it must be in another unit or in percent."""
     spec, limits = problem.robot, problem.limits
-    per_joint = {"velocity": limits.velocity, "acceleration": limits.acceleration}  # effort is often a placeholder
+    per_joint = {
+        "velocity": limits.velocity,
+        "acceleration": limits.acceleration,
+    }  # effort is often a placeholder
     given: dict[str, list[tuple[float, ...]]] = {}
-    given |= {key: [(value,) for value in limit.values] for key, limit in per_joint.items() if limit is not None}
-    given |= {"position": [(span.low, span.high) for span in limits.position]} if limits.position else {}
+    given |= {
+        key: [(value,) for value in limit.values]
+        for key, limit in per_joint.items()
+        if limit is not None
+    }
+    given |= (
+        {"position": [(span.low, span.high) for span in limits.position]}
+        if limits.position
+        else {}
+    )
     if raw.urdf is None:  # loading the robot raises the error
         return
-    joints = {joint.get("name"): joint for joint in raw.urdf.findall("joint")}  # others are of transmissions
+    joints = {
+        joint.get("name"): joint for joint in raw.urdf.findall("joint")
+    }  # others are of transmissions
     try:
-        plausible = {key: [_plausible_limit(joints[name], key) for name in spec.joints] for key in given}
+        plausible = {
+            key: [_plausible_limit(joints[name], key) for name in spec.joints]
+            for key in given
+        }
     except (ValueError, KeyError):  # loading the robot raises the error
         return
     for key, rows in given.items():
         per_row = rows * (len(spec.joints) if len(rows) == 1 else 1)
-        for name, values, (low, high, unit) in zip(spec.joints, per_row, plausible[key], strict=False):
-            wrong = next((value for value in values if low < high and not low <= value <= high), None)
+        for name, values, (low, high, unit) in zip(
+            spec.joints, per_row, plausible[key], strict=False
+        ):
+            wrong = next(
+                (value for value in values if low < high and not low <= value <= high),
+                None,
+            )
             if wrong is not None:
                 text = f"{name}: {ImplausibleValue(0, 0, wrong, low, high, unit)}"
-                hint = "" if key == "acceleration" else f" ('{key}_scale' is a fraction of the URDF's limit)"
+                hint = (
+                    ""
+                    if key == "acceleration"
+                    else f" ('{key}_scale' is a fraction of the URDF's limit)"
+                )
                 yield (raw.where / "limits" / key).message(text + hint)
                 break
 
 
 def _plausible_limit(joint: ElementTree.Element, key: str) -> tuple[float, float, str]:
     """Return the ends of the plausible range of a limit, equal where the URDF limits nothing, and the unit."""
-    limit, unit = joint.find("limit"), units_of_joints(_LIMIT_UNITS[key], (joint.get("type") == "prismatic",))
+    limit, unit = (
+        joint.find("limit"),
+        units_of_joints(_LIMIT_UNITS[key], (joint.get("type") == "prismatic",)),
+    )
     if key == "position":
         lower, upper = (number_in(limit, end, 0.0) for end in ("lower", "upper"))
         center, half = (lower + upper) / 2, MAX_RANGE_RATIO * (upper - lower) / 2
@@ -230,22 +329,37 @@ def unread_xacro(tree: ElementTree.Element, path: Path) -> str:
 
 def frames_of(tree: ElementTree.Element) -> list[str]:
     """List the links and then the joints of a URDF: Pinocchio has a frame for each."""
-    return [part.get("name", "") for kind in ("link", "joint") for part in tree.findall(kind)]
+    return [
+        part.get("name", "")
+        for kind in ("link", "joint")
+        for part in tree.findall(kind)
+    ]
 
 
 def missing_frame(tree: ElementTree.Element, path: Path, name: str) -> str:
-    """Return an error message for a missing frame, with the known names; empty if the frame exists."""
+    """Return an error message for a missing frame, with the known names.
+
+    Empty if the frame exists.
+    """
     frames = frames_of(tree)
     if name in frames:
         return ""
     return f"{path.name} has no frame {name!r}{nearest(name, frames)}; its frames: {listed(frames)}"
 
 
-def _locked_outside(joints: Iterable[ElementTree.Element], planned: list[Any]) -> Iterator[tuple[str, float, float]]:
-    """Return unplanned joints whose limits exclude zero, with the limits; mimic joints are omitted."""
+def _locked_outside(
+    joints: Iterable[ElementTree.Element], planned: list[Any]
+) -> Iterator[tuple[str, float, float]]:
+    """Return unplanned joints whose limits exclude zero, with the limits.
+
+    Mimic joints are omitted.
+    """
     for joint in joints:
         limit, name = joint.find("limit"), joint.get("name", "")
-        movable = joint.get("type") in ("revolute", "prismatic") and joint.find("mimic") is None
+        movable = (
+            joint.get("type") in ("revolute", "prismatic")
+            and joint.find("mimic") is None
+        )
         if limit is None or not movable or name in planned:
             continue
         with suppress(ValueError):  # Pinocchio rejects invalid numbers
@@ -267,4 +381,8 @@ def _repeated(raw: ProblemTables, array: str, key: str) -> Iterator[str]:
 def tables(table: dict[str, Any], array: str) -> list[tuple[int, dict[str, Any]]]:
     """Return the tables among the entries of an array, with their indices."""
     entries = table.get(array)
-    return [(i, e) for i, e in enumerate(entries) if isinstance(e, dict)] if isinstance(entries, list) else []
+    return (
+        [(i, e) for i, e in enumerate(entries) if isinstance(e, dict)]
+        if isinstance(entries, list)
+        else []
+    )

@@ -1,7 +1,8 @@
 """Conditions of a problem at a state, their derivative orders, and the residuals of its equalities.
 
-The derivative order is the highest derivative of q that a condition depends on, derived from its forms. It is 0 for
-positions, 1 for velocities, 2 for accelerations and 3 for jerks.
+The derivative order is the highest derivative of q that a condition depends on, derived
+from its forms. It is 0 for positions, 1 for velocities, 2 for accelerations and 3 for
+jerks.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -28,32 +29,62 @@ def symbolic_needs(condition: Condition, *derivatives: Any) -> int:
 
     g = ca.SX(ca.vertcat(*condition.g))
     orders = range(len(derivatives), 0, -1)
-    return next((order for order in orders if ca.depends_on(g, derivatives[order - 1])), 0)
+    return next(
+        (order for order in orders if ca.depends_on(g, derivatives[order - 1])), 0
+    )
 
 
 def measured_needs(
-    forms: "Iterable[Callable[[World], Iterable[Condition]]]", world: "World", *, jerk: bool = False
+    forms: "Iterable[Callable[[World], Iterable[Condition]]]",
+    world: "World",
+    *,
+    jerk: bool = False,
 ) -> list[int]:
     """Return the derivative orders of conditions in measured form: which of dq, ddq and the jerk change their values.
 
-    The conditions are evaluated with one of these nan and, since a form may ignore nan, far below, near and far above
-    its limit. The world is left at rest in the base configuration. Boundary states have no jerk.
+    The conditions are evaluated with one of these nan and, since a form may ignore nan,
+    far below, near and far above its limit. The world is left at rest in the base
+    configuration. Boundary states have no jerk.
     """
     robot, forms = world.robot, list(forms)
-    limits = [robot.velocity_limit, robot.acceleration_limit, *([robot.jerk_limit] if jerk else [])]
+    limits = [
+        robot.velocity_limit,
+        robot.acceleration_limit,
+        *([robot.jerk_limit] if jerk else []),
+    ]
     rest = [np.zeros(robot.n) for _ in limits]
     changed = []
     for order, limit in enumerate(limits):
-        moving = [limit + np.nan, *(share * limit * _MIXED[: robot.n] for share in _SHARES)]
-        changed.append(_changed(forms, world, [[*rest[:order], each, *rest[order + 1 :]] for each in moving]))
-    return [max(order for order, yes in enumerate((True, *each)) if yes) for each in zip(*changed, strict=True)]
+        moving = [
+            limit + np.nan,
+            *(share * limit * _MIXED[: robot.n] for share in _SHARES),
+        ]
+        changed.append(
+            _changed(
+                forms,
+                world,
+                [[*rest[:order], each, *rest[order + 1 :]] for each in moving],
+            )
+        )
+    return [
+        max(order for order, yes in enumerate((True, *each)) if yes)
+        for each in zip(*changed, strict=True)
+    ]
 
 
 def _changed(
-    forms: "Sequence[Callable[[World], Iterable[Condition]]]", world: "World", states: Sequence[Sequence[Array]]
+    forms: "Sequence[Callable[[World], Iterable[Condition]]]",
+    world: "World",
+    states: Sequence[Sequence[Array]],
 ) -> list[bool]:
-    """Return which conditions differ between one of the states and rest; the world is left at rest."""
-    obstacle_poses, rest = place_obstacles(world.obstacles), [np.zeros(world.robot.n) for _ in states[0]]
+    """Return which conditions differ between one of the states and rest.
+
+    The world is left at rest.
+    """
+    obstacle_poses, rest = (
+        place_obstacles(world.obstacles),
+        [np.zeros(world.robot.n) for _ in states[0]],
+    )
 
     def values(dq: Array, ddq: Array, jerk: Array | None = None) -> list[Array]:
         world.set_state(world.robot.home, dq, ddq, obstacle_poses, jerk)
@@ -80,10 +111,16 @@ def equality_residuals(robot: Robot, problem: Problem) -> Any:
     ]
     residual = ca.vertcat(*rows) if rows else ca.SX(0, 1)
     jacobian = ca.densify(ca.jacobian(residual, columns[0]))
-    return ca.Function("equality_residuals", [columns[0], columns[-1]], ca.cse([residual, ca.vec(jacobian)]))
+    return ca.Function(
+        "equality_residuals",
+        [columns[0], columns[-1]],
+        ca.cse([residual, ca.vec(jacobian)]),
+    )
 
 
-def state_of_symbols(robot: Robot, problem: Problem) -> tuple[list[Any], "SymbolicState"]:
+def state_of_symbols(
+    robot: Robot, problem: Problem
+) -> tuple[list[Any], "SymbolicState"]:
     """Return the columns q, dq, ddq, the jerk if it is constrained, and obstacle poses, and their state."""
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 
@@ -95,5 +132,9 @@ def conditions_with_needs(
     problem: Problem, state: "SymbolicState", moving: Sequence[Any]
 ) -> list[tuple[Condition, int]]:
     """Return all constraints at a state, each with the highest derivative of q, of ``moving``, that it depends on."""
-    conditions = [condition for constraint in problem.constraint for condition in constraint.symbolic(state)]
+    conditions = [
+        condition
+        for constraint in problem.constraint
+        for condition in constraint.symbolic(state)
+    ]
     return [(condition, symbolic_needs(condition, *moving)) for condition in conditions]

@@ -24,12 +24,16 @@ from cnpgen.store.joint_units import unit_of
 
 JERK_RATE = 5.0  # 1/s: jerk limit / acceleration limit in the authors' code
 MIN_REACH_M, MAX_REACH_M = 0.01, 100.0  # of an arm, along its joints
-MAX_LINK_RATIO = 20.0  # size of a link / reach; pedestals and mobile bases may be larger than arms
+MAX_LINK_RATIO = (
+    20.0  # size of a link / reach; pedestals and mobile bases may be larger than arms
+)
 MIN_LINK_RATIO = 0.02  # size of the largest moving link / reach
 MIN_MESH_M = 1e-3  # size of a link with a mesh
 MIN_MASS_KG = 0.01  # of bodies whose inertia is checked; lighter ones have placeholders
 MIN_ARM_KG = 0.1  # that a payload is compared with
-MAX_CENTER_RATIO = 3.0  # distance of a center of mass from its joint, and radius of gyration / reach
+MAX_CENTER_RATIO = (
+    3.0  # distance of a center of mass from its joint, and radius of gyration / reach
+)
 MAX_PAYLOAD_RATIO = 10.0  # mass of a payload / mass of the arm
 MAX_OBSTACLE_RATIO = 10.0  # distance of an obstacle / reach
 
@@ -37,9 +41,9 @@ MAX_OBSTACLE_RATIO = 10.0  # distance of an obstacle / reach
 def load_robot(problem: Problem) -> Robot:
     """Load the robot of a problem.
 
-    Raises:
-        RecipeError: The URDF cannot be read, or is inconsistent with the joints, tip, base configuration or limits.
-        PluginError: The URDF belongs to a package that is not installed.
+    Raises: RecipeError: The URDF cannot be read, or is inconsistent with the joints,
+        tip, base configuration or limits. PluginError: The URDF belongs to a package
+        that is not installed.
     """
     spec, limits = problem.robot, problem.limits
     with recipe_errors_in(problem.path):
@@ -52,8 +56,14 @@ def load_robot(problem: Problem) -> Robot:
         most = np.minimum(limits.acceleration_rate * velocity, limits.acceleration_cap)
         acceleration = _given(limits.acceleration, "acceleration", most)
         jerk = _given(limits.jerk, "jerk", JERK_RATE * acceleration)
-    center = (np.array(model.upperPositionLimit) + np.array(model.lowerPositionLimit)) / 2
-    half = limits.position_scale * (np.array(model.upperPositionLimit) - np.array(model.lowerPositionLimit)) / 2
+    center = (
+        np.array(model.upperPositionLimit) + np.array(model.lowerPositionLimit)
+    ) / 2
+    half = (
+        limits.position_scale
+        * (np.array(model.upperPositionLimit) - np.array(model.lowerPositionLimit))
+        / 2
+    )
     robot = Robot(
         urdf=problem.urdf_path,
         urdf_text=urdf,
@@ -76,8 +86,15 @@ def load_robot(problem: Problem) -> Robot:
     if errors := list(_errors(problem, robot)):
         raise RecipeError(errors)
     with recipe_errors_in(problem.path):
-        shape = load_shape(urdf, robot.model, kept_folder()) if spec.geometry == "urdf" else None
-        model, robot = robot.model, replace(robot, shape=shape, held_shape=_held_shape(problem, robot))
+        shape = (
+            load_shape(urdf, robot.model, kept_folder())
+            if spec.geometry == "urdf"
+            else None
+        )
+        model, robot = (
+            robot.model,
+            replace(robot, shape=shape, held_shape=_held_shape(problem, robot)),
+        )
     vars(robot)["model"] = model  # a cached property, expensive to build again
     if not problem.is_stored:
         _check_sizes(problem, robot)
@@ -89,14 +106,19 @@ def _attached(problem: Problem) -> Attached:
     spec, ranges = problem.robot, problem.limits.position or ()
     if ranges and len(ranges) != len(spec.joints):
         raise RecipeError(
-            [f"limits.position: needs {len(spec.joints)} ranges, one per planned joint, got {len(ranges)}"]
+            [
+                f"limits.position: needs {len(spec.joints)} ranges, one per planned joint, got {len(ranges)}"
+            ]
         )
     return Attached(
         spec.tip,
         rotation=turned(*spec.tip_rotation),
         translation=np.array(spec.tip_offset),
         payload=problem.payload,
-        ranges={name: (each.low, each.high) for name, each in zip(spec.joints, ranges, strict=False)},
+        ranges={
+            name: (each.low, each.high)
+            for name, each in zip(spec.joints, ranges, strict=False)
+        },
     )
 
 
@@ -106,7 +128,11 @@ def _given(values: PerJoint | None, what: str, otherwise: Array) -> Array:
         return np.array(otherwise)
     if len(values.values) not in (1, len(otherwise)):
         n, found = len(otherwise), len(values.values)
-        raise RecipeError([f"limits.{what}: needs one number, or {n}, one per planned joint, got {found}"])
+        raise RecipeError(
+            [
+                f"limits.{what}: needs one number, or {n}, one per planned joint, got {found}"
+            ]
+        )
     return np.broadcast_to(np.array(values.values), len(otherwise)).copy()
 
 
@@ -114,7 +140,9 @@ def _held_shape(problem: Problem, robot: Robot) -> Shape | None:
     """Load the geometry for collisions of the held object with the robot, if a constraint needs it."""
     if problem.object is None or problem.first(ObjectClearance) is None:
         return None
-    return load_held_shape(robot.urdf_text, robot.model, problem.object, robot.tip_frame, kept_folder())
+    return load_held_shape(
+        robot.urdf_text, robot.model, problem.object, robot.tip_frame, kept_folder()
+    )
 
 
 def _errors(problem: Problem, robot: Robot) -> Iterator[str]:
@@ -133,9 +161,18 @@ def _errors(problem: Problem, robot: Robot) -> Iterator[str]:
 
 def _position_errors(problem: Problem, robot: Robot) -> Iterator[str]:
     """Yield error messages for position limits that are equal or in another unit."""
-    limits = zip(robot.joint_names, robot.model.lowerPositionLimit, robot.model.upperPositionLimit, strict=True)
+    limits = zip(
+        robot.joint_names,
+        robot.model.lowerPositionLimit,
+        robot.model.upperPositionLimit,
+        strict=True,
+    )
     for (name, low, high), sliding in zip(limits, robot.prismatic, strict=True):
-        text, largest, unit = f"{robot.urdf}: {name}: ", max(low, high, key=abs), "m" if sliding else "rad"
+        text, largest, unit = (
+            f"{robot.urdf}: {name}: ",
+            max(low, high, key=abs),
+            "m" if sliding else "rad",
+        )
         most = PLAUSIBLE_MAX[unit]
         if low >= high:
             yield f"{text}the lower position limit must be below the upper one, got {low:g} and {high:g}"
@@ -162,7 +199,11 @@ def _home_errors(problem: Problem, robot: Robot) -> Iterator[str]:
     worst = int(np.argmax(np.maximum(low - base, base - high)))
     if not low[worst] <= base[worst] <= high[worst]:
         unit = unit_of(robot.units("rad"), worst)
-        hint = suggested_unit(base[worst], unit, low[worst], high[worst]) if abs(base[worst]) > 2 * np.pi else ""
+        hint = (
+            suggested_unit(base[worst], unit, low[worst], high[worst])
+            if abs(base[worst]) > 2 * np.pi
+            else ""
+        )
         yield (
             f"{problem.path}: robot.base: {robot.joint_names[worst]} = {base[worst]:g} {unit} is outside its planning"
             f" limits [{low[worst]:g}, {high[worst]:g}]{hint}"
@@ -178,7 +219,9 @@ def _check_sizes(problem: Problem, robot: Robot) -> None:
     """Raise an error that lists all lengths and masses that are probably in another unit."""
     errors = [f"{robot.urdf}: {error}" for error in _robot_errors(robot, problem)]
     if not errors:
-        errors = [f"{problem.path}: {error}" for error in _problem_errors(robot, problem)]
+        errors = [
+            f"{problem.path}: {error}" for error in _problem_errors(robot, problem)
+        ]
     if errors:
         raise RecipeError(errors)
 
@@ -194,7 +237,10 @@ def _robot_errors(robot: Robot, problem: Problem) -> Iterator[str]:
     for name, joint in zip(robot.joint_names, joints, strict=False):
         if joint.mass < MIN_MASS_KG:
             continue
-        center, gyration = np.linalg.norm(joint.com), np.sqrt(max(np.trace(joint.inertia), 0.0) / (2 * joint.mass))
+        center, gyration = (
+            np.linalg.norm(joint.com),
+            np.sqrt(max(np.trace(joint.inertia), 0.0) / (2 * joint.mass)),
+        )
         if max(center, gyration) > MAX_CENTER_RATIO * reach:
             text = f"the center of mass is {center:.3g} m away, the radius of gyration {gyration:.3g} m"
             yield f"{name}: {text}, the arm {reach:.3g} m long; an <inertial> is in kg, m and kg m^2, not in mm or g"
@@ -209,13 +255,17 @@ def _link_errors(robot: Robot, reach: float) -> Iterator[str]:
     for part in robot.shape.convex_parts:
         size = float(np.ptp(part.vertices, axis=0).max()) + 2 * part.radius
         sizes[part.link] = max(size, sizes.get(part.link, 0.0))
-    large = {link: size for link, size in sizes.items() if size > MAX_LINK_RATIO * reach}
+    large = {
+        link: size for link, size in sizes.items() if size > MAX_LINK_RATIO * reach
+    }
     small = {link: size for link, size in sizes.items() if size < MIN_MESH_M}
     for link, size in large.items():
         remedy = 'write scale="0.001 0.001 0.001" in the <mesh> of a file in mm'
         yield f"link {link!r}: its collision geometry is {size:.3g} m large, the arm {reach:.3g} m; {remedy}"
     remedy = "remove the scale of its <mesh> elements, or correct it"
-    for link in _mesh_links(robot.urdf_text) & small.keys() if small else ():  # spheres and boxes may be placeholders
+    for link in (
+        _mesh_links(robot.urdf_text) & small.keys() if small else ()
+    ):  # spheres and boxes may be placeholders
         text = f"its collision geometry is {small[link]:.3g} m large, expected {MIN_MESH_M:g} m or more"
         yield f"link {link!r}: {text}; {remedy}"
     largest = max(size for link, size in sizes.items() if robot.shape.joints[link])
@@ -225,7 +275,11 @@ def _link_errors(robot: Robot, reach: float) -> Iterator[str]:
 
 def _mesh_links(urdf: str) -> set[str]:
     links = urdf_tree(urdf).findall("link")
-    return {link.get("name", "") for link in links if link.find("collision/geometry/mesh") is not None}
+    return {
+        link.get("name", "")
+        for link in links
+        if link.find("collision/geometry/mesh") is not None
+    }
 
 
 def _problem_errors(robot: Robot, problem: Problem) -> Iterator[str]:
@@ -243,7 +297,10 @@ def _problem_errors(robot: Robot, problem: Problem) -> Iterator[str]:
                 yield f"payload.{key}: {text}; lengths are in m and inertias in kg m^2"
     for index, obstacle in enumerate(problem.obstacle, 1):
         distance = _distance(obstacle)
-        if distance > MAX_OBSTACLE_RATIO * reach and obstacle.position != PARKED_POSITION_M:
+        if (
+            distance > MAX_OBSTACLE_RATIO * reach
+            and obstacle.position != PARKED_POSITION_M
+        ):
             text = f"{obstacle.name!r} is {distance:.3g} m away, where the arm is {reach:.3g} m long"
             yield f"obstacle {index}: {text}: check its unit"
 
@@ -251,7 +308,16 @@ def _problem_errors(robot: Robot, problem: Problem) -> Iterator[str]:
 def _distance(obstacle: Obstacle) -> float:
     """Return a lower bound of the distance of an obstacle from the origin of the world [m]."""
     if obstacle.position is not None and not obstacle.mesh:
-        lengths = [*(obstacle.size or ()), obstacle.radius or 0.0, obstacle.radius or 0.0, obstacle.length or 0.0]
+        lengths = [
+            *(obstacle.size or ()),
+            obstacle.radius or 0.0,
+            obstacle.radius or 0.0,
+            obstacle.length or 0.0,
+        ]
         return float(np.linalg.norm(obstacle.position) - sum(lengths))
-    sides = [max(each.low, -each.high, 0.0) for each in (obstacle.x, obstacle.y) if each is not None]
+    sides = [
+        max(each.low, -each.high, 0.0)
+        for each in (obstacle.x, obstacle.y)
+        if each is not None
+    ]
     return float(np.linalg.norm(sides))

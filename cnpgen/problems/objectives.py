@@ -1,6 +1,7 @@
 """Objectives of motions: the duration plus weighted terms, each the integral over time of the size of residuals.
 
-Training, refining and reports use the same residuals. Further terms come from installed packages, as constraints do.
+Training, refining and reports use the same residuals. Further terms come from installed
+packages, as constraints do.
 """
 
 from __future__ import annotations
@@ -28,17 +29,17 @@ MIN_SQUARED_TIP_SPEED_M2_S2 = 1e-4  # defines the direction of a tip at rest
 class ObjectiveTerm(ABC):
     """Term of the objective: weight times the integral over time of the size of residuals.
 
-    A kind is a frozen dataclass whose fields are the keys of its ``[[objective.term]]`` table in ``problem.toml``. It
-    is registered under a name in cnpgen's registry or by a package's entry point in the group ``cnpgen.objectives``.
+    A kind is a frozen dataclass whose fields are the keys of its ``[[objective.term]]``
+    table in ``problem.toml``. It is registered under a name in cnpgen's registry or by
+    a package's entry point in the group ``cnpgen.objectives``.
 
-    The size is the sum of the squares of the residuals, or with a smoothing s their norm, ``sqrt(sum + s^2) - s``,
-    which is quadratic below s, so that its gradient is continuous.
+    The size is the sum of the squares of the residuals, or with a smoothing s their
+    norm, ``sqrt(sum + s^2) - s``, which is quadratic below s, so that its gradient is
+    continuous.
 
-    Attributes:
-        unit: Unit of the integral.
-        smoothing: Smoothing of the norm in the unit of the residuals; 0 for the sum of squares.
-        training_smoothing: The same in training; None for ``smoothing``.
-        uses_jerk: Whether the residuals use the jerk.
+    Attributes: unit: Unit of the integral. smoothing: Smoothing of the norm in the unit
+        of the residuals; 0 for the sum of squares. training_smoothing: The same in
+        training; None for ``smoothing``. uses_jerk: Whether the residuals use the jerk.
         weight: Weight relative to the time.
     """
 
@@ -54,13 +55,19 @@ class ObjectiveTerm(ABC):
         """Return the residuals of a state, SX scalars."""
 
     def training_residuals(self, state: SymbolicState) -> Vec:
-        """Return residuals of the same size that are cheaper in training; by default ``residuals``."""
+        """Return residuals of the same size that are cheaper in training.
+
+        By default ``residuals``.
+        """
         return self.residuals(state)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Centrifugal(ObjectiveTerm):
-    """Centrifugal acceleration ``|kappa| v^2`` of the tip (paper, Appendix B, eta); weight in s^2/m."""
+    """Centrifugal acceleration ``|kappa| v^2`` of the tip (paper, Appendix B, eta).
+
+    Weight in s^2/m.
+    """
 
     unit = "m/s"
     smoothing = 0.5
@@ -94,7 +101,10 @@ class Effort(ObjectiveTerm):
 
     def residuals(self, state: SymbolicState) -> Vec:
         """Return the torques of the inverse dynamics as fractions of their planning limits."""
-        return [tau / float(limit) for tau, limit in zip(state.torque, state.robot.torque_limit, strict=True)]
+        return [
+            tau / float(limit)
+            for tau, limit in zip(state.torque, state.robot.torque_limit, strict=True)
+        ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +116,10 @@ class Jerk(ObjectiveTerm):
 
     def residuals(self, state: SymbolicState) -> Vec:
         """Return the jerks as fractions of their planning limits."""
-        return [x / float(limit) for x, limit in zip(state.jerk or (), state.robot.jerk_limit, strict=True)]
+        return [
+            x / float(limit)
+            for x, limit in zip(state.jerk or (), state.robot.jerk_limit, strict=True)
+        ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,13 +139,18 @@ class TipReference(ObjectiveTerm):
     """Squared distance of the tip from a reference curve; weight in 1/m^2."""
 
     unit = "m^2 s"
-    points: tuple[tuple[float, ...], ...] = field("corners of the curve, a polyline in the world frame", unit="m")
+    points: tuple[tuple[float, ...], ...] = field(
+        "corners of the curve, a polyline in the world frame", unit="m"
+    )
 
     def validate(self) -> Iterator[tuple[str, str]]:
         """Yield (key, error) pairs."""
         if len(self.points) < 2 or any(len(point) != 3 for point in self.points):
             yield "points", "expected at least 2 points of 3 coordinates each"
-        elif any(first == second for first, second in zip(self.points, self.points[1:], strict=False)):
+        elif any(
+            first == second
+            for first, second in zip(self.points, self.points[1:], strict=False)
+        ):
             yield "points", "two successive points are equal"
 
     def residuals(self, state: SymbolicState) -> Vec:
@@ -147,13 +165,18 @@ class TipReference(ObjectiveTerm):
         for first, second in zip(self.points, self.points[1:], strict=False):
             along = [b - a for a, b in zip(first, second, strict=True)]
             offset = [x - a for x, a in zip(tip, first, strict=True)]
-            fraction = ca.fmin(ca.fmax(dot(offset, along) / dot(along, along), 0.0), 1.0)
+            fraction = ca.fmin(
+                ca.fmax(dot(offset, along) / dot(along, along), 0.0), 1.0
+            )
             point = [a + fraction * d for a, d in zip(first, along, strict=True)]
             distance = sum((x - y) ** 2 for x, y in zip(tip, point, strict=True))
             if best is None:
                 best, nearest = distance, point
                 continue
-            nearest = [ca.if_else(distance < best, x, y) for x, y in zip(point, nearest, strict=True)]
+            nearest = [
+                ca.if_else(distance < best, x, y)
+                for x, y in zip(point, nearest, strict=True)
+            ]
             best = ca.fmin(best, distance)
         return [x - state.freeze(y) for x, y in zip(tip, nearest, strict=True)]
 
@@ -161,8 +184,8 @@ class TipReference(ObjectiveTerm):
 def read_objective(text: str) -> tuple[ObjectiveTerm, ...] | None:
     """Read an objective such as ``"effort"``, ``"effort=0.5"`` or ``"time=2, effort=1, jerk=0.1"``.
 
-    Args:
-        text: ``OWN_OBJECTIVE`` or empty for the objective of the problem, or names of terms with weights, 1 by default.
+    Args: text: ``OWN_OBJECTIVE`` or empty for the objective of the problem, or names of
+        terms with weights, 1 by default.
             The weight of the duration, ``time``, divides the others.
 
     Returns:
@@ -180,7 +203,9 @@ def read_objective(text: str) -> tuple[ObjectiveTerm, ...] | None:
             weights[name] = _weight(name, value) if "=" in part else 1.0
         time = weights.pop(OWN_OBJECTIVE, 1.0)
         if time == 0:
-            raise UsageError("the weight of time must be above 0: without it motions may be arbitrarily slow")
+            raise UsageError(
+                "the weight of time must be above 0: without it motions may be arbitrarily slow"
+            )
         return tuple(_term(name, weight / time) for name, weight in weights.items())
 
 
@@ -190,7 +215,9 @@ def _weight(name: str, text: str) -> float:
     except ValueError:
         weight = -1.0
     if not 0 <= weight < float("inf"):
-        raise UsageError(f"the weight of {name!r} must be a number that is not negative, got {text!r}")
+        raise UsageError(
+            f"the weight of {name!r} must be a number that is not negative, got {text!r}"
+        )
     return weight
 
 
@@ -202,11 +229,16 @@ def _term(name: str, weight: float) -> ObjectiveTerm:
     errors: list[str] = []
     try:
         term: Any = parse(
-            registry.load(registry.OBJECTIVES, name), {"weight": weight}, where=RecipeLocation(name), errors=errors
+            registry.load(registry.OBJECTIVES, name),
+            {"weight": weight},
+            where=RecipeLocation(name),
+            errors=errors,
         )
     except RecipeError as error:
         raise UsageError(str(error)) from error
     if term is None:
-        raise UsageError(f"{'; '.join(errors)}: write the term as [[objective.term]] in the problem file")
+        raise UsageError(
+            f"{'; '.join(errors)}: write the term as [[objective.term]] in the problem file"
+        )
     found: ObjectiveTerm = term
     return found

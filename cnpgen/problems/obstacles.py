@@ -23,7 +23,11 @@ if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
 Capacity = Mapping[str, int]  # kind, or corners of a mesh -> number of obstacles
-_PARKED_ROTATION = (0.1, 0.1, 0.1)  # any rotation: boxes of scenes have rotation matrices
+_PARKED_ROTATION = (
+    0.1,
+    0.1,
+    0.1,
+)  # any rotation: boxes of scenes have rotation matrices
 
 
 def scene_of(
@@ -37,15 +41,16 @@ def scene_of(
 ) -> Scene:
     """Place the obstacles of N samples, compute the values that a constraint depends on, and append the parameters.
 
-    An obstacle with ``below`` ends at the bottom of the object (at the tip without an object) at that end.
+    An obstacle with ``below`` ends at the bottom of the object (at the tip without an
+    object) at that end.
 
-    Args:
-        problem: The problem.
-        start_xyz: Tip positions at the start [m], shape (N, 3).
-        goal_xyz: Tip positions at the goal [m], shape (N, 3).
-        goal_velocity: Tip velocities at the goal [m/s], shape (N, 3), for problems with a ``scene_constraint``.
-        parameters: Parameters of the samples, shape (N, width), for problems with parameters; nominal by default.
-        obstacle_poses: Poses and sizes of the obstacles of each sample, shape (N, width), in place of the problem's.
+    Args: problem: The problem. start_xyz: Tip positions at the start [m], shape (N, 3).
+        goal_xyz: Tip positions at the goal [m], shape (N, 3). goal_velocity: Tip
+        velocities at the goal [m/s], shape (N, 3), for problems with a
+        ``scene_constraint``. parameters: Parameters of the samples, shape (N, width),
+        for problems with parameters; nominal by default. obstacle_poses: Poses and
+        sizes of the obstacles of each sample, shape (N, width), in place of the
+        problem's.
     """
     half = 0.0 if problem.object is None else problem.object.size[2] / 2
     parts, constraint = [], problem.scene_constraint
@@ -58,12 +63,20 @@ def scene_of(
         parameters = np.tile(problem.nominal_parameters, (len(start_xyz), 1))
     if constraint is not None:
         if goal_velocity is None:
-            raise UsageError(f"is missing: the problem {problem.name!r} needs it", argument="goal_velocity")
+            raise UsageError(
+                f"is missing: the problem {problem.name!r} needs it",
+                argument="goal_velocity",
+            )
         shapes = [xyz.shape for xyz in (start_xyz, goal_xyz, goal_velocity)]
         if not shapes[0] == shapes[1] == shapes[2] == (len(start_xyz), 3):
-            raise UsageError(f"positions and velocities must have one shape (N, 3), got {shapes}")
+            raise UsageError(
+                f"positions and velocities must have one shape (N, 3), got {shapes}"
+            )
         if (frame := table_frame_of(problem, parameters)) is not None:
-            goal_xyz, goal_velocity = frame.to_table(goal_xyz), frame.along_table(goal_velocity)
+            goal_xyz, goal_velocity = (
+                frame.to_table(goal_xyz),
+                frame.along_table(goal_velocity),
+            )
         parts.append(constraint.scene_values(goal_xyz, goal_velocity))
     if parameters is not None:
         parts.append(parameters)
@@ -79,7 +92,9 @@ def table_frame_of(problem: Problem, parameters: Array | None) -> TableFrame | N
     return table_frame(problem.parameters, problem.table_origin, parameters)
 
 
-def goal_velocities(problem: Problem, robot: Robot, goal_q: Array, goal_dq: Array) -> Array | None:
+def goal_velocities(
+    problem: Problem, robot: Robot, goal_q: Array, goal_dq: Array
+) -> Array | None:
     """Compute tip velocities at the goals with Pinocchio [m/s], shape (N, 3); None if the problem needs none.
 
     Joint positions [rad] and velocities [rad/s] at the goals have shape (N, n).
@@ -102,11 +117,17 @@ def with_capacity(problem: Problem, capacity: Capacity) -> Problem:
         error = "has no constraint robot-clearance: obstacles would be ignored"
     elif problem.parameters or problem.scene_constraint is not None:
         values = "values of each sample (parameters or a puck)"
-        error = f"has {values}, which are not supported among obstacles that samples place"
+        error = (
+            f"has {values}, which are not supported among obstacles that samples place"
+        )
     if error:
         raise UsageError(f"the problem {problem.name!r} {error}", concerns="problem")
     shapes = [*KINDS, *sorted(capacity.keys() - set(KINDS))]
-    parked = [_parked(shape, index) for shape in shapes for index in range(1, capacity.get(shape, 0) + 1)]
+    parked = [
+        _parked(shape, index)
+        for shape in shapes
+        for index in range(1, capacity.get(shape, 0) + 1)
+    ]
     full = replace(problem, obstacle=(*problem.obstacle, *parked))
     if "urdf_text" in vars(problem):  # a cached property, expensive to read again
         vars(full)["urdf_text"] = problem.urdf_text
@@ -116,10 +137,24 @@ def with_capacity(problem: Problem, capacity: Capacity) -> Problem:
 def _parked(kind: str, index: int) -> Obstacle:
     if kind not in KINDS:
         name = f"mesh {hashlib.sha256(kind.encode()).hexdigest()[:8]} {index}"
-        return Obstacle(name=name, kind="mesh", mesh=kind, position=PARKED_POSITION_M, rotation=_PARKED_ROTATION)
+        return Obstacle(
+            name=name,
+            kind="mesh",
+            mesh=kind,
+            position=PARKED_POSITION_M,
+            rotation=_PARKED_ROTATION,
+        )
     name, small = f"{kind} {index}", 0.01
     if kind == "box":
-        return Obstacle(name=name, kind=kind, position=PARKED_POSITION_M, size=(small,) * 3, rotation=_PARKED_ROTATION)
+        return Obstacle(
+            name=name,
+            kind=kind,
+            position=PARKED_POSITION_M,
+            size=(small,) * 3,
+            rotation=_PARKED_ROTATION,
+        )
     if kind == "sphere":
         return Obstacle(name=name, kind=kind, position=PARKED_POSITION_M, radius=small)
-    return Obstacle(name=name, kind=kind, position=PARKED_POSITION_M, radius=small, length=small)
+    return Obstacle(
+        name=name, kind=kind, position=PARKED_POSITION_M, radius=small, length=small
+    )

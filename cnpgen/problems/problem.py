@@ -44,7 +44,11 @@ from cnpgen.robots.urdf_changes import (
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.keys import NAME, Range, field, to_dict
-from cnpgen.store.files.cache_folder import default_cache_folder, make_private_folder, trust_problem
+from cnpgen.store.files.cache_folder import (
+    default_cache_folder,
+    make_private_folder,
+    trust_problem,
+)
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Kind = TypeVar("Kind", bound=Constraint)
@@ -62,7 +66,9 @@ class Objective:
         default=0.0,
         low=0.0,
     )
-    term: tuple[ObjectiveTerm, ...] = optional_key("further terms", default=(), form="[[objective.term]] tables")
+    term: tuple[ObjectiveTerm, ...] = optional_key(
+        "further terms", default=(), form="[[objective.term]] tables"
+    )
 
     @property
     def terms(self) -> tuple[ObjectiveTerm, ...]:
@@ -79,20 +85,31 @@ class Problem:
         path: Path of the problem file, the base of the URDF's relative path.
     """
 
-    name: str = field("name of the problem: lower-case letters, digits and hyphens", pattern=NAME)
+    name: str = field(
+        "name of the problem: lower-case letters, digits and hyphens", pattern=NAME
+    )
     title: str = field("title in one line", default="")
     robot: RobotSpec = field("robot and its planned joints")
-    limits: LimitSpec = field("planning limits, as fractions of the URDF's or in their place")
+    limits: LimitSpec = field(
+        "planning limits, as fractions of the URDF's or in their place"
+    )
     object: HeldObject | None = field("upright cuboid that the tip holds", default=None)
     payload: Payload | None = optional_key("additional load at the tip")
     parameters: ParameterRanges = optional_key(
-        "ranges of the parameters that differ from sample to sample", default=NO_PARAMETERS
+        "ranges of the parameters that differ from sample to sample",
+        default=NO_PARAMETERS,
     )
-    obstacle: tuple[Obstacle, ...] = field("obstacles around the robot", default=(), form="[[obstacle]] tables")
+    obstacle: tuple[Obstacle, ...] = field(
+        "obstacles around the robot", default=(), form="[[obstacle]] tables"
+    )
     constraint: tuple[Constraint, ...] = field(
-        "constraints on every state of a valid motion", default=(), form="[[constraint]] tables"
+        "constraints on every state of a valid motion",
+        default=(),
+        form="[[constraint]] tables",
     )
-    trajectory: TrajectorySpec = field("parametrization of motions", default=TrajectorySpec())
+    trajectory: TrajectorySpec = field(
+        "parametrization of motions", default=TrajectorySpec()
+    )
     objective: Objective = field("objective of the optimization", default=Objective())
     path: Path = Path()
     is_stored: bool = False  # in a dataset, a plan or a model: implausible sizes and limits were accepted before
@@ -106,13 +123,15 @@ class Problem:
     def with_obstacles(self, obstacles: Sequence[Obstacle]) -> "Problem":
         """Return the problem among other obstacles; robot, limits and constraints stay the same.
 
-        Raises:
-            UsageError: A size or a pose of an obstacle is not finite, too large or not positive.
+        Raises: UsageError: A size or a pose of an obstacle is not finite, too large or
+            not positive.
         """
         if error := invalid_obstacle(obstacles):
             raise UsageError(error, concerns="obstacles")
         other = dataclasses.replace(self, obstacle=tuple(obstacles))
-        vars(other)["urdf_text"] = self.urdf_text  # a cached property, expensive to read again
+        vars(other)["urdf_text"] = (
+            self.urdf_text
+        )  # a cached property, expensive to read again
         return other
 
     @property
@@ -123,7 +142,11 @@ class Problem:
     @property
     def own_obstacles(self) -> tuple[Obstacle, ...]:
         """The obstacles that samples do not place."""
-        return tuple(obstacle for obstacle in self.obstacle if obstacle.position != PARKED_POSITION_M)
+        return tuple(
+            obstacle
+            for obstacle in self.obstacle
+            if obstacle.position != PARKED_POSITION_M
+        )
 
     @property
     def sample_obstacles(self) -> tuple[Obstacle, ...]:
@@ -145,10 +168,19 @@ class Problem:
         """Yield (key, error) pairs."""
         for key in ("obstacle", "constraint"):
             if (count := len(getattr(self, key))) > MAX_TABLES:
-                yield key, f"there are {count:,} of them, expected at most {MAX_TABLES}: kernels grow with each"
+                yield (
+                    key,
+                    f"there are {count:,} of them, expected at most {MAX_TABLES}: kernels grow with each",
+                )
         if sum(constraint.scene_width > 0 for constraint in self.constraint) > 1:
-            yield "constraint", "more than one of them has values of each motion, such as a puck, expected one"
-        depth = max((item.depth for item in self.constraint if isinstance(item, ObjectContact)), default=0.0)
+            yield (
+                "constraint",
+                "more than one of them has values of each motion, such as a puck, expected one",
+            )
+        depth = max(
+            (item.depth for item in self.constraint if isinstance(item, ObjectContact)),
+            default=0.0,
+        )
         if self.object is not None and min(self.object.size) <= 2 * depth:
             yield (
                 "object",
@@ -160,34 +192,67 @@ class Problem:
 
     def _parameter_errors(self) -> Iterator[tuple[str, str]]:
         if self.parameters.changes_payload and self.payload is None:
-            (name, *_) = (name for name in self.parameters.names if name in PAYLOAD_PARAMETERS)
-            yield "parameters", f"{name} needs the body of the load: give [payload], too"
+            (name, *_) = (
+                name for name in self.parameters.names if name in PAYLOAD_PARAMETERS
+            )
+            yield (
+                "parameters",
+                f"{name} needs the body of the load: give [payload], too",
+            )
         moving = [name for name in self.parameters.names if name in PAYLOAD_CENTRE]
         if moving and self.payload is not None and self.payload.touch_links:
             yield (
                 "parameters",
                 f"{moving[0]} moves the payload, whose body ('touch_links') cannot move: omit one of them",
             )
-        if (names := [name for name in self.parameters.names if name.startswith("upright_")]) and (
+        if (
+            names := [
+                name for name in self.parameters.names if name.startswith("upright_")
+            ]
+        ) and (
             count := sum(isinstance(item, TipAxis) for item in self.constraint)
         ) != 1:
-            yield "parameters", f"{names[0]} needs one constraint 'vertical' or 'axis', the problem has {count}"
+            yield (
+                "parameters",
+                f"{names[0]} needs one constraint 'vertical' or 'axis', the problem has {count}",
+            )
         nominal = self.nominal_parameters.tolist()
-        for name, span, value in zip(self.parameters.names, self.parameters.ranges, nominal, strict=True):
+        for name, span, value in zip(
+            self.parameters.names, self.parameters.ranges, nominal, strict=True
+        ):
             if not span.low <= value <= span.high:
-                yield "parameters", f"{name} must include {value:g}, the value of samples without parameters"
+                yield (
+                    "parameters",
+                    f"{name} must include {value:g}, the value of samples without parameters",
+                )
         if not self.parameters.tilts_table and not self.parameters.changes_rectangle:
             return
-        tables = [constraint for constraint in self.constraint if isinstance(constraint, Table)]
+        tables = [
+            constraint
+            for constraint in self.constraint
+            if isinstance(constraint, Table)
+        ]
         if len(tables) != 1:
-            yield "parameters", f"table parameters need one constraint 'table', the problem has {len(tables)}"
+            yield (
+                "parameters",
+                f"table parameters need one constraint 'table', the problem has {len(tables)}",
+            )
         for side in ("x", "y") if tables else ():
-            low, high = (getattr(self.parameters, f"table_{side}_{end}") for end in ("low", "high"))
+            low, high = (
+                getattr(self.parameters, f"table_{side}_{end}")
+                for end in ("low", "high")
+            )
             sides: Range = getattr(tables[0], side)
             if (low.high if low else sides.low) >= (high.low if high else sides.high):
-                yield "parameters", f"table_{side}_low must be below table_{side}_high in all samples"
+                yield (
+                    "parameters",
+                    f"table_{side}_low must be below table_{side}_high in all samples",
+                )
         if self.parameters.tilts_table and any(table.start_band for table in tables):
-            yield "parameters", "table parameters need starts on the table: remove start_band of the constraint 'table'"
+            yield (
+                "parameters",
+                "table parameters need starts on the table: remove start_band of the constraint 'table'",
+            )
 
     @property
     def object_size(self) -> tuple[float, float, float] | None:
@@ -199,31 +264,49 @@ class Problem:
         """Parameters of a sample for which none are given, shape (width,)."""
         values: dict[str, float] = {}
         if (payload := self.payload) is not None:
-            values |= {"payload_mass": payload.mass} | dict(zip(PAYLOAD_CENTRE, payload.centre, strict=True))
+            values |= {"payload_mass": payload.mass} | dict(
+                zip(PAYLOAD_CENTRE, payload.centre, strict=True)
+            )
         if (table := self.first(Table)) is not None:
             values |= table.bounds
         uprights = (item for item in self.constraint if isinstance(item, TipAxis))
-        values[UPRIGHT_TOLERANCE] = next((item.nominal_tolerance for item in uprights), 0.0)
+        values[UPRIGHT_TOLERANCE] = next(
+            (item.nominal_tolerance for item in uprights), 0.0
+        )
         return self.parameters.nominal(values)
 
     @property
     def table_origin(self) -> NDArray[np.float64]:
-        """Center of the rectangle of the table, about which it turns [m], shape (3,); zero without a table."""
+        """Center of the rectangle of the table, about which it turns [m], shape (3,).
+
+        Zero without a table.
+        """
         table = self.first(Table)
         if table is None:
             return np.zeros(3)
-        return np.array([(table.x.low + table.x.high) / 2, (table.y.low + table.y.high) / 2, table.z])
+        return np.array(
+            [
+                (table.x.low + table.x.high) / 2,
+                (table.y.low + table.y.high) / 2,
+                table.z,
+            ]
+        )
 
     @cached_property
     def scene_constraint(self) -> Constraint | None:
         """The constraint that depends on values of each motion (``Constraint.scene_values``), or None."""
-        return next((constraint for constraint in self.constraint if constraint.scene_width), None)
+        return next(
+            (constraint for constraint in self.constraint if constraint.scene_width),
+            None,
+        )
 
     @property
     def scene_width(self) -> int:
         """Number of values of a scene: poses and sizes of obstacles, those of the constraint above, parameters."""
         constraint = self.scene_constraint
-        width = pose_width(self.obstacle) + (0 if constraint is None else constraint.scene_width)
+        width = pose_width(self.obstacle) + (
+            0 if constraint is None else constraint.scene_width
+        )
         return width + len(self.parameters)
 
     @property
@@ -234,11 +317,16 @@ class Problem:
     @property
     def uses_jerk(self) -> bool:
         """Whether a constraint or a term of the objective uses jerks."""
-        return any(item.uses_jerk for item in self.constraint) or any(term.uses_jerk for term in self.objective.term)
+        return any(item.uses_jerk for item in self.constraint) or any(
+            term.uses_jerk for term in self.objective.term
+        )
 
     @property
     def path_orders(self) -> int:
-        """Number of derivatives of p(s), including p itself, in the constraints; for r(s) it is one less."""
+        """Number of derivatives of p(s), including p itself, in the constraints.
+
+        For r(s) it is one less.
+        """
         return 4 if self.uses_jerk else 3
 
     @property
@@ -259,62 +347,103 @@ class Problem:
     def urdf_text(self) -> str:
         """Text of the URDF, read once, so that robot, kernels and identity use the same text.
 
-        Locked joints are fixed. If constraints use the URDF's geometry, the text includes the hulls of meshes, the
-        pairs of an SRDF and the box of a payload that is a body.
+        Locked joints are fixed. If constraints use the URDF's geometry, the text
+        includes the hulls of meshes, the pairs of an SRDF and the box of a payload that
+        is a body.
 
-        Raises:
-            RecipeError: The URDF, a mesh or the SRDF cannot be read, or is not UTF-8, or a joint cannot be locked.
+        Raises: RecipeError: The URDF, a mesh or the SRDF cannot be read, or is not
+            UTF-8, or a joint cannot be locked.
         """
         spec = self.robot
         positions = dict(zip(spec.locked_joints, spec.locked_positions, strict=True))
-        text = with_locked_joints(read_urdf(self.urdf_path), positions, is_stored=self.is_stored)
+        text = with_locked_joints(
+            read_urdf(self.urdf_path), positions, is_stored=self.is_stored
+        )
         if not self.uses_link_geometry:
             return text
         keep = kept_folder() if spec.convex_parts > 1 else None
         text = with_inline_meshes(
-            text, self.urdf_path, self.packages, most=spec.convex_parts, links=spec.decomposed, keep=keep
+            text,
+            self.urdf_path,
+            self.packages,
+            most=spec.convex_parts,
+            links=spec.decomposed,
+            keep=keep,
         )
-        text = with_disabled_pairs(text, self.path.parent / spec.srdf) if spec.srdf else text
+        text = (
+            with_disabled_pairs(text, self.path.parent / spec.srdf)
+            if spec.srdf
+            else text
+        )
         ignored = spec.ignored_pairs
         text = with_payload_link(text, spec, self.payload, is_stored=self.is_stored)
         if self.payload is not None:
-            ignored = (*ignored, *((link, PAYLOAD) for link in self.payload.touch_links))
+            ignored = (
+                *ignored,
+                *((link, PAYLOAD) for link in self.payload.touch_links),
+            )
         return with_ignored_pairs(text, ignored) if ignored else text
 
     @cached_property
     def identity(self) -> str:
         """Hash (sha256) of everything that kernels and plans of the problem depend on; the key of caches.
 
-        It depends on the values of the object and not on a file. Only the title and the file paths are excluded.
+        It depends on the values of the object and not on a file. Only the title and the
+        file paths are excluded.
         """
-        content = json.dumps(without_labels(to_dict(self, label=_all_of)), sort_keys=True)
+        content = json.dumps(
+            without_labels(to_dict(self, label=_all_of)), sort_keys=True
+        )
         return hashlib.sha256(content.encode() + self.urdf_text.encode()).hexdigest()
 
     @cached_property
     def structure(self) -> str | None:
         """Hash (sha256) as ``identity``, without names, poses and sizes of obstacles; None with plug-in constraints.
 
-        Kernels that read these numbers from their arguments are equal for all problems of one structure.
+        Kernels that read these numbers from their arguments are equal for all problems
+        of one structure.
         """
-        if not all(type(constraint).__module__.startswith("cnpgen.") for constraint in self.constraint):
+        if not all(
+            type(constraint).__module__.startswith("cnpgen.")
+            for constraint in self.constraint
+        ):
             return None
         content = without_labels(to_dict(self, label=_all_of))
         content = {key: value for key, value in content.items() if key != "name"}
-        content["obstacle"] = [_structure_of(obstacle) for obstacle in content["obstacle"]]
+        content["obstacle"] = [
+            _structure_of(obstacle) for obstacle in content["obstacle"]
+        ]
         text = json.dumps(content, sort_keys=True)
-        return hashlib.sha256(b"structure" + text.encode() + self.urdf_text.encode()).hexdigest()
+        return hashlib.sha256(
+            b"structure" + text.encode() + self.urdf_text.encode()
+        ).hexdigest()
 
 
 def _structure_of(obstacle: Mapping[str, Any]) -> dict[str, Any]:
     """Return the keys of a resolved obstacle that kernels contain as constants: all but name, pose and sizes."""
     if obstacle.get("x") is not None or obstacle.get("y") is not None:
-        return {key: value for key, value in obstacle.items() if key not in {"name", "top", "below"}}
+        return {
+            key: value
+            for key, value in obstacle.items()
+            if key not in {"name", "top", "below"}
+        }
     turned = any(obstacle.get("rotation") or ())
-    return {key: obstacle.get(key) for key in ("kind", "mesh", "scale")} | {"turned": turned}
+    return {key: obstacle.get(key) for key in ("kind", "mesh", "scale")} | {
+        "turned": turned
+    }
 
 
-# Keys of [robot] that only locate, read or describe files; their results are in the text of the URDF.
-FILES = ("urdf", "packages", "srdf", "ignored_pairs", "convex_parts", "decomposed", "hull_gap")
+# Keys of [robot] that only locate, read or describe files; their results are in the
+# text of the URDF.
+FILES = (
+    "urdf",
+    "packages",
+    "srdf",
+    "ignored_pairs",
+    "convex_parts",
+    "decomposed",
+    "hull_gap",
+)
 
 
 def kept_folder() -> Path | None:
@@ -340,8 +469,14 @@ def _use(obj: object) -> dict[str, str]:
     group = registry.group_of(type(obj))
     if not group:
         return {}
-    about = {"package": registry.package_of(group, type(obj)), "source": registry.source_digest(type(obj))}
-    return {"use": registry.name_of(group, type(obj)), **{key: text for key, text in about.items() if text}}
+    about = {
+        "package": registry.package_of(group, type(obj)),
+        "source": registry.source_digest(type(obj)),
+    }
+    return {
+        "use": registry.name_of(group, type(obj)),
+        **{key: text for key, text in about.items() if text},
+    }
 
 
 def _all_of(obj: object) -> dict[str, str]:
@@ -356,4 +491,6 @@ def _all_of(obj: object) -> dict[str, str]:
 def without_labels(problem: Mapping[str, Any]) -> dict[str, Any]:
     """Remove title and file names from a resolved problem, which do not affect its motions."""
     robot = {key: value for key, value in problem["robot"].items() if key not in FILES}
-    return {key: value for key, value in problem.items() if key != "title"} | {"robot": robot}
+    return {key: value for key, value in problem.items() if key != "title"} | {
+        "robot": robot
+    }

@@ -27,7 +27,9 @@ from cnpgen.schema.units import show
 
 
 @checked_arguments
-def load_problem(name_or_path: str | Path, *, relative_to: Path | None = None) -> Problem:
+def load_problem(
+    name_or_path: str | Path, *, relative_to: Path | None = None
+) -> Problem:
     """Load a problem.
 
     Args:
@@ -47,8 +49,13 @@ KIND_READERS: dict[type, Reader] = {
 
 
 def load_problem_behind(name_or_path: str | Path) -> Problem:
-    """Load the problem of a problem, pipeline or dataset recipe, by name or path; RecipeError if it has errors."""
-    return load_recipe(("problem", "pipeline", "dataset"), name_or_path, None, _read_behind)
+    """Load the problem of a problem, pipeline or dataset recipe, by name or path.
+
+    RecipeError if it has errors.
+    """
+    return load_recipe(
+        ("problem", "pipeline", "dataset"), name_or_path, None, _read_behind
+    )
 
 
 def _read_behind(path: Path, errors: list[str]) -> Problem | None:
@@ -62,7 +69,9 @@ def _read_behind(path: Path, errors: list[str]) -> Problem | None:
         return read_problem(path, errors)
     where = RecipeLocation(str(path)) / key
     try:
-        found: Problem | None = reference(key, _read_behind, path.parent)(table[key], where, errors)
+        found: Problem | None = reference(key, _read_behind, path.parent)(
+            table[key], where, errors
+        )
     except ValueError as error:
         errors.append(where.message(str(error)))
         return None
@@ -70,7 +79,10 @@ def _read_behind(path: Path, errors: list[str]) -> Problem | None:
 
 
 def read_problem(path: Path, errors: list[str]) -> Problem | None:
-    """Read a problem file and append its errors to ``errors``; return None if it is unusable."""
+    """Read a problem file and append its errors to ``errors``.
+
+    Return None if it is unusable.
+    """
     table = read_table(path, ("problem",), errors)
     if table is None:
         return None
@@ -82,11 +94,22 @@ def read_problem(path: Path, errors: list[str]) -> Problem | None:
     if problem is None or len(errors) > before:
         return None
     errors.extend(limit_errors(problem, raw))
-    spec, constraints = replace(problem.robot, geometry=raw.geometry), raw.with_object_clearance(problem)
-    return replace(problem, path=path.absolute(), robot=spec, obstacle=obstacles, constraint=constraints)
+    spec, constraints = (
+        replace(problem.robot, geometry=raw.geometry),
+        raw.with_object_clearance(problem),
+    )
+    return replace(
+        problem,
+        path=path.absolute(),
+        robot=spec,
+        obstacle=obstacles,
+        constraint=constraints,
+    )
 
 
-def _with_meshes(problem: Problem, path: Path, where: RecipeLocation, errors: list[str]) -> tuple[Obstacle, ...]:
+def _with_meshes(
+    problem: Problem, path: Path, where: RecipeLocation, errors: list[str]
+) -> tuple[Obstacle, ...]:
     """Return the obstacles with inline hulls of their mesh files."""
     packages = [path.parent / each for each in problem.robot.packages]
     found = []
@@ -94,10 +117,15 @@ def _with_meshes(problem: Problem, path: Path, where: RecipeLocation, errors: li
         obstacle = each
         if each.mesh and not is_inline(each.mesh):
             try:
-                mesh = inline_mesh(find_named_file(each.mesh, path, packages), np.array(each.scale))
+                mesh = inline_mesh(
+                    find_named_file(each.mesh, path, packages), np.array(each.scale)
+                )
                 obstacle = replace(each, mesh=mesh, scale=Obstacle.scale)
             except RecipeError as error:
-                errors += [(where / "obstacle" / index / "mesh").message(text) for text in error.errors]
+                errors += [
+                    (where / "obstacle" / index / "mesh").message(text)
+                    for text in error.errors
+                ]
         found.append(obstacle)
     return tuple(found)
 
@@ -105,12 +133,20 @@ def _with_meshes(problem: Problem, path: Path, where: RecipeLocation, errors: li
 def without_defaults(value: Any) -> Any:
     """Remove nulls, empty arrays and records of plug-ins, which recipes do not contain."""
     if isinstance(value, dict):
-        given = {key: entry for key, entry in value.items() if entry is not None and entry != []}
+        given = {
+            key: entry
+            for key, entry in value.items()
+            if entry is not None and entry != []
+        }
         if "use" in given:
             given.pop("source", None)
             given.pop("package", None)
         return {key: without_defaults(entry) for key, entry in given.items()}
-    return [without_defaults(entry) for entry in value] if isinstance(value, list) else value
+    return (
+        [without_defaults(entry) for entry in value]
+        if isinstance(value, list)
+        else value
+    )
 
 
 def restore_problem(content: dict[str, Any], urdf: str, folder: Path) -> Problem:
@@ -136,10 +172,14 @@ def restoring_reader(urdf: str, path: Path) -> Reader:
     def read(value: Any, where: RecipeLocation, errors: list[str]) -> Problem | None:
         if not isinstance(value, dict) or not isinstance(value.get("robot"), dict):
             raise ValueError("expected the table of a problem, with a robot")  # noqa: TRY004 - as of other errors
-        robot = {key: entry for key, entry in value["robot"].items() if key not in FILES}
+        robot = {
+            key: entry for key, entry in value["robot"].items() if key not in FILES
+        }
         value = {**value, "robot": robot | {"urdf": "robot.urdf"}}
         with stored_values():
-            made = parse(Problem, value, where=where, errors=errors, readers=KIND_READERS)
+            made = parse(
+                Problem, value, where=where, errors=errors, readers=KIND_READERS
+            )
         if made is None or (named := list(_meshes_on_disk(made, urdf, where))):
             errors.extend(() if made is None else named)
             return None
@@ -148,7 +188,9 @@ def restoring_reader(urdf: str, path: Path) -> Reader:
     return read
 
 
-def _meshes_on_disk(problem: Problem, urdf: str, where: RecipeLocation) -> Iterator[str]:
+def _meshes_on_disk(
+    problem: Problem, urdf: str, where: RecipeLocation
+) -> Iterator[str]:
     """Yield error messages for meshes that are not inline."""
     text = "names the mesh {}, expected its corners in the text"
     with suppress(ValueError):  # loading the robot raises the error
@@ -156,7 +198,9 @@ def _meshes_on_disk(problem: Problem, urdf: str, where: RecipeLocation) -> Itera
             yield (where / "robot" / "urdf").message(text.format(show(name)))
     for index, each in enumerate(problem.obstacle):
         if each.mesh and not is_inline(each.mesh):
-            yield (where / "obstacle" / index / "mesh").message(text.format(show(each.mesh)))
+            yield (where / "obstacle" / index / "mesh").message(
+                text.format(show(each.mesh))
+            )
 
 
 def missing_kinds_of_problem(content: dict[str, Any]) -> list[str]:
@@ -171,5 +215,8 @@ def missing_kinds_of_problem(content: dict[str, Any]) -> list[str]:
 
 def missing_kinds(group: str, entries: list[tuple[int, dict[str, Any]]]) -> list[str]:
     """Return the missing packages of resolved stage or constraint tables."""
-    found = (registry.why_missing(group, str(each.get("use")), str(each.get("package", ""))) for _, each in entries)
+    found = (
+        registry.why_missing(group, str(each.get("use")), str(each.get("package", "")))
+        for _, each in entries
+    )
     return list(dict.fromkeys(text for text in found if text))

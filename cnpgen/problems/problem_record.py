@@ -26,8 +26,19 @@ from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import parse, stored_values
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.files.cache_folder import temporary_folder
-from cnpgen.store.files.document_structure import ANY_KEY, NUMBER, TEXT, WHOLE, check_structure
-from cnpgen.store.files.documents import canonical_sha256, differences, parse_json, plain
+from cnpgen.store.files.document_structure import (
+    ANY_KEY,
+    NUMBER,
+    TEXT,
+    WHOLE,
+    check_structure,
+)
+from cnpgen.store.files.documents import (
+    canonical_sha256,
+    differences,
+    parse_json,
+    plain,
+)
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 if TYPE_CHECKING:
@@ -36,7 +47,13 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 _MOVING = ("revolute", "continuous", "prismatic")
-_SCALES = ("position_scale", "velocity_scale", "acceleration_rate", "acceleration_cap", "torque_scale")
+_SCALES = (
+    "position_scale",
+    "velocity_scale",
+    "acceleration_rate",
+    "acceleration_cap",
+    "torque_scale",
+)
 _FORM = {
     "name": TEXT,
     "robot": {"urdf": TEXT, "joints": [TEXT], "tip": TEXT, "base": [NUMBER]},
@@ -44,7 +61,11 @@ _FORM = {
     "constraint": [{"use": TEXT}],
     "trajectory": {ANY_KEY: WHOLE},
 }
-_JUDGED_BY = ("tolerance", "budget", "weight")  # strictness of the verdict, not part of the problem's definition
+_JUDGED_BY = (
+    "tolerance",
+    "budget",
+    "weight",
+)  # strictness of the verdict, not part of the problem's definition
 
 
 @dataclass(frozen=True, repr=False)
@@ -65,7 +86,9 @@ class ProblemRecord(StoredProblem):
             content: dict[str, Any] = parse_json(self.recipe)
             check_structure(content, _FORM)
         except ValueError as error:
-            raise RecipeError([f"problem_recipe is not that of a problem: {error}"]) from error
+            raise RecipeError(
+                [f"problem_recipe is not that of a problem: {error}"]
+            ) from error
         return content
 
     @property
@@ -82,15 +105,21 @@ class ProblemRecord(StoredProblem):
     def prismatic_joints(self) -> tuple[bool, ...]:
         """Whether each planned joint is prismatic."""
         joints = urdf_tree(self.urdf).iter("joint")
-        sliding = {joint.get("name") for joint in joints if joint.get("type") == "prismatic"}
+        sliding = {
+            joint.get("name") for joint in joints if joint.get("type") == "prismatic"
+        }
         return tuple(name in sliding for name in self.joint_names)
 
     @property
     def held_joints(self) -> dict[str, float]:
         """Unplanned movable joints of the URDF -> constant position [rad or m], zero."""
         joints = urdf_tree(self.urdf).iter("joint")
-        moving = (joint.get("name", "") for joint in joints if joint.get("type") in _MOVING)
-        return dict.fromkeys((name for name in moving if name not in self.joint_names), 0.0)
+        moving = (
+            joint.get("name", "") for joint in joints if joint.get("type") in _MOVING
+        )
+        return dict.fromkeys(
+            (name for name in moving if name not in self.joint_names), 0.0
+        )
 
     @cached_property
     def trajectory(self) -> TrajectorySpec:
@@ -108,12 +137,16 @@ class ProblemRecord(StoredProblem):
         Raises:
             RecipeError: There are no such parameters.
         """
-        return self._parsed(ParameterRanges, "parameters", self.content.get("parameters", {}))
+        return self._parsed(
+            ParameterRanges, "parameters", self.content.get("parameters", {})
+        )
 
     def _parsed(self, kind: type[T], key: str, table: Any) -> T:
         errors: list[str] = []
         with stored_values():
-            parsed = parse(kind, table, where=RecipeLocation("problem_recipe", key), errors=errors)
+            parsed = parse(
+                kind, table, where=RecipeLocation("problem_recipe", key), errors=errors
+            )
         if parsed is None:
             raise RecipeError(errors)
         return parsed
@@ -122,8 +155,9 @@ class ProblemRecord(StoredProblem):
     def comparable_sha256(self) -> str:
         """Hash (sha256) of the part that problems with comparable plans share: ``problem_sha256`` in files.
 
-        Excluded are name and title, base configuration, suggested parametrization, objective, and tolerances of
-        constraints. It does not identify a problem; caches must use ``Problem.identity``.
+        Excluded are name and title, base configuration, suggested parametrization,
+        objective, and tolerances of constraints. It does not identify a problem; caches
+        must use ``Problem.identity``.
         """
         return canonical_sha256(_comparable(self))
 
@@ -136,12 +170,14 @@ class ProblemRecord(StoredProblem):
     def restored(self) -> Iterator[Problem]:
         """Rebuild the problem; its URDF is in a temporary folder, which is deleted at the end of the block.
 
-        Raises:
-            RecipeError: The problem needs another version of cnpgen, or a plug-in that is not installed.
+        Raises: RecipeError: The problem needs another version of cnpgen, or a plug-in
+            that is not installed.
         """
         with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
             problem = restore_problem(self.content, self.urdf, Path(folder))
-            vars(problem)["urdf_text"] = self.urdf  # a cached property: the text contains meshes and pairs already
+            vars(problem)["urdf_text"] = (
+                self.urdf
+            )  # a cached property: the text contains meshes and pairs already
             yield problem
 
     @checked_arguments
@@ -156,32 +192,52 @@ class ProblemRecord(StoredProblem):
         """
         (_, robot), q = open_problem(self), numbers("q", q)
         if q.ndim != 2 or q.shape[1] != robot.n:
-            raise UsageError(f"must have shape (N, {robot.n}), got {q.shape}", argument="q")
+            raise UsageError(
+                f"must have shape (N, {robot.n}), got {q.shape}", argument="q"
+            )
         return robot.tip_positions(q)
 
 
-def with_control_points(record: ProblemRecord, path: int | None, rate: int | None) -> ProblemRecord:
+def with_control_points(
+    record: ProblemRecord, path: int | None, rate: int | None
+) -> ProblemRecord:
     """Return the record of a problem with other numbers of control points of p(s) and r(s); None keeps a number."""
     counts = {"path_control_points": path, "rate_control_points": rate}
-    changed = {key: count for key, count in counts.items() if count not in {None, record.content["trajectory"][key]}}
+    changed = {
+        key: count
+        for key, count in counts.items()
+        if count not in {None, record.content["trajectory"][key]}
+    }
     if not changed:
         return record
-    content = {**record.content, "trajectory": {**record.content["trajectory"], **changed}}
-    found = ProblemRecord(json.dumps(content, ensure_ascii=False, allow_nan=False), record.urdf)
+    content = {
+        **record.content,
+        "trajectory": {**record.content["trajectory"], **changed},
+    }
+    found = ProblemRecord(
+        json.dumps(content, ensure_ascii=False, allow_nan=False), record.urdf
+    )
     try:
         found.trajectory  # noqa: B018 - checks the numbers
     except RecipeError as error:
-        raise UsageError(f"{', '.join(changed)}: {error}", concerns=next(iter(changed))) from error
+        raise UsageError(
+            f"{', '.join(changed)}: {error}", concerns=next(iter(changed))
+        ) from error
     return found
 
 
 def with_objective(record: ProblemRecord, objective: str) -> ProblemRecord:
-    """Return the record of a problem with another objective (``read_objective``); empty or "time" for its own."""
+    """Return the record of a problem with another objective (``read_objective``).
+
+    Empty or "time" for its own.
+    """
     terms = read_objective(objective)
     if terms is None:
         return record
     content = {**record.content, "objective": resolved(Objective(term=terms))}
-    return ProblemRecord(json.dumps(plain(content), ensure_ascii=False, allow_nan=False), record.urdf)
+    return ProblemRecord(
+        json.dumps(plain(content), ensure_ascii=False, allow_nan=False), record.urdf
+    )
 
 
 def with_payload_of(record: ProblemRecord, parameters: Array) -> ProblemRecord:
@@ -189,7 +245,9 @@ def with_payload_of(record: ProblemRecord, parameters: Array) -> ProblemRecord:
     with record.restored() as problem:
         values = dict(zip(problem.parameters.names, parameters.tolist(), strict=True))
         payload = None if problem.payload is None else problem.payload.at(values)
-        return record_problem(replace(problem, payload=payload, parameters=NO_PARAMETERS))
+        return record_problem(
+            replace(problem, payload=payload, parameters=NO_PARAMETERS)
+        )
 
 
 def record_problem(problem: Problem) -> ProblemRecord:
@@ -230,16 +288,20 @@ def _rebuilt(record: ProblemRecord) -> Problem:
 def open_problem(record: ProblemRecord) -> tuple[Problem, Robot]:
     """Rebuild a problem and its robot, which both contain the URDF; the files are deleted afterwards.
 
-    Raises:
-        RecipeError: The problem needs another version of cnpgen, or a plug-in that is not installed.
+    Raises: RecipeError: The problem needs another version of cnpgen, or a plug-in that
+        is not installed.
     """
     from cnpgen.problems.load_robot import load_robot
 
     with record.restored() as problem:
         if problem.obstacle:
-            with suppress(RecipeError):  # errors are reported below, with the whole problem
+            with suppress(
+                RecipeError
+            ):  # errors are reported below, with the whole problem
                 content = {**record.content, "obstacle": []}
-                return problem, _robot_of(ProblemRecord(json.dumps(content), record.urdf))
+                return problem, _robot_of(
+                    ProblemRecord(json.dumps(content), record.urdf)
+                )
         return problem, load_robot(problem)
 
 
@@ -255,14 +317,26 @@ def _robot_of(record: ProblemRecord) -> Robot:
 def _comparable(record: ProblemRecord) -> dict[str, Any]:
     """Reduce a resolved problem to the part that problems with comparable plans share."""
     kept = {
-        key: value for key, value in record.content.items() if key not in {"name", "title", "trajectory", "objective"}
+        key: value
+        for key, value in record.content.items()
+        if key not in {"name", "title", "trajectory", "objective"}
     }
-    robot = {key: value for key, value in kept["robot"].items() if key not in {*FILES, "base"}}
+    robot = {
+        key: value
+        for key, value in kept["robot"].items()
+        if key not in {*FILES, "base"}
+    }
     robot["urdf"] = hashlib.sha256(record.urdf.encode()).hexdigest()
     constraints: dict[str, Any] = {}
     counts = Counter[str]()
     for kind in kept["constraint"]:
         counts[kind["use"]] += 1
-        name = f"{kind['use']} {counts[kind['use']]}" if counts[kind["use"]] > 1 else kind["use"]
-        constraints[name] = {key: value for key, value in kind.items() if key not in _JUDGED_BY}
+        name = (
+            f"{kind['use']} {counts[kind['use']]}"
+            if counts[kind["use"]] > 1
+            else kind["use"]
+        )
+        constraints[name] = {
+            key: value for key, value in kind.items() if key not in _JUDGED_BY
+        }
     return kept | {"robot": robot, "constraint": constraints}

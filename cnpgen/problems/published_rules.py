@@ -18,11 +18,18 @@ if TYPE_CHECKING:
 
 
 class PublishedRules(ABC):
-    """Conditions of a publication; packages register them in the group ``cnpgen.rules``."""
+    """Conditions of a publication.
+
+    Packages register them in the group ``cnpgen.rules``.
+    """
 
     @abstractmethod
     def judge(
-        self, problem: Problem, world: PathWorld, obstacle_poses: NDArray[np.float64], goal_xyz: NDArray[np.float64]
+        self,
+        problem: Problem,
+        world: PathWorld,
+        obstacle_poses: NDArray[np.float64],
+        goal_xyz: NDArray[np.float64],
     ) -> tuple[bool, tuple[str, ...]]:
         """Judge one motion whose samples the world has.
 
@@ -32,17 +39,22 @@ class PublishedRules(ABC):
             obstacle_poses: Poses of the obstacles, shape (width,).
             goal_xyz: Position of the tip at the goal [m], shape (3,).
 
-        Returns:
-            Whether the motion ends at the goal, and the reasons of the violated constraints.
+        Returns: Whether the motion ends at the goal, and the reasons of the violated
+            constraints.
         """
 
     @abstractmethod
-    def conditions(self, constraint: Constraint, state: SymbolicState) -> tuple[Condition, ...]:
+    def conditions(
+        self, constraint: Constraint, state: SymbolicState
+    ) -> tuple[Condition, ...]:
         """Return the conditions of a constraint that the loss of the publication penalizes."""
 
 
 def load_rules(name: str) -> PublishedRules:
-    """Load the rules of a publication; raise MissingAddonError if their add-on is missing."""
+    """Load the rules of a publication.
+
+    Raise MissingAddonError if their add-on is missing.
+    """
     rules: PublishedRules = registry.load(registry.RULES, name)()
     return rules
 

@@ -32,20 +32,20 @@ if TYPE_CHECKING:
 class ConstraintValues:
     """Values of all conditions of a problem at N states, with derivatives.
 
-    A state is valid if ``lower - tolerance <= g <= upper + tolerance``. Derivatives belong to the symbolic form, with
-    closest points of distances treated as constant (envelope theorem).
+    A state is valid if ``lower - tolerance <= g <= upper + tolerance``. Derivatives
+    belong to the symbolic form, with closest points of distances treated as constant
+    (envelope theorem).
 
-    Attributes:
-        names: Name of the constraint of each value, length m.
-        g: Values in SI units, shape (N, m).
-        lower: Lower bounds, shape (m,); -inf without a bound.
-        upper: Upper bounds, shape (m,); inf without a bound.
-        tolerance: Accepted violation of each value, shape (m,).
-        jacobian_q: Derivatives with respect to joint positions, shape (N, m, n).
-        jacobian_dq: Derivatives with respect to joint velocities, shape (N, m, n).
-        jacobian_ddq: Derivatives with respect to joint accelerations, shape (N, m, n).
-        drift: ``(dJ_q / dt) dq``, shape (N, m), 0 for conditions that depend on dq or ddq. The second time derivative
-            of a condition of positions is ``jacobian_q @ ddq + drift``, as controllers on the manifold use it.
+    Attributes: names: Name of the constraint of each value, length m. g: Values in SI
+        units, shape (N, m). lower: Lower bounds, shape (m,); -inf without a bound.
+        upper: Upper bounds, shape (m,); inf without a bound. tolerance: Accepted
+        violation of each value, shape (m,). jacobian_q: Derivatives with respect to
+        joint positions, shape (N, m, n). jacobian_dq: Derivatives with respect to joint
+        velocities, shape (N, m, n). jacobian_ddq: Derivatives with respect to joint
+        accelerations, shape (N, m, n). drift: ``(dJ_q / dt) dq``, shape (N, m), 0 for
+        conditions that depend on dq or ddq. The second time derivative
+            of a condition of positions is ``jacobian_q @ ddq + drift``, as controllers
+            on the manifold use it.
     """
 
     names: tuple[str, ...]
@@ -72,24 +72,22 @@ class ConstraintValues:
 class RobotModel:
     """The robot of a problem: limits, batched forward kinematics, Jacobians, dynamics, collisions and constraints.
 
-    Positions, velocities and accelerations have shape (N, n) or (n,), in rad, rad/s and rad/s^2 (m for sliding joints).
-    Results have the first axis N. Vectors are in the world frame. Kernels are compiled on first use. Distances are
-    measured by Coal; all other results use the kernels of the solvers. Use an object in one thread only.
+    Positions, velocities and accelerations have shape (N, n) or (n,), in rad, rad/s and
+    rad/s^2 (m for sliding joints). Results have the first axis N. Vectors are in the
+    world frame. Kernels are compiled on first use. Distances are measured by Coal; all
+    other results use the kernels of the solvers. Use an object in one thread only.
 
-    Args:
-        problem: The problem, its record, or the name or file of a problem, a pipeline or a dataset.
-        backend: "compiled", "numpy" or "casadi"; by default the fastest available.
+    Args: problem: The problem, its record, or the name or file of a problem, a pipeline
+        or a dataset. backend: "compiled", "numpy" or "casadi"; by default the fastest
+        available.
 
-    Attributes:
-        problem: The problem.
-        joint_names: Names of the n planned joints.
-        tip: Name of the tip frame.
-        home: Home configuration [rad], the key `base` of files, shape (n,).
-        position_lower: Planning limits of joint positions [rad], shape (n,).
-        position_upper: Planning limits of joint positions [rad], shape (n,).
+    Attributes: problem: The problem. joint_names: Names of the n planned joints. tip:
+        Name of the tip frame. home: Home configuration [rad], the key `base` of files,
+        shape (n,). position_lower: Planning limits of joint positions [rad], shape
+        (n,). position_upper: Planning limits of joint positions [rad], shape (n,).
         velocity_limit: Planning limits of joint velocities [rad/s], shape (n,).
-        acceleration_limit: Planning limits of joint accelerations [rad/s^2], shape (n,).
-        jerk_limit: Planning limits of joint jerks [rad/s^3], shape (n,).
+        acceleration_limit: Planning limits of joint accelerations [rad/s^2], shape
+        (n,). jerk_limit: Planning limits of joint jerks [rad/s^3], shape (n,).
         torque_limit: Planning limits of joint torques [N m], shape (n,).
 
     Raises:
@@ -99,17 +97,30 @@ class RobotModel:
     """
 
     @checked_arguments
-    def __init__(self, problem: Problem | StoredProblem | str | Path, *, backend: str | None = None) -> None:
+    def __init__(
+        self,
+        problem: Problem | StoredProblem | str | Path,
+        *,
+        backend: str | None = None,
+    ) -> None:
         from cnpgen.kernels.library import choose_backend, problem_kernels
 
         self.problem = as_problem(problem)
         self._robot: Robot = load_robot(self.problem)
         robot = self._robot
         self.joint_names, self.tip, self.home = robot.joint_names, robot.tip, robot.home
-        self.position_lower, self.position_upper = robot.position_lower, robot.position_upper
-        self.velocity_limit, self.acceleration_limit = robot.velocity_limit, robot.acceleration_limit
+        self.position_lower, self.position_upper = (
+            robot.position_lower,
+            robot.position_upper,
+        )
+        self.velocity_limit, self.acceleration_limit = (
+            robot.velocity_limit,
+            robot.acceleration_limit,
+        )
         self.jerk_limit, self.torque_limit = robot.jerk_limit, robot.torque_limit
-        self._kernels: KernelLibrary = problem_kernels(self.problem, robot, *choose_backend(backend))
+        self._kernels: KernelLibrary = problem_kernels(
+            self.problem, robot, *choose_backend(backend)
+        )
         self._loaded: dict[str, Kernel] = {}
         self._world: World | None = None
 
@@ -143,7 +154,9 @@ class RobotModel:
         return jacobian.T.reshape(-1, 6, len(self.joint_names))
 
     @checked_arguments
-    def inverse_dynamics(self, q: ArrayLike, dq: ArrayLike | None = None, ddq: ArrayLike | None = None) -> Array:
+    def inverse_dynamics(
+        self, q: ArrayLike, dq: ArrayLike | None = None, ddq: ArrayLike | None = None
+    ) -> Array:
         """Compute joint torques, payload included.
 
         Args:
@@ -168,28 +181,40 @@ class RobotModel:
     ) -> Scene:
         """Place the obstacles of N samples; some stand below the object at the start or at the goal.
 
-        Args:
-            start_xyz: Tip positions at the start [m], shape (N, 3) or (3,).
-            goal_xyz: Tip positions at the goal [m], shape (N, 3) or (3,).
-            goal_velocity: Tip velocities at the goal [m/s], shape (N, 3) or (3,), from which the pucks of hits follow;
+        Args: start_xyz: Tip positions at the start [m], shape (N, 3) or (3,). goal_xyz:
+            Tip positions at the goal [m], shape (N, 3) or (3,). goal_velocity: Tip
+            velocities at the goal [m/s], shape (N, 3) or (3,), from which the pucks of
+            hits follow;
                 zero by default.
-            parameters: Parameters of the problem, shape (N, width) or (width,); nominal by default.
+            parameters: Parameters of the problem, shape (N, width) or (width,); nominal
+                by default.
         """
         from cnpgen.problems.obstacles import scene_of
 
         vectors: dict[str, ArrayLike] = {"start_xyz": start_xyz, "goal_xyz": goal_xyz}
         if goal_velocity is not None:
             vectors["goal_velocity"] = goal_velocity
-        given = {name: np.atleast_2d(numbers(name, xyz)) for name, xyz in vectors.items()}
+        given = {
+            name: np.atleast_2d(numbers(name, xyz)) for name, xyz in vectors.items()
+        }
         start, goal = given["start_xyz"], given["goal_xyz"]
         for name, xyz in given.items():
             if xyz.shape != (len(start), 3):
-                raise UsageError(f"must have shape ({len(start)}, 3) or (3,), got {xyz.shape}", argument=name)
+                raise UsageError(
+                    f"must have shape ({len(start)}, 3) or (3,), got {xyz.shape}",
+                    argument=name,
+                )
         velocity = given.get("goal_velocity", np.zeros(goal.shape))
         if parameters is None:
             return scene_of(self.problem, start, goal, velocity)
         rows = self.problem.parameters.checked(numbers("parameters", parameters))
-        return scene_of(self.problem, start, goal, velocity, np.broadcast_to(rows, (len(start), rows.shape[1])))
+        return scene_of(
+            self.problem,
+            start,
+            goal,
+            velocity,
+            np.broadcast_to(rows, (len(start), rows.shape[1])),
+        )
 
     @checked_arguments
     def constraint_values(
@@ -202,39 +227,59 @@ class RobotModel:
     ) -> ConstraintValues:
         """Evaluate every condition of the problem with its derivatives; conditions of jerks are left out.
 
-        Args:
-            q: Joint positions [rad], shape (N, n) or (n,).
-            dq: Joint velocities [rad/s]; zero by default.
-            ddq: Joint accelerations [rad/s^2]; zero by default.
-            scene: Obstacles of N samples, or of one for all states; by default where the problem places them.
+        Args: q: Joint positions [rad], shape (N, n) or (n,). dq: Joint velocities
+            [rad/s]; zero by default. ddq: Joint accelerations [rad/s^2]; zero by
+            default. scene: Obstacles of N samples, or of one for all states; by default
+            where the problem places them.
         """
         states = self._motion(q, dq, ddq)
         lanes = self._lanes(scene, states[0].shape[1])
         g, *jacobians, drift = self._run("constraint_values_of", *states, lanes)
         names, lower, upper, tolerance = self._conditions()
         shape = (len(self.joint_names), len(names))
-        by_q, by_dq, by_ddq = (part.T.reshape(-1, *shape).swapaxes(1, 2) for part in jacobians)
-        return ConstraintValues(names, g.T.copy(), lower, upper, tolerance, by_q, by_dq, by_ddq, drift.T.copy())
+        by_q, by_dq, by_ddq = (
+            part.T.reshape(-1, *shape).swapaxes(1, 2) for part in jacobians
+        )
+        return ConstraintValues(
+            names,
+            g.T.copy(),
+            lower,
+            upper,
+            tolerance,
+            by_q,
+            by_dq,
+            by_ddq,
+            drift.T.copy(),
+        )
 
     @checked_arguments
     def min_distance(self, q: ArrayLike, *, scene: Scene | None = None) -> Array:
         """Measure the smallest distance with Coal: links and held object from obstacles, and links from each other.
 
-        Args:
-            q: Joint positions [rad], shape (N, n) or (n,).
-            scene: Obstacles of N samples, or of one for all states; by default where the problem places them.
+        Args: q: Joint positions [rad], shape (N, n) or (n,). scene: Obstacles of N
+            samples, or of one for all states; by default where the problem places them.
 
-        Returns:
-            Signed distances [m], negative for penetration, shape (N,); inf without collision pairs. With the
-            paper's capsule model, the distance of the capsule axes less the radius of ``robot-clearance``.
+        Returns: Signed distances [m], negative for penetration, shape (N,); inf without
+            collision pairs. With the paper's capsule model, the distance of the capsule
+            axes less the radius of ``robot-clearance``.
         """
         states = self._states("q", q)
         poses = self._lanes(scene, states.shape[1])
-        return np.array([self._distance_at(states[:, k], poses[:, k]) for k in range(states.shape[1])])
+        return np.array(
+            [
+                self._distance_at(states[:, k], poses[:, k])
+                for k in range(states.shape[1])
+            ]
+        )
 
     @checked_arguments
-    def is_collision_free(self, q: ArrayLike, *, scene: Scene | None = None) -> NDArray[np.bool_]:
-        """Return whether nothing penetrates at each state, shape (N,); arguments as of ``min_distance``."""
+    def is_collision_free(
+        self, q: ArrayLike, *, scene: Scene | None = None
+    ) -> NDArray[np.bool_]:
+        """Return whether nothing penetrates at each state, shape (N,).
+
+        Arguments as of ``min_distance``.
+        """
         return np.asarray(self.min_distance(q, scene=scene) >= 0)
 
     def _distance_at(self, q: Array, poses: Array) -> float:
@@ -247,10 +292,19 @@ class RobotModel:
         world.set_state(q, rest, rest, poses)
         distances: list[float] = []
         if robot.shape is not None:
-            distances += [*world.self_distances(), *(world.shape_distances() if problem.obstacle else ())]
+            distances += [
+                *world.self_distances(),
+                *(world.shape_distances() if problem.obstacle else ()),
+            ]
         elif problem.obstacle:
-            radii = [float(getattr(item, "radius", 0.0) or 0.0) for item in problem.constraint]
-            distances += [distance - max(radii, default=0.0) for distance in world.segment_distances()]
+            radii = [
+                float(getattr(item, "radius", 0.0) or 0.0)
+                for item in problem.constraint
+            ]
+            distances += [
+                distance - max(radii, default=0.0)
+                for distance in world.segment_distances()
+            ]
         if problem.obstacle and problem.object_size is not None:
             distances += world.object_distances()
         return min(distances, default=np.inf)
@@ -263,26 +317,37 @@ class RobotModel:
             scene = scene_of(self.problem, *np.zeros((3, 1, 3)))
             return np.repeat(scene.lanes, n, axis=1)
         if len(scene) not in {1, n}:
-            raise UsageError(f"must have one sample or {n}, got {len(scene)}", argument="scene")
+            raise UsageError(
+                f"must have one sample or {n}, got {len(scene)}", argument="scene"
+            )
         return scene.lanes if len(scene) == n else np.repeat(scene.lanes, n, axis=1)
 
     def _states(self, name: str, values: ArrayLike) -> Array:
         """Return states as kernels take them, shape (n, N)."""
         array, n = np.atleast_2d(numbers(name, values)), len(self.joint_names)
         if array.ndim != 2 or array.shape[1] != n or not len(array):
-            raise UsageError(f"must have shape (N, {n}) or ({n},), got {np.shape(values)}", argument=name)
+            raise UsageError(
+                f"must have shape (N, {n}) or ({n},), got {np.shape(values)}",
+                argument=name,
+            )
         if not np.isfinite(array).all():
             raise UsageError("must be finite", argument=name)
         return np.ascontiguousarray(array.T)
 
-    def _motion(self, q: ArrayLike, dq: ArrayLike | None, ddq: ArrayLike | None) -> tuple[Array, Array, Array]:
+    def _motion(
+        self, q: ArrayLike, dq: ArrayLike | None, ddq: ArrayLike | None
+    ) -> tuple[Array, Array, Array]:
         states = self._states("q", q)
         rates = [
-            np.zeros_like(states) if x is None else self._states(name, x) for name, x in (("dq", dq), ("ddq", ddq))
+            np.zeros_like(states) if x is None else self._states(name, x)
+            for name, x in (("dq", dq), ("ddq", ddq))
         ]
         for name, rate in zip(("dq", "ddq"), rates, strict=True):
             if rate.shape != states.shape:
-                raise UsageError(f"must have as many rows as q, {states.shape[1]}, got {rate.shape[1]}", argument=name)
+                raise UsageError(
+                    f"must have as many rows as q, {states.shape[1]}, got {rate.shape[1]}",
+                    argument=name,
+                )
         return states, rates[0], rates[1]
 
     def _run(self, builder: str, *arguments: Array) -> list[Array]:
@@ -297,7 +362,9 @@ class RobotModel:
         empty = [np.zeros(0)]
         lower = np.concatenate([condition.lower for _, condition in pairs] or empty)
         upper = np.concatenate([condition.upper for _, condition in pairs] or empty)
-        tolerance = np.concatenate([constraint.allowed(condition) for constraint, condition in pairs] or empty)
+        tolerance = np.concatenate(
+            [constraint.allowed(condition) for constraint, condition in pairs] or empty
+        )
         return names, lower, upper, tolerance
 
 
@@ -310,10 +377,21 @@ def tip_pose(robot: Robot) -> Any:
 
     q_sx, q = symbols("q", robot.n)
     kin = forward_kinematics(robot.chain, q)
-    angular = [axis if turns else [0.0, 0.0, 0.0] for axis, turns in zip(kin.axes, kin.revolute, strict=True)]
-    jacobian = [column[row] for columns in (kin.jacobian, angular) for row in range(3) for column in columns]
+    angular = [
+        axis if turns else [0.0, 0.0, 0.0]
+        for axis, turns in zip(kin.axes, kin.revolute, strict=True)
+    ]
+    jacobian = [
+        column[row]
+        for columns in (kin.jacobian, angular)
+        for row in range(3)
+        for column in columns
+    ]
     rotation = [value for row in kin.rotation for value in row]
-    outputs = [ca.densify(ca.vertcat(*map(ca.SX, values))) for values in (kin.tip, rotation, jacobian)]
+    outputs = [
+        ca.densify(ca.vertcat(*map(ca.SX, values)))
+        for values in (kin.tip, rotation, jacobian)
+    ]
     return ca.Function("tip_pose", [q_sx], ca.cse(outputs))
 
 
@@ -326,7 +404,11 @@ def inverse_dynamics_of(robot: Robot) -> Any:
 
     pairs = [symbols(name, robot.n) for name in ("q", "dq", "ddq")]
     torque = inverse_dynamics(robot.chain, *(values for _, values in pairs))
-    return ca.Function("inverse_dynamics_of", [sx for sx, _ in pairs], [ca.cse(ca.densify(ca.vertcat(*torque)))])
+    return ca.Function(
+        "inverse_dynamics_of",
+        [sx for sx, _ in pairs],
+        [ca.cse(ca.densify(ca.vertcat(*torque)))],
+    )
 
 
 def constraint_values_of(robot: Robot, problem: Problem) -> Any:
@@ -336,20 +418,33 @@ def constraint_values_of(robot: Robot, problem: Problem) -> Any:
     from cnpgen.problems.conditions import symbolic_needs
 
     state, pairs = _symbolic_conditions(robot, problem)
-    inputs = [ca.vertcat(*values) for values in (state.q, state.dq, state.ddq, state.obstacle_poses)]
+    inputs = [
+        ca.vertcat(*values)
+        for values in (state.q, state.dq, state.ddq, state.obstacle_poses)
+    ]
     g = ca.vertcat(*(value for _, condition in pairs for value in condition.g))
     jacobians = [ca.vec(ca.densify(ca.jacobian(g, x))) for x in inputs[:3]]
-    still = [symbolic_needs(condition, *inputs[1:3]) == 0 for _, condition in pairs for _ in condition.g]
+    still = [
+        symbolic_needs(condition, *inputs[1:3]) == 0
+        for _, condition in pairs
+        for _ in condition.g
+    ]
     positions = g * ca.DM([float(flag) for flag in still])
-    drift = ca.densify(ca.jtimes(ca.jtimes(positions, inputs[0], inputs[1]), inputs[0], inputs[1]))
+    drift = ca.densify(
+        ca.jtimes(ca.jtimes(positions, inputs[0], inputs[1]), inputs[0], inputs[1])
+    )
     outputs = ca.cse(state.unfrozen([ca.densify(g), *jacobians, drift]))
     return ca.Function("constraint_values_of", inputs, outputs)
 
 
-def _symbolic_conditions(robot: Robot, problem: Problem) -> tuple[FrozenState, list[tuple[Constraint, Condition]]]:
+def _symbolic_conditions(
+    robot: Robot, problem: Problem
+) -> tuple[FrozenState, list[tuple[Constraint, Condition]]]:
     from cnpgen.kernels.symbolic.symbolic_state import FrozenState
 
-    _, state = FrozenState.of_symbols(robot, problem.obstacle, problem.object_size, problem.scene_width)
+    _, state = FrozenState.of_symbols(
+        robot, problem.obstacle, problem.object_size, problem.scene_width
+    )
     pairs = [
         (constraint, condition)
         for constraint in problem.constraint

@@ -26,28 +26,47 @@ from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
 
-NEARLY_VALID = 30.0  # tolerances; attempts with larger violations are left for joint-space paths
+NEARLY_VALID = (
+    30.0  # tolerances; attempts with larger violations are left for joint-space paths
+)
 MAX_PENETRATION_M = 0.02  # of links in a plan that hull levels continue from
 MIN_END_PENETRATION_M = 1e-5  # of an end: smaller ones may be rounding errors
-MAX_LINE_PENETRATION_M = 0.05  # of the initial line, above which joint-space paths come first
+MAX_LINE_PENETRATION_M = (
+    0.05  # of the initial line, above which joint-space paths come first
+)
 
 
-def make_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> Iterator[Attempt]:
-    """Yield attempts at a task with an input plan of variables x, or None; they stay near its path if they must."""
+def make_attempts(
+    refiner: Refiner, task: RefinementTask, x: Array | None
+) -> Iterator[Attempt]:
+    """Yield attempts at a task with an input plan of variables x, or None.
+
+    They stay near its path if they must.
+    """
     task = replace(task, stay_within=None) if x is None else task
     for attempt in _all_attempts(refiner, task, x):
         if task.is_near(attempt.path, refiner.spec.degree):
             yield attempt
 
 
-def _all_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> Iterator[Attempt]:
+def _all_attempts(
+    refiner: Refiner, task: RefinementTask, x: Array | None
+) -> Iterator[Attempt]:
     if refiner.settings.max_iterations == 0:
-        guess, outcome = (refiner.line_guess(task), Outcome.SOLVED) if x is None else (x, Outcome.ADJUSTED)
+        guess, outcome = (
+            (refiner.line_guess(task), Outcome.SOLVED)
+            if x is None
+            else (x, Outcome.ADJUSTED)
+        )
         yield refiner.measured(task, guess, outcome, unlimited=True)
         return
     if x is not None and refiner.coarser is not None:
         yield from _with_fewer_control_points(refiner, refiner.coarser, task, x)
-    adjusted = refiner.measured(task, x, Outcome.ADJUSTED) if x is not None and task.at_rest else None
+    adjusted = (
+        refiner.measured(task, x, Outcome.ADJUSTED)
+        if x is not None and task.at_rest
+        else None
+    )
     searches_trees = refiner.measures_hulls and task.deadline is None
     if searches_trees and x is None and _is_deep(refiner, task):
         best = refiner.measured(task, refiner.line_guess(task), Outcome.NOT_CONVERGED)
@@ -55,13 +74,17 @@ def _all_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> It
     else:
         limit = NEARLY_VALID if searches_trees else np.inf
         best = yield from run_levels(refiner, task, x, adjusted, max_violation=limit)
-    if task.stay_within is not None or refiner.check.ends_are_invalid(task):  # the other guesses are other paths
+    if task.stay_within is not None or refiner.check.ends_are_invalid(
+        task
+    ):  # the other guesses are other paths
         return
     if searches_trees:
         if ends_penetrate(refiner, task):
             return
         best = yield from _best_of(along_tree_paths(refiner, task, best), best)
-    others = _from_other_guesses(refiner, task, x if adjusted is None else adjusted.variables, best)
+    others = _from_other_guesses(
+        refiner, task, x if adjusted is None else adjusted.variables, best
+    )
     best = yield from _best_of(others, best)
     even_line = refiner.even_line_guess(task)
     # all attempts so far may depend on the input plan or on the rising rate
@@ -73,10 +96,14 @@ def _all_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> It
     if has_clearance_constraints(refiner.problem, refiner.robot):
         yield from around_obstacles(refiner, task, best)
     elif task.at_rest:
-        yield from (along_path(refiner, task, guess) for guess in path_guesses(refiner, task))
+        yield from (
+            along_path(refiner, task, guess) for guess in path_guesses(refiner, task)
+        )
 
 
-def _best_of(attempts: Iterator[Attempt], best: Attempt) -> Generator[Attempt, None, Attempt]:
+def _best_of(
+    attempts: Iterator[Attempt], best: Attempt
+) -> Generator[Attempt, None, Attempt]:
     """Yield attempts; return the best of them and ``best``."""
     for attempt in attempts:
         yield attempt
@@ -87,17 +114,30 @@ def _best_of(attempts: Iterator[Attempt], best: Attempt) -> Generator[Attempt, N
 # Levels from one initial guess
 
 
-def _with_fewer_control_points(refiner: Refiner, coarser: Refiner, task: RefinementTask, x: Array) -> Iterator[Attempt]:
+def _with_fewer_control_points(
+    refiner: Refiner, coarser: Refiner, task: RefinementTask, x: Array
+) -> Iterator[Attempt]:
     """Yield the attempts of the levels with the problem's own control points, written with all of the plan's.
 
-    With three times as many control points a step takes ten times as long, for objectives that are 0.3 % lower.
+    With three times as many control points a step takes ten times as long, for
+    objectives that are 0.3 % lower.
     """
-    if coarser.spec.path_control_points < task.boundary.min_control_points(coarser.spec.degree):
+    if coarser.spec.path_control_points < task.boundary.min_control_points(
+        coarser.spec.degree
+    ):
         return
-    own, fewer, degree = refiner.check.transcription(task), coarser.check.transcription(task), refiner.spec.degree
+    own, fewer, degree = (
+        refiner.check.transcription(task),
+        coarser.check.transcription(task),
+        refiner.spec.degree,
+    )
     path, rate = own.unpack(x)
-    fitted = with_fewer_knots(Motion(path[None], rate[None], degree), task.boundary, coarser.spec)
-    guess = coarser.input_variables(replace(task, path=fitted.path[0], rate=fitted.rate[0]))
+    fitted = with_fewer_knots(
+        Motion(path[None], rate[None], degree), task.boundary, coarser.spec
+    )
+    guess = coarser.input_variables(
+        replace(task, path=fitted.path[0], rate=fitted.rate[0])
+    )
     for attempt in () if guess is None else run_levels(coarser, task, guess, None):
         motion = Motion(attempt.path[None], attempt.rate[None], degree)
         finer = with_finer_knots(motion, refiner.spec)
@@ -105,7 +145,9 @@ def _with_fewer_control_points(refiner: Refiner, coarser: Refiner, task: Refinem
         path, rate = own.unpack(variables)
         yield replace(attempt, x=variables, path=path, rate=rate)
     if task.deadline is not None:
-        task.deadline.max_duration *= (own.nx / fewer.nx) ** 2  # estimate for steps with all control points
+        task.deadline.max_duration *= (
+            own.nx / fewer.nx
+        ) ** 2  # estimate for steps with all control points
 
 
 def run_levels(
@@ -119,18 +161,25 @@ def run_levels(
 ) -> Generator[Attempt, None, Attempt]:
     """Yield the attempts of the coarse, fine and strict levels; return the best one.
 
-    For motions from rest to rest ``adjusted`` is the input plan with exact ends, scaled in time, which replaces x.
-    ``line`` is the initial guess without a plan, or with a plan of large violation; the straight line by default. The
-    finer levels are left out if the violation of the coarse level is above ``max_violation``, in tolerances.
+    For motions from rest to rest ``adjusted`` is the input plan with exact ends, scaled
+    in time, which replaces x. ``line`` is the initial guess without a plan, or with a
+    plan of large violation; the straight line by default. The finer levels are left out
+    if the violation of the coarse level is above ``max_violation``, in tolerances.
     """
-    coarse = run_coarse_level(refiner, task, x if adjusted is None else adjusted.variables, line)
+    coarse = run_coarse_level(
+        refiner, task, x if adjusted is None else adjusted.variables, line
+    )
     outcome = Outcome.SOLVED if coarse.converged else Outcome.NOT_CONVERGED
     feasible = coarse.violation <= refiner.settings.violation_tolerance
     if feasible:
         cost = coarse.cost - refiner.check.transcription(task).regularization(coarse.x)
         # most of these are valid, so that their violation is not needed
-        yield refiner.attempt(task, coarse.x, cost, outcome, iterations=coarse.iterations, violation=0.0)
-    best = refiner.measured(task, coarse.x, outcome, 0 if feasible else coarse.iterations)
+        yield refiner.attempt(
+            task, coarse.x, cost, outcome, iterations=coarse.iterations, violation=0.0
+        )
+    best = refiner.measured(
+        task, coarse.x, outcome, 0 if feasible else coarse.iterations
+    )
     best = refiner.continue_scaled(task, best)
     if not feasible or best.x is not coarse.x:
         yield best
@@ -138,27 +187,39 @@ def run_levels(
         return best
     fine = refiner.solve(task, refiner.levels.fine, best.variables, Outcome.SOLVED_FINE)
     yield fine
-    if adjusted is not None and adjusted.outcome is Outcome.TIME_SCALED and adjusted.violation <= 1:
+    if (
+        adjusted is not None
+        and adjusted.outcome is Outcome.TIME_SCALED
+        and adjusted.violation <= 1
+    ):
         yield adjusted
     best = fine if fine.is_better(best) else best
-    strict = refiner.solve(task, refiner.levels.strict, best.variables, Outcome.SOLVED_FINE)
+    strict = refiner.solve(
+        task, refiner.levels.strict, best.variables, Outcome.SOLVED_FINE
+    )
     yield strict
     return strict if strict.is_better(best) else best
 
 
-def run_coarse_level(refiner: Refiner, task: RefinementTask, x: Array | None, line: Array | None) -> Result:
+def run_coarse_level(
+    refiner: Refiner, task: RefinementTask, x: Array | None, line: Array | None
+) -> Result:
     """Run the coarse level from variables x, or from a line if there are none or their violation is too large."""
     if x is not None:
         result = refiner.run_level(task, refiner.levels.warm, x)
         if result.violation < MAX_INITIAL_VIOLATION:
             return result
-    return refiner.run_level(task, refiner.levels.coarse, refiner.line_guess(task) if line is None else line)
+    return refiner.run_level(
+        task, refiner.levels.coarse, refiner.line_guess(task) if line is None else line
+    )
 
 
 # Other initial guesses
 
 
-def _from_other_guesses(refiner: Refiner, task: RefinementTask, x: Array | None, best: Attempt) -> Iterator[Attempt]:
+def _from_other_guesses(
+    refiner: Refiner, task: RefinementTask, x: Array | None, best: Attempt
+) -> Iterator[Attempt]:
     """Yield attempts from the input plan with more iterations, from other guesses, and from the best attempt."""
     for guess in [*([] if x is None else [x]), *refiner.other_guesses(task)]:
         other = refiner.solve(task, refiner.levels.restart, guess, Outcome.RESTARTED)
@@ -173,9 +234,16 @@ def _from_other_guesses(refiner: Refiner, task: RefinementTask, x: Array | None,
 def _restart(
     refiner: Refiner, task: RefinementTask, x: Array | None, line: Array, best: Attempt
 ) -> Generator[Attempt, None, Attempt]:
-    """Yield the attempts of all levels from another initial guess; return the best of these and ``best``."""
+    """Yield the attempts of all levels from another initial guess.
+
+    Return the best of these and ``best``.
+    """
     attempts = run_levels(refiner, task, x, None, line)
-    return (yield from _best_of((replace(attempt, outcome=Outcome.RESTARTED) for attempt in attempts), best))
+    return (
+        yield from _best_of(
+            (replace(attempt, outcome=Outcome.RESTARTED) for attempt in attempts), best
+        )
+    )
 
 
 # Obstacles
@@ -185,7 +253,9 @@ def _is_deep(refiner: Refiner, task: RefinementTask) -> bool:
     """Return whether the initial line is so deep in an obstacle that paths around it are tried first."""
     motion = refiner.transcription(task, refiner.levels.coarse)
     positions = motion.positions(refiner.line_guess(task))
-    return refiner.hulls.violation(positions, task.scene.poses[0]) > MAX_LINE_PENETRATION_M
+    return (
+        refiner.hulls.violation(positions, task.scene.poses[0]) > MAX_LINE_PENETRATION_M
+    )
 
 
 def ends_penetrate(refiner: Refiner, task: RefinementTask) -> bool:
@@ -193,19 +263,28 @@ def ends_penetrate(refiner: Refiner, task: RefinementTask) -> bool:
     return refiner.penetration(task, task.ends) > MIN_END_PENETRATION_M
 
 
-def along_tree_paths(refiner: Refiner, task: RefinementTask, best: Attempt) -> Iterator[Attempt]:
-    """Yield attempts along paths of compiled trees; without a path only ``best``, as one without."""
+def along_tree_paths(
+    refiner: Refiner, task: RefinementTask, best: Attempt
+) -> Iterator[Attempt]:
+    """Yield attempts along paths of compiled trees.
+
+    Without a path only ``best``, as one without.
+    """
     found_path = False
     for guess in path_guesses(refiner, task):
         found_path, attempt = True, along_path(refiner, task, guess)
         yield attempt
         if attempt.violation <= MAX_JUDGED_VIOLATION:
-            yield refiner.solve(task, refiner.levels.strict, attempt.variables, Outcome.RESTARTED)
+            yield refiner.solve(
+                task, refiner.levels.strict, attempt.variables, Outcome.RESTARTED
+            )
     if not found_path:
         yield replace(best, outcome=Outcome.NO_PATH, iterations=0)
 
 
-def around_obstacles(refiner: Refiner, task: RefinementTask, best: Attempt) -> Iterator[Attempt]:
+def around_obstacles(
+    refiner: Refiner, task: RefinementTask, best: Attempt
+) -> Iterator[Attempt]:
     """Yield attempts on hulls in place of capsules, from the best attempt and along joint-space paths.
 
     The best attempt comes first if its links hardly penetrate anything.
@@ -213,23 +292,37 @@ def around_obstacles(refiner: Refiner, task: RefinementTask, best: Attempt) -> I
     if ends_penetrate(refiner, task):
         return
     positions = refiner.check.transcription(task).positions(best.variables)
-    best_first = refiner.hulls.violation(positions, task.scene.poses[0]) < MAX_PENETRATION_M
+    best_first = (
+        refiner.hulls.violation(positions, task.scene.poses[0]) < MAX_PENETRATION_M
+    )
     if best_first:
         yield from _on_hulls(refiner, task, best)
     for guess in path_guesses(refiner, task):
         attempt = along_path(refiner, task, guess)
         yield attempt
-        yield from _on_hulls(refiner, task, attempt if attempt.violation <= 1 else guess)
+        yield from _on_hulls(
+            refiner, task, attempt if attempt.violation <= 1 else guess
+        )
     if not best_first:
         yield from _on_hulls(refiner, task, best)
 
 
-def _on_hulls(refiner: Refiner, task: RefinementTask, guess: Attempt) -> Iterator[Attempt]:
+def _on_hulls(
+    refiner: Refiner, task: RefinementTask, guess: Attempt
+) -> Iterator[Attempt]:
     """Yield attempts on hulls in place of capsules: on the coarse and on the strict level."""
-    coarse = refiner.solve(task, refiner.levels.warm, guess.variables, Outcome.RESTARTED, refiner.hulls)
+    coarse = refiner.solve(
+        task, refiner.levels.warm, guess.variables, Outcome.RESTARTED, refiner.hulls
+    )
     yield coarse
     if coarse.violation <= 1:
-        yield refiner.solve(task, refiner.levels.strict, coarse.variables, Outcome.RESTARTED, refiner.hulls)
+        yield refiner.solve(
+            task,
+            refiner.levels.strict,
+            coarse.variables,
+            Outcome.RESTARTED,
+            refiner.hulls,
+        )
 
 
 def path_guesses(refiner: Refiner, task: RefinementTask) -> Iterator[Attempt]:
@@ -238,7 +331,12 @@ def path_guesses(refiner: Refiner, task: RefinementTask) -> Iterator[Attempt]:
     if refiner.measures_hulls:
         paths = TreeSearch(task, space, refiner.hulls, refiner.manifold(task)).paths()
     else:
-        paths = find_paths(task.boundary.start_q[0], task.boundary.goal_q[0], refiner.robot, space.follow)
+        paths = find_paths(
+            task.boundary.start_q[0],
+            task.boundary.goal_q[0],
+            refiner.robot,
+            space.follow,
+        )
     for states in paths:
         guess = refiner.path_guess(task, states)
         yield refiner.measured(task, guess, Outcome.RESTARTED, unlimited=True)
@@ -247,8 +345,13 @@ def path_guesses(refiner: Refiner, task: RefinementTask) -> Iterator[Attempt]:
 def along_path(refiner: Refiner, task: RefinementTask, guess: Attempt) -> Attempt:
     """Optimize a motion along a joint-space path: with a high penalty of violations first, then as usual."""
     best = refiner.solve(task, refiner.levels.path, guess.variables, Outcome.RESTARTED)
-    same_level = refiner.levels.path is refiner.levels.warm and best.outcome is not Outcome.TIME_SCALED
+    same_level = (
+        refiner.levels.path is refiner.levels.warm
+        and best.outcome is not Outcome.TIME_SCALED
+    )
     if best.violation <= 1 and not same_level:
-        again = refiner.solve(task, refiner.levels.warm, best.variables, Outcome.RESTARTED)
+        again = refiner.solve(
+            task, refiner.levels.warm, best.variables, Outcome.RESTARTED
+        )
         best = refiner.continue_scaled(task, again if again.is_better(best) else best)
     return replace(best, outcome=Outcome.RESTARTED)

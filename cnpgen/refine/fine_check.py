@@ -9,7 +9,11 @@ from numpy.typing import NDArray
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.bounds import NO_TIGHTENING, bounds_template
 from cnpgen.refine.solver.grid import make_grid
-from cnpgen.refine.solver.transcription import ResidualKernels, Transcription, cache_last
+from cnpgen.refine.solver.transcription import (
+    ResidualKernels,
+    Transcription,
+    cache_last,
+)
 from cnpgen.refine.task import RefinementTask
 from cnpgen.world.world import World
 
@@ -17,9 +21,13 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 FINE_POINTS = 600
 PENETRATION_SCALE_M = 1e-4  # of violated distances without a tolerance of their own
-MAX_SCALINGS = 6  # of one motion, each by the factor that its largest violation requires
+MAX_SCALINGS = (
+    6  # of one motion, each by the factor that its largest violation requires
+)
 MIN_RESIDUAL_TOLERANCE = 1e-12  # of scaled residuals: below rounding errors
-MIN_END_VIOLATION = 1.5  # tolerances: the bounds near an end differ slightly from those at it
+MIN_END_VIOLATION = (
+    1.5  # tolerances: the bounds near an end differ slightly from those at it
+)
 MAX_SCALING = 1.25  # a motion that must be slower by more is left to the solver, which finds a better one
 
 
@@ -29,16 +37,17 @@ class GridViolation:
 
     worst: float  # largest violation as a multiple of its tolerance; inf where a residual is not finite
     position: bool  # whether a condition on q alone violates its tolerance
-    # Factor of the duration, at least 1, that removes the worst violations of velocity, acceleration, torque and jerk.
-    # These scale with the rate, its square and its cube.
+    # Factor of the duration, at least 1, that removes the worst violations of velocity,
+    # acceleration, torque and jerk. These scale with the rate, its square and its cube.
     time_scale: float
 
 
 class FineCheck:
     """Evaluation of motions of one problem on the fine grid.
 
-    ``poses`` returns the scene values of a task that the kernels take. ``penetration`` returns by how much distances
-    that the kernels do not compute are violated above their tolerance at states (n, K) [m].
+    ``poses`` returns the scene values of a task that the kernels take. ``penetration``
+    returns by how much distances that the kernels do not compute are violated above
+    their tolerance at states (n, K) [m].
     """
 
     def __init__(
@@ -53,17 +62,27 @@ class FineCheck:
         self._penetration = penetration
         self._grid = make_grid(kernels.spec, FINE_POINTS, problem.path_orders)
         self.transcription = cache_last(
-            lambda task: Transcription(kernels, self._grid, boundary=task.boundary, obstacle_poses=poses(task))
+            lambda task: Transcription(
+                kernels, self._grid, boundary=task.boundary, obstacle_poses=poses(task)
+            )
         )
         self._bounds = bounds_template(problem, world, self._grid.s, NO_TIGHTENING)
         conditions = self._bounds.conditions
-        self.equalities = {condition.name for condition in conditions if condition.is_equality}
+        self.equalities = {
+            condition.name for condition in conditions if condition.is_equality
+        }
         limits = np.repeat(
             [condition.tolerance_kind == "limit" for condition in conditions],
             [len(condition.g) for condition in conditions],
         )
-        self._speeds = np.flatnonzero((self._bounds.orders == 1) & ~limits)  # bounded speeds other than those of joints
-        self._powers = _powers_of_rate(problem, world, kernels)[self._speeds] if len(self._speeds) else np.empty(0)
+        self._speeds = np.flatnonzero(
+            (self._bounds.orders == 1) & ~limits
+        )  # bounded speeds other than those of joints
+        self._powers = (
+            _powers_of_rate(problem, world, kernels)[self._speeds]
+            if len(self._speeds)
+            else np.empty(0)
+        )
 
     def measure(self, task: RefinementTask, x: Array) -> tuple[float, GridViolation]:
         """Return the objective [s] and the largest violation of a motion with variables x, shape (nx,)."""
@@ -71,19 +90,31 @@ class FineCheck:
         cost, g = motion.measured(x)
         bounds = self._bounds.bounds_for(task.start_xyz)
         with np.errstate(invalid="ignore"):
-            ratio = bounds.violations(g) / np.maximum(self._bounds.tolerances, MIN_RESIDUAL_TOLERANCE)
+            ratio = bounds.violations(g) / np.maximum(
+                self._bounds.tolerances, MIN_RESIDUAL_TOLERANCE
+            )
         worst = float(ratio.max())
         if not np.isfinite(worst):
             return cost, GridViolation(np.inf, True, np.inf)
-        excess = -1.0 if self._penetration is None else self._penetration(task, motion.positions(x))
+        excess = (
+            -1.0
+            if self._penetration is None
+            else self._penetration(task, motion.positions(x))
+        )
         collision = 1.0 + excess / PENETRATION_SCALE_M if excess > 0 else 0.0
         if max(worst, collision) <= 1:
             return cost, GridViolation(worst, False, 1.0)
         violated = ratio > 1
         with np.errstate(divide="ignore", invalid="ignore"):
-            size = np.where(violated, g / np.where(g > bounds.upper, bounds.upper, bounds.lower), 0.0).max(axis=0)
+            size = np.where(
+                violated,
+                g / np.where(g > bounds.upper, bounds.upper, bounds.lower),
+                0.0,
+            ).max(axis=0)
             size[self._speeds] **= 1 / self._powers
-        speed, strength, jerk = (size[self._bounds.orders == order].max(initial=1.0) for order in (1, 2, 3))
+        speed, strength, jerk = (
+            size[self._bounds.orders == order].max(initial=1.0) for order in (1, 2, 3)
+        )
         time_scale = max(speed, float(np.sqrt(strength)), float(np.cbrt(jerk)))
         position = collision > 1 or bool(violated[:, self._bounds.orders == 0].any())
         return cost, GridViolation(max(worst, collision), position, time_scale)
@@ -91,21 +122,37 @@ class FineCheck:
     def rest_bounds(self, task: RefinementTask) -> tuple[Array, Array, Mask, Mask]:
         """Return bounds of a robot at rest halfway along the motion, relaxed by tolerances except for clearances.
 
-        The result is ``(lower, upper, capsules, equal)``, see ``cnpgen.refine.rrt_connect.RestSpace``.
+        The result is ``(lower, upper, capsules, equal)``, see
+        ``cnpgen.refine.rrt_connect.RestSpace``.
         """
-        bounds, half, capsules = self._bounds.bounds_for(task.start_xyz), FINE_POINTS // 2, self._bounds.capsules
-        tolerances = np.where(capsules | self._bounds.held_clearances, 0.0, self._bounds.tolerances)
+        bounds, half, capsules = (
+            self._bounds.bounds_for(task.start_xyz),
+            FINE_POINTS // 2,
+            self._bounds.capsules,
+        )
+        tolerances = np.where(
+            capsules | self._bounds.held_clearances, 0.0, self._bounds.tolerances
+        )
         equal = self._bounds.equal & (self._bounds.orders == 0)
-        return bounds.lower[half] - tolerances, bounds.upper[half] + tolerances, capsules, equal
+        return (
+            bounds.lower[half] - tolerances,
+            bounds.upper[half] + tolerances,
+            capsules,
+            equal,
+        )
 
     def speed_ratio(self, task: RefinementTask, x: Array) -> float:
         """Return the factor by which a motion exceeds bounds of speeds other than those of joints, at least 1.
 
-        Initial guesses respect the velocity limits of the joints only, not those of the tip or of a plug-in.
+        Initial guesses respect the velocity limits of the joints only, not those of the
+        tip or of a plug-in.
         """
         if not len(self._speeds):
             return 1.0
-        g, upper = self.transcription(task).measured(x)[1], self._bounds.bounds_for(task.start_xyz).upper
+        g, upper = (
+            self.transcription(task).measured(x)[1],
+            self._bounds.bounds_for(task.start_xyz).upper,
+        )
         with np.errstate(divide="ignore", invalid="ignore"):
             over = np.nanmax(g[:, self._speeds] / upper[:, self._speeds], axis=0)
         return max(float(np.max(np.maximum(over, 0.0) ** (1 / self._powers))), 1.0)
@@ -116,28 +163,46 @@ class FineCheck:
 
     def end_equality_error(self, task: RefinementTask) -> float:
         """Return the largest error of the boundary conditions in an equality, as a multiple of its tolerance."""
-        return float(np.fmax.reduce(self._end_violations(task)[:, self._bounds.equal], axis=None, initial=0.0))
+        return float(
+            np.fmax.reduce(
+                self._end_violations(task)[:, self._bounds.equal],
+                axis=None,
+                initial=0.0,
+            )
+        )
 
     def _end_violations(self, task: RefinementTask) -> Array:
-        bounds, motion = self._bounds.bounds_for(task.start_xyz), self.transcription(task)
+        bounds, motion = (
+            self._bounds.bounds_for(task.start_xyz),
+            self.transcription(task),
+        )
         violations = bounds.end_violations(motion.end_residuals())
-        return np.asarray(violations / np.maximum(self._bounds.tolerances, MIN_RESIDUAL_TOLERANCE))
+        return np.asarray(
+            violations / np.maximum(self._bounds.tolerances, MIN_RESIDUAL_TOLERANCE)
+        )
 
     def scale_time(
         self, task: RefinementTask, x: Array, *, unlimited: bool = False
     ) -> tuple[Array, float, GridViolation]:
         """Scale a motion from rest to rest uniformly in time until it meets its limits.
 
-        The path is unchanged; the rate is divided by one factor. This does not reduce violations of positions or of
-        torques that gravity causes. Motions with such violations are scaled only if ``unlimited``. The result is
-        ``(variables, objective, violation)`` of the scaled motion, or of the last one tried.
+        The path is unchanged; the rate is divided by one factor. This does not reduce
+        violations of positions or of torques that gravity causes. Motions with such
+        violations are scaled only if ``unlimited``. The result is ``(variables,
+        objective, violation)`` of the scaled motion, or of the last one tried.
         """
         total, split = 1.0, self.transcription(task).split
         cost, violation = self.measure(task, x)
         for _ in range(MAX_SCALINGS):
-            if violation.worst <= 1 or violation.time_scale <= 1 or not np.isfinite(violation.time_scale):
+            if (
+                violation.worst <= 1
+                or violation.time_scale <= 1
+                or not np.isfinite(violation.time_scale)
+            ):
                 break
-            if not unlimited and (violation.position or total * violation.time_scale > MAX_SCALING):
+            if not unlimited and (
+                violation.position or total * violation.time_scale > MAX_SCALING
+            ):
                 break
             total *= violation.time_scale * (1 + 1e-9)
             x = x.copy()
@@ -153,7 +218,9 @@ def _powers_of_rate(problem: Problem, world: World, kernels: ResidualKernels) ->
     w[: 2 * n] = random.uniform(0.1, 1.0, (2 * n, 1))
     w[orders * n] = 1.0, 2.0
     scene = np.zeros((problem.scene_width, 2))
-    scene[problem.scene_width - len(problem.parameters) :] = world.robot.nominal_parameters[:, None]
+    scene[problem.scene_width - len(problem.parameters) :] = (
+        world.robot.nominal_parameters[:, None]
+    )
     (g,) = kernels.values(w, scene)
     with np.errstate(divide="ignore", invalid="ignore"):
         powers = np.log2(g[:, 1] / g[:, 0]).round()

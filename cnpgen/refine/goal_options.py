@@ -1,8 +1,9 @@
 """Tasks with several goal states: the fastest valid motion to any of them.
 
-The rows of a task have the same ``sample_id``, and the column ``goal_option`` numbers its goal states, the nearest
-first. No motion is faster than the straight line at the velocity limits. Goal states that cannot improve on the best
-motion so far are therefore not tried.
+The rows of a task have the same ``sample_id``, and the column ``goal_option`` numbers
+its goal states, the nearest first. No motion is faster than the straight line at the
+velocity limits. Goal states that cannot improve on the best motion so far are therefore
+not tried.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ from cnpgen.refine.refinement import Refinement
 from cnpgen.refine.task import Attempt
 
 Array = NDArray[np.float64]
-Progress = Callable[[int, int], None]  # called with plans finished and valid since the last call
+Progress = Callable[
+    [int, int], None
+]  # called with plans finished and valid since the last call
 
 
 def refine_goal_options(
@@ -38,22 +41,36 @@ def refine_goal_options(
 ) -> Refinement:
     """Refine plans to several goal states of each task; return the refinement of the best row of each, in their order.
 
-    The arguments are those of ``refine_plans``, which ``refine`` calls. Later rounds have files beside the journal.
-    ``begin`` is called with the number of tasks, and tasks count as finished after their first goal state.
+    The arguments are those of ``refine_plans``, which ``refine`` calls. Later rounds
+    have files beside the journal. ``begin`` is called with the number of tasks, and
+    tasks count as finished after their first goal state.
     """
     _check_tasks(plans)
     tasks = list(dict.fromkeys(plans.sample_id.tolist()))
     rounds, results = list[Refinement](), list[Attempt]()  # of all rounds
-    chosen, lowest, files = dict[int, int](), dict[int, float](), list[Path]()  # by task: index of a result, its cost
+    chosen, lowest, files = (
+        dict[int, int](),
+        dict[int, float](),
+        list[Path](),
+    )  # by task: index of a result, its cost
     if begin is not None:
         begin(len(tasks), 0)
     for round_number, rows in enumerate(_rounds(plans, min_durations(plans), lowest)):
-        file = Path(f"{journal}.{round_number}" if round_number else f"{journal}") if journal is not None else None
+        file = (
+            Path(f"{journal}.{round_number}" if round_number else f"{journal}")
+            if journal is not None
+            else None
+        )
         files += [] if file is None or not round_number else [file]
         refinement = refine(plans[rows], journal=file)
         rounds.append(refinement)
-        for task, result in zip(refinement.plans.sample_id.tolist(), refinement.results, strict=True):
-            first, improves = task not in chosen, result.valid and result.cost < lowest.get(task, np.inf)
+        for task, result in zip(
+            refinement.plans.sample_id.tolist(), refinement.results, strict=True
+        ):
+            first, improves = (
+                task not in chosen,
+                result.valid and result.cost < lowest.get(task, np.inf),
+            )
             if progress is not None and (first or improves):
                 progress(int(first), int(improves and task not in lowest))
             if first or improves:
@@ -66,7 +83,9 @@ def refine_goal_options(
     rows = np.array([chosen[task] for task in tasks])
     return replace(
         rounds[0],
-        input_plans=concatenate([refinement.input_plans for refinement in rounds])[rows],
+        input_plans=concatenate([refinement.input_plans for refinement in rounds])[
+            rows
+        ],
         plans=concatenate([refinement.plans for refinement in rounds])[rows],
         results=tuple(results[row] for row in rows),
         times=sum((refinement.times for refinement in rounds), NO_TIME),
@@ -75,7 +94,11 @@ def refine_goal_options(
 
 def _check_tasks(plans: Plans) -> None:
     """Raise UsageError if rows of different tasks have one number, for example after joining two files of tasks."""
-    rows = zip(plans.sample_id.tolist(), np.asarray(plans.columns[GOAL_OPTION]).tolist(), strict=True)
+    rows = zip(
+        plans.sample_id.tolist(),
+        np.asarray(plans.columns[GOAL_OPTION]).tolist(),
+        strict=True,
+    )
     starts: dict[int, Array] = {}
     seen = set[tuple[int, float]]()
     for row, key in enumerate(rows):
@@ -95,15 +118,23 @@ def min_durations(plans: Plans) -> Array:
     if velocity is None:
         return np.zeros(len(plans))
     distance = np.abs(plans.boundary.goal_q - plans.boundary.start_q)
-    return np.asarray((distance / (robot.velocity_limit * (1 + velocity.tolerance))).max(axis=1))
+    return np.asarray(
+        (distance / (robot.velocity_limit * (1 + velocity.tolerance))).max(axis=1)
+    )
 
 
-def _rounds(plans: Plans, min_duration: Array, lowest: dict[int, float]) -> Iterator[NDArray[np.int64]]:
+def _rounds(
+    plans: Plans, min_duration: Array, lowest: dict[int, float]
+) -> Iterator[NDArray[np.int64]]:
     """Yield the rows of each round: the next goal state of every task that it may improve."""
     options = np.asarray(plans.columns[GOAL_OPTION])
     for option in np.unique(options):
         rows = np.flatnonzero(options == option)
-        bound = np.array([lowest.get(int(task), np.inf) for task in plans.sample_id[rows]])
-        waiting = rows[(min_duration[rows] < bound) | np.isinf(bound)]  # also goals that are not finite
+        bound = np.array(
+            [lowest.get(int(task), np.inf) for task in plans.sample_id[rows]]
+        )
+        waiting = rows[
+            (min_duration[rows] < bound) | np.isinf(bound)
+        ]  # also goals that are not finite
         if len(waiting):
             yield waiting

@@ -6,13 +6,28 @@ from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.bounds import Tightening
 from cnpgen.refine.solver.sqp import Settings
 
-EARLY_EDGE, LATE_EDGE = 0.012, 0.05  # phases of full tightening; contacts at the ends need the later one
+EARLY_EDGE, LATE_EDGE = (
+    0.012,
+    0.05,
+)  # phases of full tightening; contacts at the ends need the later one
 WARM_RADIUS = 0.1  # initial trust radius from a nearly valid plan
 WARM_VIOLATION_BOUND = 1.0  # from a nearly valid plan; it saves steps there, but some other guesses fail with it
-WARM_SELECTION_DISTANCES = ((0.09, 1.0), (0.04, 0.3), (-1.0, 0.1))  # the first steps from a plan speed it up as a whole
-PATH_VIOLATION_BOUND, PATH_PENALTY = 0.03, 1000.0  # from a motion along a valid joint-space path
-MAX_INITIAL_VIOLATION = 100.0  # in scaled units; with larger ones a straight line is a better initial guess
-COLD_COST_TOLERANCE, CLUTTERED_COST_TOLERANCE = 0.1, 0.05  # factors without a plan, where small steps still lead far
+WARM_SELECTION_DISTANCES = (
+    (0.09, 1.0),
+    (0.04, 0.3),
+    (-1.0, 0.1),
+)  # the first steps from a plan speed it up as a whole
+PATH_VIOLATION_BOUND, PATH_PENALTY = (
+    0.03,
+    1000.0,
+)  # from a motion along a valid joint-space path
+MAX_INITIAL_VIOLATION = (
+    100.0  # in scaled units; with larger ones a straight line is a better initial guess
+)
+COLD_COST_TOLERANCE, CLUTTERED_COST_TOLERANCE = (
+    0.1,
+    0.05,
+)  # factors without a plan, where small steps still lead far
 
 
 @dataclass(frozen=True)
@@ -31,17 +46,24 @@ class GridLevels:
     warm: GridLevel  # coarse level from an input plan
     coarse: GridLevel  # coarse level from a straight line
     fine: GridLevel  # finer grid, from the result of a coarse level
-    strict: GridLevel  # finer grid with tighter bounds, for plans that the verdict rejects
+    strict: (
+        GridLevel  # finer grid with tighter bounds, for plans that the verdict rejects
+    )
     restart: GridLevel  # level for other initial guesses
     path: GridLevel  # level for motions along a valid joint-space path: violations weigh more than any duration
 
 
 def default_grid_levels(problem: Problem, settings: Settings) -> GridLevels:
-    """Return the grid levels of a problem; obstacles need more tightening between grid points."""
+    """Return the grid levels of a problem.
+
+    Obstacles need more tightening between grid points.
+    """
     cluttered = bool(problem.obstacle)
     gentle, edge = (1e-3, LATE_EDGE) if cluttered else (1e-4, EARLY_EDGE)
     usual = Tightening(limit=4e-3, gentle=gentle, clearance=1e-3, band=0.088, edge=edge)
-    strict = Tightening(limit=8e-3, gentle=2e-3, clearance=3e-3, band=0.05, edge=LATE_EDGE)
+    strict = Tightening(
+        limit=8e-3, gentle=2e-3, clearance=3e-3, band=0.05, edge=LATE_EDGE
+    )
     late = replace(usual, edge=strict.edge)
     close = replace(settings, radius=WARM_RADIUS)
     short = replace(close, max_iterations=settings.max_iterations // 2)
@@ -54,7 +76,12 @@ def default_grid_levels(problem: Problem, settings: Settings) -> GridLevels:
         violation_bound=WARM_VIOLATION_BOUND,
         max_initial_violation=MAX_INITIAL_VIOLATION,
     )
-    path = replace(longer, radius=WARM_RADIUS, violation_bound=PATH_VIOLATION_BOUND, penalty=PATH_PENALTY)
+    path = replace(
+        longer,
+        radius=WARM_RADIUS,
+        violation_bound=PATH_VIOLATION_BOUND,
+        penalty=PATH_PENALTY,
+    )
     return GridLevels(
         warm=GridLevel(128, usual, warm),
         coarse=GridLevel(128, usual, cold),

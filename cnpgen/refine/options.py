@@ -16,16 +16,22 @@ MAX_STAY_WITHIN = 1.0  # rad or m
 class RefineOptions:
     """Options of ``refine_plans`` and ``solve_plans``.
 
-    Attributes:
-        objective: "time": the problem's own objective; or the time with other terms, such as "effort",
-            "effort=0.5" or "effort=1, jerk=0.1" (``cnpgen.problems.objectives.read_objective``).
-        weight: Weight of these terms, or of the problem's centrifugal acceleration; by default as they are defined.
-        max_iterations: Largest number of iterations on the coarse level; 0 only scales plans in time.
-        tolerance: Relative change of the objective at which it has converged; further steps restore feasibility.
-            Without an input plan a tenth of it applies, among obstacles a twentieth.
-        deadline: Largest time per plan [s], or None. With a deadline results depend on the machine and its load.
-        stay_within: Largest difference of every joint from the input path at the same phase [rad or m], or None. Input
-            plans that the refiner cannot use as initial guesses have no such bound.
+    Attributes: objective: "time": the problem's own objective; or the time with other
+        terms, such as "effort",
+            "effort=0.5" or "effort=1, jerk=0.1"
+            (``cnpgen.problems.objectives.read_objective``).
+        weight: Weight of these terms, or of the problem's centrifugal acceleration; by
+            default as they are defined.
+        max_iterations: Largest number of iterations on the coarse level; 0 only scales
+            plans in time.
+        tolerance: Relative change of the objective at which it has converged; further
+            steps restore feasibility. Without an input plan a tenth of it applies,
+            among obstacles a twentieth.
+        deadline: Largest time per plan [s], or None. With a deadline results depend on
+            the machine and its load.
+        stay_within: Largest difference of every joint from the input path at the same
+            phase [rad or m], or None. Input plans that the refiner cannot use as
+            initial guesses have no such bound.
 
     Raises:
         UsageError: A value is invalid.
@@ -42,20 +48,36 @@ class RefineOptions:
         check_fields(self)
         read_objective(self.objective)
         if self.weight is not None and number("weight", self.weight) < 0:
-            raise UsageError(f"must not be negative, got {self.weight}", argument="weight")
+            raise UsageError(
+                f"must not be negative, got {self.weight}", argument="weight"
+            )
         integer("max_iterations", self.max_iterations, least=0)
         if not 0 < number("tolerance", self.tolerance) < 1:
-            raise UsageError(f"must be above 0 and below 1, got {self.tolerance}", argument="tolerance")
+            raise UsageError(
+                f"must be above 0 and below 1, got {self.tolerance}",
+                argument="tolerance",
+            )
         if self.deadline is not None and number("deadline", self.deadline) <= 0:
-            raise UsageError(f"must be above 0 s, got {self.deadline}", argument="deadline")
-        if self.stay_within is not None and number("stay_within", self.stay_within) <= 0:
-            raise UsageError(f"must be above 0, got {self.stay_within}", argument="stay_within")
+            raise UsageError(
+                f"must be above 0 s, got {self.deadline}", argument="deadline"
+            )
+        if (
+            self.stay_within is not None
+            and number("stay_within", self.stay_within) <= 0
+        ):
+            raise UsageError(
+                f"must be above 0, got {self.stay_within}", argument="stay_within"
+            )
         check_range("stay_within", self.stay_within or 0.0, 0.0, MAX_STAY_WITHIN, "rad")
 
     def document(self) -> dict[str, Any]:
         """Return the options for JSON, without a deadline or a distance of None."""
         optional = {"deadline", "stay_within"}
-        return {name: value for name, value in asdict(self).items() if name not in optional or value is not None}
+        return {
+            name: value
+            for name, value in asdict(self).items()
+            if name not in optional or value is not None
+        }
 
 
 DEFAULT_OPTIONS = RefineOptions()

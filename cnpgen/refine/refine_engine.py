@@ -32,19 +32,27 @@ Solver = Callable[..., tuple[Motion, NDArray[np.bool_]]]  # of ``load_solver``
 def refine_serially(plans: Plans, options: RefineOptions) -> list[Attempt]:
     """Refine plans one by one; results do not depend on the other plans or their order.
 
-    Where control points are not finite or rates not positive, the input plan is not used.
+    Where control points are not finite or rates not positive, the input plan is not
+    used.
     """
     refiner = prepare(plans, options)
     checker = _checker(plans.problem, plans.degree, get_ident())
     tasks = [replace(task, stay_within=options.stay_within) for task in tasks_of(plans)]
     if options.deadline is not None:
-        return [refine_task_until(refiner, checker, task, options.deadline) for task in tasks]
+        return [
+            refine_task_until(refiner, checker, task, options.deadline)
+            for task in tasks
+        ]
     return [refine_task(refiner, checker, task) for task in tasks]
 
 
 def prepare(plans: Plans, options: RefineOptions) -> Refiner:
     """Return the refiner for plans; kernels that are not in the cache are compiled."""
-    return _refiner(plans.problem, plans.motion.spec, replace(options, deadline=None, stay_within=None))
+    return _refiner(
+        plans.problem,
+        plans.motion.spec,
+        replace(options, deadline=None, stay_within=None),
+    )
 
 
 def tasks_of(plans: Plans) -> list[RefinementTask]:
@@ -56,35 +64,58 @@ def tasks_of(plans: Plans) -> list[RefinementTask]:
 def load_solver(problem: Problem, robot: Robot, kernels: KernelLibrary) -> Solver:
     """Load a function that plans rows of a dataset with the problem's own objective, in one thread.
 
-    Returns:
-        A function of the columns of N rows, shape (N, width) each, among them ``obstacle_poses`` of scenes, and of N
-        motions as initial guesses, or None. It returns N motions and the mask of those that the verdict accepts, (N,).
+    Returns: A function of the columns of N rows, shape (N, width) each, among them
+        ``obstacle_poses`` of scenes, and of N motions as initial guesses, or None. It
+        returns N motions and the mask of those that the verdict accepts, (N,).
     """
     refiner = Refiner(problem, robot, kernels=kernels)
-    checker, spec = PlanChecker(problem, robot, degree=refiner.spec.degree), refiner.spec
+    checker, spec = (
+        PlanChecker(problem, robot, degree=refiner.spec.degree),
+        refiner.spec,
+    )
 
-    def solve(columns: Mapping[str, Array], initial_guess: Motion | None = None) -> tuple[Motion, NDArray[np.bool_]]:
+    def solve(
+        columns: Mapping[str, Array], initial_guess: Motion | None = None
+    ) -> tuple[Motion, NDArray[np.bool_]]:
         ends = columns["start_xyz"], columns["goal_xyz"]
         boundary = Boundary.from_batch(columns, None)
         velocity = goal_velocities(problem, robot, boundary.goal_q, boundary.goal_dq)
         poses = columns.get(OBSTACLE_POSES)
-        scene = scene_of(problem, *ends, velocity, boundary.parameters, obstacle_poses=poses)
+        scene = scene_of(
+            problem, *ends, velocity, boundary.parameters, obstacle_poses=poses
+        )
         tasks = _tasks(boundary, scene, *ends, initial_guess)
         results = [refine_task(refiner, checker, task) for task in tasks]
-        path = np.array([result.path for result in results]).reshape(-1, spec.path_control_points, robot.n)
-        rate = np.array([result.rate for result in results]).reshape(-1, spec.rate_control_points)
-        return Motion(path, rate, spec.degree), np.array([result.valid for result in results], bool)
+        path = np.array([result.path for result in results]).reshape(
+            -1, spec.path_control_points, robot.n
+        )
+        rate = np.array([result.rate for result in results]).reshape(
+            -1, spec.rate_control_points
+        )
+        return Motion(path, rate, spec.degree), np.array(
+            [result.valid for result in results], bool
+        )
 
     return solve
 
 
 def _tasks(
-    boundary: Boundary, scene: Scene, start_xyz: Array, goal_xyz: Array, plan: Motion | None
+    boundary: Boundary,
+    scene: Scene,
+    start_xyz: Array,
+    goal_xyz: Array,
+    plan: Motion | None,
 ) -> list[RefinementTask]:
-    tasks = [RefinementTask(boundary[i : i + 1], scene[i], start_xyz[i], goal_xyz[i]) for i in range(len(boundary))]
+    tasks = [
+        RefinementTask(boundary[i : i + 1], scene[i], start_xyz[i], goal_xyz[i])
+        for i in range(len(boundary))
+    ]
     if plan is None:
         return tasks
-    return [replace(task, path=plan.path[i], rate=plan.rate[i]) for i, task in enumerate(tasks)]
+    return [
+        replace(task, path=plan.path[i], rate=plan.rate[i])
+        for i, task in enumerate(tasks)
+    ]
 
 
 @lru_cache(maxsize=8)
@@ -94,7 +125,13 @@ def _checker(record: ProblemRecord, degree: int, _thread: int) -> PlanChecker:
 
 
 @lru_cache(maxsize=8)
-def _refiner(record: ProblemRecord, spec: TrajectorySpec, options: RefineOptions) -> Refiner:
+def _refiner(
+    record: ProblemRecord, spec: TrajectorySpec, options: RefineOptions
+) -> Refiner:
     problem, robot = open_problem(record)
-    coarser = _refiner(record, problem.trajectory, options) if is_finer(spec, problem.trajectory) else None
+    coarser = (
+        _refiner(record, problem.trajectory, options)
+        if is_finer(spec, problem.trajectory)
+        else None
+    )
     return Refiner(problem, robot, spec=spec, options=options, coarser=coarser)

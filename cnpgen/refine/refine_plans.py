@@ -29,7 +29,9 @@ from cnpgen.refine.task import Attempt
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.scene_table import OBSTACLE_POSES
 
-MAX_SERIAL_PLANS = 60  # up to which the start of a second process takes longer than the plans
+MAX_SERIAL_PLANS = (
+    60  # up to which the start of a second process takes longer than the plans
+)
 PLANS_PER_TASK = 4  # of one of several processes: the transfer of a task takes a twentieth of a plan's time
 
 
@@ -48,20 +50,30 @@ def solve_plans(
 ) -> Refinement:
     """Plan boundary problems without initial guesses; existing plans are ignored.
 
-    Problems with the column ``goal_option`` are goal states of tasks: rows with the same ``sample_id`` belong to one
-    task, and the result has the best valid motion to any of its goal states, one row for each task.
+    Problems with the column ``goal_option`` are goal states of tasks: rows with the
+    same ``sample_id`` belong to one task, and the result has the best valid motion to
+    any of its goal states, one row for each task.
 
-    ``problems`` come from ``draw_boundary_problems`` or ``load_boundary_problems``. The other arguments, and the
-    errors, are those of ``refine_plans``.
+    ``problems`` come from ``draw_boundary_problems`` or ``load_boundary_problems``. The
+    other arguments, and the errors, are those of ``refine_plans``.
     """
     without_plans = replace(
         problems,
         path_control_points=np.full_like(problems.path_control_points, np.nan),
         rate_control_points=np.full_like(problems.rate_control_points, np.nan),
     )
-    run = partial(refine_plans, options=options, workers=workers, engine=engine, address=address, discard=discard)
+    run = partial(
+        refine_plans,
+        options=options,
+        workers=workers,
+        engine=engine,
+        address=address,
+        discard=discard,
+    )
     if GOAL_OPTION in problems.columns and len(problems):
-        return refine_goal_options(without_plans, run, journal=journal, begin=begin, progress=progress)
+        return refine_goal_options(
+            without_plans, run, journal=journal, begin=begin, progress=progress
+        )
     return run(without_plans, journal=journal, begin=begin, progress=progress)
 
 
@@ -80,29 +92,35 @@ def refine_plans(
 ) -> Refinement:
     """Refine plans, or plan where their control points are nan.
 
-    Results do not depend on the other plans or the number of processes. The result is never worse than the input: it
-    replaces the input only if the independent verdict finds a smaller violation, or none and a lower cost.
+    Results do not depend on the other plans or the number of processes. The result is
+    never worse than the input: it replaces the input only if the independent verdict
+    finds a smaller violation, or none and a lower cost.
 
-    Args:
-        plans: The plans.
-        options: Options of the refiner.
-        workers: Number of processes; default one per available core, or one for few plans.
-        engine: "loky": processes of this machine; "dask" or "ray": a cluster. By default loky, or the backend that
+    Args: plans: The plans. options: Options of the refiner. workers: Number of
+        processes; default one per available core, or one for few plans. engine: "loky":
+        processes of this machine; "dask" or "ray": a cluster. By default loky, or the
+        backend that
             ``joblib.parallel_config`` names.
-        address: Address of the cluster's scheduler or head; by default a cluster on this machine, for this call.
+        address: Address of the cluster's scheduler or head; by default a cluster on
+            this machine, for this call.
         journal: File for finished plans, from which an interrupted run resumes.
         discard: Whether to discard finished plans of another run in the journal.
-        begin: Function that is called once with the number of plans and of those in the journal.
-        progress: Function that is called with the numbers of plans finished and valid since the last call.
+        begin: Function that is called once with the number of plans and of those in the
+            journal.
+        progress: Function that is called with the numbers of plans finished and valid
+            since the last call.
 
-    Raises:
-        UsageError: An option is invalid, there is less than one worker, or the journal is another run's.
-        RecipeError: The problem needs a plug-in that is not installed.
-        MachineError: A worker died, or the journal cannot be written.
+    Raises: UsageError: An option is invalid, there is less than one worker, or the
+        journal is another run's. RecipeError: The problem needs a plug-in that is not
+        installed. MachineError: A worker died, or the journal cannot be written.
     """
     watch, where = Stopwatch(), Engine(engine, address, workers)
     plans = correct_tips(plans)
-    file = None if journal is None else open_journal(Path(journal), _identity(plans, options), discard=discard)
+    file = (
+        None
+        if journal is None
+        else open_journal(Path(journal), _identity(plans, options), discard=discard)
+    )
     finished: dict[int, Attempt] = {} if file is None else dict(file.finished)
     if begin is not None:
         begin(len(plans), len(finished))
@@ -137,12 +155,20 @@ def _run(
         if journal is None
         else f": {journal.path} has the finished plans; the same call with the same arguments resumes"
     )
-    with assembled(engine, -(-len(waiting) // PLANS_PER_TASK), quick=len(waiting) <= MAX_SERIAL_PLANS) as pool:
+    with assembled(
+        engine,
+        -(-len(waiting) // PLANS_PER_TASK),
+        quick=len(waiting) <= MAX_SERIAL_PLANS,
+    ) as pool:
         count = pool.size
         size = PLANS_PER_TASK if count > 1 else 1
-        parts = (waiting[first : first + size] for first in range(0, len(waiting), size))
+        parts = (
+            waiting[first : first + size] for first in range(0, len(waiting), size)
+        )
         tasks = ((part, plans[np.array(part)]) for part in parts)
-        with closing(pool.distribute(partial(_refine, options=options), tasks, hint=hint)) as results:
+        with closing(
+            pool.distribute(partial(_refine, options=options), tasks, hint=hint)
+        ) as results:
             for part, attempts, seconds in results:
                 watch.computing += seconds / count
                 if journal is not None:
@@ -150,14 +176,21 @@ def _run(
                 yield dict(zip(part, attempts, strict=True))
 
 
-def _refine(task: tuple[list[int], Plans], *, options: RefineOptions) -> tuple[list[int], list[Attempt], float]:
-    """Refine some of the plans; return their indices, the results and the CPU time [s]."""
+def _refine(
+    task: tuple[list[int], Plans], *, options: RefineOptions
+) -> tuple[list[int], list[Attempt], float]:
+    """Refine some of the plans.
+
+    Return their indices, the results and the CPU time [s].
+    """
     (part, plans), begun = task, time.thread_time()
     with one_thread():
         return part, refine_serially(plans, options), time.thread_time() - begun
 
 
-def _refinement(plans: Plans, results: list[Attempt], options: RefineOptions) -> Refinement:
+def _refinement(
+    plans: Plans, results: list[Attempt], options: RefineOptions
+) -> Refinement:
     """Return the refined plans with the columns of their results."""
     if not results:
         return Refinement(plans, plans, ())
@@ -168,7 +201,9 @@ def _refinement(plans: Plans, results: list[Attempt], options: RefineOptions) ->
         columns={
             **plans.columns,
             "refine_outcome": np.array([result.outcome for result in results], float),
-            "refine_iterations": np.array([result.iterations for result in results], float),
+            "refine_iterations": np.array(
+                [result.iterations for result in results], float
+            ),
             "refine_objective": np.array([result.cost for result in results], float),
         },
         refined_with=json.dumps({"cnpgen": __version__, **options.document()}),
@@ -178,17 +213,37 @@ def _refinement(plans: Plans, results: list[Attempt], options: RefineOptions) ->
     status = np.full(len(plans), PlanStatus.VALID, np.uint8)
     if invalid.any():
         screened = screen(refined[invalid])
-        status[invalid] = np.where(screened == PlanStatus.UNKNOWN, PlanStatus.INVALID, screened)
+        status[invalid] = np.where(
+            screened == PlanStatus.UNKNOWN, PlanStatus.INVALID, screened
+        )
     return Refinement(plans, replace(refined, status=status), tuple(results))
 
 
 def _identity(plans: Plans, options: RefineOptions) -> str:
     """Return the JSON text that identifies a run: version, options and a checksum of the plans."""
     digest = hashlib.sha256(plans.problem.recipe.encode() + plans.problem.urdf.encode())
-    boundary = [values for values in vars(plans.boundary).values() if values is not None]
-    ends = [plans.columns[name] for name in ("start_xyz", "goal_xyz", OBSTACLE_POSES) if name in plans.columns]
-    for values in (*boundary, *ends, plans.path_control_points, plans.rate_control_points):
-        digest.update(str(values.shape).encode() + np.ascontiguousarray(values).tobytes())
+    boundary = [
+        values for values in vars(plans.boundary).values() if values is not None
+    ]
+    ends = [
+        plans.columns[name]
+        for name in ("start_xyz", "goal_xyz", OBSTACLE_POSES)
+        if name in plans.columns
+    ]
+    for values in (
+        *boundary,
+        *ends,
+        plans.path_control_points,
+        plans.rate_control_points,
+    ):
+        digest.update(
+            str(values.shape).encode() + np.ascontiguousarray(values).tobytes()
+        )
     return json.dumps(
-        {"version": __version__, "options": options.document(), "degree": plans.degree, "plans": digest.hexdigest()}
+        {
+            "version": __version__,
+            "options": options.document(),
+            "degree": plans.degree,
+            "plans": digest.hexdigest(),
+        }
     )

@@ -24,11 +24,10 @@ REFINEMENT_VERSION = 1
 class Refinement:
     """Result of refining N plans.
 
-    Attributes:
-        input_plans: Input plans, with the tip positions of their boundary conditions.
-        plans: Refined plans, in the same order.
-        results: Best attempt at every plan with its verdict, outcome, iterations and cost.
-        times: Times of the run; plans from a journal took none.
+    Attributes: input_plans: Input plans, with the tip positions of their boundary
+        conditions. plans: Refined plans, in the same order. results: Best attempt at
+        every plan with its verdict, outcome, iterations and cost. times: Times of the
+        run; plans from a journal took none.
     """
 
     input_plans: Plans
@@ -51,8 +50,15 @@ class Refinement:
     def deviation(self) -> NDArray[np.float64]:
         """Largest difference of a joint from the input path at the same phase [rad], nan without one, shape (N,)."""
         s = np.linspace(0, 1, DISTANCE_PHASES)
-        pairs = zip(self.plans.path_control_points, self.input_plans.path_control_points, strict=True)
-        paths = [basis(s, len(path), self.plans.degree) @ (path - before) for path, before in pairs]
+        pairs = zip(
+            self.plans.path_control_points,
+            self.input_plans.path_control_points,
+            strict=True,
+        )
+        paths = [
+            basis(s, len(path), self.plans.degree) @ (path - before)
+            for path, before in pairs
+        ]
         return np.array([np.abs(path).max() for path in paths])
 
     def summary(self) -> dict[str, Any]:
@@ -65,8 +71,12 @@ class Refinement:
             "checksum": self.input_plans.checksum,
             "plans": len(self.results),
             "valid": int(self.valid.sum()),
-            "outcomes": _counted(result.outcome.name.lower() for result in self.results),
-            "reasons": _counted(str(result.reason) for result in self.results if not result.valid),
+            "outcomes": _counted(
+                result.outcome.name.lower() for result in self.results
+            ),
+            "reasons": _counted(
+                str(result.reason) for result in self.results if not result.valid
+            ),
             "mean_duration_s": float(durations.mean()) if len(durations) else None,
             "median_iterations": float(np.median(iterations)) if iterations else None,
             "seconds": self.times.rounded(),
@@ -77,7 +87,9 @@ class Refinement:
                     "reason": str(result.reason),
                     "outcome": result.outcome.text,
                 }
-                for index, (sample, result) in enumerate(zip(self.plans.sample_id, self.results, strict=True))
+                for index, (sample, result) in enumerate(
+                    zip(self.plans.sample_id, self.results, strict=True)
+                )
                 if not result.valid
             ],
         }

@@ -17,7 +17,8 @@ from cnpgen.store.files.documents import differences, parse_json
 from cnpgen.store.files.journal import JournalFile, open_journal_file
 
 JOURNAL_MAGIC = b"cnpgen journal 1\n"
-# Errors of NumPy and Python for a record with a valid checksum that cnpgen has not written.
+# Errors of NumPy and Python for a record with a valid checksum that cnpgen has not
+# written.
 _RECORD_ERRORS = (
     ValueError, KeyError, TypeError, IndexError, EOFError, AttributeError, RuntimeError, MemoryError, OverflowError,
     zipfile.BadZipFile,
@@ -26,10 +27,15 @@ _RECORD_ERRORS = (
 
 @dataclass
 class Journal:
-    """Finished plans of a run in an append-only file; the first record identifies the run."""
+    """Finished plans of a run in an append-only file.
+
+    The first record identifies the run.
+    """
 
     path: Path  # path of the file
-    finished: dict[int, Attempt]  # results of earlier runs, index of the plan -> judged attempt
+    finished: dict[
+        int, Attempt
+    ]  # results of earlier runs, index of the plan -> judged attempt
     _file: JournalFile
 
     def append(self, indices: Sequence[int], results: Sequence[Attempt]) -> None:
@@ -48,7 +54,8 @@ class Journal:
 def open_journal(path: Path, identity: str, *, discard: bool = False) -> Journal:
     """Open the journal of a run with the results of earlier runs of the same identity; create it if it is missing.
 
-    The identity is a JSON text: plans, options, version. Finished plans of another run are lost only if ``discard``.
+    The identity is a JSON text: plans, options, version. Finished plans of another run
+    are lost only if ``discard``.
 
     Raises:
         UsageError: The file is no journal, holds another run's plans, or is in use.
@@ -58,7 +65,8 @@ def open_journal(path: Path, identity: str, *, discard: bool = False) -> Journal
         file = open_journal_file(path, JOURNAL_MAGIC)
     except DatasetError as error:
         raise UsageError(
-            f"{path} is not a journal of cnpgen: remove it, or choose another output", concerns="journal"
+            f"{path} is not a journal of cnpgen: remove it, or choose another output",
+            concerns="journal",
         ) from error
     try:
         return _resume(path, file, identity, discard=discard)
@@ -74,7 +82,10 @@ def _resume(path: Path, file: JournalFile, identity: str, *, discard: bool) -> J
         try:
             journal.finished |= _unpack(record)
         except _RECORD_ERRORS as error:
-            raise UsageError(f"{path} is not a journal that cnpgen has written: {error}", concerns="journal") from error
+            raise UsageError(
+                f"{path} is not a journal that cnpgen has written: {error}",
+                concerns="journal",
+            ) from error
     if file.records and file.records[0] == identity.encode():
         return journal
     if journal.finished and not discard:
@@ -91,12 +102,20 @@ def _resume(path: Path, file: JournalFile, identity: str, *, discard: bool) -> J
 
 
 def _changed(old: bytes, new: str) -> list[str]:
-    """List the differences of two runs, with short values; those of plans are checksums."""
+    """List the differences of two runs, with short values.
+
+    Those of plans are checksums.
+    """
     try:
         changed = differences(parse_json(old.decode()), json.loads(new))
     except ValueError:
         return ["another version"]
-    return [f"{item.key} {item.old}, now {item.new}" if item.is_short else f"other {item.key}" for item in changed]
+    return [
+        f"{item.key} {item.old}, now {item.new}"
+        if item.is_short
+        else f"other {item.key}"
+        for item in changed
+    ]
 
 
 def _pack(indices: Sequence[int], results: Sequence[Attempt]) -> bytes:
@@ -106,7 +125,8 @@ def _pack(indices: Sequence[int], results: Sequence[Attempt]) -> bytes:
         "cost": np.array([result.cost for result in results]),
     }
     numbers = [
-        [int(index), int(result.outcome), result.iterations] for index, result in zip(indices, results, strict=True)
+        [int(index), int(result.outcome), result.iterations]
+        for index, result in zip(indices, results, strict=True)
     ]
     words = json.dumps([numbers, [str(result.reason) for result in results]]).encode()
     buffer = io.BytesIO()
@@ -116,8 +136,13 @@ def _pack(indices: Sequence[int], results: Sequence[Attempt]) -> bytes:
 
 def _unpack(record: bytes) -> dict[int, Attempt]:
     with np.load(io.BytesIO(record), allow_pickle=False) as arrays:
-        if any(member.compress_type != zipfile.ZIP_STORED for member in arrays.zip.infolist()):
-            raise ValueError("its arrays are compressed")  # a few bytes could expand to gigabytes
+        if any(
+            member.compress_type != zipfile.ZIP_STORED
+            for member in arrays.zip.infolist()
+        ):
+            raise ValueError(
+                "its arrays are compressed"
+            )  # a few bytes could expand to gigabytes
         numbers, reasons = parse_json(arrays["words"].tobytes().decode())
         path, rate, cost = (arrays[name] for name in ("path", "rate", "cost"))
     return {

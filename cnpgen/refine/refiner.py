@@ -1,4 +1,7 @@
-"""Solver runs, fine checks and initial guesses of the refiner for one problem; ``strategy`` decides their order."""
+"""Solver runs, fine checks and initial guesses of the refiner for one problem.
+
+``strategy`` decides their order.
+"""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -18,7 +21,12 @@ from cnpgen.refine.fine_check import FineCheck
 from cnpgen.refine.grid_levels import GridLevel, GridLevels, default_grid_levels
 from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
 from cnpgen.refine.rrt_connect import RestSpace
-from cnpgen.refine.solver.bounds import Bounds, accepted_along, bounds_template, near_ends
+from cnpgen.refine.solver.bounds import (
+    Bounds,
+    accepted_along,
+    bounds_template,
+    near_ends,
+)
 from cnpgen.refine.solver.compiled_backend import load_step_library
 from cnpgen.refine.solver.grid import make_grid
 from cnpgen.refine.solver.hull_levels import (
@@ -37,7 +45,11 @@ from cnpgen.refine.solver.residuals import (
     stage_values,
 )
 from cnpgen.refine.solver.sqp import Result, Settings, minimize
-from cnpgen.refine.solver.transcription import ResidualKernels, Transcription, cache_last
+from cnpgen.refine.solver.transcription import (
+    ResidualKernels,
+    Transcription,
+    cache_last,
+)
 from cnpgen.refine.task import Attempt, Outcome, RefinementTask
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import pose_width
@@ -48,7 +60,9 @@ from cnpgen.world.world import World
 Array = NDArray[np.float64]
 MAX_INPUT_DURATION_S = 60.0  # of an input plan that is used as initial guess; slower ones hardly change in a step
 MIN_RATE_FRACTION = 1e-3  # of a plan's largest rate control point
-MAX_END_VIOLATION = 10.0  # of boundary states, in scaled units; DAQP may take hours for larger ones
+MAX_END_VIOLATION = (
+    10.0  # of boundary states, in scaled units; DAQP may take hours for larger ones
+)
 MAX_CONTINUATIONS = 4  # of a motion that was scaled in time; most need one
 MAX_FEEDBACKS = 5  # of collisions between grid points to the solver
 SLOWNESS = 1.6  # times slower than the bounds of speeds require: the solver changes such guesses more easily
@@ -57,9 +71,10 @@ SLOWNESS = 1.6  # times slower than the bounds of speeds require: the solver cha
 class Refiner:
     """Solver of one problem, and the checks and initial guesses for it.
 
-    If it ``measures_hulls``, distances of the links' hulls replace those of capsules in all levels, see
-    ``cnpgen.refine.solver.hull_levels``. By default kernels have the fastest backend of this machine, and control
-    points are those of the problem. ``coarser`` is a refiner with these, for plans with several spans for each of its
+    If it ``measures_hulls``, distances of the links' hulls replace those of capsules in
+    all levels, see ``cnpgen.refine.solver.hull_levels``. By default kernels have the
+    fastest backend of this machine, and control points are those of the problem.
+    ``coarser`` is a refiner with these, for plans with several spans for each of its
     spans.
     """
 
@@ -76,28 +91,45 @@ class Refiner:
     ) -> None:
         self.problem, self.robot, self.coarser = problem, robot, coarser
         self.spec = problem.trajectory if spec is None else spec
-        self.settings = Settings(cost_tolerance=options.tolerance, max_iterations=options.max_iterations)
+        self.settings = Settings(
+            cost_tolerance=options.tolerance, max_iterations=options.max_iterations
+        )
         cost_term = choose_cost_term(problem, options.objective, options.weight)
         if kernels is None:
             kernels = problem_kernels(problem, robot, *choose_backend(None))
-        library, world = load_collision_library(kernels), World(robot, problem.obstacle, problem.object_size)
-        self.measures_hulls = library is not None and can_measure_hulls(problem, robot, world)
+        library, world = (
+            load_collision_library(kernels),
+            World(robot, problem.obstacle, problem.object_size),
+        )
+        self.measures_hulls = library is not None and can_measure_hulls(
+            problem, robot, world
+        )
         self._library, self._hulls, solved = library, dict[int, Hulls](), problem
         if self.measures_hulls:
             solved = without_distances(problem)
-            kernels = problem_kernels(solved, robot, kernels.backend, kernels.cache_folder)
-        self._kernel_poses = slice(pose_width(problem.obstacle) - pose_width(solved.obstacle), None)
+            kernels = problem_kernels(
+                solved, robot, kernels.backend, kernels.cache_folder
+            )
+        self._kernel_poses = slice(
+            pose_width(problem.obstacle) - pose_width(solved.obstacle), None
+        )
         self.residual_kernels = ResidualKernels(
             self.spec,
             kernels.load_by_structure(stage_values),
             kernels.load_by_structure(stage_jacobian),
             cost_term,
-            None if cost_term is None else kernels.load_by_structure(cost_term_residuals, terms=cost_term.tables),
+            None
+            if cost_term is None
+            else kernels.load_by_structure(cost_term_residuals, terms=cost_term.tables),
             () if cost_term is None else residual_counts(robot, cost_term),
             load_step_library(kernels),
         )
-        self.levels = default_grid_levels(problem, self.settings) if levels is None else levels
-        if self.measures_hulls and levels is None:  # trees avoid the hulls, so that their paths are nearly valid
+        self.levels = (
+            default_grid_levels(problem, self.settings) if levels is None else levels
+        )
+        if (
+            self.measures_hulls and levels is None
+        ):  # trees avoid the hulls, so that their paths are nearly valid
             self.levels = replace(self.levels, path=self.levels.warm)
         self._world = world
         self.check = FineCheck(
@@ -108,28 +140,46 @@ class Refiner:
             penetration=self.penetration if self.measures_hulls else None,
         )
         has_manifold = self.measures_hulls and bool(self.check.equalities)
-        self._equalities = kernels.load_by_structure(equality_residuals) if has_manifold else None
-        # by how much the hulls at both ends violate their distances within the tolerance [m], shape (2, m)
-        self.accepted_at_ends = cache_last(lambda task: self.hulls.accepted_at(task.ends, task.scene.poses[0]))
+        self._equalities = (
+            kernels.load_by_structure(equality_residuals) if has_manifold else None
+        )
+        # by how much the hulls at both ends violate their distances within the
+        # tolerance [m], shape (2, m)
+        self.accepted_at_ends = cache_last(
+            lambda task: self.hulls.accepted_at(task.ends, task.scene.poses[0])
+        )
         every, orders = tuple(vars(self.levels).values()), problem.path_orders
-        self._grids = {points: make_grid(self.spec, points, orders) for points in {level.points for level in every}}
+        self._grids = {
+            points: make_grid(self.spec, points, orders)
+            for points in {level.points for level in every}
+        }
         self._feedbacks = dict[int, HullFeedback]()
         self._bounds = {
-            level: bounds_template(solved, world, self._grids[level.points].s, level.tightening) for level in every
+            level: bounds_template(
+                solved, world, self._grids[level.points].s, level.tightening
+            )
+            for level in every
         }
 
     def input_variables(self, task: RefinementTask) -> Array | None:
         """Return the variables of the task's input plan, or None if it is no usable initial guess.
 
-        Rate control points that are not positive are raised, since the variables are logarithms. Plans that take longer
-        than a minute are not used.
+        Rate control points that are not positive are raised, since the variables are
+        logarithms. Plans that take longer than a minute are not used.
         """
         if task.path is None or task.rate is None or not np.isfinite(task.path).all():
             return None
         if not np.isfinite(task.rate).all() or not np.any(task.rate > 0):
             return None
-        motion, rate = self.check.transcription(task), np.maximum(task.rate, MIN_RATE_FRACTION * task.rate.max())
-        return motion.pack(task.path, rate) if motion.duration(rate) < MAX_INPUT_DURATION_S else None
+        motion, rate = (
+            self.check.transcription(task),
+            np.maximum(task.rate, MIN_RATE_FRACTION * task.rate.max()),
+        )
+        return (
+            motion.pack(task.path, rate)
+            if motion.duration(rate) < MAX_INPUT_DURATION_S
+            else None
+        )
 
     def run_level(
         self,
@@ -141,8 +191,9 @@ class Refiner:
     ) -> Result:
         """Run the solver on one level from variables x, shape (nx,); ``hulls`` replace the capsules.
 
-        A refiner that ``measures_hulls`` has no capsules: its hulls are rows of compiled code on all levels. Their
-        required distances then grow by ``extra`` [m], shape (K, columns), for a motion that is nearly valid.
+        A refiner that ``measures_hulls`` has no capsules: its hulls are rows of
+        compiled code on all levels. Their required distances then grow by ``extra``
+        [m], shape (K, columns), for a motion that is nearly valid.
         """
         motion = self.transcription(task, level)
         settings = level.settings if extra is None else self.levels.strict.settings
@@ -152,12 +203,18 @@ class Refiner:
             settings = replace(settings, max_iterations=0)
         hulls = self.hulls if self.measures_hulls else hulls
         if hulls is not None:
-            kind = CompiledHullTranscription if self.measures_hulls else HullTranscription
+            kind = (
+                CompiledHullTranscription if self.measures_hulls else HullTranscription
+            )
             motion = kind(motion, hulls, task.scene.poses[0])
             more: Array | float = 0.0 if extra is None else extra
             if self.measures_hulls:
-                more = more - accepted_along(near_ends(motion.grid.s), self.accepted_at_ends(task))
-            bounds = self._bounds[level].with_hull_distances(bounds, hulls.min_distances, more)
+                more = more - accepted_along(
+                    near_ends(motion.grid.s), self.accepted_at_ends(task)
+                )
+            bounds = self._bounds[level].with_hull_distances(
+                bounds, hulls.min_distances, more
+            )
         return minimize(motion, bounds, x, settings, deadline=task.deadline)
 
     def transcription(self, task: RefinementTask, level: GridLevel) -> Transcription:
@@ -186,9 +243,17 @@ class Refiner:
         return self._bounds[level].near(bounds, reference, task.stay_within)
 
     def solve(
-        self, task: RefinementTask, level: GridLevel, x: Array, outcome: Outcome, hulls: Hulls | None = None
+        self,
+        task: RefinementTask,
+        level: GridLevel,
+        x: Array,
+        outcome: Outcome,
+        hulls: Hulls | None = None,
     ) -> Attempt:
-        """Run one level from variables x; return the result with its violation, scaled in time where that helps."""
+        """Run one level from variables x.
+
+        Return the result with its violation, scaled in time where that helps.
+        """
         result = self.run_level(task, level, x, hulls)
         if self.measures_hulls:
             result = self._separated(task, level, result)
@@ -197,7 +262,8 @@ class Refiner:
     def continue_scaled(self, task: RefinementTask, best: Attempt) -> Attempt:
         """Optimize a motion that was scaled in time again, while it becomes cheaper.
 
-        Uniform time scaling makes the whole motion slower for the violation at a single phase.
+        Uniform time scaling makes the whole motion slower for the violation at a single
+        phase.
         """
         for _ in range(MAX_CONTINUATIONS):
             if best.outcome is not Outcome.TIME_SCALED:
@@ -209,120 +275,218 @@ class Refiner:
         return best
 
     def fed_back(
-        self, task: RefinementTask, attempt: Attempt, phase: float, depth: float, extra: Array | None
+        self,
+        task: RefinementTask,
+        attempt: Attempt,
+        phase: float,
+        depth: float,
+        extra: Array | None,
     ) -> tuple[Attempt, Array] | None:
         """Continue an attempt that the verdict rejected for a collision at a phase with a depth [m].
 
-        Return the result with larger required distances there, and all additional distances [m], shape (K, columns),
-        which include ``extra`` of earlier collisions; None without compiled hulls.
+        Return the result with larger required distances there, and all additional
+        distances [m], shape (K, columns), which include ``extra`` of earlier
+        collisions; None without compiled hulls.
         """
         if not self.measures_hulls:
             return None
         level, path = self.levels.warm, attempt.path
-        more = self._feedback(level).clearance_at(path, self.hulls, task.scene.poses[0], phase=phase, depth=depth)
+        more = self._feedback(level).clearance_at(
+            path, self.hulls, task.scene.poses[0], phase=phase, depth=depth
+        )
         extra = more if extra is None else extra + more
         result = self.run_level(task, level, attempt.variables, extra=extra)
         result = self._separated(task, level, result, extra)
-        return self.measured(task, result.x, Outcome.SOLVED_FINE, result.iterations), extra
+        return self.measured(
+            task, result.x, Outcome.SOLVED_FINE, result.iterations
+        ), extra
 
-    def _separated(self, task: RefinementTask, level: GridLevel, result: Result, extra: Array | None = None) -> Result:
+    def _separated(
+        self,
+        task: RefinementTask,
+        level: GridLevel,
+        result: Result,
+        extra: Array | None = None,
+    ) -> Result:
         """Run a level again with larger required distances where hulls collide between its grid points."""
         feedback, motion = self._feedback(level), self.transcription(task, level)
         accepted = self.accepted_at_ends(task)
         for _ in range(MAX_FEEDBACKS):
             path, _ = motion.unpack(result.x)
-            missing = feedback.missing_clearance(path, self.hulls, task.scene.poses[0], accepted=accepted)
+            missing = feedback.missing_clearance(
+                path, self.hulls, task.scene.poses[0], accepted=accepted
+            )
             if missing is None:
                 break
             extra = missing if extra is None else extra + missing
-            earlier, result = result.iterations, self.run_level(task, level, result.x, extra=extra)
+            earlier, result = (
+                result.iterations,
+                self.run_level(task, level, result.x, extra=extra),
+            )
             result = replace(result, iterations=earlier + result.iterations)
         return result
 
     def _feedback(self, level: GridLevel) -> HullFeedback:
         if level.points not in self._feedbacks:
-            self._feedbacks[level.points] = HullFeedback(self.spec, self._grids[level.points].s)
+            self._feedbacks[level.points] = HullFeedback(
+                self.spec, self._grids[level.points].s
+            )
         return self._feedbacks[level.points]
 
     def measured(
-        self, task: RefinementTask, x: Array, outcome: Outcome, iterations: int = 0, *, unlimited: bool = False
+        self,
+        task: RefinementTask,
+        x: Array,
+        outcome: Outcome,
+        iterations: int = 0,
+        *,
+        unlimited: bool = False,
     ) -> Attempt:
-        """Evaluate a motion on the fine grid; scale it in time if that removes its violations."""
-        cost, violation = self.check.measure(task, x)
-        attempt = self.attempt(task, x, cost, outcome, iterations=iterations, violation=violation.worst)
-        scalable = attempt.violation > 1 and task.at_rest
-        return self.time_scaled(task, attempt, unlimited=unlimited) if scalable else attempt
+        """Evaluate a motion on the fine grid.
 
-    def time_scaled(self, task: RefinementTask, attempt: Attempt, *, unlimited: bool = False) -> Attempt:
+        Scale it in time if that removes its violations.
+        """
+        cost, violation = self.check.measure(task, x)
+        attempt = self.attempt(
+            task, x, cost, outcome, iterations=iterations, violation=violation.worst
+        )
+        scalable = attempt.violation > 1 and task.at_rest
+        return (
+            self.time_scaled(task, attempt, unlimited=unlimited)
+            if scalable
+            else attempt
+        )
+
+    def time_scaled(
+        self, task: RefinementTask, attempt: Attempt, *, unlimited: bool = False
+    ) -> Attempt:
         """Scale an attempt uniformly in time; return the better of both."""
-        x, cost, violation = self.check.scale_time(task, attempt.variables, unlimited=unlimited)
+        x, cost, violation = self.check.scale_time(
+            task, attempt.variables, unlimited=unlimited
+        )
         scaled = self.attempt(
-            task, x, cost, Outcome.TIME_SCALED, iterations=attempt.iterations, violation=violation.worst
+            task,
+            x,
+            cost,
+            Outcome.TIME_SCALED,
+            iterations=attempt.iterations,
+            violation=violation.worst,
         )
         return scaled if scaled.is_better(attempt) else attempt
 
     def attempt(
-        self, task: RefinementTask, x: Array, cost: float, outcome: Outcome, *, iterations: int, violation: float
+        self,
+        task: RefinementTask,
+        x: Array,
+        cost: float,
+        outcome: Outcome,
+        *,
+        iterations: int,
+        violation: float,
     ) -> Attempt:
         """Return the attempt with variables x."""
         path, rate = self.check.transcription(task).unpack(x)
         return Attempt(
-            path=path, rate=rate, cost=cost, outcome=outcome, iterations=iterations, violation=violation, x=x
+            path=path,
+            rate=rate,
+            cost=cost,
+            outcome=outcome,
+            iterations=iterations,
+            violation=violation,
+            x=x,
         )
 
     def line_guess(self, task: RefinementTask) -> Array:
         """Return the variables of the initial guess of the coarse level: along a tip path, or a line."""
         for guess in self.tip_path_guesses(task):
             return guess
-        return self.slow_guess(task, initial_guesses.rising_line(*self._guess_arguments(task)))
+        return self.slow_guess(
+            task, initial_guesses.rising_line(*self._guess_arguments(task))
+        )
 
     def tip_path_guesses(self, task: RefinementTask) -> Iterator[Array]:
         """Yield the variables of motions along the initial tip paths of the problem's constraint."""
         constraint = self.problem.scene_constraint
-        width = self.problem.scene_width - len(self.problem.parameters)  # of all values before the parameters
+        width = self.problem.scene_width - len(
+            self.problem.parameters
+        )  # of all values before the parameters
         values = task.scene.poses[0, pose_width(self.problem.obstacle) : width]
         frame = table_frame_of(self.problem, task.scene.poses[:, width:])
-        start = task.start_xyz if frame is None else frame.to_table(task.start_xyz[None])[0]
-        for polyline in [] if constraint is None else constraint.initial_tip_paths(values, start):
-            path = polyline if frame is None else np.array([frame.to_world(point[None])[0] for point in polyline])
+        start = (
+            task.start_xyz if frame is None else frame.to_table(task.start_xyz[None])[0]
+        )
+        for polyline in (
+            [] if constraint is None else constraint.initial_tip_paths(values, start)
+        ):
+            path = (
+                polyline
+                if frame is None
+                else np.array([frame.to_world(point[None])[0] for point in polyline])
+            )
             ends = task.boundary.start_q[0], task.boundary.goal_q[0]
-            yield self.path_guess(task, initial_guesses.along_tip_path(self._world, *ends, path))
+            yield self.path_guess(
+                task, initial_guesses.along_tip_path(self._world, *ends, path)
+            )
 
     def even_line_guess(self, task: RefinementTask) -> Array:
         """Return the variables of the straight line at constant rate."""
-        return self.slow_guess(task, initial_guesses.straight_line(*self._guess_arguments(task)))
+        return self.slow_guess(
+            task, initial_guesses.straight_line(*self._guess_arguments(task))
+        )
 
     def other_guesses(self, task: RefinementTask) -> list[Array]:
         """Return the variables of the other initial guesses."""
-        arguments, center = self._guess_arguments(task), (self.robot.position_lower + self.robot.position_upper) / 2
+        arguments, center = (
+            self._guess_arguments(task),
+            (self.robot.position_lower + self.robot.position_upper) / 2,
+        )
         guesses = [
             initial_guesses.straight_line(*arguments),
             initial_guesses.line_through(*arguments, configuration=self.robot.home),
             initial_guesses.quintic(*arguments),
             initial_guesses.line_through(*arguments, configuration=center),
         ]
-        return [*self.tip_path_guesses(task), *(self.slow_guess(task, guess) for guess in guesses)]
+        return [
+            *self.tip_path_guesses(task),
+            *(self.slow_guess(task, guess) for guess in guesses),
+        ]
 
     def path_guess(self, task: RefinementTask, states: Array) -> Array:
         """Return the variables of a motion along a joint-space path, shape (K, n)."""
-        return self.slow_guess(task, initial_guesses.fit_to_path(states, *self._guess_arguments(task)))
+        return self.slow_guess(
+            task, initial_guesses.fit_to_path(states, *self._guess_arguments(task))
+        )
 
     def slow_guess(self, task: RefinementTask, guess: tuple[Array, Array]) -> Array:
         """Return the variables of a guess, slower where speeds other than those of joints are bounded.
 
-        From a motion that is many times too fast the solver ends far from the feasible set.
+        From a motion that is many times too fast the solver ends far from the feasible
+        set.
         """
         interior, rate = guess
         x = np.concatenate([interior.ravel(), np.log(rate)])
         factor = self.check.speed_ratio(task, x)
-        return x if factor == 1 else np.concatenate([interior.ravel(), np.log(rate / (SLOWNESS * factor))])
+        return (
+            x
+            if factor == 1
+            else np.concatenate([interior.ravel(), np.log(rate / (SLOWNESS * factor))])
+        )
 
     def rest_space(self, task: RefinementTask) -> RestSpace:
         """Return the valid states at rest, for the search of joint-space paths."""
         poses = self.kernel_poses(task)
-        hulls = self.hulls if has_clearance_constraints(self.problem, self.robot) else None
+        hulls = (
+            self.hulls if has_clearance_constraints(self.problem, self.robot) else None
+        )
         bounds = self.check.rest_bounds(task)
-        return RestSpace(self.residual_kernels, self.robot, *bounds, poses, task.scene.poses[0], hulls)
+        return RestSpace(
+            self.residual_kernels,
+            self.robot,
+            *bounds,
+            poses,
+            task.scene.poses[0],
+            hulls,
+        )
 
     def manifold(self, task: RefinementTask) -> EqualityKernel | None:
         """Return the equalities that compiled trees keep, or None if there are none."""
@@ -332,11 +496,18 @@ class Refiner:
 
     @property
     def hulls(self) -> Hulls:
-        """Clearances of the links' hulls, one object per thread; see ``has_clearance_constraints``."""
+        """Clearances of the links' hulls, one object per thread.
+
+        See ``has_clearance_constraints``.
+        """
         thread = get_ident()
         if thread not in self._hulls:
-            self._hulls[thread] = Hulls(self.problem, self.robot, self._library, with_object=self.measures_hulls)
+            self._hulls[thread] = Hulls(
+                self.problem, self.robot, self._library, with_object=self.measures_hulls
+            )
         return self._hulls[thread]
 
-    def _guess_arguments(self, task: RefinementTask) -> tuple[Boundary, Array, TrajectorySpec]:
+    def _guess_arguments(
+        self, task: RefinementTask
+    ) -> tuple[Boundary, Array, TrajectorySpec]:
         return task.boundary, self.robot.velocity_limit, self.spec

@@ -1,10 +1,12 @@
 """Joint-space paths between two configurations by RRT-Connect (Kuffner and LaValle 2000).
 
-Kernels check many states of an edge at once against capsules; Coal's hulls decide where only a capsule collides. Where
-there are equalities, the states of an edge are first projected onto the manifold by Gauss-Newton steps within the joint
-limits (CBiRRT, Berenson et al. 2009). Where compiled code measures hulls, its trees search instead (``TreeSearch``).
-Random numbers are the same for every task. The refiner adds velocities and accelerations. The tree of
-``benchmark/planners/sst.py`` has states, costs and pruning (SST) and is separate.
+Kernels check many states of an edge at once against capsules; Coal's hulls decide where
+only a capsule collides. Where there are equalities, the states of an edge are first
+projected onto the manifold by Gauss-Newton steps within the joint limits (CBiRRT,
+Berenson et al. 2009). Where compiled code measures hulls, its trees search instead
+(``TreeSearch``). Random numbers are the same for every task. The refiner adds
+velocities and accelerations. The tree of ``benchmark/planners/sst.py`` has states,
+costs and pruning (SST) and is separate.
 """
 
 from collections.abc import Callable, Iterator
@@ -14,18 +16,27 @@ from itertools import count, islice, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.collision.tree_search import EqualityKernel, TreeSettings, estimated_duration, find_tree_path
+from cnpgen.kernels.collision.tree_search import (
+    EqualityKernel,
+    TreeSettings,
+    estimated_duration,
+    find_tree_path,
+)
 from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.refine.solver.transcription import ResidualKernels
 from cnpgen.refine.task import RefinementTask
 from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
-Follow = Callable[[Array], Array]  # states (n, K) of an edge -> the leading valid ones, projected, (n, k)
+Follow = Callable[
+    [Array], Array
+]  # states (n, K) of an edge -> the leading valid ones, projected, (n, k)
 
 STATE_SPACING = 0.04  # rad or m, between checked states
 MAX_STATE_SPACING = 0.12  # rad or m, between projected states of one edge
-MAX_TURN = 2 * np.pi  # rad or m, of random configurations from the range between both ends
+MAX_TURN = (
+    2 * np.pi
+)  # rad or m, of random configurations from the range between both ends
 MAX_EXTENSION = 1.0  # rad or m, of a tree towards a random configuration
 STATES_PER_CHECK = 24
 MAX_EXTENSIONS = 1000  # of the trees
@@ -36,14 +47,27 @@ MAX_PROJECTION_STEP = 0.5  # rad or m, of any joint
 RELATIVE_DAMPING = 1e-6  # of these steps, in scaled units
 PROJECTED_FRACTION = 0.05  # of its tolerance, at which an equality is met
 
-TREE_MARGINS_M = (6e-3, 3e-3, 1e-3, 0.0)  # of small trees in turn, added to the required distances
+TREE_MARGINS_M = (
+    6e-3,
+    3e-3,
+    1e-3,
+    0.0,
+)  # of small trees in turn, added to the required distances
 SMALL_TREES, SMALL_TREE_EXTENSIONS = 12, 4_000  # four, if these find too few paths
 MIN_TREE_PATHS, MAX_TREE_PATHS = 3, 8
 LARGE_TREE_EXTENSIONS = 128_000  # without margin, in narrow passages
-LARGE_TREES, MAX_UNCONNECTED_TREES = 12, 3  # with edges of either length; three if no tree connects
-TREE_EXTENSION_RAD, SHORT_TREE_EXTENSION_RAD = 1.0, 0.5  # length of an edge [rad or m]; shorter ones after the others
+LARGE_TREES, MAX_UNCONNECTED_TREES = (
+    12,
+    3,
+)  # with edges of either length; three if no tree connects
+TREE_EXTENSION_RAD, SHORT_TREE_EXTENSION_RAD = (
+    1.0,
+    0.5,
+)  # length of an edge [rad or m]; shorter ones after the others
 TREE_SHORTCUTS = 400  # attempted on a path
-MANIFOLD_SPACING_RAD = 0.04  # of projected states, which are all nodes, so that trees have more of them
+MANIFOLD_SPACING_RAD = (
+    0.04  # of projected states, which are all nodes, so that trees have more of them
+)
 MANIFOLD_NODES, MANIFOLD_LARGE_TREE_NODES = 6_000, 24_000
 
 
@@ -59,19 +83,30 @@ class RestSpace:
     equal: NDArray[np.bool_]  # mask of the equalities of positions, shape (m,)
     kernel_poses: Array  # scene values that the kernels take, shape (width,)
     scene_poses: Array  # poses and sizes of the obstacles of the hulls, shape (width,)
-    # Hulls that decide where capsules collide, or without capsules everywhere; None where links are capsules.
+    # Hulls that decide where capsules collide, or without capsules everywhere; None
+    # where links are capsules.
     hulls: Hulls | None
 
     def follow(self, q: Array) -> Array:
-        """Project K states, shape (n, K), onto the equalities; return the leading valid ones."""
+        """Project K states, shape (n, K), onto the equalities.
+
+        Return the leading valid ones.
+        """
         q = self.projected(q) if self.equal.any() else q
         return q[:, : self._count_valid(q)]
 
     def meets_other_conditions(self, path: Array) -> bool:
         """Return whether the states of a polyline, corners of shape (K, n), meet all conditions except distances."""
-        counts = [max(int(np.ceil(np.abs(b - a).max() / STATE_SPACING)), 1) for a, b in pairwise(path)]
-        where = np.concatenate([k + np.arange(count) / count for k, count in enumerate(counts)])
-        q = np.stack([np.interp(where, np.arange(len(path)), joint) for joint in path.T])
+        counts = [
+            max(int(np.ceil(np.abs(b - a).max() / STATE_SPACING)), 1)
+            for a, b in pairwise(path)
+        ]
+        where = np.concatenate(
+            [k + np.arange(count) / count for k, count in enumerate(counts)]
+        )
+        q = np.stack(
+            [np.interp(where, np.arange(len(path)), joint) for joint in path.T]
+        )
         return bool(self._met(q)[~self.capsules].all())
 
     def _met(self, q: Array) -> NDArray[np.bool_]:
@@ -86,7 +121,9 @@ class RestSpace:
             return _first(~np.logical_and.reduce(met))
         first = _first(~np.logical_and.reduce(met[~self.capsules]))
         if first:
-            first = _first(~self.hulls.clear_states(q[:, :first], poses, uncovered_only=True))
+            first = _first(
+                ~self.hulls.clear_states(q[:, :first], poses, uncovered_only=True)
+            )
         resolved = np.logical_and.reduce(met[self.capsules]) & self.capsules.any()
         unresolved = np.flatnonzero(~resolved[:first])
         if not len(unresolved):
@@ -95,8 +132,14 @@ class RestSpace:
         return first if collision == len(unresolved) else int(unresolved[collision])
 
     def projected(self, q: Array) -> Array:
-        """Project K states onto the equalities; joints that reach a limit stay there."""
-        low, high = self.robot.position_lower[:, None], self.robot.position_upper[:, None]
+        """Project K states onto the equalities.
+
+        Joints that reach a limit stay there.
+        """
+        low, high = (
+            self.robot.position_lower[:, None],
+            self.robot.position_upper[:, None],
+        )
         q, rows = np.clip(q, low, high), self.equal
         lower, upper = self.lower[rows, None], self.upper[rows, None]
         for _ in range(MAX_PROJECTIONS):
@@ -104,11 +147,22 @@ class RestSpace:
             error = g[rows] - (lower + upper) / 2
             if (np.abs(error) <= PROJECTED_FRACTION * (upper - lower) / 2).all():
                 break
-            J = columns.reshape(-1, len(rows), q.shape[1])[: len(q), rows] * ((q > low) & (q < high))[:, None]
+            J = (
+                columns.reshape(-1, len(rows), q.shape[1])[: len(q), rows]
+                * ((q > low) & (q < high))[:, None]
+            )
             square = np.einsum("iak,ibk->kab", J, J)
-            damping = RELATIVE_DAMPING * (1 + np.trace(square, axis1=1, axis2=2))[:, None, None] * np.eye(len(error))
+            damping = (
+                RELATIVE_DAMPING
+                * (1 + np.trace(square, axis1=1, axis2=2))[:, None, None]
+                * np.eye(len(error))
+            )
             force = np.linalg.solve(square + damping, error.T[..., None])[..., 0]
-            step = np.clip(np.einsum("iak,ka->ik", J, force), -MAX_PROJECTION_STEP, MAX_PROJECTION_STEP)
+            step = np.clip(
+                np.einsum("iak,ka->ik", J, force),
+                -MAX_PROJECTION_STEP,
+                MAX_PROJECTION_STEP,
+            )
             q = np.clip(q - step, low, high)
         return q
 
@@ -132,11 +186,18 @@ class _Tree:
         self.nodes, self.parents, self.states = [root], [-1], [root[None]]
 
     def grow(self, target: Array, follow: Follow, max_extension: float) -> bool:
-        """Extend the nearest node towards a configuration while states are valid; return whether it is reached."""
+        """Extend the nearest node towards a configuration while states are valid.
+
+        Return whether it is reached.
+        """
         nearest = int(np.argmin(np.square(np.array(self.nodes) - target).sum(axis=1)))
         begin = self.nodes[nearest]
         distance = float(np.linalg.norm(target - begin))
-        end = target if distance <= max_extension else begin + (target - begin) * (max_extension / distance)
+        end = (
+            target
+            if distance <= max_extension
+            else begin + (target - begin) * (max_extension / distance)
+        )
         states, reached = follow_line(begin, end, follow)
         if len(states):
             self.nodes.append(states[-1])
@@ -156,25 +217,30 @@ class _Tree:
 def follow_line(begin: Array, end: Array, follow: Follow) -> tuple[Array, bool]:
     """Return the valid states of a straight line, shape (k, n), and whether they reach its end.
 
-    Both ends have shape (n,); ``begin`` is not among the states. See ``RestSpace.follow`` for the leading valid states.
+    Both ends have shape (n,); ``begin`` is not among the states. See
+    ``RestSpace.follow`` for the leading valid states.
     """
     count = max(int(np.ceil(np.abs(end - begin).max() / STATE_SPACING)), 1)
     fractions, states = np.arange(1, count + 1) / count, begin[:, None]
     for first in range(0, count, STATES_PER_CHECK):
         block = fractions[first : first + STATES_PER_CHECK]
         valid = follow(begin[:, None] + (end - begin)[:, None] * block)
-        spacing = np.abs(np.diff(np.hstack([states[:, -1:], valid]))).max(axis=0, initial=0.0)
+        spacing = np.abs(np.diff(np.hstack([states[:, -1:], valid]))).max(
+            axis=0, initial=0.0
+        )
         states = np.hstack([states, valid[:, : _first(spacing > MAX_STATE_SPACING)]])
         if states.shape[1] < 1 + first + len(block):
             break
     return states[:, 1:].T, states.shape[1] == 1 + count
 
 
-def find_paths(start: Array, goal: Array, robot: Robot, follow: Follow) -> Iterator[Array]:
+def find_paths(
+    start: Array, goal: Array, robot: Robot, follow: Follow
+) -> Iterator[Array]:
     """Yield valid paths between two configurations, shape (K, n): the line, if it is valid, or several of the trees.
 
-    Random configurations are within the robot's limits and at most a turn away from both ends. The search ends with the
-    first trees that do not connect.
+    Random configurations are within the robot's limits and at most a turn away from
+    both ends. The search ends with the first trees that do not connect.
     """
     states, reached = follow_line(start, goal, follow)
     if reached:
@@ -187,7 +253,9 @@ def find_paths(start: Array, goal: Array, robot: Robot, follow: Follow) -> Itera
         yield path
 
 
-def find_path(start: Array, goal: Array, robot: Robot, follow: Follow, *, seed: int) -> Array | None:
+def find_path(
+    start: Array, goal: Array, robot: Robot, follow: Follow, *, seed: int
+) -> Array | None:
     """Search for one path by RRT-Connect; return its states, shape (K, n), or None if the trees do not connect.
 
     The arguments are those of ``find_paths``, and the seed of the random numbers.
@@ -200,7 +268,9 @@ def find_path(start: Array, goal: Array, robot: Robot, follow: Follow, *, seed: 
         before = len(tree.nodes)
         tree.grow(random.uniform(lower, upper), follow, MAX_EXTENSION)
         if len(tree.nodes) > before and other.grow(tree.nodes[-1], follow, np.inf):
-            return _shortened(np.vstack([trees[0].path(), trees[1].path()[::-1]]), follow, random)
+            return _shortened(
+                np.vstack([trees[0].path(), trees[1].path()[::-1]]), follow, random
+            )
     return None
 
 
@@ -218,9 +288,10 @@ def _shortened(path: Array, follow: Follow, random: np.random.Generator) -> Arra
 class TreeSearch:
     """Search for paths between the ends of a task by compiled trees, on a manifold if there are equalities.
 
-    Several small trees with different margins grow in milliseconds, and large ones if these find few paths. The paths
-    are sorted by an estimated duration. Large trees with shorter edges follow one by one, until a motion along one of
-    their paths is valid. Conditions other than distances are checked on the paths, not in the trees.
+    Several small trees with different margins grow in milliseconds, and large ones if
+    these find few paths. The paths are sorted by an estimated duration. Large trees
+    with shorter edges follow one by one, until a motion along one of their paths is
+    valid. Conditions other than distances are checked on the paths, not in the trees.
     """
 
     task: RefinementTask
@@ -231,8 +302,9 @@ class TreeSearch:
     def paths(self) -> Iterator[Array]:
         """Yield paths, corners of shape (K, n) each.
 
-        At most ``MAX_TREE_PATHS`` paths of the first trees are sorted: those that meet all conditions at rest come
-        first, and then those of shorter estimated duration. Paths of large trees with shorter edges follow.
+        At most ``MAX_TREE_PATHS`` paths of the first trees are sorted: those that meet
+        all conditions at rest come first, and then those of shorter estimated duration.
+        Paths of large trees with shorter edges follow.
         """
         found, seeds = list[Array](), count()
         line = self._grow(0, 0, TREE_EXTENSION_RAD)
@@ -241,10 +313,17 @@ class TreeSearch:
             return
         found += self._small_trees(seeds)
         missing = max(MIN_TREE_PATHS - len(found), 0)
-        found += islice(self._large_trees(seeds, TREE_EXTENSION_RAD, bool(found)), missing)
+        found += islice(
+            self._large_trees(seeds, TREE_EXTENSION_RAD, bool(found)), missing
+        )
         space, limit = self.space, self.space.robot.velocity_limit
-        durations = [(not space.meets_other_conditions(path), estimated_duration(path, limit)) for path in found]
-        for index in sorted(range(len(found)), key=durations.__getitem__)[:MAX_TREE_PATHS]:
+        durations = [
+            (not space.meets_other_conditions(path), estimated_duration(path, limit))
+            for path in found
+        ]
+        for index in sorted(range(len(found)), key=durations.__getitem__)[
+            :MAX_TREE_PATHS
+        ]:
             yield found[index]
         yield from self._large_trees(seeds, SHORT_TREE_EXTENSION_RAD, bool(found))
 
@@ -260,7 +339,9 @@ class TreeSearch:
                 number += 1
                 yield path
 
-    def _large_trees(self, seeds: Iterator[int], extension: float, connected: bool) -> Iterator[Array]:
+    def _large_trees(
+        self, seeds: Iterator[int], extension: float, connected: bool
+    ) -> Iterator[Array]:
         """Yield the paths of large trees; of fewer ones if there is no path yet."""
         for number, seed in enumerate(islice(seeds, LARGE_TREES)):
             if number == MAX_UNCONNECTED_TREES and not connected:
@@ -270,7 +351,9 @@ class TreeSearch:
                 connected = True
                 yield path
 
-    def _grow(self, seed: int, extensions: int, length: float, margin: float = 0.0) -> Array | None:
+    def _grow(
+        self, seed: int, extensions: int, length: float, margin: float = 0.0
+    ) -> Array | None:
         """Return the path of one pair of trees, or None."""
         settings = TreeSettings(
             self.hulls.obstacle_distance,
@@ -281,13 +364,29 @@ class TreeSearch:
             shortcuts=TREE_SHORTCUTS,
         )
         if self.manifold is not None:
-            nodes = MANIFOLD_LARGE_TREE_NODES if extensions == LARGE_TREE_EXTENSIONS else MANIFOLD_NODES
+            nodes = (
+                MANIFOLD_LARGE_TREE_NODES
+                if extensions == LARGE_TREE_EXTENSIONS
+                else MANIFOLD_NODES
+            )
             settings = replace(settings, spacing=MANIFOLD_SPACING_RAD, max_nodes=nodes)
         task, robot = self.task, self.space.robot
         start, goal = task.boundary.start_q[0], task.boundary.goal_q[0]
-        lower, upper = np.minimum(start, goal) - MAX_TURN, np.maximum(start, goal) + MAX_TURN
-        box = np.maximum(robot.position_lower, lower), np.minimum(robot.position_upper, upper)
+        lower, upper = (
+            np.minimum(start, goal) - MAX_TURN,
+            np.maximum(start, goal) + MAX_TURN,
+        )
+        box = (
+            np.maximum(robot.position_lower, lower),
+            np.minimum(robot.position_upper, upper),
+        )
         checker = self.hulls.placed_checker(task.scene.poses[0])
         return find_tree_path(
-            checker, (start, goal), box, robot.velocity_limit, settings, seed=seed, manifold=self.manifold
+            checker,
+            (start, goal),
+            box,
+            robot.velocity_limit,
+            settings,
+            seed=seed,
+            manifold=self.manifold,
         )

@@ -1,10 +1,12 @@
 """Strategy of the refiner: attempts at a task in their order (``attempts``), and the rule that accepts one of them.
 
-The independent verdict decides, never the solver's own residuals. The first valid plan is returned if it is precise;
-otherwise one more attempt is judged. A plan whose links touch something within the tolerance is not precise, and up to
-``MAX_CONTACTS`` attempts are judged. If the verdict rejects an attempt for a shallow collision of hulls, or finds such
-a contact, the solver continues it with a constraint at the phase that the verdict names. The result is never worse than
-the input plan: it replaces it only if the verdict finds a smaller violation, or none and a lower cost.
+The independent verdict decides, never the solver's own residuals. The first valid plan
+is returned if it is precise; otherwise one more attempt is judged. A plan whose links
+touch something within the tolerance is not precise, and up to ``MAX_CONTACTS`` attempts
+are judged. If the verdict rejects an attempt for a shallow collision of hulls, or finds
+such a contact, the solver continues it with a constraint at the phase that the verdict
+names. The result is never worse than the input plan: it replaces it only if the verdict
+finds a smaller violation, or none and a lower cost.
 """
 
 from __future__ import annotations
@@ -26,7 +28,11 @@ from cnpgen.refine.attempts import make_attempts
 from cnpgen.refine.proof.explain import end_violations
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.bounds import PRECISE_FRACTION
-from cnpgen.refine.solver.hull_levels import MAX_FED_BACK_M, MIN_FED_BACK_M, without_contacts
+from cnpgen.refine.solver.hull_levels import (
+    MAX_FED_BACK_M,
+    MIN_FED_BACK_M,
+    without_contacts,
+)
 from cnpgen.refine.solver.sqp import Deadline
 from cnpgen.refine.task import MAX_JUDGED_VIOLATION, Attempt, Outcome, RefinementTask
 from cnpgen.robots.robot import Robot
@@ -50,19 +56,29 @@ VERDICT_TIME_S = 5e-3  # of a verdict, before one was timed
 
 
 @np.errstate(all="ignore")  # squares of huge boundary conditions overflow
-def refine_task(refiner: Refiner, checker: PlanChecker, task: RefinementTask) -> Attempt:
+def refine_task(
+    refiner: Refiner, checker: PlanChecker, task: RefinementTask
+) -> Attempt:
     """Refine the input plan of a task, or plan without one."""
     if not task.is_finite:
         return _invalid_input(refiner, task)
     search, x = RefinementSearch(refiner, checker, task), refiner.input_variables(task)
     for attempt in make_attempts(refiner, task, x):
-        if search.add(attempt) or search.found_no_path or search.continue_rejected(attempt):
+        if (
+            search.add(attempt)
+            or search.found_no_path
+            or search.continue_rejected(attempt)
+        ):
             break
     if not (search.judged or search.skipped):  # no attempt stays near the input path
         search.judged.append(search.judge(next(_input_plans(refiner, task, x))))
     best = search.best()
-    for plan in () if search.costs_less_than_input(best, x) else _input_plans(refiner, task, x):
-        if not best.valid or (plan.cost <= best.cost and not checker.refutes(task, plan.path, plan.rate)):
+    for plan in (
+        () if search.costs_less_than_input(best, x) else _input_plans(refiner, task, x)
+    ):
+        if not best.valid or (
+            plan.cost <= best.cost and not checker.refutes(task, plan.path, plan.rate)
+        ):
             judged = search.judge(plan)
             best = min(best, judged, key=lambda attempt: attempt.rank)
             if judged.valid:
@@ -74,11 +90,14 @@ def refine_task(refiner: Refiner, checker: PlanChecker, task: RefinementTask) ->
 
 
 @np.errstate(all="ignore")  # see ``refine_task``
-def refine_task_until(refiner: Refiner, checker: PlanChecker, task: RefinementTask, seconds: float) -> Attempt:
+def refine_task_until(
+    refiner: Refiner, checker: PlanChecker, task: RefinementTask, seconds: float
+) -> Attempt:
     """Refine the input plan of a task until a deadline; the result is never worse than the input.
 
-    The input plan is judged first. Steps and verdicts are not interrupted: one starts only if it is expected to end in
-    time. Without a usable input plan one attempt is always made. The deadline is ``seconds`` [s] from now.
+    The input plan is judged first. Steps and verdicts are not interrupted: one starts
+    only if it is expected to end in time. Without a usable input plan one attempt is
+    always made. The deadline is ``seconds`` [s] from now.
     """
     until = time.perf_counter() + seconds
     if not task.is_finite:
@@ -93,7 +112,9 @@ def refine_task_until(refiner: Refiner, checker: PlanChecker, task: RefinementTa
         verdicts.note(begun)
         if best.valid:
             break
-    attempts = make_attempts(refiner, replace(task, deadline=Deadline(until - verdicts.max_duration)), x)
+    attempts = make_attempts(
+        refiner, replace(task, deadline=Deadline(until - verdicts.max_duration)), x
+    )
     cut = late = best is not None and not verdicts.allows(1)
     while not late and (attempt := next(attempts, None)) is not None:
         cut |= attempt.outcome is Outcome.NOT_CONVERGED
@@ -112,35 +133,56 @@ def _better(best: Attempt | None, other: Attempt) -> Attempt:
     return other if best is None or other.rank < best.rank else best
 
 
-def _input_plans(refiner: Refiner, task: RefinementTask, x: Array | None) -> Iterator[Attempt]:
+def _input_plans(
+    refiner: Refiner, task: RefinementTask, x: Array | None
+) -> Iterator[Attempt]:
     """Yield the input plan if it can be evaluated: with exact ends if that changes it, then unmodified."""
     motion = refiner.check.transcription(task)
     if x is not None:
         path, rate = motion.unpack(x)
         if not _is_input(task, path, rate):
-            yield Attempt(path=path, rate=rate, cost=motion.objective(path, rate), outcome=Outcome.ADJUSTED)
+            yield Attempt(
+                path=path,
+                rate=rate,
+                cost=motion.objective(path, rate),
+                outcome=Outcome.ADJUSTED,
+            )
     if task.path is None or task.rate is None or not np.isfinite(task.path).all():
         return
     if Motion(task.path[None], task.rate[None], refiner.spec.degree).runs_forward()[0]:
         cost = motion.objective(task.path, task.rate)
-        yield Attempt(path=task.path, rate=task.rate, cost=cost, outcome=Outcome.UNCHANGED)
+        yield Attempt(
+            path=task.path, rate=task.rate, cost=cost, outcome=Outcome.UNCHANGED
+        )
 
 
 def _is_input(task: RefinementTask, path: Array, rate: Array) -> bool:
     """Return whether a plan is the input plan up to rounding."""
     pairs = (path, task.path), (rate, task.rate)
     return all(
-        before is not None and np.allclose(now, before, rtol=0.0, atol=MAX_ROUNDING_ERROR) for now, before in pairs
+        before is not None
+        and np.allclose(now, before, rtol=0.0, atol=MAX_ROUNDING_ERROR)
+        for now, before in pairs
     )
 
 
 def _invalid_input(refiner: Refiner, task: RefinementTask) -> Attempt:
     """Return the input plan, or nan, for boundary conditions that are not finite."""
     spec, n = refiner.spec, task.boundary.start_q.shape[1]
-    path = np.full((spec.path_control_points, n), np.nan) if task.path is None else task.path
+    path = (
+        np.full((spec.path_control_points, n), np.nan)
+        if task.path is None
+        else task.path
+    )
     rate = np.full(spec.rate_control_points, np.nan) if task.rate is None else task.rate
     cost = float(Motion(path[None], rate[None], spec.degree).duration()[0])
-    return Attempt(path=path, rate=rate, cost=cost, outcome=Outcome.INVALID_INPUT, reason=Reason.NOT_FINITE)
+    return Attempt(
+        path=path,
+        rate=rate,
+        cost=cost,
+        outcome=Outcome.INVALID_INPUT,
+        reason=Reason.NOT_FINITE,
+    )
 
 
 # Acceptance
@@ -158,7 +200,9 @@ class PlanChecker:
 
     def strict_verdict(self, task: RefinementTask, path: Array, rate: Array) -> Verdict:
         """Judge such a plan without a tolerance of contacts of the links."""
-        return self._strict_judge(*self._arguments(task, path, rate), early_exit=True)[0]
+        return self._strict_judge(*self._arguments(task, path, rate), early_exit=True)[
+            0
+        ]
 
     @cached_property
     def _judge(self) -> Judge:
@@ -170,7 +214,9 @@ class PlanChecker:
 
     def reason_of_ends(self, task: RefinementTask) -> str | None:
         """Return the reason of a constraint that an end violates, so that no plan is valid; None without one."""
-        for constraint, _ in end_violations(self._problem, self._robot, task.boundary, task.scene):
+        for constraint, _ in end_violations(
+            self._problem, self._robot, task.boundary, task.scene
+        ):
             return constraint.boundary_reason or constraint.reason
         return None
 
@@ -178,8 +224,15 @@ class PlanChecker:
         """Return whether a few samples prove that such a plan is not valid."""
         return self._judge.refutes(*self._arguments(task, path, rate))[0]
 
-    def _arguments(self, task: RefinementTask, path: Array, rate: Array) -> tuple[Motion, Boundary, Scene, Array]:
-        return Motion(path[None], rate[None], self._degree), task.boundary, task.scene, task.goal_xyz[None]
+    def _arguments(
+        self, task: RefinementTask, path: Array, rate: Array
+    ) -> tuple[Motion, Boundary, Scene, Array]:
+        return (
+            Motion(path[None], rate[None], self._degree),
+            task.boundary,
+            task.scene,
+            task.goal_xyz[None],
+        )
 
 
 @dataclass
@@ -191,9 +244,13 @@ class RefinementSearch:
     task: RefinementTask
     iterations: int = 0  # of all attempts so far
     judged: list[Attempt] = field(default_factory=list)
-    skipped: list[Attempt] = field(default_factory=list)  # with violations above ``MAX_JUDGED_VIOLATION``
+    skipped: list[Attempt] = field(
+        default_factory=list
+    )  # with violations above ``MAX_JUDGED_VIOLATION``
     verdict: Verdict | None = None  # the last one
-    found_no_path: bool = False  # whether trees searched paths among the obstacles in vain
+    found_no_path: bool = (
+        False  # whether trees searched paths among the obstacles in vain
+    )
     contacts: int = 0  # valid plans whose links touch something within the tolerance
 
     def add(self, attempt: Attempt) -> bool:
@@ -217,12 +274,18 @@ class RefinementSearch:
         extra: Array | None = None
         for earlier in range(MAX_VERDICT_FEEDBACKS):
             margin = None if self.verdict is None else self.verdict.worst
-            if margin is None or margin.reason not in COLLISION_REASONS or attempt.violation > MAX_JUDGED_VIOLATION:
+            if (
+                margin is None
+                or margin.reason not in COLLISION_REASONS
+                or attempt.violation > MAX_JUDGED_VIOLATION
+            ):
                 break
             if not 0 < margin.violation < MAX_FED_BACK_M:
                 break
             depth = margin.violation * FEEDBACK_GROWTH**earlier
-            following = self.refiner.fed_back(self.task, attempt, margin.phase, depth, extra)
+            following = self.refiner.fed_back(
+                self.task, attempt, margin.phase, depth, extra
+            )
             if following is None or following[0].violation > MAX_JUDGED_VIOLATION:
                 break
             attempt, extra = following
@@ -233,25 +296,42 @@ class RefinementSearch:
     def best(self) -> Attempt:
         """Return the best attempt."""
         if not self.judged:
-            least = min(self.skipped, key=lambda attempt: (attempt.violation, attempt.cost))
+            least = min(
+                self.skipped, key=lambda attempt: (attempt.violation, attempt.cost)
+            )
             self.judged.append(self._judge_attempt(least))
-        return min(self.judged, key=lambda attempt: (attempt.severity, not attempt.is_precise, attempt.cost))
+        return min(
+            self.judged,
+            key=lambda attempt: (
+                attempt.severity,
+                not attempt.is_precise,
+                attempt.cost,
+            ),
+        )
 
     def costs_less_than_input(self, best: Attempt, x: Array | None) -> bool:
         """Return whether a valid plan costs less than the duration of the input plan of variables x alone."""
         motion = self.refiner.check.transcription(self.task)
-        return best.valid and x is not None and best.cost < motion.duration(np.exp(x[motion.split :]))
+        return (
+            best.valid
+            and x is not None
+            and best.cost < motion.duration(np.exp(x[motion.split :]))
+        )
 
     def judge(self, plan: Attempt) -> Attempt:
         """Return a plan with its verdict."""
-        removable = self.refiner.measures_hulls and not self._ends_touch  # contacts, by the solver
+        removable = (
+            self.refiner.measures_hulls and not self._ends_touch
+        )  # contacts, by the solver
         judge = self.checker.strict_verdict if removable else self.checker.verdict
         verdict = self.verdict = judge(self.task, plan.path, plan.rate)
         touches = not verdict.valid and verdict.reason in LINK_REASONS
         if touches and removable:
             verdict = self.checker.verdict(self.task, plan.path, plan.rate)
         keeps_outcome = verdict.valid or plan.outcome in INPUT_OUTCOMES
-        worst = max((margin.severity for margin in verdict.margins.values()), default=np.inf)
+        worst = max(
+            (margin.severity for margin in verdict.margins.values()), default=np.inf
+        )
         return replace(
             plan,
             outcome=plan.outcome if keeps_outcome else Outcome.UNSOLVED,
@@ -264,16 +344,28 @@ class RefinementSearch:
     @cached_property
     def _ends_touch(self) -> bool:
         """Whether an end has a contact within the tolerance, which every motion has."""
-        return float(self.refiner.accepted_at_ends(self.task).max(initial=0.0)) > MIN_FED_BACK_M
+        return (
+            float(self.refiner.accepted_at_ends(self.task).max(initial=0.0))
+            > MIN_FED_BACK_M
+        )
 
     def _judge_attempt(self, attempt: Attempt) -> Attempt:
-        if attempt.outcome is Outcome.ADJUSTED and _is_input(self.task, attempt.path, attempt.rate):
+        if attempt.outcome is Outcome.ADJUSTED and _is_input(
+            self.task, attempt.path, attempt.rate
+        ):
             return self.judge(replace(attempt, outcome=Outcome.UNCHANGED))
         return self.judge(attempt)
 
     def _is_precise(self, verdict: Verdict) -> bool:
         """Return whether equalities are met within a fraction of their tolerance, beside the errors of the ends."""
         check = self.refiner.check
-        equalities = (margin.severity for margin in verdict.margins.values() if margin.name in check.equalities)
+        equalities = (
+            margin.severity
+            for margin in verdict.margins.values()
+            if margin.name in check.equalities
+        )
         worst = max(equalities, default=0.0)
-        return worst <= PRECISE_FRACTION or worst <= PRECISE_FRACTION + check.end_equality_error(self.task)
+        return (
+            worst <= PRECISE_FRACTION
+            or worst <= PRECISE_FRACTION + check.end_equality_error(self.task)
+        )

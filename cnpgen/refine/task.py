@@ -60,15 +60,24 @@ class RefinementTask:
     scene: Scene  # its obstacles, one sample
     start_xyz: Array  # position of the tip at the start [m], shape (3,)
     goal_xyz: Array  # position of the tip at the goal [m], shape (3,)
-    path: Array | None = None  # path control points of the input plan [rad], shape (C, n), or None
-    rate: Array | None = None  # rate control points of the input plan [1/s], shape (R,), or None
+    path: Array | None = (
+        None  # path control points of the input plan [rad], shape (C, n), or None
+    )
+    rate: Array | None = (
+        None  # rate control points of the input plan [1/s], shape (R,), or None
+    )
     deadline: Deadline | None = None  # deadline of the solver's iterations, or None
-    # Largest difference of every joint from the path of the input plan [rad or m], or None.
+    # Largest difference of every joint from the path of the input plan [rad or m], or
+    # None.
     stay_within: float | None = None
 
     def reference(self, s: Array, degree: int) -> Array | None:
         """Return the input path at phases s, shape (K, n), if motions must stay near it, else None."""
-        if self.stay_within is None or self.path is None or not np.isfinite(self.path).all():
+        if (
+            self.stay_within is None
+            or self.path is None
+            or not np.isfinite(self.path).all()
+        ):
             return None
         positions: Array = basis(s, len(self.path), degree) @ self.path
         return positions
@@ -79,7 +88,10 @@ class RefinementTask:
         reference = self.reference(s, degree)
         if reference is None or self.stay_within is None:
             return True
-        return bool(np.abs(basis(s, len(path), degree) @ path - reference).max() <= self.stay_within)
+        return bool(
+            np.abs(basis(s, len(path), degree) @ path - reference).max()
+            <= self.stay_within
+        )
 
     @property
     def ends(self) -> Array:
@@ -88,35 +100,52 @@ class RefinementTask:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the motion starts and ends at rest; time scaling then preserves its boundary conditions."""
-        ends = (self.boundary.start_dq, self.boundary.start_ddq, self.boundary.goal_dq, self.boundary.goal_ddq)
+        """Whether the motion starts and ends at rest.
+
+        Time scaling then preserves its boundary conditions.
+        """
+        ends = (
+            self.boundary.start_dq,
+            self.boundary.start_ddq,
+            self.boundary.goal_dq,
+            self.boundary.goal_ddq,
+        )
         return all(values is None or not np.any(values) for values in ends)
 
     @property
     def is_finite(self) -> bool:
         """Whether the boundary conditions are finite."""
-        conditions = (self.scene.poses, self.start_xyz, self.goal_xyz, *vars(self.boundary).values())
-        return all(values is None or bool(np.isfinite(values).all()) for values in conditions)
+        conditions = (
+            self.scene.poses,
+            self.start_xyz,
+            self.goal_xyz,
+            *vars(self.boundary).values(),
+        )
+        return all(
+            values is None or bool(np.isfinite(values).all()) for values in conditions
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Attempt:
     """Trajectory for a boundary problem; after the independent check also its verdict.
 
-    ``violation``, ``severity``, ``is_precise``, ``touches`` and ``x`` are used by the search, not part of its result.
+    ``violation``, ``severity``, ``is_precise``, ``touches`` and ``x`` are used by the
+    search, not part of its result.
 
-    Attributes:
-        path: Path control points [rad], shape (C, n).
-        rate: Rate control points [1/s], shape (R,).
-        cost: Objective [s].
-        outcome: Outcome of the refinement if this attempt is its result.
-        iterations: Iterations of the solver.
-        reason: Reason of the independent verdict: "ok", or why the plan is not valid; None before it is judged. For
+    Attributes: path: Path control points [rad], shape (C, n). rate: Rate control points
+        [1/s], shape (R,). cost: Objective [s]. outcome: Outcome of the refinement if
+        this attempt is its result. iterations: Iterations of the solver. reason: Reason
+        of the independent verdict: "ok", or why the plan is not valid; None before it
+        is judged. For
             ends that violate a constraint, the reason of that constraint.
-        violation: Largest violation on the 600-point grid, as a multiple of its tolerance; at most 1 is accepted. It is
-            0 where it was not evaluated because the solver converged within its bounds.
-        severity: 1 if the plan is valid; otherwise larger, inf if it cannot be evaluated.
-        is_precise: Whether equalities are met within a fraction of their tolerance, and links do not touch anything.
+        violation: Largest violation on the 600-point grid, as a multiple of its
+            tolerance; at most 1 is accepted. It is 0 where it was not evaluated because
+            the solver converged within its bounds.
+        severity: 1 if the plan is valid; otherwise larger, inf if it cannot be
+            evaluated.
+        is_precise: Whether equalities are met within a fraction of their tolerance, and
+            links do not touch anything.
         touches: Whether it is valid and its links touch something within the tolerance.
         x: Variables of the transcription, shape (nx,), or None.
     """

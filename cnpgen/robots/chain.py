@@ -27,13 +27,11 @@ _KINDS = {  # Pinocchio's name of a joint type -> URDF's name
 class Joint:
     """Planned joint and the rigid body that it moves.
 
-    Attributes:
-        rotation: Rotation of the joint frame in the previous joint frame at q = 0, shape (3, 3).
-        translation: Origin of the joint frame in the previous one [m], shape (3,).
-        axis: Unit axis in the joint frame, shape (3,).
-        prismatic: Whether q is a displacement [m] and not an angle [rad].
-        mass: Mass of the body with all fixed parts [kg].
-        com: Center of mass in the joint frame [m], shape (3,).
+    Attributes: rotation: Rotation of the joint frame in the previous joint frame at q =
+        0, shape (3, 3). translation: Origin of the joint frame in the previous one [m],
+        shape (3,). axis: Unit axis in the joint frame, shape (3,). prismatic: Whether q
+        is a displacement [m] and not an angle [rad]. mass: Mass of the body with all
+        fixed parts [kg]. com: Center of mass in the joint frame [m], shape (3,).
         inertia: Inertia about the center of mass, joint axes [kg m^2], shape (3, 3).
     """
 
@@ -50,11 +48,10 @@ class Joint:
 class Chain:
     """Serial chain from the world to a tip frame.
 
-    Attributes:
-        joints: The planned joints, from the base outwards.
-        tip_rotation: Rotation of the tip frame in the last joint frame, shape (3, 3).
-        tip_translation: Origin of the tip frame in the last joint frame [m], shape (3,).
-        gravity: Gravity in the world frame [m/s^2], shape (3,).
+    Attributes: joints: The planned joints, from the base outwards. tip_rotation:
+        Rotation of the tip frame in the last joint frame, shape (3, 3).
+        tip_translation: Origin of the tip frame in the last joint frame [m], shape
+        (3,). gravity: Gravity in the world frame [m/s^2], shape (3,).
     """
 
     joints: tuple[Joint, ...]
@@ -64,29 +61,50 @@ class Chain:
 
     @property
     def reach(self) -> float:
-        """Upper bound of the distance of the tip from the first joint's origin [m]; infinite with prismatic joints."""
+        """Upper bound of the distance of the tip from the first joint's origin [m].
+
+        Infinite with prismatic joints.
+        """
         if any(joint.prismatic for joint in self.joints):
             return np.inf
-        lengths = [float(np.linalg.norm(joint.translation)) for joint in self.joints[1:]]
+        lengths = [
+            float(np.linalg.norm(joint.translation)) for joint in self.joints[1:]
+        ]
         return sum(lengths) + float(np.linalg.norm(self.tip_translation))
 
 
 def chain_from_model(model: "pin.Model", tip: str) -> Chain:
-    """Read the chain that ends in a tip frame; RecipeError if the model is not one serial chain that carries it."""
+    """Read the chain that ends in a tip frame.
+
+    RecipeError if the model is not one serial chain that carries it.
+    """
     data = model.createData()
     for index in range(1, model.njoints):
         name, joint = model.names[index], model.joints[index]
         if joint.nq != 1 or joint.nv != 1:
-            raise RecipeError([f"robot.joints: {name!r} is {_kind(joint.shortname())}: {_PLANNED}"])
+            raise RecipeError(
+                [f"robot.joints: {name!r} is {_kind(joint.shortname())}: {_PLANNED}"]
+            )
         if model.parents[index] != index - 1:
             before = model.names[index - 1]
-            raise RecipeError([f"robot.joints: {name!r} is not moved by {before!r}, expected one serial chain"])
+            raise RecipeError(
+                [
+                    f"robot.joints: {name!r} is not moved by {before!r}, expected one serial chain"
+                ]
+            )
     frame = model.frames[frame_of(model, tip)]
     if frame.parentJoint != model.njoints - 1:
-        raise RecipeError([f"robot.tip: frame {tip!r} is not moved by the last planned joint {model.names[-1]!r}"])
+        raise RecipeError(
+            [
+                f"robot.tip: frame {tip!r} is not moved by the last planned joint {model.names[-1]!r}"
+            ]
+        )
     joints = tuple(_joint(model, data, index) for index in range(1, model.njoints))
     return Chain(
-        joints, _snap(frame.placement.rotation), _snap(frame.placement.translation), np.array(model.gravity.linear)
+        joints,
+        _snap(frame.placement.rotation),
+        _snap(frame.placement.translation),
+        np.array(model.gravity.linear),
     )
 
 
@@ -101,13 +119,23 @@ def name_links_uniquely(model: "pin.Model") -> None:
 
 
 def frame_of(model: "pin.Model", name: str) -> int:
-    """Return the index of a frame; a link has priority over a joint of the same name."""
-    return int(model.getFrameId(name + LINK_SUFFIX if model.existFrame(name + LINK_SUFFIX) else name))
+    """Return the index of a frame.
+
+    A link has priority over a joint of the same name.
+    """
+    return int(
+        model.getFrameId(
+            name + LINK_SUFFIX if model.existFrame(name + LINK_SUFFIX) else name
+        )
+    )
 
 
 def _kind(name: str) -> str:
     """Return the URDF name of a joint's Pinocchio type."""
-    return next((text for start, text in _KINDS.items() if name.startswith(start)), "a joint of another kind")
+    return next(
+        (text for start, text in _KINDS.items() if name.startswith(start)),
+        "a joint of another kind",
+    )
 
 
 def _joint(model: "pin.Model", data: "pin.Data", index: int) -> Joint:

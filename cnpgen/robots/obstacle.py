@@ -25,13 +25,17 @@ _OPTIONAL = {"rotation": (0.0, 0.0, 0.0), "scale": (1.0, 1.0, 1.0)}
 class Obstacle:
     """Convex static obstacle: an upright box given by ranges, or another kind with a pose.
 
-    With ``below`` its highest point touches the bottom of the object at that end of the motion; the z of a
-    ``position`` is then an additional offset.
+    With ``below`` its highest point touches the bottom of the object at that end of the
+    motion; the z of a ``position`` is then an additional offset.
     """
 
     name: str = field("name of the obstacle")
-    x: Range | None = field("extent of an upright box along world x", unit="m", default=None)
-    y: Range | None = field("extent of an upright box along world y", unit="m", default=None)
+    x: Range | None = field(
+        "extent of an upright box along world x", unit="m", default=None
+    )
+    y: Range | None = field(
+        "extent of an upright box along world y", unit="m", default=None
+    )
     height: float | None = field(
         "height of the upright box, measured down from its top; default: without lower end",
         unit="m",
@@ -39,10 +43,17 @@ class Obstacle:
         low=1e-6,
     )
     top: float | None = field("height of the upper face", unit="m", default=None)
-    below: str = field("end whose object stands on this obstacle", choices=("", "start", "goal"), default="")
-    kind: str = optional_key("kind of the obstacle", choices=tuple(_KEYS), default="box")
+    below: str = field(
+        "end whose object stands on this obstacle",
+        choices=("", "start", "goal"),
+        default="",
+    )
+    kind: str = optional_key(
+        "kind of the obstacle", choices=tuple(_KEYS), default="box"
+    )
     position: tuple[float, float, float] | None = optional_key(
-        "position of the centre, for a mesh of the origin of its file: x, y, z", unit="m"
+        "position of the centre, for a mesh of the origin of its file: x, y, z",
+        unit="m",
     )
     rotation: tuple[float, float, float] = optional_key(
         "rotation: roll, pitch and yaw about the world's axes, as <origin rpy> of a URDF",
@@ -50,13 +61,20 @@ class Obstacle:
         default=_OPTIONAL["rotation"],
         plausible=2 * math.pi,
     )
-    size: tuple[float, float, float] | None = optional_key("edge lengths of a box", unit="m", low=1e-6)
-    radius: float | None = optional_key("radius of a sphere, a cylinder, a capsule", unit="m", low=1e-6)
+    size: tuple[float, float, float] | None = optional_key(
+        "edge lengths of a box", unit="m", low=1e-6
+    )
+    radius: float | None = optional_key(
+        "radius of a sphere, a cylinder, a capsule", unit="m", low=1e-6
+    )
     length: float | None = optional_key(
-        "length of a cylinder, or of a capsule without its round ends, along its z axis", unit="m", low=1e-6
+        "length of a cylinder, or of a capsule without its round ends, along its z axis",
+        unit="m",
+        low=1e-6,
     )
     mesh: str = optional_key(
-        "mesh file (STL, DAE, OBJ), relative to the problem file; its convex hull is used", default=""
+        "mesh file (STL, DAE, OBJ), relative to the problem file; its convex hull is used",
+        default="",
     )
     scale: tuple[float, float, float] = optional_key(
         "scale factors of the mesh along x, y and z", default=_OPTIONAL["scale"]
@@ -81,12 +99,19 @@ class Obstacle:
             entries = ends if isinstance(ends, tuple) else (ends,)
             numbers = [entry for entry in entries if isinstance(entry, int | float)]
             largest = max(map(abs, numbers), default=0.0)
-            limit = PLAUSIBLE_MAX.get(key.unit, MAX_COORDINATE_M) if key.plausible is None else key.plausible
+            limit = (
+                PLAUSIBLE_MAX.get(key.unit, MAX_COORDINATE_M)
+                if key.plausible is None
+                else key.plausible
+            )
             if not all(map(math.isfinite, numbers)):
                 yield key.name, f"must be finite, got {value}"
             elif largest > limit:
                 hint = suggested_unit(largest, key.unit, high=limit)
-                yield key.name, f"must be at most {limit:.4g} {key.unit}, got {value}{hint}"
+                yield (
+                    key.name,
+                    f"must be at most {limit:.4g} {key.unit}, got {value}{hint}",
+                )
             elif key.low is not None and numbers and min(numbers) < key.low:
                 yield key.name, f"must be at least {key.low:g} {key.unit}, got {value}"
         yield from self.validate()
@@ -103,23 +128,43 @@ class Obstacle:
 
     def _mistakes_upright(self) -> Iterator[tuple[str, str]]:
         if self.top is None and not self.below:
-            yield "top", f"obstacle {self.name!r} has no height: expected a 'top', or 'below' = \"start\" or \"goal\""
+            yield (
+                "top",
+                f"obstacle {self.name!r} has no height: expected a 'top', or 'below' = \"start\" or \"goal\"",
+            )
         if self.top is not None and self.below:
-            yield "top", f"obstacle {self.name!r} has both a 'top' and a 'below', expected one of them"
+            yield (
+                "top",
+                f"obstacle {self.name!r} has both a 'top' and a 'below', expected one of them",
+            )
         for key, extent in (("x", self.x), ("y", self.y)):
             if extent is None:
-                yield key, f"obstacle {self.name!r} is an upright box and needs its extent here"
+                yield (
+                    key,
+                    f"obstacle {self.name!r} is an upright box and needs its extent here",
+                )
             elif extent.low == extent.high:
-                yield key, f"obstacle {self.name!r} has no extent here, expected a low end below the high end"
+                yield (
+                    key,
+                    f"obstacle {self.name!r} has no extent here, expected a low end below the high end",
+                )
         for key in self._given(set().union(*_KEYS.values())):
-            yield key, f"an upright box has {_listed(_UPRIGHT)}: leave this out, or give a box with a pose"
+            yield (
+                key,
+                f"an upright box has {_listed(_UPRIGHT)}: leave this out, or give a box with a pose",
+            )
 
     def _mistakes_posed(self) -> Iterator[tuple[str, str]]:
         known = _KEYS[self.kind]
         needed = [key for key in known if key not in _OPTIONAL]
-        instead = f", or {_listed(_UPRIGHT)} in their place" if self.kind == "box" else ""
+        instead = (
+            f", or {_listed(_UPRIGHT)} in their place" if self.kind == "box" else ""
+        )
         for key in sorted(set(needed) - set(self._given(needed))):
-            yield key, f"obstacle {self.name!r} is a {self.kind} and needs {_listed(needed)}{instead}"
+            yield (
+                key,
+                f"obstacle {self.name!r} is a {self.kind} and needs {_listed(needed)}{instead}",
+            )
         for key in self._given(set(_UPRIGHT).union(*_KEYS.values()) - set(known)):
             yield key, f"a {self.kind} has no such key, expected {_listed(known)}"
         if 0.0 in self.scale:
@@ -132,13 +177,30 @@ class Obstacle:
 
     def _given(self, keys: Iterable[str]) -> list[str]:
         """Return the given keys among some keys."""
-        return [key for key in sorted(keys) if getattr(self, key) not in (None, "", _OPTIONAL.get(key))]
+        return [
+            key
+            for key in sorted(keys)
+            if getattr(self, key) not in (None, "", _OPTIONAL.get(key))
+        ]
 
 
 def invalid_obstacle(obstacles: Iterable[Obstacle]) -> str:
-    """Return the first error of obstacles, with the name of the obstacle; empty without one."""
-    errors = ((f"obstacle {each.name!r}", *error) for each in obstacles for error in each.value_errors())
-    return next((text if text.startswith(name) else f"{name}: {key} {text}" for name, key, text in errors), "")
+    """Return the first error of obstacles, with the name of the obstacle.
+
+    Empty without one.
+    """
+    errors = (
+        (f"obstacle {each.name!r}", *error)
+        for each in obstacles
+        for error in each.value_errors()
+    )
+    return next(
+        (
+            text if text.startswith(name) else f"{name}: {key} {text}"
+            for name, key, text in errors
+        ),
+        "",
+    )
 
 
 def _listed(keys: Sequence[str]) -> str:

@@ -37,7 +37,9 @@ def _tilt(doc: str) -> Any:
 
 def _has_any(names: Sequence[str], doc: str) -> cached_property[bool]:
     """Declare a property that is true if one of some parameters differs from sample to sample."""
-    declared = cached_property[bool](lambda ranges: any(name in names for name in ranges.names))
+    declared = cached_property[bool](
+        lambda ranges: any(name in names for name in ranges.names)
+    )
     declared.__doc__ = doc
     return declared
 
@@ -46,14 +48,20 @@ def _has_any(names: Sequence[str], doc: str) -> cached_property[bool]:
 class ParameterRanges:
     """Ranges of the parameters that samples of a problem have, in the order of their columns."""
 
-    table_height: Range | None = optional_key("height of the table above that of the constraint 'table'", "m")
+    table_height: Range | None = optional_key(
+        "height of the table above that of the constraint 'table'", "m"
+    )
     table_roll: Range | None = _tilt("turn of the table about its x axis")
     table_pitch: Range | None = _tilt("turn of the table about world y, after the roll")
-    table_x_low: Range | None = optional_key("lower bound of the table's rectangle along its x axis", "m")
+    table_x_low: Range | None = optional_key(
+        "lower bound of the table's rectangle along its x axis", "m"
+    )
     table_x_high: Range | None = optional_key("upper bound along x", "m")
     table_y_low: Range | None = optional_key("lower bound along y", "m")
     table_y_high: Range | None = optional_key("upper bound along y", "m")
-    upright_roll: Range | None = _tilt("turn about world x of the direction of the constraint 'vertical' or 'axis'")
+    upright_roll: Range | None = _tilt(
+        "turn about world x of the direction of the constraint 'vertical' or 'axis'"
+    )
     upright_pitch: Range | None = _tilt("its turn about world y, after the roll")
     upright_tolerance: Range | None = optional_key(
         "'angle' of the constraint 'axis', or 'tolerance' of an aligned axis and of 'vertical'",
@@ -65,22 +73,33 @@ class ParameterRanges:
         "joint velocity limit, as a fraction of that of [limits]", low=1e-3, high=1.0
     )
     acceleration_factor: Range | None = optional_key(
-        "joint acceleration limit, as a fraction of that of [limits]", low=1e-3, high=1.0
+        "joint acceleration limit, as a fraction of that of [limits]",
+        low=1e-3,
+        high=1.0,
     )
     payload_mass: Range | None = optional_key(
         "mass of the payload, whose inertia is proportional to it", "kg", low=1e-9
     )
-    payload_x: Range | None = optional_key("centre of mass of the payload along the tip's x axis", "m", plausible=5.0)
-    payload_y: Range | None = optional_key("the same along its y axis", "m", plausible=5.0)
-    payload_z: Range | None = optional_key("the same along its z axis", "m", plausible=5.0)
+    payload_x: Range | None = optional_key(
+        "centre of mass of the payload along the tip's x axis", "m", plausible=5.0
+    )
+    payload_y: Range | None = optional_key(
+        "the same along its y axis", "m", plausible=5.0
+    )
+    payload_z: Range | None = optional_key(
+        "the same along its z axis", "m", plausible=5.0
+    )
     payload_inertia: Range | None = optional_key(
-        "inertia of the payload about its centre, as a fraction of that of [payload] at equal mass", low=0.0
+        "inertia of the payload about its centre, as a fraction of that of [payload] at equal mass",
+        low=0.0,
     )
 
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters that samples have."""
-        return tuple(key.name for key in keys(type(self)) if getattr(self, key.name) is not None)
+        return tuple(
+            key.name for key in keys(type(self)) if getattr(self, key.name) is not None
+        )
 
     @property
     def units(self) -> str:
@@ -99,30 +118,45 @@ class ParameterRanges:
         return tuple(getattr(self, name) for name in self.names)
 
     tilts_table = _has_any(TABLE_PARAMETERS, "Whether the table is raised or tilted.")
-    changes_rectangle = _has_any(TABLE_BOUNDS, "Whether the rectangle of the table differs from sample to sample.")
-    turns_upright = _has_any(UPRIGHT_TURN, "Whether the direction of ``vertical`` or ``axis`` differs.")
-    changes_payload = _has_any(PAYLOAD_PARAMETERS, "Whether the payload differs from sample to sample.")
+    changes_rectangle = _has_any(
+        TABLE_BOUNDS,
+        "Whether the rectangle of the table differs from sample to sample.",
+    )
+    turns_upright = _has_any(
+        UPRIGHT_TURN, "Whether the direction of ``vertical`` or ``axis`` differs."
+    )
+    changes_payload = _has_any(
+        PAYLOAD_PARAMETERS, "Whether the payload differs from sample to sample."
+    )
 
     def __len__(self) -> int:
         return len(self.names)
 
     def nominal(self, values: Mapping[str, float]) -> Array:
-        """Return the parameters of a sample that gives none, shape (width,); ``values`` are those of the problem."""
+        """Return the parameters of a sample that gives none, shape (width,).
+
+        ``values`` are those of the problem.
+        """
         factors = ("velocity_factor", "acceleration_factor", "payload_inertia")
-        nominal = dict.fromkeys(self.names, 0.0) | dict.fromkeys(factors, 1.0) | dict(values)
+        nominal = (
+            dict.fromkeys(self.names, 0.0) | dict.fromkeys(factors, 1.0) | dict(values)
+        )
         return np.array([nominal[name] for name in self.names], np.float64)
 
-    def split(self, values: Sequence[Any] | Array, nominal: Array) -> tuple[Any, dict[str, Any]]:
+    def split(
+        self, values: Sequence[Any] | Array, nominal: Array
+    ) -> tuple[Any, dict[str, Any]]:
         """Split the values of a scene after its obstacles: those for a constraint, and the parameters by name.
 
-        Args:
-            values: The values; empty for an undefined sample, whose parameters are nominal.
-            nominal: Result of ``nominal``.
+        Args: values: The values; empty for an undefined sample, whose parameters are
+            nominal. nominal: Result of ``nominal``.
         """
         if not len(self):
             return values, {}
         first = max(len(values) - len(self), 0)
-        return values[:first], dict(zip(self.names, values[first:] if len(values) else nominal, strict=True))
+        return values[:first], dict(
+            zip(self.names, values[first:] if len(values) else nominal, strict=True)
+        )
 
     def checked(self, values: Array) -> Array:
         """Return parameters of N samples, or of one for all, shape (N, width); check their shape and ranges.
@@ -131,16 +165,23 @@ class ParameterRanges:
             UsageError: The shape is wrong, or a value is outside its range.
         """
         if not len(self):
-            raise UsageError("must be None: the problem has no parameters", argument="parameters")
+            raise UsageError(
+                "must be None: the problem has no parameters", argument="parameters"
+            )
         if values.ndim not in {1, 2} or values.shape[-1] != len(self):
             raise UsageError(
                 f"must have shape (N, {len(self)}) for {', '.join(self.names)}, got {values.shape}",
                 argument="parameters",
             )
         rows = values.reshape(-1, len(self))
-        for column, (name, span) in enumerate(zip(self.names, self.ranges, strict=True)):
+        for column, (name, span) in enumerate(
+            zip(self.names, self.ranges, strict=True)
+        ):
             rounding = RANGE_ROUNDING * max(abs(span.low), abs(span.high))
-            outside = ~((rows[:, column] >= span.low - rounding) & (rows[:, column] <= span.high + rounding))
+            outside = ~(
+                (rows[:, column] >= span.low - rounding)
+                & (rows[:, column] <= span.high + rounding)
+            )
             if outside.any():
                 row = int(outside.argmax())
                 raise UsageError(
@@ -153,7 +194,9 @@ class ParameterRanges:
         """Yield a text of every parameter with its range in SI units."""
         for key in keys(type(self)):
             if (span := getattr(self, key.name)) is not None:
-                yield f"{key.name} in [{span.low:.4g}, {span.high:.4g}]" + ("" if key.unit == "1" else f" {key.unit}")
+                yield f"{key.name} in [{span.low:.4g}, {span.high:.4g}]" + (
+                    "" if key.unit == "1" else f" {key.unit}"
+                )
 
 
 NO_PARAMETERS = ParameterRanges()

@@ -13,9 +13,7 @@ from cnpgen.schema.units import suggested_unit
 from cnpgen.store.joint_units import unit_of
 
 MAX_RANGE_RATIO = 2.0  # distance from the center of a joint's range, in half ranges
-MAX_LIMIT_RATIO = (
-    10.0  # of velocities, accelerations and positions of the tip; deg/s is 57 times rad/s, mm 1,000 times m
-)
+MAX_LIMIT_RATIO = 10.0  # of velocities, accelerations and positions of the tip; deg/s is 57 times rad/s, mm 1,000 times m
 MAX_ANGLE_RAD = 2 * np.pi  # of directions
 
 
@@ -39,22 +37,35 @@ class ImplausibleValue:
         return text + suggested_unit(self.value, self.unit)
 
 
-def find_implausible_value(robot: Robot, name: str, values: NDArray[Any], unit: str) -> ImplausibleValue | None:
+def find_implausible_value(
+    robot: Robot, name: str, values: NDArray[Any], unit: str
+) -> ImplausibleValue | None:
     """Find the first value outside of the plausible range of its quantity; nan and infinite values are ignored.
 
-    The name is that of the column, such as "start_q" or "hit_angle", its values have shape (N, width), and the unit is
-    that of ``Field.unit``.
+    The name is that of the column, such as "start_q" or "hit_angle", its values have
+    shape (N, width), and the unit is that of ``Field.unit``.
     """
-    low, high = (np.broadcast_to(bound, values.shape[1:]) for bound in _plausible_range(robot, name, unit))
+    low, high = (
+        np.broadcast_to(bound, values.shape[1:])
+        for bound in _plausible_range(robot, name, unit)
+    )
     outside = np.isfinite(values) & ((values < low) | (values > high))
     if not outside.any():
         return None
     row, column = np.argwhere(outside)[0].tolist()
     bounds = float(low[column]), float(high[column])
-    return ImplausibleValue(row, column, float(values[row, column]), *bounds, unit_of(unit, column))
+    return ImplausibleValue(
+        row, column, float(values[row, column]), *bounds, unit_of(unit, column)
+    )
 
 
-def check_plausible(robot: Robot, columns: Mapping[str, NDArray[Any]], units: Mapping[str, str], *, noun: str) -> None:
+def check_plausible(
+    robot: Robot,
+    columns: Mapping[str, NDArray[Any]],
+    units: Mapping[str, str],
+    *,
+    noun: str,
+) -> None:
     """Raise an error for the first value of columns, shape (N, width), that is probably in another unit than theirs.
 
     The noun of a row is "task" or "plan".
@@ -62,9 +73,13 @@ def check_plausible(robot: Robot, columns: Mapping[str, NDArray[Any]], units: Ma
     for name, values in columns.items():
         wrong = find_implausible_value(robot, name, values, units[name])
         if wrong is not None:
-            joint = f" of {robot.joint_names[wrong.column]}" if name.endswith("q") else ""
+            joint = (
+                f" of {robot.joint_names[wrong.column]}" if name.endswith("q") else ""
+            )
             text, mark, hint = str(wrong).partition(";")
-            raise UnitError(f"{text} in {noun} {wrong.row}{joint}{mark}{hint}", argument=name)
+            raise UnitError(
+                f"{text} in {noun} {wrong.row}{joint}{mark}{hint}", argument=name
+            )
 
 
 def _plausible_range(robot: Robot, name: str, unit: str) -> tuple[Any, Any]:
@@ -75,7 +90,9 @@ def _plausible_range(robot: Robot, name: str, unit: str) -> tuple[Any, Any]:
         with np.errstate(invalid="ignore"):
             center, half = (low + high) / 2, MAX_RANGE_RATIO * (high - low) / 2
         bounded = np.isfinite(half)
-        return np.where(bounded, center - half, -np.inf), np.where(bounded, center + half, np.inf)
+        return np.where(bounded, center - half, -np.inf), np.where(
+            bounded, center + half, np.inf
+        )
     limits = {"dq": robot.velocity_limit, "ddq": robot.acceleration_limit}
     if quantity in limits:
         return -MAX_LIMIT_RATIO * limits[quantity], MAX_LIMIT_RATIO * limits[quantity]

@@ -54,26 +54,25 @@ class Attached:
 class Robot:
     """Robot of a problem, used by stages, kernels and checks.
 
-    Attributes:
-        urdf: Path of the URDF file, for messages only; the file may be deleted.
-        urdf_text: Text of the URDF.
-        joint_names: The n planned joints; every other joint of the URDF stays at zero.
-        tip: Name of the tip frame in the model.
-        attached: Attachments of the problem.
-        position_lower: Lower planning limits of joint positions [rad], shape (n,).
-        position_upper: Upper planning limits of joint positions [rad], shape (n,).
-        velocity_limit: Symmetric planning limit of joint velocities [rad/s], shape (n,).
-        acceleration_limit: Symmetric planning limit of joint accelerations [rad/s^2], shape (n,).
-        jerk_limit: Symmetric planning limit of joint jerks [rad/s^3], shape (n,); only ``joint-jerk`` constrains them.
-        torque_limit: Symmetric planning limit of joint torques [N m], shape (n,).
-        rated_velocity: The URDF's own velocity limit [rad/s], shape (n,).
-        home: Home configuration [rad], the key `base` of files, shape (n,).
-        chain: Parameters of the kinematic chain from the world to the tip.
-        shape: Collision geometry; None for the paper's, a line through the joint origins.
-        held_shape: Link geometry and the held object, for collisions between the two; None if these are not checked.
-        parameters: Parameters that differ from sample to sample.
-        table_origin: Point about which the table turns, the center of its rectangle [m], shape (3,).
-        nominal_parameters: Parameters of a sample for which none are given, shape (width,).
+    Attributes: urdf: Path of the URDF file, for messages only; the file may be deleted.
+        urdf_text: Text of the URDF. joint_names: The n planned joints; every other
+        joint of the URDF stays at zero. tip: Name of the tip frame in the model.
+        attached: Attachments of the problem. position_lower: Lower planning limits of
+        joint positions [rad], shape (n,). position_upper: Upper planning limits of
+        joint positions [rad], shape (n,). velocity_limit: Symmetric planning limit of
+        joint velocities [rad/s], shape (n,). acceleration_limit: Symmetric planning
+        limit of joint accelerations [rad/s^2], shape (n,). jerk_limit: Symmetric
+        planning limit of joint jerks [rad/s^3], shape (n,); only ``joint-jerk``
+        constrains them. torque_limit: Symmetric planning limit of joint torques [N m],
+        shape (n,). rated_velocity: The URDF's own velocity limit [rad/s], shape (n,).
+        home: Home configuration [rad], the key `base` of files, shape (n,). chain:
+        Parameters of the kinematic chain from the world to the tip. shape: Collision
+        geometry; None for the paper's, a line through the joint origins. held_shape:
+        Link geometry and the held object, for collisions between the two; None if these
+        are not checked. parameters: Parameters that differ from sample to sample.
+        table_origin: Point about which the table turns, the center of its rectangle
+        [m], shape (3,). nominal_parameters: Parameters of a sample for which none are
+        given, shape (width,).
     """
 
     urdf: Path
@@ -106,7 +105,9 @@ class Robot:
         """Lower and upper limits of positions, velocities and accelerations at both ends, shape (6 n,) each."""
         moving = self.velocity_limit, self.acceleration_limit
         low = [self.position_lower, *(-limit for limit in moving)]
-        return np.concatenate(2 * low), np.concatenate(2 * [self.position_upper, *moving])
+        return np.concatenate(2 * low), np.concatenate(
+            2 * [self.position_upper, *moving]
+        )
 
     @cached_property
     def prismatic(self) -> tuple[bool, ...]:
@@ -114,15 +115,19 @@ class Robot:
         return tuple(joint.prismatic for joint in self.chain.joints)
 
     def units(self, revolute: str) -> str:
-        """Return the units of a joint quantity from its unit for revolute joints; see ``units_of_joints``."""
+        """Return the units of a joint quantity from its unit for revolute joints.
+
+        See ``units_of_joints``.
+        """
         return units_of_joints(revolute, self.prismatic)
 
     @cached_property
     def capsule_axes(self) -> tuple[tuple[int, int], ...]:
         """Segments that represent the moving links: index pairs into (joint origins..., tip).
 
-        Segments connect the origins of successive joints. Coincident points are merged, collinear neighbors become one
-        segment, and parts that joint 1 does not move are omitted.
+        Segments connect the origins of successive joints. Coincident points are merged,
+        collinear neighbors become one segment, and parts that joint 1 does not move are
+        omitted.
         """
         return _capsule_axes(self.model, self.tip)
 
@@ -143,17 +148,26 @@ class Robot:
         data, positions = self.model.createData(), np.empty((len(q), 3))
         for row, configuration in enumerate(q):
             pin.forwardKinematics(self.model, data, configuration)
-            positions[row] = pin.updateFramePlacement(self.model, data, self.tip_frame).translation
+            positions[row] = pin.updateFramePlacement(
+                self.model, data, self.tip_frame
+            ).translation
         return positions
 
     @cached_property
     def reach(self) -> float:
         """Length of the polyline from the world's origin over all joints to the tip [m]."""
-        placements = [*self.model.jointPlacements, self.model.frames[self.tip_frame].placement]
-        return float(sum(np.linalg.norm(placement.translation) for placement in placements))
+        placements = [
+            *self.model.jointPlacements,
+            self.model.frames[self.tip_frame].placement,
+        ]
+        return float(
+            sum(np.linalg.norm(placement.translation) for placement in placements)
+        )
 
 
-def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Attached) -> "pin.Model":
+def reduced_model(
+    urdf: Path, text: str, joints: tuple[str, ...], attached: Attached
+) -> "pin.Model":
     """Build the Pinocchio model of a URDF, reduced to the planned joints, with the attachments of a problem.
 
     The path is for messages. Joints that are not planned are locked at zero.
@@ -172,19 +186,35 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
             model = pin.buildModelFromXML(limited)
         except ValueError:
             with recipe_errors_in(urdf):
-                _check_order_of_limits(parameters, [joint.name for joint in parameters.joints.values()])
+                _check_order_of_limits(
+                    parameters, [joint.name for joint in parameters.joints.values()]
+                )
             raise
         name_links_uniquely(model)
     except (ValueError, RuntimeError, IndexError) as error:
-        raise RecipeError([f"{urdf}: not a URDF that Pinocchio can read: {error}"]) from error
+        raise RecipeError(
+            [f"{urdf}: not a URDF that Pinocchio can read: {error}"]
+        ) from error
     known = list(model.names)[1:]
-    missing = [f"{urdf.name} has no joint {name!r}{nearest(name, known)}" for name in joints if name not in known]
+    missing = [
+        f"{urdf.name} has no joint {name!r}{nearest(name, known)}"
+        for name in joints
+        if name not in known
+    ]
     if missing:
         raise RecipeError([f"robot.joints: {text}" for text in missing])
-    locked = [index for index in range(1, model.njoints) if model.names[index] not in joints]
-    reduced = pin.buildReducedModel(model, locked, pin.neutral(model)) if locked else model
+    locked = [
+        index for index in range(1, model.njoints) if model.names[index] not in joints
+    ]
+    reduced = (
+        pin.buildReducedModel(model, locked, pin.neutral(model)) if locked else model
+    )
     if tuple(reduced.names)[1:] != tuple(joints):
-        raise RecipeError([f"robot.joints: must be in the URDF's order {list(reduced.names)[1:]}, got {list(joints)}"])
+        raise RecipeError(
+            [
+                f"robot.joints: must be in the URDF's order {list(reduced.names)[1:]}, got {list(joints)}"
+            ]
+        )
     with recipe_errors_in(urdf):
         check_model(reduced, parameters)
     attach(reduced, attached)
@@ -216,7 +246,11 @@ def _mimic_offset(mimic: ElementTree.Element) -> str:
 
 def _check_order_of_limits(parameters: UrdfParameters, joints: Collection[str]) -> None:
     """Raise an error that lists the joints whose lower limits are above the upper ones."""
-    limits = {joint.name: joint.limits for joint in parameters.joints.values() if joint.name in joints}
+    limits = {
+        joint.name: joint.limits
+        for joint in parameters.joints.values()
+        if joint.name in joints
+    }
     errors = [
         f"joint {name!r}: its limits lower={of['lower']:g} and upper={of['upper']:g} are swapped: exchange them"
         for name, of in limits.items()
@@ -236,7 +270,10 @@ def recipe_errors_in(urdf: Path) -> Iterator[None]:
 
 
 def _capsule_axes(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:
-    """Merge the chain of joint origins into segments; parts that are straight at random configurations always are."""
+    """Merge the chain of joint origins into segments.
+
+    Parts that are straight at random configurations always are.
+    """
     import pinocchio as pin
 
     data, random = model.createData(), np.random.default_rng(0)
@@ -253,7 +290,9 @@ def _capsule_axes(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:
 
     def straight(a: int, b: int, c: int) -> bool:
         first, second = points[:, b] - points[:, a], points[:, c] - points[:, b]
-        onwards = bool((first * second).sum(axis=1).min() > 0)  # a link that folds back is a separate segment
+        onwards = bool(
+            (first * second).sum(axis=1).min() > 0
+        )  # a link that folds back is a separate segment
         return onwards and bool(np.abs(np.cross(first, second)).max() < 1e-9)
 
     kept = [0]
@@ -279,7 +318,16 @@ def attach(model: "pin.Model", attached: Attached) -> None:
     frame = model.frames[index]
     placement = frame.placement * pin.SE3(attached.rotation, attached.translation)
     if attached.tip != attached.frame:
-        model.addFrame(pin.Frame(attached.tip, frame.parentJoint, index, placement, pin.FrameType.OP_FRAME), False)
+        model.addFrame(
+            pin.Frame(
+                attached.tip,
+                frame.parentJoint,
+                index,
+                placement,
+                pin.FrameType.OP_FRAME,
+            ),
+            False,
+        )
     if body := attached.payload:
         inertia = pin.Inertia(body.mass, np.array(body.centre), body.inertia_matrix)
         model.appendBodyToJoint(frame.parentJoint, inertia, placement)
@@ -289,8 +337,13 @@ def attach(model: "pin.Model", attached: Attached) -> None:
 
 
 def bounded(urdf: str, tree: ElementTree.Element, attached: Attached) -> str:
-    """Return a URDF in which continuous joints with a given range are revolute; the tree is modified in place."""
-    turning = [joint for joint in tree.iter("joint") if joint.get("type") == "continuous"]
+    """Return a URDF in which continuous joints with a given range are revolute.
+
+    The tree is modified in place.
+    """
+    turning = [
+        joint for joint in tree.iter("joint") if joint.get("type") == "continuous"
+    ]
     given = [joint for joint in turning if joint.get("name") in attached.ranges]
     for joint in given:
         joint.set("type", "revolute")

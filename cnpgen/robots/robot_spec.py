@@ -22,9 +22,14 @@ class RobotSpec:
         "planned joints, in order; all other joints stay at zero, or at their 'locked_positions'"
     )
     tip: str = field("name of the tip frame (URDF link)")
-    base: tuple[float, ...] = field("base configuration of the planned joints", unit="rad", plausible=100.0)
+    base: tuple[float, ...] = field(
+        "base configuration of the planned joints", unit="rad", plausible=100.0
+    )
     tip_offset: tuple[float, float, float] = optional_key(
-        "offset of the tip in the frame 'tip': x, y, z", unit="m", default=(0.0, 0.0, 0.0), plausible=5.0
+        "offset of the tip in the frame 'tip': x, y, z",
+        unit="m",
+        default=(0.0, 0.0, 0.0),
+        plausible=5.0,
     )
     tip_rotation: tuple[float, float, float] = optional_key(
         "rotation of the tip in the frame 'tip': roll, pitch and yaw about fixed axes",
@@ -46,13 +51,18 @@ class RobotSpec:
         "their positions, one per joint", unit="rad", default=(), plausible=100.0
     )
     packages: tuple[str, ...] = optional_key(
-        "folders, relative to the problem file, that are searched for package:// of the URDF", default=()
+        "folders, relative to the problem file, that are searched for package:// of the URDF",
+        default=(),
     )
     convex_parts: int = optional_key(
-        "maximum number of convex parts of a collision mesh; 1 for its convex hull", default=1, low=1, high=64
+        "maximum number of convex parts of a collision mesh; 1 for its convex hull",
+        default=1,
+        low=1,
+        high=64,
     )
     decomposed: tuple[str, ...] = optional_key(
-        "links whose collision meshes are decomposed into convex parts; by default all", default=()
+        "links whose collision meshes are decomposed into convex parts; by default all",
+        default=(),
     )
     hull_gap: float | None = optional_key(
         "fraction of the random states without overlap of the links' triangle meshes in which their convex parts"
@@ -66,16 +76,23 @@ class RobotSpec:
         default="",
     )
     ignored_pairs: tuple[tuple[str, str], ...] = optional_key(
-        "pairs of links whose collisions are not checked, besides those of the SRDF", default=()
+        "pairs of links whose collisions are not checked, besides those of the SRDF",
+        default=(),
     )
 
     def validate(self) -> Iterator[tuple[str, str]]:
         """Yield (key, error) pairs."""
         twice = sorted({name for name in self.joints if self.joints.count(name) > 1})
         if twice:
-            yield "joints", f"each joint can be planned once, got {', '.join(twice)} more than once"
+            yield (
+                "joints",
+                f"each joint can be planned once, got {', '.join(twice)} more than once",
+            )
         if len(self.base) != len(self.joints):
-            yield "base", f"expected {len(self.joints)} numbers, one per planned joint, got {len(self.base)}"
+            yield (
+                "base",
+                f"expected {len(self.joints)} numbers, one per planned joint, got {len(self.base)}",
+            )
         if len(self.locked_positions) != len(self.locked_joints):
             count = len(self.locked_joints)
             yield (
@@ -83,24 +100,51 @@ class RobotSpec:
                 f"expected {count} numbers, one per locked joint, got {len(self.locked_positions)}",
             )
         if both := sorted(set(self.joints) & set(self.locked_joints)):
-            yield "locked_joints", f"a joint is planned or locked, got {', '.join(both)} in both lists"
+            yield (
+                "locked_joints",
+                f"a joint is planned or locked, got {', '.join(both)} in both lists",
+            )
         if len(set(self.locked_joints)) != len(self.locked_joints):
-            yield "locked_joints", f"each joint can be locked once, got {list(self.locked_joints)}"
+            yield (
+                "locked_joints",
+                f"each joint can be locked once, got {list(self.locked_joints)}",
+            )
         if self.decomposed and self.convex_parts == 1:
-            yield "decomposed", "links are decomposed into more than one part only: set 'convex_parts', such as 4"
+            yield (
+                "decomposed",
+                "links are decomposed into more than one part only: set 'convex_parts', such as 4",
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
 class LimitSpec:
     """Planning limits as fractions of the URDF's limits or of given limits."""
 
-    position_scale: float = field("planning limit / URDF limit of joint positions", default=1.0, low=1e-3, high=1.0)
-    velocity_scale: float = field("planning limit / URDF limit of joint velocities", default=1.0, low=1e-3, high=1.0)
-    acceleration_rate: float = field("acceleration limit / velocity limit", unit="1/s", default=10.0, low=1e-3)
-    acceleration_cap: float = field(
-        "maximum of the acceleration limits", unit="rad/s^2", default=20.0, low=1e-3, plausible=1000.0
+    position_scale: float = field(
+        "planning limit / URDF limit of joint positions",
+        default=1.0,
+        low=1e-3,
+        high=1.0,
     )
-    torque_scale: float = field("planning limit / URDF limit of joint torques", default=1.0, low=1e-3, high=1.0)
+    velocity_scale: float = field(
+        "planning limit / URDF limit of joint velocities",
+        default=1.0,
+        low=1e-3,
+        high=1.0,
+    )
+    acceleration_rate: float = field(
+        "acceleration limit / velocity limit", unit="1/s", default=10.0, low=1e-3
+    )
+    acceleration_cap: float = field(
+        "maximum of the acceleration limits",
+        unit="rad/s^2",
+        default=20.0,
+        low=1e-3,
+        plausible=1000.0,
+    )
+    torque_scale: float = field(
+        "planning limit / URDF limit of joint torques", default=1.0, low=1e-3, high=1.0
+    )
     position: tuple[Range, ...] | None = optional_key(
         "limits of joint positions in place of the URDF's, one range per planned joint; required for continuous joints",
         unit="rad",
@@ -110,7 +154,9 @@ class LimitSpec:
         "limits of joint velocities in place of the URDF's", unit="rad/s", low=1e-6
     )
     acceleration: PerJoint | None = optional_key(
-        "planning limits of joint accelerations in place of rate and cap", unit="rad/s^2", low=1e-6
+        "planning limits of joint accelerations in place of rate and cap",
+        unit="rad/s^2",
+        low=1e-6,
     )
     jerk: PerJoint | None = optional_key(
         "planning limits of joint jerks; default 5/s times those of the accelerations",
@@ -118,19 +164,25 @@ class LimitSpec:
         low=1e-6,
         plausible=1e5,
     )
-    torque: PerJoint | None = optional_key("limits of joint torques in place of the URDF's", unit="N m", low=1e-6)
+    torque: PerJoint | None = optional_key(
+        "limits of joint torques in place of the URDF's", unit="N m", low=1e-6
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Payload:
     """Rigid body carried at the tip frame; a point mass without inertia and size.
 
-    With ``touch_links``, its box is a body that touches neither other links nor obstacles.
+    With ``touch_links``, its box is a body that touches neither other links nor
+    obstacles.
     """
 
     mass: float = field("mass", unit="kg", low=1e-9)
     centre: tuple[float, float, float] = field(
-        "centre of mass in the tip frame", unit="m", default=(0.0, 0.0, 0.0), plausible=5.0
+        "centre of mass in the tip frame",
+        unit="m",
+        default=(0.0, 0.0, 0.0),
+        plausible=5.0,
     )
     inertia: tuple[float, float, float, float, float, float] | None = field(
         "inertia about the centre of mass along the tip frame's axes: xx, yy, zz, xy, xz, yz",
@@ -153,11 +205,16 @@ class Payload:
     def validate(self) -> Iterator[tuple[str, str]]:
         """Yield (key, error) pairs."""
         if self.inertia is not None and self.size is not None and not self.touch_links:
-            yield "size", "the payload has both an 'inertia' and a 'size', expected one of them"
+            yield (
+                "size",
+                "the payload has both an 'inertia' and a 'size', expected one of them",
+            )
         if self.touch_links and self.size is None:
             yield "touch_links", "a payload that is a body needs a 'size'"
         principal = np.linalg.eigvalsh(self.inertia_matrix)
-        if principal[0] < 0 or principal[2] > (principal[0] + principal[1]) * (1 + 1e-9):
+        if principal[0] < 0 or principal[2] > (principal[0] + principal[1]) * (
+            1 + 1e-9
+        ):
             text = ", ".join(f"{each:g}" for each in principal)
             yield (
                 "inertia",
@@ -166,10 +223,17 @@ class Payload:
 
     def at(self, parameters: Mapping[str, float]) -> Payload:
         """Return the payload of a sample, from its parameters by name."""
-        mass, factor = parameters.get("payload_mass", self.mass), parameters.get("payload_inertia", 1.0)
-        x, y, z = (parameters.get(name, value) for name, value in zip(PAYLOAD_CENTRE, self.centre, strict=True))
+        mass, factor = (
+            parameters.get("payload_mass", self.mass),
+            parameters.get("payload_inertia", 1.0),
+        )
+        x, y, z = (
+            parameters.get(name, value)
+            for name, value in zip(PAYLOAD_CENTRE, self.centre, strict=True)
+        )
         xx, yy, zz, xy, xz, yz = (
-            self.inertia_matrix[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]] * (factor * mass / self.mass)
+            self.inertia_matrix[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+            * (factor * mass / self.mass)
         ).tolist()
         return replace(
             self,
@@ -197,5 +261,6 @@ class HeldObject:
         "edge lengths along the tip frame's x, y, z", unit="m", low=1e-6, plausible=10.0
     )
     touch_links: tuple[str, ...] = optional_key(
-        "links that carry the object and may touch it (constraint 'object-clearance')", default=()
+        "links that carry the object and may touch it (constraint 'object-clearance')",
+        default=(),
     )

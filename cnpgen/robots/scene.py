@@ -1,4 +1,7 @@
-"""The scene of samples: their obstacles with poses and sizes; scene tables of datasets in the same layout."""
+"""The scene of samples: their obstacles with poses and sizes.
+
+Scene tables of datasets in the same layout.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +15,22 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, Array
-from cnpgen.robots.solid import Solid, number_slices, place_obstacles, pose_width, posed_numbers, solids_of
+from cnpgen.robots.solid import (
+    Solid,
+    number_slices,
+    place_obstacles,
+    pose_width,
+    posed_numbers,
+    solids_of,
+)
 from cnpgen.schema.arguments import integer
 from cnpgen.store.scene_table import NO_OBSTACLE, OBSTACLE_KINDS, SceneTable
 
-PARKED_POSITION_M = (0.0, 0.0, -100.0)  # of obstacles that a sample with fewer obstacles does not have
+PARKED_POSITION_M = (
+    0.0,
+    0.0,
+    -100.0,
+)  # of obstacles that a sample with fewer obstacles does not have
 
 
 class SampleIndexError(UsageError, IndexError):
@@ -27,9 +41,9 @@ class SampleIndexError(UsageError, IndexError):
 class Scene:
     """The obstacles of N samples, created where samples enter and passed along.
 
-    Attributes:
-        obstacles: The obstacles, the same for all samples.
-        poses: Poses and sizes of the obstacles of each sample (``cnpgen.robots.solid``), shape (N, width).
+    Attributes: obstacles: The obstacles, the same for all samples. poses: Poses and
+        sizes of the obstacles of each sample (``cnpgen.robots.solid``), shape (N,
+        width).
     """
 
     obstacles: tuple[Obstacle, ...]
@@ -39,9 +53,17 @@ class Scene:
         obstacles: Any = self.obstacles
         poses: Any = self.poses
         if not isinstance(obstacles, tuple):
-            raise UsageError(f"must be a tuple of obstacles, got {obstacles!r:.60}", argument="obstacles")
-        if poses is None or isinstance(poses, int | float | str):  # JAX puts other objects in the place of arrays
-            raise UsageError(f"must be an array of shape (N, width), got {poses!r:.60}", argument="poses")
+            raise UsageError(
+                f"must be a tuple of obstacles, got {obstacles!r:.60}",
+                argument="obstacles",
+            )
+        if poses is None or isinstance(
+            poses, int | float | str
+        ):  # JAX puts other objects in the place of arrays
+            raise UsageError(
+                f"must be an array of shape (N, width), got {poses!r:.60}",
+                argument="poses",
+            )
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -55,17 +77,18 @@ class Scene:
             return Scene(self.obstacles, self.poses[rows])
         except IndexError as error:
             raise SampleIndexError(
-                f"samples are selected by numbers, a mask or a slice: {error}", concerns="index"
+                f"samples are selected by numbers, a mask or a slice: {error}",
+                concerns="index",
             ) from error
 
     def with_poses(self, poses: Array) -> Scene:
         """Return the scene with other poses and sizes of the obstacles; values for a constraint are kept.
 
-        Args:
-            poses: Poses and sizes of the obstacles of each sample, shape (N, ``pose_width(obstacles)``).
+        Args: poses: Poses and sizes of the obstacles of each sample, shape (N,
+            ``pose_width(obstacles)``).
 
-        Raises:
-            UsageError: The shape is wrong, or a number is not finite or larger than ``MAX_COORDINATE_M``.
+        Raises: UsageError: The shape is wrong, or a number is not finite or larger than
+            ``MAX_COORDINATE_M``.
         """
         expected = len(self), pose_width(self.obstacles)
         if poses.shape != expected:
@@ -74,13 +97,18 @@ class Scene:
                 argument="obstacle_poses",
             )
         if not (np.abs(poses) <= MAX_COORDINATE_M).all():  # also false for nan
-            sample, entry = np.argwhere(~(np.abs(poses) <= MAX_COORDINATE_M))[0].tolist()
+            sample, entry = np.argwhere(~(np.abs(poses) <= MAX_COORDINATE_M))[
+                0
+            ].tolist()
             value = poses[sample, entry]
             raise UsageError(
                 f"must be finite and at most {MAX_COORDINATE_M:g}, got {value:g} at sample {sample}",
                 argument="obstacle_poses",
             )
-        return Scene(self.obstacles, np.concatenate([poses, self.poses[:, expected[1] :]], axis=1))
+        return Scene(
+            self.obstacles,
+            np.concatenate([poses, self.poses[:, expected[1] :]], axis=1),
+        )
 
     def astype(self, dtype: str) -> Scene:
         """Return the scene in another float type."""
@@ -98,12 +126,17 @@ class Scene:
 
     def _check_sample(self, sample: int, argument: str) -> None:
         if not -len(self) <= sample < len(self):
-            text = f"there is no sample {sample}: {len(self)} samples are numbered from 0"
+            text = (
+                f"there is no sample {sample}: {len(self)} samples are numbered from 0"
+            )
             raise SampleIndexError(text, concerns=argument)
 
 
 def sample_obstacles(obstacles: Sequence[Obstacle]) -> dict[str, list[int]]:
-    """Return the obstacles that samples place: kind -> indices; they are parked far below the robot."""
+    """Return the obstacles that samples place: kind -> indices.
+
+    They are parked far below the robot.
+    """
     parked: dict[str, list[int]] = {kind: [] for kind in OBSTACLE_KINDS}
     for index, obstacle in enumerate(obstacles):
         if obstacle.position == PARKED_POSITION_M and obstacle.kind in parked:
@@ -116,7 +149,9 @@ def scene_capacity(obstacles: Sequence[Obstacle]) -> int:
     return sum(map(len, sample_obstacles(obstacles).values()))
 
 
-def make_scene_table(layouts: Sequence[Sequence[Obstacle]], families: Sequence[int], obstacles: int) -> SceneTable:
+def make_scene_table(
+    layouts: Sequence[Sequence[Obstacle]], families: Sequence[int], obstacles: int
+) -> SceneTable:
     """Return the obstacles of S scenes, at most O each, as arrays; scene IDs are the indices of the scenes.
 
     No obstacle is upright, below an object, or a mesh.
@@ -129,10 +164,23 @@ def make_scene_table(layouts: Sequence[Sequence[Obstacle]], families: Sequence[i
     quaternion[..., 0] = 1.0
     kind[real] = [OBSTACLE_KINDS.index(obstacle.kind) for obstacle in flat]
     if flat:
-        size[real] = [obstacle.size or (obstacle.radius, obstacle.length or 0.0, 0.0) for obstacle in flat]
+        size[real] = [
+            obstacle.size or (obstacle.radius, obstacle.length or 0.0, 0.0)
+            for obstacle in flat
+        ]
         position[real] = [obstacle.position for obstacle in flat]
-        quaternion[real] = _quaternions(np.array([obstacle.rotation for obstacle in flat]))
-    return SceneTable(np.arange(len(layouts)), np.array(families, np.int64), count, kind, size, position, quaternion)
+        quaternion[real] = _quaternions(
+            np.array([obstacle.rotation for obstacle in flat])
+        )
+    return SceneTable(
+        np.arange(len(layouts)),
+        np.array(families, np.int64),
+        count,
+        kind,
+        size,
+        position,
+        quaternion,
+    )
 
 
 def _quaternions(rotation: Array) -> Array:
@@ -146,7 +194,9 @@ def _quaternions(rotation: Array) -> Array:
 def rotations_of(table: SceneTable) -> Array:
     """Return the rotation matrices of the obstacles, whose columns are their axes, shape (S, O, 3, 3)."""
     quaternion = table.obstacle_quaternion.astype(np.float64)
-    return rotation_matrices(quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True))
+    return rotation_matrices(
+        quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    )
 
 
 def rotation_matrices(wxyz: Array) -> Array:
@@ -163,19 +213,30 @@ def rotation_matrices(wxyz: Array) -> Array:
 def scene_poses(obstacles: Sequence[Obstacle], table: SceneTable) -> Array:
     """Return the poses and sizes of a problem's obstacles in every scene (``cnpgen.robots.solid``), shape (S, width).
 
-    The obstacles of a scene take the places of the parked obstacles of their kind, in order; the others stay parked.
+    The obstacles of a scene take the places of the parked obstacles of their kind, in
+    order; the others stay parked.
     """
     poses = np.tile(place_obstacles(obstacles), (len(table), 1))
     slices, rotations = number_slices(obstacles), rotations_of(table)
-    position, size = table.obstacle_position.astype(np.float64), table.obstacle_size.astype(np.float64)
+    position, size = (
+        table.obstacle_position.astype(np.float64),
+        table.obstacle_size.astype(np.float64),
+    )
     for code, (kind, places) in enumerate(sample_obstacles(obstacles).items()):
         scenes, entries = np.nonzero(table.obstacle_kind == code)
         rank = np.cumsum(table.obstacle_kind == code, axis=1)[scenes, entries] - 1
         if len(rank) and rank.max() >= len(places):
-            raise UsageError(f"a scene has {rank.max() + 1} obstacles of the kind {kind}, expected {len(places)}")
+            raise UsageError(
+                f"a scene has {rank.max() + 1} obstacles of the kind {kind}, expected {len(places)}"
+            )
         if not len(rank):
             continue
-        numbers = posed_numbers(kind, position[scenes, entries], size[scenes, entries], rotations[scenes, entries])
+        numbers = posed_numbers(
+            kind,
+            position[scenes, entries],
+            size[scenes, entries],
+            rotations[scenes, entries],
+        )
         first = np.array([slices[place].start for place in places])[rank]
         poses[scenes[:, None], first[:, None] + np.arange(numbers.shape[1])] = numbers
     assert poses.shape[1] == pose_width(obstacles)

@@ -12,7 +12,9 @@ from cnpgen.errors import RecipeError
 from cnpgen.schema.texts import read_at_most, utf8_text
 
 MAX_URDF_BYTES = 1 << 23
-MAX_URDF_ELEMENTS = 1_000  # links or joints: Pinocchio recurses along a chain and crashes at 5,000
+MAX_URDF_ELEMENTS = (
+    1_000  # links or joints: Pinocchio recurses along a chain and crashes at 5,000
+)
 MAX_DEPTH = 64  # of nested elements
 _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _CONTROL = re.compile(
@@ -32,7 +34,9 @@ class _Builder(ElementTree.TreeBuilder):
         if self._depth > MAX_DEPTH:
             raise ValueError(f"it has more than {MAX_DEPTH} nested elements")
         for name, value in attrs.items():
-            if _CONTROL.search(value):  # names appear in output and in comments of recipes
+            if _CONTROL.search(
+                value
+            ):  # names appear in output and in comments of recipes
                 raise ValueError(f"its <{tag} {name}=...> has control characters")
         return super().start(tag, attrs)
 
@@ -45,19 +49,33 @@ class _Builder(ElementTree.TreeBuilder):
 
 
 def read_urdf(path: Path) -> str:
-    """Read the text of a URDF file; RecipeError if it cannot be read, is too large or is not UTF-8."""
+    """Read the text of a URDF file.
+
+    RecipeError if it cannot be read, is too large or is not UTF-8.
+    """
     try:
-        return utf8_text(read_at_most(path, MAX_URDF_BYTES, "a URDF"), "utf-8", hint="; save the URDF as UTF-8")
+        return utf8_text(
+            read_at_most(path, MAX_URDF_BYTES, "a URDF"),
+            "utf-8",
+            hint="; save the URDF as UTF-8",
+        )
     except OSError as error:
-        raise RecipeError([f"{path}: cannot be read: {error.strerror or error}"]) from error
+        raise RecipeError(
+            [f"{path}: cannot be read: {error.strerror or error}"]
+        ) from error
     except ValueError as error:
         raise RecipeError([f"{path}: {error}"]) from error
 
 
 def urdf_tree(text: str) -> ElementTree.Element:
-    """Parse the text of a URDF; ValueError if it is not XML, too deep or too large, or defines entities."""
+    """Parse the text of a URDF.
+
+    ValueError if it is not XML, too deep or too large, or defines entities.
+    """
     if len(text) > MAX_URDF_BYTES:
-        raise ValueError(f"it has {len(text):,} characters, expected at most {MAX_URDF_BYTES:,}")
+        raise ValueError(
+            f"it has {len(text):,} characters, expected at most {MAX_URDF_BYTES:,}"
+        )
     parser = ElementTree.XMLParser(target=_Builder(), encoding="utf-8")  # noqa: S314 - the builder allows no entities
     try:
         parser.feed(text.encode())
@@ -68,7 +86,9 @@ def urdf_tree(text: str) -> ElementTree.Element:
         tree = _tree_without_namespaces(text)
     for part in ("link", "joint"):
         if (count := sum(1 for _ in tree.iter(part))) > MAX_URDF_ELEMENTS:
-            raise ValueError(f"it has {count:,} {part}s, expected at most {MAX_URDF_ELEMENTS:,}")
+            raise ValueError(
+                f"it has {count:,} {part}s, expected at most {MAX_URDF_ELEMENTS:,}"
+            )
     return tree
 
 
@@ -76,7 +96,10 @@ def _tree_without_namespaces(text: str) -> ElementTree.Element:
     """Parse the text of a URDF with undeclared prefixes, such as those of Gazebo, as other URDF parsers do."""
     parser, builder = ParserCreate("utf-8"), _Builder()
     parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
-    parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = builder.data, builder.doctype
+    parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = (
+        builder.data,
+        builder.doctype,
+    )
     try:
         parser.Parse(text.encode(), True)
     except ExpatError as error:
@@ -89,21 +112,28 @@ def numbers_text(values: Iterable[float]) -> str:
     return " ".join(f"{value:.17g}" for value in values)
 
 
-def number_in(element: ElementTree.Element | None, attribute: str, default: float) -> float:
+def number_in(
+    element: ElementTree.Element | None, attribute: str, default: float
+) -> float:
     """Return a numeric attribute of an element; ValueError if it is not a number."""
     return numbers_in(element, attribute, (default,))[0]
 
 
-def numbers_in(element: ElementTree.Element | None, attribute: str, default: tuple[float, ...]) -> tuple[float, ...]:
+def numbers_in(
+    element: ElementTree.Element | None, attribute: str, default: tuple[float, ...]
+) -> tuple[float, ...]:
     """Return the numbers in an attribute of an element; as many as the default ones of a missing attribute or element.
 
-    The accepted notation is that of URDF parsers, which drop an element with other numbers without an error.
+    The accepted notation is that of URDF parsers, which drop an element with other
+    numbers without an error.
     """
     text = None if element is None else element.get(attribute)
     if element is None or text is None:
         return default
     words = [text] if len(default) == 1 else [word for word in text.split(" ") if word]
-    if len(words) != len(default) or not all(_DECIMAL.fullmatch(word) for word in words):
+    if len(words) != len(default) or not all(
+        _DECIMAL.fullmatch(word) for word in words
+    ):
         expected = "a number" if len(default) == 1 else f"{len(default)} numbers"
         raise ValueError(
             f"<{element.tag} {attribute}={text!r}> must be {expected}, with a point and not a comma, without units"

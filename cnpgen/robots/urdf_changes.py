@@ -14,12 +14,21 @@ from cnpgen.robots.urdf import number_in, numbers_in, numbers_text, read_urdf, u
 from cnpgen.robots.urdf_parameters import placement_of
 
 _TURNING, _SLIDING = ("revolute", "continuous"), ("prismatic",)
-_MOTION = ("axis", "limit", "mimic", "calibration", "dynamics", "safety_controller")  # elements of a joint that moves
+_MOTION = (
+    "axis",
+    "limit",
+    "mimic",
+    "calibration",
+    "dynamics",
+    "safety_controller",
+)  # elements of a joint that moves
 _TAG = "disable_collisions"
 PAYLOAD = "carried payload"  # name of the link and of its joint
 
 
-def with_locked_joints(urdf: str, positions: Mapping[str, float], *, is_stored: bool) -> str:
+def with_locked_joints(
+    urdf: str, positions: Mapping[str, float], *, is_stored: bool
+) -> str:
     """Return a URDF whose locked joints are fixed at their positions [rad or m], with those that mimic them.
 
     The joints of a stored problem are fixed already.
@@ -31,7 +40,9 @@ def with_locked_joints(urdf: str, positions: Mapping[str, float], *, is_stored: 
         robot = urdf_tree(urdf)
         joints = {joint.get("name", ""): joint for joint in robot.findall("joint")}
         errors += [
-            f"the URDF has no joint {name!r}{nearest(name, joints)}" for name in positions if name not in joints
+            f"the URDF has no joint {name!r}{nearest(name, joints)}"
+            for name in positions
+            if name not in joints
         ]
         if not errors:
             all_positions = dict(positions) | _mimicking(joints, positions)
@@ -47,13 +58,22 @@ def with_locked_joints(urdf: str, positions: Mapping[str, float], *, is_stored: 
     return ElementTree.tostring(robot, encoding="unicode")
 
 
-def _mimicking(joints: Mapping[str, Element], positions: Mapping[str, float]) -> dict[str, float]:
+def _mimicking(
+    joints: Mapping[str, Element], positions: Mapping[str, float]
+) -> dict[str, float]:
     """Return the positions of joints that mimic a locked one and have none of their own."""
     found = {}
     for name, joint in joints.items():
         mimic = joint.find("mimic")
-        if mimic is not None and mimic.get("joint") in positions and name not in positions:
-            factor, offset = number_in(mimic, "multiplier", 1.0), number_in(mimic, "offset", 0.0)
+        if (
+            mimic is not None
+            and mimic.get("joint") in positions
+            and name not in positions
+        ):
+            factor, offset = (
+                number_in(mimic, "multiplier", 1.0),
+                number_in(mimic, "offset", 0.0),
+            )
             found[name] = factor * positions[mimic.get("joint", "")] + offset
     return found
 
@@ -66,12 +86,16 @@ def _fix(joint: Element, position: float, is_stored: bool) -> list[str]:
     if kind == "fixed" and is_stored:
         return []
     if kind not in _TURNING + _SLIDING:
-        return [f"joint {name!r} is {kind} and has no position, expected a revolute, continuous or prismatic joint"]
+        return [
+            f"joint {name!r} is {kind} and has no position, expected a revolute, continuous or prismatic joint"
+        ]
     limit = joint.find("limit")
     low, high = number_in(limit, "lower", 0.0), number_in(limit, "upper", 0.0)
     if kind != "continuous" and not low - 1e-9 <= position <= high + 1e-9:
         unit = "m" if kind in _SLIDING else "rad"
-        return [f"joint {name!r} is locked at {position:g} {unit}, outside of its limits {low:g} to {high:g} {unit}"]
+        return [
+            f"joint {name!r} is locked at {position:g} {unit}, outside of its limits {low:g} to {high:g} {unit}"
+        ]
     axis = np.array(numbers_in(joint.find("axis"), "xyz", (1.0, 0.0, 0.0)))
     if not np.linalg.norm(axis):
         return [f"joint {name!r} has the axis 0 0 0"]
@@ -85,7 +109,14 @@ def _fix(joint: Element, position: float, is_stored: bool) -> list[str]:
     for part in [part for part in joint if part.tag in (*_MOTION, "origin")]:
         joint.remove(part)
     joint.set("type", "fixed")
-    joint.insert(0, Element("origin", xyz=numbers_text(xyz), rpy=numbers_text(pin.rpy.matrixToRpy(rotation))))
+    joint.insert(
+        0,
+        Element(
+            "origin",
+            xyz=numbers_text(xyz),
+            rpy=numbers_text(pin.rpy.matrixToRpy(rotation)),
+        ),
+    )
     return []
 
 
@@ -93,23 +124,34 @@ def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
     """Return the rotation about a unit axis (Rodrigues), shape (3, 3)."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
+    return np.asarray(
+        np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    )
 
 
 def with_disabled_pairs(urdf: str, srdf: Path) -> str:
-    """Return a URDF with the disabled link pairs of an SRDF file; URDF parsers ignore unknown elements."""
+    """Return a URDF with the disabled link pairs of an SRDF file.
+
+    URDF parsers ignore unknown elements.
+    """
     try:
         tree = urdf_tree(read_urdf(srdf))
     except ValueError as error:
         raise RecipeError([f"{srdf}: not an SRDF that can be read: {error}"]) from error
     if tree.find("link") is not None:
-        raise RecipeError([f"{srdf}: is a URDF, expected an SRDF with <{_TAG}> elements"])
-    return _with_entries(urdf, [dict(entry.attrib) for entry in tree.iter(_TAG)], str(srdf))
+        raise RecipeError(
+            [f"{srdf}: is a URDF, expected an SRDF with <{_TAG}> elements"]
+        )
+    return _with_entries(
+        urdf, [dict(entry.attrib) for entry in tree.iter(_TAG)], str(srdf)
+    )
 
 
 def with_ignored_pairs(urdf: str, pairs: Iterable[tuple[str, str]]) -> str:
     """Return a URDF with disabled link pairs of a problem."""
-    entries = [{"link1": first, "link2": second, "reason": "User"} for first, second in pairs]
+    entries = [
+        {"link1": first, "link2": second, "reason": "User"} for first, second in pairs
+    ]
     return _with_entries(urdf, entries, "robot.ignored_pairs")
 
 
@@ -122,7 +164,9 @@ def _with_entries(urdf: str, entries: list[dict[str, str]], source: str) -> str:
     named = {entry[key] for entry in entries for key in ("link1", "link2")}
     if unknown := sorted(named - links):
         raise RecipeError([f"{source}: the URDF has no link {', '.join(unknown)}"])
-    known = [frozenset((one.get("link1"), one.get("link2"))) for one in robot.iter(_TAG)]
+    known = [
+        frozenset((one.get("link1"), one.get("link2"))) for one in robot.iter(_TAG)
+    ]
     for entry in entries:
         if frozenset((entry["link1"], entry["link2"])) not in known:
             robot.append(ElementTree.Element(_TAG, entry))
@@ -132,27 +176,41 @@ def _with_entries(urdf: str, entries: list[dict[str, str]], source: str) -> str:
 def disabled_pairs(urdf: str) -> frozenset[frozenset[str]] | None:
     """Return the disabled link pairs; None without any."""
     entries = list(urdf_tree(urdf).iter(_TAG))
-    pairs = frozenset(frozenset((entry.get("link1", ""), entry.get("link2", ""))) for entry in entries)
+    pairs = frozenset(
+        frozenset((entry.get("link1", ""), entry.get("link2", ""))) for entry in entries
+    )
     return pairs or None
 
 
-def with_payload_link(urdf: str, spec: RobotSpec, payload: Payload | None, *, is_stored: bool) -> str:
+def with_payload_link(
+    urdf: str, spec: RobotSpec, payload: Payload | None, *, is_stored: bool
+) -> str:
     """Return a URDF with the box of the payload as a link without mass, fixed to the tip.
 
-    The mass belongs to the robot's attachments. A payload with touch links is a body. A stored problem has the link
-    already, which is replaced if it differs.
+    The mass belongs to the robot's attachments. A payload with touch links is a body. A
+    stored problem has the link already, which is replaced if it differs.
     """
     is_body = payload is not None and bool(payload.touch_links)
     if not is_body and PAYLOAD not in urdf:
         return urdf
     robot = urdf_tree(urdf)
-    old = [part for part in robot if part.tag in {"link", "joint"} and part.get("name") == PAYLOAD]
+    old = [
+        part
+        for part in robot
+        if part.tag in {"link", "joint"} and part.get("name") == PAYLOAD
+    ]
     if old and not is_stored:
         raise RecipeError(
-            [f"payload: the URDF has a link or joint {PAYLOAD!r}, which is the name of the payload's own"]
+            [
+                f"payload: the URDF has a link or joint {PAYLOAD!r}, which is the name of the payload's own"
+            ]
         )
-    new = list(_elements(robot, spec, payload)) if payload is not None and is_body else []
-    if [ElementTree.tostring(part) for part in old] == [ElementTree.tostring(part) for part in new]:
+    new = (
+        list(_elements(robot, spec, payload)) if payload is not None and is_body else []
+    )
+    if [ElementTree.tostring(part) for part in old] == [
+        ElementTree.tostring(part) for part in new
+    ]:
         return urdf
     for part in old:
         robot.remove(part)
@@ -172,16 +230,34 @@ def _elements(
     }
     parent = spec.tip if spec.tip in links else children.get(spec.tip, "")
     if not parent:
-        raise RecipeError([f"robot.tip: the URDF has no frame {spec.tip!r}{nearest(spec.tip, links)}"])
+        raise RecipeError(
+            [f"robot.tip: the URDF has no frame {spec.tip!r}{nearest(spec.tip, links)}"]
+        )
     for name in payload.touch_links:
         if name not in links:
-            raise RecipeError([f"payload.touch_links: the URDF has no link {name!r}{nearest(name, links)}"])
-    link, joint = ElementTree.Element("link", name=PAYLOAD), ElementTree.Element("joint", name=PAYLOAD, type="fixed")
+            raise RecipeError(
+                [
+                    f"payload.touch_links: the URDF has no link {name!r}{nearest(name, links)}"
+                ]
+            )
+    link, joint = (
+        ElementTree.Element("link", name=PAYLOAD),
+        ElementTree.Element("joint", name=PAYLOAD, type="fixed"),
+    )
     for kind in ("visual", "collision"):
-        geometry = ElementTree.SubElement(ElementTree.SubElement(link, kind), "geometry")
+        geometry = ElementTree.SubElement(
+            ElementTree.SubElement(link, kind), "geometry"
+        )
         ElementTree.SubElement(geometry, "box", size=numbers_text(payload.size or ()))
     ElementTree.SubElement(joint, "parent", link=parent)
     ElementTree.SubElement(joint, "child", link=PAYLOAD)
-    center = np.array(spec.tip_offset) + turned(*spec.tip_rotation) @ np.array(payload.centre)
-    ElementTree.SubElement(joint, "origin", xyz=numbers_text(center.tolist()), rpy=numbers_text(spec.tip_rotation))
+    center = np.array(spec.tip_offset) + turned(*spec.tip_rotation) @ np.array(
+        payload.centre
+    )
+    ElementTree.SubElement(
+        joint,
+        "origin",
+        xyz=numbers_text(center.tolist()),
+        rpy=numbers_text(spec.tip_rotation),
+    )
     return link, joint

@@ -38,7 +38,10 @@ class LinkFrame:
 
     def of(self, inner: "LinkFrame") -> "LinkFrame":
         """Return a placement in this frame as a placement in the frame around it."""
-        return LinkFrame(self.rotation @ inner.rotation, self.rotation @ inner.translation + self.translation)
+        return LinkFrame(
+            self.rotation @ inner.rotation,
+            self.rotation @ inner.translation + self.translation,
+        )
 
 
 IDENTITY = LinkFrame(np.eye(3), np.zeros(3))
@@ -57,10 +60,9 @@ class LinkInertia:
 class UrdfJoint:
     """Joint of a URDF, which moves the link ``child`` on the link ``parent``.
 
-    Attributes:
-        origin: LinkFrame of the child at position zero in the parent.
-        axis: Unit axis, shape (3,).
-        limits: Limit -> value [rad, rad/s, N m, or with m and N]: "lower", "upper", "velocity" and "effort".
+    Attributes: origin: LinkFrame of the child at position zero in the parent. axis:
+        Unit axis, shape (3,). limits: Limit -> value [rad, rad/s, N m, or with m and
+        N]: "lower", "upper", "velocity" and "effort".
     """
 
     name: str
@@ -81,22 +83,38 @@ class UrdfParameters:
 
 
 def urdf_parameters(tree: Element) -> UrdfParameters:
-    """Read the numbers of all links and joints; RecipeError lists missing ones and those not plain finite decimals."""
+    """Read the numbers of all links and joints.
+
+    RecipeError lists missing ones and those not plain finite decimals.
+    """
     errors: list[str] = []
     inertias: dict[str, LinkInertia | None] = {}
     joints: dict[str, UrdfJoint] = {}
     for link in tree.findall("link"):
-        _read_named(link, lambda link: inertias.update({link.get("name", ""): _inertia(link)}), errors)
+        _read_named(
+            link,
+            lambda link: inertias.update({link.get("name", ""): _inertia(link)}),
+            errors,
+        )
     for element in tree.findall("joint"):
-        _read_named(element, lambda element: joints.update({(joint := _joint(element)).child: joint}), errors)
-    errors += [f"link {link!r}: its joints form a cycle" for link in _links_in_cycles(joints)]
+        _read_named(
+            element,
+            lambda element: joints.update({(joint := _joint(element)).child: joint}),
+            errors,
+        )
+    errors += [
+        f"link {link!r}: its joints form a cycle" for link in _links_in_cycles(joints)
+    ]
     if errors:
         raise RecipeError(errors)
     return UrdfParameters(inertias, joints)
 
 
 def _links_in_cycles(joints: Mapping[str, UrdfJoint]) -> list[str]:
-    """List a link of every cycle of joints; the parser ignores cycles that no root moves."""
+    """List a link of every cycle of joints.
+
+    The parser ignores cycles that no root moves.
+    """
     rooted, found = set[str](), list[str]()
     for first in joints:
         link, path = first, set[str]()
@@ -109,7 +127,9 @@ def _links_in_cycles(joints: Mapping[str, UrdfJoint]) -> list[str]:
     return found
 
 
-def _read_named(element: Element, read: Callable[[Element], None], errors: list[str]) -> None:
+def _read_named(
+    element: Element, read: Callable[[Element], None], errors: list[str]
+) -> None:
     """Read an element; add its error to the errors, with the name of the element."""
     problems = list(_unread(element))
     try:
@@ -117,7 +137,9 @@ def _read_named(element: Element, read: Callable[[Element], None], errors: list[
             read(element)
     except ValueError as error:
         problems.append(str(error))
-    errors += [f"{element.tag} {element.get('name', '')!r}: {problem}" for problem in problems]
+    errors += [
+        f"{element.tag} {element.get('name', '')!r}: {problem}" for problem in problems
+    ]
 
 
 def _unread(element: Element) -> Iterator[str]:
@@ -140,27 +162,45 @@ def _inertia(link: Element) -> LinkInertia | None:
     mass, tensor = element.find("mass"), element.find("inertia")
     if mass is None or mass.get("value") is None:
         raise ValueError("its <inertial> has no <mass value=...>")
-    if tensor is not None and (missing := [name for name in _INERTIA_ENTRIES if tensor.get(name) is None]):
-        raise ValueError(f"its <inertia> has no {', '.join(missing)}: all of its numbers would be ignored")
+    if tensor is not None and (
+        missing := [name for name in _INERTIA_ENTRIES if tensor.get(name) is None]
+    ):
+        raise ValueError(
+            f"its <inertia> has no {', '.join(missing)}: all of its numbers would be ignored"
+        )
     rows = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
     matrix = np.array([[number_in(tensor, name, 0.0) for name in row] for row in rows])
     if (value := number_in(mass, "value", 0.0)) < 0:
-        raise ValueError(f"<mass value={mass.get('value')!r}> must not be negative: give the mass of the link in kg")
+        raise ValueError(
+            f"<mass value={mass.get('value')!r}> must not be negative: give the mass of the link in kg"
+        )
     return LinkInertia(value, placement_of(element), matrix)
 
 
 def _joint(element: Element) -> UrdfJoint:
     limit, kind = element.find("limit"), element.get("type", "")
-    keys = ("velocity", "effort") if kind == "continuous" else ("lower", "upper", "velocity", "effort")
+    keys = (
+        ("velocity", "effort")
+        if kind == "continuous"
+        else ("lower", "upper", "velocity", "effort")
+    )
     limits = {} if limit is None else {key: number_in(limit, key, 0.0) for key in keys}
     for key in ("velocity", "effort"):
         if kind in _TURNING_OR_SLIDING and limits.get(key, 0.0) < 0:
             raise ValueError(f"{key}={limits[key]:g} must not be negative")
-    ends = {tag: found.get("link", "") for tag in ("parent", "child") if (found := element.find(tag)) is not None}
+    ends = {
+        tag: found.get("link", "")
+        for tag in ("parent", "child")
+        if (found := element.find(tag)) is not None
+    }
     axis = np.array(numbers_in(element.find("axis"), "xyz", (1.0, 0.0, 0.0)))
     length = float(np.linalg.norm(axis))
-    if kind in _TURNING_OR_SLIDING and not math.isfinite(1 / length if length else math.inf):
-        raise ValueError(f"<axis xyz={element.find('axis').get('xyz')!r}> has no direction")  # type: ignore[union-attr]
+    if kind in _TURNING_OR_SLIDING and not math.isfinite(
+        1 / length if length else math.inf
+    ):
+        axis = element.find("axis")
+        text = None if axis is None else axis.get("xyz")
+        raise ValueError(f"<axis xyz={text!r}> has no direction")
     return UrdfJoint(
         name=element.get("name", ""),
         kind=kind,
@@ -176,8 +216,13 @@ def placement_of(element: Element) -> LinkFrame:
     """Return the <origin> of an element."""
     origin = element.find("origin")
     if origin is not None and origin.get("quat_xyzw") is not None:
-        raise ValueError("<origin quat_xyzw=...> is not supported: give rpy, the angles of roll, pitch and yaw")
-    return LinkFrame(turned(*numbers_in(origin, "rpy", _ZERO)), np.array(numbers_in(origin, "xyz", _ZERO)))
+        raise ValueError(
+            "<origin quat_xyzw=...> is not supported: give rpy, the angles of roll, pitch and yaw"
+        )
+    return LinkFrame(
+        turned(*numbers_in(origin, "rpy", _ZERO)),
+        np.array(numbers_in(origin, "xyz", _ZERO)),
+    )
 
 
 def check_model(model: "pin.Model", parameters: UrdfParameters) -> None:
@@ -191,8 +236,12 @@ class _Comparison:
 
     def __init__(self, model: "pin.Model", parameters: UrdfParameters) -> None:
         self.model, self.parameters = model, parameters
-        self.joints = {name: index for index, name in enumerate(model.names) if index != WORLD}
-        self.bodies: dict[str, tuple[int, LinkFrame]] = {}  # link -> joint that moves it, and its placement in that
+        self.joints = {
+            name: index for index, name in enumerate(model.names) if index != WORLD
+        }
+        self.bodies: dict[
+            str, tuple[int, LinkFrame]
+        ] = {}  # link -> joint that moves it, and its placement in that
         for link in parameters.inertias:
             self.bodies[link] = self._body(link)
 
@@ -223,11 +272,17 @@ class _Comparison:
         model, index = self.model, self.joints[joint.name]
         parent, placement = self.bodies.get(joint.parent, (WORLD, IDENTITY))
         actual = model.jointPlacements[index]
-        if model.parents[index] != parent or not _same_placement(actual, placement.of(joint.origin)):
+        if model.parents[index] != parent or not _same_placement(
+            actual, placement.of(joint.origin)
+        ):
             yield _difference(f"joint {joint.name!r}", "its <origin> or parent")
-        if not joint.limits:  # of a joint that neither turns nor slides, or without a <limit>
+        if (
+            not joint.limits
+        ):  # of a joint that neither turns nor slides, or without a <limit>
             return
-        subspace = np.asarray(model.createData().joints[index].S, float).ravel()  # (linear, angular)
+        subspace = np.asarray(
+            model.createData().joints[index].S, float
+        ).ravel()  # (linear, angular)
         axis = subspace[:3] if joint.kind == "prismatic" else subspace[3:]
         if not _same(axis, joint.axis):
             yield _difference(f"joint {joint.name!r}", "its <axis>", axis, joint.axis)
@@ -240,7 +295,9 @@ class _Comparison:
         }
         for name, value in joint.limits.items():
             if not _same(limits[name], value):
-                yield _difference(f"joint {joint.name!r}", f"its limit {name!r}", limits[name], value)
+                yield _difference(
+                    f"joint {joint.name!r}", f"its limit {name!r}", limits[name], value
+                )
 
     def _of_inertia(self, index: int) -> Iterator[str]:
         """Compare the body that a joint moves with the links of which it consists."""
@@ -255,7 +312,11 @@ class _Comparison:
         actual = self.model.inertias[index]
         lever = np.asarray(actual.lever)
         found = _parameters_about_origin(actual.mass, lever, np.asarray(actual.inertia))
-        for name, part in (("mass", slice(0, 1)), ("center of mass", slice(1, 4)), ("inertia", slice(4, 10))):
+        for name, part in (
+            ("mass", slice(0, 1)),
+            ("center of mass", slice(1, 4)),
+            ("inertia", slice(4, 10)),
+        ):
             if not _same(found[part], expected[part], scale=scale[part].max()):
                 subject = f"the body of joint {self.model.names[index]!r}, of the links {', '.join(map(repr, links))}"
                 yield _difference(subject, f"its {name}", found[part], expected[part])
@@ -264,17 +325,27 @@ class _Comparison:
         """Compare the placements of the links."""
         import pinocchio as pin
 
-        frames = {frame.name: frame for frame in self.model.frames if frame.type == pin.FrameType.BODY}
+        frames = {
+            frame.name: frame
+            for frame in self.model.frames
+            if frame.type == pin.FrameType.BODY
+        }
         for link, (joint, placement) in self.bodies.items():
             frame = frames.get(link + LINK_SUFFIX) or frames.get(link)
-            if frame is None or frame.parentJoint != joint or not _same_placement(frame.placement, placement):
+            if (
+                frame is None
+                or frame.parentJoint != joint
+                or not _same_placement(frame.placement, placement)
+            ):
                 yield _difference(f"link {link!r}", "its placement")
 
 
 def _dynamic_parameters(inertia: LinkInertia, link: LinkFrame) -> Array:
     """Return the parameters of a link about the origin of the joint that moves it, shape (10,)."""
     com = link.of(inertia.com)
-    return _parameters_about_origin(inertia.mass, com.translation, com.rotation @ inertia.inertia @ com.rotation.T)
+    return _parameters_about_origin(
+        inertia.mass, com.translation, com.rotation @ inertia.inertia @ com.rotation.T
+    )
 
 
 def _parameters_about_origin(mass: float, com: Array, inertia: Array) -> Array:
@@ -286,12 +357,17 @@ def _parameters_about_origin(mass: float, com: Array, inertia: Array) -> Array:
 
 def _same_placement(actual: "pin.SE3", expected: LinkFrame) -> bool:
     return _same(actual.rotation, expected.rotation, scale=1.0) and _same(
-        actual.translation, expected.translation, scale=max(np.abs(expected.translation).max(), 1e-3)
+        actual.translation,
+        expected.translation,
+        scale=max(np.abs(expected.translation).max(), 1e-3),
     )
 
 
 def _same(actual: object, expected: object, *, scale: float | None = None) -> bool:
-    """Return whether values are equal up to rounding; values that are not finite never are."""
+    """Return whether values are equal up to rounding.
+
+    Values that are not finite never are.
+    """
     found, wanted = np.asarray(actual, float), np.asarray(expected, float)
     size = np.abs(wanted).max() if scale is None else scale
     with np.errstate(all="ignore"):
@@ -299,9 +375,13 @@ def _same(actual: object, expected: object, *, scale: float | None = None) -> bo
     return bool((close & np.isfinite(found) & np.isfinite(wanted)).all())
 
 
-def _difference(subject: str, part: str, actual: object = None, expected: object = None) -> str:
+def _difference(
+    subject: str, part: str, actual: object = None, expected: object = None
+) -> str:
     text = f"{subject}: Pinocchio reads {part} differently from the XML"
     if expected is None:
         return text
-    values = (np.array2string(np.asarray(item), precision=4) for item in (expected, actual))
+    values = (
+        np.array2string(np.asarray(item), precision=4) for item in (expected, actual)
+    )
     return "{}: {} in the XML, {} in the model".format(text, *values)

@@ -15,23 +15,40 @@ ADDONS = "cnpgen.addons"
 
 @functools.cache
 def entry_points() -> Mapping[str, tuple[EntryPoint, ...]]:
-    """Return the entry points of cnpgen's groups, group -> entries; cached, since reading metadata takes long."""
+    """Return the entry points of cnpgen's groups, group -> entries.
+
+    Cached, since reading metadata takes long.
+    """
     entries = importlib.metadata.entry_points()
-    return {group: tuple(entries.select(group=group)) for group in entries.groups if group.startswith("cnpgen.")}
+    return {
+        group: tuple(entries.select(group=group))
+        for group in entries.groups
+        if group.startswith("cnpgen.")
+    }
 
 
 def installed(group: str) -> tuple[EntryPoint, ...]:
     """Return the entry points of a group, without those of missing add-ons."""
-    return tuple(entry for entry in entry_points().get(group, ()) if not is_missing(entry))
+    return tuple(
+        entry for entry in entry_points().get(group, ()) if not is_missing(entry)
+    )
 
 
 def find(group: str, name: str) -> EntryPoint | None:
-    """Return the entry point of a name, also of a missing add-on; None if no package registers the name."""
-    return next((entry for entry in entry_points().get(group, ()) if entry.name == name), None)
+    """Return the entry point of a name, also of a missing add-on.
+
+    None if no package registers the name.
+    """
+    return next(
+        (entry for entry in entry_points().get(group, ()) if entry.name == name), None
+    )
 
 
 def addon_of(module: str) -> str:
-    """Return the name of the add-on that a module belongs to; empty for other modules."""
+    """Return the name of the add-on that a module belongs to.
+
+    Empty for other modules.
+    """
     prefix, _, rest = module.partition(f"{ADDONS}.")
     return rest.partition(".")[0] if not prefix else ""
 
@@ -72,4 +89,6 @@ def load_entry(entry: EntryPoint, use: str) -> Any:
 
 def missing(addon: str, use: str) -> MissingAddonError:
     """Return the error for a missing add-on."""
-    return MissingAddonError(f"{use} needs the add-on {addon!r}, which this installation lacks: reinstall cnpgen")
+    return MissingAddonError(
+        f"{use} needs the add-on {addon!r}, which this installation lacks: reinstall cnpgen"
+    )

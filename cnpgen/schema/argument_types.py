@@ -9,7 +9,15 @@ import os
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal, ParamSpec, TypeVar, get_args, get_origin, get_type_hints
+from typing import (
+    Any,
+    Literal,
+    ParamSpec,
+    TypeVar,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,21 +44,34 @@ _ARRAYS = set(get_args(ArrayLike))
 def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
     """Check the types of the arguments of every call by the annotations.
 
-    Flags, texts, functions, masked arrays and the classes of ``NOUNS`` are checked first. The function itself checks
-    ranges and shapes. If it raises another error than a ``CnpgenError``, the types of all arguments are compared with
-    the annotations, and the first wrong one becomes a UsageError.
+    Flags, texts, functions, masked arrays and the classes of ``NOUNS`` are checked
+    first. The function itself checks ranges and shapes. If it raises another error than
+    a ``CnpgenError``, the types of all arguments are compared with the annotations, and
+    the first wrong one becomes a UsageError.
     """
 
     @functools.cache
     def prepared() -> tuple[tuple[str, ...], dict[str, Check], dict[str, Check]]:
         """Return the positional parameters, their checks before the call, and those after an error."""
         parameters = inspect.signature(function).parameters.values()
-        names = tuple(p.name for p in parameters if p.kind in {p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD})
-        annotations = {p.name: p.annotation for p in parameters if p.kind != p.VAR_KEYWORD and p.annotation != p.empty}
+        names = tuple(
+            p.name
+            for p in parameters
+            if p.kind in {p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD}
+        )
+        annotations = {
+            p.name: p.annotation
+            for p in parameters
+            if p.kind != p.VAR_KEYWORD and p.annotation != p.empty
+        }
         hints = {name: _evaluated(function, hint) for name, hint in annotations.items()}
         found = {name: _check_of(hint) for name, hint in hints.items()}
         late = {name: check for name, check in found.items() if check is not None}
-        return names, {name: check for name, check in late.items() if _is_first(hints[name])}, late
+        return (
+            names,
+            {name: check for name, check in late.items() if _is_first(hints[name])},
+            late,
+        )
 
     @functools.wraps(function)
     def call(*args: P.args, **keywords: P.kwargs) -> R:
@@ -70,7 +91,12 @@ def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
     return call
 
 
-def _run(checks: dict[str, Check], names: tuple[str, ...], args: tuple[Any, ...], keywords: dict[str, Any]) -> None:
+def _run(
+    checks: dict[str, Check],
+    names: tuple[str, ...],
+    args: tuple[Any, ...],
+    keywords: dict[str, Any],
+) -> None:
     """Raise a UsageError for the first invalid argument."""
     for name, value in (*zip(names, args, strict=False), *keywords.items()):
         if name in checks:
@@ -84,20 +110,31 @@ def _is_first(hint: Any) -> bool:
         return set(present) >= _ARRAYS
     (kind,) = present
     kind = get_origin(kind) or kind
-    return kind in {bool, str, collections.abc.Callable, np.ndarray} or getattr(kind, "__name__", kind) in NOUNS
+    return (
+        kind in {bool, str, collections.abc.Callable, np.ndarray}
+        or getattr(kind, "__name__", kind) in NOUNS
+    )
 
 
 def _evaluated(function: Callable[..., Any], annotation: Any) -> Any:
-    """Evaluate a postponed annotation; return its text if a name in it is imported for type checkers only."""
+    """Evaluate a postponed annotation.
+
+    Return its text if a name in it is imported for type checkers only.
+    """
     if not isinstance(annotation, str):
         return annotation
     with suppress(NameError):
-        return eval(annotation, vars(collections.abc) | inspect.unwrap(function).__globals__)  # noqa: S307 - text of a source file of this package
+        return eval(  # noqa: S307
+            annotation, vars(collections.abc) | inspect.unwrap(function).__globals__
+        )
     return annotation
 
 
 def check_fields(options: Any) -> None:
-    """Check the fields of a frozen dataclass by their annotations; convert NumPy's scalars."""
+    """Check the fields of a frozen dataclass by their annotations.
+
+    Convert NumPy's scalars.
+    """
     for name, check in _field_checks(type(options)):  # type: ignore[arg-type]
         object.__setattr__(options, name, check(name, getattr(options, name)))
 
@@ -105,12 +142,18 @@ def check_fields(options: Any) -> None:
 @functools.cache
 def _field_checks(cls: type) -> tuple[tuple[str, Check], ...]:
     hints = get_type_hints(cls)
-    found = ((entry.name, _check_of(hints[entry.name], strict=True)) for entry in dataclasses.fields(cls))
+    found = (
+        (entry.name, _check_of(hints[entry.name], strict=True))
+        for entry in dataclasses.fields(cls)
+    )
     return tuple((name, check) for name, check in found if check is not None)
 
 
 def _check_of(hint: Any, *, strict: bool = False) -> Check | None:
-    """Return the check of an annotation, None if every value is accepted; fields are ``strict``."""
+    """Return the check of an annotation, None if every value is accepted.
+
+    Fields are ``strict``.
+    """
     options = alternatives(hint)
     arrays = set(options) >= _ARRAYS
     present = [option for option in options if not (arrays and option in _ARRAYS)]
@@ -126,7 +169,9 @@ def _check_of(hint: Any, *, strict: bool = False) -> Check | None:
     optional = hint != options[0] and type(None) in get_args(hint)
 
     def check_options(name: str, value: Any) -> Any:
-        if (optional and value is None) or (arrays and type(value) is np.ndarray):  # the usual case
+        if (optional and value is None) or (
+            arrays and type(value) is np.ndarray
+        ):  # the usual case
             return value
         errors = []
         for check in checks:
@@ -134,33 +179,55 @@ def _check_of(hint: Any, *, strict: bool = False) -> Check | None:
                 return check(name, value)
             except UsageError as error:
                 errors.append(error.args[0])
-        expected = either([error.partition(", got ")[0].removeprefix("must be ") for error in errors])
+        expected = either(
+            [error.partition(", got ")[0].removeprefix("must be ") for error in errors]
+        )
         got = errors[0].partition(", got ")[2]
-        raise UsageError(f"must be {expected}, got {got}" if len(errors) > 1 else errors[0], argument=name)
+        raise UsageError(
+            f"must be {expected}, got {got}" if len(errors) > 1 else errors[0],
+            argument=name,
+        )
 
     return check_options if checks else None
 
 
 def _check_of_type(hint: Any, *, strict: bool) -> Check | None:
-    """Return the check of one alternative; if ``strict`` only NumPy's arrays, and numbers may be infinite."""
+    """Return the check of one alternative.
+
+    If ``strict`` only NumPy's arrays, and numbers may be infinite.
+    """
     if isinstance(hint, str):
         return functools.partial(_named, hint) if hint.isidentifier() else None
     kind = get_origin(hint) or hint
     if kind is Literal:
         return functools.partial(_choice, get_args(hint))
-    known: dict[Any, Check] = {int: integer, bool: flag, float: _real if strict else number}
+    known: dict[Any, Check] = {
+        int: integer,
+        bool: flag,
+        float: _real if strict else number,
+    }
     known |= {
-        str: functools.partial(_accepted, lambda value: isinstance(value, str), "a text"),
+        str: functools.partial(
+            _accepted, lambda value: isinstance(value, str), "a text"
+        ),
         collections.abc.Callable: functools.partial(_accepted, callable, "a function"),
         np.ndarray: _array if strict else reject_masked,
     }
     if kind in known:
         return known[kind]
-    if not inspect.isclass(kind) or kind is object or getattr(kind, "_is_protocol", False):
+    if (
+        not inspect.isclass(kind)
+        or kind is object
+        or getattr(kind, "_is_protocol", False)
+    ):
         return None
     if kind in {collections.abc.Iterable, collections.abc.Sequence}:
         return functools.partial(
-            _accepted, lambda value: isinstance(value, kind) and not isinstance(value, str | bytes), "a list"
+            _accepted,
+            lambda value: (
+                isinstance(value, kind) and not isinstance(value, str | bytes)
+            ),
+            "a list",
         )
     return functools.partial(_instance, kind)
 
@@ -168,13 +235,17 @@ def _check_of_type(hint: Any, *, strict: bool) -> Check | None:
 def _array(name: str, value: Any) -> Any:
     reject_masked(name, value)
     if not isinstance(value, np.ndarray):
-        raise UsageError(f"must be an array of NumPy, got {type(value).__name__}", argument=name)
+        raise UsageError(
+            f"must be an array of NumPy, got {type(value).__name__}", argument=name
+        )
     return value
 
 
 def _real(name: str, value: Any) -> float:
     """Return a number; accept infinity."""
-    return value if isinstance(value, float) and math.isinf(value) else number(name, value)
+    return (
+        value if isinstance(value, float) and math.isinf(value) else number(name, value)
+    )
 
 
 def _accepted(accepts: Callable[[Any], bool], noun: str, name: str, value: Any) -> Any:
@@ -184,8 +255,15 @@ def _accepted(accepts: Callable[[Any], bool], noun: str, name: str, value: Any) 
 
 
 def _path(name: str, value: Any) -> str | Path:
-    """Return a name or a path; reject empty ones, and null characters, which no operating system accepts."""
-    if not isinstance(value, str | os.PathLike) or not os.fspath(value) or "\0" in str(value):
+    """Return a name or a path.
+
+    Reject empty ones, and null characters, which no operating system accepts.
+    """
+    if (
+        not isinstance(value, str | os.PathLike)
+        or not os.fspath(value)
+        or "\0" in str(value)
+    ):
         raise UsageError(f"must be a name or a path, got {value!r:.100}", argument=name)
     return value if isinstance(value, str) else Path(value)
 
@@ -193,7 +271,10 @@ def _path(name: str, value: Any) -> str | Path:
 def _choice(choices: tuple[Any, ...], name: str, value: Any) -> Any:
     if not isinstance(value, str) or value not in choices:
         hint = nearest(value, choices) if isinstance(value, str) else ""
-        raise UsageError(f"must be one of {', '.join(map(str, choices))}, got {value!r:.100}{hint}", argument=name)
+        raise UsageError(
+            f"must be one of {', '.join(map(str, choices))}, got {value!r:.100}{hint}",
+            argument=name,
+        )
     return value
 
 
@@ -203,5 +284,8 @@ def _instance(kind: type, name: str, value: Any) -> Any:
 
 def _named(kind: str, name: str, value: Any) -> Any:
     if kind not in {base.__name__ for base in type(value).__mro__}:
-        raise UsageError(f"must be {NOUNS.get(kind, f'of type {kind}')}, got {type(value).__name__}", argument=name)
+        raise UsageError(
+            f"must be {NOUNS.get(kind, f'of type {kind}')}, got {type(value).__name__}",
+            argument=name,
+        )
     return value

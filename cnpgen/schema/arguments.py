@@ -18,15 +18,32 @@ BYTES_PER_FLOAT = 8
 MIN_CHECKED_SIZE = 10_000_000  # floats from which on the available memory is measured
 
 
-def integer(name: str, value: Any, *, least: int | None = None, most: int | None = None) -> int:
-    """Return an argument as an integer; accept NumPy integers, raise UsageError for bool and values out of range."""
+def integer(
+    name: str, value: Any, *, least: int | None = None, most: int | None = None
+) -> int:
+    """Return an argument as an integer.
+
+    Accept NumPy integers, raise UsageError for bool and values out of range.
+    """
     try:
         found = None if isinstance(value, bool) else operator.index(value)
     except TypeError:
         found = None
-    if found is None or (least is not None and found < least) or (most is not None and found > most):
-        bounds = "" if least is None else f" from {least} on" if most is None else f" from {least} to {most}"
-        raise UsageError(f"must be an integer{bounds}, got {value!r:.100}", argument=name)
+    if (
+        found is None
+        or (least is not None and found < least)
+        or (most is not None and found > most)
+    ):
+        bounds = (
+            ""
+            if least is None
+            else f" from {least} on"
+            if most is None
+            else f" from {least} to {most}"
+        )
+        raise UsageError(
+            f"must be an integer{bounds}, got {value!r:.100}", argument=name
+        )
     return found
 
 
@@ -37,7 +54,10 @@ def number(name: str, value: Any) -> float:
         UsageError: The value is a text, a bool, an array, or not finite.
     """
     try:
-        real = not isinstance(value, str | bytes | bool | np.bool_ | np.complexfloating) and np.ndim(value) == 0
+        real = (
+            not isinstance(value, str | bytes | bool | np.bool_ | np.complexfloating)
+            and np.ndim(value) == 0
+        )
         found = float(value) if real else math.nan
     except (TypeError, ValueError):
         found = math.nan
@@ -46,20 +66,30 @@ def number(name: str, value: Any) -> float:
     return found
 
 
-def numbers(name: str, values: ArrayLike, dtype: str = "float64", *, differentiable: bool = False) -> Array:
+def numbers(
+    name: str,
+    values: ArrayLike,
+    dtype: str = "float64",
+    *,
+    differentiable: bool = False,
+) -> Array:
     """Return an argument as an array of "float64" or "float32"; accept nan and inf, and tensors on the CPU.
 
     Tensors with gradients are detached or, with ``differentiable``, raise an error.
 
-    Raises:
-        UsageError: The values are texts, dates or complex numbers, have uneven rows, or are not in CPU memory.
+    Raises: UsageError: The values are texts, dates or complex numbers, have uneven
+        rows, or are not in CPU memory.
     """
     if type(values) is np.ndarray and values.dtype == dtype:  # the usual case
         return _fitting(name, values)
     reject_masked(name, values)
     wrong = f"must be an array of numbers, got {type(values).__name__}"
     try:
-        detached = values.detach() if hasattr(values, "detach") and not differentiable else values
+        detached = (
+            values.detach()
+            if hasattr(values, "detach") and not differentiable
+            else values
+        )
         array = _fitting(name, np.asarray(detached))
         if array.dtype == dtype:
             return array
@@ -67,9 +97,14 @@ def numbers(name: str, values: ArrayLike, dtype: str = "float64", *, differentia
             real: Array = array.real.astype(dtype, copy=False)
     except (TypeError, ValueError, RuntimeError) as error:  # the last from torch
         uneven = "inhomogeneous" in str(error)
-        raise UsageError(f"{wrong}: {'its rows have different lengths' if uneven else error}", argument=name) from error
+        raise UsageError(
+            f"{wrong}: {'its rows have different lengths' if uneven else error}",
+            argument=name,
+        ) from error
     missing = array.dtype.kind == "O" and any(value is None for value in array.flat)
-    if array.dtype.kind in "cUSmM" or missing:  # NumPy would drop imaginary parts and convert texts and None
+    if (
+        array.dtype.kind in "cUSmM" or missing
+    ):  # NumPy would drop imaginary parts and convert texts and None
         raise UsageError(f"{wrong}: {array.dtype} is no real type", argument=name)
     return real
 
@@ -81,7 +116,9 @@ def _fitting(name: str, array: Array) -> Array:
     return array
 
 
-def check_range(name: str, values: ArrayLike, low: float, high: float, unit: str) -> None:
+def check_range(
+    name: str, values: ArrayLike, low: float, high: float, unit: str
+) -> None:
     """Raise UsageError for values [unit] outside of their range or nan, with the unit that was probably meant."""
     array = np.asarray(values, np.float64)
     outside = ~((low <= array) & (array <= high))
@@ -95,7 +132,10 @@ def reject_masked(name: str, values: Any) -> Any:
     """Return an argument; raise UsageError for masked arrays and lists of them, whose masks NumPy's functions drop."""
     parts = values if isinstance(values, list | tuple) else [values]
     if any(isinstance(part, np.ma.MaskedArray) for part in parts):
-        raise UsageError("must not be a masked array: pass filled values, such as values.filled(0.0)", argument=name)
+        raise UsageError(
+            "must not be a masked array: pass filled values, such as values.filled(0.0)",
+            argument=name,
+        )
     return values
 
 
@@ -113,7 +153,10 @@ def concerning(argument: str) -> Iterator[None]:
 
 
 def flag(name: str, value: Any) -> bool:
-    """Return an argument as a bool; accept NumPy's bool, raise UsageError for other types such as 1 and "no"."""
+    """Return an argument as a bool.
+
+    Accept NumPy's bool, raise UsageError for other types such as 1 and "no".
+    """
     if not isinstance(value, bool | np.bool_):
         raise UsageError(f"must be True or False, got {value!r:.100}", argument=name)
     return bool(value)
@@ -129,12 +172,19 @@ def check_memory(argument: str, value: int, n_floats: int) -> None:
     """
     needed = n_floats * BYTES_PER_FLOAT
     if n_floats > MIN_CHECKED_SIZE and needed > (available := available_bytes()):
-        text = f"{needed / 1e9:,.3g} GB of memory, {available / 1e9:,.3g} GB are available"
-        raise UsageError(f"must be smaller: {value:,} needs at least {text}", argument=argument)
+        text = (
+            f"{needed / 1e9:,.3g} GB of memory, {available / 1e9:,.3g} GB are available"
+        )
+        raise UsageError(
+            f"must be smaller: {value:,} needs at least {text}", argument=argument
+        )
 
 
 def check_memory_of_rows(counts: Mapping[str, int], n_floats: int) -> None:
-    """Refuse arguments, name -> number of rows, of at least so many floats; name the one with most rows."""
+    """Refuse arguments, name -> number of rows, of at least so many floats.
+
+    Name the one with most rows.
+    """
     argument = max(counts, key=lambda name: counts[name])
     check_memory(argument, counts[argument], counts[argument] * n_floats)
 

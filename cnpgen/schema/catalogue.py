@@ -28,10 +28,14 @@ _LAYOUT: dict[Kind, str] = {  # paths of the shipped files of a kind
 def list_recipes(kind: Kind) -> dict[str, Path]:
     """List the shipped recipes of a kind: name -> file, by name."""
     if not isinstance(kind, str) or kind not in _LAYOUT:
-        raise UsageError(f"must be one of {', '.join(_LAYOUT)}, got {kind!r:.100}", argument="kind")
+        raise UsageError(
+            f"must be one of {', '.join(_LAYOUT)}, got {kind!r:.100}", argument="kind"
+        )
     folder, _, pattern = _LAYOUT[kind].partition("/")
     files = sorted((recipes_root() / folder).glob(pattern))
-    return {file.parent.name if kind == "problem" else file.stem: file for file in files}
+    return {
+        file.parent.name if kind == "problem" else file.stem: file for file in files
+    }
 
 
 def recipes_root() -> Path:
@@ -41,39 +45,66 @@ def recipes_root() -> Path:
     return installed if installed.is_dir() else package.parent
 
 
-def find_file(kinds: tuple[Kind, ...], name_or_path: str | Path, folder: Path | None) -> Path:
-    """Find a recipe of one of several kinds, in this priority; raise ValueError if there is none."""
+def find_file(
+    kinds: tuple[Kind, ...], name_or_path: str | Path, folder: Path | None
+) -> Path:
+    """Find a recipe of one of several kinds, in this priority.
+
+    Raise ValueError if there is none.
+    """
     text = os.fspath(name_or_path)
     path = (folder or Path()) / text
     shown = text if len(text) <= MAX_NAME_LENGTH else f"{text[:MAX_NAME_LENGTH]}..."
-    known = {name: file for kind in reversed(kinds) for name, file in list_recipes(kind).items()}
-    is_path = isinstance(name_or_path, Path) or text.endswith(".toml") or "/" in text or os.sep in text
+    known = {
+        name: file
+        for kind in reversed(kinds)
+        for name, file in list_recipes(kind).items()
+    }
+    is_path = (
+        isinstance(name_or_path, Path)
+        or text.endswith(".toml")
+        or "/" in text
+        or os.sep in text
+    )
     if os.path.isfile(path):  # noqa: PTH113 - Path.is_file raises for names that are too long
         return path
     if is_path:
         hint = nearest(Path(shown).stem, known)
         if os.path.isdir(path):  # noqa: PTH112 - as above
-            raise ValueError(f"{path} is a folder, expected a .toml file{_hint_of_folder(path, kinds)}")
+            raise ValueError(
+                f"{path} is a folder, expected a .toml file{_hint_of_folder(path, kinds)}"
+            )
         raise ValueError(f"no such file: {(folder or Path()) / shown}{hint}")
     if text not in known:
         hint = _hint_of_folder(path, kinds) or _hint(shown, kinds, known)
-        raise ValueError(f"unknown {either(kinds)} {shown!r}{hint}; known: {', '.join(known) or 'none'}")
+        raise ValueError(
+            f"unknown {either(kinds)} {shown!r}{hint}; known: {', '.join(known) or 'none'}"
+        )
     return known[text]
 
 
 def _hint_of_folder(folder: Path, kinds: tuple[Kind, ...]) -> str:
     """Return a hint for a folder of recipes as 'cnpgen copy' writes it: its file of one of the kinds."""
     files = [os.path.join(folder, f"{kind}.toml") for kind in kinds]  # noqa: PTH118 - names may be too long
-    return next((f" (did you mean {file!r}?)" for file in files if os.path.isfile(file)), "")  # noqa: PTH113
+    return next(
+        (f" (did you mean {file!r}?)" for file in files if os.path.isfile(file)),  # noqa: PTH113
+        "",
+    )
 
 
 def _hint(text: str, kinds: tuple[Kind, ...], known: Iterable[str]) -> str:
     """Return a hint: other kinds with a recipe of this name, or a similar known name."""
-    others = " and ".join(f"a {kind}" for kind in _LAYOUT if kind not in kinds and text in list_recipes(kind))
+    others = " and ".join(
+        f"a {kind}"
+        for kind in _LAYOUT
+        if kind not in kinds and text in list_recipes(kind)
+    )
     return f": it is the name of {others}" if others else nearest(text, known)
 
 
-def find_recipe(kinds: tuple[Kind, ...], name_or_path: str | Path, folder: Path | None = None) -> Path:
+def find_recipe(
+    kinds: tuple[Kind, ...], name_or_path: str | Path, folder: Path | None = None
+) -> Path:
     """Find the file of a recipe; raise RecipeError if there is none."""
     try:
         return find_file(kinds, name_or_path, folder)
@@ -97,7 +128,9 @@ def load_recipe(
     return recipe
 
 
-def reference(kind: Kind, build: Callable[[Path, list[str]], Any], folder: Path) -> Reader:
+def reference(
+    kind: Kind, build: Callable[[Path, list[str]], Any], folder: Path
+) -> Reader:
     """Return a reader of keys that refer to another recipe."""
 
     def read(value: Any, where: RecipeLocation, errors: list[str]) -> Any:
@@ -125,8 +158,15 @@ def read_kind(group: str, value: Any, where: RecipeLocation, errors: list[str]) 
         errors.extend((where / "use").message(text) for text in error.errors)
         return None
     rest = {key: entry for key, entry in value.items() if key != "use"}
-    hints = {hint for key in keys(kind) for hint in get_args(key.hint) if isinstance(hint, type)}
+    hints = {
+        hint
+        for key in keys(kind)
+        for hint in get_args(key.hint)
+        if isinstance(hint, type)
+    }
     readers: dict[type, Reader] = {
-        hint: partial(read_kind, nested) for hint in hints if (nested := registry.group_of(hint))
+        hint: partial(read_kind, nested)
+        for hint in hints
+        if (nested := registry.group_of(hint))
     }
     return parse(kind, rest, where=where, errors=errors, readers=readers)

@@ -51,26 +51,39 @@ def field(
 ) -> Any:
     """Declare a key of a recipe table.
 
-    Args:
-        doc: Short description of the key.
-        unit: SI unit of the stored value; quantities in other units of the same dimension are converted.
-        default: Value of an absent key; without a default the key is required.
-        low: Minimum value.
-        high: Maximum value.
-        plausible: Largest plausible absolute value: larger ones in a user's file are probably in another unit. By
+    Args: doc: Short description of the key. unit: SI unit of the stored value;
+        quantities in other units of the same dimension are converted. default: Value of
+        an absent key; without a default the key is required. low: Minimum value. high:
+        Maximum value. plausible: Largest plausible absolute value: larger ones in a
+        user's file are probably in another unit. By
             default that of the unit, ``PLAUSIBLE_MAX``.
         choices: Allowed strings.
-        pattern: Regular expression that a string, or the names in a table of integers, must match.
+        pattern: Regular expression that a string, or the names in a table of integers,
+            must match.
         form: Notation of the value, if the type does not determine it.
-        since_version: First version of the recipe schema with this key. Keys of versions later than 1 are omitted from
-            records at their default, so that digests of older recipes stay the same.
+        since_version: First version of the recipe schema with this key. Keys of
+            versions later than 1 are omitted from records at their default, so that
+            digests of older recipes stay the same.
 
     Returns:
         A dataclass field with this as metadata.
     """
-    bounds = {"low": low, "high": high, "plausible": plausible, "choices": choices, "pattern": pattern}
+    bounds = {
+        "low": low,
+        "high": high,
+        "plausible": plausible,
+        "choices": choices,
+        "pattern": pattern,
+    }
     return dataclasses.field(
-        default=default, metadata={"doc": doc, "unit": unit, "form": form, "since_version": since_version, **bounds}
+        default=default,
+        metadata={
+            "doc": doc,
+            "unit": unit,
+            "form": form,
+            "since_version": since_version,
+            **bounds,
+        },
     )
 
 
@@ -105,7 +118,10 @@ class Key:
 
 
 def keys(cls: type) -> tuple[Key, ...]:
-    """List the keys of a dataclass, in order; fields that are not declared with ``field`` are not keys."""
+    """List the keys of a dataclass, in order.
+
+    Fields that are not declared with ``field`` are not keys.
+    """
     return _keys_of(cls)
 
 
@@ -114,7 +130,12 @@ def _keys_of(cls: Hashable) -> tuple[Key, ...]:
     assert isinstance(cls, type)
     hints = get_type_hints(cls)
     return tuple(
-        Key(name=spec.name, hint=_present(hints[spec.name]), default=spec.default, **spec.metadata)
+        Key(
+            name=spec.name,
+            hint=_present(hints[spec.name]),
+            default=spec.default,
+            **spec.metadata,
+        )
         for spec in dataclasses.fields(cls)
         if "doc" in spec.metadata
     )
@@ -141,15 +162,22 @@ class RecipeLocation:
         return ": ".join(part for part in (self.file, self.key, text) if part)
 
 
-def to_dict(obj: Any, *, label: Callable[[Any], Mapping[str, Any]] = lambda _: {}) -> dict[str, Any]:
+def to_dict(
+    obj: Any, *, label: Callable[[Any], Mapping[str, Any]] = lambda _: {}
+) -> dict[str, Any]:
     """Turn an object declared with ``field`` into plain dicts, lists, numbers and strings, all in SI.
 
-    Fields that are not keys are omitted; ``label`` returns further entries of an object, such as its registered name.
+    Fields that are not keys are omitted; ``label`` returns further entries of an
+    object, such as its registered name.
     """
     values = ((key, getattr(obj, key.name)) for key in keys(type(obj)))
     return {
         **label(obj),
-        **{k.name: _plain(value, label) for k, value in values if not (k.since_version > 1 and value == k.default)},
+        **{
+            k.name: _plain(value, label)
+            for k, value in values
+            if not (k.since_version > 1 and value == k.default)
+        },
     }
 
 
@@ -188,8 +216,12 @@ def _expected(hint: Any, unit: str) -> str:
     if hint is PerJoint:
         return f"{dimension(unit)}, or a list of them, one per planned joint"
     if hint in (float, Range):
-        return dimension(unit) if hint is float else f"a range, each end {dimension(unit)}"
-    return {int: "an integer", bool: "true or false", str: "a string"}.get(hint, "a table")
+        return (
+            dimension(unit) if hint is float else f"a range, each end {dimension(unit)}"
+        )
+    return {int: "an integer", bool: "true or false", str: "a string"}.get(
+        hint, "a table"
+    )
 
 
 NAME = "^[a-z0-9][a-z0-9-]{0,99}$"

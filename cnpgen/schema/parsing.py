@@ -11,7 +11,14 @@ from typing import Any, NoReturn, TypeVar, get_args, get_origin
 
 from cnpgen.errors import nearest
 from cnpgen.schema.keys import Key, PerJoint, Range, RecipeLocation, keys
-from cnpgen.schema.units import PLAUSIBLE_MAX, parse_number, parse_numbers, parse_range, show, suggested_unit
+from cnpgen.schema.units import (
+    PLAUSIBLE_MAX,
+    parse_number,
+    parse_numbers,
+    parse_range,
+    show,
+    suggested_unit,
+)
 
 T = TypeVar("T")
 
@@ -44,10 +51,11 @@ def parse(
 ) -> T | None:
     """Build a dataclass declared with ``field`` from the table at a location; all values are in SI.
 
-    Returns None after an error, and appends one line per error to ``errors``. Field types that are not tables of
-    their own keys have ``readers``. Further conditions are checked by the dataclass: by a ValueError in
-    ``__post_init__``, or by a method ``validate()`` that yields (key, error) pairs. The method also runs if
-    other keys have errors, and then stops at the first use of such a key.
+    Returns None after an error, and appends one line per error to ``errors``. Field
+    types that are not tables of their own keys have ``readers``. Further conditions are
+    checked by the dataclass: by a ValueError in ``__post_init__``, or by a method
+    ``validate()`` that yields (key, error) pairs. The method also runs if other keys
+    have errors, and then stops at the first use of such a key.
     """
     before = len(errors)
     parser = _Parser(errors, readers or {})
@@ -57,7 +65,10 @@ def parse(
 
 @dataclass(frozen=True)
 class _Parser:
-    """Parser of values of all supported types; None marks an error, since TOML has no null."""
+    """Parser of values of all supported types.
+
+    None marks an error, since TOML has no null.
+    """
 
     errors: list[str]
     readers: Mapping[type, Reader]
@@ -79,12 +90,23 @@ class _Parser:
             hint = nearest(name, known) or f", known: {', '.join(known)}"
             self.errors.append((where / name).message(f"unknown key{hint}"))
         if len(unknown) > MAX_UNKNOWN_KEYS:
-            self.errors.append(where.message(f"and {len(unknown) - MAX_UNKNOWN_KEYS:,} more unknown keys"))
+            self.errors.append(
+                where.message(
+                    f"and {len(unknown) - MAX_UNKNOWN_KEYS:,} more unknown keys"
+                )
+            )
         for name, key in known.items():
             if key.required and name not in table:
-                self.errors.append((where / name).message(f"missing key, expected {key.expected}: {key.doc}"))
+                self.errors.append(
+                    (where / name).message(
+                        f"missing key, expected {key.expected}: {key.doc}"
+                    )
+                )
         given = [key for name, key in known.items() if name in table]
-        values = {key.name: self.value(key.hint, table[key.name], key, where / key.name) for key in given}
+        values = {
+            key.name: self.value(key.hint, table[key.name], key, where / key.name)
+            for key in given
+        }
         if len(self.errors) == before:
             made = cls(**values)
             self.check(getattr(made, "validate", tuple)(), where)
@@ -109,25 +131,51 @@ class _Parser:
         if get_origin(hint) is dict:
             return self.entries(args[1], value, key, where)
         if get_origin(hint) is tuple and args[0] is float:
-            return _plausible(_floats(value, key, None if args[1] is Ellipsis else len(args)), value, key)
+            return _plausible(
+                _floats(value, key, None if args[1] is Ellipsis else len(args)),
+                value,
+                key,
+            )
         if get_origin(hint) is tuple:
-            return self.array(args[0], None if args[1] is Ellipsis else len(args), value, key, where)
-        raise ValueError(f"the type of this key, {hint}, is not one that a recipe can hold")
+            return self.array(
+                args[0], None if args[1] is Ellipsis else len(args), value, key, where
+            )
+        raise ValueError(
+            f"the type of this key, {hint}, is not one that a recipe can hold"
+        )
 
-    def array(self, hint: Any, count: int | None, values: Any, key: Key, where: RecipeLocation) -> tuple[Any, ...]:
+    def array(
+        self, hint: Any, count: int | None, values: Any, key: Key, where: RecipeLocation
+    ) -> tuple[Any, ...]:
         _check_filled(list, values, key)
         if hint is Range and any(isinstance(item, int | float) for item in values):
-            raise ValueError(f"expected a list of ranges, got {show(values)}; write a point as [0.1, 0.1]")
+            raise ValueError(
+                f"expected a list of ranges, got {show(values)}; write a point as [0.1, 0.1]"
+            )
         if count not in (None, len(values)):
-            raise ValueError(f"expected {count} entries, got {len(values)}: {show(values)}")
-        return tuple(self.value(hint, item, key, where / index) for index, item in enumerate(values))
+            raise ValueError(
+                f"expected {count} entries, got {len(values)}: {show(values)}"
+            )
+        return tuple(
+            self.value(hint, item, key, where / index)
+            for index, item in enumerate(values)
+        )
 
-    def entries(self, hint: Any, values: Any, key: Key, where: RecipeLocation) -> dict[str, Any]:
+    def entries(
+        self, hint: Any, values: Any, key: Key, where: RecipeLocation
+    ) -> dict[str, Any]:
         _check_filled(dict, values, key)
         for name in values:
             if key.pattern and not re.fullmatch(key.pattern, name):
-                self.errors.append((where / name).message(f"the name {show(name)} does not match {key.pattern}"))
-        return {name: self.value(hint, item, key, where / name) for name, item in values.items()}
+                self.errors.append(
+                    (where / name).message(
+                        f"the name {show(name)} does not match {key.pattern}"
+                    )
+                )
+        return {
+            name: self.value(hint, item, key, where / name)
+            for name, item in values.items()
+        }
 
 
 class _Wrong:
@@ -136,7 +184,9 @@ class _Wrong:
     def _refuse(self, *_: Any) -> NoReturn:
         raise TypeError("a value with an error cannot be used")
 
-    __bool__ = __len__ = __iter__ = __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = _refuse
+    __bool__ = __len__ = __iter__ = __eq__ = __ne__ = __lt__ = __le__ = __gt__ = (
+        __ge__
+    ) = _refuse
     __hash__ = None  # type: ignore[assignment]
 
 
@@ -145,7 +195,13 @@ def _partly(cls: type[T], known: Mapping[str, Key], values: Mapping[str, Any]) -
     made = object.__new__(cls)
     for name, key in known.items():
         value = values.get(name, key.default)
-        object.__setattr__(made, name, _Wrong() if value is MISSING or (name in values and value is None) else value)
+        object.__setattr__(
+            made,
+            name,
+            _Wrong()
+            if value is MISSING or (name in values and value is None)
+            else value,
+        )
     return made
 
 
@@ -185,7 +241,9 @@ def _str(value: Any, key: Key) -> str:
     if not isinstance(value, str):
         raise ValueError(f"expected a string, got {show(value)}")  # noqa: TRY004 - a user's error
     if key.choices and value not in key.choices:
-        raise ValueError(f"expected {key.expected}, got {show(value)}{nearest(value, key.choices)}")
+        raise ValueError(
+            f"expected {key.expected}, got {show(value)}{nearest(value, key.choices)}"
+        )
     if key.pattern and not re.fullmatch(key.pattern, value):
         raise ValueError(f"{show(value)} does not match {key.pattern}: {key.doc}")
     return value
@@ -197,12 +255,17 @@ def _range(value: Any, key: Key) -> Range:
 
 
 def _per_joint(value: Any, key: Key) -> PerJoint:
-    several = isinstance(value, list) or (isinstance(value, str) and value.lstrip().startswith("["))
+    several = isinstance(value, list) or (
+        isinstance(value, str) and value.lstrip().startswith("[")
+    )
     return PerJoint(_floats(value, key, None) if several else (_float(value, key),))
 
 
 def _floats(value: Any, key: Key, count: int | None) -> tuple[float, ...]:
-    return tuple(_bounded(number, key, value) for number in parse_numbers(value, key.unit, count=count))
+    return tuple(
+        _bounded(number, key, value)
+        for number in parse_numbers(value, key.unit, count=count)
+    )
 
 
 _Number = TypeVar("_Number", int, float)
@@ -211,31 +274,58 @@ _Number = TypeVar("_Number", int, float)
 def _bounded(number: _Number, key: Key, value: Any) -> _Number:
     unit = "" if key.unit == "1" else f" {key.unit}"
     if key.low is not None and number < key.low:
-        raise ValueError(f"{number}{unit} is too small, expected at least {key.low:g}{unit}")
+        raise ValueError(
+            f"{number}{unit} is too small, expected at least {key.low:g}{unit}"
+        )
     if key.high is not None and number > key.high:
-        hint = "" if _has_unit(value) else suggested_unit(number, key.unit, high=key.high)
-        raise ValueError(f"{number}{unit} is too large, expected at most {key.high:g}{unit}{hint}")
+        hint = (
+            "" if _has_unit(value) else suggested_unit(number, key.unit, high=key.high)
+        )
+        raise ValueError(
+            f"{number}{unit} is too large, expected at most {key.high:g}{unit}{hint}"
+        )
     return number
 
 
 def _plausible(read: Any, value: Any, key: Key) -> Any:
     """Return a value in SI; raise ValueError if it is probably in another unit, with a hint if it has no unit."""
-    limit = PLAUSIBLE_MAX.get(key.unit, math.inf) if key.plausible is None else key.plausible
+    limit = (
+        PLAUSIBLE_MAX.get(key.unit, math.inf)
+        if key.plausible is None
+        else key.plausible
+    )
     if limit == math.inf or _IS_STORED.get():
         return read
-    numbers = (read.low, read.high) if isinstance(read, Range) else getattr(read, "values", read)
+    numbers = (
+        (read.low, read.high)
+        if isinstance(read, Range)
+        else getattr(read, "values", read)
+    )
     for number in numbers if isinstance(numbers, tuple) else (numbers,):
         if abs(number) > limit:
-            size = "small, expected at least -" if number < 0 else "large, expected at most "
-            hint = "" if _has_unit(value) else suggested_unit(number, key.unit, -limit, limit)
-            raise ValueError(f"{number} {key.unit} is too {size}{limit:.4g} {key.unit}{hint}")
+            size = (
+                "small, expected at least -"
+                if number < 0
+                else "large, expected at most "
+            )
+            hint = (
+                ""
+                if _has_unit(value)
+                else suggested_unit(number, key.unit, -limit, limit)
+            )
+            raise ValueError(
+                f"{number} {key.unit} is too {size}{limit:.4g} {key.unit}{hint}"
+            )
     return read
 
 
 def _has_unit(value: Any) -> bool:
     """Return whether a TOML value states a unit."""
     items = value if isinstance(value, list) else [value]
-    return any(isinstance(item, str) and bool(re.search(r"[a-zA-Z°](?![+-]?[0-9])", item)) for item in items)
+    return any(
+        isinstance(item, str) and bool(re.search(r"[a-zA-Z°](?![+-]?[0-9])", item))
+        for item in items
+    )
 
 
 _LEAVES: dict[Any, Callable[[Any, Key], Any]] = {

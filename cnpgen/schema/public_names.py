@@ -1,7 +1,8 @@
 """Public names that load on use: those of a stub in the core, and those that add-ons register.
 
-A module of public names has a stub, ``results.pyi`` beside ``results.py``, that lists its names of the core with their
-modules. Add-ons register further ones in the group ``cnpgen.names``, such as ``cnpgen.results.PlanRuntime``.
+A module of public names has a stub, ``results.pyi`` beside ``results.py``, that lists
+its names of the core with their modules. Add-ons register further ones in the group
+``cnpgen.names``, such as ``cnpgen.results.PlanRuntime``.
 """
 
 import ast
@@ -14,8 +15,13 @@ from typing import Any
 NAMES = "cnpgen.names"
 
 
-def lazy_exports(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Return ``__getattr__`` and ``__dir__`` of a module of public names; ``__all__`` is one of its attributes."""
+def lazy_exports(
+    package: str, file: str
+) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return ``__getattr__`` and ``__dir__`` of a module of public names.
+
+    ``__all__`` is one of its attributes.
+    """
     stub = Path(file).with_suffix(".pyi")
     modules = _modules_of(stub) if stub.is_file() else {}
 
@@ -24,7 +30,9 @@ def lazy_exports(package: str, file: str) -> tuple[Callable[[str], Any], Callabl
             return names()
         if name in modules:
             value = getattr(import_module(modules[name]), name)
-        elif name.startswith("_"):  # tools look up special names, for which the metadata need not be read
+        elif name.startswith(
+            "_"
+        ):  # tools look up special names, for which the metadata need not be read
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         else:
             value = _load_of_addon(package, name)
@@ -39,7 +47,11 @@ def lazy_exports(package: str, file: str) -> tuple[Callable[[str], Any], Callabl
 
 def _modules_of(stub: Path) -> dict[str, str]:
     """Read a stub: name -> module."""
-    imports = [node for node in ast.parse(stub.read_text(encoding="utf-8")).body if isinstance(node, ast.ImportFrom)]
+    imports = [
+        node
+        for node in ast.parse(stub.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ImportFrom)
+    ]
     own = [node for node in imports if str(node.module).startswith("cnpgen.")]
     return {alias.name: str(node.module) for node in own for alias in node.names}
 
@@ -53,7 +65,10 @@ def _names_of_addons(package: str) -> list[str]:
 
 
 def _load_of_addon(package: str, name: str) -> Any:
-    """Import a name that an add-on defines; a name that none defines raises AttributeError."""
+    """Import a name that an add-on defines.
+
+    A name that none defines raises AttributeError.
+    """
     from cnpgen.schema import addons
 
     entry = addons.find(NAMES, f"{package}.{name}")

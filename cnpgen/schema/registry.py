@@ -1,7 +1,7 @@
 """Registry of what recipes, commands and options name: the kinds of the core, of add-ons and of installed packages.
 
-A group is a kind of extension with a contract. The core lists its own kinds here; add-ons and other packages register
-theirs by entry points of the same groups.
+A group is a kind of extension with a contract. The core lists its own kinds here;
+add-ons and other packages register theirs by entry points of the same groups.
 """
 
 import contextlib
@@ -29,7 +29,9 @@ ENGINES = "cnpgen.engines"
 DOCUMENTS = "cnpgen.documents"
 RULES = "cnpgen.rules"
 RECIPES = "cnpgen.recipes"  # types of recipe files; they have no common base class
-COMMANDS = "cnpgen.commands"  # modules with the functions of ``cnpgen.cli.parser.add_command``
+COMMANDS = (
+    "cnpgen.commands"  # modules with the functions of ``cnpgen.cli.parser.add_command``
+)
 
 PROJECT = "cnpgen"  # the distribution of core and add-ons
 
@@ -108,7 +110,9 @@ BUILT_IN: dict[str, dict[str, str]] = {
     },
 }
 
-RENAMED = {"cnpgen.planners": {"cnp-b": "cnpgen", "cnp-b+refine": "cnpgen+refine"}}  # group -> old name -> new name
+RENAMED = {
+    "cnpgen.planners": {"cnp-b": "cnpgen", "cnp-b+refine": "cnpgen+refine"}
+}  # group -> old name -> new name
 
 
 def names(group: str) -> tuple[str, ...]:
@@ -135,7 +139,11 @@ def load(group: str, name: str, base: type[Any] | None = None) -> type[Any]:
         known = f"known: {', '.join(names(group))}, and those of packages with the entry point group {group!r}"
         raise RecipeError([f"unknown {noun} {name!r}{name_hint(group, name)}; {known}"])
     if len(sources) > 1:
-        raise RecipeError([f"{noun} {name!r} is defined more than once: by {' and by '.join(sources)}"])
+        raise RecipeError(
+            [
+                f"{noun} {name!r} is defined more than once: by {' and by '.join(sources)}"
+            ]
+        )
     source, importer = next(iter(sources.items()))
     what, base = f"{noun} {name!r} of {source}", base or contract(group)
     try:
@@ -143,9 +151,15 @@ def load(group: str, name: str, base: type[Any] | None = None) -> type[Any]:
     except MissingAddonError:
         raise
     except Exception as error:  # imported modules may raise any exception
-        raise RecipeError([f"{what} cannot be imported: {type(error).__name__}: {error}"]) from error
+        raise RecipeError(
+            [f"{what} cannot be imported: {type(error).__name__}: {error}"]
+        ) from error
     if not (inspect.isclass(kind) and issubclass(kind, base)):
-        raise RecipeError([f"{what} is not a subclass of {base.__module__}.{base.__name__}, got {kind!r}"])
+        raise RecipeError(
+            [
+                f"{what} is not a subclass of {base.__module__}.{base.__name__}, got {kind!r}"
+            ]
+        )
     if faults := list(_faults(kind)):
         raise RecipeError([f"{what}: {fault}" for fault in faults])
     return kind
@@ -154,7 +168,11 @@ def load(group: str, name: str, base: type[Any] | None = None) -> type[Any]:
 def name_hint(group: str, name: str) -> str:
     """Return the new name of a renamed kind, or the most similar name, in parentheses; empty if there is none."""
     renamed = RENAMED.get(group, {}).get(name)
-    return nearest(name, names(group)) if renamed is None else f" (its name is now {renamed!r})"
+    return (
+        nearest(name, names(group))
+        if renamed is None
+        else f" (its name is now {renamed!r})"
+    )
 
 
 def contract(group: str) -> type[Any]:
@@ -197,33 +215,62 @@ def source_digest(kind: type) -> str:
 
 
 def package_digest(package: str) -> str:
-    """Hash the source files of an imported top-level package or module; empty if it has none."""
+    """Hash the source files of an imported top-level package or module.
+
+    Empty if it has none.
+    """
     module = sys.modules.get(package)
-    folders = [Path(folder) for folder in getattr(module, "__path__", ())]  # a namespace package has several
+    folders = [
+        Path(folder) for folder in getattr(module, "__path__", ())
+    ]  # a namespace package has several
     source = getattr(module, "__file__", None)
     files = [file for folder in folders for file in sorted(folder.rglob("*.py"))]
     if not folders and source:
         files = [Path(source)]
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest() if files else ""
+    return (
+        hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+        if files
+        else ""
+    )
 
 
 def package_of(group: str, kind: type) -> str:
-    """Return the name of the installed package that registers a class; empty for built-in and unregistered ones."""
+    """Return the name of the installed package that registers a class.
+
+    Empty for built-in and unregistered ones.
+    """
     name = name_of(group, kind)
-    distributions = (entry.dist for entry in addons.installed(group) if entry.name == name)
-    return next((dist.name for dist in distributions if dist and dist.name != PROJECT), "")
+    distributions = (
+        entry.dist for entry in addons.installed(group) if entry.name == name
+    )
+    return next(
+        (dist.name for dist in distributions if dist and dist.name != PROJECT), ""
+    )
 
 
 def package_in(error: BaseException) -> str:
-    """Return the installed package of plug-ins in whose code an error was raised; empty if there is none."""
+    """Return the installed package of plug-ins in whose code an error was raised.
+
+    Empty if there is none.
+    """
     packages = {
         entry.module.partition(".")[0]: entry.dist.name if entry.dist else entry.module
         for entries in addons.entry_points().values()
         for entry in entries
     }
     packages.pop(PROJECT, None)
-    modules = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
-    return next((packages[top] for top in (name.partition(".")[0] for name in modules[::-1]) if top in packages), "")
+    modules = [
+        frame.f_globals.get("__name__", "")
+        for frame, _ in traceback.walk_tb(error.__traceback__)
+    ]
+    return next(
+        (
+            packages[top]
+            for top in (name.partition(".")[0] for name in modules[::-1])
+            if top in packages
+        ),
+        "",
+    )
 
 
 def why_missing(group: str, use: str, package: str) -> str:
@@ -249,7 +296,9 @@ def _sources(group: str, name: str) -> dict[str, Callable[[], Any]]:
             package = entry.dist.name if entry.dist else "an installed package"
             own = f"the add-on {addons.addon_of(entry.module)!r}"
             source = own if package == PROJECT else f"{package} ({entry.value})"
-            found[source] = functools.partial(addons.load_entry, entry, f"{noun_of(group)} {name!r}")
+            found[source] = functools.partial(
+                addons.load_entry, entry, f"{noun_of(group)} {name!r}"
+            )
     return found
 
 
@@ -260,5 +309,9 @@ def _faults(kind: type[Any]) -> Iterator[str]:
     if "__dataclass_params__" not in vars(kind):
         yield f"{kind.__name__} is not a dataclass"
     for spec in dataclasses.fields(kind):
-        if spec.init and spec.default is dataclasses.MISSING and "doc" not in spec.metadata:
+        if (
+            spec.init
+            and spec.default is dataclasses.MISSING
+            and "doc" not in spec.metadata
+        ):
             yield f"the field {spec.name!r} is not declared with cnpgen.plugins.field"

@@ -27,18 +27,22 @@ def read_own(path: Path, owner: Path, what: str) -> bytes:
     """
     folders = Path(os.path.realpath(owner)).parent, Path(os.path.realpath(owner.parent))
     if Path(os.path.realpath(path)).parent not in folders:
-        raise ValueError("is a link that leads to another folder, from which nothing is taken over: copy the file")
+        raise ValueError(
+            "is a link that leads to another folder, from which nothing is taken over: copy the file"
+        )
     return read_at_most(path, MAX_NOTES_BYTES, what)
 
 
 def utf8_text(content: bytes, encoding: str = "utf-8-sig", *, hint: str = "") -> str:
     """Decode a text, by default without a byte order mark; "utf-8" keeps it.
 
-    Raises:
-        ValueError: The content is not UTF-8; the message names line and byte, and ends with the hint.
+    Raises: ValueError: The content is not UTF-8; the message names line and byte, and
+        ends with the hint.
     """
     try:
         return content.decode(encoding)
     except UnicodeDecodeError as error:
         line = error.object[: error.start].count(b"\n") + 1
-        raise ValueError(f"line {line}: not UTF-8: byte 0x{error.object[error.start]:02x}{hint}") from error
+        raise ValueError(
+            f"line {line}: not UTF-8: byte 0x{error.object[error.start]:02x}{hint}"
+        ) from error

@@ -18,16 +18,21 @@ MARKS: dict[Kind, set[str]] = {
 """Top-level keys that are specific to a kind."""
 
 
-# Limits of untrusted files, checked before parsing: the time of tomllib is quadratic in the parts of a key.
+# Limits of untrusted files, checked before parsing: the time of tomllib is quadratic in
+# the parts of a key.
 MAX_RECIPE_BYTES = 1 << 18
 MAX_KEY_PARTS = 16  # a.b.c has three
 _LONG_KEY = re.compile(
-    rf"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{MAX_KEY_PARTS}}}""", re.ASCII
+    rf"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{MAX_KEY_PARTS}}}""",
+    re.ASCII,
 )
 
 
 def kind_of_file(path: Path) -> Kind:
-    """Return the kind of a recipe file from its keys; "dataset" if it is unknown or the file cannot be read."""
+    """Return the kind of a recipe file from its keys.
+
+    "dataset" if it is unknown or the file cannot be read.
+    """
     try:
         table = _read(path)
     except (OSError, ValueError):
@@ -35,7 +40,9 @@ def kind_of_file(path: Path) -> Kind:
     return next((kind for kind in MARKS if is_kind(kind, table)), "dataset")
 
 
-def read_table(path: Path, kinds: tuple[Kind, ...], errors: list[str]) -> dict[str, Any] | None:
+def read_table(
+    path: Path, kinds: tuple[Kind, ...], errors: list[str]
+) -> dict[str, Any] | None:
     """Return the top-level table of a recipe file, or None after an error, such as a recipe of another kind."""
     try:
         table = _read(path)
@@ -49,7 +56,14 @@ def read_table(path: Path, kinds: tuple[Kind, ...], errors: list[str]) -> dict[s
     if not found or set(found) & set(kinds):
         return table
     beside = [path.parent / f"{kind}.toml" for kind in kinds]
-    hint = next((f" (did you mean {file}?)" for file in beside if file.is_file() and file != path), "")
+    hint = next(
+        (
+            f" (did you mean {file}?)"
+            for file in beside
+            if file.is_file() and file != path
+        ),
+        "",
+    )
     errors.append(f"{path}: is a {found[0]}, expected a {' or a '.join(kinds)}{hint}")
     return None
 
@@ -64,7 +78,9 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(content)
     except (ValueError, RecursionError) as error:
-        found = re.search(r" \(at line (\d+), column \d+\)| \(at end of document\)", str(error))
+        found = re.search(
+            r" \(at line (\d+), column \d+\)| \(at end of document\)", str(error)
+        )
         line = int(found[1]) if found and found[1] else len(data.splitlines())
         text = str(error).replace(found[0], "") if found else str(error)
         text += " (entries are separated by commas)" if text == "Unclosed array" else ""

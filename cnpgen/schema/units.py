@@ -9,17 +9,34 @@ from cnpgen.errors import nearest
 
 _DEG = "0.0174532925199432957692369"
 
-# SI unit -> dimension, largest plausible absolute value, and units with their conversion factors.
+# SI unit -> dimension, largest plausible absolute value, and units with their
+# conversion factors.
 _QUANTITIES: dict[str, tuple[str, float, dict[str, str]]] = {
     "1": ("a number", math.inf, {"1": "1", "%": "0.01"}),
-    "m": ("a length", 100.0, {"m": "1", "km": "1000", "cm": "0.01", "mm": "0.001", "um": "0.000001"}),
-    "s": ("a time", 3600.0, {"s": "1", "ms": "0.001", "us": "0.000001", "min": "60", "h": "3600"}),
+    "m": (
+        "a length",
+        100.0,
+        {"m": "1", "km": "1000", "cm": "0.01", "mm": "0.001", "um": "0.000001"},
+    ),
+    "s": (
+        "a time",
+        3600.0,
+        {"s": "1", "ms": "0.001", "us": "0.000001", "min": "60", "h": "3600"},
+    ),
     "rad": ("an angle", 8 * math.pi, {"rad": "1", "mrad": "0.001", "deg": _DEG}),
-    "rad/s": ("an angular velocity", 200.0, {"rad/s": "1", "deg/s": _DEG, "rpm": "0.1047197551196597746154214"}),
+    "rad/s": (
+        "an angular velocity",
+        200.0,
+        {"rad/s": "1", "deg/s": _DEG, "rpm": "0.1047197551196597746154214"},
+    ),
     "rad/s^2": ("an angular acceleration", 1e4, {"rad/s^2": "1", "deg/s^2": _DEG}),
     "rad/s^3": ("an angular jerk", 1e7, {"rad/s^3": "1", "deg/s^3": _DEG}),
     "m/s": ("a velocity", 100.0, {"m/s": "1", "cm/s": "0.01", "mm/s": "0.001"}),
-    "m/s^2": ("an acceleration", 1e4, {"m/s^2": "1", "cm/s^2": "0.01", "mm/s^2": "0.001"}),
+    "m/s^2": (
+        "an acceleration",
+        1e4,
+        {"m/s^2": "1", "cm/s^2": "0.01", "mm/s^2": "0.001"},
+    ),
     "kg": ("a mass", 2500.0, {"kg": "1", "g": "0.001", "t": "1000"}),
     "N": ("a force", 1e6, {"N": "1", "kN": "1000"}),
     "N m": ("a torque", 1e5, {"N m": "1", "Nm": "1", "kN m": "1000"}),
@@ -28,12 +45,22 @@ _QUANTITIES: dict[str, tuple[str, float, dict[str, str]]] = {
 }
 
 UNITS: dict[str, tuple[str, Decimal]] = {
-    unit: (si, Decimal(factor)) for si, (_, _, scale) in _QUANTITIES.items() for unit, factor in scale.items()
+    unit: (si, Decimal(factor))
+    for si, (_, _, scale) in _QUANTITIES.items()
+    for unit, factor in scale.items()
 }
-"""Unit -> SI unit and conversion factor. Decimal, so that "9 mm" and 0.009 are the same float."""
+"""Unit -> SI unit and conversion factor.
 
-PLAUSIBLE_MAX = {si: largest for si, (_, largest, _) in _QUANTITIES.items() if largest < math.inf}
-"""SI unit -> largest plausible absolute value of a quantity; larger ones are probably in another unit."""
+Decimal, so that "9 mm" and 0.009 are the same float.
+"""
+
+PLAUSIBLE_MAX = {
+    si: largest for si, (_, largest, _) in _QUANTITIES.items() if largest < math.inf
+}
+"""SI unit -> largest plausible absolute value of a quantity.
+
+Larger ones are probably in another unit.
+"""
 
 OTHER_UNITS = {"rad": "deg", "m": "mm", "s": "ms", "kg": "g"}
 """SI unit -> unit in which values are often given by error."""
@@ -41,7 +68,14 @@ OTHER_UNITS = {"rad": "deg", "m": "mm", "s": "ms", "kg": "g"}
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _QUANTITY = re.compile(rf"\s*({_NUMBER.pattern})(.*)", re.DOTALL)
 _LIST = re.compile(r"\s*\[(.*)\](.*)", re.DOTALL)
-_SPELLINGS = (("**", "^"), ("*", " "), ("·", " "), ("²", "^2"), ("°", "deg"), ("µ", "u"))
+_SPELLINGS = (
+    ("**", "^"),
+    ("*", " "),
+    ("·", " "),
+    ("²", "^2"),
+    ("°", "deg"),
+    ("µ", "u"),
+)
 
 
 def dimension(unit: str) -> str:
@@ -50,17 +84,22 @@ def dimension(unit: str) -> str:
     return name if unit == "1" else f"{name} [{unit}]"
 
 
-def suggested_unit(value: float, unit: str, low: float = -math.inf, high: float = math.inf) -> str:
+def suggested_unit(
+    value: float, unit: str, low: float = -math.inf, high: float = math.inf
+) -> str:
     """Return a hint for a value [unit] outside of its plausible range: ``"; did you mean 15 deg = 0.262 rad?"``.
 
-    The hint is empty for units without a common error, and if the converted value is outside of ``low`` to ``high``.
+    The hint is empty for units without a common error, and if the converted value is
+    outside of ``low`` to ``high``.
     """
     base, slash, per = unit.partition("/")
     factor = float(UNITS[OTHER_UNITS[base]][1]) if base in OTHER_UNITS else 0.0
     if not factor or not low <= value * factor <= high:
         return ""
     other = f"{OTHER_UNITS[base]}{slash}{per}"
-    text = f"; {value:.6g} {unit} is {value / factor:.0f} {other}" if base == "rad" else ""
+    text = (
+        f"; {value:.6g} {unit} is {value / factor:.0f} {other}" if base == "rad" else ""
+    )
     return f"{text}; did you mean {value:.6g} {other} = {value * factor:.3g} {unit}?"
 
 
@@ -73,28 +112,36 @@ def show(value: object) -> str:
 def parse_number(value: Any, unit: str) -> float:
     """Read a number in ``unit``, or a text such as ``"50 ms"`` or ``"0.05"``; return the value [unit], an SI unit.
 
-    Raises:
-        ValueError: The value is not a finite number, or its unit is unknown or of another dimension.
+    Raises: ValueError: The value is not a finite number, or its unit is unknown or of
+        another dimension.
     """
     match = _QUANTITY.fullmatch(value) if isinstance(value, str) else None
     if match:
         ordinary = 0.0 < abs(float(match[1])) < math.inf
-        return _finite(Decimal(match[1]) if ordinary else float(match[1]), match[2], value, unit)
+        return _finite(
+            Decimal(match[1]) if ordinary else float(match[1]), match[2], value, unit
+        )
     if isinstance(value, bool | str) or not isinstance(value, int | float):
         raise ValueError(f"expected {dimension(unit)}, got {show(value)}")  # noqa: TRY004 - a user's error
     return _finite(value, "", value, unit)
 
 
-def parse_numbers(value: Any, unit: str, *, count: int | None = None) -> tuple[float, ...]:
+def parse_numbers(
+    value: Any, unit: str, *, count: int | None = None
+) -> tuple[float, ...]:
     """Read a list of values for ``parse_number``, or a text such as ``"[0.6, 1.3] m"``; return the values [unit].
 
-    Raises:
-        ValueError: The value is not a list, has an invalid entry, or not ``count`` entries (None for one or more).
+    Raises: ValueError: The value is not a list, has an invalid entry, or not ``count``
+        entries (None for one or more).
     """
     match = _LIST.fullmatch(value) if isinstance(value, str) else None
     if match:
         _check_commas(match, value)
-    items = [f"{item.strip()} {match[2].strip()}".strip() for item in match[1].split(",")] if match else value
+    items = (
+        [f"{item.strip()} {match[2].strip()}".strip() for item in match[1].split(",")]
+        if match
+        else value
+    )
     if not isinstance(items, list):
         raise ValueError(f"expected a list, each {dimension(unit)}, got {show(value)}")  # noqa: TRY004 - a user's error
     if not items or (match and not match[1].strip()):
@@ -110,12 +157,16 @@ def parse_range(value: Any, unit: str) -> tuple[float, float]:
     Raises:
         ValueError: An end is invalid, or the low end is above the high end.
     """
-    if isinstance(value, list) or (isinstance(value, str) and value.lstrip().startswith("[")):
+    if isinstance(value, list) or (
+        isinstance(value, str) and value.lstrip().startswith("[")
+    ):
         low, high = parse_numbers(value, unit, count=2)
     else:
         low = high = parse_number(value, unit)
     if low > high:
-        raise ValueError(f"empty range {show(value)}: its low end is above its high end")
+        raise ValueError(
+            f"empty range {show(value)}: its low end is above its high end"
+        )
     return low, high
 
 
@@ -124,7 +175,9 @@ def _check_commas(match: re.Match[str], value: object) -> None:
     items = [re.split(r"[;\s]+", item.strip()) for item in match[1].split(",")]
     if any(len(words) > 1 and all(map(_NUMBER.fullmatch, words)) for words in items):
         meant = ", ".join(word for words in items for word in words)
-        raise ValueError(f"numbers are separated by commas, got {show(value)} (did you mean '[{meant}]{match[2]}'?)")
+        raise ValueError(
+            f"numbers are separated by commas, got {show(value)} (did you mean '[{meant}]{match[2]}'?)"
+        )
 
 
 def _finite(number: Decimal | float, suffix: str, value: object, unit: str) -> float:
@@ -135,7 +188,9 @@ def _finite(number: Decimal | float, suffix: str, value: object, unit: str) -> f
     except ArithmeticError:
         result = math.inf
     if not math.isfinite(result):
-        raise ValueError(f"expected {dimension(unit)} that is finite, got {show(value)}")
+        raise ValueError(
+            f"expected {dimension(unit)} that is finite, got {show(value)}"
+        )
     return result + 0.0  # no negative zero: "-0" and "0" are the same recipe
 
 
@@ -146,7 +201,9 @@ def _factor(written: str, value: object, unit: str) -> Decimal:
     if written not in UNITS:
         same = [known for known, (si, _) in UNITS.items() if si == unit]
         hint = nearest(written, same) or nearest(written, UNITS)
-        raise ValueError(f"unknown unit {written!r} in {show(value)}, expected {dimension(unit)}{hint}")
+        raise ValueError(
+            f"unknown unit {written!r} in {show(value)}, expected {dimension(unit)}{hint}"
+        )
     si, factor = UNITS[written]
     if si != unit:
         raise ValueError(f"expected {dimension(unit)}, got {show(value)}")

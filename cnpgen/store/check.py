@@ -9,13 +9,31 @@ import numpy as np
 
 from cnpgen.errors import DatasetError
 from cnpgen.store.checked_shard import Shard, read_rows
-from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, load_dataset_spec, shard_attributes, shards
+from cnpgen.store.dataset_spec import (
+    DatasetSpec,
+    ShardTask,
+    load_dataset_spec,
+    shard_attributes,
+    shards,
+)
 from cnpgen.store.dataset_summary import summarize_dataset, unfinished
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import file_sha256
-from cnpgen.store.intact import COPY_HINT, OUTSIDE, RERUN_HINT, leads_outside, outside_links
+from cnpgen.store.intact import (
+    COPY_HINT,
+    OUTSIDE,
+    RERUN_HINT,
+    leads_outside,
+    outside_links,
+)
 from cnpgen.store.layout import CROISSANT, MANIFEST, SPECIFICATION, WORK
-from cnpgen.store.manifest import LISTED, data_fingerprint, lists_shards_of, load_manifest, shard_entries
+from cnpgen.store.manifest import (
+    LISTED,
+    data_fingerprint,
+    lists_shards_of,
+    load_manifest,
+    shard_entries,
+)
 from cnpgen.store.scene_table import SCENE_ARRAYS, scene_attributes
 from cnpgen.store.shard import (
     SHARD_FORMAT,
@@ -68,7 +86,12 @@ def check_dataset(folder: Path) -> list[Finding]:
     try:
         spec = load_dataset_spec(folder)
     except DatasetError as error:
-        return [*links, Finding(SPECIFICATION, _reason(error, folder / SPECIFICATION), hint=REPLACE_HINT)]
+        return [
+            *links,
+            Finding(
+                SPECIFICATION, _reason(error, folder / SPECIFICATION), hint=REPLACE_HINT
+            ),
+        ]
     findings, manifest = _check_manifest(folder, spec)
     findings = links + findings
     entries, finished = shard_entries(manifest), (folder / MANIFEST).exists()
@@ -83,7 +106,9 @@ def check_documents(folder: Path, spec: DatasetSpec) -> list[Finding]:
     """Check the documents of a finished dataset: the manifest, the files it lists and the sidecars, but no shard."""
     findings, manifest = _check_manifest(folder, spec)
     for entry in shard_entries(manifest).values():
-        findings += _check_file(folder, entry["sidecar"]["file"], entry["sidecar"]["sha256"])
+        findings += _check_file(
+            folder, entry["sidecar"]["file"], entry["sidecar"]["sha256"]
+        )
     return findings
 
 
@@ -92,52 +117,116 @@ def _reason(error: DatasetError, path: Path) -> str:
     return str(error).removeprefix(f"{path} ").removeprefix(f"{path}: ")
 
 
-def _check_manifest(folder: Path, spec: DatasetSpec) -> tuple[list[Finding], dict[str, Any]]:
-    """Check the manifest and the files it lists; return also the manifest, empty if it is not valid."""
+def _check_manifest(
+    folder: Path, spec: DatasetSpec
+) -> tuple[list[Finding], dict[str, Any]]:
+    """Check the manifest and the files it lists.
+
+    Return also the manifest, empty if it is not valid.
+    """
     if not (folder / MANIFEST).exists():
         summary = summarize_dataset(folder, spec, allow_incomplete=True)
-        return [Finding(MANIFEST, f"is missing: the dataset is {unfinished(summary)}", hint=REMAKE_HINT)], {}
+        return [
+            Finding(
+                MANIFEST,
+                f"is missing: the dataset is {unfinished(summary)}",
+                hint=REMAKE_HINT,
+            )
+        ], {}
     try:
         manifest = load_manifest(folder)
     except DatasetError as error:
-        return [Finding(MANIFEST, _reason(error, folder / MANIFEST), hint=REMAKE_HINT)], {}
+        return [
+            Finding(MANIFEST, _reason(error, folder / MANIFEST), hint=REMAKE_HINT)
+        ], {}
     if manifest["specification_fingerprint"] != spec.fingerprint:
-        return [Finding(MANIFEST, f"is of another specification than {SPECIFICATION}", hint=REMAKE_HINT)], {}
+        return [
+            Finding(
+                MANIFEST,
+                f"is of another specification than {SPECIFICATION}",
+                hint=REMAKE_HINT,
+            )
+        ], {}
     if not lists_shards_of(manifest, spec):
-        return [Finding(MANIFEST, f"lists other shards than {SPECIFICATION}", hint=REMAKE_HINT)], {}
+        return [
+            Finding(
+                MANIFEST, f"lists other shards than {SPECIFICATION}", hint=REMAKE_HINT
+            )
+        ], {}
     entries, findings = shard_entries(manifest), []
-    if data_fingerprint((file, entry["sha256"]) for file, entry in entries.items()) != manifest["fingerprint"]:
-        findings.append(Finding(MANIFEST, "its fingerprint is not that of the shards it lists", hint=REMAKE_HINT))
+    if (
+        data_fingerprint((file, entry["sha256"]) for file, entry in entries.items())
+        != manifest["fingerprint"]
+    ):
+        findings.append(
+            Finding(
+                MANIFEST,
+                "its fingerprint is not that of the shards it lists",
+                hint=REMAKE_HINT,
+            )
+        )
     for name in (name for name in LISTED if name in manifest["files"]):
         entry = manifest["files"][name]
         if name == CROISSANT and not (folder / name).exists():
-            findings.append(Finding(name, "is missing, as in published datasets", note=True, hint=REMAKE_HINT))
+            findings.append(
+                Finding(
+                    name,
+                    "is missing, as in published datasets",
+                    note=True,
+                    hint=REMAKE_HINT,
+                )
+            )
         else:
             findings += _check_file(folder, name, entry["sha256"], entry["bytes"])
     return findings, manifest
 
 
-def _check_file(folder: Path, name: str, sha256: str, size: int | None = None) -> list[Finding]:
+def _check_file(
+    folder: Path, name: str, sha256: str, size: int | None = None
+) -> list[Finding]:
     """Compare a file with its recorded sha256 and its size, if that is recorded."""
     path = folder / name
     if not path.is_file():
         return [Finding(name, "is missing", hint=REMAKE_HINT)]
     if size is not None and (actual := path.stat().st_size) != size:
-        return [Finding(name, f"has {actual} bytes instead of {size}", hint=REMAKE_HINT)]
+        return [
+            Finding(name, f"has {actual} bytes instead of {size}", hint=REMAKE_HINT)
+        ]
     if file_sha256(path) != sha256:
-        return [Finding(name, "was changed: its sha256 is not the recorded one", hint=REMAKE_HINT)]
+        return [
+            Finding(
+                name,
+                "was changed: its sha256 is not the recorded one",
+                hint=REMAKE_HINT,
+            )
+        ]
     return []
 
 
-def check_shard(folder: Path, spec: DatasetSpec, task: ShardTask, entry: dict[str, Any] | None = None) -> list[Finding]:
-    """Check one shard and its sidecar; ``entry`` is the entry of the shard in the manifest, None without a manifest."""
+def check_shard(
+    folder: Path,
+    spec: DatasetSpec,
+    task: ShardTask,
+    entry: dict[str, Any] | None = None,
+) -> list[Finding]:
+    """Check one shard and its sidecar.
+
+    ``entry`` is the entry of the shard in the manifest, None without a manifest.
+    """
     path = folder / task.file
     findings, expected = _check_sidecar(folder, spec, task, entry)
     if not path.is_file():
         return [*findings, Finding(task.file, "is missing", hint=REMAKE_HINT)]
-    if outside := [name for name in (task.file, task.sidecar) if leads_outside(folder / name)]:
-        return [*findings, *(Finding(name, OUTSIDE, hint=COPY_HINT) for name in outside)]
-    if expected is None:  # neither manifest nor sidecar is valid, which is a finding already
+    if outside := [
+        name for name in (task.file, task.sidecar) if leads_outside(folder / name)
+    ]:
+        return [
+            *findings,
+            *(Finding(name, OUTSIDE, hint=COPY_HINT) for name in outside),
+        ]
+    if (
+        expected is None
+    ):  # neither manifest nor sidecar is valid, which is a finding already
         return findings
     damage = _check_file(folder, task.file, *expected)
     if damage and not _is_of_another_spec(path, spec.version_with(task)):
@@ -151,7 +240,10 @@ def check_shard(folder: Path, spec: DatasetSpec, task: ShardTask, entry: dict[st
 def _is_of_another_spec(path: Path, spec: DatasetSpec) -> bool:
     """Return whether a shard that is not the recorded one is an intact shard of another specification."""
     try:
-        return read_attributes(path, ["specification_key"])["specification_key"] != spec.key
+        return (
+            read_attributes(path, ["specification_key"])["specification_key"]
+            != spec.key
+        )
     except DatasetError:
         return False
 
@@ -164,8 +256,16 @@ def _check_sidecar(
     try:
         record = load_record(folder, task)
     except DatasetError as error:
-        return [Finding(task.sidecar, _reason(error, folder / task.sidecar), hint=REMAKE_HINT)], expected
-    findings = [] if entry is None else _check_file(folder, task.sidecar, entry["sidecar"]["sha256"])
+        return [
+            Finding(
+                task.sidecar, _reason(error, folder / task.sidecar), hint=REMAKE_HINT
+            )
+        ], expected
+    findings = (
+        []
+        if entry is None
+        else _check_file(folder, task.sidecar, entry["sidecar"]["sha256"])
+    )
     if record.specification_fingerprint != spec.version_with(task).fingerprint:
         text = f"belongs to another specification ({record.specification_fingerprint[:12]}...)"
         findings.append(Finding(task.sidecar, text, hint=REMAKE_HINT))
@@ -182,19 +282,29 @@ def check_content(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[Find
         attributes, schema = read_attributes(path), read_schema(path)
     except DatasetError as error:
         return [Finding(task.file, _reason(error, path), hint=DELETE_HINT)]
-    expected = {"format": SHARD_FORMAT, "format_version": SHARD_VERSION, **shard_attributes(spec, task)}
+    expected = {
+        "format": SHARD_FORMAT,
+        "format_version": SHARD_VERSION,
+        **shard_attributes(spec, task),
+    }
     problems = [
         f"its {name} is {attributes.get(name)!r}, expected {value!r} by {SPECIFICATION}"
         for name, value in expected.items()
         if attributes.get(name) != value
     ]
-    names = {field.name for field in spec.fields} | {item.name for item in SCENE_ARRAYS if spec.scene_obstacles}
+    names = {field.name for field in spec.fields} | {
+        item.name for item in SCENE_ARRAYS if spec.scene_obstacles
+    }
     problems += [f"lacks the field {name!r}" for name in sorted(names - schema.keys())]
-    problems += [f"has an unknown field {name!r}" for name in sorted(schema.keys() - names)]
+    problems += [
+        f"has an unknown field {name!r}" for name in sorted(schema.keys() - names)
+    ]
     for field in spec.fields:
         if field.name in schema:
             problems += _check_field(field, schema[field.name], spec, task)
-    expected_scenes = scene_attributes(spec.scene_families) if spec.scene_obstacles else {}
+    expected_scenes = (
+        scene_attributes(spec.scene_families) if spec.scene_obstacles else {}
+    )
     problems += [
         f"{name} has the attributes {schema[name].attributes}, expected {expected}"
         for name, expected in expected_scenes.items()
@@ -208,12 +318,16 @@ def check_content(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[Find
     return [Finding(task.file, problem, hint=DELETE_HINT) for problem in problems]
 
 
-def _check_field(field: Field, stored: StoredField, spec: DatasetSpec, task: ShardTask) -> list[str]:
+def _check_field(
+    field: Field, stored: StoredField, spec: DatasetSpec, task: ShardTask
+) -> list[str]:
     """Compare the description of a field in a shard with the specification."""
     shape, dtype = field.shape(task.rows), storage_dtype(field, spec.dtype)
     problems = []
     if stored.shape != shape or stored.dtype != dtype:
-        problems.append(f"field {field.name!r} is {stored.dtype} of shape {stored.shape}, not {dtype} of shape {shape}")
+        problems.append(
+            f"field {field.name!r} is {stored.dtype} of shape {stored.shape}, not {dtype} of shape {shape}"
+        )
     expected = field_attributes(field)
     pairs = {
         name: (stored.attributes.get(name, _MISSING), expected.get(name, _MISSING))
@@ -236,5 +350,7 @@ def _extras(folder: Path, spec: DatasetSpec) -> Iterator[Finding]:
             name = item.relative_to(folder).as_posix()
             if name not in known:
                 loaded = parent != folder and item.suffix == ".h5"
-                text = "is not part of the dataset" + (", but loaders would read it" if loaded else "")
+                text = "is not part of the dataset" + (
+                    ", but loaders would read it" if loaded else ""
+                )
                 yield Finding(name, text, note=not loaded, hint=REMOVE_HINT)

@@ -15,8 +15,20 @@ from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import machine_errors
 from cnpgen.store.intact import RERUN_HINT, require_intact, size_problem
 from cnpgen.store.layout import SPECIFICATION
-from cnpgen.store.scene_table import SCENE_ARRAYS, SCENE_ID, SceneTable, check_scenes, check_shapes
-from cnpgen.store.shard import StoredField, finite_problem, read_placements, read_shard, storage_dtype
+from cnpgen.store.scene_table import (
+    SCENE_ARRAYS,
+    SCENE_ID,
+    SceneTable,
+    check_scenes,
+    check_shapes,
+)
+from cnpgen.store.shard import (
+    StoredField,
+    finite_problem,
+    read_placements,
+    read_shard,
+    storage_dtype,
+)
 
 SAMPLE_ID = "sample_id"
 
@@ -42,7 +54,10 @@ class Shard:
         return self.task.rows
 
     def problem(self) -> str:
-        """Describe the problem of the file without opening it; empty if it has the recorded size."""
+        """Describe the problem of the file without opening it.
+
+        Empty if it has the recorded size.
+        """
         return size_problem(self.path, self.size)
 
 
@@ -52,29 +67,46 @@ def read_checked(shard: Shard) -> dict[str, NDArray[Any]]:
     return read_rows(shard)
 
 
-def read_rows(shard: Shard, names: Iterable[str] | None = None) -> dict[str, NDArray[Any]]:
+def read_rows(
+    shard: Shard, names: Iterable[str] | None = None
+) -> dict[str, NDArray[Any]]:
     """Read and check fields of a shard, by default all, after its sha256 was compared.
 
-    The result is field name -> values as stored, shape (rows, width) or (rows,). A missing or damaged shard, and one
-    that differs from the specification, raises DatasetError.
+    The result is field name -> values as stored, shape (rows, width) or (rows,). A
+    missing or damaged shard, and one that differs from the specification, raises
+    DatasetError.
     """
     placements = check_header(shard)
-    columns = read_columns(shard, placements, [item.name for item in shard.spec.fields] if names is None else names)
+    columns = read_columns(
+        shard,
+        placements,
+        [item.name for item in shard.spec.fields] if names is None else names,
+    )
     check_values(shard, columns)
     if names is None and shard.spec.scene_obstacles:
         read_scenes(shard, placements)
     return columns
 
 
-def read_scenes(shard: Shard, placements: Mapping[str, StoredField] | None = None) -> SceneTable:
-    """Read and check the scenes of a shard after its sha256 was compared; ``check_header`` returns the placements."""
+def read_scenes(
+    shard: Shard, placements: Mapping[str, StoredField] | None = None
+) -> SceneTable:
+    """Read and check the scenes of a shard after its sha256 was compared.
+
+    ``check_header`` returns the placements.
+    """
     placements = check_header(shard) if placements is None else placements
     names, spec = [item.name for item in SCENE_ARRAYS], shard.spec
     try:
-        check_shapes({name: placements[name].shape for name in names if name in placements}, spec.scene_obstacles)
+        check_shapes(
+            {name: placements[name].shape for name in names if name in placements},
+            spec.scene_obstacles,
+        )
         columns = read_columns(shard, placements, [SCENE_ID, *names])
         table = SceneTable(**{name: columns[name] for name in names}).astype(spec.dtype)
-        check_scenes(table, spec.scene_obstacles, columns[SCENE_ID], len(spec.scene_families))
+        check_scenes(
+            table, spec.scene_obstacles, columns[SCENE_ID], len(spec.scene_families)
+        )
     except DatasetError as error:
         raise DatasetError(f"{shard.path}: {error}") from error
     return table
@@ -83,13 +115,20 @@ def read_scenes(shard: Shard, placements: Mapping[str, StoredField] | None = Non
 def check_header(shard: Shard) -> dict[str, StoredField]:
     """Return the stored fields of a shard.
 
-    Raise DatasetError if position, fields, shapes, types or sample IDs are not those of the specification.
+    Raise DatasetError if position, fields, shapes, types or sample IDs are not those of
+    the specification.
     """
     placements, identity = read_placements(shard.path)
     spec, task = shard.spec, shard.task
     key = spec.version_with(task).key
-    if identity != {"specification_key": key, "first_sample_id": task.first_row, "rows": task.rows}:
-        raise DatasetError(f"{shard.path} is of another dataset or another position in it; {RERUN_HINT}")
+    if identity != {
+        "specification_key": key,
+        "first_sample_id": task.first_row,
+        "rows": task.rows,
+    }:
+        raise DatasetError(
+            f"{shard.path} is of another dataset or another position in it; {RERUN_HINT}"
+        )
     for item in spec.fields:
         check_field(shard, item, placements.get(item.name))
     if SAMPLE_ID in {item.name for item in spec.fields}:
@@ -100,16 +139,27 @@ def check_header(shard: Shard) -> dict[str, StoredField]:
 def check_field(shard: Shard, item: Field, placement: StoredField | None) -> None:
     """Raise an error if a field of a shard does not have the shape and type of the specification."""
     shape, dtype = item.shape(shard.rows), storage_dtype(item, shard.spec.dtype)
-    if placement is None or placement.shape != shape or placement.dtype.newbyteorder("<") != dtype:
-        actual = "is missing" if placement is None else f"is {placement.dtype} of shape {placement.shape}"
+    if (
+        placement is None
+        or placement.shape != shape
+        or placement.dtype.newbyteorder("<") != dtype
+    ):
+        actual = (
+            "is missing"
+            if placement is None
+            else f"is {placement.dtype} of shape {placement.shape}"
+        )
         expected = f"expected {dtype} of shape {shape} by {SPECIFICATION}"
         raise DatasetError(f"{shard.path}: field {item.name!r} {actual}, {expected}")
 
 
-def read_columns(shard: Shard, placements: Mapping[str, StoredField], names: Iterable[str]) -> dict[str, NDArray[Any]]:
+def read_columns(
+    shard: Shard, placements: Mapping[str, StoredField], names: Iterable[str]
+) -> dict[str, NDArray[Any]]:
     """Read fields of a shard after ``check_header``; values that are contiguous in the file are read directly.
 
-    Reading a file that is truncated meanwhile raises DatasetError; reading its memory map would end the process.
+    Reading a file that is truncated meanwhile raises DatasetError; reading its memory
+    map would end the process.
     """
     selected = {name: placements[name] for name in names}
     if any(place.offset is None for place in selected.values()):
@@ -122,7 +172,9 @@ def read_columns(shard: Shard, placements: Mapping[str, StoredField], names: Ite
             buffer = columns[name].data.cast("B")
             while buffer:  # the system reads at most 2 GiB at once
                 if not (count := file.readinto(buffer)):
-                    raise DatasetError(f"{shard.path} was cut off while it was read; {RERUN_HINT}")
+                    raise DatasetError(
+                        f"{shard.path} was cut off while it was read; {RERUN_HINT}"
+                    )
                 buffer = buffer[count:]
     return columns
 
@@ -132,5 +184,9 @@ def check_values(shard: Shard, columns: Mapping[str, NDArray[Any]]) -> None:
     if problem := finite_problem(columns):
         raise DatasetError(f"{shard.path}: {problem}")
     ids = columns.get(SAMPLE_ID)
-    if ids is not None and not np.array_equal(ids, shard.task.first_row + np.arange(shard.rows)):
-        raise DatasetError(f"{shard.path}: sample_id is not the index of the row in the split")
+    if ids is not None and not np.array_equal(
+        ids, shard.task.first_row + np.arange(shard.rows)
+    ):
+        raise DatasetError(
+            f"{shard.path}: sample_id is not the index of the row in the split"
+        )

@@ -17,7 +17,9 @@ class DatasetDocument(ABC):
     file: ClassVar[str]
 
     @abstractmethod
-    def render(self, summary: DatasetSummary, *, created: str, folder: str, notes: str) -> str:
+    def render(
+        self, summary: DatasetSummary, *, created: str, folder: str, notes: str
+    ) -> str:
         """Return the text of the document.
 
         It depends on the arguments only, so that the same samples give the same bytes.
@@ -36,4 +38,7 @@ class DatasetDocument(ABC):
 
 def dataset_documents() -> list[DatasetDocument]:
     """Return the documents that the installed add-ons write."""
-    return [registry.load(registry.DOCUMENTS, name)() for name in registry.names(registry.DOCUMENTS)]
+    return [
+        registry.load(registry.DOCUMENTS, name)()
+        for name in registry.names(registry.DOCUMENTS)
+    ]

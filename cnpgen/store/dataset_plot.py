@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 MAX_DRAWN_ROWS = 300  # in the top view
 MIN_CANDIDATES_PER_CELL = 25  # acceptance rates of fewer candidates are noise
-ARROW_DURATION_S = 0.05  # an arrow is the distance covered at the goal velocity in this time
+ARROW_DURATION_S = (
+    0.05  # an arrow is the distance covered at the goal velocity in this time
+)
 
 _COLORS = {"start": "tab:blue", "goal": "tab:red"}
 
@@ -34,12 +36,16 @@ def plot_dataset(inspection: Inspection, path: str | Path) -> None:
         MachineError: matplotlib is missing, or the file cannot be written.
     """
     if not inspection.statistics:
-        raise DatasetError(f"{inspection.folder} has no rows yet: there is nothing to plot")
+        raise DatasetError(
+            f"{inspection.folder} has no rows yet: there is nothing to plot"
+        )
     joints = _joint_fields(inspection)
     heights = [1.3 * len(joints) + 0.3, 4.2]
     figure = new_figure(14, sum(heights) + 0.5)
     spec = inspection.spec
-    figure.suptitle(f"{spec.name} {spec.version}, {counted(sum(inspection.rows.values()), 'row')} ({inspection.state})")
+    figure.suptitle(
+        f"{spec.name} {spec.version}, {counted(sum(inspection.rows.values()), 'row')} ({inspection.state})"
+    )
     parts = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)
     _draw_histograms(parts[0, 0], joints, inspection.statistics)
     _draw_task_space(parts[1, 0], inspection)
@@ -52,10 +58,16 @@ def _joint_fields(inspection: Inspection) -> list[Field]:
     statistics = inspection.statistics
     fields = [field for field in inspection.spec.fields if field.names == joints]
     found = [(field, statistics[field.name]) for field in fields]
-    return [field for field, values in found if values.histogram is not None and not values.constant.all()]
+    return [
+        field
+        for field, values in found
+        if values.histogram is not None and not values.constant.all()
+    ]
 
 
-def _draw_histograms(figure: "SubFigure", fields: list[Field], statistics: Mapping[str, FieldStatistics]) -> None:
+def _draw_histograms(
+    figure: "SubFigure", fields: list[Field], statistics: Mapping[str, FieldStatistics]
+) -> None:
     """Draw one row of histograms per field and one column per joint, between the planning limits."""
     if not fields:
         return
@@ -73,7 +85,9 @@ def _draw_histogram(axis: "Axes", statistics: FieldStatistics, column: int) -> N
     assert statistics.low is not None
     assert statistics.high is not None
     counts = statistics.histogram[column]
-    edges = np.linspace(statistics.low[column], statistics.high[column], len(counts) + 1)
+    edges = np.linspace(
+        statistics.low[column], statistics.high[column], len(counts) + 1
+    )
     axis.stairs(counts, edges, fill=True, color="tab:gray")
     axis.set_xlim(*_widened(edges[0], edges[-1]))
     axis.set_yticks([])
@@ -85,7 +99,12 @@ def _draw_task_space(figure: "SubFigure", inspection: Inspection) -> None:
     maps = inspection.sampling.densities
     axes = figure.subplots(1, 1 + len(maps), squeeze=False)[0]
     _draw_motions(axes[0], _some_rows(inspection))
-    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=7, loc="outside lower left", ncols=2)
+    figure.legend(
+        *axes[0].get_legend_handles_labels(),
+        fontsize=7,
+        loc="outside lower left",
+        ncols=2,
+    )
     for axis, (name, density) in zip(axes[1:], maps.items(), strict=True):
         _draw_acceptance(figure, axis, name, density)
     for axis in axes:
@@ -111,20 +130,55 @@ def _draw_motions(axis: "Axes", rows: dict[str, NDArray[Any]]) -> None:
         x, y = rows[f"{end}_xyz"][:, :2].T
         axis.plot(x, y, ".", color=color, markersize=2, label=end)
     if "hit_angle" in rows and "hit_speed" in rows:
-        (x, y), angle, length = rows["goal_xyz"][:, :2].T, rows["hit_angle"], ARROW_DURATION_S * rows["hit_speed"]
-        arrows: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.003, "alpha": 0.6}
-        axis.quiver(x, y, length * np.cos(angle), length * np.sin(angle), color=_COLORS["goal"], **arrows)
-    legend = f", arrows: goal velocity x {1e3 * ARROW_DURATION_S:g} ms" if "hit_speed" in rows else ""
-    axis.set_title(f"{counted(len(rows['goal_xyz']), 'row')} from above{legend}", fontsize=9)
+        (x, y), angle, length = (
+            rows["goal_xyz"][:, :2].T,
+            rows["hit_angle"],
+            ARROW_DURATION_S * rows["hit_speed"],
+        )
+        arrows: dict[str, Any] = {
+            "angles": "xy",
+            "scale_units": "xy",
+            "scale": 1,
+            "width": 0.003,
+            "alpha": 0.6,
+        }
+        axis.quiver(
+            x,
+            y,
+            length * np.cos(angle),
+            length * np.sin(angle),
+            color=_COLORS["goal"],
+            **arrows,
+        )
+    legend = (
+        f", arrows: goal velocity x {1e3 * ARROW_DURATION_S:g} ms"
+        if "hit_speed" in rows
+        else ""
+    )
+    axis.set_title(
+        f"{counted(len(rows['goal_xyz']), 'row')} from above{legend}", fontsize=9
+    )
 
 
-def _draw_acceptance(figure: "SubFigure", axis: "Axes", name: str, density: DensityMap) -> None:
-    """Draw the acceptance rate per cell; cells with too few candidates are left white."""
+def _draw_acceptance(
+    figure: "SubFigure", axis: "Axes", name: str, density: DensityMap
+) -> None:
+    """Draw the acceptance rate per cell.
+
+    Cells with too few candidates are left white.
+    """
     candidates, accepted = _coarsened(density)
-    rate = np.where(candidates >= MIN_CANDIDATES_PER_CELL / 5, accepted / np.maximum(candidates, 1), np.nan)
+    rate = np.where(
+        candidates >= MIN_CANDIDATES_PER_CELL / 5,
+        accepted / np.maximum(candidates, 1),
+        np.nan,
+    )
     extent = (*_widened(*density.x), *_widened(*density.y))
     image = axis.imshow(rate.T, origin="lower", extent=extent, vmin=0, cmap="viridis")
-    axis.set_title(f"acceptance rate by {name}\n{candidates.mean():,.0f} candidates per cell", fontsize=9)
+    axis.set_title(
+        f"acceptance rate by {name}\n{candidates.mean():,.0f} candidates per cell",
+        fontsize=9,
+    )
     figure.colorbar(image, ax=axis, shrink=0.8).ax.tick_params(labelsize=7)
 
 
@@ -132,7 +186,11 @@ def _coarsened(density: DensityMap) -> tuple[NDArray[np.int64], NDArray[np.int64
     """Return candidates and accepted candidates per cell of the finest grid with enough candidates per cell."""
     cells = min(density.candidates.shape)
     divisors = (k for k in range(1, cells) if cells % k == 0)
-    enough = (k for k in divisors if _summed(density.candidates, k).mean() >= MIN_CANDIDATES_PER_CELL)
+    enough = (
+        k
+        for k in divisors
+        if _summed(density.candidates, k).mean() >= MIN_CANDIDATES_PER_CELL
+    )
     factor = next(enough, cells)
     return _summed(density.candidates, factor), _summed(density.accepted, factor)
 

@@ -13,9 +13,19 @@ from cnpgen.store.files.document_structure import ANY_KEY, TEXT
 from cnpgen.store.files.documents import load_document
 from cnpgen.store.intact import RERUN_HINT
 from cnpgen.store.layout import SPECIFICATION, STATS
-from cnpgen.store.sampling_statistics import DENSITIES_STRUCTURE, SamplingStatistics, densities_to_json, merge_sampling
+from cnpgen.store.sampling_statistics import (
+    DENSITIES_STRUCTURE,
+    SamplingStatistics,
+    densities_to_json,
+    merge_sampling,
+)
 from cnpgen.store.shard_record import ShardRecord, load_committed
-from cnpgen.store.statistics import STATISTICS_STRUCTURE, FieldStatistics, are_of, merge_statistics
+from cnpgen.store.statistics import (
+    STATISTICS_STRUCTURE,
+    FieldStatistics,
+    are_of,
+    merge_statistics,
+)
 
 STATS_FORMAT = "cnpgen-stats"
 STATS_VERSION = 2
@@ -54,7 +64,8 @@ class DatasetSummary:
     def sampling_by_split(self) -> dict[str, SamplingStatistics]:
         """Sampling statistics of every split."""
         return {
-            split: merge_sampling([item.sampling for _, item in self.of_split(split)]) for split in self.spec.splits
+            split: merge_sampling([item.sampling for _, item in self.of_split(split)])
+            for split in self.spec.splits
         }
 
     @cached_property
@@ -79,14 +90,22 @@ class DatasetSummary:
     @cached_property
     def statistics(self) -> dict[str, dict[str, FieldStatistics]]:
         """Statistics of every split with finished shards: split -> field -> statistics."""
-        parts = {split: [item.statistics for _, item in self.of_split(split)] for split in self.spec.splits}
-        return {split: merge_statistics(items) for split, items in parts.items() if items}
+        parts = {
+            split: [item.statistics for _, item in self.of_split(split)]
+            for split in self.spec.splits
+        }
+        return {
+            split: merge_statistics(items) for split, items in parts.items() if items
+        }
 
 
-def summarize_dataset(folder: Path, spec: DatasetSpec, *, allow_incomplete: bool = False) -> DatasetSummary:
+def summarize_dataset(
+    folder: Path, spec: DatasetSpec, *, allow_incomplete: bool = False
+) -> DatasetSummary:
     """Read the sidecars of a dataset; of an incomplete one only with ``allow_incomplete``.
 
-    Otherwise a shard that is missing, damaged or of another specification raises DatasetError, which names it.
+    Otherwise a shard that is missing, damaged or of another specification raises
+    DatasetError, which names it.
     """
     records, problems = [], []
     for task in shards(spec):
@@ -96,17 +115,25 @@ def summarize_dataset(folder: Path, spec: DatasetSpec, *, allow_incomplete: bool
             problems.append(str(error))
     summary = DatasetSummary(spec, tuple(records), tuple(problems))
     if problems and not allow_incomplete:
-        more = [f"and {len(problems) - _MAX_SHOWN_PROBLEMS} more"] if len(problems) > _MAX_SHOWN_PROBLEMS else []
+        more = (
+            [f"and {len(problems) - _MAX_SHOWN_PROBLEMS} more"]
+            if len(problems) > _MAX_SHOWN_PROBLEMS
+            else []
+        )
         shown = "\n  ".join([*problems[:_MAX_SHOWN_PROBLEMS], *more])
         raise DatasetError(f"{folder} is {unfinished(summary)}:\n  {shown}")
     return summary
 
 
-def _load_record_with_fields(folder: Path, spec: DatasetSpec, task: ShardTask) -> ShardRecord:
+def _load_record_with_fields(
+    folder: Path, spec: DatasetSpec, task: ShardTask
+) -> ShardRecord:
     """Read a sidecar and check that its statistics are of the fields of the specification."""
     record = load_committed(folder, spec, task)
     if not are_of(record.statistics, spec.fields):
-        raise DatasetError(f"{folder / task.sidecar} has other fields than {SPECIFICATION}")
+        raise DatasetError(
+            f"{folder / task.sidecar} has other fields than {SPECIFICATION}"
+        )
     return record
 
 
@@ -128,10 +155,15 @@ def stats_document(summary: DatasetSummary) -> dict[str, Any]:
             split: {name: item.to_json() for name, item in fields.items()}
             for split, fields in summary.statistics.items()
         },
-        "densities": {split: densities_to_json(item.densities) for split, item in summary.sampling_by_split.items()},
+        "densities": {
+            split: densities_to_json(item.densities)
+            for split, item in summary.sampling_by_split.items()
+        },
     }
 
 
 def load_stats_document(folder: Path) -> dict[str, Any]:
     """Read ``stats.json``; raise DatasetError if it is missing, damaged or of another format version."""
-    return load_document(folder / STATS, STATS_FORMAT, version=STATS_VERSION, structure=STATS_STRUCTURE)
+    return load_document(
+        folder / STATS, STATS_FORMAT, version=STATS_VERSION, structure=STATS_STRUCTURE
+    )

@@ -12,7 +12,8 @@ class Field:
     Attributes:
         name: HDF5 dataset name at the root of the shard.
         unit: SI unit as text: "rad", "rad/s", "rad/s^2", "m", "m/s", "N m", "1"; or
-            one per joint, separated by commas, if some joints are prismatic and others revolute.
+            one per joint, separated by commas, if some joints are prismatic and others
+            revolute.
         long_name: Description in a few words.
         width: Number of columns; 0 for a scalar per row.
         names: Names of the columns (joints, axes), empty for scalars.
@@ -35,7 +36,10 @@ class Field:
     dtype: str = "float"
 
     def __post_init__(self) -> None:
-        for name in ("valid_min", "valid_max"):  # floats, as read from JSON, because they are part of the fingerprint
+        for name in (
+            "valid_min",
+            "valid_max",
+        ):  # floats, as read from JSON, because they are part of the fingerprint
             limits = getattr(self, name)
             if limits is not None:
                 object.__setattr__(self, name, tuple(map(float, limits)))
@@ -53,4 +57,8 @@ class Field:
     def columns(self) -> tuple[str, ...]:
         """Names of the columns in a table of several fields: ``"start_q.joint_1"``, or ``"hit_speed"`` of a scalar."""
         names = self.names or tuple(map(str, range(self.width)))
-        return tuple(f"{self.name}.{name}" for name in names) if self.width else (self.name,)
+        return (
+            tuple(f"{self.name}.{name}" for name in names)
+            if self.width
+            else (self.name,)
+        )

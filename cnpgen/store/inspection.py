@@ -1,4 +1,7 @@
-"""Inspection of a dataset: its content and origin, from its documents and sidecars; no sample is read."""
+"""Inspection of a dataset: its content and origin, from its documents and sidecars.
+
+No sample is read.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,12 +25,10 @@ from cnpgen.store.statistics import FieldStatistics, merge_statistics
 class Inspection:
     """Description of a dataset, which may be unfinished.
 
-    Attributes:
-        folder: Folder of the dataset.
-        summary: The specification and the records of the finished shards.
-        is_finalized: Whether the manifest exists.
-        bytes: Size of all files [bytes].
-        damage: Problems of the documents of a finalized dataset, one per line; shards are not read.
+    Attributes: folder: Folder of the dataset. summary: The specification and the
+        records of the finished shards. is_finalized: Whether the manifest exists.
+        bytes: Size of all files [bytes]. damage: Problems of the documents of a
+        finalized dataset, one per line; shards are not read.
     """
 
     folder: Path
@@ -72,7 +73,10 @@ class Inspection:
     @cached_property
     def rows(self) -> dict[str, int]:
         """Number of existing rows per split."""
-        return {split: sum(record.rows for _, record in self.summary.of_split(split)) for split in self.spec.splits}
+        return {
+            split: sum(record.rows for _, record in self.summary.of_split(split))
+            for split in self.spec.splits
+        }
 
     @cached_property
     def statistics(self) -> Mapping[str, FieldStatistics]:
@@ -95,18 +99,44 @@ class Inspection:
         spec = self.spec
         content = {
             "folder": self.folder,
-            **{name: getattr(spec, name) for name in ("name", "version", "title", "license")},
-            **{name: getattr(self, name) for name in ("complete", "state", "bytes", "seconds")},
-            "damage": [*self.summary.problems, *self.damage] if self.is_finalized else [],
-            "shards": {"planned": self.summary.n_shards, "finished": len(self.summary.records)},
-            "rows": {split: {"planned": spec.splits[split], "stored": rows} for split, rows in self.rows.items()},
+            **{
+                name: getattr(spec, name)
+                for name in ("name", "version", "title", "license")
+            },
+            **{
+                name: getattr(self, name)
+                for name in ("complete", "state", "bytes", "seconds")
+            },
+            "damage": [*self.summary.problems, *self.damage]
+            if self.is_finalized
+            else [],
+            "shards": {
+                "planned": self.summary.n_shards,
+                "finished": len(self.summary.records),
+            },
+            "rows": {
+                split: {"planned": spec.splits[split], "stored": rows}
+                for split, rows in self.rows.items()
+            },
             "fields": [self._field(field) for field in spec.fields],
             "yield": _yield(self.sampling),
-            "yield_by_split": {split: _yield(sampling) for split, sampling in self.summary.sampling_by_split.items()},
+            "yield_by_split": {
+                split: _yield(sampling)
+                for split, sampling in self.summary.sampling_by_split.items()
+            },
             "densities": densities_to_json(self.sampling.densities),
             "verification": self.sampling.verification,
             "seed": str(spec.seed),
-            **{name: getattr(spec, name) for name in ("generator", "backend", "dtype", "shard_size", "recipe_sha256")},
+            **{
+                name: getattr(spec, name)
+                for name in (
+                    "generator",
+                    "backend",
+                    "dtype",
+                    "shard_size",
+                    "recipe_sha256",
+                )
+            },
             "specification_fingerprint": spec.fingerprint,
             "versions": spec.versions,
             "environments": self.environments,
@@ -115,12 +145,28 @@ class Inspection:
         return result
 
     def _field(self, field: Field) -> dict[str, Any]:
-        names = ("name", "unit", "long_name", "width", "names", "role", "frame", "dtype", "valid_min", "valid_max")
+        names = (
+            "name",
+            "unit",
+            "long_name",
+            "width",
+            "names",
+            "role",
+            "frame",
+            "dtype",
+            "valid_min",
+            "valid_max",
+        )
         content = {name: getattr(field, name) for name in names}
         item = self.statistics.get(field.name)
         if item is None:
             return content
-        return content | {"min": item.minimum, "mean": item.mean, "max": item.maximum, "std": item.std}
+        return content | {
+            "min": item.minimum,
+            "mean": item.mean,
+            "max": item.maximum,
+            "std": item.std,
+        }
 
 
 def _yield(sampling: SamplingStatistics) -> dict[str, Any]:
@@ -130,10 +176,21 @@ def _yield(sampling: SamplingStatistics) -> dict[str, Any]:
         left -= count
         stage = sampling.stages.get(reason, "")
         steps.append(
-            {"stage": stage, "reason": reason, "candidates": count, "share": count / tried, "left": left / tried}
+            {
+                "stage": stage,
+                "reason": reason,
+                "candidates": count,
+                "share": count / tried,
+                "left": left / tried,
+            }
         )
     share = sampling.accepted / tried
-    return {"tried": sampling.tried, "accepted": sampling.accepted, "acceptance": share, "rejections": steps}
+    return {
+        "tried": sampling.tried,
+        "accepted": sampling.accepted,
+        "acceptance": share,
+        "rejections": steps,
+    }
 
 
 def inspect_dataset(folder: str | Path) -> Inspection:
@@ -154,11 +211,20 @@ def inspect_dataset(folder: str | Path) -> Inspection:
         raise DatasetError(f"{error}; for a remedy run 'cnpgen validate'") from error
     summary = summarize_dataset(folder, spec, allow_incomplete=True)
     is_finalized = (folder / MANIFEST).is_file()
-    damage = tuple(str(finding) for finding in check_documents(folder, spec)) if is_finalized else ()
+    damage = (
+        tuple(str(finding) for finding in check_documents(folder, spec))
+        if is_finalized
+        else ()
+    )
     return Inspection(folder, summary, is_finalized, _size(folder, spec), damage)
 
 
 def _size(folder: Path, spec: DatasetSpec) -> int:
     """Return the size of all files of the dataset [bytes], without other files in its folder."""
-    names = [*DOCUMENTS, *(name for task in shards(spec) for name in (task.file, task.sidecar))]
-    return sum((folder / name).stat().st_size for name in names if (folder / name).is_file())
+    names = [
+        *DOCUMENTS,
+        *(name for task in shards(spec) for name in (task.file, task.sidecar)),
+    ]
+    return sum(
+        (folder / name).stat().st_size for name in names if (folder / name).is_file()
+    )

@@ -25,7 +25,9 @@ def leads_outside(path: Path, folder: Path | None = None) -> bool:
     folder = path.parents[1] if folder is None else folder
     if not (path.is_symlink() or (path.parent != folder and path.parent.is_symlink())):
         return False
-    return not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))  # resolve() refuses circular links
+    return not Path(os.path.realpath(path)).is_relative_to(
+        os.path.realpath(folder)
+    )  # resolve() refuses circular links
 
 
 def outside_links(folder: Path, names: Iterable[str] = (*DOCUMENTS, WORK)) -> list[str]:
@@ -34,7 +36,10 @@ def outside_links(folder: Path, names: Iterable[str] = (*DOCUMENTS, WORK)) -> li
 
 
 def size_problem(path: Path, size: int) -> str:
-    """Describe the problem of a shard without opening it; empty if it has the recorded size [bytes]."""
+    """Describe the problem of a shard without opening it.
+
+    Empty if it has the recorded size [bytes].
+    """
     if not path.is_file():
         return f"{path} is missing"
     if leads_outside(path):
@@ -49,7 +54,10 @@ def digest_problem(path: Path) -> str:
 
 
 def require_intact(path: Path, *, size: int, sha256: str) -> None:
-    """Raise DatasetError if a shard has not its recorded size [bytes] and sha256; verify it once per process."""
+    """Raise DatasetError if a shard has not its recorded size [bytes] and sha256.
+
+    Verify it once per process.
+    """
     if problem := size_problem(path, size):
         raise DatasetError(f"{problem}; {RERUN_HINT}")
     identity = (path.absolute(), path.stat().st_mtime_ns, size, sha256)

@@ -2,7 +2,13 @@
 
 from functools import cache
 
-_PRISMATIC = {"rad": "m", "rad/s": "m/s", "rad/s^2": "m/s^2", "rad/s^3": "m/s^3", "N m": "N"}
+_PRISMATIC = {
+    "rad": "m",
+    "rad/s": "m/s",
+    "rad/s^2": "m/s^2",
+    "rad/s^3": "m/s^3",
+    "N m": "N",
+}
 _SEPARATOR = ", "
 
 
@@ -12,11 +18,17 @@ def units_of_joints(revolute_unit: str, is_prismatic: tuple[bool, ...]) -> str:
 
     The unit of revolute joints is "rad", "rad/s", "rad/s^2", "rad/s^3" or "N m".
     """
-    units = [_PRISMATIC[revolute_unit] if prismatic else revolute_unit for prismatic in is_prismatic]
+    units = [
+        _PRISMATIC[revolute_unit] if prismatic else revolute_unit
+        for prismatic in is_prismatic
+    ]
     return units[0] if len(set(units)) == 1 else _SEPARATOR.join(units)
 
 
 def unit_of(units: str, index: int) -> str:
-    """Return the unit of one column; the units of joints repeat for several values per joint."""
+    """Return the unit of one column.
+
+    The units of joints repeat for several values per joint.
+    """
     names = units.split(_SEPARATOR)
     return names[index % len(names)]

@@ -1,4 +1,7 @@
-"""The manifest of a dataset. It is written last, so it exists only for a complete dataset."""
+"""The manifest of a dataset.
+
+It is written last, so it exists only for a complete dataset.
+"""
 
 import hashlib
 import os
@@ -12,7 +15,11 @@ from typing import Any, cast
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.store.dataset_document import dataset_documents
 from cnpgen.store.dataset_spec import DatasetSpec, shards
-from cnpgen.store.dataset_summary import DatasetSummary, stats_document, summarize_dataset
+from cnpgen.store.dataset_summary import (
+    DatasetSummary,
+    stats_document,
+    summarize_dataset,
+)
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import file_sha256, write_file
 from cnpgen.store.files.document_structure import ANY_KEY, TEXT, WHOLE, check_structure
@@ -22,7 +29,11 @@ from cnpgen.store.layout import DESCRIPTIONS, MANIFEST, SPECIFICATION, STATS, WO
 
 MANIFEST_FORMAT = "cnpgen-dataset"
 MANIFEST_VERSION = 2
-LISTED = (SPECIFICATION, STATS, *DESCRIPTIONS)  # files with their size and sha256 beside the shards
+LISTED = (
+    SPECIFICATION,
+    STATS,
+    *DESCRIPTIONS,
+)  # files with their size and sha256 beside the shards
 _FILE_STRUCTURE = {"bytes": WHOLE, "sha256": TEXT}
 _SHARD_STRUCTURE = {
     **dict.fromkeys(("file", "sha256"), TEXT),
@@ -40,15 +51,18 @@ MANIFEST_STRUCTURE = {
 def finalize(folder: Path, spec: DatasetSpec, *, notes: str = "") -> dict[str, Any]:
     """Summarize the shards of a dataset: write statistics, descriptions and, last, the manifest.
 
-    The same shards give the same files, so several processes may do it at the same time. ``notes`` is Markdown for the
-    descriptions. Errors are those of ``summarize_dataset`` and ``source_date``.
+    The same shards give the same files, so several processes may do it at the same
+    time. ``notes`` is Markdown for the descriptions. Errors are those of
+    ``summarize_dataset`` and ``source_date``.
     """
     summary = summarize_dataset(folder, spec)
     created = _created(summary)
     (folder / MANIFEST).unlink(missing_ok=True)
     save_document(folder / STATS, stats_document(summary))
     for document in dataset_documents():
-        text = document.render(summary, created=created, folder=_name(folder), notes=notes)
+        text = document.render(
+            summary, created=created, folder=_name(folder), notes=notes
+        )
         write_file(folder / document.file, text)
     manifest = _manifest(folder, summary, created=created)
     save_document(folder / MANIFEST, manifest)
@@ -59,14 +73,27 @@ def finalize(folder: Path, spec: DatasetSpec, *, notes: str = "") -> dict[str, A
 
 
 def _name(folder: Path) -> str:
-    """Return the name of a folder as text; bytes that are not UTF-8 are replaced by question marks."""
+    """Return the name of a folder as text.
+
+    Bytes that are not UTF-8 are replaced by question marks.
+    """
     return os.fsencode(folder.resolve().name).decode(errors="replace")
 
 
 def load_manifest(folder: Path) -> dict[str, Any]:
-    """Read ``manifest.json``; raise DatasetError if it is missing, damaged or of another format version."""
-    manifest = load_document(folder / MANIFEST, MANIFEST_FORMAT, version=MANIFEST_VERSION, structure=MANIFEST_STRUCTURE)
-    described = {name: _FILE_STRUCTURE for name in DESCRIPTIONS if name in manifest["files"]}
+    """Read ``manifest.json``.
+
+    Raise DatasetError if it is missing, damaged or of another format version.
+    """
+    manifest = load_document(
+        folder / MANIFEST,
+        MANIFEST_FORMAT,
+        version=MANIFEST_VERSION,
+        structure=MANIFEST_STRUCTURE,
+    )
+    described = {
+        name: _FILE_STRUCTURE for name in DESCRIPTIONS if name in manifest["files"]
+    }
     try:
         check_structure(manifest["files"], described)
     except ValueError as error:
@@ -76,41 +103,65 @@ def load_manifest(folder: Path) -> dict[str, Any]:
 
 def shard_entries(manifest: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Return the entries of the shards of all splits, by file."""
-    return {entry["file"]: entry for split in manifest.get("splits", {}).values() for entry in split["shards"]}
+    return {
+        entry["file"]: entry
+        for split in manifest.get("splits", {}).values()
+        for entry in split["shards"]
+    }
 
 
 def lists_shards_of(manifest: dict[str, Any], spec: DatasetSpec) -> bool:
     """Return whether a manifest lists exactly the shards of a specification, in order.
 
-    Only these file names are opened: no path in a manifest can lead outside the folder of the dataset.
+    Only these file names are opened: no path in a manifest can lead outside the folder
+    of the dataset.
     """
     if manifest["splits"].keys() != spec.splits.keys():
         return False
     listed = [
-        (split, entry["file"], entry["sidecar"]["file"], entry["first_sample_id"], entry["rows"])
+        (
+            split,
+            entry["file"],
+            entry["sidecar"]["file"],
+            entry["first_sample_id"],
+            entry["rows"],
+        )
         for split in spec.splits
         for entry in manifest["splits"][split]["shards"]
     ]
-    return listed == [(task.split, task.file, task.sidecar, task.first_row, task.rows) for task in shards(spec)]
+    return listed == [
+        (task.split, task.file, task.sidecar, task.first_row, task.rows)
+        for task in shards(spec)
+    ]
 
 
 def source_date() -> datetime | None:
-    """Return the time in the variable SOURCE_DATE_EPOCH, or None if it is not set; another value raises UsageError."""
+    """Return the time in the variable SOURCE_DATE_EPOCH, or None if it is not set.
+
+    Another value raises UsageError.
+    """
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
     try:
         return datetime.fromtimestamp(int(epoch), UTC) if epoch else None
     except (ValueError, OverflowError, OSError) as error:
-        raise UsageError(f"SOURCE_DATE_EPOCH must be whole seconds since 1970, got {epoch!r}: unset it") from error
+        raise UsageError(
+            f"SOURCE_DATE_EPOCH must be whole seconds since 1970, got {epoch!r}: unset it"
+        ) from error
 
 
 def _created(summary: DatasetSummary) -> str:
     """Return the start time of the last shard, or SOURCE_DATE_EPOCH, in UTC to the second.
 
-    It does not depend on when the dataset is finished, so finishing it twice gives the same files.
+    It does not depend on when the dataset is finished, so finishing it twice gives the
+    same files.
     """
     fixed = source_date()
     try:
-        started = [datetime.fromisoformat(record.started) for _, record in summary.records if record.started]
+        started = [
+            datetime.fromisoformat(record.started)
+            for _, record in summary.records
+            if record.started
+        ]
         last = max((instant.timestamp() for instant in started), default=time.time())
         instant = datetime.fromtimestamp(int(last), UTC) if fixed is None else fixed
         return instant.strftime("%Y-%m-%dT%H:%M:%SZ")
@@ -128,7 +179,9 @@ def _manifest(folder: Path, summary: DatasetSummary, *, created: str) -> dict[st
         **{name: getattr(spec, name) for name in ("name", "version", "title")},
         "created": created,
         "license": spec.license,
-        "fingerprint": data_fingerprint((item.file, item.sha256) for _, item in summary.records),
+        "fingerprint": data_fingerprint(
+            (item.file, item.sha256) for _, item in summary.records
+        ),
         "specification_fingerprint": spec.fingerprint,
         **_origin(summary),
         "features": {field.name: _feature(field, spec) for field in spec.fields},
@@ -137,7 +190,10 @@ def _manifest(folder: Path, summary: DatasetSummary, *, created: str) -> dict[st
         "splits": {split: _split(folder, summary, split) for split in spec.splits},
         "stats": STATS,
         "files": {
-            name: {"bytes": (folder / name).stat().st_size, "sha256": file_sha256(folder / name)}
+            name: {
+                "bytes": (folder / name).stat().st_size,
+                "sha256": file_sha256(folder / name),
+            }
             for name in LISTED
             if (folder / name).exists()
         },
@@ -154,14 +210,22 @@ def data_fingerprint(files: Iterable[tuple[str, str]]) -> str:
 
 
 def _origin(summary: DatasetSummary) -> dict[str, Any]:
-    """Describe the origin of the samples; "environments" are all combinations of versions that made shards."""
+    """Describe the origin of the samples.
+
+    "environments" are all combinations of versions that made shards.
+    """
     spec = summary.spec
     pipeline = spec.recipe.get("pipeline")
     return {
-        "pipeline": pipeline.get("name", "") if isinstance(pipeline, dict) else pipeline,
+        "pipeline": pipeline.get("name", "")
+        if isinstance(pipeline, dict)
+        else pipeline,
         **{name: getattr(spec, name) for name in ("recipe_sha256", "recipe")},
         "seed": str(spec.seed),
-        **{name: getattr(spec, name) for name in ("generator", "backend", "dtype", "block_rows", "shard_size")},
+        **{
+            name: getattr(spec, name)
+            for name in ("generator", "backend", "dtype", "block_rows", "shard_size")
+        },
         **{name: getattr(spec, name) for name in ("robot", "versions")},
         "environments": summary.environments,
         "seconds": summary.seconds,
@@ -175,7 +239,10 @@ def _feature(field: Field, spec: DatasetSpec) -> dict[str, Any]:
         "shape": [field.width] if field.width else [],
         "names": field.names,
         "units": field.unit,
-        **{name: getattr(field, name) for name in ("long_name", "role", "frame", "valid_min", "valid_max")},
+        **{
+            name: getattr(field, name)
+            for name in ("long_name", "role", "frame", "valid_min", "valid_max")
+        },
     }
 
 
@@ -183,10 +250,20 @@ def _split(folder: Path, summary: DatasetSummary, split: str) -> dict[str, Any]:
     """List the shards of a split."""
     entries = [
         {
-            **{name: getattr(record, name) for name in ("file", "rows", "first_sample_id", "bytes", "sha256")},
-            "sidecar": {"file": task.sidecar, "sha256": file_sha256(folder / task.sidecar)},
+            **{
+                name: getattr(record, name)
+                for name in ("file", "rows", "first_sample_id", "bytes", "sha256")
+            },
+            "sidecar": {
+                "file": task.sidecar,
+                "sha256": file_sha256(folder / task.sidecar),
+            },
         }
         for task, record in summary.of_split(split)
     ]
     sampling = summary.sampling_by_split[split]
-    return {"rows": summary.spec.splits[split], "yield": sampling.yield_json(), "shards": entries}
+    return {
+        "rows": summary.spec.splits[split],
+        "yield": sampling.yield_json(),
+        "shards": entries,
+    }

@@ -11,7 +11,10 @@ from cnpgen.store.files.kind import PLANS, is_hdf5, kind_of_content, own_kind
 from cnpgen.store.layout import SPECIFICATION
 from cnpgen.store.workspace import is_dataset
 
-MAX_SIMILAR_PATHS, MIN_SIMILARITY = 1000, 0.65  # names of a folder that are compared, and their share of equal letters
+MAX_SIMILAR_PATHS, MIN_SIMILARITY = (
+    1000,
+    0.65,
+)  # names of a folder that are compared, and their share of equal letters
 ANY_HDF5 = "an HDF5 file"  # of other software
 _KIND_OF_FORMAT = {"cnpgen-plans": PLANS, "cnpgen-shard": "a shard of a dataset"}
 HDF5_KINDS = (ANY_HDF5, *_KIND_OF_FORMAT.values())
@@ -20,14 +23,17 @@ HDF5_KINDS = (ANY_HDF5, *_KIND_OF_FORMAT.values())
 def require_folder(folder: str | Path, *, argument: str = "folder") -> Path:
     """Return the path of a folder that exists; errors name the argument.
 
-    No text or path, a missing folder and a file raise UsageError, and a folder that cannot be read MachineError.
+    No text or path, a missing folder and a file raise UsageError, and a folder that
+    cannot be read MachineError.
     """
     if not isinstance(folder, str | Path) or not str(folder) or "\0" in str(folder):
         raise UsageError(f"must name a folder, got {folder!r:.100}", argument=argument)
     folder = Path(folder)
     require_path(folder, "the folder of a dataset", argument=argument)
     if not folder.is_dir():
-        raise UsageError(f"{folder} is a file, expected the folder of a dataset", concerns=argument)
+        raise UsageError(
+            f"{folder} is a file, expected the folder of a dataset", concerns=argument
+        )
     return folder
 
 
@@ -38,23 +44,41 @@ def require_dataset(folder: str | Path, *, argument: str = "folder") -> Path:
         return folder
     recipe = folder / "dataset.toml"  # as of 'cnpgen copy'
     hint = f": 'cnpgen make-dataset {recipe}' makes one" if recipe.is_file() else ""
-    raise UsageError(f"{folder} is not a dataset of cnpgen: it has no {SPECIFICATION}{hint}", concerns=argument)
+    raise UsageError(
+        f"{folder} is not a dataset of cnpgen: it has no {SPECIFICATION}{hint}",
+        concerns=argument,
+    )
 
 
 def require_file(
-    path: Path, expected: str, *, kinds: Collection[str] = (), of_dataset: str = "", argument: str = "path"
+    path: Path,
+    expected: str,
+    *,
+    kinds: Collection[str] = (),
+    of_dataset: str = "",
+    argument: str = "path",
 ) -> None:
     """Raise an error that names the argument if a path is not a file with some expected content: "a file of plans".
 
-    Files of other ``kinds``, as of ``file_kind``, are refused, if any are listed. ``of_dataset`` is a hint for the
-    folder of a dataset. Files that cannot be read raise MachineError, other paths UsageError.
+    Files of other ``kinds``, as of ``file_kind``, are refused, if any are listed.
+    ``of_dataset`` is a hint for the folder of a dataset. Files that cannot be read
+    raise MachineError, other paths UsageError.
     """
     require_path(path, expected, argument=argument)
     if path.is_dir():
-        actual, hint = ("the folder of a dataset", of_dataset) if is_dataset(path) else ("a folder", "")
-        raise UsageError(f"{path} is {actual}, expected {expected}{hint and f': {hint}'}", concerns=argument)
+        actual, hint = (
+            ("the folder of a dataset", of_dataset)
+            if is_dataset(path)
+            else ("a folder", "")
+        )
+        raise UsageError(
+            f"{path} is {actual}, expected {expected}{hint and f': {hint}'}",
+            concerns=argument,
+        )
     if not path.is_file():
-        raise UsageError(f"{path} is a device or a pipe, expected {expected}", concerns=argument)
+        raise UsageError(
+            f"{path} is a device or a pipe, expected {expected}", concerns=argument
+        )
     kind = file_kind(path) or kind_of_content(path) if kinds else ""
     if kind and kind not in kinds:
         raise UsageError(f"{path} is {kind}, expected {expected}", concerns=argument)
@@ -64,20 +88,33 @@ def require_path(path: Path, expected: str, *, argument: str = "path") -> None:
     """Raise UsageError, naming the argument, if a path is missing, and MachineError if it cannot be read."""
     check_readable(path)
     if not path.exists():
-        raise UsageError(f"{path} is not there, expected {expected}{similar_path(path)}", concerns=argument)
+        raise UsageError(
+            f"{path} is not there, expected {expected}{similar_path(path)}",
+            concerns=argument,
+        )
 
 
 def similar_path(path: Path, names: Iterable[str] = ()) -> str:
     """Return ``" (did you mean 'x'?)"`` for the most similar of names and of paths beside it, or an empty text."""
     with suppress(OSError):
         beside = itertools.islice(path.parent.iterdir(), MAX_SIMILAR_PATHS)
-        names = [*names, *(each.name for each in beside if path.suffix in ("", each.suffix) or each.is_dir())]
+        names = [
+            *names,
+            *(
+                each.name
+                for each in beside
+                if path.suffix in ("", each.suffix) or each.is_dir()
+            ),
+        ]
     others = [name for name in names if name != path.name]  # a link may lead nowhere
     return nearest(path.name, others, similarity=MIN_SIMILARITY)
 
 
 def file_kind(path: Path) -> str:
-    """Return the kind of a file, "a model of cnpgen" or "a file of plans"; empty if it is not known."""
+    """Return the kind of a file, "a model of cnpgen" or "a file of plans".
+
+    Empty if it is not known.
+    """
     if not path.is_file():  # opening a pipe would block
         return ""
     try:
@@ -93,7 +130,10 @@ def _hdf5_kind(path: Path) -> str:
 
     try:
         with open_hdf5(path) as file:
-            format_name, names = file.attributes.some(["format"]).get("format"), set(file)
+            format_name, names = (
+                file.attributes.some(["format"]).get("format"),
+                set(file),
+            )
     except (DatasetError, MachineError):
         return ANY_HDF5
     if isinstance(format_name, bytes):

@@ -34,21 +34,35 @@ class StoredDataset:
     manifest: dict[str, Any] | None
 
     def tasks(self, split: str) -> list[ShardTask]:
-        """List the existing shards of a split, in order; an unknown split raises DatasetError."""
+        """List the existing shards of a split, in order.
+
+        An unknown split raises DatasetError.
+        """
         if split not in self.spec.splits:
-            raise DatasetError(f"{self.folder} {lacks('split', split, self.spec.splits)}", concerns="split")
+            raise DatasetError(
+                f"{self.folder} {lacks('split', split, self.spec.splits)}",
+                concerns="split",
+            )
         tasks = [task for task in shards(self.spec) if task.split == split]
         if self.manifest is None:
-            return [task for task in tasks if is_committed(self.folder, self.spec, task)]
+            return [
+                task for task in tasks if is_committed(self.folder, self.spec, task)
+            ]
         return tasks
 
     def read(
-        self, split: str, *, fields: Sequence[str] | None = None, start: int = 0, stop: int | None = None
+        self,
+        split: str,
+        *,
+        fields: Sequence[str] | None = None,
+        start: int = 0,
+        stop: int | None = None,
     ) -> dict[str, NDArray[Any]]:
         """Read rows ``start`` to ``stop`` of a split; of an unfinished dataset, only the existing ones of them.
 
-        By default, all fields are read, in the order of the specification, and all rows. The result is field name ->
-        values, shape (rows, width) or (rows,). An unknown split or field, rows out of range, and a damaged shard raise
+        By default, all fields are read, in the order of the specification, and all
+        rows. The result is field name -> values, shape (rows, width) or (rows,). An
+        unknown split or field, rows out of range, and a damaged shard raise
         DatasetError.
         """
         names = self._names(fields)
@@ -56,21 +70,30 @@ class StoredDataset:
         rows = self.spec.splits[split]
         stop = rows if stop is None else stop
         if not 0 <= start <= stop <= rows:
-            raise DatasetError(f"split {split!r} has rows 0 to {rows}, got {start} to {stop}")
-        parts: dict[str, list[NDArray[Any]]] = {name: [self._no_rows(name)] for name in names}
+            raise DatasetError(
+                f"split {split!r} has rows 0 to {rows}, got {start} to {stop}"
+            )
+        parts: dict[str, list[NDArray[Any]]] = {
+            name: [self._no_rows(name)] for name in names
+        }
         for task in tasks:
-            low, high = max(start - task.first_row, 0), min(stop - task.first_row, task.rows)
+            low, high = (
+                max(start - task.first_row, 0),
+                min(stop - task.first_row, task.rows),
+            )
             if low < high:
                 columns = read_rows(self._checked(task), names)
                 for name in names:
                     parts[name].append(columns[name][low:high])
         return {name: np.concatenate(items) for name, items in parts.items()}
 
-    def read_scenes(self, split: str, *, start: int = 0, stop: int | None = None) -> SceneTable:
+    def read_scenes(
+        self, split: str, *, start: int = 0, stop: int | None = None
+    ) -> SceneTable:
         """Read the scenes of rows ``start`` to ``stop`` of a split, and those of other rows in the same shards.
 
-        ``table.rows_of(scene_id)`` returns the index of the scene of each row. A dataset without scenes or rows, and a
-        damaged shard, raise DatasetError.
+        ``table.rows_of(scene_id)`` returns the index of the scene of each row. A
+        dataset without scenes or rows, and a damaged shard, raise DatasetError.
         """
         if not self.spec.scene_obstacles:
             raise DatasetError(f"{self.folder} has no scenes")
@@ -81,7 +104,9 @@ class StoredDataset:
             if task.first_row < end and task.first_row + task.rows > start
         ]
         if not tables:
-            raise DatasetError(f"split {split!r} of {self.folder} has no rows {start} to {end}")
+            raise DatasetError(
+                f"split {split!r} of {self.folder} has no rows {start} to {end}"
+            )
         return distinct_scenes(tables)
 
     def shard(self, task: ShardTask) -> Shard:
@@ -102,14 +127,20 @@ class StoredDataset:
         return shard_entries(self.manifest or {})
 
     def _names(self, fields: Sequence[str] | None) -> list[str]:
-        return [self.spec.field_named(name).name for name in fields] if fields else [f.name for f in self.spec.fields]
+        return (
+            [self.spec.field_named(name).name for name in fields]
+            if fields
+            else [f.name for f in self.spec.fields]
+        )
 
     def _no_rows(self, name: str) -> NDArray[Any]:
         field = self.spec.field_named(name)
         return np.empty(field.shape(0), storage_dtype(field, self.spec.dtype))
 
 
-def open_dataset(folder: str | Path, *, allow_incomplete: bool = False) -> StoredDataset:
+def open_dataset(
+    folder: str | Path, *, allow_incomplete: bool = False
+) -> StoredDataset:
     """Open a dataset for reading; an unfinished one only with ``allow_incomplete``.
 
     Raises:
@@ -126,8 +157,12 @@ def open_dataset(folder: str | Path, *, allow_incomplete: bool = False) -> Store
                 f"{folder / MANIFEST} is of another specification than {SPECIFICATION}: the folder mixes two datasets"
             )
         if not lists_shards_of(manifest, spec):
-            raise DatasetError(f"{folder / MANIFEST} lists other shards than {SPECIFICATION}")
+            raise DatasetError(
+                f"{folder / MANIFEST} lists other shards than {SPECIFICATION}"
+            )
         return StoredDataset(folder, spec, manifest)
     if not allow_incomplete:
-        raise DatasetError(f"{folder} is {unfinished(summarize_dataset(folder, spec, allow_incomplete=True))}")
+        raise DatasetError(
+            f"{folder} is {unfinished(summarize_dataset(folder, spec, allow_incomplete=True))}"
+        )
     return StoredDataset(folder, spec, None)

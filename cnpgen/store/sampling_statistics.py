@@ -38,22 +38,29 @@ class DensityMap:
         Raises:
             DatasetError: The grids differ.
         """
-        if (self.x, self.y, self.candidates.shape) != (other.x, other.y, other.candidates.shape):
+        if (self.x, self.y, self.candidates.shape) != (
+            other.x,
+            other.y,
+            other.candidates.shape,
+        ):
             raise DatasetError("density maps with different grids cannot be merged")
-        return DensityMap(self.x, self.y, self.candidates + other.candidates, self.accepted + other.accepted)
+        return DensityMap(
+            self.x,
+            self.y,
+            self.candidates + other.candidates,
+            self.accepted + other.accepted,
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SamplingStatistics:
     """Numbers of accepted and rejected candidates: ``tried == accepted + sum(rejections)``.
 
-    Attributes:
-        tried: Number of candidates.
-        accepted: Number of candidates that passed every stage.
-        rejections: Reason -> number of rejected candidates, in pipeline order.
-        stages: Reason -> stage of the pipeline that rejects for this reason.
-        densities: Name -> density map.
-        verification: Constraint -> worst violation among the verified rows, in the unit of the constraint.
+    Attributes: tried: Number of candidates. accepted: Number of candidates that passed
+        every stage. rejections: Reason -> number of rejected candidates, in pipeline
+        order. stages: Reason -> stage of the pipeline that rejects for this reason.
+        densities: Name -> density map. verification: Constraint -> worst violation
+        among the verified rows, in the unit of the constraint.
     """
 
     tried: int
@@ -66,24 +73,33 @@ class SamplingStatistics:
     def __post_init__(self) -> None:
         rejected = sum(self.rejections.values())
         if self.tried != self.accepted + rejected:
-            raise DatasetError(f"{self.tried} candidates, but {self.accepted} accepted and {rejected} rejected ones")
+            raise DatasetError(
+                f"{self.tried} candidates, but {self.accepted} accepted and {rejected} rejected ones"
+            )
         for name, worst in self.verification.items():
             if not math.isfinite(worst):
-                raise DatasetError(f"the worst violation of {name!r} must be a finite number, got {worst}")
+                raise DatasetError(
+                    f"the worst violation of {name!r} must be a finite number, got {worst}"
+                )
 
     def merge(self, other: SamplingStatistics) -> SamplingStatistics:
         """Return the statistics of both sets of candidates: the sums of counts and the maxima of violations."""
         reasons = _merged_order(list(self.rejections), list(other.rejections))
         densities = dict(self.densities)
         for name, density in other.densities.items():
-            densities[name] = densities[name].merge(density) if name in densities else density
+            densities[name] = (
+                densities[name].merge(density) if name in densities else density
+            )
         worst = dict(self.verification)
         for name, value in other.verification.items():
             worst[name] = max(worst.get(name, value), value)
         return SamplingStatistics(
             tried=self.tried + other.tried,
             accepted=self.accepted + other.accepted,
-            rejections={name: self.rejections.get(name, 0) + other.rejections.get(name, 0) for name in reasons},
+            rejections={
+                name: self.rejections.get(name, 0) + other.rejections.get(name, 0)
+                for name in reasons
+            },
             stages={**self.stages, **other.stages},
             densities=densities,
             verification=worst,
@@ -91,7 +107,11 @@ class SamplingStatistics:
 
     def yield_json(self) -> dict[str, Any]:
         """Return tried, accepted and rejections as a JSON-able dict."""
-        return {"tried": self.tried, "accepted": self.accepted, "rejections": dict(self.rejections)}
+        return {
+            "tried": self.tried,
+            "accepted": self.accepted,
+            "rejections": dict(self.rejections),
+        }
 
     def to_json(self) -> dict[str, Any]:
         """Return everything as a JSON-able dict."""
@@ -104,11 +124,16 @@ class SamplingStatistics:
 
 
 def _merged_order(first: Sequence[str], second: Sequence[str]) -> list[str]:
-    """Merge two orders of reasons; a reason of the second one only keeps its predecessor."""
+    """Merge two orders of reasons.
+
+    A reason of the second one only keeps its predecessor.
+    """
     merged = list(first)
     for position, reason in enumerate(second):
         if reason not in merged:
-            merged.insert(merged.index(second[position - 1]) + 1 if position else 0, reason)
+            merged.insert(
+                merged.index(second[position - 1]) + 1 if position else 0, reason
+            )
     return merged
 
 
@@ -117,7 +142,14 @@ def densities_to_json(densities: Mapping[str, DensityMap]) -> dict[str, Any]:
     return {name: plain(vars(item)) for name, item in densities.items()}
 
 
-DENSITIES_STRUCTURE = {ANY_KEY: {"x": [NUMBER], "y": [NUMBER], "candidates": [[WHOLE]], "accepted": [[WHOLE]]}}
+DENSITIES_STRUCTURE = {
+    ANY_KEY: {
+        "x": [NUMBER],
+        "y": [NUMBER],
+        "candidates": [[WHOLE]],
+        "accepted": [[WHOLE]],
+    }
+}
 SAMPLING_STRUCTURE = {
     "tried": WHOLE,
     "accepted": WHOLE,
@@ -130,22 +162,38 @@ SAMPLING_STRUCTURE = {
 
 def _density(content: Mapping[str, Any]) -> DensityMap:
     (x_low, x_high), (y_low, y_high) = content["x"], content["y"]
-    candidates, accepted = (np.array(content[key], np.int64) for key in ("candidates", "accepted"))
+    candidates, accepted = (
+        np.array(content[key], np.int64) for key in ("candidates", "accepted")
+    )
     if candidates.ndim != 2 or candidates.shape != accepted.shape:
         shapes = f"{candidates.shape} and {accepted.shape}"
-        raise ValueError(f"a density map must have two grids of the same shape, got {shapes}")
-    return DensityMap((float(x_low), float(x_high)), (float(y_low), float(y_high)), candidates, accepted)
+        raise ValueError(
+            f"a density map must have two grids of the same shape, got {shapes}"
+        )
+    return DensityMap(
+        (float(x_low), float(x_high)),
+        (float(y_low), float(y_high)),
+        candidates,
+        accepted,
+    )
 
 
 def sampling_from_json(content: Mapping[str, Any]) -> SamplingStatistics:
     """Rebuild sampling statistics from a dict with the structure ``SAMPLING_STRUCTURE``."""
     return SamplingStatistics(
-        **{name: content[name] for name in ("tried", "accepted", "rejections", "stages")},
+        **{
+            name: content[name]
+            for name in ("tried", "accepted", "rejections", "stages")
+        },
         densities={name: _density(item) for name, item in content["densities"].items()},
-        verification={name: float(value) for name, value in content["verification"].items()},
+        verification={
+            name: float(value) for name, value in content["verification"].items()
+        },
     )
 
 
 def merge_sampling(parts: Sequence[SamplingStatistics]) -> SamplingStatistics:
     """Merge sampling statistics, in order; without any, all counts are 0."""
-    return reduce(SamplingStatistics.merge, parts, SamplingStatistics(tried=0, accepted=0))
+    return reduce(
+        SamplingStatistics.merge, parts, SamplingStatistics(tried=0, accepted=0)
+    )

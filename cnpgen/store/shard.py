@@ -1,7 +1,7 @@
 """A shard: an HDF5 file with one contiguous dataset per field and attributes that describe it.
 
-The bytes of a shard depend only on its rows, fields and attributes and on the version of HDF5, not on time, host or
-path.
+The bytes of a shard depend only on its rows, fields and attributes and on the version
+of HDF5, not on time, host or path.
 """
 
 import io
@@ -29,7 +29,9 @@ def storage_dtype(field: Field, dtype: str) -> np.dtype[Any]:
     """Return the little-endian type of a field in a dataset of the float type "float64" or "float32"."""
     name = dtype if field.dtype == "float" else field.dtype
     if name not in _STORAGE:
-        raise DatasetError(f"field {field.name!r} cannot be stored as {name!r}, only as one of {', '.join(_STORAGE)}")
+        raise DatasetError(
+            f"field {field.name!r} cannot be stored as {name!r}, only as one of {', '.join(_STORAGE)}"
+        )
     return np.dtype(_STORAGE[name])
 
 
@@ -43,7 +45,11 @@ def field_attributes(field: Field) -> dict[str, Any]:
         "role": field.role,
     }
     limits = {"valid_min": field.valid_min, "valid_max": field.valid_max}
-    return attributes | {name: np.array(limit, "<f8") for name, limit in limits.items() if limit is not None}
+    return attributes | {
+        name: np.array(limit, "<f8")
+        for name, limit in limits.items()
+        if limit is not None
+    }
 
 
 def write_shard(
@@ -59,14 +65,22 @@ def write_shard(
 ) -> int:
     """Write a shard atomically, and read it back before it is renamed; return the size of the file [bytes].
 
-    Columns are finite, in their stored type, of shape (rows, width) or (rows,), one for every field; others raise
-    DatasetError. The attribute "rows" must be their number. The scenes are in their stored types, too.
+    Columns are finite, in their stored type, of shape (rows, width) or (rows,), one for
+    every field; others raise DatasetError. The attribute "rows" must be their number.
+    The scenes are in their stored types, too.
     """
     rows = int(attributes["rows"])
     _check_columns(columns, fields, rows, dtype)
     arrays = {} if scenes is None else dict(scenes.arrays())
     about_scenes = scene_attributes(families)
-    parts = [(f.name, np.asarray(columns[f.name], storage_dtype(f, dtype)), field_attributes(f)) for f in fields]
+    parts = [
+        (
+            f.name,
+            np.asarray(columns[f.name], storage_dtype(f, dtype)),
+            field_attributes(f),
+        )
+        for f in fields
+    ]
     parts += [(name, values, about_scenes[name]) for name, values in arrays.items()]
     content = _encode(parts, attributes)
     with committing(path, work) as temporary:
@@ -75,27 +89,42 @@ def write_shard(
             shapes = {name: item.shape for name, item in file.columns().items()}
         expected = {field.name: field.shape(rows) for field in fields}
         if shapes != expected | {name: values.shape for name, values in arrays.items()}:
-            raise DatasetError(f"{path} was not written correctly: it has the shapes {shapes}")
+            raise DatasetError(
+                f"{path} was not written correctly: it has the shapes {shapes}"
+            )
     return len(content)
 
 
-def _check_columns(columns: Mapping[str, NDArray[Any]], fields: Sequence[Field], rows: int, dtype: str) -> None:
+def _check_columns(
+    columns: Mapping[str, NDArray[Any]], fields: Sequence[Field], rows: int, dtype: str
+) -> None:
     """Raise an error if the columns do not fit the fields."""
     names = {field.name for field in fields}
     if columns.keys() != names or rows < 1:
         missing, extra = sorted(names - columns.keys()), sorted(columns.keys() - names)
-        raise DatasetError(f"a shard needs rows and every field: {rows} rows, missing {missing}, unknown {extra}")
+        raise DatasetError(
+            f"a shard needs rows and every field: {rows} rows, missing {missing}, unknown {extra}"
+        )
     for field in fields:
-        values, shape, stored = columns[field.name], field.shape(rows), storage_dtype(field, dtype)
+        values, shape, stored = (
+            columns[field.name],
+            field.shape(rows),
+            storage_dtype(field, dtype),
+        )
         if values.shape != shape or values.dtype != stored:
             actual = f"{values.dtype} of shape {values.shape}"
-            raise DatasetError(f"field {field.name!r} must be {stored} of shape {shape}, got {actual}")
+            raise DatasetError(
+                f"field {field.name!r} must be {stored} of shape {shape}, got {actual}"
+            )
     if problem := finite_problem({field.name: columns[field.name] for field in fields}):
         raise DatasetError(problem)
 
 
 def finite_problem(columns: Mapping[str, NDArray[Any]]) -> str:
-    """Describe the first column with a value that is not finite; empty if there is none."""
+    """Describe the first column with a value that is not finite.
+
+    Empty if there is none.
+    """
     for name, values in columns.items():
         if values.dtype.kind == "f" and not _is_finite(values):
             bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
@@ -104,13 +133,19 @@ def finite_problem(columns: Mapping[str, NDArray[Any]]) -> str:
 
 
 def _is_finite(values: NDArray[Any]) -> bool:
-    """Return whether all values are finite; their sum, which needs no memory, is infinite only by overflow."""
+    """Return whether all values are finite.
+
+    Their sum, which needs no memory, is infinite only by overflow.
+    """
     with np.errstate(all="ignore"):
-        return bool(np.isfinite(values.sum(dtype=np.float64)) or np.isfinite(values).all())
+        return bool(
+            np.isfinite(values.sum(dtype=np.float64)) or np.isfinite(values).all()
+        )
 
 
 def _encode(
-    parts: Sequence[tuple[str, NDArray[Any], dict[str, Any]]], attributes: Mapping[str, str | int]
+    parts: Sequence[tuple[str, NDArray[Any], dict[str, Any]]],
+    attributes: Mapping[str, str | int],
 ) -> memoryview:
     """Build the file in memory: a full disk then causes a plain system error, and no partial file."""
     import h5py
@@ -118,13 +153,19 @@ def _encode(
     buffer = io.BytesIO()
     with h5py.File(create_hdf5(buffer)) as file:
         for name, values, about in parts:
-            dataset = file.create_dataset(name, data=values, dtype=values.dtype, track_times=False)
+            dataset = file.create_dataset(
+                name, data=values, dtype=values.dtype, track_times=False
+            )
             dataset.attrs.update(about)
-        file.attrs.update({"format": SHARD_FORMAT, "format_version": SHARD_VERSION, **attributes})
+        file.attrs.update(
+            {"format": SHARD_FORMAT, "format_version": SHARD_VERSION, **attributes}
+        )
     return buffer.getbuffer()
 
 
-def read_shard(path: Path, fields: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
+def read_shard(
+    path: Path, fields: Sequence[str] | None = None
+) -> dict[str, NDArray[Any]]:
     """Read whole fields of a shard, by default all: field name -> values, shape (rows, width) or (rows,).
 
     A damaged file and an unknown field raise DatasetError.
@@ -133,22 +174,35 @@ def read_shard(path: Path, fields: Sequence[str] | None = None) -> dict[str, NDA
         known = list(file)
         for name in fields or ():
             if name not in known:
-                raise DatasetError(f"{path} has no field {name!r}{nearest(name, known)}")
-        return {name: file[name].read() for name in (known if fields is None else fields)}
+                raise DatasetError(
+                    f"{path} has no field {name!r}{nearest(name, known)}"
+                )
+        return {
+            name: file[name].read() for name in (known if fields is None else fields)
+        }
 
 
-def read_attributes(path: Path, names: Sequence[str] | None = None) -> dict[str, str | int]:
+def read_attributes(
+    path: Path, names: Sequence[str] | None = None
+) -> dict[str, str | int]:
     """Read attributes of a shard, by default all; a missing one raises DatasetError."""
     with open_hdf5(path) as file:
-        values = {name: file.attributes[name] for name in (file.attributes if names is None else names)}
-        return {name: value if isinstance(value, str) else int(value) for name, value in values.items()}
+        values = {
+            name: file.attributes[name]
+            for name in (file.attributes if names is None else names)
+        }
+        return {
+            name: value if isinstance(value, str) else int(value)
+            for name, value in values.items()
+        }
 
 
 @dataclass(frozen=True, eq=False)
 class StoredField:
     """Shape, stored type and attributes of an HDF5 dataset in a shard; without attributes if they were not read.
 
-    The offset is the position of the first value in the file [bytes]; None for chunks, which cnpgen does not write.
+    The offset is the position of the first value in the file [bytes]; None for chunks,
+    which cnpgen does not write.
     """
 
     shape: tuple[int, ...]
@@ -161,17 +215,27 @@ def read_schema(path: Path) -> dict[str, StoredField]:
     """Read the descriptions of the datasets of a shard, without their values."""
     with open_hdf5(path) as file:
         columns = file.columns().items()
-        return {name: StoredField(item.shape, item.dtype, item.offset, item.attributes.all()) for name, item in columns}
+        return {
+            name: StoredField(
+                item.shape, item.dtype, item.offset, item.attributes.all()
+            )
+            for name, item in columns
+        }
 
 
 def read_placements(path: Path) -> tuple[dict[str, StoredField], dict[str, int]]:
     """Read the locations of the fields of a shard, without their attributes, and the identity of the shard.
 
-    The identity consists of the attributes ``specification_key``, ``first_sample_id`` and ``rows`` of the file.
+    The identity consists of the attributes ``specification_key``, ``first_sample_id``
+    and ``rows`` of the file.
     """
     with open_hdf5(path) as file:
         columns = file.columns().items()
-        placements = {name: StoredField(item.shape, item.dtype, item.offset, {}) for name, item in columns}
+        placements = {
+            name: StoredField(item.shape, item.dtype, item.offset, {})
+            for name, item in columns
+        }
         return placements, {
-            name: int(file.attributes[name]) for name in ("specification_key", "first_sample_id", "rows")
+            name: int(file.attributes[name])
+            for name in ("specification_key", "first_sample_id", "rows")
         }

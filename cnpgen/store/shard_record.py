@@ -10,13 +10,28 @@ from numpy.typing import NDArray
 from cnpgen.errors import CnpgenError, DatasetError
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shard_attributes, shards
 from cnpgen.store.files.atomic import file_sha256
-from cnpgen.store.files.document_structure import ANY_KEY, NUMBER, TEXT, WHOLE, check_structure
+from cnpgen.store.files.document_structure import (
+    ANY_KEY,
+    NUMBER,
+    TEXT,
+    WHOLE,
+    check_structure,
+)
 from cnpgen.store.files.documents import load_document, save_document
 from cnpgen.store.layout import WORK
-from cnpgen.store.sampling_statistics import SAMPLING_STRUCTURE, SamplingStatistics, sampling_from_json
+from cnpgen.store.sampling_statistics import (
+    SAMPLING_STRUCTURE,
+    SamplingStatistics,
+    sampling_from_json,
+)
 from cnpgen.store.scene_table import SCENE_ID, SceneTable, check_scenes
 from cnpgen.store.shard import write_shard
-from cnpgen.store.statistics import STATISTICS_STRUCTURE, FieldStatistics, column_statistics, statistics_from_json
+from cnpgen.store.statistics import (
+    STATISTICS_STRUCTURE,
+    FieldStatistics,
+    column_statistics,
+    statistics_from_json,
+)
 
 SHARD_RECORD_FORMAT = "cnpgen-shard-record"
 SHARD_RECORD_VERSION = 2
@@ -61,7 +76,11 @@ _RECORD_STRUCTURE = {
     "sampling": SAMPLING_STRUCTURE,
     "statistics": {ANY_KEY: STATISTICS_STRUCTURE},
 }
-_PLAIN = tuple(item.name for item in fields(ShardRecord) if item.name not in {"statistics", "sampling"})
+_PLAIN = tuple(
+    item.name
+    for item in fields(ShardRecord)
+    if item.name not in {"statistics", "sampling"}
+)
 
 
 def record_to_json(record: ShardRecord) -> dict[str, Any]:
@@ -69,32 +88,59 @@ def record_to_json(record: ShardRecord) -> dict[str, Any]:
     return {
         **{name: getattr(record, name) for name in _PLAIN},
         "sampling": record.sampling.to_json(),
-        "statistics": {name: item.to_json() for name, item in record.statistics.items()},
+        "statistics": {
+            name: item.to_json() for name, item in record.statistics.items()
+        },
     }
 
 
 def record_from_json(content: Mapping[str, Any]) -> ShardRecord:
-    """Rebuild a record from the result of ``record_to_json``; a missing key or a wrong type raises DatasetError."""
+    """Rebuild a record from the result of ``record_to_json``.
+
+    A missing key or a wrong type raises DatasetError.
+    """
     try:
         check_structure(content, _RECORD_STRUCTURE)
-        statistics = {name: statistics_from_json(item) for name, item in content["statistics"].items()}
+        statistics = {
+            name: statistics_from_json(item)
+            for name, item in content["statistics"].items()
+        }
         sampling = sampling_from_json(content["sampling"])
-        return ShardRecord(**{name: content[name] for name in _PLAIN}, statistics=statistics, sampling=sampling)
+        return ShardRecord(
+            **{name: content[name] for name in _PLAIN},
+            statistics=statistics,
+            sampling=sampling,
+        )
     except ValueError as error:
         raise DatasetError(f"the shard's record is damaged: {error}") from error
 
 
 def save_record(folder: Path, task: ShardTask, record: ShardRecord) -> None:
     """Write a shard's sidecar; from now on the shard counts as made."""
-    document = {"format": SHARD_RECORD_FORMAT, "format_version": SHARD_RECORD_VERSION, **record_to_json(record)}
+    document = {
+        "format": SHARD_RECORD_FORMAT,
+        "format_version": SHARD_RECORD_VERSION,
+        **record_to_json(record),
+    }
     save_document(folder / task.sidecar, document, work=folder / WORK)
 
 
 def load_record(folder: Path, task: ShardTask) -> ShardRecord:
-    """Read the sidecar of a shard; a missing or damaged one, and that of another shard, raise DatasetError."""
+    """Read the sidecar of a shard.
+
+    A missing or damaged one, and that of another shard, raise DatasetError.
+    """
     path = folder / task.sidecar
-    record = record_from_json(load_document(path, SHARD_RECORD_FORMAT, version=SHARD_RECORD_VERSION, structure={}))
-    if (record.file, record.rows, record.first_sample_id) != (task.file, task.rows, task.first_row):
+    record = record_from_json(
+        load_document(
+            path, SHARD_RECORD_FORMAT, version=SHARD_RECORD_VERSION, structure={}
+        )
+    )
+    if (record.file, record.rows, record.first_sample_id) != (
+        task.file,
+        task.rows,
+        task.first_row,
+    ):
         shard = f"{record.file}, {record.rows} rows from row {record.first_sample_id}"
         raise DatasetError(f"{path} is the record of another shard: {shard}")
     return record
@@ -114,18 +160,28 @@ def commit_shard(
 ) -> ShardRecord:
     """Write a shard and then its sidecar; a committed shard is not written again. Return the record of the shard.
 
-    The columns are finite, in their stored type, of shape (rows, width) or (rows,), the scenes, too; others raise
-    DatasetError. Other arguments become attributes of the record.
+    The columns are finite, in their stored type, of shape (rows, width) or (rows,), the
+    scenes, too; others raise DatasetError. Other arguments become attributes of the
+    record.
     """
     if is_committed(folder, spec, task):  # another process made the same shard
         return load_record(folder, task)
     if scenes is not None:
-        check_scenes(scenes, spec.scene_obstacles, columns[SCENE_ID], len(spec.scene_families))
+        check_scenes(
+            scenes, spec.scene_obstacles, columns[SCENE_ID], len(spec.scene_families)
+        )
     path, attributes = folder / task.file, shard_attributes(spec, task)
     families, work = spec.scene_families, folder / WORK
     try:
         size = write_shard(
-            path, columns, spec.fields, attributes, dtype=spec.dtype, scenes=scenes, families=families, work=work
+            path,
+            columns,
+            spec.fields,
+            attributes,
+            dtype=spec.dtype,
+            scenes=scenes,
+            families=families,
+            work=work,
         )
         record = ShardRecord(
             file=task.file,
@@ -140,11 +196,14 @@ def commit_shard(
             seconds=seconds,
             versions=versions or {},
         )
-        if not is_committed(folder, spec, task):  # otherwise another process may already have summarized its record
+        if not is_committed(
+            folder, spec, task
+        ):  # otherwise another process may already have summarized its record
             save_record(folder, task, record)
             return record
     except CnpgenError:
-        # Another process may have committed the shard, finished the dataset and removed all temporary files.
+        # Another process may have committed the shard, finished the dataset and removed
+        # all temporary files.
         if not is_committed(folder, spec, task):
             raise
     return load_record(folder, task)
@@ -153,7 +212,8 @@ def commit_shard(
 def load_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> ShardRecord:
     """Read the sidecar of a shard, without the shard itself.
 
-    Raise DatasetError if it is damaged or of another specification, or if the shard is missing or has another size.
+    Raise DatasetError if it is damaged or of another specification, or if the shard is
+    missing or has another size.
     """
     record = load_record(folder, task)
     if record.specification_fingerprint != spec.version_with(task).fingerprint:
@@ -162,7 +222,11 @@ def load_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> ShardRec
     path = folder / task.file
     size = path.stat().st_size if path.is_file() else None
     if size != record.bytes:
-        problem = "it is missing" if size is None else f"it has {size} bytes instead of {record.bytes}"
+        problem = (
+            "it is missing"
+            if size is None
+            else f"it has {size} bytes instead of {record.bytes}"
+        )
         raise DatasetError(f"{path} is not the recorded file: {problem}")
     return record
 
@@ -171,7 +235,9 @@ def check_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> None:
     """Check a shard as ``load_committed``, and its sha256: a changed shard raises DatasetError."""
     record = load_committed(folder, spec, task)
     if file_sha256(folder / task.file) != record.sha256:
-        raise DatasetError(f"{folder / task.file} was changed: its sha256 is not the recorded one")
+        raise DatasetError(
+            f"{folder / task.file} was changed: its sha256 is not the recorded one"
+        )
 
 
 def is_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> bool:

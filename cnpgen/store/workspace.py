@@ -8,12 +8,26 @@ from pathlib import Path
 from typing import Literal
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
-from cnpgen.store.dataset_spec import INFORMATIONAL, DatasetSpec, load_dataset_spec, to_json, write_dataset_spec
+from cnpgen.store.dataset_spec import (
+    INFORMATIONAL,
+    DatasetSpec,
+    load_dataset_spec,
+    to_json,
+    write_dataset_spec,
+)
 from cnpgen.store.files.atomic import check_writable, machine_errors, read_file
 from cnpgen.store.files.documents import Difference, differences
 from cnpgen.store.files.leftovers import remove_leftovers
 from cnpgen.store.intact import COPY_HINT, OUTSIDE, outside_links
-from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, OLD_SPECIFICATION, SPECIFICATION, STATS, WORK
+from cnpgen.store.layout import (
+    CARD,
+    CROISSANT,
+    MANIFEST,
+    OLD_SPECIFICATION,
+    SPECIFICATION,
+    STATS,
+    WORK,
+)
 
 _SUMMARIES = (MANIFEST, STATS, CROISSANT, CARD)
 _SHARD = re.compile(r"shard-\d{5,}\.(h5|json)")
@@ -22,13 +36,20 @@ _FORMAT_KEY = re.compile(rb'\{\s*"format": "cnpgen-')
 
 @dataclass(frozen=True)
 class Workspace:
-    """The content of a folder for a dataset, possibly unfinished or damaged; other processes may change it later."""
+    """The content of a folder for a dataset, possibly unfinished or damaged.
+
+    Other processes may change it later.
+    """
 
     folder: Path  # the folder
     existing: Path  # the folder, or its nearest existing parent
-    content: Literal["nothing", "a dataset", "a file", "something else"]  # a file is in place of the folder
+    content: Literal[
+        "nothing", "a dataset", "a file", "something else"
+    ]  # a file is in place of the folder
     has_shards: bool = False  # whether there are shards or sidecars
-    spec: DatasetSpec | None = None  # the specification in it; None where there is none that can be read
+    spec: DatasetSpec | None = (
+        None  # the specification in it; None where there is none that can be read
+    )
     damage: str = ""  # reason why the specification cannot be read; empty if it can
 
 
@@ -45,7 +66,9 @@ def find_workspace(folder: Path) -> Workspace:
         return Workspace(folder, existing, "something else")
     has_shards = any(_shard_files(folder))
     try:
-        return Workspace(folder, existing, "a dataset", has_shards, load_dataset_spec(folder))
+        return Workspace(
+            folder, existing, "a dataset", has_shards, load_dataset_spec(folder)
+        )
     except DatasetError as error:
         return Workspace(folder, existing, "a dataset", has_shards, damage=str(error))
 
@@ -58,9 +81,13 @@ def check_place(workspace: Workspace) -> None:
     if workspace.content == "a file":
         raise _other_folder(f"{workspace.existing} is a file, not a folder")
     if workspace.content == "something else":
-        raise _other_folder(f"{workspace.folder} is not empty and not a dataset of cnpgen")
+        raise _other_folder(
+            f"{workspace.folder} is not empty and not a dataset of cnpgen"
+        )
     splits = () if workspace.spec is None else tuple(workspace.spec.splits)
-    if workspace.content == "a dataset" and (outside := outside_links(workspace.folder, (WORK, *splits))):
+    if workspace.content == "a dataset" and (
+        outside := outside_links(workspace.folder, (WORK, *splits))
+    ):
         raise UsageError(f"{workspace.folder / outside[0]} {OUTSIDE}; {COPY_HINT}")
     if (workspace.folder / MANIFEST).is_file():
         return
@@ -70,8 +97,9 @@ def check_place(workspace: Workspace) -> None:
 def started_spec(workspace: Workspace, wanted: DatasetSpec) -> DatasetSpec | None:
     """Return the specification in a folder if it equals the wanted one, or None if the folder has no shards.
 
-    The returned specification may have been written by another version of cnpgen. Shards of another specification raise
-    UsageError, those of a damaged one DatasetError.
+    The returned specification may have been written by another version of cnpgen.
+    Shards of another specification raise UsageError, those of a damaged one
+    DatasetError.
     """
     existing = workspace.spec
     if existing is not None and existing.fingerprint == wanted.fingerprint:
@@ -79,17 +107,23 @@ def started_spec(workspace: Workspace, wanted: DatasetSpec) -> DatasetSpec | Non
     if not workspace.has_shards:
         return None
     if existing is None:
-        raise DatasetError(f"{workspace.damage}; {{force}} replaces the whole dataset", remedies={"force": True})
+        raise DatasetError(
+            f"{workspace.damage}; {{force}} replaces the whole dataset",
+            remedies={"force": True},
+        )
     text = f"{workspace.folder} {_describe_conflict(existing, wanted)}"
     raise UsageError(text, remedies={"out": None, "force": True})
 
 
-def open_workspace(folder: Path, spec: DatasetSpec, *, force: bool = False) -> DatasetSpec:
+def open_workspace(
+    folder: Path, spec: DatasetSpec, *, force: bool = False
+) -> DatasetSpec:
     """Create the folder with its specification, or check that it already contains the same specification.
 
-    The folder is inspected again, because another process may have started the dataset while kernels were compiled. A
-    specification without shards is replaced; ``force`` deletes an existing dataset. Errors are those of ``check_place``
-    and ``started_spec``.
+    The folder is inspected again, because another process may have started the dataset
+    while kernels were compiled. A specification without shards is replaced; ``force``
+    deletes an existing dataset. Errors are those of ``check_place`` and
+    ``started_spec``.
     """
     workspace = find_workspace(folder)
     check_place(workspace)
@@ -114,7 +148,9 @@ def require_dataset_spec(folder: Path, spec: DatasetSpec) -> None:
         text = f"{folder}: {missing} was deleted or moved while the dataset was made; make it again"
         raise MachineError(text) from error
     if not is_unchanged:
-        raise _other_folder(f"{folder} was replaced by another dataset while this one was made")
+        raise _other_folder(
+            f"{folder} was replaced by another dataset while this one was made"
+        )
 
 
 def _other_folder(text: str) -> UsageError:
@@ -124,7 +160,9 @@ def _other_folder(text: str) -> UsageError:
 def is_dataset(folder: Path) -> bool:
     """Return whether a folder contains a dataset of cnpgen, possibly unfinished or damaged."""
     sidecars = (path for path in _shard_files(folder) if path.suffix == ".json")
-    documents = (folder / name for name in (SPECIFICATION, OLD_SPECIFICATION, MANIFEST, STATS))
+    documents = (
+        folder / name for name in (SPECIFICATION, OLD_SPECIFICATION, MANIFEST, STATS)
+    )
     return any(_is_cnpgen_document(path) for path in (*documents, *sidecars))
 
 
@@ -147,7 +185,9 @@ def _describe_conflict(existing: DatasetSpec, wanted: DatasetSpec) -> str:
     """Explain why a dataset cannot become another one, with a hint."""
     if changed := changed_settings(existing, wanted):
         return f"holds another dataset ({changed}); choose another {{out}}, or replace it with {{force}}"
-    larger = all(rows <= wanted.splits.get(split, 0) for split, rows in existing.splits.items())
+    larger = all(
+        rows <= wanted.splits.get(split, 0) for split, rows in existing.splits.items()
+    )
     extend = "extend_dataset or 'cnpgen extend' adds the rows, or " if larger else ""
     return (
         f"holds this dataset with {_sizes(existing)}, not with {_sizes(wanted)}; the common rows are the"
@@ -156,10 +196,20 @@ def _describe_conflict(existing: DatasetSpec, wanted: DatasetSpec) -> str:
 
 
 def changed_settings(existing: DatasetSpec, wanted: DatasetSpec) -> str:
-    """Describe up to three differences of two specifications, except for their sizes; empty if they are equal."""
+    """Describe up to three differences of two specifications, except for their sizes.
+
+    Empty if they are equal.
+    """
     same = (*INFORMATIONAL, "splits", "previous_splits")
-    old, new = ({key: value for key, value in to_json(item).items() if key not in same} for item in (existing, wanted))
-    return "; ".join([*dict.fromkeys(_setting(difference) for difference in differences(old, new))][:3])
+    old, new = (
+        {key: value for key, value in to_json(item).items() if key not in same}
+        for item in (existing, wanted)
+    )
+    return "; ".join(
+        [*dict.fromkeys(_setting(difference) for difference in differences(old, new))][
+            :3
+        ]
+    )
 
 
 def _setting(difference: Difference) -> str:
@@ -183,7 +233,9 @@ def _cleared(workspace: Workspace) -> Workspace:
         return workspace
     folder, splits = workspace.folder, check_clearable(workspace)
     with machine_errors("delete from", folder):
-        (folder / MANIFEST).unlink(missing_ok=True)  # first: a partially deleted dataset must not appear complete
+        (folder / MANIFEST).unlink(
+            missing_ok=True
+        )  # first: a partially deleted dataset must not appear complete
         for split in splits:
             for path in split.iterdir():
                 path.unlink()
@@ -198,7 +250,8 @@ def _cleared(workspace: Workspace) -> Workspace:
 def check_clearable(workspace: Workspace) -> list[Path]:
     """Return the folders of the splits of a dataset; other files in its folder raise UsageError.
 
-    These are the splits of the specification, or all folders with shards if the specification cannot be read.
+    These are the splits of the specification, or all folders with shards if the
+    specification cannot be read.
     """
     folder, spec = workspace.folder, workspace.spec
     named = sorted({path.parent for path in _shard_files(folder)})
@@ -213,9 +266,17 @@ def check_clearable(workspace: Workspace) -> list[Path]:
 
 def _foreign(folder: Path, splits: list[Path]) -> Path | None:
     """Return the first file that is not part of the dataset, or None."""
-    known = {*_SUMMARIES, OLD_SPECIFICATION, SPECIFICATION, WORK, *(split.name for split in splits)}
+    known = {
+        *_SUMMARIES,
+        OLD_SPECIFICATION,
+        SPECIFICATION,
+        WORK,
+        *(split.name for split in splits),
+    }
     candidates = [path for path in folder.iterdir() if path.name not in known]
     for split in splits:
-        candidates += [path for path in split.iterdir() if not _SHARD.fullmatch(path.name)]
+        candidates += [
+            path for path in split.iterdir() if not _SHARD.fullmatch(path.name)
+        ]
         candidates += [split] if split.is_symlink() else []
     return min(candidates, default=None)

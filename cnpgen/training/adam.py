@@ -1,7 +1,8 @@
 """Adam (Kingma and Ba, 2015) on one flat vector, in place, with an average of the parameters and clipped gradients.
 
-A few percent of the samples violate a constraint by far. Without clipping one of them weighs as much as hundreds of
-others, and Adam's average of squared gradients contains it for a thousand steps.
+A few percent of the samples violate a constraint by far. Without clipping one of them
+weighs as much as hundreds of others, and Adam's average of squared gradients contains
+it for a thousand steps.
 """
 
 import math
@@ -14,17 +15,22 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8
-PARAMETERS_PER_BLOCK = 1 << 17  # small enough for the five arrays of a block to stay in the CPU cache
+PARAMETERS_PER_BLOCK = (
+    1 << 17
+)  # small enough for the five arrays of a block to stay in the CPU cache
 SAMPLE_MEMORY, BATCH_MEMORY = 0.98, 0.99
-MAX_NORM_RATIO = 3.0  # of a batch's norm to the running norm, in the update of the latter
+MAX_NORM_RATIO = (
+    3.0  # of a batch's norm to the running norm, in the update of the latter
+)
 
 
 @dataclass
 class Adam:
     """State of the optimizer after a number of steps; all arrays have shape (n_parameters,).
 
-    ``average`` is the exponential average of the parameters, which is validated and kept. ``first`` and ``second`` are
-    the averages of the gradient and of the squared gradient.
+    ``average`` is the exponential average of the parameters, which is validated and
+    kept. ``first`` and ``second`` are the averages of the gradient and of the squared
+    gradient.
     """
 
     parameters: Array
@@ -34,7 +40,10 @@ class Adam:
     step: int = 0
 
     def update(self, gradient: Array, *, rate: float, memory: float = 0.999) -> None:
-        """Take one step at a learning rate; the decay ``memory`` of the average is smaller during the first steps."""
+        """Take one step at a learning rate.
+
+        The decay ``memory`` of the average is smaller during the first steps.
+        """
         self.step += 1
         new = 1 - min(memory, (1 + self.step) / (10 + self.step))
         scratch = np.empty(min(PARAMETERS_PER_BLOCK, len(gradient)), gradient.dtype)
@@ -42,12 +51,30 @@ class Adam:
         factor = rate * bias / (1 - BETA_1**self.step)
         for start in range(0, len(gradient), PARAMETERS_PER_BLOCK):
             part = slice(start, start + PARAMETERS_PER_BLOCK)
-            self._update_block(part, gradient[part], scratch, factor=factor, epsilon=EPSILON * bias, new=new)
+            self._update_block(
+                part,
+                gradient[part],
+                scratch,
+                factor=factor,
+                epsilon=EPSILON * bias,
+                new=new,
+            )
 
     def _update_block(
-        self, part: slice, gradient: Array, scratch: Array, *, factor: float, epsilon: float, new: float
+        self,
+        part: slice,
+        gradient: Array,
+        scratch: Array,
+        *,
+        factor: float,
+        epsilon: float,
+        new: float,
     ) -> None:
-        first, second, parameters = self.first[part], self.second[part], self.parameters[part]
+        first, second, parameters = (
+            self.first[part],
+            self.second[part],
+            self.parameters[part],
+        )
         average, work = self.average[part], scratch[: len(gradient)]
         first *= BETA_1
         first += np.multiply(gradient, 1 - BETA_1, out=work)
@@ -67,18 +94,30 @@ class Adam:
 
 def start_adam(parameters: Array) -> Adam:
     """Return the initial state for parameters of shape (n_parameters,)."""
-    return Adam(parameters, parameters.copy(), np.zeros_like(parameters), np.zeros_like(parameters))
+    return Adam(
+        parameters,
+        parameters.copy(),
+        np.zeros_like(parameters),
+        np.zeros_like(parameters),
+    )
 
 
-def learning_rate(step: int, steps: int, *, peak: float, final: float, warm_up: int) -> float:
+def learning_rate(
+    step: int, steps: int, *, peak: float, final: float, warm_up: int
+) -> float:
     """Return the learning rate: a cosine from ``peak`` to ``final * peak``, after a linear warm-up of some steps."""
     falling = 0.5 * (1 + math.cos(math.pi * min(step / steps, 1.0)))
-    return peak * (final + (1 - final) * falling) * min(1.0, (step + 1) / max(warm_up, 1))
+    return (
+        peak * (final + (1 - final) * falling) * min(1.0, (step + 1) / max(warm_up, 1))
+    )
 
 
 @dataclass
 class Clipping:
-    """Running median of the samples' gradient norms, running norm of the batch's; 0 before the first batch."""
+    """Running median of the samples' gradient norms, running norm of the batch's.
+
+    0 before the first batch.
+    """
 
     sample: float = 0.0
     batch: float = 0.0
@@ -86,18 +125,31 @@ class Clipping:
     def sample_factors(self, norms: Array, *, limit: float) -> Array:
         """Return the factors of the samples' gradients, shape (N,), in (0, 1], from their finite norms.
 
-        The largest norm is in running medians; inf for no clipping. Factors are 1 while half of the gradients of every
-        batch are zero.
+        The largest norm is in running medians; inf for no clipping. Factors are 1 while
+        half of the gradients of every batch are zero.
         """
         median = float(np.median(norms))
-        self.sample = SAMPLE_MEMORY * self.sample + (1 - SAMPLE_MEMORY) * median if self.sample else median
+        self.sample = (
+            SAMPLE_MEMORY * self.sample + (1 - SAMPLE_MEMORY) * median
+            if self.sample
+            else median
+        )
         if not self.sample or np.isinf(limit):
             return np.ones_like(norms)
-        return np.minimum(1.0, limit * self.sample / np.maximum(norms, 1e-30)).astype(norms.dtype)
+        return np.minimum(1.0, limit * self.sample / np.maximum(norms, 1e-30)).astype(
+            norms.dtype
+        )
 
     def batch_factor(self, norm: float, *, limit: float) -> float:
-        """Return the factor of the batch's gradient; the largest norm is in running norms, inf for no clipping."""
-        self.batch = BATCH_MEMORY * self.batch + (1 - BATCH_MEMORY) * min(norm, MAX_NORM_RATIO * self.batch) or norm
+        """Return the factor of the batch's gradient.
+
+        The largest norm is in running norms, inf for no clipping.
+        """
+        self.batch = (
+            BATCH_MEMORY * self.batch
+            + (1 - BATCH_MEMORY) * min(norm, MAX_NORM_RATIO * self.batch)
+            or norm
+        )
         if not self.batch or np.isinf(limit):
             return 1.0
         return min(1.0, limit * self.batch / max(norm, 1e-30))

@@ -12,8 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.store.files.checksum_file import Content, read_with_checksum, write_with_checksum
-from cnpgen.store.files.document_structure import ANY_KEY, ANYTHING, NUMBER, WHOLE, check_structure
+from cnpgen.store.files.checksum_file import (
+    Content,
+    read_with_checksum,
+    write_with_checksum,
+)
+from cnpgen.store.files.document_structure import (
+    ANY_KEY,
+    ANYTHING,
+    NUMBER,
+    WHOLE,
+    check_structure,
+)
 from cnpgen.store.files.documents import differences, parse_json
 from cnpgen.training.adam import Adam, Clipping, start_adam
 
@@ -29,8 +39,9 @@ _STATE_NUMBERS = ("steps", "imitating", "metric", "seconds", "checking")
 class Sums:
     """Sums since the last line of the log.
 
-    ``terms`` sums the terms' means over steps, shape (1 + m,). ``lost`` plans had no finite loss. ``distance`` sums the
-    mean distance from demonstrations over imitating steps, which are not included in ``steps``.
+    ``terms`` sums the terms' means over steps, shape (1 + m,). ``lost`` plans had no
+    finite loss. ``distance`` sums the mean distance from demonstrations over imitating
+    steps, which are not included in ``steps``.
     """
 
     terms: Array
@@ -45,7 +56,10 @@ class Sums:
         self.imitating += 1
 
     def add(self, terms: Array) -> None:
-        """Add the terms of a batch, shape (N, 1 + m); plans without a finite loss are counted and omitted."""
+        """Add the terms of a batch, shape (N, 1 + m).
+
+        Plans without a finite loss are counted and omitted.
+        """
         finite: NDArray[np.bool_] = np.asarray(np.isfinite(terms).all(axis=1))
         if finite.any():
             self.terms += terms[finite].mean(axis=0, dtype=np.float64)
@@ -66,8 +80,8 @@ class Best:
 class State:
     """State of a run of ``steps`` steps, of which the first ones imitate.
 
-    The state of the metric is JSON-able. ``seconds`` is the CPU time of all steps, ``checking`` that of validation [s].
-    ``log`` has the lines of the log so far.
+    The state of the metric is JSON-able. ``seconds`` is the CPU time of all steps,
+    ``checking`` that of validation [s]. ``log`` has the lines of the log so far.
     """
 
     adam: Adam
@@ -86,10 +100,22 @@ class State:
         return max(step - self.imitating, 0) / (self.steps - self.imitating)
 
 
-def start_state(parameters: Array, *, terms: int, steps: int, imitation: float = 0.0) -> State:
-    """Return the initial state of a run, a fraction of which imitates; ``terms`` is the number of loss terms."""
+def start_state(
+    parameters: Array, *, terms: int, steps: int, imitation: float = 0.0
+) -> State:
+    """Return the initial state of a run, a fraction of which imitates.
+
+    ``terms`` is the number of loss terms.
+    """
     best = Best(-math.inf, 0, parameters.copy())
-    return State(start_adam(parameters), Clipping(), Sums(np.zeros(terms)), best, steps, int(imitation * steps))
+    return State(
+        start_adam(parameters),
+        Clipping(),
+        Sums(np.zeros(terms)),
+        best,
+        steps,
+        int(imitation * steps),
+    )
 
 
 def to_content(state: State) -> Content:
@@ -100,11 +126,15 @@ def to_content(state: State) -> Content:
         "step": adam.step,
         **{name: getattr(state, name) for name in _STATE_NUMBERS},
         "clipping": asdict(state.clipping),
-        "sums": {name: value for name, value in vars(state.sums).items() if name != "terms"},
+        "sums": {
+            name: value for name, value in vars(state.sums).items() if name != "terms"
+        },
         "best": {"score": best.score, "step": best.step},
     }
     texts = {"numbers": json.dumps(numbers, indent=1), "log": "\n".join(state.log)}
-    return Content({**arrays, "best": best.parameters, "terms": state.sums.terms}, texts)
+    return Content(
+        {**arrays, "best": best.parameters, "terms": state.sums.terms}, texts
+    )
 
 
 _FORM = {
@@ -120,16 +150,22 @@ _FORM = {
 def from_content(content: Content) -> State:
     """Make a state from arrays and texts.
 
-    Raises:
-        KeyError, TypeError, ValueError: A key is missing, unknown to this version, or has an invalid value.
+    Raises: KeyError, TypeError, ValueError: A key is missing, unknown to this version,
+        or has an invalid value.
     """
     numbers, arrays = parse_json(content.texts["numbers"]), content.arrays
     check_structure(numbers, _FORM)
-    best, shapes = numbers["best"], {arrays[name].shape for name in (*_ADAM_ARRAYS, "best")}
+    best, shapes = (
+        numbers["best"],
+        {arrays[name].shape for name in (*_ADAM_ARRAYS, "best")},
+    )
     if len(shapes) > 1 or len(shapes.pop()) != 1 or arrays["terms"].ndim != 1:
         raise ValueError("its arrays do not belong to one network")
     return State(
-        Adam(**{name: np.array(arrays[name]) for name in _ADAM_ARRAYS}, step=numbers["step"]),
+        Adam(
+            **{name: np.array(arrays[name]) for name in _ADAM_ARRAYS},
+            step=numbers["step"],
+        ),
         Clipping(**numbers["clipping"]),
         Sums(np.array(arrays["terms"]), **numbers["sums"]),
         Best(best["score"], best["step"], np.array(arrays["best"])),
@@ -165,11 +201,18 @@ class Checkpoints:
             raise
 
     def _load(self) -> State:
-        content = read_with_checksum(self.path, kind=CHECKPOINT_KIND, version=CHECKPOINT_VERSION)
+        content = read_with_checksum(
+            self.path, kind=CHECKPOINT_KIND, version=CHECKPOINT_VERSION
+        )
         try:
-            identity, state = parse_json(content.texts["identity"]), from_content(content)
+            identity, state = (
+                parse_json(content.texts["identity"]),
+                from_content(content),
+            )
         except (KeyError, TypeError, ValueError) as error:
-            raise DatasetError(f"{self.path} does not fit this version of cnpgen: {error!r}") from error
+            raise DatasetError(
+                f"{self.path} does not fit this version of cnpgen: {error!r}"
+            ) from error
         changed = list(map(str, differences(identity, self.identity)))
         if changed:
             raise UsageError(
@@ -187,10 +230,16 @@ class Checkpoints:
     def save(self, state: State) -> None:
         """Save the state."""
         started, content = time.monotonic(), to_content(state)
-        content = replace(content, texts={**content.texts, "identity": json.dumps(self.identity)})
-        write_with_checksum(self.path, content, kind=CHECKPOINT_KIND, version=CHECKPOINT_VERSION)
+        content = replace(
+            content, texts={**content.texts, "identity": json.dumps(self.identity)}
+        )
+        write_with_checksum(
+            self.path, content, kind=CHECKPOINT_KIND, version=CHECKPOINT_VERSION
+        )
         interval = INTERVAL_PER_WRITING_TIME * (time.monotonic() - started)
-        self._next = time.monotonic() + min(max(MIN_INTERVAL_S, interval), MAX_INTERVAL_S)
+        self._next = time.monotonic() + min(
+            max(MIN_INTERVAL_S, interval), MAX_INTERVAL_S
+        )
 
     def remove(self) -> None:
         """Remove the file."""

@@ -30,7 +30,10 @@ from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
 
-DEMONSTRATION = ("path_control_points", "rate_control_points")  # columns of a certified dataset
+DEMONSTRATION = (
+    "path_control_points",
+    "rate_control_points",
+)  # columns of a certified dataset
 VALIDATION_SHARE = 0.05  # of the problems of scenes, the last ones
 MAX_VALIDATION_ROWS = 200  # verdicts among obstacles take a quarter of a second
 MIN_SCENE_ROWS = 40
@@ -40,7 +43,8 @@ MIN_SCENE_ROWS = 40
 class TrainingData(ABC):
     """Rows to train on and to validate with.
 
-    ``place`` is the folder or file, for messages. ``stages`` are those of the pipeline that made the rows, if any.
+    ``place`` is the folder or file, for messages. ``stages`` are those of the pipeline
+    that made the rows, if any.
     """
 
     problem: StoredProblem
@@ -87,11 +91,17 @@ class DatasetRows(TrainingData):
 
     def training(self) -> TrainingProblems:
         """Read all training rows."""
-        return _problems(self.dataset.arrays(self.train, fields=self._names, dtype="float64"))
+        return _problems(
+            self.dataset.arrays(self.train, fields=self._names, dtype="float64")
+        )
 
     def _validation(self, first: int, stop: int) -> TrainingProblems:
         rows = list(range(first, stop))
-        return _problems(self.dataset.rows(self.validation, rows, fields=self._names, dtype="float64"))
+        return _problems(
+            self.dataset.rows(
+                self.validation, rows, fields=self._names, dtype="float64"
+            )
+        )
 
     @property
     def _names(self) -> list[str]:
@@ -99,7 +109,10 @@ class DatasetRows(TrainingData):
         return [*names, OBSTACLE_POSES] if self.dataset.spec.scene_obstacles else names
 
     def demonstrations(self, joints: int) -> ControlPoints | None:
-        """Read the plans of the training rows of a certified dataset; None for another one."""
+        """Read the plans of the training rows of a certified dataset.
+
+        None for another one.
+        """
         if not set(DEMONSTRATION) <= set(self.dataset.fields):
             return None
         columns = self.dataset.arrays(self.train, fields=DEMONSTRATION, dtype="float32")
@@ -120,9 +133,16 @@ class DatasetRows(TrainingData):
 
 
 def _problems(columns: dict[str, Array]) -> TrainingProblems:
-    """Return the problems in columns of a dataset; missing conditions are zero, goal accelerations free."""
+    """Return the problems in columns of a dataset.
+
+    Missing conditions are zero, goal accelerations free.
+    """
     zero = np.zeros_like(columns["start_q"])
-    named = {name: columns.get(name, zero) for name in CONDITIONS if name in columns or name in BOUNDARY}
+    named = {
+        name: columns.get(name, zero)
+        for name in CONDITIONS
+        if name in columns or name in BOUNDARY
+    }
     return TrainingProblems(Boundary(**named), columns.get(OBSTACLE_POSES))
 
 
@@ -130,8 +150,9 @@ def _problems(columns: dict[str, Array]) -> TrainingProblems:
 class SceneRows(TrainingData):
     """Problems of scenes to train on; exact symmetries multiply the training rows.
 
-    The training rows are the problems and their reverses, from the goal to the start. The last problems are the
-    validation rows. Boundary conditions have shape (N, n) each, poses and sizes of the obstacles (N, width).
+    The training rows are the problems and their reverses, from the goal to the start.
+    The last problems are the validation rows. Boundary conditions have shape (N, n)
+    each, poses and sizes of the obstacles (N, width).
     """
 
     boundary: Boundary
@@ -143,7 +164,10 @@ class SceneRows(TrainingData):
         start, goal = self.boundary.start_q[training], self.boundary.goal_q[training]
         zero = np.zeros((2 * len(start), start.shape[1]))
         there, back = np.concatenate([start, goal]), np.concatenate([goal, start])
-        return TrainingProblems(Boundary(there, zero, zero, back, zero), np.tile(self.obstacle_poses[training], (2, 1)))
+        return TrainingProblems(
+            Boundary(there, zero, zero, back, zero),
+            np.tile(self.obstacle_poses[training], (2, 1)),
+        )
 
     def _validation(self, first: int, stop: int) -> TrainingProblems:
         offset = len(self.boundary) - self.n_validation
@@ -153,15 +177,26 @@ class SceneRows(TrainingData):
     def describe(self) -> dict[str, Any]:
         """Return the identity of the problems."""
         digest = hashlib.sha256()
-        for values in (self.boundary.start_q, self.boundary.goal_q, self.obstacle_poses):
+        for values in (
+            self.boundary.start_q,
+            self.boundary.goal_q,
+            self.obstacle_poses,
+        ):
             digest.update(np.ascontiguousarray(values).tobytes())
-        return {"name": self.place, "fingerprint": digest.hexdigest(), "rows": {"scenes": len(self.boundary)}}
+        return {
+            "name": self.place,
+            "fingerprint": digest.hexdigest(),
+            "rows": {"scenes": len(self.boundary)},
+        }
 
 
-def make_scene_rows(problem: Problem, scenes: Sequence[SceneProblem], place: str) -> SceneRows:
+def make_scene_rows(
+    problem: Problem, scenes: Sequence[SceneProblem], place: str
+) -> SceneRows:
     """Make training rows of scenes; the last ones validate models, so they should be of other scenes.
 
-    Raise SceneError if a scene does not fit the robot, and UsageError if there are too few, or no ``robot-clearance``.
+    Raise SceneError if a scene does not fit the robot, and UsageError if there are too
+    few, or no ``robot-clearance``.
     """
     if len(scenes) < MIN_SCENE_ROWS:
         raise UsageError(
@@ -170,27 +205,40 @@ def make_scene_rows(problem: Problem, scenes: Sequence[SceneProblem], place: str
         )
     plans = scene_plans(problem, scenes)
     n_validation = min(round(VALIDATION_SHARE * len(plans)), MAX_VALIDATION_ROWS)
-    return SceneRows(plans.problem, place, [], n_validation, plans.boundary, plans.columns[OBSTACLE_POSES])
+    return SceneRows(
+        plans.problem,
+        place,
+        [],
+        n_validation,
+        plans.boundary,
+        plans.columns[OBSTACLE_POSES],
+    )
 
 
-def open_training_data(folder: str | Path, robot: str | Path | None = None) -> TrainingData:
+def open_training_data(
+    folder: str | Path, robot: str | Path | None = None
+) -> TrainingData:
     """Open a dataset for training or, with the problem of a robot, a scene file or a folder of scene files.
 
-    Raises:
-        DatasetError: It is missing, unfinished or damaged, or has no rows for training or validation.
-        UsageError: There is no such robot or file.
-        SceneError: A scene does not fit the robot.
+    Raises: DatasetError: It is missing, unfinished or damaged, or has no rows for
+        training or validation. UsageError: There is no such robot or file. SceneError:
+        A scene does not fit the robot.
     """
     if robot is not None:
         with concerning("robot"):
             problem = as_problem(robot)
         return make_scene_rows(problem, read_scenes(Path(folder)), str(folder))
     if Path(folder).exists() and holds_scenes(Path(folder)):
-        raise UsageError(f"{folder} holds scenes: {{robot}} trains on them", remedies={"robot": "panda"})
+        raise UsageError(
+            f"{folder} holds scenes: {{robot}} trains on them",
+            remedies={"robot": "panda"},
+        )
     dataset = load_dataset(folder)
     names = [name for name, rows in dataset.splits.items() if rows]
     if len(names) < 2:
-        raise DatasetError(f"{folder} needs a split to train on and another one to validate with, it has {names}")
+        raise DatasetError(
+            f"{folder} needs a split to train on and another one to validate with, it has {names}"
+        )
     train = "train" if "train" in names else names[0]
     others = [name for name in names if name != train]
     validation = "validation" if "validation" in others else others[0]
@@ -200,5 +248,11 @@ def open_training_data(folder: str | Path, robot: str | Path | None = None) -> T
             f"{folder} has 1 row in {validation!r}: models are compared on some rows and scored on others"
         )
     return DatasetRows(
-        dataset.problem, str(dataset.folder), dataset.spec.stages, n_validation, dataset, train, validation
+        dataset.problem,
+        str(dataset.folder),
+        dataset.spec.stages,
+        n_validation,
+        dataset,
+        train,
+        validation,
     )

@@ -54,8 +54,8 @@ def is_log(path: Path) -> bool:
 def plot_curve(log: str, path: str | Path) -> None:
     """Draw a training log, one JSON object per line, as ``.png``, ``.pdf`` or ``.svg``; an existing file is replaced.
 
-    Raise UsageError if the log contains no step, and MachineError if matplotlib is missing or the file cannot be
-    written.
+    Raise UsageError if the log contains no step, and MachineError if matplotlib is
+    missing or the file cannot be written.
     """
     records = [json.loads(line) for line in log.splitlines()]
     steps = [record for record in records if "loss" in record]
@@ -81,7 +81,9 @@ def plot_curve(log: str, path: str | Path) -> None:
 def _draw_loss(axis: "Axes", steps: list[dict[str, Any]]) -> None:
     seconds = _column(steps, "seconds")
     axis.plot(seconds, _column(steps, "loss"), label="weighted sum")
-    axis.plot(seconds, [record["terms"]["time"] for record in steps], label="task loss alone")
+    axis.plot(
+        seconds, [record["terms"]["time"] for record in steps], label="task loss alone"
+    )
     axis.set_ylabel("loss [s]")
     axis.set_yscale("log")
     _name_lines(axis)
@@ -91,9 +93,15 @@ def _draw_terms(axis: "Axes", steps: list[dict[str, Any]]) -> None:
     """Draw every constraint term, and its budget in the problem file as a dashed line."""
     seconds, budgets = _column(steps, "seconds"), steps[0].get("budgets", {})
     for name in steps[0]["weights"]:
-        (line,) = axis.plot(seconds, [max(record["terms"][name], MIN_DRAWN_TERM) for record in steps], label=name)
+        (line,) = axis.plot(
+            seconds,
+            [max(record["terms"][name], MIN_DRAWN_TERM) for record in steps],
+            label=name,
+        )
         if budgets.get(name):
-            axis.axhline(budgets[name], color=line.get_color(), linestyle="--", linewidth=0.8)
+            axis.axhline(
+                budgets[name], color=line.get_color(), linestyle="--", linewidth=0.8
+            )
     axis.set_ylabel("terms (dashed: budgets)")
     axis.set_yscale("log")
     _name_lines(axis)
@@ -101,9 +109,17 @@ def _draw_terms(axis: "Axes", steps: list[dict[str, Any]]) -> None:
 
 def _draw_validity(axis: "Axes", checks: list[dict[str, Any]]) -> None:
     seconds = _column(checks, "seconds")
-    for name, label in (("valid", "strict verdict"), ("paper_valid", "the paper's rules")):
+    for name, label in (
+        ("valid", "strict verdict"),
+        ("paper_valid", "the paper's rules"),
+    ):
         if all(name in record["validation"] for record in checks):
-            axis.plot(seconds, [100 * record["validation"][name] for record in checks], marker=".", label=label)
+            axis.plot(
+                seconds,
+                [100 * record["validation"][name] for record in checks],
+                marker=".",
+                label=label,
+            )
     axis.set_ylabel("valid plans [%]")
     axis.set_ylim(0, 101)
     _name_lines(axis)
@@ -111,7 +127,13 @@ def _draw_validity(axis: "Axes", checks: list[dict[str, Any]]) -> None:
 
 def _name_lines(axis: "Axes") -> None:
     """Draw a legend above the axes, so that it covers no curve."""
-    axis.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)
+    axis.legend(
+        fontsize=8,
+        loc="lower center",
+        bbox_to_anchor=(0.5, 1.0),
+        ncols=4,
+        frameon=False,
+    )
 
 
 def _column(records: list[dict[str, Any]], name: str) -> list[float]:

@@ -1,4 +1,7 @@
-"""Set up a run: rows, kernels, loss, network and validation; determine its number of steps."""
+"""Set up a run: rows, kernels, loss, network and validation.
+
+Determine its number of steps.
+"""
 
 import math
 import time
@@ -13,10 +16,20 @@ from cnpgen.losses.metric import Metric, suggested_weights
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.machine.versions import __version__
 from cnpgen.planner.control_points import make_projection
-from cnpgen.planner.inference_pipeline import InferencePipeline, LoadedProblem, make_inference_pipeline
+from cnpgen.planner.inference_pipeline import (
+    InferencePipeline,
+    LoadedProblem,
+    make_inference_pipeline,
+)
 from cnpgen.planner.model import Model, ModelConfig, is_rest_to_rest
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
-from cnpgen.planner.network.features import SCENE, Features, count_features, feature_blocks, published_features
+from cnpgen.planner.network.features import (
+    SCENE,
+    Features,
+    count_features,
+    feature_blocks,
+    published_features,
+)
 from cnpgen.planner.tasks import Tasks
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.schema.arguments import check_memory
@@ -26,7 +39,12 @@ from cnpgen.training.checkpoint import State, start_state
 from cnpgen.training.data import TrainingData
 from cnpgen.training.settings import Length, TrainingSettings
 from cnpgen.training.step import Learner
-from cnpgen.training.training_rows import Rows, TrainingProblems, prepare_rows, zero_conditions
+from cnpgen.training.training_rows import (
+    Rows,
+    TrainingProblems,
+    prepare_rows,
+    zero_conditions,
+)
 from cnpgen.training.training_run import Run
 from cnpgen.trajectory.boundary import Boundary
 
@@ -45,11 +63,12 @@ def prepare_run(
 ) -> tuple[Run, InferencePipeline]:
     """Load rows, kernels and loss; set up the network; return the run, and the inference pipeline of its plans.
 
-    Without an initial model, parameters are random and features are standardized by the rows. Models are compared on
-    ``check_rows`` validation rows. The command is recorded in the model.
+    Without an initial model, parameters are random and features are standardized by the
+    rows. Models are compared on ``check_rows`` validation rows. The command is recorded
+    in the model.
 
-    Raises:
-        UsageError: The dataset has no plans to imitate, or the initial model does not fit.
+    Raises: UsageError: The dataset has no plans to imitate, or the initial model does
+        not fit.
     """
     problems = source.training()
     boundary = problems.boundary
@@ -61,7 +80,11 @@ def prepare_run(
         config = replace(config, via_points=initial_model.config.via_points)
         blocks, features = initial_model.features.blocks, initial_model.features
     inference = make_inference_pipeline(
-        loaded, config, scale_time=is_rest_to_rest(zero, fixed), fixed_at_goal=fixed, observed=SCENE in blocks
+        loaded,
+        config,
+        scale_time=is_rest_to_rest(zero, fixed),
+        fixed_at_goal=fixed,
+        observed=SCENE in blocks,
     )
     architecture = _architecture(loaded, settings, blocks, boundary)
     if initial_model is not None:
@@ -71,16 +94,27 @@ def prepare_run(
         assert initial_model is not None
         return inference.planned(initial_model, boundary)[0]
 
-    lines = None if initial_model is None or inference.via_points is None else planned_lines
+    lines = (
+        None if initial_model is None or inference.via_points is None else planned_lines
+    )
     poses = problems.obstacle_poses
     rows, features = prepare_rows(
-        boundary, inference.prepare, features=features, blocks=blocks, lines=lines, obstacle_poses=poses
+        boundary,
+        inference.prepare,
+        features=features,
+        blocks=blocks,
+        lines=lines,
+        obstacle_poses=poses,
     )
     if settings.imitation:
         rows = _with_demonstrations(rows, source, loaded)
     loss = _loss(loaded, settings)
     held_out = source.checked(check_rows)
-    training = {"command": command, **identity(source, settings), "stages": source.stages}
+    training = {
+        "command": command,
+        **identity(source, settings),
+        "stages": source.stages,
+    }
     projection = make_projection(
         loaded.problem.for_planning,
         loaded.kernels,
@@ -90,7 +124,13 @@ def prepare_run(
     )
     run = Run(
         learner=Learner(
-            architecture, loaded.problem.trajectory, loss, settings, projection, inference.prepare.along, features
+            architecture,
+            loaded.problem.trajectory,
+            loss,
+            settings,
+            projection,
+            inference.prepare.along,
+            features,
         ),
         names=loss.terms,
         budgets=dict(zip(loss.terms[1:], loss.budgets.tolist(), strict=True)),
@@ -116,18 +156,28 @@ def _initial_features(
 ) -> tuple[tuple[str, ...], Features | None]:
     """Return the blocks of a new model's features, and the features if they do not depend on the rows."""
     placed, iterated = loaded.problem.has_sample_obstacles, settings.iterations > 1
-    blocks = feature_blocks(boundary, settings.features, placed=placed, iterated=iterated)
+    blocks = feature_blocks(
+        boundary, settings.features, placed=placed, iterated=iterated
+    )
     if settings.features != "paper":
         return blocks, None
-    return blocks, published_features(blocks, loaded.robot.velocity_limit, loaded.robot.acceleration_limit)
+    return blocks, published_features(
+        blocks, loaded.robot.velocity_limit, loaded.robot.acceleration_limit
+    )
 
 
 def identity(source: TrainingData, settings: TrainingSettings) -> dict[str, Any]:
     """Return the identity of a run without its length; JSON-able."""
-    return {"cnpgen": __version__, "dataset": source.describe(), "settings": plain(asdict(settings))}
+    return {
+        "cnpgen": __version__,
+        "dataset": source.describe(),
+        "settings": plain(asdict(settings)),
+    }
 
 
-def _with_demonstrations(rows: Rows, source: TrainingData, loaded: LoadedProblem) -> Rows:
+def _with_demonstrations(
+    rows: Rows, source: TrainingData, loaded: LoadedProblem
+) -> Rows:
     target = source.demonstrations(loaded.robot.n)
     if target is None:
         raise UsageError(
@@ -135,44 +185,72 @@ def _with_demonstrations(rows: Rows, source: TrainingData, loaded: LoadedProblem
             " make_dataset(..., certify=True) or 'cnpgen make-dataset --certify', or train without imitation"
         )
     spec = loaded.problem.trajectory
-    theirs, ours = (target.path.shape[1], target.rate.shape[1]), (spec.path_control_points, spec.rate_control_points)
+    theirs, ours = (
+        (target.path.shape[1], target.rate.shape[1]),
+        (spec.path_control_points, spec.rate_control_points),
+    )
     if theirs != ours:
-        raise UsageError(f"the plans to imitate have {theirs} control points, these motions {ours}")
+        raise UsageError(
+            f"the plans to imitate have {theirs} control points, these motions {ours}"
+        )
     return replace(rows, target=target)
 
 
 def _check_initial_model(
-    model: Model, architecture: Architecture, settings: TrainingSettings, loaded: LoadedProblem, zero: tuple[str, ...]
+    model: Model,
+    architecture: Architecture,
+    settings: TrainingSettings,
+    loaded: LoadedProblem,
+    zero: tuple[str, ...],
 ) -> None:
     """Raise an error if the model's parameters cannot be used in this run."""
     if model.problem.comparable_sha256 != loaded.record.comparable_sha256:
         differs = ", ".join(loaded.record.differences(model.problem)[:4])
-        raise UsageError(f"the model to start from is for another problem, they differ in {differs}: train without it")
-    theirs = _parameter_definition(model.architecture, model.config, model.zero_conditions)
+        raise UsageError(
+            f"the model to start from is for another problem, they differ in {differs}: train without it"
+        )
+    theirs = _parameter_definition(
+        model.architecture, model.config, model.zero_conditions
+    )
     ours = _parameter_definition(architecture, settings.config, zero)
     changed = [
-        f"{name} is {theirs[name]!r} there and {ours[name]!r} here" for name in ours if theirs[name] != ours[name]
+        f"{name} is {theirs[name]!r} there and {ours[name]!r} here"
+        for name in ours
+        if theirs[name] != ours[name]
     ]
     if changed:
         raise UsageError(f"the model to start from does not fit: {', '.join(changed)}")
 
 
-def _parameter_definition(architecture: Architecture, config: ModelConfig, zero: tuple[str, ...]) -> dict[str, Any]:
+def _parameter_definition(
+    architecture: Architecture, config: ModelConfig, zero: tuple[str, ...]
+) -> dict[str, Any]:
     """Return the values that must agree for parameters to be interchangeable."""
-    outputs = {"path_scale": config.path_scale, "zero conditions": zero, "expected_time": config.expected_time}
+    outputs = {
+        "path_scale": config.path_scale,
+        "zero conditions": zero,
+        "expected_time": config.expected_time,
+    }
     outputs["iterations"] = config.iterations
     return {**asdict(architecture), **outputs}
 
 
 def _architecture(
-    loaded: LoadedProblem, settings: TrainingSettings, blocks: tuple[str, ...], boundary: Boundary
+    loaded: LoadedProblem,
+    settings: TrainingSettings,
+    blocks: tuple[str, ...],
+    boundary: Boundary,
 ) -> Architecture:
     check_memory("hidden", settings.hidden, settings.layers * settings.hidden**2)
-    check_memory("batch_size", settings.batch_size, settings.batch_size * settings.nodes)
+    check_memory(
+        "batch_size", settings.batch_size, settings.batch_size * settings.nodes
+    )
     spec = loaded.problem.trajectory
     outputs = loaded.robot.n * (spec.path_control_points - 3 - boundary.fixed_at_goal)
     return Architecture(
-        inputs=count_features(blocks, loaded.robot.n, len(loaded.problem.parameters), line=outputs),
+        inputs=count_features(
+            blocks, loaded.robot.n, len(loaded.problem.parameters), line=outputs
+        ),
         hidden=settings.hidden,
         layers=settings.layers,
         path_outputs=outputs,
@@ -197,7 +275,9 @@ def _loss(loaded: LoadedProblem, settings: TrainingSettings) -> PlanLoss:
 
 def _metric(loss: PlanLoss, settings: TrainingSettings) -> Metric:
     learned = settings.metric.kind == "learned"
-    weights = loss.weights0 if learned else suggested_weights(loss.problem, loss.weights0)
+    weights = (
+        loss.weights0 if learned else suggested_weights(loss.problem, loss.weights0)
+    )
     if settings.constraint_terms == "budgeted":
         weights = np.where(loss.budgets > 0, weights, 0.0)
     return Metric(weights, loss.budgets, settings.metric)
@@ -226,7 +306,9 @@ def _fresh(run: Run, steps: int) -> State:
             head_scale=settings.head_scale,
             rate_bias=settings.rate_bias,
         )
-    return start_state(parameters, terms=len(run.names), steps=steps, imitation=settings.imitation)
+    return start_state(
+        parameters, terms=len(run.names), steps=steps, imitation=settings.imitation
+    )
 
 
 def _step_seconds(run: Run) -> float:
@@ -243,15 +325,18 @@ def _step_seconds(run: Run) -> float:
 
 
 def validate(
-    model: Model, inference: InferencePipeline, problems: TrainingProblems, *, workers: int | None = 1
+    model: Model,
+    inference: InferencePipeline,
+    problems: TrainingProblems,
+    *,
+    workers: int | None = 1,
 ) -> dict[str, Any]:
     """Plan for N validation rows and judge the plans in some processes.
 
-    Returns:
-        JSON-able: number of ``plans``; fractions ``valid`` and, if the paper's rules are installed,
-        ``paper_valid``; means of some
-        metrics; ``broken``, condition -> number of violating plans; ``score``, which compares models: 1 % of the plans
-        counts as much as 1 % of the motion time.
+    Returns: JSON-able: number of ``plans``; fractions ``valid`` and, if the paper's
+        rules are installed, ``paper_valid``; means of some metrics; ``broken``,
+        condition -> number of violating plans; ``score``, which compares models: 1 % of
+        the plans counts as much as 1 % of the motion time.
     """
     poses = problems.obstacle_poses
     columns = None if poses is None else {OBSTACLE_POSES: poses}
@@ -262,7 +347,11 @@ def validate(
     return {
         "plans": summary["plans"],
         "valid": summary["valid_ratio"],
-        **({"paper_valid": summary["paper_valid_ratio"]} if "paper_valid_ratio" in summary else {}),
+        **(
+            {"paper_valid": summary["paper_valid_ratio"]}
+            if "paper_valid_ratio" in summary
+            else {}
+        ),
         **{name: metrics[name]["mean"] for name in MEANS if name in metrics},
         "broken": {
             name: condition["violating_plans"]

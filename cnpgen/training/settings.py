@@ -46,43 +46,51 @@ CHOICES: dict[str, tuple[str, ...]] = {
 class TrainingSettings:
     """Settings that, together with rows, problem and number of steps, determine a trained model to the bit.
 
-    Attributes:
-        hidden: Width of the network's layers.
-        layers: Depth of its trunk.
-        batch_size: Rows per step; all of them if there are fewer.
-        learning_rate: Peak learning rate.
-        final_rate: Last learning rate, as a fraction of the peak.
-        warm_up: Number of steps until the peak.
-        seed: Seed of the initial parameters and of the order of rows.
-        path_scale: Factor of the configuration head's output [rad].
-        head_scale: Factor of the heads' initial weights.
-        rate_bias: Logarithm of the initial guess of expected time over duration.
-        line_projection_steps: Gauss-Newton steps that project the line onto the equalities.
-        projection_steps: Gauss-Newton steps that project the path onto the equalities.
-        within_limits: Whether both clip control points to the joint limits.
-        iterations: Number of evaluations of the network; see ``ModelConfig``.
-        time_parametrized: Whether the planner fits rates to the limits after the network; training steps do not include
+    Attributes: hidden: Width of the network's layers. layers: Depth of its trunk.
+        batch_size: Rows per step; all of them if there are fewer. learning_rate: Peak
+        learning rate. final_rate: Last learning rate, as a fraction of the peak.
+        warm_up: Number of steps until the peak. seed: Seed of the initial parameters
+        and of the order of rows. path_scale: Factor of the configuration head's output
+        [rad]. head_scale: Factor of the heads' initial weights. rate_bias: Logarithm of
+        the initial guess of expected time over duration. line_projection_steps:
+        Gauss-Newton steps that project the line onto the equalities. projection_steps:
+        Gauss-Newton steps that project the path onto the equalities. within_limits:
+        Whether both clip control points to the joint limits. iterations: Number of
+        evaluations of the network; see ``ModelConfig``. time_parametrized: Whether the
+        planner fits rates to the limits after the network; training steps do not
+        include
             it, validations do.
         nodes: Number of quadrature nodes of the loss.
-        shifts: Number of shifted sets of nodes, used in turn to cover the phases between nodes.
+        shifts: Number of shifted sets of nodes, used in turn to cover the phases
+            between nodes.
         sample_clip: Largest norm of a sample's gradient, in running medians.
         batch_clip: Largest norm of a batch's gradient, in running norms.
         memory: Decay of the average of the parameters.
         metric: Schedule of the weights of the constraint terms.
         expected_time: Unit of durations; see ``ModelConfig``.
-        margins: Constraint term -> factor of its limits, in (0, 1], that replaces the usual one.
-        usual_margins: Whether the other bounds are tightened as the constraint classes suggest.
-        imitation: Fraction of the run, at its beginning, that imitates the plans of a certified dataset.
-        features: Inputs of the network: "full"; "no-scene", without obstacles that samples place; "states", the
-            standardized boundary states; or "paper", the boundary states divided by pi and by the limits.
-        loss_form: Form of the loss, "signed" or "paper" (``PlanLoss``); empty for the one that suits the metric.
-        constraint_terms: "all", or "budgeted": only those with a budget, which are those of the paper.
-        time_varying_bounds: Whether motions that start off the manifold have the time-varying bounds of the verdict.
-        path_control_points: Number of path control points; None for that of the problem.
-        rate_control_points: Number of rate control points; None for that of the problem.
+        margins: Constraint term -> factor of its limits, in (0, 1], that replaces the
+            usual one.
+        usual_margins: Whether the other bounds are tightened as the constraint classes
+            suggest.
+        imitation: Fraction of the run, at its beginning, that imitates the plans of a
+            certified dataset.
+        features: Inputs of the network: "full"; "no-scene", without obstacles that
+            samples place; "states", the standardized boundary states; or "paper", the
+            boundary states divided by pi and by the limits.
+        loss_form: Form of the loss, "signed" or "paper" (``PlanLoss``); empty for the
+            one that suits the metric.
+        constraint_terms: "all", or "budgeted": only those with a budget, which are
+            those of the paper.
+        time_varying_bounds: Whether motions that start off the manifold have the
+            time-varying bounds of the verdict.
+        path_control_points: Number of path control points; None for that of the
+            problem.
+        rate_control_points: Number of rate control points; None for that of the
+            problem.
         keep: Model that is kept: the "best" of all validations, or the "last" one.
-        objective: Objective in place of that of the problem, such as "effort" or "effort=2, jerk=0.1"
-            (``cnpgen.problems.objectives.read_objective``); empty for that of the problem.
+        objective: Objective in place of that of the problem, such as "effort" or
+            "effort=2, jerk=0.1" (``cnpgen.problems.objectives.read_objective``); empty
+            for that of the problem.
         precision: Precision of the loss and its gradient; the network has float32.
         validations: Number of validations, evenly distributed over the run.
     """
@@ -136,7 +144,10 @@ class TrainingSettings:
         for name, choices in CHOICES.items():
             if getattr(self, name) not in choices:
                 known = ", ".join(filter(None, choices))
-                raise UsageError(f"must be one of {known}, got {getattr(self, name)!r}", argument=name)
+                raise UsageError(
+                    f"must be one of {known}, got {getattr(self, name)!r}",
+                    argument=name,
+                )
         if self.iterations > 1 and self.features in {"states", "paper"}:
             raise UsageError(
                 f"{self.iterations} evaluations of the network need its path as an input: expected features"
@@ -152,7 +163,11 @@ class TrainingSettings:
         """Form of the loss: as set, else "paper" for the paper's metric, whose budgets belong to it, or "signed"."""
         if self.loss_form:
             return self.loss_form
-        return "paper" if self.metric.kind == "learned" and self.metric.every == "epoch" else "signed"
+        return (
+            "paper"
+            if self.metric.kind == "learned" and self.metric.every == "epoch"
+            else "signed"
+        )
 
     @property
     def config(self) -> ModelConfig:
@@ -183,10 +198,13 @@ class Length:
     cpu_seconds: float | None = None
 
     def __post_init__(self) -> None:
-        lengths = {name: value for name, value in vars(self).items() if value is not None}
+        lengths = {
+            name: value for name, value in vars(self).items() if value is not None
+        }
         if len(lengths) != 1:
             raise UsageError(
-                f"pass exactly one of steps, epochs or cpu_seconds, got {lengths or 'none'}", concerns="steps"
+                f"pass exactly one of steps, epochs or cpu_seconds, got {lengths or 'none'}",
+                concerns="steps",
             )
         if self.steps is not None:
             integer("steps", self.steps, least=1)
@@ -197,6 +215,12 @@ class Length:
 def _within(name: str, value: Any, interval: str, *, of: str = "") -> None:
     """Raise an error if a value is no number, or outside an interval such as ``[0, 1)``, which may include infinity."""
     low, high = map(float, interval[1:-1].split(","))
-    real = value if isinstance(value, float) and math.isinf(value) else number(name, value)
-    if not low <= real <= high or (real == low and interval[0] == "(") or (real == high and interval[-1] == ")"):
+    real = (
+        value if isinstance(value, float) and math.isinf(value) else number(name, value)
+    )
+    if (
+        not low <= real <= high
+        or (real == low and interval[0] == "(")
+        or (real == high and interval[-1] == ")")
+    ):
         raise UsageError(f"must be in {interval}{of}, got {value!r}", argument=name)

@@ -30,7 +30,9 @@ def imitation_loss(points: ControlPoints, target: ControlPoints) -> LossValue:
     """
     by_path = points.path - target.path
     logs = np.log(points.rate / target.rate)
-    total = 0.5 * (np.einsum("ijk,ijk->i", by_path, by_path) + np.einsum("ij,ij->i", logs, logs))
+    total = 0.5 * (
+        np.einsum("ijk,ijk->i", by_path, by_path) + np.einsum("ij,ij->i", logs, logs)
+    )
     return LossValue(total, total[:, None], by_path, logs / points.rate)
 
 
@@ -38,8 +40,9 @@ def imitation_loss(points: ControlPoints, target: ControlPoints) -> LossValue:
 class Learner:
     """Constants of a training step.
 
-    The projection leads the network's paths onto the equalities, if there are any. ``along`` returns tasks along the
-    paths of plans for them, whose features are defined by ``features``.
+    The projection leads the network's paths onto the equalities, if there are any.
+    ``along`` returns tasks along the paths of plans for them, whose features are
+    defined by ``features``.
     """
 
     architecture: Architecture
@@ -51,16 +54,25 @@ class Learner:
     features: Features | None = None
 
     def gradient(
-        self, parameters: Array, rows: Rows, weights: Array, *, shift: float, clipping: Clipping, out: Array
+        self,
+        parameters: Array,
+        rows: Rows,
+        weights: Array,
+        *,
+        shift: float,
+        clipping: Clipping,
+        out: Array,
     ) -> Array:
         """Write the gradient of the mean loss of a batch with respect to all parameters, shape (n_parameters,).
 
-        The constraint terms have weights of shape (m,); the quadrature nodes have a shift in [0, 1). Return the terms
-        of every sample, shape (N, 1 + m).
+        The constraint terms have weights of shape (m,); the quadrature nodes have a
+        shift in [0, 1). Return the terms of every sample, shape (N, 1 + m).
         """
 
         def cost(rows: Rows, points: ControlPoints) -> LossValue:
-            start_tip = rows.tasks.start_xyz if self.settings.time_varying_bounds else None
+            start_tip = (
+                rows.tasks.start_xyz if self.settings.time_varying_bounds else None
+            )
             return self.loss(
                 points.path,
                 points.rate,
@@ -72,11 +84,22 @@ class Learner:
 
         return self._gradient(parameters, rows, cost, clipping, out)
 
-    def imitation_gradient(self, parameters: Array, rows: Rows, *, clipping: Clipping, out: Array) -> Array:
-        """Write the gradient of the mean distance from demonstrations; return the distances, shape (N, 1)."""
+    def imitation_gradient(
+        self, parameters: Array, rows: Rows, *, clipping: Clipping, out: Array
+    ) -> Array:
+        """Write the gradient of the mean distance from demonstrations.
+
+        Return the distances, shape (N, 1).
+        """
         target = rows.target
         assert target is not None
-        return self._gradient(parameters, rows, lambda _, points: imitation_loss(points, target), clipping, out)
+        return self._gradient(
+            parameters,
+            rows,
+            lambda _, points: imitation_loss(points, target),
+            clipping,
+            out,
+        )
 
     def _gradient(
         self,
@@ -86,10 +109,20 @@ class Learner:
         clipping: Clipping,
         out: Array,
     ) -> Array:
-        network, scale, part = self.architecture.split(parameters), self.settings.path_scale, out
+        network, scale, part = (
+            self.architecture.split(parameters),
+            self.settings.path_scale,
+            out,
+        )
         for iteration in range(self.settings.iterations):
             activations = forward(network, rows.features)
-            points = control_points(rows.tasks, activations.path, activations.log_rate, scale=scale, spec=self.spec)
+            points = control_points(
+                rows.tasks,
+                activations.path,
+                activations.log_rate,
+                scale=scale,
+                spec=self.spec,
+            )
             projected = self._projected(points, rows)
             value = cost(rows, projected)
             phi, log_rate = self._output_gradients(rows, points, value)
@@ -97,7 +130,13 @@ class Learner:
             phi *= factors
             log_rate *= factors
             gradients = self.architecture.split(part)
-            backward(network, activations, path_gradient=phi, log_rate_gradient=log_rate, out=gradients)
+            backward(
+                network,
+                activations,
+                path_gradient=phi,
+                log_rate_gradient=log_rate,
+                out=gradients,
+            )
             if iteration:
                 out += part
             if iteration + 1 < self.settings.iterations:
@@ -110,26 +149,47 @@ class Learner:
         assert self.along is not None
         assert self.features is not None
         tasks = self.along(rows.tasks, path)
-        return replace(rows, tasks=replace(tasks, observation=None), features=self.features.of(tasks))
+        return replace(
+            rows,
+            tasks=replace(tasks, observation=None),
+            features=self.features.of(tasks),
+        )
 
-    def _output_gradients(self, rows: Rows, points: ControlPoints, value: LossValue) -> tuple[Array, Array]:
+    def _output_gradients(
+        self, rows: Rows, points: ControlPoints, value: LossValue
+    ) -> tuple[Array, Array]:
         """Return the loss's gradients with respect to both heads."""
         by_path, by_rate = (
-            gradient.astype(points.path.dtype, copy=False) for gradient in (value.path_gradient, value.rate_gradient)
+            gradient.astype(points.path.dtype, copy=False)
+            for gradient in (value.path_gradient, value.rate_gradient)
         )
         if self.projection is not None:
             by_path = self.projection.vjp(points.path, rows.tasks.scene.poses, by_path)
         scale = self.settings.path_scale
-        return vjp(rows.tasks, points, path_gradient=by_path, rate_gradient=by_rate, scale=scale, spec=self.spec)
+        return vjp(
+            rows.tasks,
+            points,
+            path_gradient=by_path,
+            rate_gradient=by_rate,
+            scale=scale,
+            spec=self.spec,
+        )
 
     def _projected(self, points: ControlPoints, rows: Rows) -> ControlPoints:
         if self.projection is None:
             return points
-        return ControlPoints(self.projection.project(points.path, rows.tasks.scene.poses), points.rate)
+        return ControlPoints(
+            self.projection.project(points.path, rows.tasks.scene.poses), points.rate
+        )
 
     def _factors(self, phi: Array, log_rate: Array, clipping: Clipping) -> Array:
-        """Return the factors of the samples' gradients, shape (N, 1); a gradient that is not finite becomes 0."""
-        norms = np.sqrt(np.einsum("ij,ij->i", phi, phi) + np.einsum("ij,ij->i", log_rate, log_rate))
+        """Return the factors of the samples' gradients, shape (N, 1).
+
+        A gradient that is not finite becomes 0.
+        """
+        norms = np.sqrt(
+            np.einsum("ij,ij->i", phi, phi) + np.einsum("ij,ij->i", log_rate, log_rate)
+        )
         usable = np.isfinite(norms)
         if not usable.all():
             phi[~usable], log_rate[~usable] = 0, 0
@@ -137,8 +197,13 @@ class Learner:
         factors = clipping.sample_factors(norms, limit=self.settings.sample_clip)
         return (factors / len(factors))[:, None]
 
-    def update(self, adam: Adam, clipping: Clipping, gradient: Array, *, rate: float) -> None:
-        """Clip the gradient of a batch and take an Adam step; one that is not finite only increments the step count."""
+    def update(
+        self, adam: Adam, clipping: Clipping, gradient: Array, *, rate: float
+    ) -> None:
+        """Clip the gradient of a batch and take an Adam step.
+
+        One that is not finite only increments the step count.
+        """
         norm = float(np.sqrt(np.dot(gradient, gradient)))
         if np.isfinite(norm):
             gradient *= clipping.batch_factor(norm, limit=self.settings.batch_clip)

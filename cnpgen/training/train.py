@@ -13,7 +13,11 @@ from cnpgen.machine.times import NO_TIME, Stopwatch, Times
 from cnpgen.planner.inference_pipeline import loaded_problem
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import find_model, load_model, save_model
-from cnpgen.problems.problem_record import as_record, with_control_points, with_objective
+from cnpgen.problems.problem_record import (
+    as_record,
+    with_control_points,
+    with_objective,
+)
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning, integer
 from cnpgen.store.files.atomic import check_writable, file_sha256
@@ -28,7 +32,12 @@ from cnpgen.training.settings import Length, TrainingSettings
 from cnpgen.training.training_run import Run, Watcher
 
 DEFAULT_CPU_TIME_S = 120.0
-CHECKPOINT, LOG, PICTURE, LOCK = ".checkpoint", ".jsonl", ".png", ".lock"  # in place of .h5
+CHECKPOINT, LOG, PICTURE, LOCK = (
+    ".checkpoint",
+    ".jsonl",
+    ".png",
+    ".lock",
+)  # in place of .h5
 MAX_SCORED_ROWS = 2000  # validation rows for the final score
 
 
@@ -36,12 +45,10 @@ MAX_SCORED_ROWS = 2000  # validation rows for the final score
 class Trained:
     """Result of a run.
 
-    Attributes:
-        model: The best model.
-        path: Its file.
-        score: Result of ``validate`` on up to 2,000 validation rows that were not used to select it.
-        made: Whether it was made now; False if it existed.
-        times: Times of this run including the final validation; of a resumed run, since it was resumed. The model's
+    Attributes: model: The best model. path: Its file. score: Result of ``validate`` on
+        up to 2,000 validation rows that were not used to select it. made: Whether it
+        was made now; False if it existed. times: Times of this run including the final
+        validation; of a resumed run, since it was resumed. The model's
             ``training`` has the CPU time of all steps and validations.
     """
 
@@ -72,55 +79,79 @@ def train_model(
 ) -> Trained:
     """Train a model, or resume an interrupted run; an existing model of the same run is returned.
 
-    The run writes a log, ``.jsonl``, and until it is finished a checkpoint, ``.checkpoint``, beside the model. An
-    interrupted and resumed run gives the same parameters to the bit as an uninterrupted one.
+    The run writes a log, ``.jsonl``, and until it is finished a checkpoint,
+    ``.checkpoint``, beside the model. An interrupted and resumed run gives the same
+    parameters to the bit as an uninterrupted one.
 
-    Args:
-        folder: The dataset; with ``robot`` a scene file, or a folder of scene files.
-        out: The model's file, ``.h5``.
-        steps: Length in steps.
-        epochs: Length in epochs.
-        cpu_seconds: Length in CPU time of the steps [s]: the time of a step is measured first, and the number of steps
-            is then fixed. Compiling, reading rows and validation are not included. The default is 120 s.
+    Args: folder: The dataset; with ``robot`` a scene file, or a folder of scene files.
+        out: The model's file, ``.h5``. steps: Length in steps. epochs: Length in
+        epochs. cpu_seconds: Length in CPU time of the steps [s]: the time of a step is
+        measured first, and the number of steps
+            is then fixed. Compiling, reading rows and validation are not included. The
+            default is 120 s.
         settings: Training settings.
-        start_from: Model, by name or path, whose parameters and features replace random ones; width, depth and output
-            definition in the settings must be the same.
-        check_rows: Number of validation rows that models are compared on during the run, at most half of them; the best
-            one is scored on up to 2,000 others.
+        start_from: Model, by name or path, whose parameters and features replace random
+            ones; width, depth and output definition in the settings must be the same.
+        check_rows: Number of validation rows that models are compared on during the
+            run, at most half of them; the best one is scored on up to 2,000 others.
         command: Command recorded in the model.
-        force: Replace an existing model, log and picture; discard another run's checkpoint.
-        workers: Number of processes of the final validation; training itself uses one process.
+        force: Replace an existing model, log and picture; discard another run's
+            checkpoint.
+        workers: Number of processes of the final validation; training itself uses one
+            process.
         robot: Problem of the robot that moves in the scenes, such as "panda".
         begin: Called once before the first step.
         watch: Called with every line of the log.
 
-    Raises:
-        UsageError: An argument is invalid, the initial model is missing or does not fit, there is another model,
-            another run's checkpoint, or a log or picture of another origin, or another process writes the same model.
+    Raises: UsageError: An argument is invalid, the initial model is missing or does not
+        fit, there is another model,
+            another run's checkpoint, or a log or picture of another origin, or another
+            process writes the same model.
         DatasetError: The dataset or the checkpoint is damaged.
         MachineError: The disk is full, or the loss is not finite any more.
     """
     clock = Stopwatch()
     out, settings = Path(out), settings or TrainingSettings()
     lengths = {"steps": steps, "epochs": epochs, "cpu_seconds": cpu_seconds}
-    passed: dict[str, Any] = {name: value for name, value in lengths.items() if value is not None}
+    passed: dict[str, Any] = {
+        name: value for name, value in lengths.items() if value is not None
+    }
     passed = passed or {"cpu_seconds": DEFAULT_CPU_TIME_S}
     length, check_rows = Length(**passed), integer("check_rows", check_rows, least=1)
     check_out(out)
     remove_temporary_files(out)
     source = open_training_data(folder, robot)
     initial_model, digest = _read_initial_model(start_from)
-    run_identity = {"length": plain(passed), "check_rows": check_rows, "start_from": digest}
-    checkpoints = Checkpoints(out.with_suffix(CHECKPOINT), identity(source, settings) | run_identity)
+    run_identity = {
+        "length": plain(passed),
+        "check_rows": check_rows,
+        "start_from": digest,
+    }
+    checkpoints = Checkpoints(
+        out.with_suffix(CHECKPOINT), identity(source, settings) | run_identity
+    )
     if not force:
         if out.exists() and not checkpoints.path.exists():
             return _finished(out, checkpoints.identity)
         check_beside(out)
-    record = with_control_points(as_record(source.problem), settings.path_control_points, settings.rate_control_points)
+    record = with_control_points(
+        as_record(source.problem),
+        settings.path_control_points,
+        settings.rate_control_points,
+    )
     record = with_objective(record, settings.objective)
-    with output_lock(out, out.with_suffix(LOCK)), one_thread(), loaded_problem(record) as loaded:
+    with (
+        output_lock(out, out.with_suffix(LOCK)),
+        one_thread(),
+        loaded_problem(record) as loaded,
+    ):
         run, inference = prepare_run(
-            source, loaded, settings, initial_model=initial_model, check_rows=check_rows, command=command
+            source,
+            loaded,
+            settings,
+            initial_model=initial_model,
+            check_rows=check_rows,
+            command=command,
         )
         state = checkpoints.load(discard=force) or begin_run(run, length)
         clock.prepared()
@@ -130,7 +161,12 @@ def train_model(
         run.train(state, checkpoints, log, watch)
         checkpoints.save(state)
         best = run.model(state.best.parameters)
-        score = validate(best, inference, source.judged(MAX_SCORED_ROWS, after=check_rows), workers=workers)
+        score = validate(
+            best,
+            inference,
+            source.judged(MAX_SCORED_ROWS, after=check_rows),
+            workers=workers,
+        )
         # The checkpoint lacks this line, so that it is written once.
         log.write({"step": state.adam.step, "best": state.best.step, "final": score})
         training = {**best.training, **checkpoints.identity, **_outcome(state, score)}
@@ -141,7 +177,9 @@ def train_model(
     return Trained(model, out, score, times=clock.times())
 
 
-def _read_initial_model(start_from: str | Path | None) -> tuple[Model | None, str | None]:
+def _read_initial_model(
+    start_from: str | Path | None,
+) -> tuple[Model | None, str | None]:
     """Read the model to start from, and its file's sha256; None if there is none."""
     if start_from is None:
         return None, None
@@ -155,12 +193,15 @@ def _finished(path: Path, identity: Mapping[str, Any]) -> Trained:
     try:
         model = load_model(path)
     except (DatasetError, UsageError) as error:
-        raise UsageError(f"{path} exists and is no model ({error}): {hint}", remedies={"force": True}) from error
+        raise UsageError(
+            f"{path} exists and is no model ({error}): {hint}", remedies={"force": True}
+        ) from error
     existing = {name: model.training.get(name) for name in identity}
     changed = list(map(str, differences(existing, identity)))
     if changed:
         raise UsageError(
-            f"{path} is another model, it differs in {', '.join(changed[:4])}: {hint}", remedies={"force": True}
+            f"{path} is another model, it differs in {', '.join(changed[:4])}: {hint}",
+            remedies={"force": True},
         )
     return Trained(model, path, model.training["score"], made=False)
 
@@ -179,18 +220,28 @@ def _outcome(state: State, score: Mapping[str, Any]) -> dict[str, Any]:
 def check_out(out: Path) -> None:
     """Raise an error if the path is no possible model file, or cannot be written."""
     if out.suffix != ".h5" or out.is_dir() or not out.parent.is_dir():
-        raise UsageError(f"{out} must be a file that ends in .h5, in a folder that exists", concerns="out")
+        raise UsageError(
+            f"{out} must be a file that ends in .h5, in a folder that exists",
+            concerns="out",
+        )
     check_writable(out)
 
 
 def check_beside(out: Path) -> None:
     """Raise UsageError if a log or a picture of another origin beside a model's file would be replaced."""
     log, picture = out.with_suffix(LOG), out.with_suffix(PICTURE)
-    hint, remedies = "choose another {out}, or replace it with {force}", {"out": None, "force": True}
+    hint, remedies = (
+        "choose another {out}, or replace it with {force}",
+        {"out": None, "force": True},
+    )
     if log.exists() and not is_log(log):
-        raise UsageError(f"{log} exists and is no training log: {hint}", remedies=remedies)
+        raise UsageError(
+            f"{log} exists and is no training log: {hint}", remedies=remedies
+        )
     if picture.exists() and not log.exists():
-        raise UsageError(f"{picture} exists and is of no training run: {hint}", remedies=remedies)
+        raise UsageError(
+            f"{picture} exists and is of no training run: {hint}", remedies=remedies
+        )
 
 
 def remove_temporary_files(out: Path) -> None:

@@ -32,7 +32,11 @@ class Rows:
 
     def take(self, which: NDArray[np.intp]) -> "Rows":
         """Return a subset of the rows."""
-        target = None if self.target is None else ControlPoints(self.target.path[which], self.target.rate[which])
+        target = (
+            None
+            if self.target is None
+            else ControlPoints(self.target.path[which], self.target.rate[which])
+        )
         return Rows(self.tasks.take(which), self.features[which], target)
 
 
@@ -40,7 +44,8 @@ class Rows:
 class TrainingProblems:
     """N boundary problems to train on or to validate with.
 
-    Poses and sizes of obstacles that samples place have shape (N, width); they are None for other problems.
+    Poses and sizes of obstacles that samples place have shape (N, width); they are None
+    for other problems.
     """
 
     boundary: Boundary
@@ -59,50 +64,81 @@ def prepare_rows(
 ) -> tuple[Rows, Features]:
     """Prepare rows in blocks, because temporary arrays take four times the memory of the result.
 
-    Without ``features``, they are standardized by these rows, with some or all ``blocks``. ``lines`` preprocesses tasks
-    along other lines than ``prepare``. Obstacles that samples place have poses and sizes of shape (N, width). Return
-    the rows, and the standardization of their features.
+    Without ``features``, they are standardized by these rows, with some or all
+    ``blocks``. ``lines`` preprocesses tasks along other lines than ``prepare``.
+    Obstacles that samples place have poses and sizes of shape (N, width). Return the
+    rows, and the standardization of their features.
     """
     parts = [
         slice(first, first + PREPARED_ROWS_PER_BLOCK)
         for first in range(0, max(len(boundary), 1), PREPARED_ROWS_PER_BLOCK)
     ]
-    straight = replace(prepare, line=None)  # features do not depend on the projected line, which takes most of the time
+    straight = replace(
+        prepare, line=None
+    )  # features do not depend on the projected line, which takes most of the time
     placed = bool(prepare.placed)
     poses = [None if obstacle_poses is None else obstacle_poses[part] for part in parts]
     definition = features or fit_features(
-        (straight(boundary[part], obstacle_poses=own) for part, own in zip(parts, poses, strict=True)),
+        (
+            straight(boundary[part], obstacle_poses=own)
+            for part, own in zip(parts, poses, strict=True)
+        ),
         blocks or feature_blocks(boundary, placed=placed),
     )
     arrays: dict[str, Array] = {}
     for part, own in zip(parts, poses, strict=True):
-        tasks = prepare(boundary[part], obstacle_poses=own) if lines is None else lines(boundary[part])
+        tasks = (
+            prepare(boundary[part], obstacle_poses=own)
+            if lines is None
+            else lines(boundary[part])
+        )
         for name, values in _arrays(tasks, definition, dtype).items():
             if name not in arrays:
                 arrays[name] = np.empty((len(boundary), *values.shape[1:]), dtype)
             arrays[name][part] = values
     ends = Boundary(**{name: arrays.pop(name) for name in boundary.arrays()})
-    row_features, scene = arrays.pop("features"), Scene(tuple(prepare.problem.obstacle), arrays.pop("poses"))
+    row_features, scene = (
+        arrays.pop("features"),
+        Scene(tuple(prepare.problem.obstacle), arrays.pop("poses")),
+    )
     obstacles = Scene(prepare.placed, arrays.pop("placed")) if placed else None
-    return Rows(features=row_features, tasks=Tasks(ends, scene=scene, placed=obstacles, **arrays)), definition
+    return Rows(
+        features=row_features,
+        tasks=Tasks(ends, scene=scene, placed=obstacles, **arrays),
+    ), definition
 
 
 def _arrays(tasks: Tasks, features: Features, dtype: str) -> dict[str, Array]:
     """Return all arrays of a block of rows with one entry per task, by name."""
     arrays = tasks.boundary.arrays()
-    parts = {name: values for name, values in vars(tasks).items() if isinstance(values, np.ndarray)}
+    parts = {
+        name: values
+        for name, values in vars(tasks).items()
+        if isinstance(values, np.ndarray)
+    }
     parts.pop("observation", None)  # it is part of the features
     parts |= {} if tasks.placed is None else {"placed": tasks.placed.poses}
-    return arrays | parts | {"features": features.of(tasks, dtype), "poses": tasks.scene.poses}
+    return (
+        arrays
+        | parts
+        | {"features": features.of(tasks, dtype), "poses": tasks.scene.poses}
+    )
 
 
 def zero_conditions(boundary: Boundary) -> tuple[str, ...]:
     """Return the names of the boundary conditions that are zero in all rows."""
-    return tuple(name for name, values in boundary.conditions().items() if name.endswith("dq") and not np.any(values))
+    return tuple(
+        name
+        for name, values in boundary.conditions().items()
+        if name.endswith("dq") and not np.any(values)
+    )
 
 
 class StepRows:
-    """Batches of shuffled rows; every epoch has another order, and rows that do not fill a batch are omitted."""
+    """Batches of shuffled rows.
+
+    Every epoch has another order, and rows that do not fill a batch are omitted.
+    """
 
     def __init__(self, rows: int, batch_size: int, seed: int) -> None:
         self.batch_size = min(batch_size, rows)
@@ -114,5 +150,8 @@ class StepRows:
         """Return the rows of the batch of one step, shape (batch_size,)."""
         epoch, index = divmod(step, self.batches)
         if epoch != self._epoch:
-            self._epoch, self._order = epoch, Order("train", (self._rows,), self._seed, epoch).rows_of(0)
+            self._epoch, self._order = (
+                epoch,
+                Order("train", (self._rows,), self._seed, epoch).rows_of(0),
+            )
         return self._order[index * self.batch_size : (index + 1) * self.batch_size]

@@ -23,17 +23,20 @@ Array = NDArray[Any]
 Watcher = Callable[[Mapping[str, Any]], None]
 
 LOG_LINES = 100  # per run
-SHIFT_STRIDE = 7  # between the shifts of successive steps; coprime to the number of shifts
+SHIFT_STRIDE = (
+    7  # between the shifts of successive steps; coprime to the number of shifts
+)
 
 
 @dataclass
 class Run:
     """One run.
 
-    ``budgets`` maps a term of the loss to its acceptable value, from the problem file. ``metric`` has the weights of
-    the constraint terms. ``model`` makes a model of parameters. ``validate`` scores it: a record for the log with a
-    ``score``, the larger the better. Without ``initial_parameters``, they are random. ``order`` is the order of the
-    rows.
+    ``budgets`` maps a term of the loss to its acceptable value, from the problem file.
+    ``metric`` has the weights of the constraint terms. ``model`` makes a model of
+    parameters. ``validate`` scores it: a record for the log with a ``score``, the
+    larger the better. Without ``initial_parameters``, they are random. ``order`` is the
+    order of the rows.
     """
 
     learner: Learner
@@ -49,7 +52,13 @@ class Run:
         settings = self.learner.settings
         self.order = StepRows(len(self.rows), settings.batch_size, settings.seed)
 
-    def train(self, state: State, checkpoints: Checkpoints, log: TrainingLog, watch: Watcher | None = None) -> None:
+    def train(
+        self,
+        state: State,
+        checkpoints: Checkpoints,
+        log: TrainingLog,
+        watch: Watcher | None = None,
+    ) -> None:
         """Train until the last step; the state is changed in place, and ``watch`` is called with every line of the log.
 
         Raise MachineError if the loss is not finite any more, or the disk is full.
@@ -65,7 +74,9 @@ class Run:
                 if waiting.came:
                     checkpoints.save(state)
 
-    def _train_step(self, state: State, gradient: Array, log: TrainingLog, watch: Watcher | None) -> None:
+    def _train_step(
+        self, state: State, gradient: Array, log: TrainingLog, watch: Watcher | None
+    ) -> None:
         """Take a step, and write the records that are due after it."""
         started = time.process_time()
         self.step(state, gradient)
@@ -80,11 +91,15 @@ class Run:
         adam, step = state.adam, state.adam.step
         rows = self.rows.take(self.order.batch(step))
         if step < state.imitating:
-            distances = self.learner.imitation_gradient(adam.parameters, rows, clipping=state.clipping, out=gradient)
+            distances = self.learner.imitation_gradient(
+                adam.parameters, rows, clipping=state.clipping, out=gradient
+            )
             state.sums.add_distances(distances)
         else:
             self._gradient(state, rows, gradient)
-        self.learner.update(adam, state.clipping, gradient, rate=self._rate(state, step))
+        self.learner.update(
+            adam, state.clipping, gradient, rate=self._rate(state, step)
+        )
 
     def _gradient(self, state: State, rows: Rows, gradient: Array) -> None:
         """Write the gradient of the loss, and pass the terms of the batch to the metric."""
@@ -93,7 +108,9 @@ class Run:
             state.adam.parameters,
             rows,
             self.metric.weights(progress),
-            shift=rotating_shift(state.adam.step * SHIFT_STRIDE, self.learner.settings.shifts),
+            shift=rotating_shift(
+                state.adam.step * SHIFT_STRIDE, self.learner.settings.shifts
+            ),
             clipping=state.clipping,
             out=gradient,
         )
@@ -106,7 +123,11 @@ class Run:
     def _rate(self, state: State, step: int) -> float:
         settings = self.learner.settings
         return learning_rate(
-            step, state.steps, peak=settings.learning_rate, final=settings.final_rate, warm_up=settings.warm_up
+            step,
+            state.steps,
+            peak=settings.learning_rate,
+            final=settings.final_rate,
+            warm_up=settings.warm_up,
         )
 
     def _due(self, state: State) -> list[dict[str, Any]]:
@@ -138,7 +159,10 @@ class Run:
         }
 
     def _means(self, state: State, sums: Sums) -> dict[str, Any]:
-        means, weights = sums.terms / sums.steps, self.metric.weights(state.progress(state.adam.step - 1))
+        means, weights = (
+            sums.terms / sums.steps,
+            self.metric.weights(state.progress(state.adam.step - 1)),
+        )
         return {
             "loss": float(means[0] + means[1:] @ weights),
             "terms": dict(zip(self.names, means.tolist(), strict=True)),
@@ -153,7 +177,11 @@ class Run:
         if self.learner.settings.keep == "last" or record["score"] >= state.best.score:
             state.best = Best(record["score"], step, state.adam.average.copy())
         state.checking += time.process_time() - started
-        return {"step": step, "seconds": round(state.seconds, 2), "validation": dict(record)}
+        return {
+            "step": step,
+            "seconds": round(state.seconds, 2),
+            "validation": dict(record),
+        }
 
 
 def _is_due(step: int, steps: int, times: int) -> bool:

@@ -1,11 +1,13 @@
 """Fit of a motion to a time-sampled trajectory, so that plans of any planner can be evaluated and refined.
 
-A trajectory q(t) corresponds to many motions: any r(s) > 0 is possible, with the path p(s) = q(t(s)). They differ in
-how well a spline of few control points fits that path. Phase proportional to time is exact for polynomials, but spends
-control points where the robot rests. Phase proportional to arc length does the opposite, and is impossible at rest,
-where r would be zero. Therefore a few mixtures of both are tried. The best one is improved by least squares over log r,
-with the path eliminated (variable projection, Golub and Pereyra 1973). The path is fitted at the phases that r assigns
-to the samples, so that no r causes a drift in time.
+A trajectory q(t) corresponds to many motions: any r(s) > 0 is possible, with the path
+p(s) = q(t(s)). They differ in how well a spline of few control points fits that path.
+Phase proportional to time is exact for polynomials, but spends control points where the
+robot rests. Phase proportional to arc length does the opposite, and is impossible at
+rest, where r would be zero. Therefore a few mixtures of both are tried. The best one is
+improved by least squares over log r, with the path eliminated (variable projection,
+Golub and Pereyra 1973). The path is fitted at the phases that r assigns to the samples,
+so that no r causes a drift in time.
 """
 
 from __future__ import annotations
@@ -32,33 +34,45 @@ ARC_LENGTH_FRACTIONS = (0.0, 0.3, 0.6, 0.9)  # of the arc length in the phase
 MIN_FIT_ERROR_RAD = 1e-6  # smaller errors count as equal, and the simplest r is chosen
 MAX_RATE_FIT_SAMPLES = 2000  # in the optimization of r
 MAX_LOG_RATE_CHANGE = 4.0  # in the optimization of r
-PATH_SMOOTHNESS, RATE_SMOOTHNESS = 1e-8, 3e-5  # weights of p''' and of second differences of log r; positions: rad
+PATH_SMOOTHNESS, RATE_SMOOTHNESS = (
+    1e-8,
+    3e-5,
+)  # weights of p''' and of second differences of log r; positions: rad
 
 
 @checked_arguments
 def fit_motion(
-    t: ArrayLike, q: ArrayLike, dq: ArrayLike | None = None, *, spec: TrajectorySpec, boundary: Boundary | None = None
+    t: ArrayLike,
+    q: ArrayLike,
+    dq: ArrayLike | None = None,
+    *,
+    spec: TrajectorySpec,
+    boundary: Boundary | None = None,
 ) -> Motion:
     """Fit a motion to samples of one trajectory; ``largest_error`` returns the error of the fit.
 
-    Args:
-        t: Times of the samples [s], shape (K,), increasing; the motion starts at the first one.
-        q: Joint positions [rad], shape (K, n).
-        dq: Joint velocities [rad/s], shape (K, n): with them, samples are connected by cubics.
-        spec: Degree and numbers of control points.
-        boundary: Boundary conditions of the motion, met exactly; ``sampled_boundary`` by default.
+    Args: t: Times of the samples [s], shape (K,), increasing; the motion starts at the
+        first one. q: Joint positions [rad], shape (K, n). dq: Joint velocities [rad/s],
+        shape (K, n): with them, samples are connected by cubics. spec: Degree and
+        numbers of control points. boundary: Boundary conditions of the motion, met
+        exactly; ``sampled_boundary`` by default.
 
     Returns:
         One motion of duration ``t[-1] - t[0]``.
 
-    Raises:
-        UsageError: A shape is wrong, the times do not increase, or a value is not finite.
+    Raises: UsageError: A shape is wrong, the times do not increase, or a value is not
+        finite.
     """
     times, positions, velocities = checked_samples(t, q, dq)
     if boundary is None:
         boundary = sampled_boundary(times, positions, velocities)
     boundary = _checked_boundary(boundary, positions.shape[1])
-    fit = _Fit(*resampled(times - times[0], positions, velocities), times[-1] - times[0], spec, boundary)
+    fit = _Fit(
+        *resampled(times - times[0], positions, velocities),
+        times[-1] - times[0],
+        spec,
+        boundary,
+    )
     rates = [fit.mixed_rate(mixture) for mixture in ARC_LENGTH_FRACTIONS]
     errors = [fit.error(rate) for rate in rates]
     rate = rates[int(np.argmin(np.maximum(errors, MIN_FIT_ERROR_RAD)))]
@@ -79,17 +93,29 @@ def largest_error(motion: Motion, t: ArrayLike, q: ArrayLike) -> float:
         q: Joint positions [rad], shape (K, n).
     """
     times, positions, _ = checked_samples(t, q, None)
-    return float(np.abs(motion.at(motion.phase_at(times[None] - times[0])).q[0] - positions).max())
+    return float(
+        np.abs(
+            motion.at(motion.phase_at(times[None] - times[0])).q[0] - positions
+        ).max()
+    )
 
 
 def _checked_boundary(boundary: Boundary, n: int) -> Boundary:
     """Return the boundary conditions of one motion as arrays; check their shapes."""
-    arrays = {name: numbers("boundary", row) for name, row in boundary.conditions().items()}
+    arrays = {
+        name: numbers("boundary", row) for name, row in boundary.conditions().items()
+    }
     for name, row in arrays.items():
         if row.shape != (1, n):
-            raise UsageError(f"the boundary's {name} must have shape (1, {n}), got {row.shape}", concerns="boundary")
+            raise UsageError(
+                f"the boundary's {name} must have shape (1, {n}), got {row.shape}",
+                concerns="boundary",
+            )
         if not np.isfinite(row).all():
-            raise UsageError(f"the boundary's {name} must be finite, got {row[0]}", concerns="boundary")
+            raise UsageError(
+                f"the boundary's {name} must be finite, got {row[0]}",
+                concerns="boundary",
+            )
     return Boundary(**arrays)
 
 
@@ -105,7 +131,10 @@ class _Path:
 
 @dataclass(frozen=True)
 class _Fit:
-    """The fitting problem: K samples of a trajectory from t = 0. Rates are control points of shape (N, R)."""
+    """The fitting problem: K samples of a trajectory from t = 0.
+
+    Rates are control points of shape (N, R).
+    """
 
     t: Array
     q: Array
@@ -121,13 +150,18 @@ class _Fit:
     def mixed_rate(self, mixture: float) -> Array:
         """Choose r so that the phase is a mixture of arc length and time, shape (1, R).
 
-        Every control point is the mean of ds/dt around its Greville abscissa, so all are positive.
+        Every control point is the mean of ds/dt around its Greville abscissa, so all
+        are positive.
         """
         time = self.t / self.duration
-        length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(self.q, axis=0), axis=1)))
+        length = np.append(
+            0.0, np.cumsum(np.linalg.norm(np.diff(self.q, axis=0), axis=1))
+        )
         s = time + mixture * (length / length[-1] - time) if length[-1] > 0 else time
         points, degree = self.spec.rate_control_points, self.spec.degree
-        greville = sliding_window_view(clamped_knots(points, degree)[1:-1], degree).mean(axis=1)
+        greville = sliding_window_view(
+            clamped_knots(points, degree)[1:-1], degree
+        ).mean(axis=1)
         half = 0.5 / (points - degree)
         low, high = np.clip(greville - half, 0, 1), np.clip(greville + half, 0, 1)
         passed = np.interp(high, s, self.t) - np.interp(low, s, self.t)
@@ -139,7 +173,9 @@ class _Fit:
 
         first = np.log(rate[0])
         bounds = first - MAX_LOG_RATE_CHANGE, first + MAX_LOG_RATE_CHANGE
-        solution = least_squares(self._residual, first, self._jacobian, bounds, ftol=1e-4, max_nfev=40)
+        solution = least_squares(
+            self._residual, first, self._jacobian, bounds, ftol=1e-4, max_nfev=40
+        )
         return self._timed(np.exp(solution.x)[None])
 
     def error(self, rate: Array) -> float:
@@ -150,11 +186,15 @@ class _Fit:
         """Fit the path for a rate of shape (1, R)."""
         points, degree = self.spec.path_control_points, self.spec.degree
         s = self._motion(rate).phase_at(self.t[None])[0]
-        smoothing = PATH_SMOOTHNESS * np.sqrt(len(s)) * _third_derivative(points, degree)
+        smoothing = (
+            PATH_SMOOTHNESS * np.sqrt(len(s)) * _third_derivative(points, degree)
+        )
         rows = np.concatenate([basis(s, points, degree), smoothing])
         target = np.concatenate([self.q, np.zeros((len(smoothing), self.q.shape[1]))])
         control = self._fixed(rate)[0]
-        control[self.free] = np.linalg.lstsq(rows[:, self.free], target - rows @ control, rcond=None)[0]
+        control[self.free] = np.linalg.lstsq(
+            rows[:, self.free], target - rows @ control, rcond=None
+        )[0]
         return _Path(s, rows, control, rows @ control - target)
 
     def _timed(self, rates: Array) -> Array:
@@ -162,17 +202,28 @@ class _Fit:
         return scaled_to_duration(rates, self.duration, self.spec)
 
     def _motion(self, rates: Array) -> Motion:
-        return Motion(np.zeros((len(rates), self.spec.path_control_points, 1)), rates, self.spec.degree)
+        return Motion(
+            np.zeros((len(rates), self.spec.path_control_points, 1)),
+            rates,
+            self.spec.degree,
+        )
 
     def _fixed(self, rates: Array) -> Array:
         """Compute the boundary control points, with interior ones of zero, shape (N, C, n)."""
         interior = np.zeros((len(rates), self.free.stop - 3, self.q.shape[1]))
-        return assemble(self.boundary[np.zeros(len(rates), int)], interior, rates, self.spec)
+        return assemble(
+            self.boundary[np.zeros(len(rates), int)], interior, rates, self.spec
+        )
 
     def _residual(self, log_rate: Array) -> Array:
         """Compute the residuals of the best path, followed by those of the smoothness of r."""
         residual = self.path(self._timed(np.exp(log_rate)[None])).residual
-        return np.concatenate([residual.ravel(), _second_difference(len(self.t), len(log_rate)) @ log_rate])
+        return np.concatenate(
+            [
+                residual.ravel(),
+                _second_difference(len(self.t), len(log_rate)) @ log_rate,
+            ]
+        )
 
     def _jacobian(self, log_rate: Array) -> Array:
         """Differentiate the residuals without the derivative of the projection (Kaufman 1975)."""
@@ -181,13 +232,25 @@ class _Fit:
         others = self._timed(rate * np.exp(step * np.eye(len(log_rate))))
         path = self.path(rate)
         speed = self._motion(rate).at(path.s).rate[0]
-        shift = (self.t - self._motion(others).time_at(path.s)) * speed / step  # of s at equal times, shape (R, K)
-        dp = basis(path.s, self.spec.path_control_points, self.spec.degree, 1) @ path.control
-        changes = np.einsum("kc,rcn->knr", path.rows, (self._fixed(others) - self._fixed(rate)) / step)
+        shift = (
+            (self.t - self._motion(others).time_at(path.s)) * speed / step
+        )  # of s at equal times, shape (R, K)
+        dp = (
+            basis(path.s, self.spec.path_control_points, self.spec.degree, 1)
+            @ path.control
+        )
+        changes = np.einsum(
+            "kc,rcn->knr", path.rows, (self._fixed(others) - self._fixed(rate)) / step
+        )
         changes[: len(self.t)] += dp[:, :, None] * shift.T[:, None]
         onto, _ = np.linalg.qr(path.rows[:, self.free])
         changes -= np.tensordot(onto, np.tensordot(onto, changes, (0, 0)), 1)
-        return np.concatenate([changes.reshape(-1, len(log_rate)), _second_difference(len(self.t), len(log_rate))])
+        return np.concatenate(
+            [
+                changes.reshape(-1, len(log_rate)),
+                _second_difference(len(self.t), len(log_rate)),
+            ]
+        )
 
 
 @cache
@@ -200,4 +263,6 @@ def _third_derivative(points: int, degree: int) -> Array:
 @cache
 def _second_difference(samples: int, points: int) -> Array:
     """Return rows that penalize second differences of log r, where r and p are not determined separately."""
-    return np.asarray(np.diff(np.eye(points), 2, axis=0) * (RATE_SMOOTHNESS * np.sqrt(samples)))
+    return np.asarray(
+        np.diff(np.eye(points), 2, axis=0) * (RATE_SMOOTHNESS * np.sqrt(samples))
+    )

@@ -1,8 +1,9 @@
 """Remaining trajectories of motions after a time, as motions of their own, with refined knots if necessary.
 
-The remainder of a spline is a spline, but its knots are not uniform, as those of a motion must be. It is therefore
-fitted by least squares, with exact ends and the same duration. If few knots remain, the fit is exact to rounding; if
-many remain, each span is divided into two or three.
+The remainder of a spline is a spline, but its knots are not uniform, as those of a
+motion must be. It is therefore fitted by least squares, with exact ends and the same
+duration. If few knots remain, the fit is exact to rounding; if many remain, each span
+is divided into two or three.
 """
 
 from functools import cache
@@ -17,19 +18,29 @@ from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Array = NDArray[np.float64]
 
-MAX_ACCELERATION_ERROR = 1e-3  # relative to the limits; smaller than the tolerances of problems
-MAX_SPAN_DIVISIONS = 3  # then accelerations of motions at their limits differ by at most 0.5 %
+MAX_ACCELERATION_ERROR = (
+    1e-3  # relative to the limits; smaller than the tolerances of problems
+)
+MAX_SPAN_DIVISIONS = (
+    3  # then accelerations of motions at their limits differ by at most 0.5 %
+)
 COMPARISON_SAMPLES = 64  # times at which accelerations are compared
 
 
 def remaining_trajectory(
-    motion: Motion, t: Array, boundary: Boundary, *, spec: TrajectorySpec, acceleration_limit: Array
+    motion: Motion,
+    t: Array,
+    boundary: Boundary,
+    *,
+    spec: TrajectorySpec,
+    acceleration_limit: Array,
 ) -> Motion:
     """Fit a motion to the remaining trajectory of each of N motions after a time [s], shape (N,), before their end.
 
-    Boundary conditions are the states at these times and the goals. Acceleration limits [rad/s^2] have shape (n,). Ends
-    and durations are exact. Each span of ``spec`` is divided into two or three if accelerations would otherwise differ
-    by more than 0.1 % of the limits.
+    Boundary conditions are the states at these times and the goals. Acceleration limits
+    [rad/s^2] have shape (n,). Ends and durations are exact. Each span of ``spec`` is
+    divided into two or three if accelerations would otherwise differ by more than 0.1 %
+    of the limits.
     """
     duration = motion.duration() - t
     times = duration[:, None] * np.linspace(0, 1, COMPARISON_SAMPLES)
@@ -45,9 +56,12 @@ def remaining_trajectory(
 def finer(spec: TrajectorySpec, spans: int) -> TrajectorySpec:
     """Return a spec whose spans are each divided into ``spans``."""
     path, rate = (
-        spans * (points - spec.degree) + spec.degree for points in (spec.path_control_points, spec.rate_control_points)
+        spans * (points - spec.degree) + spec.degree
+        for points in (spec.path_control_points, spec.rate_control_points)
     )
-    return TrajectorySpec(degree=spec.degree, path_control_points=path, rate_control_points=rate)
+    return TrajectorySpec(
+        degree=spec.degree, path_control_points=path, rate_control_points=rate
+    )
 
 
 def is_finer(spec: TrajectorySpec, than: TrajectorySpec) -> bool:
@@ -55,24 +69,40 @@ def is_finer(spec: TrajectorySpec, than: TrajectorySpec) -> bool:
     return spec in {finer(than, spans) for spans in range(2, MAX_SPAN_DIVISIONS + 1)}
 
 
-def with_fewer_knots(motion: Motion, boundary: Boundary, spec: TrajectorySpec) -> Motion:
+def with_fewer_knots(
+    motion: Motion, boundary: Boundary, spec: TrajectorySpec
+) -> Motion:
     """Fit motions with the control points of a coarser spec by least squares, with exact ends and durations."""
     duration = motion.duration()
     return _fitted(motion, np.zeros(len(duration)), duration, boundary, spec)
 
 
 def with_finer_knots(motion: Motion, spec: TrajectorySpec) -> Motion:
-    """Represent motions with the control points of a finer spec; the motions do not change."""
+    """Represent motions with the control points of a finer spec.
+
+    The motions do not change.
+    """
     if motion.spec == spec:
         return motion
-    path = _refinement(motion.path.shape[1], spec.path_control_points, spec.degree) @ motion.path
-    rate = motion.rate @ _refinement(motion.rate.shape[1], spec.rate_control_points, spec.degree).T
+    path = (
+        _refinement(motion.path.shape[1], spec.path_control_points, spec.degree)
+        @ motion.path
+    )
+    rate = (
+        motion.rate
+        @ _refinement(motion.rate.shape[1], spec.rate_control_points, spec.degree).T
+    )
     return Motion(path, rate, motion.degree)
 
 
-def _fitted(motion: Motion, t: Array, duration: Array, boundary: Boundary, spec: TrajectorySpec) -> Motion:
+def _fitted(
+    motion: Motion, t: Array, duration: Array, boundary: Boundary, spec: TrajectorySpec
+) -> Motion:
     """Fit rate and path to a motion after times t at equal phases, and scale the rate to the duration."""
-    n, free = motion.path.shape[2], slice(3, spec.path_control_points - boundary.fixed_at_goal)
+    n, free = (
+        motion.path.shape[2],
+        slice(3, spec.path_control_points - boundary.fixed_at_goal),
+    )
     phases, rate_fit, path_basis, path_fit = _fits(spec, free.stop)
     first = motion.phase_at(t[:, None])
     states = motion.at(first + (1 - first) * phases)
@@ -86,13 +116,23 @@ def _fitted(motion: Motion, t: Array, duration: Array, boundary: Boundary, spec:
 def _fits(spec: TrajectorySpec, end: int) -> tuple[Array, Array, Array, Array]:
     """Return phases, the pseudoinverse of the rate's basis, the path's basis, and that of its columns 3 to ``end``."""
     phases = chebyshev(4 * max(spec.path_control_points, spec.rate_control_points))
-    rate, path = (basis(phases, points, spec.degree) for points in (spec.rate_control_points, spec.path_control_points))
-    return phases, np.asarray(np.linalg.pinv(rate)), path, np.asarray(np.linalg.pinv(path[:, 3:end]))
+    rate, path = (
+        basis(phases, points, spec.degree)
+        for points in (spec.rate_control_points, spec.path_control_points)
+    )
+    return (
+        phases,
+        np.asarray(np.linalg.pinv(rate)),
+        path,
+        np.asarray(np.linalg.pinv(path[:, 3:end])),
+    )
 
 
 @cache
 def _refinement(points: int, more: int, degree: int) -> Array:
     """Return the knot refinement matrix of splines with uniform knots, shape (more, points)."""
     phases = chebyshev(4 * more)
-    matrix: Array = np.linalg.pinv(basis(phases, more, degree)) @ basis(phases, points, degree)
+    matrix: Array = np.linalg.pinv(basis(phases, more, degree)) @ basis(
+        phases, points, degree
+    )
     return matrix

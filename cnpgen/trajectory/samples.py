@@ -10,37 +10,71 @@ from cnpgen.trajectory.boundary import Boundary
 Array = NDArray[np.float64]
 
 MAX_SAMPLE = 1e9  # of times, positions and velocities in SI units; powers of larger ones overflow
-MIN_DENSE_SAMPLES = 400  # fewer samples are resampled from the cubic through positions and velocities
-WINDOWS = (5, 8, 12, 18, 27, 40, 60, 90, 135, 200)  # samples at each end for estimating velocity and acceleration
+MIN_DENSE_SAMPLES = (
+    400  # fewer samples are resampled from the cubic through positions and velocities
+)
+WINDOWS = (
+    5,
+    8,
+    12,
+    18,
+    27,
+    40,
+    60,
+    90,
+    135,
+    200,
+)  # samples at each end for estimating velocity and acceleration
 MAX_REST_SPEED_RATIO = 2e-3  # of the mean speed: smaller velocities are 0; accelerations: ten times, per duration
 
 
-def checked_samples(t: ArrayLike, q: ArrayLike, dq: ArrayLike | None) -> tuple[Array, Array, Array | None]:
+def checked_samples(
+    t: ArrayLike, q: ArrayLike, dq: ArrayLike | None
+) -> tuple[Array, Array, Array | None]:
     """Return times (K,) [s], positions and velocities (K, n) of one trajectory as arrays of float64.
 
-    Raises:
-        UsageError: A shape is wrong, the times do not increase, or a value is not finite.
+    Raises: UsageError: A shape is wrong, the times do not increase, or a value is not
+        finite.
     """
     times, positions = numbers("t", t), numbers("q", q)
     velocities = None if dq is None else numbers("dq", dq)
-    if times.ndim != 1 or positions.ndim != 2 or len(positions) != len(times) or not positions.shape[1]:
+    if (
+        times.ndim != 1
+        or positions.ndim != 2
+        or len(positions) != len(times)
+        or not positions.shape[1]
+    ):
         raise UsageError(
-            f"must have shape (K,) and q shape (K, n), got {times.shape} and {positions.shape}", argument="t"
+            f"must have shape (K,) and q shape (K, n), got {times.shape} and {positions.shape}",
+            argument="t",
         )
     if velocities is not None and velocities.shape != positions.shape:
-        raise UsageError(f"must have the shape of q, {positions.shape}, got {velocities.shape}", argument="dq")
+        raise UsageError(
+            f"must have the shape of q, {positions.shape}, got {velocities.shape}",
+            argument="dq",
+        )
     if len(times) < 2:
-        raise UsageError(f"a trajectory needs at least 2 samples, got {len(times)}", concerns="t")
+        raise UsageError(
+            f"a trajectory needs at least 2 samples, got {len(times)}", concerns="t"
+        )
     for name, values in (("t", times), ("q", positions), ("dq", velocities)):
         if values is not None and not np.isfinite(values).all():
-            index = int(np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1)))
-            raise UsageError(f"must be finite, got {values[index]} in sample {index}", argument=name)
+            index = int(
+                np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1))
+            )
+            raise UsageError(
+                f"must be finite, got {values[index]} in sample {index}", argument=name
+            )
         if values is not None and np.abs(values).max() > MAX_SAMPLE:
-            raise UsageError(f"must be at most {MAX_SAMPLE:g}, got {np.abs(values).max():g}", argument=name)
+            raise UsageError(
+                f"must be at most {MAX_SAMPLE:g}, got {np.abs(values).max():g}",
+                argument=name,
+            )
     if np.any(np.diff(times) <= 0):
         index = int(np.argmin(np.diff(times) > 0))
         raise UsageError(
-            f"must increase, got {times[index]} s in sample {index}, then {times[index + 1]} s", argument="t"
+            f"must increase, got {times[index]} s in sample {index}, then {times[index + 1]} s",
+            argument="t",
         )
     return times, positions, velocities
 
@@ -56,11 +90,14 @@ def resampled(t: Array, q: Array, dq: Array | None) -> tuple[Array, Array]:
     return finer, CubicHermiteSpline(t, q, dq)(finer)
 
 
-def sampled_boundary(t: ArrayLike, q: ArrayLike, dq: ArrayLike | None = None) -> Boundary:
+def sampled_boundary(
+    t: ArrayLike, q: ArrayLike, dq: ArrayLike | None = None
+) -> Boundary:
     """Estimate the boundary conditions of one trajectory from its samples.
 
-    Positions, and velocities if they are passed, are those of the first and the last sample. Other derivatives are
-    those of cubics through the samples next to the ends; negligible values are set to zero.
+    Positions, and velocities if they are passed, are those of the first and the last
+    sample. Other derivatives are those of cubics through the samples next to the ends;
+    negligible values are set to zero.
 
     Args:
         t: Times [s], shape (K,).
@@ -70,15 +107,19 @@ def sampled_boundary(t: ArrayLike, q: ArrayLike, dq: ArrayLike | None = None) ->
     Returns:
         Boundary conditions of one motion with a free goal acceleration.
 
-    Raises:
-        UsageError: A shape is wrong, the times do not increase, or a value is not finite.
+    Raises: UsageError: A shape is wrong, the times do not increase, or a value is not
+        finite.
     """
     times, positions, velocities = checked_samples(t, q, dq)
     times, path = resampled(times - times[0], positions, velocities)
-    first, last = (None, None) if velocities is None else (velocities[0], -velocities[-1])
+    first, last = (
+        (None, None) if velocities is None else (velocities[0], -velocities[-1])
+    )
     start_dq, start_ddq = _derivatives(times, path, first)
     goal_dq, _ = _derivatives(times[-1] - times[::-1], path[::-1], last)
-    return Boundary(*(part[None] for part in (path[0], start_dq, start_ddq, path[-1], -goal_dq)))
+    return Boundary(
+        *(part[None] for part in (path[0], start_dq, start_ddq, path[-1], -goal_dq))
+    )
 
 
 def _derivatives(t: Array, q: Array, velocity: Array | None) -> tuple[Array, Array]:
@@ -92,16 +133,20 @@ def _derivatives(t: Array, q: Array, velocity: Array | None) -> tuple[Array, Arr
         return velocity, np.zeros_like(velocity)
     travel, first = travel - velocity * t[1:, None], 2
     acceleration = 2 * _cubic(t[1:], travel, first)
-    return velocity, np.where(np.abs(acceleration) < 10 * min_speed / t[-1], 0.0, acceleration)
+    return velocity, np.where(
+        np.abs(acceleration) < 10 * min_speed / t[-1], 0.0, acceleration
+    )
 
 
 def _cubic(t: Array, travel: Array, first: int) -> Array:
     """Fit a cubic without powers below t^first to the first samples; return its coefficient of t^first, shape (n,).
 
-    A wide window averages noise, a narrow one follows the motion: the window with the smallest estimated standard error
-    is chosen.
+    A wide window averages noise, a narrow one follows the motion: the window with the
+    smallest estimated standard error is chosen.
     """
-    widths = [min(width, len(t)) for width in WINDOWS if width <= max(len(t) // 5, WINDOWS[0])]
+    widths = [
+        min(width, len(t)) for width in WINDOWS if width <= max(len(t) // 5, WINDOWS[0])
+    ]
     best = np.inf, np.zeros(travel.shape[1])
     for width in widths:
         powers = (t[:width, None] / t[width - 1]) ** np.arange(first, min(width, 3) + 1)

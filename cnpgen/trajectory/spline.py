@@ -1,8 +1,9 @@
 """Clamped uniform B-splines: knots, basis functions, derivatives, extrema, and quadrature cells.
 
-All production code evaluates splines by this module: by a matrix of basis functions at common phases (``basis``), which
-kernels and compiled code multiply with control points, by Horner's rule at the phases of each spline (``horner``), or
-at one phase of each of N splines (``derivatives_of_each``). The judges have their own splines.
+All production code evaluates splines by this module: by a matrix of basis functions at
+common phases (``basis``), which kernels and compiled code multiply with control points,
+by Horner's rule at the phases of each spline (``horner``), or at one phase of each of N
+splines (``derivatives_of_each``). The judges have their own splines.
 """
 
 from dataclasses import dataclass
@@ -14,7 +15,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-MAX_UNSCALED = 1e150  # larger control points are scaled, because products of them would overflow
+MAX_UNSCALED = (
+    1e150  # larger control points are scaled, because products of them would overflow
+)
 ORDERS = 3  # of ``derivatives_of_each``: value, first and second derivative
 
 
@@ -27,12 +30,15 @@ def clamped_knots(points: int, degree: int) -> Array:
 def basis(s: Array, points: int, degree: int, order: int = 0) -> Array:
     """Evaluate every basis function at phases s, or a derivative of some order, by the Cox-de Boor recursion.
 
-    Phases in [0, 1] have shape (K,), the result (K, C): ``basis(s, C, D, order) @ control_points`` is the derivative of
-    the spline.
+    Phases in [0, 1] have shape (K,), the result (K, C): ``basis(s, C, D, order) @
+    control_points`` is the derivative of the spline.
     """
     knots, matrix = derivative(points, degree, order)
     degree -= order
-    first = np.clip(np.searchsorted(knots, s, side="right") - 1, degree, len(matrix) - 1) - degree
+    first = (
+        np.clip(np.searchsorted(knots, s, side="right") - 1, degree, len(matrix) - 1)
+        - degree
+    )
     values = np.zeros((len(s), points))
     for k, weight in enumerate(_cox_de_boor(s, knots, degree, first)):
         values += weight[:, None] * matrix[first + k]
@@ -42,11 +48,16 @@ def basis(s: Array, points: int, degree: int, order: int = 0) -> Array:
 def derivative(points: int, degree: int, order: int) -> tuple[Array, Array]:
     """Return the knots of a derivative of a spline, and the matrix from its control points to those of the derivative.
 
-    The shapes are (C + D + 1 - 2 order,) and (C - order, C); the derivative's degree is D - order.
+    The shapes are (C + D + 1 - 2 order,) and (C - order, C); the derivative's degree is
+    D - order.
     """
     knots, matrix = clamped_knots(points, degree), np.eye(points)
     for p in range(degree, degree - order, -1):
-        matrix = np.diff(matrix, axis=0) * p / (knots[p + 1 : -1] - knots[1 : -p - 1])[:, None]
+        matrix = (
+            np.diff(matrix, axis=0)
+            * p
+            / (knots[p + 1 : -1] - knots[1 : -p - 1])[:, None]
+        )
         knots = knots[1:-1]
     return knots, matrix
 
@@ -70,12 +81,14 @@ def _cox_de_boor(s: Array, knots: Array, degree: int, first: NDArray[np.intp]) -
 def power_coefficients(control: Array, degree: int) -> Array:
     """Convert N splines to the power basis of each span, for ``select_spans`` and ``horner``.
 
-    Control points have shape (N, C) or (N, C, n), the coefficients of the powers of (s - left knot), highest first,
-    shape (D + 1, spans, N, ...).
+    Control points have shape (N, C) or (N, C, n), the coefficients of the powers of (s
+    - left knot), highest first, shape (D + 1, spans, N, ...).
     """
     matrices = taylor_coefficients(control.shape[1], degree)[::-1]
     columns = control.reshape(*control.shape[:2], prod(control.shape[2:]))
-    powers = np.ascontiguousarray((matrices[:, None] @ columns).swapaxes(1, 2))  # motion by motion
+    powers = np.ascontiguousarray(
+        (matrices[:, None] @ columns).swapaxes(1, 2)
+    )  # motion by motion
     return powers.reshape(*matrices.shape[:2], len(control), *control.shape[2:])
 
 
@@ -86,13 +99,19 @@ def taylor_coefficients(points: int, degree: int) -> Array:
     Entry k times the control points gives the coefficients of (s - left knot)^k.
     """
     left = np.arange(points - degree) / (points - degree)
-    return np.stack([basis(left, points, degree, order) / factorial(order) for order in range(degree + 1)])
+    return np.stack(
+        [
+            basis(left, points, degree, order) / factorial(order)
+            for order in range(degree + 1)
+        ]
+    )
 
 
 def select_spans(coefficients: Array, s: Array) -> tuple[Array, Array]:
     """Select, for every spline, the coefficients of the spans that contain its phases in [0, 1], shape (N, K).
 
-    The result are the coefficients, shape (D + 1, N, K, ...), and s - left knot, shape (N, K).
+    The result are the coefficients, shape (D + 1, N, K, ...), and s - left knot, shape
+    (N, K).
     """
     spans = coefficients.shape[1]
     span = np.clip(np.nan_to_num(s) * spans, 0, spans - 1).astype(np.intp)
@@ -102,13 +121,18 @@ def select_spans(coefficients: Array, s: Array) -> tuple[Array, Array]:
 def horner(selected: Array, offset: Array, order: int = 0) -> Array:
     """Evaluate the polynomials of ``select_spans``, or a derivative of some order, by Horner's rule.
 
-    Phases minus left knots have shape (N, K), or (M, N, K) for M phases of each polynomial; values the same with (...).
+    Phases minus left knots have shape (N, K), or (M, N, K) for M phases of each
+    polynomial; values the same with (...).
     """
     degree = len(selected) - 1
     offset = offset.reshape(*offset.shape, *(1,) * (selected.ndim - 3))
     value = np.zeros(selected.shape[1:])
     powers = range(degree, order - 1, -1)
-    for coefficients in [perm(power, order) * selected[degree - power] for power in powers] if order else selected:
+    for coefficients in (
+        [perm(power, order) * selected[degree - power] for power in powers]
+        if order
+        else selected
+    ):
         value = value * offset + coefficients
     return value
 
@@ -122,7 +146,9 @@ def derivatives_of_each(control: Array, degree: int, s: Array) -> Array:
     span = np.minimum((s * spans).astype(np.intp), spans - 1)
     factor, exponent = _powers(degree)
     powers = factor * (s - span / spans)[:, None, None] ** exponent  # (N, 3, D + 1)
-    table = taylor_coefficients(control.shape[1], degree)[:, span].swapaxes(0, 1)  # (N, D + 1, C)
+    table = taylor_coefficients(control.shape[1], degree)[:, span].swapaxes(
+        0, 1
+    )  # (N, D + 1, C)
     return np.asarray((powers @ table @ control).swapaxes(0, 1))
 
 
@@ -138,7 +164,9 @@ def extrema(control: Array, degree: int) -> tuple[Array, Array]:
     """Return the ends and the critical points of one spline on [0, 1], shape (C,) and finite, and its values there."""
     from scipy.interpolate import BSpline, PPoly
 
-    scale = 2.0**-600 if np.abs(control).max() > MAX_UNSCALED else 1.0  # a power of two, exact in floating point
+    scale = (
+        2.0**-600 if np.abs(control).max() > MAX_UNSCALED else 1.0
+    )  # a power of two, exact in floating point
     spline = BSpline(clamped_knots(len(control), degree), control * scale, degree)
     roots = PPoly.from_spline(spline.derivative()).roots(extrapolate=False)
     s = np.clip(np.concatenate([[0.0, 1.0], roots[np.isfinite(roots)]]), 0, 1)
@@ -149,8 +177,9 @@ def extrema(control: Array, degree: int) -> tuple[Array, Array]:
 class EndDerivatives:
     """Factors of the derivatives of a clamped uniform B-spline at s = 0 (mirrored at s = 1).
 
-    ``x'(0) = eta (c1 - c0)`` with ``eta = D (C - D)`` (the paper's Appendix A prints the square of C - D) and
-    ``x''(0) = beta (c2 - 3 c1 + 2 c0)`` with ``beta = D (D - 1) / 2 (C - D)^2``; both need C >= D + 2.
+    ``x'(0) = eta (c1 - c0)`` with ``eta = D (C - D)`` (the paper's Appendix A prints
+    the square of C - D) and ``x''(0) = beta (c2 - 3 c1 + 2 c0)`` with ``beta = D (D -
+    1) / 2 (C - D)^2``; both need C >= D + 2.
     """
 
     eta: float  # factor of the first derivative
@@ -173,13 +202,20 @@ def chebyshev(count: int) -> Array:
 def graded_edges(points: int, degree: int) -> Array:
     """Return the edges of quadrature cells on [0, 1] in which 1 / r is smooth enough for eight Gauss nodes.
 
-    There are four cells per span, and cells that halve towards s = 0 and s = 1. There the first basis function is 0.01
-    wide, and 1 / r is nearly singular if the first control point is much smaller than the second. With cells of equal
-    size the duration of such motions is wrong in the third digit. The edges ascend from 0 to 1 and include the knots.
+    There are four cells per span, and cells that halve towards s = 0 and s = 1. There
+    the first basis function is 0.01 wide, and 1 / r is nearly singular if the first
+    control point is much smaller than the second. With cells of equal size the duration
+    of such motions is wrong in the third digit. The edges ascend from 0 to 1 and
+    include the knots.
     """
     spans = points - degree
     end = 0.5 ** np.arange(24, 2, -1)
-    return np.unique(np.concatenate([np.linspace(0, spans, 4 * spans + 1), end, spans - end])) / spans
+    return (
+        np.unique(
+            np.concatenate([np.linspace(0, spans, 4 * spans + 1), end, spans - end])
+        )
+        / spans
+    )
 
 
 def edges_around(s: Array, points: int, degree: int) -> Array:

@@ -28,7 +28,9 @@ from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Array = NDArray[np.float64]
 MAX_BLOCK_VALUES = 16_384  # per temporary array, to fit into the cache
-_NODES, _WEIGHTS = (np.polynomial.legendre.leggauss(8) + np.array([[1.0], [0.0]])) / 2  # on [0, 1]
+_NODES, _WEIGHTS = (
+    np.polynomial.legendre.leggauss(8) + np.array([[1.0], [0.0]])
+) / 2  # on [0, 1]
 _NODES_AND_END = np.append(_NODES, 1.0)[:, None, None]
 
 
@@ -75,16 +77,22 @@ class Motion:
         try:
             path, rate = np.shape(self.path), np.shape(self.rate)
         except ValueError as error:  # rows of different lengths
-            raise UsageError(f"control points must be arrays: {error}", concerns="path") from error
+            raise UsageError(
+                f"control points must be arrays: {error}", concerns="path"
+            ) from error
         if len(path) != 3 or len(rate) != 2 or path[0] != rate[0]:
             raise UsageError(
-                f"control points must have shapes (N, C, n) and (N, R), got {path} and {rate}", concerns="path"
+                f"control points must have shapes (N, C, n) and (N, R), got {path} and {rate}",
+                concerns="path",
             )
         if not isinstance(self.degree, int | np.integer):
-            raise UsageError(f"must be an integer, got {self.degree!r:.100}", argument="degree")
+            raise UsageError(
+                f"must be an integer, got {self.degree!r:.100}", argument="degree"
+            )
         if min(path[1], rate[1]) <= self.degree:
             raise UsageError(
-                f"splines of degree {self.degree} need at least {self.degree + 1} control points", concerns="degree"
+                f"splines of degree {self.degree} need at least {self.degree + 1} control points",
+                concerns="degree",
             )
 
     def __repr__(self) -> str:
@@ -98,14 +106,18 @@ class Motion:
         try:
             return Motion(self.path[index], self.rate[index], self.degree)
         except (IndexError, TypeError, ValueError, UsageError) as error:
-            text = f"motions are selected by a number, numbers, a mask or a slice: {error}"
+            text = (
+                f"motions are selected by a number, numbers, a mask or a slice: {error}"
+            )
             raise MotionIndexError(text, concerns="index") from error
 
     @property
     def spec(self) -> TrajectorySpec:
         """Degree and numbers of control points."""
         return TrajectorySpec(
-            degree=self.degree, path_control_points=self.path.shape[1], rate_control_points=self.rate.shape[1]
+            degree=self.degree,
+            path_control_points=self.path.shape[1],
+            rate_control_points=self.rate.shape[1],
         )
 
     def at(self, s: Array) -> States:
@@ -121,23 +133,43 @@ class Motion:
         blocks = self._blocks(s.shape[1]) if s.ndim == 2 else []
         if len(blocks) > 1:
             parts = [vars(self[block].at(s[block])) for block in blocks]
-            return States(**{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+            return States(
+                **{
+                    name: np.concatenate([part[name] for part in parts])
+                    for name in parts[0]
+                }
+            )
         with np.errstate(over="ignore", invalid="ignore"):  # invalid inputs give nan
             if s.ndim == 1:
-                p = [basis(s, self.path.shape[1], self.degree, i) @ self.path for i in range(4)]
-                r = [(basis(s, self.rate.shape[1], self.degree, i) @ self.rate[..., None])[..., 0] for i in range(3)]
+                p = [
+                    basis(s, self.path.shape[1], self.degree, i) @ self.path
+                    for i in range(4)
+                ]
+                r = [
+                    (
+                        basis(s, self.rate.shape[1], self.degree, i)
+                        @ self.rate[..., None]
+                    )[..., 0]
+                    for i in range(3)
+                ]
             else:
                 path, rate = (
-                    select_spans(power_coefficients(control, self.degree), s) for control in (self.path, self.rate)
+                    select_spans(power_coefficients(control, self.degree), s)
+                    for control in (self.path, self.rate)
                 )
-                p, r = [horner(*path, i) for i in range(4)], [horner(*rate, i) for i in range(3)]
+                p, r = (
+                    [horner(*path, i) for i in range(4)],
+                    [horner(*rate, i) for i in range(3)],
+                )
             q, dq, ddq, jerk = time_derivatives(p, [values[..., None] for values in r])
             return States(q, dq, ddq, jerk, rate=r[0])
 
     def runs_forward(self) -> NDArray[np.bool_]:
         """Return whether r > 0 over the whole motion, not only at samples, shape (N,); False where r is not finite."""
         forward: NDArray[np.bool_] = np.asarray(np.isfinite(self.rate).all(axis=1))
-        unproven = forward & (self.rate <= 0).any(axis=1)  # convex hull property: r lies between its control points
+        unproven = forward & (self.rate <= 0).any(
+            axis=1
+        )  # convex hull property: r lies between its control points
         for i in np.flatnonzero(unproven):
             forward[i] = extrema(self.rate[i], self.degree)[1].min() > 0
         return forward
@@ -157,11 +189,14 @@ class Motion:
     def duration_bound(self) -> Array:
         """Return a fast upper bound of the duration [s], shape (N,), for positive control points of r.
 
-        1 / r is convex in r, so it is at most the mean of 1 / r_j with the weights of the basis at a phase (Jensen).
+        1 / r is convex in r, so it is at most the mean of 1 / r_j with the weights of
+        the basis at a phase (Jensen).
         """
         points, degree = self.rate.shape[1], self.degree
         knots = clamped_knots(points, degree)
-        return np.asarray((1 / self.rate) @ ((knots[degree + 1 :] - knots[:points]) / (degree + 1)))
+        return np.asarray(
+            (1 / self.rate) @ ((knots[degree + 1 :] - knots[:points]) / (degree + 1))
+        )
 
     def time_at(self, s: Array) -> Array:
         """Compute the time at phases s, ``t(s) = integral of 1 / r from 0 to s`` [s].
@@ -177,12 +212,16 @@ class Motion:
         """
         s = np.clip(self._checked("s", s), 0.0, 1.0)
         if s.ndim == 2:
-            return np.array([self[[i]].time_at(s[i])[0] for i in range(len(self))]).reshape(s.shape)
+            return np.array(
+                [self[[i]].time_at(s[i])[0] for i in range(len(self))]
+            ).reshape(s.shape)
         times = np.empty((len(self), len(s)))
         for rows, coarse, _ in self._cells():
             edges = np.union1d(coarse, s)
             table = _kept_nodes(edges.tobytes(), self.rate.shape[1], self.degree)
-            times[rows] = self[rows]._times_at(edges, table)[:, np.searchsorted(edges, s)]
+            times[rows] = self[rows]._times_at(edges, table)[
+                :, np.searchsorted(edges, s)
+            ]
         return times
 
     def _times_at(self, edges: Array, table: Array) -> Array:
@@ -190,19 +229,23 @@ class Motion:
         width, times = np.diff(edges), np.zeros((len(self), len(edges)))
         for block in self._blocks(table.shape[1]):
             with np.errstate(all="ignore"):  # invalid inputs give invalid results
-                inverse = 1.0 / (self.rate[block, None] @ table)  # one product per motion: same bits in any batch
-                cells = inverse.reshape(-1, len(width), len(_WEIGHTS)) @ _WEIGHTS * width
+                inverse = 1.0 / (
+                    self.rate[block, None] @ table
+                )  # one product per motion: same bits in any batch
+                cells = (
+                    inverse.reshape(-1, len(width), len(_WEIGHTS)) @ _WEIGHTS * width
+                )
                 np.cumsum(cells, axis=1, out=times[block, 1:])
         return times
 
     def phase_at(self, t: Array) -> Array:
         """Compute the phase at times t: the inverse of ``time_at``, by Newton's method in the cells of its quadrature.
 
-        Args:
-            t: Times in [0, T] [s], shape (K,), the same for all motions, or (N, K); clipped to the motion.
+        Args: t: Times in [0, T] [s], shape (K,), the same for all motions, or (N, K);
+            clipped to the motion.
 
-        Returns:
-            Phases, shape (N, K), exactly 0 and 1 at the ends; undefined where r is not positive.
+        Returns: Phases, shape (N, K), exactly 0 and 1 at the ends; undefined where r is
+            not positive.
 
         Raises:
             UsageError: t has another shape.
@@ -222,19 +265,33 @@ class Motion:
         known = self._times_at(edges, table)
         with np.errstate(all="ignore"):
             t = np.clip(t, 0.0, known[:, -1:])
-            index = [np.searchsorted(row, times, side="right") for row, times in zip(known, t, strict=True)]
-            cell = np.clip(np.array(index, np.intp).reshape(t.shape) - 1, 0, len(edges) - 2)
+            index = [
+                np.searchsorted(row, times, side="right")
+                for row, times in zip(known, t, strict=True)
+            ]
+            cell = np.clip(
+                np.array(index, np.intp).reshape(t.shape) - 1, 0, len(edges) - 2
+            )
             low, width = edges[cell], np.diff(edges)[cell]
-            rate, offset = select_spans(power_coefficients(self.rate, self.degree), low + width / 2)
+            rate, offset = select_spans(
+                power_coefficients(self.rate, self.degree), low + width / 2
+            )
             offset = offset - width / 2
             left = t - np.take_along_axis(known, cell, axis=1)
             ahead = width * left / np.take_along_axis(np.diff(known), cell, axis=1)
             done = np.zeros(t.shape, bool)
             for _ in range(30):  # three or four are enough if r is positive
                 values = horner(rate, offset + ahead * _NODES_AND_END)
-                taken = ahead * sum(_WEIGHTS[:, None, None] / values[:-1])  # node by node: same bits in any batch
-                new = np.minimum(np.maximum(ahead + (left - taken) * values[-1], 0.0), width)
-                ahead, done = np.where(done, ahead, new), done | ~(np.abs(new - ahead) > 1e-15)
+                taken = ahead * sum(
+                    _WEIGHTS[:, None, None] / values[:-1]
+                )  # node by node: same bits in any batch
+                new = np.minimum(
+                    np.maximum(ahead + (left - taken) * values[-1], 0.0), width
+                )
+                ahead, done = (
+                    np.where(done, ahead, new),
+                    done | ~(np.abs(new - ahead) > 1e-15),
+                )
                 if done.all():
                     break
         return np.where(t >= known[:, -1:], 1.0, low + ahead)
@@ -246,16 +303,18 @@ class Motion:
     def time_scaled(self, factor: Array | float) -> Motion:
         """Scale time uniformly: keep the path and divide the rate by a factor.
 
-        Exact for motions from rest to rest: their boundary velocities and accelerations stay zero.
+        Exact for motions from rest to rest: their boundary velocities and accelerations
+        stay zero.
 
-        Args:
-            factor: Scale of the durations, at least 1: one per motion, shape (N,), or one for all.
+        Args: factor: Scale of the durations, at least 1: one per motion, shape (N,), or
+            one for all.
         """
         factors = numbers("factor", factor).reshape(-1, 1)
         if len(factors) not in {1, len(self)} or not (factors > 0).all():
             got = f"got {factor!s:.100}"
             raise UsageError(
-                f"must be one positive number or one for each of {len(self)} motions, {got}", argument="factor"
+                f"must be one positive number or one for each of {len(self)} motions, {got}",
+                argument="factor",
             )
         return Motion(self.path, self.rate / factors, self.degree)
 
@@ -263,13 +322,17 @@ class Motion:
         """Return phases or times as an array of shape (K,) or (N, K)."""
         array = numbers(name, values)
         if array.ndim not in {1, 2} or (array.ndim == 2 and len(array) != len(self)):
-            raise UsageError(f"must have shape (K,) or ({len(self)}, K), got {array.shape}", argument=name)
+            raise UsageError(
+                f"must have shape (K,) or ({len(self)}, K), got {array.shape}",
+                argument=name,
+            )
         return array
 
     def _cells(self) -> Iterator[tuple[slice | list[int], Array, Array]]:
         """Yield groups of motions, the edges of the quadrature cells of ``t(s)`` for them, and ``_nodes`` of the edges.
 
-        All motions share the edges, except those whose r has control points that are not positive: it may nearly be 0.
+        All motions share the edges, except those whose r has control points that are
+        not positive: it may nearly be 0.
         """
         points, degree = self.rate.shape[1], self.degree
         shared = _shared_cells(points, degree)
@@ -281,7 +344,10 @@ class Motion:
         for i in np.flatnonzero(near_zero).tolist():
             s, r = extrema(self.rate[i], degree)
             edges = edges_around(s, points, degree)
-            yield [i], *((edges, _nodes(edges, points, degree)) if r.min() > 0 else shared)
+            yield (
+                [i],
+                *((edges, _nodes(edges, points, degree)) if r.min() > 0 else shared),
+            )
 
     def _blocks(self, columns: int) -> list[slice]:
         """Split the motions into blocks whose arrays of shape (block, columns) fit into the cache."""
@@ -289,7 +355,9 @@ class Motion:
         return [slice(first, first + size) for first in range(0, len(self), size)]
 
 
-def scaled_to_duration(rate: Array, duration: Array | float, spec: TrajectorySpec) -> Array:
+def scaled_to_duration(
+    rate: Array, duration: Array | float, spec: TrajectorySpec
+) -> Array:
     """Scale rate control points [1/s], shape (N, R), to a duration [s], one number or shape (N,)."""
     path = np.zeros((len(rate), spec.path_control_points, 1))
     return rate * (Motion(path, rate, spec.degree).duration() / duration)[:, None]
@@ -317,19 +385,24 @@ def _nodes(edges: Array, points: int, degree: int) -> Array:
 def time_derivatives(p: Sequence[Array], r: Sequence[Array]) -> list[Array]:
     """Convert derivatives of the path and the rate by phase to positions and their derivatives by time.
 
-    ``dq = p' r``, ``ddq = (p'' r + p' r') r`` and ``jerk = ((p''' r + 3 p'' r') r + p' (r'' r + r'^2)) r``. The jerk is
-    returned if the path has three derivatives; the rate has one less. Their shapes broadcast to those of the path.
+    ``dq = p' r``, ``ddq = (p'' r + p' r') r`` and ``jerk = ((p''' r + 3 p'' r') r + p'
+    (r'' r + r'^2)) r``. The jerk is returned if the path has three derivatives; the
+    rate has one less. Their shapes broadcast to those of the path.
     """
     states = [p[0], p[1] * r[0], (p[2] * r[0] + p[1] * r[1]) * r[0]]
     if len(p) > 3:
-        states.append(((p[3] * r[0] + 3 * p[2] * r[1]) * r[0] + p[1] * (r[2] * r[0] + r[1] ** 2)) * r[0])
+        states.append(
+            ((p[3] * r[0] + 3 * p[2] * r[1]) * r[0] + p[1] * (r[2] * r[0] + r[1] ** 2))
+            * r[0]
+        )
     return states
 
 
 def states_at_times(motion: Motion, t: Array) -> tuple[Array, Array, Array]:
     """Evaluate each of N motions at one time [s], shape (N,), faster than ``Motion.at_times``, for online replanning.
 
-    The result are positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (N, n) each.
+    The result are positions [rad], velocities [rad/s] and accelerations [rad/s^2],
+    shape (N, n) each.
     """
     s = motion.phase_at(t[:, None])[:, 0]
     p = derivatives_of_each(motion.path, motion.degree, s)

@@ -5,7 +5,10 @@ from dataclasses import dataclass
 
 from cnpgen.schema.keys import field
 
-MAX_DEGREE, MAX_CONTROL_POINTS = 20, 500  # tables of splines grow with degree x points^2: these take 0.15 GB
+MAX_DEGREE, MAX_CONTROL_POINTS = (
+    20,
+    500,
+)  # tables of splines grow with degree x points^2: these take 0.15 GB
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -14,10 +17,16 @@ class TrajectorySpec:
 
     degree: int = field("degree of both B-splines", default=7, low=3, high=MAX_DEGREE)
     path_control_points: int = field(
-        "control points of p(s), the path in joint space", default=15, low=6, high=MAX_CONTROL_POINTS
+        "control points of p(s), the path in joint space",
+        default=15,
+        low=6,
+        high=MAX_CONTROL_POINTS,
     )
     rate_control_points: int = field(
-        "control points of r(s) = ds/dt, the rate along it", default=20, low=4, high=MAX_CONTROL_POINTS
+        "control points of r(s) = ds/dt, the rate along it",
+        default=20,
+        low=4,
+        high=MAX_CONTROL_POINTS,
     )
 
     def validate(self) -> Iterator[tuple[str, str]]:

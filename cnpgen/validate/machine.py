@@ -1,6 +1,7 @@
 """Check of this machine: libraries, compiler, cores, cache and recipes, with a remedy for every problem.
 
-A library is imported only within its check, so that a broken library is reported and not raised as an exception.
+A library is imported only within its check, so that a broken library is reported and
+not raised as an exception.
 """
 
 import importlib
@@ -34,7 +35,13 @@ MIN_DISK_BYTES = 10**9
 # Attributes that distinguish these projects from others with the same module name.
 _DISTINCTIVE_ATTRIBUTES = {"pinocchio": "buildModelFromUrdf", "coal": "Box"}
 
-_VECTOR_FLAGS = (("avx512f", "avx512"), ("avx2", "avx2"), ("avx", "avx"), ("asimd", "neon"), ("sse2", "sse2"))
+_VECTOR_FLAGS = (
+    ("avx512f", "avx512"),
+    ("avx2", "avx2"),
+    ("avx", "avx"),
+    ("asimd", "neon"),
+    ("sse2", "sse2"),
+)
 
 
 @dataclass(kw_only=True)
@@ -49,27 +56,20 @@ class _Findings:
 class MachineReport:
     """Properties and problems of a machine.
 
-    Attributes:
-        cnpgen: Version of cnpgen.
-        python: Version of Python.
-        executable: Path of the Python interpreter.
-        platform: Operating system and processor.
-        cores: Number of cores that this process may use.
-        cores_present: Number of cores of the machine.
-        vector: Widest vector instructions: "avx512", "avx2", "avx", "neon", "sse2" or "unknown".
-        libraries: Project -> version, "missing" or "broken".
-        hdf5: Version of the HDF5 library.
-        environment: Relevant environment variables set by the user.
-        compiler: C compiler and its version; empty if there is none.
-        backend: Backend of the kernels; empty if none works.
-        backend_reason: Reason for the choice of the backend.
-        cache_folder: Folder of cached kernels.
-        cache_writable: Whether kernels can be cached.
-        cache_used: Whether cached kernels are loaded; they are not if other users may change them.
-        recipes: Number and folder of the recipes.
-        free_bytes: Free disk space in the working directory [bytes]; 0 if it does not exist.
-        problems: Problems that prevent cnpgen from working, each with a remedy.
-        notes: Remarks, for example on a lower speed.
+    Attributes: cnpgen: Version of cnpgen. python: Version of Python. executable: Path
+        of the Python interpreter. platform: Operating system and processor. cores:
+        Number of cores that this process may use. cores_present: Number of cores of the
+        machine. vector: Widest vector instructions: "avx512", "avx2", "avx", "neon",
+        "sse2" or "unknown". libraries: Project -> version, "missing" or "broken". hdf5:
+        Version of the HDF5 library. environment: Relevant environment variables set by
+        the user. compiler: C compiler and its version; empty if there is none. backend:
+        Backend of the kernels; empty if none works. backend_reason: Reason for the
+        choice of the backend. cache_folder: Folder of cached kernels. cache_writable:
+        Whether kernels can be cached. cache_used: Whether cached kernels are loaded;
+        they are not if other users may change them. recipes: Number and folder of the
+        recipes. free_bytes: Free disk space in the working directory [bytes]; 0 if it
+        does not exist. problems: Problems that prevent cnpgen from working, each with a
+        remedy. notes: Remarks, for example on a lower speed.
     """
 
     cnpgen: str
@@ -122,7 +122,9 @@ def check_machine() -> MachineReport:
         vector=vector_instructions(),
         libraries=libraries,
         hdf5=_value_or(_hdf5_version, "unknown"),
-        environment={name: environment[name] for name in VARIABLES if environment.get(name)},
+        environment={
+            name: environment[name] for name in VARIABLES if environment.get(name)
+        },
         compiler=_value_or(_compiler, ""),
         backend=backend,
         backend_reason=reason,
@@ -160,7 +162,9 @@ def _check_libraries(findings: _Findings) -> dict[str, str]:
         findings.problems += [problem] if problem else []
     for module in OPTIONAL_MODULES:
         versions[module], problem = _try_library(module, module)
-        findings.notes += [f"{problem}, for 'cnpgen inspect --plot' only"] if problem else []
+        findings.notes += (
+            [f"{problem}, for 'cnpgen inspect --plot' only"] if problem else []
+        )
     return versions
 
 
@@ -172,19 +176,29 @@ def _try_library(module: str, project: str) -> tuple[str, str]:
     except Exception as error:  # noqa: BLE001 - a broken library may raise anything
         if isinstance(error, ModuleNotFoundError) and error.name == module:
             return "missing", f"{project} is not installed: run '{install} {project}'"
-        reason = str(error) if isinstance(error, ModuleNotFoundError) else _one_line(error)
-        return "broken", f"{project} cannot be imported ({reason}): run '{install} --force-reinstall {project}'"
+        reason = (
+            str(error) if isinstance(error, ModuleNotFoundError) else _one_line(error)
+        )
+        return (
+            "broken",
+            f"{project} cannot be imported ({reason}): run '{install} --force-reinstall {project}'",
+        )
     attribute = _DISTINCTIVE_ATTRIBUTES.get(module)
     if attribute and not hasattr(imported, attribute):
         remedy = f"run '{sys.executable} -m pip uninstall {module}', then '{install} --force-reinstall {project}'"
-        return "broken", f"the module {module!r} that is installed is another project of that name: {remedy}"
+        return (
+            "broken",
+            f"the module {module!r} that is installed is another project of that name: {remedy}",
+        )
     return str(getattr(imported, "__version__", "")) or _version_of(project), ""
 
 
 def _check_cores(findings: _Findings) -> tuple[int, int]:
     """Return the number of available cores and of all cores."""
     present = os.cpu_count() or 1
-    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else present
+    available = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else present
+    )
     try:
         from joblib import cpu_count
 
@@ -193,7 +207,9 @@ def _check_cores(findings: _Findings) -> tuple[int, int]:
         granted = available
     if granted < available:
         workers = counted(granted, "worker")
-        findings.notes.append(f"this container may use {granted} of {available} cores: use at most {workers}")
+        findings.notes.append(
+            f"this container may use {granted} of {available} cores: use at most {workers}"
+        )
     return min(granted, available), present
 
 
@@ -234,12 +250,20 @@ def _check_backend(findings: _Findings, cache: str) -> tuple[str, str, bool]:
             backend, folder = choose_backend()
     except Exception as error:  # noqa: BLE001 - broken libraries raise anything
         text = _one_line(error)
-        findings.problems += [] if findings.problems else [f"no backend works ({text}): reinstall cnpgen"]
+        findings.problems += (
+            []
+            if findings.problems
+            else [f"no backend works ({text}): reinstall cnpgen"]
+        )
         return "", text, False
     findings.notes += [str(warning.message) for warning in caught]
     if str(folder) != cache:
         shutil.rmtree(folder, ignore_errors=True)  # a temporary folder of this check
-    reason = "a test kernel was compiled and is correct" if backend == "compiled" else "no C compiler works"
+    reason = (
+        "a test kernel was compiled and is correct"
+        if backend == "compiled"
+        else "no C compiler works"
+    )
     return backend, reason, str(folder) == cache
 
 
@@ -247,7 +271,9 @@ def _check_cache(findings: _Findings, cache: str) -> bool:
     """Return whether cached kernels may be loaded, and note those that may not."""
     from cnpgen.store.files.cache_folder import trust_problem, untrusted_files
 
-    if not cache or not Path(cache).is_dir() or trust_problem(Path(cache)):  # noted by the choice of the backend
+    if (
+        not cache or not Path(cache).is_dir() or trust_problem(Path(cache))
+    ):  # noted by the choice of the backend
         return False
     if files := untrusted_files(Path(cache)):
         findings.notes.append(
@@ -273,11 +299,19 @@ def _check_recipes(findings: _Findings) -> str:
     except Exception as error:  # noqa: BLE001 - broken libraries raise anything
         text = _one_line(error)
         if not findings.problems:
-            findings.problems.append(f"the shipped recipes cannot be loaded ({text}): reinstall cnpgen")
+            findings.problems.append(
+                f"the shipped recipes cannot be loaded ({text}): reinstall cnpgen"
+            )
         return f"cannot be loaded: {text}"
     if not names:
-        findings.problems.append(f"there are no recipes in {recipes_root()}: reinstall cnpgen")
-    more = f", but for those of {', '.join(missing)}: pip install 'cnpgen[robots]'" if missing else ""
+        findings.problems.append(
+            f"there are no recipes in {recipes_root()}: reinstall cnpgen"
+        )
+    more = (
+        f", but for those of {', '.join(missing)}: pip install 'cnpgen[robots]'"
+        if missing
+        else ""
+    )
     return f"{len(names)} datasets in {recipes_root()}, their robots load{more}"
 
 
@@ -285,7 +319,9 @@ def _check_disk(findings: _Findings) -> int:
     try:
         free = shutil.disk_usage(Path.cwd()).free
     except OSError as error:
-        findings.notes.append(f"the working directory cannot be read ({error.strerror}): change to another one")
+        findings.notes.append(
+            f"the working directory cannot be read ({error.strerror}): change to another one"
+        )
         return 0
     if free < MIN_DISK_BYTES:
         findings.notes.append(

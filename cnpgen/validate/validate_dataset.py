@@ -17,8 +17,18 @@ from cnpgen.make.recipe import DatasetRecipe, recipe_digest, resolved_digest, re
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.store.check import REPLACE_HINT, Finding, check_dataset
-from cnpgen.store.dataset_spec import GENERATOR_REVISION, DatasetSpec, ShardTask, load_dataset_spec, shards
-from cnpgen.store.dataset_summary import load_stats_document, stats_document, summarize_dataset
+from cnpgen.store.dataset_spec import (
+    GENERATOR_REVISION,
+    DatasetSpec,
+    ShardTask,
+    load_dataset_spec,
+    shards,
+)
+from cnpgen.store.dataset_summary import (
+    load_stats_document,
+    stats_document,
+    summarize_dataset,
+)
 from cnpgen.store.files.documents import plain
 from cnpgen.store.intact import RERUN_HINT
 from cnpgen.store.layout import SPECIFICATION, STATS
@@ -28,8 +38,12 @@ from cnpgen.store.scene_table import SCENE_ID
 from cnpgen.store.shard_record import is_committed
 from cnpgen.validate.validate_rows import DeepCheck, check_rows
 
-MAX_REGENERATION_ERROR = 1e-9  # in SI units; accepted difference of rows made on another machine or backend
-MAX_REGENERATION_ERROR_FLOAT32 = 1e-5  # in SI units; accepted difference of rows stored as float32
+MAX_REGENERATION_ERROR = (
+    1e-9  # in SI units; accepted difference of rows made on another machine or backend
+)
+MAX_REGENERATION_ERROR_FLOAT32 = (
+    1e-5  # in SI units; accepted difference of rows stored as float32
+)
 
 
 @dataclass(frozen=True)
@@ -42,18 +56,24 @@ class Regeneration:
     findings: tuple[Finding, ...] = ()
 
 
-def regenerate_blocks(folder: Path, spec: DatasetSpec, tasks: list[ShardTask], count: int) -> Regeneration:
+def regenerate_blocks(
+    folder: Path, spec: DatasetSpec, tasks: list[ShardTask], count: int
+) -> Regeneration:
     """Regenerate ``count`` random blocks of some shards, or all, and compare them with the stored rows."""
     size = spec.block_rows
     blocks = [(task, block) for task in tasks for block in blocks_of(task, size)]
     backend, cache_folder = backend_of(folder, spec)
-    dataset = StoredDataset(folder, spec, None)  # without the manifest, which may be damaged
+    dataset = StoredDataset(
+        folder, spec, None
+    )  # without the manifest, which may be damaged
     chosen = np.random.default_rng().permutation(len(blocks))[:count]
     identical, findings = 0, []
     with restored(spec) as recipe:
         prepared = prepare(Job(folder, spec, recipe.pipeline, backend, cache_folder))
         if prepared.block_rows != size:
-            raise UsageError(f"the blocks of {folder} have {size} rows, those of this version {prepared.block_rows}")
+            raise UsageError(
+                f"the blocks of {folder} have {size} rows, those of this version {prepared.block_rows}"
+            )
         for task, block in (blocks[index] for index in chosen):
             start = max(block * size, task.first_row)
             stop = min((block + 1) * size, task.first_row + task.rows)
@@ -62,7 +82,9 @@ def regenerate_blocks(folder: Path, spec: DatasetSpec, tasks: list[ShardTask], c
             stored = dataset.read(task.split, start=start, stop=stop)
             if scenes is not None:
                 table = dataset.read_scenes(task.split, start=start, stop=stop)
-                stored |= dict(table[table.rows_of(np.unique(stored[SCENE_ID]))].arrays())
+                stored |= dict(
+                    table[table.rows_of(np.unique(stored[SCENE_ID]))].arrays()
+                )
                 again |= dict(scenes.arrays())
             same, problem = _compare(stored, again)
             identical += same
@@ -89,10 +111,19 @@ def _compare(stored: dict[str, Any], again: dict[str, Any]) -> tuple[bool, str]:
     same = all(np.array_equal(stored[name], values) for name, values in again.items())
     for name, values in again.items():
         if stored[name].shape != values.shape:
-            return False, f"{name} has the shape {stored[name].shape}, not {values.shape}"
+            return (
+                False,
+                f"{name} has the shape {stored[name].shape}, not {values.shape}",
+            )
         difference = np.abs(stored[name].astype(float) - values.astype(float))
-        float_tolerance = MAX_REGENERATION_ERROR_FLOAT32 if values.dtype == np.float32 else MAX_REGENERATION_ERROR
-        if not (difference <= (0.0 if values.dtype.kind == "i" else float_tolerance)).all():
+        float_tolerance = (
+            MAX_REGENERATION_ERROR_FLOAT32
+            if values.dtype == np.float32
+            else MAX_REGENERATION_ERROR
+        )
+        if not (
+            difference <= (0.0 if values.dtype.kind == "i" else float_tolerance)
+        ).all():
             return same, f"{name} differs by {difference.max():.3g}"
     return same, ""
 
@@ -100,10 +131,18 @@ def _compare(stored: dict[str, Any], again: dict[str, Any]) -> tuple[bool, str]:
 def _explanation(spec: DatasetSpec, recipe: DatasetRecipe) -> str:
     """Name the libraries and plug-ins that have changed since the dataset was made."""
     now = versions()
-    changed = [f"{name} {old} -> {now.get(name)}" for name, old in spec.versions.items() if now.get(name) != old]
+    changed = [
+        f"{name} {old} -> {now.get(name)}"
+        for name, old in spec.versions.items()
+        if now.get(name) != old
+    ]
     if spec.revision != GENERATOR_REVISION:
-        changed.append(f"revision of the generator {spec.revision} -> {GENERATOR_REVISION}")
-    if recipe_digest(recipe) != spec.recipe_sha256:  # the recipe is that of the dataset, so only code can differ
+        changed.append(
+            f"revision of the generator {spec.revision} -> {GENERATOR_REVISION}"
+        )
+    if (
+        recipe_digest(recipe) != spec.recipe_sha256
+    ):  # the recipe is that of the dataset, so only code can differ
         changed.append("the code of its plug-ins has changed")
     return f" (made with other versions: {', '.join(changed)})" if changed else ""
 
@@ -112,16 +151,13 @@ def _explanation(spec: DatasetSpec, recipe: DatasetRecipe) -> str:
 class ValidationReport:
     """Result of a validation.
 
-    Attributes:
-        folder: Folder of the dataset.
-        rows: Number of rows of the existing shards.
-        findings: Problems and notes, by file.
-        deep: Report of the recomputation of every row with Pinocchio and Coal; None without a deep check.
-        plans: Numbers of judged and of valid plans; None without a deep check or without plans.
-        wanted: Number of blocks that were requested to be regenerated.
-        blocks: Number of blocks of the dataset.
-        regenerated: Number of regenerated blocks.
-        identical: Number of regenerated blocks that are bitwise identical.
+    Attributes: folder: Folder of the dataset. rows: Number of rows of the existing
+        shards. findings: Problems and notes, by file. deep: Report of the recomputation
+        of every row with Pinocchio and Coal; None without a deep check. plans: Numbers
+        of judged and of valid plans; None without a deep check or without plans.
+        wanted: Number of blocks that were requested to be regenerated. blocks: Number
+        of blocks of the dataset. regenerated: Number of regenerated blocks. identical:
+        Number of regenerated blocks that are bitwise identical.
     """
 
     folder: Path
@@ -147,7 +183,9 @@ class ValidationReport:
             "rows": self.rows,
             "findings": [asdict(finding) for finding in self.findings],
             "deep": self.deep.to_dict() if self.deep else None,
-            "plans": dict(zip(("judged", "valid"), self.plans, strict=True)) if self.plans else None,
+            "plans": dict(zip(("judged", "valid"), self.plans, strict=True))
+            if self.plans
+            else None,
             "blocks": self.blocks,
             "regenerated": self.regenerated,
             "identical": self.identical,
@@ -160,19 +198,33 @@ class ValidationReport:
         lines = [f"{self.folder}: {counted(self.rows, 'row')}, {findings}"]
         if self.deep:
             failed = f"{len(self.deep.failed_rows):,} out"
-            lines.append(f"  recomputed with Pinocchio and Coal: {counted(self.deep.rows, 'row')}, {failed}")
+            lines.append(
+                f"  recomputed with Pinocchio and Coal: {counted(self.deep.rows, 'row')}, {failed}"
+            )
             lines += [
                 f"    {check.name:<22} worst {check.worst:9.2e} of {check.tolerance:9.2e} {check.unit:<8}"
                 f" {counted(check.n_failed, 'row')} out"
                 for check in self.deep.checks
             ]
         if self.plans:
-            lines.append(f"  judged at all times: {counted(self.plans[0], 'plan')}, {self.plans[1]:,} valid")
+            lines.append(
+                f"  judged at all times: {counted(self.plans[0], 'plan')}, {self.plans[1]:,} valid"
+            )
         if self.wanted:
-            requested = f" ({self.wanted:,} were requested)" if self.wanted > self.blocks else ""
+            requested = (
+                f" ({self.wanted:,} were requested)"
+                if self.wanted > self.blocks
+                else ""
+            )
             text = f"{self.regenerated:,} of {counted(self.blocks, 'block')}{requested}"
-            lines.append(f"  made again: {text}, {self.identical:,} identical to the bit")
-        hints = dict.fromkeys(finding.hint for finding in self.findings if finding.hint and not finding.note)
+            lines.append(
+                f"  made again: {text}, {self.identical:,} identical to the bit"
+            )
+        hints = dict.fromkeys(
+            finding.hint
+            for finding in self.findings
+            if finding.hint and not finding.note
+        )
         return "\n".join([*lines, *(f"  hint: {text}" for text in hints)])
 
 
@@ -189,33 +241,39 @@ def validate_dataset(
 ) -> ValidationReport:
     """Validate a dataset.
 
-    Checksums, counts, schema and provenance are always checked; every row and some regenerated blocks optionally.
+    Checksums, counts, schema and provenance are always checked; every row and some
+    regenerated blocks optionally.
 
-    Args:
-        folder: Folder of the dataset.
-        deep: Whether to recompute kinematics, limits, torques, manifold and collisions of every row with Pinocchio and
+    Args: folder: Folder of the dataset. deep: Whether to recompute kinematics, limits,
+        torques, manifold and collisions of every row with Pinocchio and
             Coal.
         regenerate: Number of random blocks to regenerate and compare.
-        workers: Number of processes for the deep check; by default one per available core.
+        workers: Number of processes for the deep check; by default one per available
+            core.
         engine: Engine of the processes, as in ``make_dataset``.
         address: Address of the engine, as in ``make_dataset``.
         progress: Called with the number of rows of every recomputed shard.
 
-    Raises:
-        UsageError: The folder does not exist or contains no dataset, or an argument is invalid.
-        RecipeError: The recipe in the specification does not fit this version of cnpgen.
-        PluginError: The recipe needs packages that are not installed.
-        MachineError: A file cannot be read, or blocks are to be regenerated and the backend of the dataset does not
+    Raises: UsageError: The folder does not exist or contains no dataset, or an argument
+        is invalid. RecipeError: The recipe in the specification does not fit this
+        version of cnpgen. PluginError: The recipe needs packages that are not
+        installed. MachineError: A file cannot be read, or blocks are to be regenerated
+        and the backend of the dataset does not
             work on this machine.
     """
-    regenerate, machine_engine = integer("regenerate", regenerate, least=0), Engine(engine, address, workers)
+    regenerate, machine_engine = (
+        integer("regenerate", regenerate, least=0),
+        Engine(engine, address, workers),
+    )
     folder = require_dataset(folder)
     findings = check_dataset(folder)
     try:
         spec = load_dataset_spec(folder)
     except DatasetError:
         return ValidationReport(folder, 0, tuple(findings))
-    if regenerate:  # missing packages and backends are reported before the expensive checks
+    if (
+        regenerate
+    ):  # missing packages and backends are reported before the expensive checks
         backend_of(folder, spec)
     if deep or regenerate:
         with restored(spec):
@@ -224,8 +282,16 @@ def validate_dataset(
     damaged = {finding.file for finding in findings if not finding.note}
     undamaged = [task for task in existing if task.file not in damaged]
     findings += check_recipe(spec) + (check_statistics(folder, spec) if deep else [])
-    checked = check_rows(folder, spec, undamaged, machine_engine, progress) if deep else DeepCheck()
-    again = regenerate_blocks(folder, spec, undamaged, regenerate) if regenerate else Regeneration()
+    checked = (
+        check_rows(folder, spec, undamaged, machine_engine, progress)
+        if deep
+        else DeepCheck()
+    )
+    again = (
+        regenerate_blocks(folder, spec, undamaged, regenerate)
+        if regenerate
+        else Regeneration()
+    )
     return ValidationReport(
         folder,
         sum(task.rows for task in existing),
@@ -242,15 +308,24 @@ def validate_dataset(
 def check_recipe(spec: DatasetSpec) -> list[Finding]:
     """Check that the recipe in a specification has the recorded sha256."""
     try:
-        digest = resolved_digest(spec.recipe["pipeline"], str(spec.robot["urdf"]).encode())
+        digest = resolved_digest(
+            spec.recipe["pipeline"], str(spec.robot["urdf"]).encode()
+        )
     except (KeyError, TypeError, AttributeError):
         return [Finding(SPECIFICATION, "its recipe cannot be read", hint=REPLACE_HINT)]
     text = f"its recipe has the sha256 {digest}, not the recorded {spec.recipe_sha256}"
-    return [] if digest == spec.recipe_sha256 else [Finding(SPECIFICATION, text, hint=REPLACE_HINT)]
+    return (
+        []
+        if digest == spec.recipe_sha256
+        else [Finding(SPECIFICATION, text, hint=REPLACE_HINT)]
+    )
 
 
 def check_statistics(folder: Path, spec: DatasetSpec) -> list[Finding]:
-    """Check that ``stats.json`` is the summary of the records of all shards; these must exist."""
+    """Check that ``stats.json`` is the summary of the records of all shards.
+
+    These must exist.
+    """
     try:
         document = load_stats_document(folder)
         expected = plain(stats_document(summarize_dataset(folder, spec)))

@@ -28,7 +28,9 @@ from cnpgen.store.shard_record import ShardRecord, load_record
 from cnpgen.store.statistics import FieldStatistics, field_statistics
 
 MAX_RELATIVE_SUM_ERROR = 1e-9  # accepted relative difference of sums of the same numbers between versions of NumPy
-_ODD_MULTIPLIERS = np.random.default_rng(0).integers(0, 2**63, 64, dtype=np.uint64) * np.uint64(2) + np.uint64(1)
+_ODD_MULTIPLIERS = np.random.default_rng(0).integers(
+    0, 2**63, 64, dtype=np.uint64
+) * np.uint64(2) + np.uint64(1)
 
 
 @dataclass(frozen=True)
@@ -42,35 +44,54 @@ class DeepCheck:
 
 
 def check_rows(
-    folder: Path, spec: DatasetSpec, tasks: list[ShardTask], engine: Engine, progress: Callable[[int], None] | None
+    folder: Path,
+    spec: DatasetSpec,
+    tasks: list[ShardTask],
+    engine: Engine,
+    progress: Callable[[int], None] | None,
 ) -> DeepCheck:
-    """Recompute every row, shard by shard, and judge every plan; report the rows of every shard that was read."""
+    """Recompute every row, shard by shard, and judge every plan.
+
+    Report the rows of every shard that was read.
+    """
     checks, findings = [], []
     with assembled(engine, len(tasks)) as pool:
-        verify = partial(_verify_shard, folder.absolute() if pool.is_remote else folder, spec)
+        verify = partial(
+            _verify_shard, folder.absolute() if pool.is_remote else folder, spec
+        )
         with closing(pool.distribute(verify, tasks, ordered=True)) as results:
             for task, result in zip(tasks, results, strict=True):
-                findings += [Finding(task.file, problem, hint=DELETE_HINT) for problem in result.problems]
+                findings += [
+                    Finding(task.file, problem, hint=DELETE_HINT)
+                    for problem in result.problems
+                ]
                 checks.append(result)
                 if progress is not None:
                     progress(task.rows)
     keys = np.concatenate([np.empty(0, np.uint64), *(check.keys for check in checks)])
     n_duplicates = len(keys) - len(np.unique(keys))
     if n_duplicates:
-        findings.append(Finding("(all splits)", f"{counted(n_duplicates, 'duplicate row')}"))
-    findings += [Finding("(all splits)", text) for text in _check_speed_fractions(spec, checks)]
+        findings.append(
+            Finding("(all splits)", f"{counted(n_duplicates, 'duplicate row')}")
+        )
+    findings += [
+        Finding("(all splits)", text) for text in _check_speed_fractions(spec, checks)
+    ]
     reports = [check.report for check in checks if check.report is not None]
     judged = sum(check.plans.judged for check in checks)
     valid = sum(check.plans.valid for check in checks)
-    return DeepCheck(merge(reports) if reports else None, judged, valid, tuple(findings))
+    return DeepCheck(
+        merge(reports) if reports else None, judged, valid, tuple(findings)
+    )
 
 
 @dataclass(frozen=True)
 class _ShardCheck:
     """Result of the deep check of one shard, without a report if it cannot be read.
 
-    The keys are hashes of the boundary states of its rows, the goals those of its hits. Hit speeds are fractions of the
-    maximum speed, and empty if the rows are no hits. All have shape (rows,).
+    The keys are hashes of the boundary states of its rows, the goals those of its hits.
+    Hit speeds are fractions of the maximum speed, and empty if the rows are no hits.
+    All have shape (rows,).
     """
 
     report: RowReport | None
@@ -89,14 +110,23 @@ def _verify_shard(folder: Path, spec: DatasetSpec, task: ShardTask) -> _ShardChe
         columns = read_checked(shard)
         scenes = read_scenes(shard) if spec.scene_obstacles else None
     except CnpgenError as error:
-        return _ShardCheck(None, [str(error)], np.empty(0, np.uint64), PlanCheck(), np.empty(0), np.empty(0, np.uint64))
+        return _ShardCheck(
+            None,
+            [str(error)],
+            np.empty(0, np.uint64),
+            PlanCheck(),
+            np.empty(0),
+            np.empty(0, np.uint64),
+        )
     with restored(spec) as recipe:
         problem = recipe.pipeline.problem
         robot = load_robot(problem)
         if scenes is not None:
             table = scenes[scenes.rows_of(columns[SCENE_ID])]
             columns[OBSTACLE_POSES] = scene_poses(problem.obstacle, table)
-        report = verify_rows(problem, robot, columns, dtype=spec.dtype, rule=hit_rule(spec.stages))
+        report = verify_rows(
+            problem, robot, columns, dtype=spec.dtype, rule=hit_rule(spec.stages)
+        )
         plans = check_plans(problem, robot, columns)
     problems = [*plans.problems, *check_numbers(spec, task, columns, record)]
     problems += [
@@ -104,42 +134,88 @@ def _verify_shard(folder: Path, spec: DatasetSpec, task: ShardTask) -> _ShardChe
         f" (allowed {check.tolerance:.3g}) in row {task.first_row + check.worst_row}"
         for check in report.failed
     ]
-    ends = [columns[name] for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq") if name in columns]
-    fractions = speed_fractions(columns) if {"hit_speed", "hit_speed_max"} <= columns.keys() else np.empty(0)
+    ends = [
+        columns[name]
+        for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
+        if name in columns
+    ]
+    fractions = (
+        speed_fractions(columns)
+        if {"hit_speed", "hit_speed_max"} <= columns.keys()
+        else np.empty(0)
+    )
     goals = row_keys(columns["goal_q"])[: len(fractions)]
-    return _ShardCheck(report, problems, row_keys(np.concatenate(ends, axis=1)), plans, fractions, goals)
+    return _ShardCheck(
+        report,
+        problems,
+        row_keys(np.concatenate(ends, axis=1)),
+        plans,
+        fractions,
+        goals,
+    )
 
 
 def _check_speed_fractions(spec: DatasetSpec, checks: list[_ShardCheck]) -> list[str]:
     """Describe hits with equal fractions of their maximum speed, if there are more than random numbers explain."""
     if hit_rule(spec.stages).full_speed is None or not checks:
         return []
-    fractions, goals = (np.concatenate([getattr(check, name) for check in checks]) for name in ("fractions", "goals"))
-    _, unique = np.unique(goals, return_index=True)  # several starts may have the same goal
+    fractions, goals = (
+        np.concatenate([getattr(check, name) for check in checks])
+        for name in ("fractions", "goals")
+    )
+    _, unique = np.unique(
+        goals, return_index=True
+    )  # several starts may have the same goal
     count, fraction = repeated_fraction(fractions[unique], spec.dtype)
     text = f"{counted(count, 'hit')} with the same fraction of their maximum speed, {fraction:.6g}"
-    return [f"{text}; fractions are random, so these hits were scaled in time afterwards"] if count else []
+    return (
+        [f"{text}; fractions are random, so these hits were scaled in time afterwards"]
+        if count
+        else []
+    )
 
 
 def row_keys(values: NDArray[Any]) -> NDArray[np.uint64]:
-    """Hash every row of numbers, shape (rows, width), to 64 bits; equal rows have equal keys."""
+    """Hash every row of numbers, shape (rows, width), to 64 bits.
+
+    Equal rows have equal keys.
+    """
     bits = np.ascontiguousarray(values, np.float64).view(np.uint64)
-    bits = bits ^ (bits >> np.uint64(32))  # float32 values have zero low bits, which products would not mix
+    bits = bits ^ (
+        bits >> np.uint64(32)
+    )  # float32 values have zero low bits, which products would not mix
     bits *= np.resize(_ODD_MULTIPLIERS, bits.shape[1])
     bits ^= bits >> np.uint64(29)
-    return np.asarray((bits * np.resize(_ODD_MULTIPLIERS[::-1], bits.shape[1])).sum(axis=1, dtype=np.uint64))
+    return np.asarray(
+        (bits * np.resize(_ODD_MULTIPLIERS[::-1], bits.shape[1])).sum(
+            axis=1, dtype=np.uint64
+        )
+    )
 
 
 def check_numbers(
-    spec: DatasetSpec, task: ShardTask, columns: Mapping[str, NDArray[Any]], record: ShardRecord
+    spec: DatasetSpec,
+    task: ShardTask,
+    columns: Mapping[str, NDArray[Any]],
+    record: ShardRecord,
 ) -> list[str]:
     """Describe the problems of all rows of a shard, shape (rows, width) or (rows,), by specification and record."""
-    problems = [text for field in spec.fields for text in _check_range(field, columns[field.name], task, spec.dtype)]
-    problems += [text for field in spec.fields for text in _check_statistics(field, columns[field.name], record)]
+    problems = [
+        text
+        for field in spec.fields
+        for text in _check_range(field, columns[field.name], task, spec.dtype)
+    ]
+    problems += [
+        text
+        for field in spec.fields
+        for text in _check_statistics(field, columns[field.name], record)
+    ]
     if {"hit_speed", "hit_speed_max"} <= columns.keys():
         faster = np.flatnonzero(~(columns["hit_speed"] <= columns["hit_speed_max"]))
         if len(faster):
-            problems.append(f"hit_speed is above hit_speed_max: {_rows_text(faster, task)}")
+            problems.append(
+                f"hit_speed is above hit_speed_max: {_rows_text(faster, task)}"
+            )
     if not np.array_equal(columns["sample_id"], task.first_row + np.arange(task.rows)):
         problems.append("sample_id is not the index of the row in the split")
     if int(columns["attempts"].sum()) != record.sampling.tried:
@@ -149,27 +225,40 @@ def check_numbers(
     return problems
 
 
-def _check_range(field: Field, values: NDArray[Any], task: ShardTask, dtype: str) -> Iterator[str]:
-    for name, bound, sign in (("valid_min", field.valid_min, 1.0), ("valid_max", field.valid_max, -1.0)):
+def _check_range(
+    field: Field, values: NDArray[Any], task: ShardTask, dtype: str
+) -> Iterator[str]:
+    for name, bound, sign in (
+        ("valid_min", field.valid_min, 1.0),
+        ("valid_max", field.valid_max, -1.0),
+    ):
         if bound is not None:
             violation = sign * (np.array(bound) - values.reshape(len(values), -1))
-            rows = np.flatnonzero((violation > tolerance(np.array(bound), dtype)).any(axis=1))
+            rows = np.flatnonzero(
+                (violation > tolerance(np.array(bound), dtype)).any(axis=1)
+            )
             if len(rows):
                 unit = field.units[int(np.argmax(violation.max(axis=0)))]
                 text = f"{field.name} is outside its {name} by up to {violation.max():.3g} {unit}"
                 yield f"{text}: {_rows_text(rows, task)}"
 
 
-def _check_statistics(field: Field, values: NDArray[Any], record: ShardRecord) -> Iterator[str]:
+def _check_statistics(
+    field: Field, values: NDArray[Any], record: ShardRecord
+) -> Iterator[str]:
     recorded = record.statistics.get(field.name)
-    if np.isfinite(values).all() and not (recorded and _agree(recorded, field_statistics(values, field))):
+    if np.isfinite(values).all() and not (
+        recorded and _agree(recorded, field_statistics(values, field))
+    ):
         yield f"the recorded statistics of {field.name} are not those of its values"
 
 
 def tolerance(bound: NDArray[np.float64], dtype: str) -> NDArray[np.float64]:
     """Return the accepted violation of a bound by a stored number: the tolerance of limits plus float32 rounding."""
     size = np.abs(bound)
-    rounding = np.spacing(size.astype(np.float32)).astype(float) if dtype == "float32" else 0.0
+    rounding = (
+        np.spacing(size.astype(np.float32)).astype(float) if dtype == "float32" else 0.0
+    )
     return BOUNDARY_TOLERANCES[dtype]["limit"] * np.maximum(size, 1.0) + rounding
 
 
@@ -183,5 +272,10 @@ def _agree(a: FieldStatistics, b: FieldStatistics) -> bool:
     if not all(np.array_equal(getattr(a, name), getattr(b, name)) for name in exact):
         return False
     spread = np.maximum(np.abs(a.minimum), np.abs(a.maximum))
-    mean, m2 = MAX_RELATIVE_SUM_ERROR * spread, MAX_RELATIVE_SUM_ERROR * a.count * spread**2
-    return bool((np.abs(a.mean - b.mean) <= mean).all() and (np.abs(a.m2 - b.m2) <= m2).all())
+    mean, m2 = (
+        MAX_RELATIVE_SUM_ERROR * spread,
+        MAX_RELATIVE_SUM_ERROR * a.count * spread**2,
+    )
+    return bool(
+        (np.abs(a.mean - b.mean) <= mean).all() and (np.abs(a.m2 - b.m2) <= m2).all()
+    )

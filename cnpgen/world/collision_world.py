@@ -14,9 +14,11 @@ from cnpgen.world.certified import CertifiedDistance, ConvexBody, Pose, convex_b
 Array = NDArray[np.float64]
 Point = Sequence[float]
 
-# Coal's default tolerance of 1e-6 shows up in full in distances just above contact. With these, 20 000 segments and
-# 20 000 upright boxes (aligned, touching, at a distance of 1e-12 m, inside) agree with the exact distance to 4e-11 m,
-# which is 1e-10 of the boxes' size: Coal enlarges a box by that much when GJK's direction is parallel to a face.
+# Coal's default tolerance of 1e-6 shows up in full in distances just above contact.
+# With these, 20 000 segments and 20 000 upright boxes (aligned, touching, at a distance
+# of 1e-12 m, inside) agree with the exact distance to 4e-11 m, which is 1e-10 of the
+# boxes' size: Coal enlarges a box by that much when GJK's direction is parallel to a
+# face.
 GJK_TOLERANCE = 1e-12
 EPA_TOLERANCE = 1e-9
 _AXIS = np.array([[0, 0, -0.5], [0, 0, 0.5]])  # ends of a segment of length 1
@@ -25,9 +27,10 @@ _AXIS = np.array([[0, 0, -0.5], [0, 0, 0.5]])  # ends of a segment of length 1
 class CollisionWorld:
     """The obstacles, the segments of a robot and the held object as Coal shapes.
 
-    A segment is a capsule of radius 0, so that Coal's distance is that of the segment itself. GJK runs without
-    Nesterov acceleration, which reports contacts that do not exist. Distances from upright boxes are Coal's; those from
-    other obstacles are certified. Shapes are moved in place: use it in one process and one thread only.
+    A segment is a capsule of radius 0, so that Coal's distance is that of the segment
+    itself. GJK runs without Nesterov acceleration, which reports contacts that do not
+    exist. Distances from upright boxes are Coal's; those from other obstacles are
+    certified. Shapes are moved in place: use it in one process and one thread only.
 
     Args:
         object_size: Edge lengths of the held object [m], or None.
@@ -37,36 +40,58 @@ class CollisionWorld:
         import coal
 
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
-        self._request.gjk_tolerance, self._request.epa_tolerance = GJK_TOLERANCE, EPA_TOLERANCE
+        self._request.gjk_tolerance, self._request.epa_tolerance = (
+            GJK_TOLERANCE,
+            EPA_TOLERANCE,
+        )
         self._certified = CertifiedDistance()
         self._capsule = coal.Capsule(0.0, 1.0)
         self._object = (
-            None if object_size is None else ConvexBody(CUBE * np.array(object_size), 0.0, coal.Box(*object_size))
+            None
+            if object_size is None
+            else ConvexBody(CUBE * np.array(object_size), 0.0, coal.Box(*object_size))
         )
         self._transform = coal.Transform3s()
-        self._solids, self._bodies, self._transforms = list[Solid](), list[ConvexBody | None](), list[Any]()
+        self._solids, self._bodies, self._transforms = (
+            list[Solid](),
+            list[ConvexBody | None](),
+            list[Any](),
+        )
         self._from_capsule, self._from_object = list[Any](), list[Any]()
 
     def place(self, solids: Sequence[Solid]) -> None:
         """Set the obstacles."""
         import coal
 
-        same = len(solids) == len(self._solids) and all(map(same_shape, solids, self._solids))
+        same = len(solids) == len(self._solids) and all(
+            map(same_shape, solids, self._solids)
+        )
         self._solids = list(solids)
         if not same:
             self._transforms = [coal.Transform3s() for _ in solids]
-            sizes = [np.ptp(solid.corners, axis=0) if isinstance(solid, Box) else None for solid in solids]
+            sizes = [
+                np.ptp(solid.corners, axis=0) if isinstance(solid, Box) else None
+                for solid in solids
+            ]
             self._boxes = [None if size is None else coal.Box(*size) for size in sizes]
             self._bodies = [
-                None if isinstance(solid, Box) else convex_body(solid.corners, solid.radius) for solid in solids
+                None
+                if isinstance(solid, Box)
+                else convex_body(solid.corners, solid.radius)
+                for solid in solids
             ]
             self._from_capsule = self._measures(self._capsule)
-            self._from_object = [] if self._object is None else self._measures(self._object.shape)
+            self._from_object = (
+                [] if self._object is None else self._measures(self._object.shape)
+            )
         for transform, solid in zip(self._transforms, solids, strict=True):
             transform.setTranslation(solid.position)
 
     def _measures(self, shape: Any) -> list[Any]:
-        """Return Coal's distance functors of a shape and every obstacle; None for certified distances."""
+        """Return Coal's distance functors of a shape and every obstacle.
+
+        None for certified distances.
+        """
         import coal
 
         return [box and coal.ComputeDistance(shape, box) for box in self._boxes]
@@ -79,12 +104,13 @@ class CollisionWorld:
             distances += self._measure(self._from_capsule)
         return distances
 
-    def segment_distance(self, a: Point, b: Point, obstacle: int) -> tuple[float, Array]:
+    def segment_distance(
+        self, a: Point, b: Point, obstacle: int
+    ) -> tuple[float, Array]:
         """Measure the signed distance of the segment from a to b [m] from one obstacle.
 
-        Returns:
-            The distance [m], minus the penetration depth if they overlap, and the separating unit vector from the
-            obstacle to the segment, shape (3,).
+        Returns: The distance [m], minus the penetration depth if they overlap, and the
+            separating unit vector from the obstacle to the segment, shape (3,).
         """
         self._place_segment(a, b)
         return self._distance_and_normal(self._from_capsule, obstacle)
@@ -94,7 +120,10 @@ class CollisionWorld:
         along = bx - ax, by - ay, bz - az
         length = math.hypot(*along)
         self._capsule.halfLength = length / 2
-        pose = frame_along(along, length), np.array([(ax + bx) / 2, (ay + by) / 2, (az + bz) / 2])
+        pose = (
+            frame_along(along, length),
+            np.array([(ax + bx) / 2, (ay + by) / 2, (az + bz) / 2]),
+        )
         self._place(ConvexBody(length * _AXIS, 0.0, self._capsule), pose)
 
     def _place(self, mover: ConvexBody, pose: Pose) -> None:
@@ -107,8 +136,13 @@ class CollisionWorld:
         self._place_object(position, rotation)
         return self._measure(self._from_object)
 
-    def object_distance(self, position: Array, rotation: Array, obstacle: int) -> tuple[float, Array]:
-        """Measure the signed distance of the held object from one obstacle; see ``segment_distance``."""
+    def object_distance(
+        self, position: Array, rotation: Array, obstacle: int
+    ) -> tuple[float, Array]:
+        """Measure the signed distance of the held object from one obstacle.
+
+        See ``segment_distance``.
+        """
         self._place_object(position, rotation)
         return self._distance_and_normal(self._from_object, obstacle)
 
@@ -116,9 +150,13 @@ class CollisionWorld:
         if self._object is not None:
             self._place(self._object, (rotation, position))
 
-    def _distance_and_normal(self, measures: list[Any], obstacle: int) -> tuple[float, Array]:
+    def _distance_and_normal(
+        self, measures: list[Any], obstacle: int
+    ) -> tuple[float, Array]:
         distance = self._distance(measures, obstacle)
-        return distance, self._normal if measures[obstacle] is None else -np.array(self._result.normal)
+        return distance, self._normal if measures[obstacle] is None else -np.array(
+            self._result.normal
+        )
 
     def _measure(self, measures: list[Any]) -> list[float]:
         """Measure the distances of the placed body from every obstacle [m]."""
@@ -128,7 +166,13 @@ class CollisionWorld:
         measure, body = measures[obstacle], self._bodies[obstacle]
         if body is not None:
             pose = np.eye(3), self._solids[obstacle].position
-            distance, self._normal = self._certified.between(body, pose, self._mover, self._pose)
+            distance, self._normal = self._certified.between(
+                body, pose, self._mover, self._pose
+            )
             return distance
         self._result.clear()  # otherwise Coal keeps the smallest distance of earlier calls
-        return float(measure(self._transform, self._transforms[obstacle], self._request, self._result))
+        return float(
+            measure(
+                self._transform, self._transforms[obstacle], self._request, self._result
+            )
+        )

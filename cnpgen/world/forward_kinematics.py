@@ -1,7 +1,7 @@
 """Forward kinematics of many states at once, from the joint placements of Pinocchio's model.
 
-One call of Pinocchio per state takes twice as long. Three states of every call are compared with Pinocchio's own
-forward kinematics.
+One call of Pinocchio per state takes twice as long. Three states of every call are
+compared with Pinocchio's own forward kinematics.
 """
 
 from typing import TYPE_CHECKING
@@ -16,7 +16,10 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_ORIGIN, _SLIDE = 3, 7  # rows of a joint's coefficients: its origin, and its direction if it slides
+_ORIGIN, _SLIDE = (
+    3,
+    7,
+)  # rows of a joint's coefficients: its origin, and its direction if it slides
 MAX_POSE_ERROR = 1e-9  # between our poses and Pinocchio's, relative to 1 + the largest joint position
 
 
@@ -26,17 +29,22 @@ class ForwardKinematics:
     def __init__(self, model: "pin.Model") -> None:
         self._model, self._data = model, model.createData()
         self._parents = list(model.parents)[1:]
-        self._coefficients = [_coefficients(model, joint) for joint in range(1, model.njoints)]
-        lengths = [np.linalg.norm(rows[[_ORIGIN, _SLIDE], :3], axis=1) for rows in self._coefficients]
+        self._coefficients = [
+            _coefficients(model, joint) for joint in range(1, model.njoints)
+        ]
+        lengths = [
+            np.linalg.norm(rows[[_ORIGIN, _SLIDE], :3], axis=1)
+            for rows in self._coefficients
+        ]
         self._lengths = np.array(lengths)
         self._slides = self._lengths[:, 1] > 0
 
     def poses(self, q: Array) -> tuple[Array, Array]:
         """Compute the poses of all joints at K > 0 states q [rad], shape (n, K).
 
-        Returns:
-            ``(rotations, positions)``: rotation matrices in the world frame, that of the base first, shape
-            (n + 1, 3, 3, K), and positions [m], shape (n + 1, 3, K).
+        Returns: ``(rotations, positions)``: rotation matrices in the world frame, that
+            of the base first, shape (n + 1, 3, 3, K), and positions [m], shape (n + 1,
+            3, K).
 
         Raises:
             MachineError: The poses differ from Pinocchio's.
@@ -46,11 +54,20 @@ class ForwardKinematics:
         np.sin(q, out=factors[:, 0])
         np.cos(q, out=factors[:, 1])
         factors[self._slides, 0] = q[self._slides]
-        frames = np.empty((len(q) + 1, 4, 3, count))  # x, y and z axis and origin of every joint in the world frame
+        frames = np.empty(
+            (len(q) + 1, 4, 3, count)
+        )  # x, y and z axis and origin of every joint in the world frame
         frames[0] = np.eye(4, 3)[..., None]
-        products = np.empty((12, 3 * count))  # reused for all joints: allocating new pages dominates the run time
-        constant, moving = products[:4].reshape(4, 3, count), products[4:].reshape(2, 4, 3, count)
-        for joint, (parent, coefficients) in enumerate(zip(self._parents, self._coefficients, strict=True), 1):
+        products = np.empty(
+            (12, 3 * count)
+        )  # reused for all joints: allocating new pages dominates the run time
+        constant, moving = (
+            products[:4].reshape(4, 3, count),
+            products[4:].reshape(2, 4, 3, count),
+        )
+        for joint, (parent, coefficients) in enumerate(
+            zip(self._parents, self._coefficients, strict=True), 1
+        ):
             np.matmul(coefficients, frames[parent].reshape(4, -1), out=products)
             moving *= factors[joint - 1, :, None, None]
             np.add(constant, moving[0], out=frames[joint])
@@ -61,14 +78,19 @@ class ForwardKinematics:
     def motion_bounds(self, extents: Array, max_positions: Array) -> Array:
         """Bound the displacement of any point of the robot per unit of motion of each joint [m], shape (n,).
 
-        It is the maximum distance along the chain to a point that the joint moves; 1 for prismatic joints. Extents are
-        the largest distances of points of the links from the origin of the base or of their joint [m], shape (n + 1,).
+        It is the maximum distance along the chain to a point that the joint moves; 1
+        for prismatic joints. Extents are the largest distances of points of the links
+        from the origin of the base or of their joint [m], shape (n + 1,).
         """
         lengths = self._lengths[:, 0] + self._lengths[:, 1] * max_positions
         bounds = extents[1:].copy()
         for joint in range(len(bounds), 1, -1):
-            bounds[joint - 2] = max(bounds[joint - 2], lengths[joint - 1] + bounds[joint - 1])
-        if self._parents != list(range(len(bounds))):  # a tree: two links can move across the whole of it
+            bounds[joint - 2] = max(
+                bounds[joint - 2], lengths[joint - 1] + bounds[joint - 1]
+            )
+        if self._parents != list(
+            range(len(bounds))
+        ):  # a tree: two links can move across the whole of it
             bounds[:] = lengths.sum() + 2 * extents.max()
         return np.where(self._slides, 1.0, bounds)
 
@@ -84,7 +106,9 @@ class ForwardKinematics:
             pose[:] = self._data.oMi[len(self._coefficients)].homogeneous[:3]
         error = float(np.abs(poses - expected.T).max())
         if error > MAX_POSE_ERROR * (1 + np.abs(states).max()):
-            raise MachineError(f"forward kinematics differ from Pinocchio's by {error:.2g} at one of {states.tolist()}")
+            raise MachineError(
+                f"forward kinematics differ from Pinocchio's by {error:.2g} at one of {states.tolist()}"
+            )
 
 
 def joint_motion(model: "pin.Model", joint: int) -> Array:
@@ -97,8 +121,9 @@ def joint_motion(model: "pin.Model", joint: int) -> Array:
 def _coefficients(model: "pin.Model", joint: int) -> Array:
     """Return the coefficients of a joint's pose in the frame of its parent, shape (12, 4).
 
-    Each four rows are its x, y and z axis and origin: constants, factors of sin q, or of q of a prismatic joint, and of
-    cos q. A point is (x, y, z, 1), a vector (x, y, z, 0).
+    Each four rows are its x, y and z axis and origin: constants, factors of sin q, or
+    of q of a prismatic joint, and of cos q. A point is (x, y, z, 1), a vector (x, y, z,
+    0).
     """
     motion = joint_motion(model, joint)
     x, y, z = motion[3:]

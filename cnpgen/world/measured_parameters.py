@@ -23,17 +23,19 @@ Array = NDArray[np.float64]
 class MeasuredParameters:
     """Parameters of the sample of a world; ``set`` replaces them.
 
-    Attributes:
-        model: Pinocchio's model with the load of the sample, a copy of the robot's if loads differ.
-        values: Parameters of the sample, by name.
-        scene_values: Values for a constraint (``Constraint.scene_values``); empty if none were given.
+    Attributes: model: Pinocchio's model with the load of the sample, a copy of the
+        robot's if loads differ. values: Parameters of the sample, by name.
+        scene_values: Values for a constraint (``Constraint.scene_values``); empty if
+        none were given.
     """
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self.model = robot.model
         self.scene_values: Array = np.empty(0)
-        self.values: dict[str, float] = robot.parameters.split(np.empty(0), robot.nominal_parameters)[1]
+        self.values: dict[str, float] = robot.parameters.split(
+            np.empty(0), robot.nominal_parameters
+        )[1]
         self._turn, self._origin = np.eye(3), np.zeros(3)
         self._upright = np.eye(3)
         self._load: tuple[int, pin.Inertia, pin.SE3] | None = None
@@ -42,12 +44,16 @@ class MeasuredParameters:
 
     def set(self, values: Array) -> None:
         """Take the values of a scene after its obstacles: those for a constraint, then parameters, shape (width,)."""
-        self.scene_values, self.values = self._robot.parameters.split(values, self._robot.nominal_parameters)
+        self.scene_values, self.values = self._robot.parameters.split(
+            values, self._robot.nominal_parameters
+        )
         if self._load is not None:
             self._set_load()
         if self._robot.parameters.tilts_table:
             self._turn = self._turned("table_roll", "table_pitch")
-            self._origin = self._robot.table_origin + np.array([0.0, 0.0, self.values.get("table_height", 0.0)])
+            self._origin = self._robot.table_origin + np.array(
+                [0.0, 0.0, self.values.get("table_height", 0.0)]
+            )
         if self._robot.parameters.turns_upright:
             self._upright = self._turned(*UPRIGHT_TURN)
 
@@ -66,11 +72,17 @@ class MeasuredParameters:
             return position
         shape = 3, *[1] * (position.ndim - 1)
         pivot = self._robot.table_origin.reshape(shape)
-        return np.asarray(self._turn.T @ (position - self._origin.reshape(shape)) + pivot)
+        return np.asarray(
+            self._turn.T @ (position - self._origin.reshape(shape)) + pivot
+        )
 
     def along_table(self, vector: Array) -> Array:
         """Return vectors along the axes of the table, shape (3,) or (3, K)."""
-        return np.asarray(self._turn.T @ vector) if self._robot.parameters.tilts_table else vector
+        return (
+            np.asarray(self._turn.T @ vector)
+            if self._robot.parameters.tilts_table
+            else vector
+        )
 
     def along_upright(self, vector: Sequence[Any] | Array) -> Array:
         """Return vectors along axes that parameters turn with the upright direction, shape (3, ...)."""
@@ -81,10 +93,19 @@ class MeasuredParameters:
     def _hold_load(self) -> None:
         """Copy the model, and keep the last body without its load."""
         robot = self._robot
-        bare = reduced_model(robot.urdf, robot.urdf_text, robot.joint_names, replace(robot.attached, payload=None))
+        bare = reduced_model(
+            robot.urdf,
+            robot.urdf_text,
+            robot.joint_names,
+            replace(robot.attached, payload=None),
+        )
         self.model = robot.model.copy()
         frame = bare.frames[frame_of(bare, robot.tip)]
-        self._load = frame.parentJoint, bare.inertias[frame.parentJoint].copy(), frame.placement.copy()
+        self._load = (
+            frame.parentJoint,
+            bare.inertias[frame.parentJoint].copy(),
+            frame.placement.copy(),
+        )
 
     def _set_load(self) -> None:
         import pinocchio as pin
@@ -94,7 +115,10 @@ class MeasuredParameters:
         assert payload is not None
         joint, bare, placement = self._load
         mass = self.values.get("payload_mass", payload.mass)
-        centre = [self.values.get(name, value) for name, value in zip(PAYLOAD_CENTRE, payload.centre, strict=True)]
+        centre = [
+            self.values.get(name, value)
+            for name, value in zip(PAYLOAD_CENTRE, payload.centre, strict=True)
+        ]
         shape = payload.inertia_matrix * self.values.get("payload_inertia", 1.0)
         body = pin.Inertia(mass, np.array(centre), shape * (mass / payload.mass))
         self.model.inertias[joint] = bare + placement.act(body)

@@ -1,8 +1,8 @@
 """Signed distances of pairs of convex bodies along a path: at its states, and over the intervals between them.
 
-The signed distance of two convex bodies (minus the penetration depth if they overlap) is the maximum over unit vectors
-u of their separation ``min over a of u . a - max over b of u . b``. Every direction therefore bounds the distances at
-all states from below.
+The signed distance of two convex bodies (minus the penetration depth if they overlap)
+is the maximum over unit vectors u of their separation ``min over a of u . a - max over
+b of u . b``. Every direction therefore bounds the distances at all states from below.
 """
 
 import math
@@ -24,10 +24,10 @@ RESOLUTION = 1e-9  # m: tolerance of the smallest distance
 class ClosestPoints:
     """Smallest signed distance between bodies at K states.
 
-    Attributes:
-        distance: Smallest distance of all pairs [m], minus the penetration depth if they overlap, shape (K,).
-        pair: Index of the pair with this distance, shape (K,).
-        points: Points of the two bodies at this distance, in the world frame [m], shape (K, 2, 3).
+    Attributes: distance: Smallest distance of all pairs [m], minus the penetration
+        depth if they overlap, shape (K,). pair: Index of the pair with this distance,
+        shape (K,). points: Points of the two bodies at this distance, in the world
+        frame [m], shape (K, 2, 3).
     """
 
     distance: Array
@@ -39,13 +39,17 @@ class ClosestPoints:
 class PairDistances:
     """Signed distances of M pairs of convex bodies at K states.
 
-    Attributes:
-        bounds: Lower bounds of the distances [m], shape (M, K).
-        measure: Returns the signed distance of a pair at a state [m] and the unit vector, shape (3,), along which the
-            bodies have this distance, or a vector of nan. Distances are never below their bounds.
-        separation: Returns lower bounds of the distances of a pair [m] along a unit vector at J states, shape (J,).
-        bodies: Returns both bodies of a pair at a state with their poses, that of the robot before an obstacle.
-        directions: Separating directions of every pair, collected from its measurements.
+    Attributes: bounds: Lower bounds of the distances [m], shape (M, K). measure:
+        Returns the signed distance of a pair at a state [m] and the unit vector, shape
+        (3,), along which the
+            bodies have this distance, or a vector of nan. Distances are never below
+            their bounds.
+        separation: Returns lower bounds of the distances of a pair [m] along a unit
+            vector at J states, shape (J,).
+        bodies: Returns both bodies of a pair at a state with their poses, that of the
+            robot before an obstacle.
+        directions: Separating directions of every pair, collected from its
+            measurements.
     """
 
     bounds: Array
@@ -65,14 +69,15 @@ class PairDistances:
     def _searched(self, pairs: list[int]) -> list[Array]:
         """Find the smallest distance of some pairs by best-first search.
 
-        The state with the smallest bound is measured, and its separating direction raises the bounds of the same pair
-        at the states that could be closer. The search ends when no bound is below the smallest measured distance, so no
-        state is missed.
+        The state with the smallest bound is measured, and its separating direction
+        raises the bounds of the same pair at the states that could be closer. The
+        search ends when no bound is below the smallest measured distance, so no state
+        is missed.
 
-        Returns:
-            Distances [m], one array of shape (K,) per pair. The smallest one is exact up to ``RESOLUTION`` and stands
-            where it was measured; values that were not measured are lower bounds above it. A state that cannot be
-            measured is nan and ends the search.
+        Returns: Distances [m], one array of shape (K,) per pair. The smallest one is
+            exact up to ``RESOLUTION`` and stands where it was measured; values that
+            were not measured are lower bounds above it. A state that cannot be measured
+            is nan and ends the search.
         """
         distances, best = self.bounds[pairs], np.inf
         measured: dict[tuple[int, int], float] = {}
@@ -103,8 +108,9 @@ class PairDistances:
     def clear_states(self, min_distance: float) -> NDArray[np.bool_]:
         """Return a mask of the states at which all pairs reach a minimum distance [m], shape (K,).
 
-        A state whose bound is too small is measured. Its separating direction also bounds the distances at the other
-        unresolved states and usually resolves most of them. States whose distance cannot be measured are not clear.
+        A state whose bound is too small is measured. Its separating direction also
+        bounds the distances at the other unresolved states and usually resolves most of
+        them. States whose distance cannot be measured are not clear.
         """
         clear = np.ones(self.bounds.shape[1], bool)
         proven = self.bounds >= min_distance
@@ -115,7 +121,9 @@ class PairDistances:
                 distance, direction = self.measure(pair, k)
                 clear[k] = distance >= min_distance
                 if len(unresolved) and np.isfinite(direction).all():
-                    unresolved = unresolved[~(self.separation(pair, direction, unresolved) >= min_distance)]
+                    unresolved = unresolved[
+                        ~(self.separation(pair, direction, unresolved) >= min_distance)
+                    ]
         return clear
 
     def smallest_per_state(self) -> tuple[Array, Indices]:
@@ -137,45 +145,68 @@ class PairDistances:
         return distances, closest
 
     def closest_points(self, radius: float = 0.0) -> ClosestPoints:
-        """Measure the smallest distance at every state, unlike ``smallest``; a radius [m] extends the first bodies."""
+        """Measure the smallest distance at every state, unlike ``smallest``.
+
+        A radius [m] extends the first bodies.
+        """
         certified, points = CertifiedDistance(), list[tuple[Array, Array]]()
         distance, closest = self.smallest_per_state()
         for k, pair in enumerate(closest.tolist()):
             (a, pose_a), (b, pose_b) = self.bodies(pair, k)
-            _, normal = certified.between(a, pose_a, b, pose_b)  # nan if Coal finds no direction
+            _, normal = certified.between(
+                a, pose_a, b, pose_b
+            )  # nan if Coal finds no direction
             point_a, point_b = certified.witnesses()
-            points.append((point_a + (a.radius + radius) * normal, point_b - b.radius * normal))
+            points.append(
+                (point_a + (a.radius + radius) * normal, point_b - b.radius * normal)
+            )
         return ClosestPoints(distance - radius, closest, np.array(points))
 
-    def interval_bounds(self, min_distances: Array, displacements: Array, deviations: Array) -> Array:
+    def interval_bounds(
+        self, min_distances: Array, displacements: Array, deviations: Array
+    ) -> Array:
         """Bound by how much all distances exceed a minimum between neighboring states [m], shape (K - 1,).
 
-        Every point of a body stays within a bounded deviation from the chord between its two positions. Bodies that are
-        separated along a direction at both states are therefore separated between them, up to that deviation. Bounds
-        are only tightened until they reach 0.
+        Every point of a body stays within a bounded deviation from the chord between
+        its two positions. Bodies that are separated along a direction at both states
+        are therefore separated between them, up to that deviation. Bounds are only
+        tightened until they reach 0.
 
-        Args:
-            min_distances: Required distance of every pair [m], shape (M,).
-            displacements: Maximum displacement of a point of one body in the frame of the other [m], shape (K - 1,).
-            deviations: Maximum deviation of its path from the chord [m], shape (K - 1,).
+        Args: min_distances: Required distance of every pair [m], shape (M,).
+            displacements: Maximum displacement of a point of one body in the frame of
+            the other [m], shape (K - 1,). deviations: Maximum deviation of its path
+            from the chord [m], shape (K - 1,).
         """
         margins = self.bounds - min_distances[:, None]
         intervals = (margins[:, 1:] + margins[:, :-1] - displacements) / 2 - deviations
         for pair in np.flatnonzero(~(intervals >= 0).all(axis=1)).tolist():
             for direction in list(self.directions.get(pair, [])):
-                self._raise(intervals[pair], pair, direction, min_distances[pair] + deviations)
+                self._raise(
+                    intervals[pair], pair, direction, min_distances[pair] + deviations
+                )
             for k in np.flatnonzero(~(intervals[pair] >= 0)).tolist():
                 for end in (k, k + 1):
                     if not intervals[pair, k] >= 0:
                         direction = self._measured(pair, end)[1]
-                        self._raise(intervals[pair], pair, direction, min_distances[pair] + deviations)
-        lowest: Array = np.where(np.isnan(intervals), -np.inf, intervals).min(axis=0, initial=np.inf)
+                        self._raise(
+                            intervals[pair],
+                            pair,
+                            direction,
+                            min_distances[pair] + deviations,
+                        )
+        lowest: Array = np.where(np.isnan(intervals), -np.inf, intervals).min(
+            axis=0, initial=np.inf
+        )
         return lowest
 
-    def _raise(self, bounds: Array, pair: int, direction: Array, required: Array) -> None:
+    def _raise(
+        self, bounds: Array, pair: int, direction: Array, required: Array
+    ) -> None:
         """Raise the negative interval bounds of a pair, shape (K - 1,), by its separation along a direction."""
         unresolved = np.flatnonzero(~(bounds >= 0))
         if len(unresolved):
             states = np.concatenate([unresolved, unresolved + 1])
             separations = self.separation(pair, direction, states).reshape(2, -1)
-            bounds[unresolved] = np.fmax(bounds[unresolved], separations.min(axis=0) - required[unresolved])
+            bounds[unresolved] = np.fmax(
+                bounds[unresolved], separations.min(axis=0) - required[unresolved]
+            )

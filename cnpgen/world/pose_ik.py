@@ -1,7 +1,8 @@
 """Inverse kinematics of tip poses for many seeds at once: damped Gauss-Newton steps within the joint limits.
 
-The damping follows the error (Levenberg-Marquardt; Sugihara 2011). The tip may be another frame that the same joint
-carries. With tolerances, every step aims for the nearest pose within them, and directions without an error are free.
+The damping follows the error (Levenberg-Marquardt; Sugihara 2011). The tip may be
+another frame that the same joint carries. With tolerances, every step aims for the
+nearest pose within them, and directions without an error are free.
 """
 
 from dataclasses import dataclass
@@ -20,16 +21,18 @@ METERS_PER_RADIAN = 0.3  # weight of an angle against a distance
 POSE_DAMPING = 1e-3  # relative to the squared error
 POSE_POSITION_TOLERANCE_M = 1e-6
 POSE_ROTATION_TOLERANCE_RAD = 1e-6
-TOLERANCE_INSET = 1e-5  # m and rad, from the end of a tolerance, so that solutions are within it
+TOLERANCE_INSET = (
+    1e-5  # m and rad, from the end of a tolerance, so that solutions are within it
+)
 
 
 @dataclass(frozen=True, eq=False)
 class PoseTolerance:
     """Tolerances of K poses along and about the axes of the wanted poses.
 
-    Attributes:
-        position: Accepted displacements along the axes [m], shape (K, 3).
-        rotation: Accepted components of the rotation vector [rad], shape (K, 3); about an axis with pi or more any
+    Attributes: position: Accepted displacements along the axes [m], shape (K, 3).
+        rotation: Accepted components of the rotation vector [rad], shape (K, 3); about
+        an axis with pi or more any
             rotation is accepted.
     """
 
@@ -46,19 +49,25 @@ class PoseTolerance:
             rotations: Wanted rotation matrices, shape (K, 3, 3).
             at: Present positions and rotation matrices.
 
-        Returns:
-            Positions; rotation matrices; and the mask of the three displacements and three rotations that are within
-            their tolerances, shape (K, 6).
+        Returns: Positions; rotation matrices; and the mask of the three displacements
+            and three rotations that are within their tolerances, shape (K, 6).
         """
         back = rotations.swapaxes(1, 2)
         shift = (back @ (at[0] - positions)[..., None])[..., 0]
         turn = rotation_vectors(back @ at[1])
         error = np.concatenate([shift, turn], axis=1)
-        limit = np.concatenate([self.position, np.where(self.rotation >= np.pi, np.inf, self.rotation)], axis=1)
+        limit = np.concatenate(
+            [self.position, np.where(self.rotation >= np.pi, np.inf, self.rotation)],
+            axis=1,
+        )
         inner = np.maximum(limit - TOLERANCE_INSET, 0.0)
         nearest = np.clip(error, -inner, inner)
         place = positions + (rotations @ nearest[:, :3, None])[..., 0]
-        return place, rotations @ rotation_matrices(nearest[:, 3:]), (error == nearest) & (limit > 0)
+        return (
+            place,
+            rotations @ rotation_matrices(nearest[:, 3:]),
+            (error == nearest) & (limit > 0),
+        )
 
 
 class PoseKinematics:
@@ -68,16 +77,23 @@ class PoseKinematics:
         model = robot.model
         placed = model.frames[robot.tip_frame if frame is None else frame]
         self.robot, self._carrier = robot, placed.parentJoint
-        self._turn, self._offset = np.array(placed.placement.rotation), np.array(placed.placement.translation)
-        self._kinematics, self._joints = ForwardKinematics(model), list(model.supports[self._carrier])[1:]
-        self._motions = [joint_motion(model, joint) for joint in range(1, model.njoints)]
+        self._turn, self._offset = (
+            np.array(placed.placement.rotation),
+            np.array(placed.placement.translation),
+        )
+        self._kinematics, self._joints = (
+            ForwardKinematics(model),
+            list(model.supports[self._carrier])[1:],
+        )
+        self._motions = [
+            joint_motion(model, joint) for joint in range(1, model.njoints)
+        ]
 
     def evaluate(self, q: Array) -> tuple[Array, Array, Array]:
         """Compute poses and Jacobians at joint positions q [rad], shape (n, K).
 
-        Returns:
-            Positions [m], shape (K, 3); rotation matrices, shape (K, 3, 3); and Jacobians of linear and angular
-            velocity in world axes, shape (K, 6, n).
+        Returns: Positions [m], shape (K, 3); rotation matrices, shape (K, 3, 3); and
+            Jacobians of linear and angular velocity in world axes, shape (K, 6, n).
         """
         rotations, origins = self._kinematics.poses(q)
         turns = rotations.transpose(3, 0, 1, 2)  # (K, n + 1, 3, 3)
@@ -85,8 +101,12 @@ class PoseKinematics:
         position = points[:, self._carrier] + turns[:, self._carrier] @ self._offset
         J = np.zeros((q.shape[1], 6, len(q)))
         for joint in self._joints:
-            linear, angular = (turns[:, joint] @ part for part in np.split(self._motions[joint - 1], 2))
-            J[:, :3, joint - 1] = linear + np.cross(angular, position - points[:, joint])
+            linear, angular = (
+                turns[:, joint] @ part for part in np.split(self._motions[joint - 1], 2)
+            )
+            J[:, :3, joint - 1] = linear + np.cross(
+                angular, position - points[:, joint]
+            )
             J[:, 3:, joint - 1] = angular
         return position, turns[:, self._carrier] @ self._turn, J
 
@@ -101,11 +121,12 @@ def solve_pose_ik(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Search joint positions with given poses, one for each seed.
 
-    Positions [m] have shape (K, 3), rotation matrices (K, 3, 3), and the seeds, joint positions at which the iteration
-    starts [rad], (n, K). By default no differences from the poses are accepted.
+    Positions [m] have shape (K, 3), rotation matrices (K, 3, 3), and the seeds, joint
+    positions at which the iteration starts [rad], (n, K). By default no differences
+    from the poses are accepted.
 
-    Returns:
-        Joint positions within their limits [rad], shape (n, K), and the mask of those that have their pose, shape (K,).
+    Returns: Joint positions within their limits [rad], shape (n, K), and the mask of
+        those that have their pose, shape (K,).
     """
     robot = kinematics.robot
     low, high = robot.position_lower[:, None], robot.position_upper[:, None]
@@ -114,8 +135,13 @@ def solve_pose_ik(
         position, rotation, J = kinematics.evaluate(q)
         place, facing, free = positions, rotations, None
         if tolerance is not None:
-            place, facing, free = tolerance.nearest(positions, rotations, (position, rotation))
-        shift, turn = place - position, rotation_vectors(facing @ rotation.swapaxes(1, 2))
+            place, facing, free = tolerance.nearest(
+                positions, rotations, (position, rotation)
+            )
+        shift, turn = (
+            place - position,
+            rotation_vectors(facing @ rotation.swapaxes(1, 2)),
+        )
         met = np.linalg.norm(shift, axis=1) <= POSE_POSITION_TOLERANCE_M
         met &= np.linalg.norm(turn, axis=1) <= POSE_ROTATION_TOLERANCE_RAD
         if step == MAX_POSE_STEPS or met.all():
@@ -127,12 +153,16 @@ def solve_pose_ik(
         damping = POSE_DAMPING * np.square(error).sum(axis=1) + 1e-9
         square = J @ J.swapaxes(1, 2) + damping[:, None, None] * np.eye(6)
         move = (J.swapaxes(1, 2) @ np.linalg.solve(square, error[..., None]))[..., 0].T
-        move *= np.minimum(1.0, MAX_POSE_STEP_RAD / np.maximum(np.abs(move).max(axis=0), 1e-12))
+        move *= np.minimum(
+            1.0, MAX_POSE_STEP_RAD / np.maximum(np.abs(move).max(axis=0), 1e-12)
+        )
         q = np.where(met, q, np.clip(q + move, low, high))
     return q, met
 
 
-def _without_free(error: Array, J: Array, rotations: Array, free: NDArray[np.bool_]) -> tuple[Array, Array]:
+def _without_free(
+    error: Array, J: Array, rotations: Array, free: NDArray[np.bool_]
+) -> tuple[Array, Array]:
     """Return errors (K, 6) and Jacobians in the axes of the wanted poses, zero in free directions (K, 6)."""
     back, count = rotations.swapaxes(1, 2)[:, None], len(error)
     turned = (back @ error.reshape(count, 2, 3, 1)).reshape(count, 6)
@@ -147,7 +177,9 @@ def rotation_matrices(vectors: Array) -> Array:
     zero = np.zeros_like(x)
     cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
     half = np.sinc(angle / (2 * np.pi))  # sin(angle / 2) / (angle / 2)
-    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * cross + half**2 / 2 * cross @ cross)
+    return np.asarray(
+        np.eye(3) + np.sinc(angle / np.pi) * cross + half**2 / 2 * cross @ cross
+    )
 
 
 def rotation_vectors(rotations: Array) -> Array:

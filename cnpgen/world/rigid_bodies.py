@@ -35,48 +35,81 @@ class RigidBodies:
         n_obstacles: Number of obstacles.
         n_joints: Number of the robot's planned joints.
 
-    Attributes:
-        obstacle_pairs: Pairs (obstacle, moving part), part by part, shape (M, 2).
-        link_pairs: Pairs of parts of links that must not touch, the one nearer to the base first, shape (M, 2).
+    Attributes: obstacle_pairs: Pairs (obstacle, moving part), part by part, shape (M,
+        2). link_pairs: Pairs of parts of links that must not touch, the one nearer to
+        the base first, shape (M, 2).
     """
 
     def __init__(self, shape: Shape, n_obstacles: int, n_joints: int) -> None:
         parts, n_parts = shape.convex_parts, len(shape.convex_parts)
-        self._bodies, self._solids = [convex_body(part.vertices, part.radius) for part in parts], list[Solid]()
-        self._frames = [shape.joints[part.link] for part in parts] + [n_joints + 1 + i for i in range(n_obstacles)]
-        self._balls = [(*ball_round(part.vertices, part.radius), np.zeros(3)) for part in parts]
+        self._bodies, self._solids = (
+            [convex_body(part.vertices, part.radius) for part in parts],
+            list[Solid](),
+        )
+        self._frames = [shape.joints[part.link] for part in parts] + [
+            n_joints + 1 + i for i in range(n_obstacles)
+        ]
+        self._balls = [
+            (*ball_round(part.vertices, part.radius), np.zeros(3)) for part in parts
+        ]
         moving = [index for index, frame in enumerate(self._frames[:n_parts]) if frame]
         obstacles = range(n_parts, n_parts + n_obstacles)
-        self.obstacle_pairs = _pairs((obstacle, part) for part in moving for obstacle in obstacles)
-        self.link_pairs = _pairs(sorted(pair, key=self._frames.__getitem__) for pair in shape.checked_pairs)
+        self.obstacle_pairs = _pairs(
+            (obstacle, part) for part in moving for obstacle in obstacles
+        )
+        self.link_pairs = _pairs(
+            sorted(pair, key=self._frames.__getitem__) for pair in shape.checked_pairs
+        )
         self._certified = CertifiedDistance()
         self._set_obstacles([])
 
-    def place(self, rotations: Array, positions: Array, solids: Sequence[Solid]) -> None:
+    def place(
+        self, rotations: Array, positions: Array, solids: Sequence[Solid]
+    ) -> None:
         """Move to K states and place the obstacles.
 
-        Rotation matrices of the joints' frames, that of the base first, have shape (n + 1, 3, 3, K), their origins [m]
-        (n + 1, 3, K).
+        Rotation matrices of the joints' frames, that of the base first, have shape (n +
+        1, 3, 3, K), their origins [m] (n + 1, 3, K).
         """
         count = rotations.shape[-1]
-        if len(solids) != len(self._solids) or not all(map(same_shape, solids, self._solids)):
+        if len(solids) != len(self._solids) or not all(
+            map(same_shape, solids, self._solids)
+        ):
             self._set_obstacles(solids)
         self._solids = list(solids)
         fixed = np.broadcast_to(np.eye(3)[..., None], (len(solids), 3, 3, count))
         self._rotations = np.concatenate([rotations, fixed])
         centers = np.array([solid.position for solid in solids]).reshape(-1, 3, 1)
-        self._positions = np.concatenate([positions, np.broadcast_to(centers, (len(solids), 3, count))])
+        self._positions = np.concatenate(
+            [positions, np.broadcast_to(centers, (len(solids), 3, count))]
+        )
 
     def _set_obstacles(self, solids: Sequence[Solid]) -> None:
-        """Make bodies of the obstacles. Obstacles are bounded by boxes, parts of links by balls."""
+        """Make bodies of the obstacles.
+
+        Obstacles are bounded by boxes, parts of links by balls.
+        """
         n_parts = len(self._balls)
-        self._bodies = self._bodies[:n_parts] + [convex_body(solid.corners, solid.radius) for solid in solids]
-        extents = [(solid.corners.min(axis=0), solid.corners.max(axis=0), solid.radius) for solid in solids]
-        boxes = [((low + high) / 2, 0.0, (high - low) / 2 + radius) for low, high, radius in extents]
-        self._centers, self._radii, self._half_sizes = map(np.array, zip(*self._balls, *boxes, strict=True))
+        self._bodies = self._bodies[:n_parts] + [
+            convex_body(solid.corners, solid.radius) for solid in solids
+        ]
+        extents = [
+            (solid.corners.min(axis=0), solid.corners.max(axis=0), solid.radius)
+            for solid in solids
+        ]
+        boxes = [
+            ((low + high) / 2, 0.0, (high - low) / 2 + radius)
+            for low, high, radius in extents
+        ]
+        self._centers, self._radii, self._half_sizes = map(
+            np.array, zip(*self._balls, *boxes, strict=True)
+        )
 
     def pair_distances(self, pairs: Pairs) -> PairDistances:
-        """Return the signed distances of ``obstacle_pairs`` or ``link_pairs``; overlaps are negative."""
+        """Return the signed distances of ``obstacle_pairs`` or ``link_pairs``.
+
+        Overlaps are negative.
+        """
         bodies = [(a, b) for a, b in pairs.tolist()]
 
         def measure(pair: int, k: int) -> tuple[float, Array]:
@@ -86,7 +119,11 @@ class RigidBodies:
             return self._separation(*bodies[pair], direction, states)
 
         def bodies_at(pair: int, k: int) -> tuple[PlacedBody, PlacedBody]:
-            a, b = bodies[pair] if bodies[pair][0] < len(self._balls) else bodies[pair][::-1]
+            a, b = (
+                bodies[pair]
+                if bodies[pair][0] < len(self._balls)
+                else bodies[pair][::-1]
+            )
             return self._placed(a, k), self._placed(b, k)
 
         return PairDistances(self._bounds(pairs), measure, separation, bodies_at)
@@ -94,7 +131,8 @@ class RigidBodies:
     def contacts(self, pairs: Pairs, within: float) -> Contacts:
         """Measure ``obstacle_pairs`` or ``link_pairs`` at states where their signed distance is below ``within`` [m].
 
-        The separating direction of a pair that is farther at one state also excludes most of the other states.
+        The separating direction of a pair that is farther at one state also excludes
+        most of the other states.
         """
         near, contacts = ~(self._bounds(pairs) >= within), list[Any]()
         for pair in np.flatnonzero(near.any(axis=1)).tolist():
@@ -103,10 +141,16 @@ class RigidBodies:
                 k, unresolved = int(unresolved[0]), unresolved[1:]
                 distance, direction = self._measure(a, b, k)
                 if distance < within:
-                    contacts.append((pair, k, distance, direction, self._certified.witnesses()))
+                    contacts.append(
+                        (pair, k, distance, direction, self._certified.witnesses())
+                    )
                 elif len(unresolved) and np.isfinite(direction).all():
-                    unresolved = unresolved[~(self._separation(a, b, direction, unresolved) >= within)]
-        return self._gathered(pairs, [contact for contact in contacts if np.isfinite(contact[3]).all()])
+                    unresolved = unresolved[
+                        ~(self._separation(a, b, direction, unresolved) >= within)
+                    ]
+        return self._gathered(
+            pairs, [contact for contact in contacts if np.isfinite(contact[3]).all()]
+        )
 
     def _gathered(self, pairs: Pairs, contacts: list[Any]) -> Contacts:
         """Gather tuples of pair, state, distance, direction in the frame of the first body, and points."""
@@ -114,18 +158,31 @@ class RigidBodies:
         pair, k, distance, direction, points = (np.array(column) for column in columns)
         pair, k = pair.astype(np.intp), k.astype(np.intp)
         frames = np.array(self._frames, np.intp)[pairs[pair]]
-        normal = np.einsum("cij,cj->ci", self._rotations[frames[:, 0], ..., k], direction.reshape(-1, 3))
+        normal = np.einsum(
+            "cij,cj->ci",
+            self._rotations[frames[:, 0], ..., k],
+            direction.reshape(-1, 3),
+        )
         return Contacts(pair, k, distance, normal, points.reshape(-1, 2, 3))
 
     def joints_of(self, bodies: Pairs) -> NDArray[np.intp]:
         """Return the indices of the joints that move bodies; 0 for fixed bodies."""
-        moved = np.where(np.arange(len(self._frames)) < len(self._balls), self._frames, 0)
+        moved = np.where(
+            np.arange(len(self._frames)) < len(self._balls), self._frames, 0
+        )
         return np.asarray(moved[bodies], np.intp)
 
     def extent(self, joint: int) -> float:
         """Return the largest distance of a point that is fixed to a joint's frame from its origin [m]."""
-        balls = [ball for frame, ball in zip(self._frames, self._balls, strict=False) if frame == joint]
-        return max((float(np.linalg.norm(center) + radius) for center, radius, _ in balls), default=0.0)
+        balls = [
+            ball
+            for frame, ball in zip(self._frames, self._balls, strict=False)
+            if frame == joint
+        ]
+        return max(
+            (float(np.linalg.norm(center) + radius) for center, radius, _ in balls),
+            default=0.0,
+        )
 
     def _bounds(self, pairs: Pairs) -> Array:
         """Bound distances from below by bounding balls of the bodies and bounding boxes of obstacles, shape (M, K)."""
@@ -136,32 +193,51 @@ class RigidBodies:
         gaps -= self._half_sizes[first, :, None]
         largest = gaps.max(axis=1)
         np.maximum(gaps, 0, out=gaps)
-        distance: Array = np.where(largest > 0, np.sqrt(np.einsum("mik,mik->mk", gaps, gaps)), largest)
+        distance: Array = np.where(
+            largest > 0, np.sqrt(np.einsum("mik,mik->mk", gaps, gaps)), largest
+        )
         distance -= (self._radii[first] + self._radii[second])[:, None]
         return distance
 
     def _measure(self, a: int, b: int, k: int) -> tuple[float, Array]:
-        """Measure a pair at a state; the direction points from a to b, in the frame of a."""
+        """Measure a pair at a state.
+
+        The direction points from a to b, in the frame of a.
+        """
         first, second = self._placed(a, k), self._placed(b, k)
         distance, normal = self._certified.between(*first, *second)
         return distance, normal @ first[1][0]
 
     def _placed(self, body: int, k: int) -> PlacedBody:
         frame = self._frames[body]
-        return self._bodies[body], (self._rotations[frame, ..., k].copy(), self._positions[frame, :, k].copy())
+        return self._bodies[body], (
+            self._rotations[frame, ..., k].copy(),
+            self._positions[frame, :, k].copy(),
+        )
 
     def _separation(self, a: int, b: int, direction: Array, states: Pairs) -> Array:
         """Compute the separation of b from a along a direction in the frame of a, at some states [m], shape (K,)."""
-        (first, second), (frame, other) = (self._bodies[a], self._bodies[b]), (self._frames[a], self._frames[b])
-        rotation, between = self._rotations[other], self._positions[other] - self._positions[frame]
+        (first, second), (frame, other) = (
+            (self._bodies[a], self._bodies[b]),
+            (self._frames[a], self._frames[b]),
+        )
+        rotation, between = (
+            self._rotations[other],
+            self._positions[other] - self._positions[frame],
+        )
         if a >= len(self._balls):  # an obstacle, whose frame has the axes of the world
             in_b = (direction @ rotation.reshape(3, -1)).reshape(3, -1)
             shift = direction @ between
         else:
             along = direction @ self._rotations[frame]
-            in_b, shift = np.einsum("ijk,ik->jk", rotation, along), np.einsum("ik,ik->k", along, between)
+            in_b, shift = (
+                np.einsum("ijk,ik->jk", rotation, along),
+                np.einsum("ik,ik->k", along, between),
+            )
         reach = float((first.corners @ direction).max()) + first.radius + second.radius
-        return np.asarray(lowest_products(second.corners, in_b[:, states]) + shift[states] - reach)
+        return np.asarray(
+            lowest_products(second.corners, in_b[:, states]) + shift[states] - reach
+        )
 
 
 def lowest_products(corners: Array, directions: Array) -> Array:
@@ -169,7 +245,9 @@ def lowest_products(corners: Array, directions: Array) -> Array:
     size = max(MAX_BLOCK_PRODUCTS // max(directions.shape[1], 1), 1)
     lowest = (corners[:size] @ directions).min(axis=0)
     for first in range(size, len(corners), size):
-        np.minimum(lowest, (corners[first : first + size] @ directions).min(axis=0), out=lowest)
+        np.minimum(
+            lowest, (corners[first : first + size] @ directions).min(axis=0), out=lowest
+        )
     return np.asarray(lowest)
 
 

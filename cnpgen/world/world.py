@@ -26,8 +26,8 @@ Value = TypeVar("Value", float, Array)  # of one state, or of K states
 class RobotWorld(ABC, Generic[Value]):
     """A robot among its obstacles, at one or at many states: the parts that ``World`` and ``PathWorld`` share.
 
-    Vectors are in the world frame. The memory of Pinocchio and Coal is reused: use a world in one process and one
-    thread only.
+    Vectors are in the world frame. The memory of Pinocchio and Coal is reused: use a
+    world in one process and one thread only.
 
     Args:
         robot: The robot.
@@ -52,8 +52,16 @@ class RobotWorld(ABC, Generic[Value]):
         self._data, self._tip = self._model.createData(), robot.tip_frame
         self._object_size = None if object_size is None else np.array(object_size)
         self._collisions, self._solids = CollisionWorld(object_size), list[Solid]()
-        self._bodies = None if robot.shape is None else RigidBodies(robot.shape, len(obstacles), robot.n)
-        self._held = None if robot.held_shape is None else RigidBodies(robot.held_shape, 0, robot.n)
+        self._bodies = (
+            None
+            if robot.shape is None
+            else RigidBodies(robot.shape, len(obstacles), robot.n)
+        )
+        self._held = (
+            None
+            if robot.held_shape is None
+            else RigidBodies(robot.held_shape, 0, robot.n)
+        )
         self._pose_width = pose_width(self.obstacles)
         self._poses: Array | None = None  # of the obstacles
         self._start()
@@ -64,23 +72,28 @@ class RobotWorld(ABC, Generic[Value]):
 
     @property
     def scene_values(self) -> Array:
-        """Values for a constraint (``Constraint.scene_values``); empty if none were given."""
+        """Values for a constraint (``Constraint.scene_values``).
+
+        Empty if none were given.
+        """
         return self.parameters.scene_values
 
     def segment_distances(self, sufficient: float = np.inf) -> list[Value]:
         """Measure the signed distance of every segment of the robot from every obstacle, segment by segment [m].
 
-        A path that is not exact returns lower bounds without measuring if these are sufficient.
+        A path that is not exact returns lower bounds without measuring if these are
+        sufficient.
 
-        Returns:
-            Exact distances at one state. At K states, arrays of shape (K,), of which the smallest value is exact.
+        Returns: Exact distances at one state. At K states, arrays of shape (K,), of
+            which the smallest value is exact.
         """
         return self._smallest("segments", sufficient)
 
     def shape_distances(self, sufficient: float = np.inf) -> list[Value]:
         """Measure the signed distance of every moving part of the robot's links from every obstacle, part by part [m].
 
-        The smallest is exact, the others are lower bounds above it (``cnpgen.world.pair_distances``).
+        The smallest is exact, the others are lower bounds above it
+        (``cnpgen.world.pair_distances``).
 
         Raises:
             RecipeError: The robot has no link geometry.
@@ -116,7 +129,9 @@ class RobotWorld(ABC, Generic[Value]):
     def _require_object(self) -> Array:
         """Return the edge lengths of the held object [m], shape (3,)."""
         if self._object_size is None:
-            raise RecipeError(["a constraint needs the held object, but the problem has no [object]"])
+            raise RecipeError(
+                ["a constraint needs the held object, but the problem has no [object]"]
+            )
         return self._object_size
 
     @abstractmethod
@@ -126,7 +141,10 @@ class RobotWorld(ABC, Generic[Value]):
     def _place(self, obstacle_poses: Array) -> None:
         """Take the poses of the obstacles, unless they stand there already, and discard the distances of the states."""
         self._pairs, self._placed = dict[str, PairDistances](), False
-        poses, values = obstacle_poses[: self._pose_width], obstacle_poses[self._pose_width :]
+        poses, values = (
+            obstacle_poses[: self._pose_width],
+            obstacle_poses[self._pose_width :],
+        )
         if self._poses is None or not np.array_equal(poses, self._poses):
             self._poses, copied = None, poses.copy()
             self._solids = solids_of(self.obstacles, copied)
@@ -144,7 +162,9 @@ class RobotWorld(ABC, Generic[Value]):
         """Return the distances of parts of links from obstacles, from each other, or from the held object."""
         if bodies != "held object":
             placed = self._placed_bodies()
-            return placed.pair_distances({"self": placed.link_pairs, "links": placed.obstacle_pairs}[bodies])
+            return placed.pair_distances(
+                {"self": placed.link_pairs, "links": placed.obstacle_pairs}[bodies]
+            )
         if self._held is None:
             raise RecipeError([NO_HELD_SHAPE])
         self._held.place(*self._joint_poses(), [])
@@ -163,39 +183,47 @@ class RobotWorld(ABC, Generic[Value]):
 class World(RobotWorld[float]):
     """A robot at one state, among the obstacles.
 
-    Constraints evaluate their ``measured`` forms on it. ``set_state`` runs the forward kinematics; every other quantity
-    is computed when it is read. Vectors are in the world frame. The memory of Pinocchio and Coal is reused: use a world
-    in one process and one thread only.
+    Constraints evaluate their ``measured`` forms on it. ``set_state`` runs the forward
+    kinematics; every other quantity is computed when it is read. Vectors are in the
+    world frame. The memory of Pinocchio and Coal is reused: use a world in one process
+    and one thread only.
 
     Args:
         robot: The robot.
         obstacles: The obstacles.
         object_size: Edge lengths of the held object [m], or None.
 
-    Attributes:
-        robot: The robot.
-        obstacles: The obstacles.
-        parameters: Parameters of the sample.
-        q: Joint positions [rad], shape (n,).
-        dq: Joint velocities [rad/s], shape (n,).
-        ddq: Joint accelerations [rad/s^2], shape (n,).
-        jerk: Joint jerks [rad/s^3], shape (n,); None at a boundary state or if no constraint needs them.
+    Attributes: robot: The robot. obstacles: The obstacles. parameters: Parameters of
+        the sample. q: Joint positions [rad], shape (n,). dq: Joint velocities [rad/s],
+        shape (n,). ddq: Joint accelerations [rad/s^2], shape (n,). jerk: Joint jerks
+        [rad/s^3], shape (n,); None at a boundary state or if no constraint needs them.
     """
 
     def _start(self) -> None:
-        self._dynamics_data = self._model.createData()  # separate: RNEA's accelerations include gravity
-        self._joints = sorted({point for segment in self.robot.capsule_axes for point in segment} - {self.robot.n})
+        self._dynamics_data = (
+            self._model.createData()
+        )  # separate: RNEA's accelerations include gravity
+        self._joints = sorted(
+            {point for segment in self.robot.capsule_axes for point in segment}
+            - {self.robot.n}
+        )
         zero = np.zeros(self.robot.n)
         self.set_state(self.robot.home, zero, zero, place_obstacles(self.obstacles))
 
-    def set_state(self, q: Array, dq: Array, ddq: Array, obstacle_poses: Array, jerk: Array | None = None) -> None:
+    def set_state(
+        self,
+        q: Array,
+        dq: Array,
+        ddq: Array,
+        obstacle_poses: Array,
+        jerk: Array | None = None,
+    ) -> None:
         """Move to a state.
 
-        Args:
-            q: Joint positions [rad], shape (n,).
-            dq: Joint velocities [rad/s], shape (n,).
-            ddq: Joint accelerations [rad/s^2], shape (n,).
-            obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``), then values for a constraint,
+        Args: q: Joint positions [rad], shape (n,). dq: Joint velocities [rad/s], shape
+            (n,). ddq: Joint accelerations [rad/s^2], shape (n,). obstacle_poses: Poses
+            and sizes of the obstacles (``cnpgen.robots.solid``), then values for a
+            constraint,
                 then the parameters of the problem, shape (width,).
             jerk: Joint jerks [rad/s^3], shape (n,), if the state has any.
         """
@@ -212,14 +240,18 @@ class World(RobotWorld[float]):
         """Inverse dynamics [N m], shape (n,)."""
         import pinocchio as pin
 
-        return np.array(pin.rnea(self._model, self._dynamics_data, self.q, self.dq, self.ddq))
+        return np.array(
+            pin.rnea(self._model, self._dynamics_data, self.q, self.dq, self.ddq)
+        )
 
     @property
     def holding_torque(self) -> Array:
         """Torque that holds the arm still at ``q`` [N m], shape (n,)."""
         import pinocchio as pin
 
-        return np.array(pin.computeGeneralizedGravity(self._model, self._dynamics_data, self.q))
+        return np.array(
+            pin.computeGeneralizedGravity(self._model, self._dynamics_data, self.q)
+        )
 
     @property
     def tip_position(self) -> Array:
@@ -252,8 +284,12 @@ class World(RobotWorld[float]):
         import pinocchio as pin
 
         frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        jacobian = pin.computeFrameJacobian(self._model, self._dynamics_data, self.q, self._tip, frame)
-        return np.array(jacobian).reshape(6, -1)[:3]  # Pinocchio returns a single column as a vector
+        jacobian = pin.computeFrameJacobian(
+            self._model, self._dynamics_data, self.q, self._tip, frame
+        )
+        return np.array(jacobian).reshape(6, -1)[
+            :3
+        ]  # Pinocchio returns a single column as a vector
 
     @property
     def tip_acceleration(self) -> Array:
@@ -272,15 +308,21 @@ class World(RobotWorld[float]):
             return self._segment_distances
         if bodies == "object":
             self._require_object()
-            return self._collisions.object_distances(self._T_world_tip.translation, self._T_world_tip.rotation)
+            return self._collisions.object_distances(
+                self._T_world_tip.translation, self._T_world_tip.rotation
+            )
         return [float(distances[0]) for distances in self._pairs_of(bodies).smallest()]
 
     @cached_property
     def _segment_distances(self) -> list[float]:
         poses = self._data.oMi  # of the universe and joints 1 to n
-        points = {joint: poses[joint + 1].translation.tolist() for joint in self._joints}
+        points = {
+            joint: poses[joint + 1].translation.tolist() for joint in self._joints
+        }
         points[self.robot.n] = self._T_world_tip.translation.tolist()
-        return self._collisions.segment_distances([(points[a], points[b]) for a, b in self.robot.capsule_axes])
+        return self._collisions.segment_distances(
+            [(points[a], points[b]) for a, b in self.robot.capsule_axes]
+        )
 
     def _joint_poses(self) -> tuple[Array, Array]:
         """Return the rotations and positions [m] of the base and the joints, as ``RigidBodies.place`` takes them."""

@@ -23,7 +23,12 @@ LIBRARIES = ("mushroom-rl", "mujoco", "numpy")
 def main() -> int:
     """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--environment", type=Path, required=True, help="clone of the Air Hockey Challenge")
+    parser.add_argument(
+        "--environment",
+        type=Path,
+        required=True,
+        help="clone of the Air Hockey Challenge",
+    )
     parser.add_argument("--episodes", type=int, default=30)
     parser.add_argument("--seed", type=int, default=0, help="seed of the first chunk")
     parser.add_argument("--chunk", type=int, default=25, help="episodes of one seed")
@@ -56,14 +61,38 @@ def main() -> int:
         seed = arguments.seed + total["episodes"] // arguments.chunk
         try:
             run_chunk(evaluate, build, count, seed, total)
-        except (AttributeError, AssertionError, IndexError, KeyError, TypeError, ValueError) as error:
+        except (
+            AttributeError,
+            AssertionError,
+            IndexError,
+            KeyError,
+            TypeError,
+            ValueError,
+        ) as error:
             installed = ", ".join(f"{name} {version(name)}" for name in LIBRARIES)
-            print(f"unsupported versions ({installed}): {type(error).__name__}: {error}", file=sys.stderr)
+            print(
+                f"unsupported versions ({installed}): {type(error).__name__}: {error}",
+                file=sys.stderr,
+            )
             return 3
         times = 1e3 * np.array(cpu)
         p50, p99, p999 = np.percentile(times, [50, 99, 99.9]).tolist()
-        cpu_text = {"p50": round(p50, 2), "p99": round(p99, 2), "p99.9": round(p999, 2), "max": round(times.max(), 2)}
-        print(json.dumps({**total, "success": total["successes"] / total["episodes"], "cpu_ms": cpu_text}), flush=True)
+        cpu_text = {
+            "p50": round(p50, 2),
+            "p99": round(p99, 2),
+            "p99.9": round(p999, 2),
+            "max": round(times.max(), 2),
+        }
+        print(
+            json.dumps(
+                {
+                    **total,
+                    "success": total["successes"] / total["episodes"],
+                    "cpu_ms": cpu_text,
+                }
+            ),
+            flush=True,
+        )
     return 0
 
 
@@ -72,10 +101,20 @@ def run_chunk(evaluate, build, count: int, seed: int, total: dict) -> None:
     text = io.StringIO()
     with TemporaryDirectory() as folder:
         with contextlib.redirect_stdout(text):
-            evaluate(build, folder, ["7dof-hit"], n_episodes=count, n_cores=1, seed=seed, interpolation_order=None)
+            evaluate(
+                build,
+                folder,
+                ["7dof-hit"],
+                n_episodes=count,
+                n_cores=1,
+                seed=seed,
+                interpolation_order=None,
+            )
         (file,) = Path(folder).rglob("violations.json")
         violations = json.loads(file.read_text())["violation summary"]
-    values = dict(line.split(":") for line in text.getvalue().splitlines() if line.count(":") == 1)
+    values = dict(
+        line.split(":") for line in text.getvalue().splitlines() if line.count(":") == 1
+    )
     total["episodes"] += count
     total["successes"] += round(float(values["Success"]) * count)
     total["penalty"] += float(values["Penalty"])

@@ -48,9 +48,17 @@ def test_a_value_is_written_with_its_unit(value, unit, text):
 
 
 def test_the_numbers_of_a_constraint_have_units():
-    constraints = {type(item).__name__: item for item in load_problem("airhockey").constraint}
+    constraints = {
+        type(item).__name__: item for item in load_problem("airhockey").constraint
+    }
     text = numbers(constraints["Table"])
-    for part in ("x [0.6, 2] m", "y [-0.45, 0.45] m", "z 0.16 m", "start_band 0.005 m", "tolerance 0.001 m"):
+    for part in (
+        "x [0.6, 2] m",
+        "y [-0.45, 0.45] m",
+        "z 0.16 m",
+        "start_band 0.005 m",
+        "tolerance 0.001 m",
+    ):
         assert part in text
 
 
@@ -70,9 +78,15 @@ def test_a_dataset_is_described_with_everything_it_refers_to(name):
 
 def test_the_stages_are_numbered_in_order():
     lines = describe_pipeline(load_pipeline("airhockey-hit")).splitlines()
-    heads = [line.split()[:2] for line in lines if line.split()[0].endswith(".") and line.startswith("  ")]
+    heads = [
+        line.split()[:2]
+        for line in lines
+        if line.split()[0].endswith(".") and line.startswith("  ")
+    ]
     names = [use for _, use in heads]
-    assert [number for number, _ in heads] == [f"{index}." for index in range(1, len(heads) + 1)]
+    assert [number for number, _ in heads] == [
+        f"{index}." for index in range(1, len(heads) + 1)
+    ]
     assert names[:2] == ["draw-positions", "start-ik"]
     assert names[-1] == "ballistic-reach"
 
@@ -80,7 +94,8 @@ def test_the_stages_are_numbered_in_order():
 def test_the_limits_of_every_joint_are_shown():
     text = describe(load_problem("airhockey"))
     assert re.search(
-        r"joint +position +velocity +acceleration +torque +base\n +\[rad\] +\[rad/s\] +\[rad/s\^2\] ", text
+        r"joint +position +velocity +acceleration +torque +base\n +\[rad\] +\[rad/s\] +\[rad/s\^2\] ",
+        text,
     )
     assert "-2.967 to 2.967" in text
     assert "11.87" in text
@@ -97,43 +112,76 @@ def test_an_object_and_obstacles_are_described():
 
 
 def test_obstacles_of_every_kind_are_described_by_what_is_theirs(tmp_path):
-    text = " ".join(describe(load_problem(write_problem(tmp_path, obstacles=EVERY_KIND))).split())
-    assert "ball: kind sphere, position (0.3, 0.35, 0.55) m, radius 0.08 m obstacle" in text
-    assert "wall: position (0.5, 0, 0.15) m, rotation (0, 0, 0.349066) rad, size (0.1, 0.5, 0.3) m obstacle" in text
+    text = " ".join(
+        describe(load_problem(write_problem(tmp_path, obstacles=EVERY_KIND))).split()
+    )
+    assert (
+        "ball: kind sphere, position (0.3, 0.35, 0.55) m, radius 0.08 m obstacle"
+        in text
+    )
+    assert (
+        "wall: position (0.5, 0, 0.15) m, rotation (0, 0, 0.349066) rad, size (0.1, 0.5, 0.3) m obstacle"
+        in text
+    )
     assert "the hull of 6 corners" in text
     assert "data:" not in text
 
 
 def test_the_objective_is_described():
-    assert "objective  minimum time, and centrifugal 0.01 s^2/m" in describe(load_problem("airhockey"))
-    assert re.search(r"objective +minimum time\n", describe(load_problem("heavy-object")))
+    assert "objective  minimum time, and centrifugal 0.01 s^2/m" in describe(
+        load_problem("airhockey")
+    )
+    assert re.search(
+        r"objective +minimum time\n", describe(load_problem("heavy-object"))
+    )
 
 
 def test_the_links_of_a_shape_and_their_pairs_are_listed(tmp_path):
     problem = load_problem(write_problem(tmp_path))
     lines = describe(problem).splitlines()
-    assert re.search(r"turret +1 +128 +[\d.]+ +99\.\d +29\.\d +1$", next(line for line in lines if " turret " in line))
-    hand = next(line for line in lines if line.startswith("    base ") and " hand " in line)
+    assert re.search(
+        r"turret +1 +128 +[\d.]+ +99\.\d +29\.\d +1$",
+        next(line for line in lines if " turret " in line),
+    )
+    hand = next(
+        line for line in lines if line.startswith("    base ") and " hand " in line
+    )
     assert re.search(r"3\.\d\d% +[45]\.\d\d% +judges and solvers$", hand)
-    assert any(re.search(r"arm +fore +ignored: joined by a joint", line) for line in lines)
+    assert any(
+        re.search(r"arm +fore +ignored: joined by a joint", line) for line in lines
+    )
     content = json.loads(json.dumps(plain(recipe_to_dict(problem))))["shape"]
     turret = next(link for link in content["links"] if link["link"] == "turret")
-    assert (turret["joint"], turret["convex_parts"], round(turret["overhang"], 3)) == (1, 1, 0.029)
+    assert (turret["joint"], turret["convex_parts"], round(turret["overhang"], 3)) == (
+        1,
+        1,
+        0.029,
+    )
     assert len(content["pairs"]) == 14
     assert "shape" not in recipe_to_dict(load_problem("heavy-object"))
 
 
 @pytest.mark.parametrize("kind", ["problem", "pipeline", "dataset"])
 def test_every_kind_of_recipe_has_a_json_form(kind):
-    load = {"problem": load_problem, "pipeline": load_pipeline, "dataset": load_dataset_recipe}[kind]
+    load = {
+        "problem": load_problem,
+        "pipeline": load_pipeline,
+        "dataset": load_dataset_recipe,
+    }[kind]
     content = json.loads(json.dumps(plain(recipe_to_dict(load("heavy-object")))))
     assert content["kind"] == kind
-    assert len(content["limits"]["velocity_limit"]["values"]) == len(content["joints"]) == 7
+    assert (
+        len(content["limits"]["velocity_limit"]["values"])
+        == len(content["joints"])
+        == 7
+    )
     assert ("stages" in content) == (kind != "problem")
 
 
 def test_a_table_is_aligned_and_its_last_column_wraps():
-    lines = table([("a", "1", "short"), ("long", "20", "word " * 40)], indent="  ", right=(1,))
+    lines = table(
+        [("a", "1", "short"), ("long", "20", "word " * 40)], indent="  ", right=(1,)
+    )
     assert lines[0] == "  a      1  short"
     assert lines[1].startswith("  long  20  word word")
     assert lines[2].startswith(" " * 12 + "word")

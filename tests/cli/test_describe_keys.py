@@ -24,12 +24,19 @@ from cnpgen.schema.toml import MARKS
 from cnpgen.store.files.documents import plain
 
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "keys.md"
-KINDS = [(group, name) for group in (registry.STAGES, registry.CONSTRAINTS) for name in registry.names(group)]
+KINDS = [
+    (group, name)
+    for group in (registry.STAGES, registry.CONSTRAINTS)
+    for name in registry.names(group)
+]
 
 
 @pytest.mark.parametrize(("group", "name"), KINDS)
 def test_every_kind_of_stage_and_constraint_is_described(group, name):
-    text, content = describe_kind(group, name), json.loads(json.dumps(plain(kind_to_dict(group, name))))
+    text, content = (
+        describe_kind(group, name),
+        json.loads(json.dumps(plain(kind_to_dict(group, name)))),
+    )
     assert name in text.splitlines()[0]
     assert content["summary"]
     for key in content["keys"]:
@@ -57,20 +64,34 @@ def test_a_summary_is_the_first_line_without_markup():
 
 def test_the_page_of_all_keys_is_what_the_command_prints(capsys):
     assert main(["show", "--keys"]) == 0
-    assert PAGE.read_text(encoding="utf-8") == capsys.readouterr().out, "run: python docs/generate.py"
+    assert PAGE.read_text(encoding="utf-8") == capsys.readouterr().out, (
+        "run: python docs/generate.py"
+    )
 
 
 def test_every_key_of_every_table_is_on_the_page_with_a_sentence():
     page = describe_keys(tuple(FILES))
     named = [*FILES.values(), *(registry.load(group, name) for group, name in KINDS)]
-    tables = {spec.type for kind in named for spec in dataclasses.fields(kind) if dataclasses.is_dataclass(spec.type)}
+    tables = {
+        spec.type
+        for kind in named
+        for spec in dataclasses.fields(kind)
+        if dataclasses.is_dataclass(spec.type)
+    }
     for kind in {*named, *tables}:
         for key in keys(kind):
             assert len(key.doc) > 5
             assert f"| `{key.name}` |" in page
     for _, name in KINDS:
         assert f"#### `{name}`" in page
-    for part in ("[robot]", "[limits]", "[payload]", "[[obstacle]]", "[[stage]]", "[replanning.pucks]"):
+    for part in (
+        "[robot]",
+        "[limits]",
+        "[payload]",
+        "[[obstacle]]",
+        "[[stage]]",
+        "[replanning.pucks]",
+    ):
         assert f"### `{part}`" in page
 
 
@@ -81,7 +102,11 @@ def test_no_default_is_a_python_object():
 
 
 def test_every_row_of_every_table_has_four_cells():
-    rows = [line for line in describe_keys(tuple(FILES)).splitlines() if line.startswith("|")]
+    rows = [
+        line
+        for line in describe_keys(tuple(FILES)).splitlines()
+        if line.startswith("|")
+    ]
     assert len(rows) > 150
     assert {len(re.split(r"(?<!\\)\|", row)) for row in rows} == {6}
 
@@ -104,9 +129,18 @@ def test_the_keys_of_one_kind_of_file_are_a_part_of_all(kind, capsys):
 def test_the_keys_have_a_json_form_with_tables_and_kinds():
     content = json.loads(json.dumps(plain(keys_to_dict(tuple(FILES)))))
     problem = {key["name"]: key for key in content["problem"]["keys"]}
-    assert [key["name"] for key in problem["robot"]["table"]["keys"]][:3] == ["urdf", "joints", "tip"]
-    assert {kind["name"] for kind in problem["constraint"]["kinds"]} == set(registry.names(registry.CONSTRAINTS))
-    assert "table" not in {key["name"]: key for key in content["pipeline"]["keys"]}["problem"]
+    assert [key["name"] for key in problem["robot"]["table"]["keys"]][:3] == [
+        "urdf",
+        "joints",
+        "tip",
+    ]
+    assert {kind["name"] for kind in problem["constraint"]["kinds"]} == set(
+        registry.names(registry.CONSTRAINTS)
+    )
+    assert (
+        "table"
+        not in {key["name"]: key for key in content["pipeline"]["keys"]}["problem"]
+    )
 
 
 def test_there_are_keys_of_every_kind_of_file():
@@ -115,4 +149,7 @@ def test_there_are_keys_of_every_kind_of_file():
 
 def test_the_keys_of_what_is_no_file_are_refused(capsys):
     assert main(["show", "--keys", "problems"]) == 2
-    assert "expected one of all, problem, pipeline, dataset, suite, got 'problems'" in capsys.readouterr().err
+    assert (
+        "expected one of all, problem, pipeline, dataset, suite, got 'problems'"
+        in capsys.readouterr().err
+    )

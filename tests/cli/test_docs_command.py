@@ -15,8 +15,16 @@ DOCS = Path(__file__).parents[2] / "docs"
 def test_all_pages_are_listed_by_kind(capsys):
     assert main(["docs"]) == 0
     printed = capsys.readouterr().out
-    assert printed.index("tutorials:") < printed.index("  hit-a-puck ") < printed.index("  your-arm ")
-    assert printed.index("  your-arm ") < printed.index("  publish-a-dataset ") < printed.index("how-to:")
+    assert (
+        printed.index("tutorials:")
+        < printed.index("  hit-a-puck ")
+        < printed.index("  your-arm ")
+    )
+    assert (
+        printed.index("  your-arm ")
+        < printed.index("  publish-a-dataset ")
+        < printed.index("how-to:")
+    )
     assert main(["docs", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
     assert {row["page"] for row in rows} == set(docs_command.list_pages()) - {"index"}
@@ -25,16 +33,26 @@ def test_all_pages_are_listed_by_kind(capsys):
 
 
 @pytest.mark.parametrize(
-    "name", ["verdict", "verdict.md", "docs/concepts/verdict.md", "../concepts/verdict.md#between-samples"]
+    "name",
+    [
+        "verdict",
+        "verdict.md",
+        "docs/concepts/verdict.md",
+        "../concepts/verdict.md#between-samples",
+    ],
 )
 def test_a_page_is_printed_as_it_is(name, capsys):
     assert main(["docs", name]) == 0
-    assert capsys.readouterr().out == (DOCS / "concepts" / "verdict.md").read_text(encoding="utf-8")
+    assert capsys.readouterr().out == (DOCS / "concepts" / "verdict.md").read_text(
+        encoding="utf-8"
+    )
 
 
 def test_pages_of_benchmarks_have_names_of_their_own(capsys):
     assert main(["docs", "benchmarks/verdict"]) == 0
-    assert capsys.readouterr().out == (DOCS / "benchmarks" / "verdict.md").read_text(encoding="utf-8")
+    assert capsys.readouterr().out == (DOCS / "benchmarks" / "verdict.md").read_text(
+        encoding="utf-8"
+    )
 
 
 def test_an_unknown_page_is_refused_with_the_nearest_one(capsys):
@@ -66,7 +84,9 @@ def test_a_search_and_a_page_exclude_each_other(capsys):
     assert "--search" in capsys.readouterr().err
 
 
-def test_an_installation_without_pages_is_an_error_of_the_machine(monkeypatch, tmp_path, capsys):
+def test_an_installation_without_pages_is_an_error_of_the_machine(
+    monkeypatch, tmp_path, capsys
+):
     monkeypatch.setattr(docs_command, "docs_folder", lambda: tmp_path)
     assert main(["docs", "verdict"]) == 3
     assert "reinstall cnpgen" in capsys.readouterr().err
@@ -74,11 +94,16 @@ def test_an_installation_without_pages_is_an_error_of_the_machine(monkeypatch, t
 
 def test_help_has_the_addresses_of_the_site_and_of_the_pages_that_it_names(capsys):
     assert main(["--help"]) == 0
-    assert f"documentation: {DOCUMENTATION_URL}, or 'cnpgen docs' without a network" in capsys.readouterr().out
+    assert (
+        f"documentation: {DOCUMENTATION_URL}, or 'cnpgen docs' without a network"
+        in capsys.readouterr().out
+    )
     assert main(["train", "--help"]) == 0
     printed = capsys.readouterr().out
     assert "'cnpgen docs training'" in " ".join(printed.split())
-    assert printed.endswith(f"on the site:\n  {DOCUMENTATION_URL}docs/how-to/training.html\n")
+    assert printed.endswith(
+        f"on the site:\n  {DOCUMENTATION_URL}docs/how-to/training.html\n"
+    )
 
 
 def test_an_error_that_names_a_page_has_its_address(monkeypatch, capsys):
@@ -93,6 +118,8 @@ def test_an_error_that_names_a_page_has_its_address(monkeypatch, capsys):
 
 def test_texts_without_installed_pages_have_no_addresses(monkeypatch, tmp_path):
     text = "'cnpgen docs scale' or 'cnpgen docs\n  no-such-page'"
-    assert docs_command.mentioned_addresses(text) == [f"{DOCUMENTATION_URL}docs/how-to/scale.html"]
+    assert docs_command.mentioned_addresses(text) == [
+        f"{DOCUMENTATION_URL}docs/how-to/scale.html"
+    ]
     monkeypatch.setattr(docs_command, "docs_folder", lambda: tmp_path)
     assert docs_command.mentioned_addresses(text) == []

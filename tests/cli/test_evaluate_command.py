@@ -50,7 +50,9 @@ def one_line(stderr: str) -> str:
 
 
 @pytest.mark.parametrize("label", ["hit", "transport"])
-def test_a_file_of_valid_plans_is_a_yes(run: Run, saved: Callable[[Plans], Path], label: str) -> None:
+def test_a_file_of_valid_plans_is_a_yes(
+    run: Run, saved: Callable[[Plans], Path], label: str
+) -> None:
     file = saved(plans_of(load(label), load(label)))
     code, out, err = run(file)
     assert (code, err) == (0, "")
@@ -59,39 +61,86 @@ def test_a_file_of_valid_plans_is_a_yes(run: Run, saved: Callable[[Plans], Path]
     assert "not valid because" not in out
 
 
-def test_what_is_not_valid_is_counted_by_reason_with_the_worst_place(run: Run, saved: Callable[[Plans], Path]) -> None:
+def test_what_is_not_valid_is_counted_by_reason_with_the_worst_place(
+    run: Run, saved: Callable[[Plans], Path]
+) -> None:
     code, out, _ = run(saved(plans_of(*(plan for plan, _ in garbage().values()))))
     assert code == 1
     assert re.search(r"^  valid +3 of 11 +27\.27%$", out, re.M)
     reasons = out.partition("not valid because")[2].split("\n\n")[0]
     assert re.search(r"^  rate not positive +3  plan 2$", reasons, re.M)
-    torque = re.search(r"^  joint torque limit +1  (.*)\n +(.*at t = .*)", reasons, re.M)
+    torque = re.search(
+        r"^  joint torque limit +1  (.*)\n +(.*at t = .*)", reasons, re.M
+    )
     assert torque
     text = r"plan 8: joint torque joint_\d: \S+ N m outside \S+ \(tolerance \S+\) at t = .*"
     assert re.fullmatch(text, f"{torque[1]} {torque[2]}")
-    assert sum(int(number) for number in re.findall(r"^  \S.*?  +(\d+)  plan", reasons, re.M)) == 8
+    assert (
+        sum(
+            int(number)
+            for number in re.findall(r"^  \S.*?  +(\d+)  plan", reasons, re.M)
+        )
+        == 8
+    )
 
 
-def test_metrics_and_margins_are_those_of_the_verdict(run: Run, saved: Callable[[Plans], Path]) -> None:
+def test_metrics_and_margins_are_those_of_the_verdict(
+    run: Run, saved: Callable[[Plans], Path]
+) -> None:
     plan = load("dragging")
     _, out, _ = run(saved(plans_of(plan)))
     verdict = plan.judged()
-    figures = {line[:26].strip(): line[26:].split() for line in out.splitlines() if line.startswith("  ")}
-    assert figures["motion time [s]"] == ["-", "-", "-", "-", *2 * [f"{verdict.metrics.duration:.4f}"]]
-    assert figures["vertical error [rad s]"][-1] == f"{verdict.metrics.vertical_error:.4f}"
+    figures = {
+        line[:26].strip(): line[26:].split()
+        for line in out.splitlines()
+        if line.startswith("  ")
+    }
+    assert figures["motion time [s]"] == [
+        "-",
+        "-",
+        "-",
+        "-",
+        *2 * [f"{verdict.metrics.duration:.4f}"],
+    ]
+    assert (
+        figures["vertical error [rad s]"][-1] == f"{verdict.metrics.vertical_error:.4f}"
+    )
     worst = verdict.margins["object contact"]
-    (line,) = [line for line in out.splitlines() if line.startswith("  object contact ")]
-    assert line.split()[2:] == ["1", f"{worst.violation:.2e}", "1.0e-03", "m", "0", f"{worst.time:.4f}", worst.part]
+    (line,) = [
+        line for line in out.splitlines() if line.startswith("  object contact ")
+    ]
+    assert line.split()[2:] == [
+        "1",
+        f"{worst.violation:.2e}",
+        "1.0e-03",
+        "m",
+        "0",
+        f"{worst.time:.4f}",
+        worst.part,
+    ]
     assert worst.part in {"pedestal-1", "pedestal-2"}
 
 
-def test_plans_are_listed_a_line_each_those_that_are_not_valid_first(run: Run, saved: Callable[[Plans], Path]) -> None:
+def test_plans_are_listed_a_line_each_those_that_are_not_valid_first(
+    run: Run, saved: Callable[[Plans], Path]
+) -> None:
     hit = load("hit")
-    plans = plans_of(hit, perturbed(hit, 0.05), hit.changed(rate=-hit.motion.rate), hit, sample_id=[30, 31, 32, 33])
+    plans = plans_of(
+        hit,
+        perturbed(hit, 0.05),
+        hit.changed(rate=-hit.motion.rate),
+        hit,
+        sample_id=[30, 31, 32, 33],
+    )
     _, out, _ = run(saved(plans), "--list")
     head, *lines = out.splitlines()[-5:]
     assert head.split()[:3] == ["plan", "sample", "verdict"]
-    assert [line.split()[:2] for line in lines] == [["1", "31"], ["2", "32"], ["0", "30"], ["3", "33"]]
+    assert [line.split()[:2] for line in lines] == [
+        ["1", "31"],
+        ["2", "32"],
+        ["0", "30"],
+        ["3", "33"],
+    ]
     assert "  rate not positive  " in lines[1]
     assert "  ok  " in lines[2]
     assert "z [mm s]" in head
@@ -104,7 +153,11 @@ def test_json_is_complete(run: Run, saved: Callable[[Plans], Path]) -> None:
     assert (code, err) == (1, "")
     found = json.loads(out)
     assert (found["format"], found["format_version"]) == ("cnpgen-evaluation", 2)
-    assert (found["file"], found["problem"], found["step_s"]) == (str(file), "airhockey", 0.002)
+    assert (found["file"], found["problem"], found["step_s"]) == (
+        str(file),
+        "airhockey",
+        0.002,
+    )
     assert (found["plans"], found["valid"]) == (2, 1)
     verdict = plan.judged(step=2e-3).to_dict()
     assert found["verdicts"][0] == {"plan": 0, "sample_id": 0, **verdict}
@@ -112,9 +165,14 @@ def test_json_is_complete(run: Run, saved: Callable[[Plans], Path]) -> None:
     assert len(out.splitlines()[-4:]) == 4  # one plan is one line
 
 
-@pytest.mark.parametrize("words", [("evaluate",), ("evaluate", "--json"), ("refine",), ("export", "--to", "npz")])
+@pytest.mark.parametrize(
+    "words",
+    [("evaluate",), ("evaluate", "--json"), ("refine",), ("export", "--to", "npz")],
+)
 def test_a_file_without_plans_is_the_same_error_for_every_command(
-    saved: Callable[[Plans], Path], capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
+    saved: Callable[[Plans], Path],
+    capsys: pytest.CaptureFixture[str],
+    words: tuple[str, ...],
 ) -> None:
     file = saved(plans_of(load("hit"))[:0])
     assert main([words[0], str(file), *words[1:]]) == 1
@@ -123,21 +181,32 @@ def test_a_file_without_plans_is_the_same_error_for_every_command(
     assert [path.name for path in file.parent.iterdir()] == ["plans.h5"]
 
 
-def test_a_motion_that_is_too_long_is_told_how_long_one_may_take(run: Run, saved: Callable[[Plans], Path]) -> None:
+def test_a_motion_that_is_too_long_is_told_how_long_one_may_take(
+    run: Run, saved: Callable[[Plans], Path]
+) -> None:
     plan = load("transport")
     assert run(saved(plans_of(plan.changed(rate=plan.motion.rate / 180))))[0] == 0
-    code, out, _ = run(saved(plans_of(plan.changed(rate=plan.motion.rate / 1800))), "--list", "--step", "10ms")
+    code, out, _ = run(
+        saved(plans_of(plan.changed(rate=plan.motion.rate / 1800))),
+        "--list",
+        "--step",
+        "10ms",
+    )
     assert code == 1
     text = "2.41e+03 s are more than 2,000 s"
     assert f"plan 0: {text}" in " ".join(out.split())
     assert out.splitlines()[-1].endswith(text)
 
 
-def test_numbers_of_garbage_do_not_burst_the_table(run: Run, saved: Callable[[Plans], Path]) -> None:
+def test_numbers_of_garbage_do_not_burst_the_table(
+    run: Run, saved: Callable[[Plans], Path]
+) -> None:
     plan = load("hit")
     path = plan.motion.path.copy()
     path[0, 7] = 1e300
-    code, out, err = run(saved(plans_of(plan.changed(path=path), perturbed(plan, 1e5))), "--list")
+    code, out, err = run(
+        saved(plans_of(plan.changed(path=path), perturbed(plan, 1e5))), "--list"
+    )
     assert (code, err) == (1, "")
     assert max(map(len, out.splitlines())) < 240
 
@@ -152,25 +221,35 @@ def test_the_goal_is_where_the_joints_put_the_tip_whatever_a_column_says(
         warnings.simplefilter("always")
         code, out, err = run(file)
     said = "goal_xyz of 1 plan is not where goal_q puts the tip (the first is plan 1, 0.3 m off)"
-    assert (code, err) == (0, f"cnpgen: warning: {file}: {said}: the joint positions are used\n")
+    assert (code, err) == (
+        0,
+        f"cnpgen: warning: {file}: {said}: the joint positions are used\n",
+    )
     assert re.search(r"^  at the goal by the paper's rules +2 of 2 ", out, re.M)
 
 
-def test_processes_change_not_a_byte(run: Run, saved: Callable[[Plans], Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_change_not_a_byte(
+    run: Run, saved: Callable[[Plans], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("cnpgen.plans.evaluate.PLANS_PER_VERDICT_TASK", 4)
     file = saved(plans_of(*(plan for plan, _ in garbage().values())))
     assert run(file, "--json", "--workers", 1) == run(file, "--json", "--workers", 2)
 
 
-def test_a_finer_step_evaluates_more_times(run: Run, saved: Callable[[Plans], Path]) -> None:
+def test_a_finer_step_evaluates_more_times(
+    run: Run, saved: Callable[[Plans], Path]
+) -> None:
     file = saved(plans_of(load("hit")))
     samples = [
-        json.loads(run(file, "--json", "--step", step)[1])["verdicts"][0]["samples"] for step in ("1e-3", "5e-4")
+        json.loads(run(file, "--json", "--step", step)[1])["verdicts"][0]["samples"]
+        for step in ("1e-3", "5e-4")
     ]
     assert samples[1] > 1.5 * samples[0]
 
 
-def test_a_tracking_error_widens_the_margins_of_positions(run: Run, saved: Callable[[Plans], Path]) -> None:
+def test_a_tracking_error_widens_the_margins_of_positions(
+    run: Run, saved: Callable[[Plans], Path]
+) -> None:
     plan = load("transport")
     file = saved(plans_of(plan))
     code, out, _ = run(file, "--tracking-error", "2deg", "--json")
@@ -190,12 +269,17 @@ def test_a_tracking_error_widens_the_margins_of_positions(run: Run, saved: Calla
         assert error in err
 
 
-def test_the_problem_that_is_given_decides_and_must_be_the_same(run: Run, saved: Callable[[Plans], Path]) -> None:
+def test_the_problem_that_is_given_decides_and_must_be_the_same(
+    run: Run, saved: Callable[[Plans], Path]
+) -> None:
     file = saved(plans_of(load("hit")))
     assert run(file, "--problem", "airhockey")[0] == 0
     code, out, err = run(file, "--problem", "heavy-object")
     assert (code, out) == (1, "")
-    assert "has plans of problem 'airhockey', not of 'heavy-object': they differ in" in one_line(err)
+    assert (
+        "has plans of problem 'airhockey', not of 'heavy-object': they differ in"
+        in one_line(err)
+    )
     assert "did you mean 'airhockey'" in run(file, "--problem", "airhocky")[2]
 
 
@@ -203,19 +287,27 @@ def test_the_problem_that_is_given_decides_and_must_be_the_same(run: Run, saved:
 
 
 @pytest.mark.slow
-def test_the_first_plan_that_is_not_valid_is_drawn(run: Run, saved: Callable[[Plans], Path], tmp_path: Path) -> None:
+def test_the_first_plan_that_is_not_valid_is_drawn(
+    run: Run, saved: Callable[[Plans], Path], tmp_path: Path
+) -> None:
     hit = load("hit")
-    file = saved(plans_of(hit, hit.changed(rate=-hit.motion.rate), perturbed(hit, 0.1), hit))
+    file = saved(
+        plans_of(hit, hit.changed(rate=-hit.motion.rate), perturbed(hit, 0.1), hit)
+    )
     code, _, err = run(file, "--plot", tmp_path / "plan.png")
     assert code == 1
     assert f"drawn: plan 2 in {tmp_path / 'plan.png'}" in err
     assert (tmp_path / "plan.png").stat().st_size > 10_000
     _, _, err = run(file, "--plot", tmp_path / "plan.svg", "--plan", 3)
     assert "drawn: plan 3" in err
-    assert "sample 3: valid" in re.sub(r"<!-- | -->", "", (tmp_path / "plan.svg").read_text())
+    assert "sample 3: valid" in re.sub(
+        r"<!-- | -->", "", (tmp_path / "plan.svg").read_text()
+    )
 
 
-def test_a_plan_file_may_have_any_suffix(run: Run, saved: Callable[[Plans], Path]) -> None:
+def test_a_plan_file_may_have_any_suffix(
+    run: Run, saved: Callable[[Plans], Path]
+) -> None:
     file = saved(plans_of(load("hit")))
     code, _, stderr = run(file.rename(file.with_suffix(".plans")))
     assert (code, stderr) == (0, "")
@@ -225,7 +317,10 @@ def test_a_plan_file_may_have_any_suffix(run: Run, saved: Callable[[Plans], Path
     ("words", "message"),
     [
         (("--plan", "0"), "--plan needs --plot"),
-        (("--plot", "x.png", "--plan", "1"), "has no plan 1: 1 plans are numbered from 0"),
+        (
+            ("--plot", "x.png", "--plan", "1"),
+            "has no plan 1: 1 plans are numbered from 0",
+        ),
         (("--plot", "x.gif"), "ends in .png, .pdf or .svg"),
         (("--step", "0"), "expected a time above 0, such as 0.001 or 1ms; got '0'"),
         (("--step", "5"), "the time step must be above 0 and at most 0.01 s, got 5 s"),
@@ -246,7 +341,11 @@ def test_what_cannot_be_drawn_is_told_after_the_verdicts(
     run: Run, saved: Callable[[Plans], Path], tmp_path: Path
 ) -> None:
     hit = load("hit")
-    code, out, err = run(saved(plans_of(hit.changed(rate=-hit.motion.rate))), "--plot", tmp_path / "plan.png")
+    code, out, err = run(
+        saved(plans_of(hit.changed(rate=-hit.motion.rate))),
+        "--plot",
+        tmp_path / "plan.png",
+    )
     assert code == 1
     assert "rate not positive" in out
     assert "none of the plans can be drawn" in one_line(err)
@@ -255,13 +354,20 @@ def test_what_cannot_be_drawn_is_told_after_the_verdicts(
 # Files that are none
 
 
-def test_cut_off_and_foreign_files_are_one_line(run: Run, saved: Callable[[Plans], Path]) -> None:
+def test_cut_off_and_foreign_files_are_one_line(
+    run: Run, saved: Callable[[Plans], Path]
+) -> None:
     file = saved(plans_of(load("hit")))
     content = file.read_bytes()
     for name, changed, expected, message in (
         ("cut.h5", content[: len(content) // 2], 1, "cut.h5 is damaged or cut off"),
         ("text.h5", b"hello", 2, "text.h5 is a text file, expected a file of plans"),
-        ("empty.h5", b"", 1, "empty.h5 is not an HDF5 file, or its beginning is damaged: it is empty"),
+        (
+            "empty.h5",
+            b"",
+            1,
+            "empty.h5 is not an HDF5 file, or its beginning is damaged: it is empty",
+        ),
     ):
         other = file.with_name(name)
         other.write_bytes(changed)
@@ -275,9 +381,18 @@ def test_cut_off_and_foreign_files_are_one_line(run: Run, saved: Callable[[Plans
     [
         ({"goal_dq": None}, "lacks goal_dq"),
         ({"start_q": np.zeros((2, 7))}, "start_q must have shape (1, 6)"),
-        ({"path_control_points": np.zeros((1, 15, 7))}, "has 7 joints, but 'airhockey' plans 6"),
-        ({"rate_control_points": np.zeros((1, 5))}, "rate_control_points must have shape (1, R) with R > 7"),
-        ({"rate_control_points": np.array([[b"x"] * 20])}, "rate_control_points must hold numbers, got |S1"),
+        (
+            {"path_control_points": np.zeros((1, 15, 7))},
+            "has 7 joints, but 'airhockey' plans 6",
+        ),
+        (
+            {"rate_control_points": np.zeros((1, 5))},
+            "rate_control_points must have shape (1, R) with R > 7",
+        ),
+        (
+            {"rate_control_points": np.array([[b"x"] * 20])},
+            "rate_control_points must hold numbers, got |S1",
+        ),
     ],
 )
 def test_fields_of_wrong_shapes_are_one_line(
@@ -295,7 +410,9 @@ def test_fields_of_wrong_shapes_are_one_line(
     assert str(file) in err
 
 
-def test_whatever_bits_are_damaged_there_is_a_verdict_or_one_line(run: Run, saved: Callable[[Plans], Path]) -> None:
+def test_whatever_bits_are_damaged_there_is_a_verdict_or_one_line(
+    run: Run, saved: Callable[[Plans], Path]
+) -> None:
     file = saved(plans_of(load("hit")))
     content, draws = file.read_bytes(), random.Random(3)
     codes = []

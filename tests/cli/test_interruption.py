@@ -16,7 +16,13 @@ import pytest
 
 import cnpgen
 import cnpgen.__main__
-from cnpgen.cli.interruption import INTERRUPTED, Terminated, exit_code, interruptible, raise_if_interrupted
+from cnpgen.cli.interruption import (
+    INTERRUPTED,
+    Terminated,
+    exit_code,
+    interruptible,
+    raise_if_interrupted,
+)
 from cnpgen.cli.main import main
 from cnpgen.kernels.compiler import find_compiler
 from tests.conftest import HANGING, some
@@ -43,7 +49,9 @@ class _Interrupting(types.ModuleType):
 
 
 def test_an_interruption_of_the_imports_is_a_line(monkeypatch, capsys) -> None:
-    monkeypatch.setitem(sys.modules, "cnpgen.cli.main", _Interrupting("cnpgen.cli.main"))
+    monkeypatch.setitem(
+        sys.modules, "cnpgen.cli.main", _Interrupting("cnpgen.cli.main")
+    )
     assert cnpgen.__main__.main() == INTERRUPTED == 130
     assert capsys.readouterr().err == "cnpgen: interrupted\n"
 
@@ -66,23 +74,40 @@ def wait_for(condition, seconds: float = HANGING) -> None:
 @contextmanager
 def making(folder: Path, workers: int, rows: str = "5e6") -> Iterator[subprocess.Popen]:
     """Make a dataset that takes a while, in a session of its own, as a terminal's foreground job."""
-    words = ["airhockey-hit", "--n", rows, "--shard-size", "4096", "--workers", str(workers), "--out", str(folder)]
+    words = [
+        "airhockey-hit",
+        "--n",
+        rows,
+        "--shard-size",
+        "4096",
+        "--workers",
+        str(workers),
+        "--out",
+        str(folder),
+    ]
     command = [sys.executable, "-m", "cnpgen", "make-dataset", *words]
     options = {"env": ENVIRONMENT, "start_new_session": True, "text": True}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options
+    ) as process:
         try:
             yield process
         finally:
             process.kill()
 
 
-def check_end(process: subprocess.Popen, number: signal.Signals, offspring: list[int]) -> str:
+def check_end(
+    process: subprocess.Popen, number: signal.Signals, offspring: list[int]
+) -> str:
     """Wait for the end of an interrupted process and check what it says and leaves; return its other lines."""
     out, err = process.communicate(timeout=HANGING)
     what, code = NAMES[number]
     *others, last = err.splitlines()
     assert (last, out) == (f"cnpgen: {what}: {KEPT}", "")
-    assert process.returncode in {code, -number}  # the latter where a second signal came in its very last time
+    assert process.returncode in {
+        code,
+        -number,
+    }  # the latter where a second signal came in its very last time
     wait_for(lambda: not any(map(alive, offspring)))
     return "\n".join(others)
 
@@ -91,14 +116,18 @@ def check_end(process: subprocess.Popen, number: signal.Signals, offspring: list
 @linux
 @pytest.mark.parametrize("workers", some([2, 1]))
 @pytest.mark.parametrize("number", some(NAMES, 1, "slow"))
-def test_a_signal_ends_the_run_and_its_workers_and_keeps_what_is_finished(tmp_path, number, workers):
+def test_a_signal_ends_the_run_and_its_workers_and_keeps_what_is_finished(
+    tmp_path, number, workers
+):
     folder = tmp_path / "out"
     with making(folder, workers) as process:
         wait_for(lambda: len(list(folder.glob("train/*.json"))) >= 2)
         offspring = descendants(process.pid)
         assert len(offspring) >= 2 * (workers > 1)
         process.send_signal(number)
-        assert check_end(process, number, offspring) == f"making {folder}: 5,000,000 rows"
+        assert (
+            check_end(process, number, offspring) == f"making {folder}: 5,000,000 rows"
+        )
     found = {path.stem for path in folder.glob("train/*.h5")}
     recorded = {path.stem for path in folder.glob("train/*.json")}
     assert recorded <= found
@@ -110,22 +139,30 @@ def test_a_signal_ends_the_run_and_its_workers_and_keeps_what_is_finished(tmp_pa
 @linux
 @pytest.mark.parametrize("number", NAMES)
 @pytest.mark.parametrize("seed", some(range(2)))
-def test_a_signal_to_all_processes_while_workers_start_gives_no_traceback(tmp_path, number, seed):
+def test_a_signal_to_all_processes_while_workers_start_gives_no_traceback(
+    tmp_path, number, seed
+):
     folder = tmp_path / "out"
     with making(folder, 2) as process:
         assert process.stderr.readline() == f"making {folder}: 5,000,000 rows\n"
         wait_for(lambda: descendants(process.pid))
-        time.sleep(random.Random(seed).uniform(0, 0.6))  # anywhere between the first fork and the first shard
+        time.sleep(
+            random.Random(seed).uniform(0, 0.6)
+        )  # anywhere between the first fork and the first shard
         offspring = descendants(process.pid)
         os.killpg(process.pid, number)
         if seed == 0:
-            os.killpg(process.pid, number)  # wrappers pass on what the terminal has sent already
+            os.killpg(
+                process.pid, number
+            )  # wrappers pass on what the terminal has sent already
         assert check_end(process, number, offspring) == ""
 
 
 @pytest.mark.slow
 @linux
-def test_workers_end_where_the_system_has_no_command_to_list_processes(tmp_path, monkeypatch):
+def test_workers_end_where_the_system_has_no_command_to_list_processes(
+    tmp_path, monkeypatch
+):
     """As in slim container images, where joblib alone fails to kill its workers."""
     (tmp_path / "bin").mkdir()
     if compiler := find_compiler():
@@ -149,8 +186,14 @@ def test_a_killed_run_leaves_no_worker_and_only_whole_shards(tmp_path):
         wait_for(lambda: not any(map(alive, offspring)))
         process.communicate()
     command = [sys.executable, "-m", "cnpgen", "validate", str(folder)]
-    validated = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=False)
-    (finding,) = [line for line in validated.stdout.splitlines() if line.startswith("manifest.json: ")]
+    validated = subprocess.run(
+        command, env=ENVIRONMENT, capture_output=True, text=True, check=False
+    )
+    (finding,) = [
+        line
+        for line in validated.stdout.splitlines()
+        if line.startswith("manifest.json: ")
+    ]
     assert "is missing: the dataset is unfinished" in finding
     assert "shard-" not in validated.stdout
 
@@ -257,5 +300,11 @@ with interruptible():
         time.sleep(5)
         print("still here")
 """
-    done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert (done.returncode, done.stdout, done.stderr) == (143, "", "")

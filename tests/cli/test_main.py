@@ -53,7 +53,12 @@ def run(capsys):
 def spawn(*words, **options):
     command = [sys.executable, *(str(word) for word in words)]
     return subprocess.Popen(
-        command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options
+        command,
+        env=ENVIRONMENT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        **options,
     )
 
 
@@ -69,7 +74,15 @@ def one_line(stderr):
 
 @pytest.mark.parametrize(
     ("text", "number"),
-    [("120000", 120_000), ("120_000", 120_000), ("1e6", 10**6), ("1.5E3", 1500), ("2e+3", 2000), ("+7", 7), ("-5", -5)],
+    [
+        ("120000", 120_000),
+        ("120_000", 120_000),
+        ("1e6", 10**6),
+        ("1.5E3", 1500),
+        ("2e+3", 2000),
+        ("+7", 7),
+        ("-5", -5),
+    ],
 )
 def test_whole_numbers_are_read_as_people_write_them(text, number):
     assert values.whole(text) == number
@@ -105,8 +118,12 @@ def test_the_bounds_are_those_of_the_library():
 
 
 @pytest.mark.parametrize("text", ["1e9x", "0", "-5", "2.5"])
-def test_a_wrong_number_of_rows_is_one_line_that_says_what_to_write(run, text, tmp_path):
-    code, out, err = run("make-dataset", "airhockey-hit", "--out", tmp_path / "x", "--n", text)
+def test_a_wrong_number_of_rows_is_one_line_that_says_what_to_write(
+    run, text, tmp_path
+):
+    code, out, err = run(
+        "make-dataset", "airhockey-hit", "--out", tmp_path / "x", "--n", text
+    )
     assert (code, out) == (2, "")
     assert repr(text) in one_line(err)
     assert "such as 120000, 120_000 or 1e6" in err
@@ -135,21 +152,29 @@ def test_a_wrong_value_is_one_line(run, option, value, tmp_path):
 
 @pytest.mark.parametrize("value", ["nan", "abc", "-5ms", "-.5"])
 def test_a_wrong_time_is_said_once(run, value):
-    expected = f"--deadline: expected a time above 0, such as 0.001 or 1ms; got {value!r}; see"
+    expected = (
+        f"--deadline: expected a time above 0, such as 0.001 or 1ms; got {value!r}; see"
+    )
     assert expected in one_line(run("refine", "x.h5", "--deadline", value)[2])
 
 
 @pytest.mark.parametrize("value", ["10", "0.01", "1e-2", "5."])
 def test_a_deadline_without_a_unit_is_refused(run, value):
     expected = f"--deadline: expected a time with its unit, such as 10ms; got {value!r}, is it {value}ms or {value}s?"
-    for command in (("refine", "x.h5"), ("solve", "airhockey-hit"), ("plan", "airhockey-hit", "--refine")):
+    for command in (
+        ("refine", "x.h5"),
+        ("solve", "airhockey-hit"),
+        ("plan", "airhockey-hit", "--refine"),
+    ):
         code, _, err = run(*command, "--deadline", value)
         assert code == 2
         assert expected in one_line(err)
 
 
 def test_a_wrong_unit_is_named(run):
-    assert "unknown unit 'mz'" in one_line(run("refine", "x.h5", "--deadline", "5mz")[2])
+    assert "unknown unit 'mz'" in one_line(
+        run("refine", "x.h5", "--deadline", "5mz")[2]
+    )
 
 
 @pytest.mark.parametrize(
@@ -192,14 +217,28 @@ def test_options_are_not_abbreviated_and_arguments_not_ignored(run):
 def test_help_lists_the_commands_and_exit_codes(run):
     code, out, err = run("--help")
     assert (code, err) == (0, "")
-    for word in ("make-dataset", "list", "show", "inspect", "validate", "doctor", "  130  interrupted"):
+    for word in (
+        "make-dataset",
+        "list",
+        "show",
+        "inspect",
+        "validate",
+        "doctor",
+        "  130  interrupted",
+    ):
         assert word in out
     assert "  3    the machine: no permission to read or write a path" in out
-    codes = {error.exit_code for error in vars(cnpgen.errors).values() if hasattr(error, "exit_code")}
+    codes = {
+        error.exit_code
+        for error in vars(cnpgen.errors).values()
+        if hasattr(error, "exit_code")
+    }
     assert all(f"\n  {code}    " in out for code in {0, *codes})
 
 
-@pytest.mark.parametrize("command", ["make-dataset", "list", "show", "inspect", "validate", "doctor"])
+@pytest.mark.parametrize(
+    "command", ["make-dataset", "list", "show", "inspect", "validate", "doctor"]
+)
 def test_every_command_has_help(run, command):
     code, out, _ = run(command, "--help")
     assert code == 0
@@ -207,7 +246,17 @@ def test_every_command_has_help(run, command):
 
 
 def test_help_imports_nothing_heavy():
-    heavy = {"numpy", "casadi", "pinocchio", "coal", "h5py", "joblib", "tqdm", "matplotlib", "importlib.metadata"}
+    heavy = {
+        "numpy",
+        "casadi",
+        "pinocchio",
+        "coal",
+        "h5py",
+        "joblib",
+        "tqdm",
+        "matplotlib",
+        "importlib.metadata",
+    }
     script = f"import sys; from cnpgen.cli.main import main; main(['--help']); print({heavy!r} & sys.modules.keys())"
     out, err = spawn("-c", script).communicate()
     assert out.splitlines()[-1] == "set()"
@@ -237,7 +286,9 @@ def test_stdout_is_the_folder_and_stderr_a_start_and_a_summary(run, tmp_path):
     assert start == f"making {tmp_path / 'hits'}: 200 rows"
     text = " ".join(summary)
     times = r"[\d.]+ s: [\d.]+ s to get ready, then [\d,]+ rows/s"
-    assert re.match(rf"made 200 rows \(train 182, validation 18\) in {times} accepted ", text)
+    assert re.match(
+        rf"made 200 rows \(train 182, validation 18\) in {times} accepted ", text
+    )
     assert "accepted " in text
     assert "rejected: " in text
     assert len(summary) <= 3
@@ -246,7 +297,10 @@ def test_stdout_is_the_folder_and_stderr_a_start_and_a_summary(run, tmp_path):
 def test_a_finished_dataset_is_already_complete(run, hits):
     code, out, err = run(*MAKE, hits)
     assert (code, out) == (0, f"{hits}\n")
-    assert err.splitlines()[:2] == [f"checking {hits}: 200 rows", f"making {hits}: 200 rows, 200 exist already"]
+    assert err.splitlines()[:2] == [
+        f"checking {hits}: 200 rows",
+        f"making {hits}: 200 rows, 200 exist already",
+    ]
     assert "already complete: 200 rows (train 182, validation 18)" in err
 
 
@@ -255,8 +309,14 @@ def test_quiet_is_quiet(run, hits):
 
 
 def test_reasons_that_round_to_nothing_are_not_summed_up():
-    outcome = SamplingStatistics(tried=10_000, accepted=7_996, rejections={"too close": 2_000, "rare": 4, "never": 0})
-    assert _yield(outcome) == "accepted 80.0% of 10,000 draws; rejected: too close 20.0%"
+    outcome = SamplingStatistics(
+        tried=10_000,
+        accepted=7_996,
+        rejections={"too close": 2_000, "rare": 4, "never": 0},
+    )
+    assert (
+        _yield(outcome) == "accepted 80.0% of 10,000 draws; rejected: too close 20.0%"
+    )
 
 
 def test_another_dataset_is_refused_until_it_is_forced(run, hits, tmp_path):
@@ -277,7 +337,10 @@ def test_parts_make_a_whole(run, tmp_path):
     assert "made 182 rows (train 182), part 0/2 of 200 rows, in " in first[2]
     assert "; other parts are still to be made" in " ".join(first[2].split())
     again = run(*MAKE, folder, "--part", "0/2")[2]
-    assert "already made: 182 rows (train 182), part 0/2 of 200 rows; other parts are still to be made" in again
+    assert (
+        "already made: 182 rows (train 182), part 0/2 of 200 rows; other parts are still to be made"
+        in again
+    )
     assert not (folder / "manifest.json").exists()
     last = " ".join(run(*MAKE, folder, "--part", "1/2")[2].split())
     assert "made 18 rows (validation 18), part 1/2 of 200 rows, in " in last
@@ -290,7 +353,10 @@ def test_a_part_that_was_interrupted_says_what_was_missing_of_it(run, tmp_path):
     words = [*MAKE, folder, "--shard-size", "50", "--part", "0/2"]
     run(*words)
     (folder / "train" / "shard-00001.json").unlink()
-    assert "made the missing 50 of 100 rows (train 100), part 0/2 of 200 rows, in " in run(*words)[2]
+    assert (
+        "made the missing 50 of 100 rows (train 100), part 0/2 of 200 rows, in "
+        in run(*words)[2]
+    )
 
 
 def test_a_damaged_shard_is_a_warning_of_one_line(run, hits, tmp_path):
@@ -301,7 +367,10 @@ def test_a_damaged_shard_is_a_warning_of_one_line(run, hits, tmp_path):
         warnings.simplefilter("always")
         code, out, err = run(*MAKE, folder)
     assert (code, out) == (0, f"{folder}\n")
-    assert f"cnpgen: warning: a shard is damaged and is made again: {shard} was changed" in err
+    assert (
+        f"cnpgen: warning: a shard is damaged and is made again: {shard} was changed"
+        in err
+    )
     assert "made the missing 182 of 200 rows" in err
     assert run("validate", folder)[0] == 0
 
@@ -311,15 +380,27 @@ def test_a_lost_manifest_is_written_again_and_not_passed_over(run, hits, tmp_pat
     (folder / "manifest.json").unlink()
     code, out, err = run(*MAKE, folder)
     assert (code, out) == (0, f"{folder}\n")
-    assert "all samples existed, manifest.json written again: 200 rows (train 182, validation 18)" in err
-    assert (folder / "manifest.json").read_bytes() == (hits / "manifest.json").read_bytes()
+    assert (
+        "all samples existed, manifest.json written again: 200 rows (train 182, validation 18)"
+        in err
+    )
+    assert (folder / "manifest.json").read_bytes() == (
+        hits / "manifest.json"
+    ).read_bytes()
 
 
 def test_a_dry_run_prints_the_plan_and_writes_nothing(run, tmp_path):
     code, out, err = run(*MAKE, tmp_path / "hits", "--dry-run", "--dtype", "float32")
     assert code == 0
     assert err in {"", "cnpgen: compiling kernels, once per problem and machine\n"}
-    for text in ("state    new", "200: train 182, validation 18", "float32", "rad/s^2", "start_ddq", "bytes per row"):
+    for text in (
+        "state    new",
+        "200: train 182, validation 18",
+        "float32",
+        "rad/s^2",
+        "start_ddq",
+        "bytes per row",
+    ):
         assert text in out
     assert list(tmp_path.iterdir()) == []
 
@@ -329,13 +410,24 @@ def test_a_dry_run_says_what_is_in_the_folder(run, hits, tmp_path):
     (tmp_path / "half" / "train" / "shard-00000.json").unlink()
     (tmp_path / "half" / "manifest.json").unlink()
     assert "already complete" in run(*MAKE, hits, "--dry-run")[1]
-    assert "another dataset: would be refused" in run(*MAKE, hits, "--dry-run", "--seed", "5")[1]
-    assert "holds a dataset, which would be replaced" in run(*MAKE, hits, "--dry-run", "--force")[1]
-    assert "1 of 2 shards exist: would resume" in run(*MAKE, tmp_path / "half", "--dry-run")[1]
+    assert (
+        "another dataset: would be refused"
+        in run(*MAKE, hits, "--dry-run", "--seed", "5")[1]
+    )
+    assert (
+        "holds a dataset, which would be replaced"
+        in run(*MAKE, hits, "--dry-run", "--force")[1]
+    )
+    assert (
+        "1 of 2 shards exist: would resume"
+        in run(*MAKE, tmp_path / "half", "--dry-run")[1]
+    )
     assert "something else: would be refused" in run(*MAKE, tmp_path, "--dry-run")[1]
 
 
-def test_a_dry_run_with_force_says_that_foreign_files_would_be_in_the_way(run, hits, tmp_path):
+def test_a_dry_run_with_force_says_that_foreign_files_would_be_in_the_way(
+    run, hits, tmp_path
+):
     folder = Path(shutil.copytree(hits, tmp_path / "hits"))
     (folder / "train" / "thesis.tex").write_text("mine")
     code, out, _ = run(*MAKE, folder, "--dry-run", "--force")
@@ -345,28 +437,44 @@ def test_a_dry_run_with_force_says_that_foreign_files_would_be_in_the_way(run, h
     assert run(*MAKE, folder, "--force")[0] == 2
 
 
-def test_a_dry_run_says_what_becomes_of_a_plan_that_is_damaged_or_of_which_nothing_was_made(run, hits, tmp_path):
+def test_a_dry_run_says_what_becomes_of_a_plan_that_is_damaged_or_of_which_nothing_was_made(
+    run, hits, tmp_path
+):
     folder = Path(shutil.copytree(hits, tmp_path / "hits"))
     content = (folder / "specification.json").read_bytes()
     (folder / "specification.json").write_bytes(content[:100])
-    assert "a damaged specification.json: would be refused without --force" in run(*MAKE, folder, "--dry-run")[1]
+    assert (
+        "a damaged specification.json: would be refused without --force"
+        in run(*MAKE, folder, "--dry-run")[1]
+    )
     assert "would be replaced" in run(*MAKE, folder, "--dry-run", "--force")[1]
     shutil.rmtree(folder / "train")
     shutil.rmtree(folder / "validation")
     for text in (content, content[:100]):
         (folder / "specification.json").write_bytes(text)
-        assert "without shards: would be replaced" in run(*MAKE, folder, "--dry-run", "--seed", "5")[1]
+        assert (
+            "without shards: would be replaced"
+            in run(*MAKE, folder, "--dry-run", "--seed", "5")[1]
+        )
 
 
 def test_the_estimated_size_is_about_right(run, hits):
-    line = next(line for line in run(*MAKE, hits, "--dry-run")[1].splitlines() if "size" in line)
+    line = next(
+        line for line in run(*MAKE, hits, "--dry-run")[1].splitlines() if "size" in line
+    )
     estimate = float(line.split("about ")[1].split(" kB")[0]) * 1000
     actual = sum(path.stat().st_size for path in hits.rglob("*") if path.is_file())
     assert estimate == pytest.approx(actual, rel=0.25)
 
 
 @pytest.mark.parametrize(
-    ("number", "text"), [(0, "0 bytes"), (999, "999 bytes"), (6_700_000, "6.7 MB"), (2 * 10**15, "2e+03 TB")]
+    ("number", "text"),
+    [
+        (0, "0 bytes"),
+        (999, "999 bytes"),
+        (6_700_000, "6.7 MB"),
+        (2 * 10**15, "2e+03 TB"),
+    ],
 )
 def test_sizes_are_written_in_decimal_units(number, text):
     assert size_text(number) == text
@@ -379,15 +487,31 @@ def test_an_interruption_is_130_and_says_how_to_go_on(run, monkeypatch, tmp_path
     monkeypatch.setattr("cnpgen.make.make_dataset.make_dataset", interrupted)
     code, out, err = run(*MAKE, tmp_path / "x", "--quiet")
     assert (code, out) == (130, "")
-    assert err == "cnpgen: interrupted: finished shards are kept; run the same command again to resume\n"
+    assert (
+        err
+        == "cnpgen: interrupted: finished shards are kept; run the same command again to resume\n"
+    )
 
 
 @pytest.mark.slow
 def test_what_a_signal_interrupts_is_kept(tmp_path):
     folder = tmp_path / "many"
-    words = ("make-dataset", "airhockey-hit", "--n", "2e6", "--shard-size", "4096", "--workers", "1", "--out", folder)
+    words = (
+        "make-dataset",
+        "airhockey-hit",
+        "--n",
+        "2e6",
+        "--shard-size",
+        "4096",
+        "--workers",
+        "1",
+        "--out",
+        folder,
+    )
     process = spawn("-m", "cnpgen", *words)
-    while not (folder / "train" / "shard-00001.json").exists() and process.poll() is None:
+    while (
+        not (folder / "train" / "shard-00001.json").exists() and process.poll() is None
+    ):
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=HANGING)
@@ -406,7 +530,9 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_a_terminal_sees_a_bar_with_the_draws_tried_and_their_share_accepted(monkeypatch):
+def test_a_terminal_sees_a_bar_with_the_draws_tried_and_their_share_accepted(
+    monkeypatch,
+):
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setenv("COLUMNS", "120")
@@ -431,7 +557,10 @@ def test_a_file_sees_a_single_line(capsys):
     meter(100)
     meter.close()
     meter.begin("making y", 1)
-    assert capsys.readouterr().err == "making x: 300 rows, 100 exist already\nmaking y: 1 row\n"
+    assert (
+        capsys.readouterr().err
+        == "making x: 300 rows, 100 exist already\nmaking y: 1 row\n"
+    )
     assert meter.rows == 0
 
 
@@ -442,7 +571,14 @@ def test_list_shows_everything_that_there_is(run):
     code, out, err = run("list")
     assert (code, err) == (0, "")
     models = "planner trained on airhockey-hit"
-    for text in ("airhockey-replan", "120,000 rows", models, "7 joints, 8 constraints", "goal-ik", "robot-clearance"):
+    for text in (
+        "airhockey-replan",
+        "120,000 rows",
+        models,
+        "7 joints, 8 constraints",
+        "goal-ik",
+        "robot-clearance",
+    ):
         assert text in out
     assert max(len(line) for line in out.splitlines()) <= 100
 
@@ -483,8 +619,12 @@ def test_a_broken_plug_in_does_not_hide_the_others(run, monkeypatch):
 
 def test_show_prefers_the_dataset_and_can_be_told_otherwise(run):
     assert run("show", "heavy-object")[1].startswith("dataset heavy-object 1.1.0")
-    assert run("show", "heavy-object", "--kind", "pipeline")[1].startswith("pipeline heavy-object")
-    assert run("show", "heavy-object", "--kind", "problem")[1].startswith("problem heavy-object")
+    assert run("show", "heavy-object", "--kind", "pipeline")[1].startswith(
+        "pipeline heavy-object"
+    )
+    assert run("show", "heavy-object", "--kind", "problem")[1].startswith(
+        "problem heavy-object"
+    )
     assert run("show", "airhockey")[1].startswith("problem airhockey")
 
 
@@ -500,7 +640,9 @@ def test_show_tells_the_kind_of_a_file(run, kind):
 def test_show_describes_kinds_of_stages_and_constraints(run):
     assert run("show", "--stage", "start-ik")[1].startswith("stage start-ik")
     assert run("show", "--constraint", "table")[1].startswith("constraint table")
-    assert json.loads(run("show", "--stage", "at-rest", "--json")[1])["keys"][0]["choices"] == ["start", "goal"]
+    assert json.loads(run("show", "--stage", "at-rest", "--json")[1])["keys"][0][
+        "choices"
+    ] == ["start", "goal"]
     assert run("show", "--stage", "at-rest", "--kind", "problem")[0] == 2
     assert run("show", "--stage", "at-rest", "airhockey")[0] == 2
 
@@ -520,7 +662,14 @@ def test_inspect_shows_rows_ranges_and_yield(run, hits):
     code, out, err = run("inspect", hits)
     assert (code, err) == (0, "")
     state = "complete; checksums of the shards were not checked, 'cnpgen validate' does"
-    for text in (state, "200: train 182, validation 18", "too close together", "joint_6", "rad/s^2", "100.00 %"):
+    for text in (
+        state,
+        "200: train 182, validation 18",
+        "too close together",
+        "joint_6",
+        "rad/s^2",
+        "100.00 %",
+    ):
         assert text in out
     assert max(len(line) for line in out.splitlines()) <= 100
 
@@ -535,12 +684,16 @@ def test_inspect_writes_json_and_a_picture(run, hits, tmp_path):
     assert "ends in .png" in one_line(run("inspect", hits, "--plot", "hits.jpeg")[2])
 
 
-def test_a_picture_in_a_folder_that_is_not_there_is_refused_before_any_work(run, hits, tmp_path):
+def test_a_picture_in_a_folder_that_is_not_there_is_refused_before_any_work(
+    run, hits, tmp_path
+):
     (tmp_path / "file").write_text("")
     for folder in ("nothing", "file"):
         code, out, err = run("inspect", hits, "--plot", tmp_path / folder / "hits.png")
         assert (code, out) == (2, "")
-        assert "--plot: expected a file in a folder that is there, got " in one_line(err)
+        assert "--plot: expected a file in a folder that is there, got " in one_line(
+            err
+        )
 
 
 def test_inspect_of_a_damaged_dataset_is_1(run, hits, tmp_path):
@@ -570,7 +723,9 @@ def test_inspect_of_something_else_is_one_line(run, tmp_path):
 
 
 def test_validate_says_yes(run, hits):
-    code, out, err = run("validate", hits, "--deep", "--workers", "1", "--regenerate", "1")
+    code, out, err = run(
+        "validate", hits, "--deep", "--workers", "1", "--regenerate", "1"
+    )
     assert code == 0
     assert "no findings" in out
     assert "recomputed with Pinocchio and Coal: 200 rows, 0 out" in out
@@ -578,7 +733,9 @@ def test_validate_says_yes(run, hits):
 
 
 def test_a_quiet_validation_prints_findings_and_nothing_else(run, hits, tmp_path):
-    assert run("validate", hits, "--deep", "--workers", "1", "--regenerate", "1", "--quiet") == (0, "", "")
+    assert run(
+        "validate", hits, "--deep", "--workers", "1", "--regenerate", "1", "--quiet"
+    ) == (0, "", "")
     folder = Path(shutil.copytree(hits, tmp_path / "hits"))
     (folder / "notes.txt").write_text("mine")
     assert run("validate", folder, "--quiet") == (0, "", "")
@@ -588,7 +745,11 @@ def test_a_quiet_validation_prints_findings_and_nothing_else(run, hits, tmp_path
 
 def test_validate_says_no_with_a_line_per_finding(run, hits, monkeypatch):
     notes = (Finding("mine.txt", "is not part of the dataset", note=True),)
-    findings = (Finding("train/shard-00000.h5", "is missing"), Finding("specification.json", "was\nchanged"), *notes)
+    findings = (
+        Finding("train/shard-00000.h5", "is missing"),
+        Finding("specification.json", "was\nchanged"),
+        *notes,
+    )
     wanted = {}
 
     def validate(folder, **options):
@@ -632,7 +793,9 @@ def test_doctor_writes_json(run):
 
 def test_doctor_is_3_with_a_line_per_problem(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "pinocchio", types.ModuleType("pinocchio"))
-    monkeypatch.delenv("LOKY_MAX_CPU_COUNT", raising=False)  # of the tests; doctor would say that cores are kept back
+    monkeypatch.delenv(
+        "LOKY_MAX_CPU_COUNT", raising=False
+    )  # of the tests; doctor would say that cores are kept back
     code, out, err = run("doctor")
     assert code == 3
     assert "1 problem, below" in out
@@ -644,7 +807,9 @@ def test_doctor_is_3_with_a_line_per_problem(run, monkeypatch):
 
 def test_every_mistake_of_a_recipe_is_a_line(run, tmp_path):
     recipe = tmp_path / "bad.toml"
-    recipe.write_text('name = "Bad Name"\npipeline = "airhockey-hit"\nsed = 3\n[splits]\ntrain = 0\n')
+    recipe.write_text(
+        'name = "Bad Name"\npipeline = "airhockey-hit"\nsed = 3\n[splits]\ntrain = 0\n'
+    )
     code, out, err = run("make-dataset", recipe)
     assert (code, out) == (2, "")
     lines = err.splitlines()
@@ -663,21 +828,29 @@ def _fail_with(monkeypatch, error):
     ("error", "code", "text"),
     [
         (DatasetError("a\n  b"), 1, "a b"),
-        (ZeroDivisionError("division\nby zero"), 3, "internal error: ZeroDivisionError: division by zero"),
+        (
+            ZeroDivisionError("division\nby zero"),
+            3,
+            "internal error: ZeroDivisionError: division by zero",
+        ),
         (ImportError("No module named 'casadi'"), 3, "'cnpgen doctor'"),
         (PermissionError(13, "Permission denied", "/x"), 3, "/x: Permission denied"),
         (MemoryError(), 3, "out of memory"),
         (DatasetError("gone"), 1, "gone"),
     ],
 )
-def test_an_error_is_a_line_and_a_code_without_a_traceback(run, hits, monkeypatch, error, code, text):
+def test_an_error_is_a_line_and_a_code_without_a_traceback(
+    run, hits, monkeypatch, error, code, text
+):
     _fail_with(monkeypatch, error)
     found, out, err = run("inspect", hits)
     assert (found, out) == (code, "")
     assert text in one_line(err)
 
 
-@pytest.mark.parametrize("words", [("--debug", "inspect", "{}"), ("inspect", "{}", "--debug")])
+@pytest.mark.parametrize(
+    "words", [("--debug", "inspect", "{}"), ("inspect", "{}", "--debug")]
+)
 def test_debug_shows_the_traceback(run, hits, monkeypatch, words):
     _fail_with(monkeypatch, ZeroDivisionError("division by zero"))
     code, _, err = run(*(word.format(hits) for word in words))
@@ -729,7 +902,10 @@ def test_a_full_disk_behind_stdout_is_a_line():
 
 def test_closed_streams_are_no_error():
     command = f"'{sys.executable}' -m cnpgen list >&- 2>&-"
-    assert subprocess.run(command, shell=True, env=ENVIRONMENT, check=False).returncode == 0
+    assert (
+        subprocess.run(command, shell=True, env=ENVIRONMENT, check=False).returncode
+        == 0
+    )
 
 
 def test_suggestions_do_not_depend_on_the_process():
@@ -737,7 +913,10 @@ def test_suggestions_do_not_depend_on_the_process():
     script = "from cnpgen.cli.recipe_names import _shipped; print(*_shipped())"
     orders = {
         subprocess.run(
-            [sys.executable, "-c", script], env=os.environ | {"PYTHONHASHSEED": seed}, capture_output=True, check=True
+            [sys.executable, "-c", script],
+            env=os.environ | {"PYTHONHASHSEED": seed},
+            capture_output=True,
+            check=True,
         ).stdout
         for seed in "123"
     }

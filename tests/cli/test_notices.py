@@ -15,7 +15,9 @@ from tests.examples.plans import load
 CHECKED = "FOLDER/plans.h5: the file's checksum is right"
 
 
-@pytest.mark.parametrize(("options", "lines"), [((), [CHECKED, "cnpgen: building it"]), (("--quiet",), [])])
+@pytest.mark.parametrize(
+    ("options", "lines"), [((), [CHECKED, "cnpgen: building it"]), (("--quiet",), [])]
+)
 def test_what_is_said_for_every_kernel_is_printed_once_per_command(
     options: tuple[str, ...],
     lines: list[str],

@@ -27,7 +27,9 @@ FILES = {  # commands that take a file of plans
     "refine": ("refine", "{}", "-o", "out.h5"),
     "export": ("export", "{}", "--to", "npz"),
 }
-MODELS = {"plan": ("plan", "airhockey-hit", "--model", "{}", "-o", "out.h5", "--n", "1")}
+MODELS = {
+    "plan": ("plan", "airhockey-hit", "--model", "{}", "-o", "out.h5", "--n", "1")
+}
 RECIPES = {
     "make-dataset": ("make-dataset", "{}.toml"),
     "show": ("show", "{}.toml"),
@@ -36,7 +38,9 @@ RECIPES = {
 
 
 @pytest.fixture
-def said(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Said:
+def said(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Said:
     """Run a command about a path in an empty folder; return its exit code and the only line that it prints."""
     monkeypatch.chdir(tmp_path)
 
@@ -51,8 +55,12 @@ def said(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest
     return call
 
 
-@pytest.mark.parametrize("words", [*FOLDERS.values(), *FILES.values(), *MODELS.values(), *RECIPES.values()])
-def test_a_path_that_is_not_there_is_a_wrong_argument(said: Said, words: tuple[str, ...], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "words", [*FOLDERS.values(), *FILES.values(), *MODELS.values(), *RECIPES.values()]
+)
+def test_a_path_that_is_not_there_is_a_wrong_argument(
+    said: Said, words: tuple[str, ...], tmp_path: Path
+) -> None:
     code, line = said(words, "./nowhere")
     assert code == 2
     assert "nowhere" in line
@@ -61,9 +69,14 @@ def test_a_path_that_is_not_there_is_a_wrong_argument(said: Said, words: tuple[s
 
 
 @pytest.mark.parametrize("words", FOLDERS.values(), ids=FOLDERS)
-def test_a_file_is_not_the_folder_of_a_dataset(said: Said, words: tuple[str, ...], tmp_path: Path) -> None:
+def test_a_file_is_not_the_folder_of_a_dataset(
+    said: Said, words: tuple[str, ...], tmp_path: Path
+) -> None:
     (tmp_path / "mine.h5").write_text("mine")
-    assert said(words, "mine.h5") == (2, "mine.h5 is a file, expected the folder of a dataset")
+    assert said(words, "mine.h5") == (
+        2,
+        "mine.h5 is a file, expected the folder of a dataset",
+    )
 
 
 @pytest.mark.parametrize("words", FILES.values(), ids=FILES)
@@ -79,32 +92,54 @@ def test_a_folder_is_not_a_file_of_plans(
 
 def test_a_folder_is_not_a_model(said: Said, tmp_path: Path) -> None:
     (tmp_path / "model.h5").mkdir()
-    assert said(MODELS["plan"], "model.h5") == (2, "model.h5 is a folder, expected a model of cnpgen")
+    assert said(MODELS["plan"], "model.h5") == (
+        2,
+        "model.h5 is a folder, expected a model of cnpgen",
+    )
 
 
 @pytest.mark.parametrize("words", [("show", "{}"), ("make-dataset", "{}")])
-def test_a_file_of_plans_is_not_a_recipe(said: Said, words: tuple[str, ...], tmp_path: Path, hit: Path) -> None:
+def test_a_file_of_plans_is_not_a_recipe(
+    said: Said, words: tuple[str, ...], tmp_path: Path, hit: Path
+) -> None:
     shutil.copy(hit, tmp_path / "planned.h5")
     line = "planned.h5 is an HDF5 file, a file of plans, expected a recipe: 'cnpgen evaluate planned.h5' judges them"
     assert said(words, "planned.h5") == (2, line)
     h5py.File(tmp_path / "other.h5", "w").close()
-    assert said(words, "other.h5")[1].startswith("other.h5 is an HDF5 file, expected a recipe: 'cnpgen inspect'")
+    assert said(words, "other.h5")[1].startswith(
+        "other.h5 is an HDF5 file, expected a recipe: 'cnpgen inspect'"
+    )
 
 
-@pytest.mark.parametrize("words", [("show", "{}"), ("make-dataset", "{}"), ("solve", "{}", "--n", "1")])
-def test_a_model_is_not_a_recipe(said: Said, words: tuple[str, ...], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "words", [("show", "{}"), ("make-dataset", "{}"), ("solve", "{}", "--n", "1")]
+)
+def test_a_model_is_not_a_recipe(
+    said: Said, words: tuple[str, ...], tmp_path: Path
+) -> None:
     shutil.copy(shipped_models()["airhockey-hit"], tmp_path / "model.h5")
-    assert said(words, "model.h5")[1].startswith("model.h5 is an HDF5 file, a model of cnpgen, expected a recipe")
+    assert said(words, "model.h5")[1].startswith(
+        "model.h5 is an HDF5 file, a model of cnpgen, expected a recipe"
+    )
 
 
-@pytest.mark.parametrize(("words", "hint"), [(("show", "{}"), "inspect hits"), (("make-dataset", "{}"), "--out hits")])
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [(("show", "{}"), "inspect hits"), (("make-dataset", "{}"), "--out hits")],
+)
 def test_the_folder_of_a_dataset_is_not_a_recipe(
-    said: Said, words: tuple[str, ...], hint: str, tmp_path: Path, tiny: Callable[[str], Path]
+    said: Said,
+    words: tuple[str, ...],
+    hint: str,
+    tmp_path: Path,
+    tiny: Callable[[str], Path],
 ) -> None:
     shutil.copytree(tiny("airhockey-hit"), tmp_path / "hits")
     code, line = said(words, "hits")
     assert code == 2
-    assert line.startswith("hits is the folder of a dataset, expected a recipe: 'cnpgen ")
+    assert line.startswith(
+        "hits is the folder of a dataset, expected a recipe: 'cnpgen "
+    )
     assert hint in line
 
 
@@ -123,13 +158,19 @@ def test_a_folder_that_is_called_like_a_recipe_does_not_hide_it(
             "hist",
             "hist is neither a folder nor a file, dataset or pipeline (did you mean 'hits'?): 'cnpgen list' names",
         ),
-        ("./hist", "./hist is neither a folder nor a file, dataset or pipeline (did you mean 'hits'?)"),
+        (
+            "./hist",
+            "./hist is neither a folder nor a file, dataset or pipeline (did you mean 'hits'?)",
+        ),
         (
             "airhockey-hot",
             "airhockey-hot is neither a folder nor a file, dataset or pipeline (did you mean 'airhockey-hit'?)",
         ),
         ("hits.tmol/mine.toml", "no such file: hits.tmol/mine.toml"),
-        ("airhockey-hit", "--n is required: the number of fresh problems of the recipe airhockey-hit"),
+        (
+            "airhockey-hit",
+            "--n is required: the number of fresh problems of the recipe airhockey-hit",
+        ),
     ],
 )
 def test_what_cannot_be_solved_because_it_is_not_there_is_said_first(
@@ -143,18 +184,28 @@ def test_what_cannot_be_solved_because_it_is_not_there_is_said_first(
 
 def test_a_model_is_not_a_file_of_plans(said: Said, tmp_path: Path) -> None:
     shutil.copy(shipped_models()["airhockey-hit"], tmp_path / "mine.h5")
-    assert said(FILES["evaluate"], "mine.h5") == (2, "mine.h5 is a model of cnpgen, expected a file of plans")
+    assert said(FILES["evaluate"], "mine.h5") == (
+        2,
+        "mine.h5 is a model of cnpgen, expected a file of plans",
+    )
 
 
-def test_force_does_not_replace_a_model_by_plans(said: Said, tmp_path: Path, hit: Path) -> None:
+def test_force_does_not_replace_a_model_by_plans(
+    said: Said, tmp_path: Path, hit: Path
+) -> None:
     model = shipped_models()["airhockey-hit"]
     shutil.copy(model, tmp_path / "mine.h5")
     code, line = said(("refine", "{}", "-o", "mine.h5", "--force", "--quiet"), str(hit))
-    assert (code, line.partition(":")[0]) == (2, "mine.h5 is a model of cnpgen, not one of plans")
+    assert (code, line.partition(":")[0]) == (
+        2,
+        "mine.h5 is a model of cnpgen, not one of plans",
+    )
     assert (tmp_path / "mine.h5").read_bytes() == model.read_bytes()
 
 
-def test_solve_does_not_take_rows_that_were_changed(said: Said, tmp_path: Path, tiny: Callable[[str], Path]) -> None:
+def test_solve_does_not_take_rows_that_were_changed(
+    said: Said, tmp_path: Path, tiny: Callable[[str], Path]
+) -> None:
     shutil.copytree(tiny("airhockey-hit"), tmp_path / "hits")
     (path,) = (tmp_path / "hits" / "validation").glob("*.h5")
     with h5py.File(path) as file:
@@ -182,7 +233,16 @@ def hit(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 SPLITS = {
     "solve": ("solve", "{}", "--split", "val", "-o", "out.h5"),
-    "plan": ("plan", "{}", "--model", "airhockey-hit", "--split", "val", "-o", "out.h5"),
+    "plan": (
+        "plan",
+        "{}",
+        "--model",
+        "airhockey-hit",
+        "--split",
+        "val",
+        "-o",
+        "out.h5",
+    ),
 }
 
 
@@ -223,7 +283,9 @@ TABLES = {  # commands that take a recipe or a table
 }
 
 
-@pytest.mark.parametrize("words", [*DATASETS.values(), *HDF5.values(), *TABLES.values()])
+@pytest.mark.parametrize(
+    "words", [*DATASETS.values(), *HDF5.values(), *TABLES.values()]
+)
 def test_a_path_without_permission_to_read_is_named_as_that(
     said: Said, words: tuple[str, ...], tmp_path: Path, file_permissions: None
 ) -> None:
@@ -236,7 +298,9 @@ def test_a_path_without_permission_to_read_is_named_as_that(
 
 
 @pytest.mark.parametrize("words", HDF5.values(), ids=HDF5)
-def test_a_text_file_is_a_wrong_argument(said: Said, words: tuple[str, ...], tmp_path: Path) -> None:
+def test_a_text_file_is_a_wrong_argument(
+    said: Said, words: tuple[str, ...], tmp_path: Path
+) -> None:
     (tmp_path / "README.md").write_text("# Hits\n")
     code, line = said(words, "README.md")
     assert code == 2
@@ -244,7 +308,9 @@ def test_a_text_file_is_a_wrong_argument(said: Said, words: tuple[str, ...], tmp
 
 
 @pytest.mark.parametrize("words", DATASETS.values(), ids=DATASETS)
-def test_a_folder_of_recipes_is_no_dataset_yet(said: Said, words: tuple[str, ...], tmp_path: Path) -> None:
+def test_a_folder_of_recipes_is_no_dataset_yet(
+    said: Said, words: tuple[str, ...], tmp_path: Path
+) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "dataset.toml").touch()
     line = "mine is not a dataset of cnpgen: it has no specification.json: 'cnpgen make-dataset mine/dataset.toml'"
@@ -285,19 +351,52 @@ def test_a_folder_of_recipes_is_answered_with_its_file(
             ("plan", "airhockey-hit", "--model", "airhokey-hit"),
             "unknown model 'airhokey-hit' (did you mean 'airhockey",
         ),
-        (("complete", "airhokey"), "airhokey is neither a folder nor a file, problem, pipeline or dataset"),
-        (("copy", "airhokey"), "airhokey is neither a folder nor a file, problem, pipeline or dataset"),
-        (("make-scenes", "tabeltop"), "unknown family 'tabeltop' (did you mean 'tabletop'?)"),
-        (("make-scenes", "tabletop", "--robot", "pandda"), "unknown problem, pipeline or dataset 'pandda'"),
-        (("benchmark", "hits-18", "--plant", "delayed"), "unknown suite, dataset or pipeline 'hits-18'"),
-        (("train", "hist"), "hist is not there, expected a file or a folder (did you mean 'hits'?)"),
-        (("train", "airhockey-hit"), "airhockey-hit is a recipe, expected a path: 'cnpgen make-dataset airhockey-hit'"),
-        (("extend", "hist"), "hist is not there, expected the folder of a dataset (did you mean 'hits'?)"),
-        (("merge", "hist"), "hist is not there, expected the folder of a dataset (did you mean 'hits'?)"),
-        (("publish", "hist"), "hist is not there, expected the folder of a dataset (did you mean 'hits'?)"),
+        (
+            ("complete", "airhokey"),
+            "airhokey is neither a folder nor a file, problem, pipeline or dataset",
+        ),
+        (
+            ("copy", "airhokey"),
+            "airhokey is neither a folder nor a file, problem, pipeline or dataset",
+        ),
+        (
+            ("make-scenes", "tabeltop"),
+            "unknown family 'tabeltop' (did you mean 'tabletop'?)",
+        ),
+        (
+            ("make-scenes", "tabletop", "--robot", "pandda"),
+            "unknown problem, pipeline or dataset 'pandda'",
+        ),
+        (
+            ("benchmark", "hits-18", "--plant", "delayed"),
+            "unknown suite, dataset or pipeline 'hits-18'",
+        ),
+        (
+            ("train", "hist"),
+            "hist is not there, expected a file or a folder (did you mean 'hits'?)",
+        ),
+        (
+            ("train", "airhockey-hit"),
+            "airhockey-hit is a recipe, expected a path: 'cnpgen make-dataset airhockey-hit'",
+        ),
+        (
+            ("extend", "hist"),
+            "hist is not there, expected the folder of a dataset (did you mean 'hits'?)",
+        ),
+        (
+            ("merge", "hist"),
+            "hist is not there, expected the folder of a dataset (did you mean 'hits'?)",
+        ),
+        (
+            ("publish", "hist"),
+            "hist is not there, expected the folder of a dataset (did you mean 'hits'?)",
+        ),
         (("export", "nowhere.h5"), "nowhere.h5 is not there"),
         (("import", "nowhere.csv"), "nowhere.csv is not there"),
-        (("import", ".", "--problem", "airhokey"), "unknown problem, pipeline or dataset 'airhokey'"),
+        (
+            ("import", ".", "--problem", "airhokey"),
+            "unknown problem, pipeline or dataset 'airhokey'",
+        ),
         (("init", "My-Arm"), "NAME must be lower-case letters"),
         (("evaluate", ""), "the argument after 'evaluate' is empty"),
         (("refine", "plans.h5", "--out="), "the argument after '--out=' is empty"),
@@ -323,19 +422,54 @@ OUTPUTS = {  # command and option -> words; the option is the last one
     ("train", "out"): ("train", "{hits}", "-o", "{out}.h5"),
     ("complete", "out"): ("complete", "airhockey-replan", "{plans}", "-o", "{out}.h5"),
     ("export", "out"): ("export", "{plans}", "--to", "npz", "-o", "{out}.npz"),
-    ("import", "out"): ("import", "{table}", "--problem", "airhockey", "-o", "{out}.h5"),
-    ("make-scenes", "out"): ("make-scenes", "tabletop", "--robot", "airhockey", "--n", "1", "-o", "{out}.h5"),
+    ("import", "out"): (
+        "import",
+        "{table}",
+        "--problem",
+        "airhockey",
+        "-o",
+        "{out}.h5",
+    ),
+    ("make-scenes", "out"): (
+        "make-scenes",
+        "tabletop",
+        "--robot",
+        "airhockey",
+        "--n",
+        "1",
+        "-o",
+        "{out}.h5",
+    ),
     ("make-dataset", "out"): ("make-dataset", "airhockey-hit", "-o", "{out}"),
     ("merge", "out"): ("merge", "{hits}", "-o", "{out}"),
-    ("benchmark", "out"): ("benchmark", "hits-81", "--planners", "solve", "-o", "{out}"),
-    ("publish", "out"): ("publish", "{hits}", "--to", "me/mine", "--dry-run", "-o", "{out}"),
+    ("benchmark", "out"): (
+        "benchmark",
+        "hits-81",
+        "--planners",
+        "solve",
+        "-o",
+        "{out}",
+    ),
+    ("publish", "out"): (
+        "publish",
+        "{hits}",
+        "--to",
+        "me/mine",
+        "--dry-run",
+        "-o",
+        "{out}",
+    ),
     ("copy", "folder"): ("copy", "airhockey-hit", "{out}"),
     ("init", "name"): ("init", "{out}", "--planner"),
 }
 
 
 def test_every_option_that_names_an_output_is_tested() -> None:
-    (commands,) = (action for action in build_parser()._actions if isinstance(action, argparse._SubParsersAction))
+    (commands,) = (
+        action
+        for action in build_parser()._actions
+        if isinstance(action, argparse._SubParsersAction)
+    )
     outputs = {
         (name, action.dest)
         for name, command in commands.choices.items()
@@ -347,21 +481,37 @@ def test_every_option_that_names_an_output_is_tested() -> None:
 
 @pytest.mark.parametrize("words", OUTPUTS.values(), ids=map("-".join, OUTPUTS))
 def test_an_output_that_cannot_be_written_is_named_before_anything_is_computed(
-    said: Said, words: tuple[str, ...], tmp_path: Path, hit: Path, tiny: Callable[[str], Path], file_permissions: None
+    said: Said,
+    words: tuple[str, ...],
+    tmp_path: Path,
+    hit: Path,
+    tiny: Callable[[str], Path],
+    file_permissions: None,
 ) -> None:
     (tmp_path / "table.csv").touch()
     (tmp_path / "ro").mkdir(0o555)
-    inputs = {"plans": hit, "hits": tiny("airhockey-hit"), "table": "table.csv", "out": "ro/mine"}
+    inputs = {
+        "plans": hit,
+        "hits": tiny("airhockey-hit"),
+        "table": "table.csv",
+        "out": "ro/mine",
+    }
     out = words[-1 if words[0] != "init" else 1].format(**inputs)
-    line = f"cannot write {out}: Permission denied; choose a folder that you may write to"
+    line = (
+        f"cannot write {out}: Permission denied; choose a folder that you may write to"
+    )
     assert said(tuple(word.format(**inputs) for word in words), "") == (3, line)
 
 
-def test_files_of_recipes_are_not_written_into_a_file(said: Said, tmp_path: Path) -> None:
+def test_files_of_recipes_are_not_written_into_a_file(
+    said: Said, tmp_path: Path
+) -> None:
     (tmp_path / "mine").touch()
     code, line = said(("copy", "airhockey-hit", "mine/hits"), "")
     assert code == 3
-    assert line.startswith("cannot write mine/hits: Not a directory; a file is where a folder should be")
+    assert line.startswith(
+        "cannot write mine/hits: Not a directory; a file is where a folder should be"
+    )
 
 
 def test_extending_needs_a_folder_that_can_be_written(
@@ -375,10 +525,15 @@ def test_extending_needs_a_folder_that_can_be_written(
 
 def test_plans_are_not_imported_as_trajectories(said: Said, hit: Path) -> None:
     line = f"{hit} is a file of plans already: 'cnpgen refine' optimizes them"
-    assert said(("import", str(hit), "--problem", "airhockey", "-o", "out.h5"), "") == (2, line)
+    assert said(("import", str(hit), "--problem", "airhockey", "-o", "out.h5"), "") == (
+        2,
+        line,
+    )
 
 
-@pytest.mark.parametrize("option", [("refine", "--stay-within"), ("evaluate", "--tracking-error")])
+@pytest.mark.parametrize(
+    "option", [("refine", "--stay-within"), ("evaluate", "--tracking-error")]
+)
 def test_large_angles_need_a_unit(said: Said, option: tuple[str, str]) -> None:
     code, line = said((option[0], "plans.h5", option[1], "2"), "")
     assert code == 2

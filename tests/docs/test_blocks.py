@@ -53,7 +53,13 @@ def environment(folder: Path) -> dict[str, str]:
 
 def run(command: list[str], folder: Path, code: int = 0) -> str:
     done = subprocess.run(
-        command, cwd=folder, env=environment(folder), capture_output=True, text=True, timeout=HANGING, check=False
+        command,
+        cwd=folder,
+        env=environment(folder),
+        capture_output=True,
+        text=True,
+        timeout=HANGING,
+        check=False,
     )
     assert done.returncode == code, f"{command}\n{done.stdout}\n{done.stderr}"
     return done.stdout if code == 0 else done.stdout + done.stderr
@@ -62,14 +68,20 @@ def run(command: list[str], folder: Path, code: int = 0) -> str:
 def test_every_block_says_what_it_is() -> None:
     for page in PAGES:
         for marks, language, text in blocks(page):
-            assert language in RUNNABLE | {""}, f"{page.name}: {language!r} cannot be run: {text[:60]}"
-            assert language != "toml" or "file" in marks, f"{page.name}: a TOML block must be a file: {text[:60]}"
+            assert language in RUNNABLE | {""}, (
+                f"{page.name}: {language!r} cannot be run: {text[:60]}"
+            )
+            assert language != "toml" or "file" in marks, (
+                f"{page.name}: a TOML block must be a file: {text[:60]}"
+            )
 
 
 @pytest.fixture(scope="session")
 def needed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Prepare the files that a marked block needs: a small dataset of hits."""
-    return make_dataset("airhockey-hit", tmp_path_factory.mktemp("needed") / "hits", n=400, workers=1).folder
+    return make_dataset(
+        "airhockey-hit", tmp_path_factory.mktemp("needed") / "hits", n=400, workers=1
+    ).folder
 
 
 def shown(page: Path) -> Iterator[tuple[dict[str, str], str, str]]:
@@ -86,7 +98,9 @@ def shown(page: Path) -> Iterator[tuple[dict[str, str], str, str]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_the_blocks_of_a_page_run_in_order(page: Path, needed: Path, tmp_path: Path) -> None:
+def test_the_blocks_of_a_page_run_in_order(
+    page: Path, needed: Path, tmp_path: Path
+) -> None:
     for marks, language, text in shown(page):
         if "needs" in marks and not (tmp_path / marks["needs"]).exists():
             shutil.copytree(needed, tmp_path / marks["needs"])
@@ -102,7 +116,9 @@ def test_the_blocks_of_a_page_run_in_order(page: Path, needed: Path, tmp_path: P
 
 WRITTEN = {
     "bash": re.compile(r"(?:-o|--out|--plot|>) ([\w.-]+)"),
-    "python": re.compile(r'(?:save_plans\("|make_dataset\("[\w-]+", "|File\("(?=[^"]+", "w"))([\w.-]+)'),
+    "python": re.compile(
+        r'(?:save_plans\("|make_dataset\("[\w-]+", "|File\("(?=[^"]+", "w"))([\w.-]+)'
+    ),
 }
 
 
@@ -119,7 +135,9 @@ def test_no_two_pages_write_the_same_file_so_that_all_can_run_in_one_folder() ->
 
 @pytest.mark.slow
 def test_the_plug_in_of_the_docs_works_when_installed(tmp_path: Path) -> None:
-    files = {marks["file"]: text for marks, _, text in blocks(PLUG_INS) if "file" in marks}
+    files = {
+        marks["file"]: text for marks, _, text in blocks(PLUG_INS) if "file" in marks
+    }
     source = tmp_path / "src"
     source.mkdir()
     (source / "my_hockey.py").write_text(files["src/my_hockey.py"], encoding="utf-8")
@@ -134,11 +152,42 @@ def test_the_plug_in_of_the_docs_works_when_installed(tmp_path: Path) -> None:
     (tmp_path / "problem.toml").write_text(problem, encoding="utf-8")
     (tmp_path / "slow.toml").write_text(pipeline, encoding="utf-8")
 
-    assert all(name in run(["cnpgen", "list"], tmp_path) for name in ("slow-hits", "keep-out", "json-lines"))
-    run(["cnpgen", "solve", "airhockey-hit", "--n", "2", "-o", "plans.h5", "--workers", "1"], tmp_path)
-    run(["cnpgen", "export", "plans.h5", "--to", "json-lines", "--rate", "50"], tmp_path)
+    assert all(
+        name in run(["cnpgen", "list"], tmp_path)
+        for name in ("slow-hits", "keep-out", "json-lines")
+    )
+    run(
+        [
+            "cnpgen",
+            "solve",
+            "airhockey-hit",
+            "--n",
+            "2",
+            "-o",
+            "plans.h5",
+            "--workers",
+            "1",
+        ],
+        tmp_path,
+    )
+    run(
+        ["cnpgen", "export", "plans.h5", "--to", "json-lines", "--rate", "50"], tmp_path
+    )
     assert len((tmp_path / "plans.jsonl").read_text(encoding="utf-8").splitlines()) == 2
-    run(["cnpgen", "make-dataset", "slow.toml", "--n", "300", "--workers", "1", "--out", "slow"], tmp_path)
+    run(
+        [
+            "cnpgen",
+            "make-dataset",
+            "slow.toml",
+            "--n",
+            "300",
+            "--workers",
+            "1",
+            "--out",
+            "slow",
+        ],
+        tmp_path,
+    )
     run(["cnpgen", "validate", "slow", "--deep", "--workers", "1"], tmp_path)
     rejected = run(["cnpgen", "inspect", "slow"], tmp_path)
     assert "hit too fast" in rejected
@@ -151,15 +200,27 @@ def test_the_plug_in_of_the_docs_works_when_installed(tmp_path: Path) -> None:
     changed = run(["cnpgen", "validate", "slow", "--regenerate", "1"], tmp_path, code=1)
     assert "made with other versions: the code of its plug-ins has changed" in changed
 
-    (source / "my_hockey-1.0.dist-info" / "entry_points.txt").unlink()  # as if it were not installed
+    (
+        source / "my_hockey-1.0.dist-info" / "entry_points.txt"
+    ).unlink()  # as if it were not installed
     run(["cnpgen", "validate", "slow"], tmp_path)
     lost = run(["cnpgen", "validate", "slow", "--deep"], tmp_path, code=3)
-    assert "stage 'slow-hits' comes from the package 'my-hockey', which is not installed" in lost
-    assert "constraint 'keep-out' comes from the package 'my-hockey', which is not installed" in lost
+    assert (
+        "stage 'slow-hits' comes from the package 'my-hockey', which is not installed"
+        in lost
+    )
+    assert (
+        "constraint 'keep-out' comes from the package 'my-hockey', which is not installed"
+        in lost
+    )
 
 
-def test_the_constraint_of_the_docs_is_measured_along_a_path_as_at_single_states() -> None:
-    files = {marks["file"]: text for marks, _, text in blocks(PLUG_INS) if "file" in marks}
+def test_the_constraint_of_the_docs_is_measured_along_a_path_as_at_single_states() -> (
+    None
+):
+    files = {
+        marks["file"]: text for marks, _, text in blocks(PLUG_INS) if "file" in marks
+    }
     module: dict[str, Any] = {"__name__": "my_hockey"}
     exec(compile(files["src/my_hockey.py"], "my_hockey.py", "exec"), module)
     keep_out = module["KeepOut"](x=1.0, y=0.0, radius=0.1, tolerance=1e-3)
@@ -183,9 +244,14 @@ def test_the_constraint_of_the_docs_is_measured_along_a_path_as_at_single_states
 
 def install(folder: Path, project: dict[str, object]) -> None:
     """Do what pip does for entry points: write the metadata beside the module."""
-    info = folder / f"{str(project['name']).replace('-', '_')}-{project['version']}.dist-info"
+    info = (
+        folder
+        / f"{str(project['name']).replace('-', '_')}-{project['version']}.dist-info"
+    )
     info.mkdir()
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
+    (info / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    )
     entry_points = configparser.ConfigParser(delimiters=("=",))
     entry_points.read_dict(project["entry-points"])  # type: ignore[arg-type]
     with (info / "entry_points.txt").open("w", encoding="utf-8") as file:
@@ -196,7 +262,9 @@ def anchors(page: Path) -> set[str]:
     """Return the anchors of a page's headings, as GitHub makes them."""
     text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.S)
     titles = re.findall(r"^#+ +(.+?) *$", text, re.M)
-    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+    return {
+        re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles
+    }
 
 
 LINKED = sorted({*PAGES, *ROOT.glob("*.md")})
@@ -204,7 +272,9 @@ LINKED = sorted({*PAGES, *ROOT.glob("*.md")})
 
 @pytest.mark.parametrize("page", LINKED, ids=lambda page: page.name)
 def test_what_a_page_links_to_is_there(page: Path) -> None:
-    text = re.sub(r"```.*?```|`[^`\n]*`", "", page.read_text(encoding="utf-8"), flags=re.S)
+    text = re.sub(
+        r"```.*?```|`[^`\n]*`", "", page.read_text(encoding="utf-8"), flags=re.S
+    )
     for link in re.findall(r"\]\(([^)\s]+)\)", text):
         if re.match(r"[a-z]+:", link):
             continue
@@ -212,8 +282,12 @@ def test_what_a_page_links_to_is_there(page: Path) -> None:
         target = page.parent / file if file else page
         assert target.exists(), f"{page.name} links to {link}"
         top, *below = target.resolve().relative_to(ROOT).parts
-        assert top in PARTS or not below, f"{page.name} links to {link}, which is not on the site: write its name only"
-        assert not anchor or anchor in anchors(target), f"{page.name} links to {link}; there are {anchors(target)}"
+        assert top in PARTS or not below, (
+            f"{page.name} links to {link}, which is not on the site: write its name only"
+        )
+        assert not anchor or anchor in anchors(target), (
+            f"{page.name} links to {link}; there are {anchors(target)}"
+        )
 
 
 def test_every_page_can_be_reached_from_the_readme() -> None:
@@ -224,8 +298,12 @@ def test_every_page_can_be_reached_from_the_readme() -> None:
             continue
         seen.add(page)
         links = re.findall(r"\]\(([^)\s#:]+)[^)]*\)", page.read_text(encoding="utf-8"))
-        waiting += [path for link in links if (path := (page.parent / link).resolve()).is_file()]
-    assert {*PAGES} <= seen, f"nothing links to {[page.name for page in {*PAGES} - seen]}"
+        waiting += [
+            path for link in links if (path := (page.parent / link).resolve()).is_file()
+        ]
+    assert {*PAGES} <= seen, (
+        f"nothing links to {[page.name for page in {*PAGES} - seen]}"
+    )
 
 
 def test_no_page_has_a_placeholder_left() -> None:

@@ -25,14 +25,34 @@ needs_challenge = pytest.mark.skipif(
 def run(python: str, *options: str) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [python, str(RUN), *options]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=False)
+    return subprocess.run(
+        command,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
 
 
 @pytest.mark.slow
 @needs_challenge
 def test_the_agent_scores_without_violating_a_constraint():
-    python, clone = os.environ["CNPGEN_CHALLENGE_PYTHON"], os.environ["CNPGEN_CHALLENGE"]
-    done = run(python, "--environment", clone, "--episodes", "4", "--chunk", "4", "--seed", "31")
+    python, clone = (
+        os.environ["CNPGEN_CHALLENGE_PYTHON"],
+        os.environ["CNPGEN_CHALLENGE"],
+    )
+    done = run(
+        python,
+        "--environment",
+        clone,
+        "--episodes",
+        "4",
+        "--chunk",
+        "4",
+        "--seed",
+        "31",
+    )
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout.splitlines()[-1])
     assert result["episodes"] == 4
@@ -57,10 +77,20 @@ print(json.dumps(edges))
 
 @needs_challenge
 def test_the_agent_refines_hits_that_leave_the_table():
-    python, clone = os.environ["CNPGEN_CHALLENGE_PYTHON"], os.environ["CNPGEN_CHALLENGE"]
+    python, clone = (
+        os.environ["CNPGEN_CHALLENGE_PYTHON"],
+        os.environ["CNPGEN_CHALLENGE"],
+    )
     command = [python, "-W", "ignore", "-c", EDGE, clone, str(RUN.parent)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=False)
+    done = subprocess.run(
+        command,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     planned, checked = json.loads(done.stdout.splitlines()[-1])
     assert planned < MIN_X_M < checked

@@ -37,15 +37,23 @@ def generator() -> ModuleType:
     return script("generate")
 
 
-@pytest.mark.parametrize("name", ["reference/keys.md", "reference/cli.md", "reference/api.md", "index.md"])
-def test_a_generated_page_is_what_the_code_says(generator: ModuleType, name: str) -> None:
+@pytest.mark.parametrize(
+    "name", ["reference/keys.md", "reference/cli.md", "reference/api.md", "index.md"]
+)
+def test_a_generated_page_is_what_the_code_says(
+    generator: ModuleType, name: str
+) -> None:
     page = (DOCS / name).read_text(encoding="utf-8")
     assert page == generator.PAGES[name]() + "\n", "run: python docs/generate.py"
 
 
 def test_every_option_of_every_command_is_on_the_page(generator: ModuleType) -> None:
     page = generator.describe_commands()
-    commands = next(action.choices for action in build_parser()._actions if isinstance(action.choices, dict))
+    commands = next(
+        action.choices
+        for action in build_parser()._actions
+        if isinstance(action.choices, dict)
+    )
     assert len(commands) >= 20
     for name, command in commands.items():
         section = page.split(f"## `cnpgen {name}`\n")[1].split("\n## ")[0]
@@ -64,10 +72,18 @@ def test_the_page_of_names_has_all_public_modules(generator: ModuleType) -> None
 
 
 @pytest.mark.parametrize("framework", ["torch", "jax", "tensorflow"])
-def test_the_page_of_names_has_the_bridges_to_frameworks(generator: ModuleType, framework: str) -> None:
-    section = generator.describe_names().split(f"## `cnpgen.interop.{framework}`\n")[1].split("\n## ")[0]
+def test_the_page_of_names_has_the_bridges_to_frameworks(
+    generator: ModuleType, framework: str
+) -> None:
+    section = (
+        generator.describe_names()
+        .split(f"## `cnpgen.interop.{framework}`\n")[1]
+        .split("\n## ")[0]
+    )
     names = re.findall(r"^\| `(\w+)` \| .*\. \|$", section, re.M)
-    assert {"torch": "TensorLoss", "jax": "plan_loss", "tensorflow": "to_tensorflow"}[framework] in names
+    assert {"torch": "TensorLoss", "jax": "plan_loss", "tensorflow": "to_tensorflow"}[
+        framework
+    ] in names
     module = pytest.importorskip(f"cnpgen.interop.{framework}", exc_type=CnpgenError)
     assert names == sorted(getattr(module, "__all__", [f"to_{framework}"]))
 
@@ -75,27 +91,43 @@ def test_the_page_of_names_has_the_bridges_to_frameworks(generator: ModuleType, 
 def test_every_page_is_of_one_kind_and_in_the_index() -> None:
     index = (DOCS / "index.md").read_text(encoding="utf-8")
     pages = {path.relative_to(DOCS) for path in DOCS.rglob("*.md")} - {Path("index.md")}
-    assert {page.parts[0] for page in pages} == set(KINDS), "a page belongs to one of the folders"
+    assert {page.parts[0] for page in pages} == set(KINDS), (
+        "a page belongs to one of the folders"
+    )
     assert all(len(page.parts) == 2 for page in pages)
-    missing = [page.as_posix() for page in pages if f"]({page.as_posix()})" not in index]
+    missing = [
+        page.as_posix() for page in pages if f"]({page.as_posix()})" not in index
+    ]
     assert missing == [], "link the page in docs/index.md"
     names = [page.stem for page in pages if page.parts[0] != "benchmarks"]
     assert len(names) == len(set(names)), "'cnpgen docs NAME' needs unique names"
 
 
 def test_concepts_have_a_picture() -> None:
-    for name in ("splines", "constraint-manifold", "certification", "verdict", "scenes"):
+    for name in (
+        "splines",
+        "constraint-manifold",
+        "certification",
+        "verdict",
+        "scenes",
+    ):
         assert pictures(DOCS / "concepts" / f"{name}.md"), name
 
 
 def test_every_picture_has_an_alternative_text() -> None:
     pages = [
         *ROOT.glob("*.md"),
-        *(path for name in ("docs", "datasets", "problems", "pipelines") for path in (ROOT / name).rglob("*.md")),
+        *(
+            path
+            for name in ("docs", "datasets", "problems", "pipelines")
+            for path in (ROOT / name).rglob("*.md")
+        ),
     ]
     texts = {(page.name, file): text for page in pages for text, file in pictures(page)}
     assert len(texts) > 15
-    assert {key: text for key, text in texts.items() if len(text) < MIN_PICTURE_TEXT} == {}
+    assert {
+        key: text for key, text in texts.items() if len(text) < MIN_PICTURE_TEXT
+    } == {}
 
 
 def pictures(page: Path) -> list[tuple[str, str]]:
@@ -113,20 +145,32 @@ def test_help_texts_and_docstrings_name_pages_that_exist_and_no_files() -> None:
     pages = list_pages()
     for path in (ROOT / "cnpgen").rglob("*.py"):
         text = " ".join(path.read_text(encoding="utf-8").split())
-        assert not re.search(r"docs/[\w/-]+\.md", text), f"{path}: the wheel has no such file, name 'cnpgen docs PAGE'"
+        assert not re.search(r"docs/[\w/-]+\.md", text), (
+            f"{path}: the wheel has no such file, name 'cnpgen docs PAGE'"
+        )
         for name in re.findall(r"['`]cnpgen docs ([a-z][\w/-]*)['`]", text):
             assert name in pages, f"{path}: no page {name!r}"
 
 
-@pytest.mark.parametrize("page", sorted((DOCS / "tutorials").glob("*.md")), ids=lambda page: page.stem)
-def test_the_notebook_of_a_tutorial_has_every_block_as_a_cell(page: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "page", sorted((DOCS / "tutorials").glob("*.md")), ids=lambda page: page.stem
+)
+def test_the_notebook_of_a_tutorial_has_every_block_as_a_cell(
+    page: Path, tmp_path: Path
+) -> None:
     pytest.importorskip("jupytext")
     script("notebooks").write_notebooks(tmp_path)
     notebook = json.loads((tmp_path / f"{page.stem}.ipynb").read_text(encoding="utf-8"))
     assert (notebook["nbformat"], notebook["nbformat_minor"]) == (4, 5)
     assert len({cell["id"] for cell in notebook["cells"]}) == len(notebook["cells"])
-    runnable = [(marks, language, text) for marks, language, text in blocks(page) if language]
-    cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    runnable = [
+        (marks, language, text) for marks, language, text in blocks(page) if language
+    ]
+    cells = [
+        "".join(cell["source"])
+        for cell in notebook["cells"]
+        if cell["cell_type"] == "code"
+    ]
     assert len(cells) == len(runnable) > 3
     for (marks, language, text), cell in zip(runnable, cells, strict=True):
         first, _, rest = cell.partition("\n")
@@ -137,8 +181,16 @@ def test_the_notebook_of_a_tutorial_has_every_block_as_a_cell(page: Path, tmp_pa
         else:
             rest = cell
         assert rest == text.strip("\n")
-    prose = "\n".join("".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "markdown")
-    headings = [line for line in page.read_text(encoding="utf-8").splitlines() if re.match(r"#+ [A-Z0-9]", line)]
+    prose = "\n".join(
+        "".join(cell["source"])
+        for cell in notebook["cells"]
+        if cell["cell_type"] == "markdown"
+    )
+    headings = [
+        line
+        for line in page.read_text(encoding="utf-8").splitlines()
+        if re.match(r"#+ [A-Z0-9]", line)
+    ]
     assert [line for line in headings if line not in prose] == []
 
 
@@ -152,7 +204,9 @@ def test_the_pictures_of_the_concepts_are_drawn_from_computed_plans(
     pictures.main()
     drawn = {path.name for path in tmp_path.iterdir()}
     assert len(drawn) == 5
-    text = "".join(page.read_text(encoding="utf-8") for page in (DOCS / "concepts").glob("*.md"))
+    text = "".join(
+        page.read_text(encoding="utf-8") for page in (DOCS / "concepts").glob("*.md")
+    )
     for name in drawn:
         assert f"../images/{name}" in text
         assert (DOCS / "images" / name).is_file()
@@ -162,13 +216,22 @@ def test_the_pictures_of_the_concepts_are_drawn_from_computed_plans(
 def test_the_plan_format_lists_every_outcome_of_refining() -> None:
     page = (DOCS / "reference" / "plan-format.md").read_text(encoding="utf-8")
     table = page.split("| outcome | definition |")[1].split("\n\n")[0]
-    assert re.findall(r"^\| (\d+) \|", table, re.MULTILINE) == [str(int(outcome)) for outcome in Outcome]
+    assert re.findall(r"^\| (\d+) \|", table, re.MULTILINE) == [
+        str(int(outcome)) for outcome in Outcome
+    ]
 
 
 def test_the_new_names_of_modules_in_the_change_log_exist() -> None:
     table = (
-        (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").split("| `benchmarks/loader_ways.py` |")[1].split("\n\n")[0]
+        (ROOT / "CHANGELOG.md")
+        .read_text(encoding="utf-8")
+        .split("| `benchmarks/loader_ways.py` |")[1]
+        .split("\n\n")[0]
     )
     names = re.findall(r"\| `([\w/.-]+)` \|$", table, re.MULTILINE)
     assert len(names) > 100
-    assert [name for name in names if not (ROOT / name).exists() and not (ROOT / "cnpgen" / name).exists()] == []
+    assert [
+        name
+        for name in names
+        if not (ROOT / name).exists() and not (ROOT / "cnpgen" / name).exists()
+    ] == []

@@ -27,14 +27,20 @@ PARTS = ("cnpgen", "docs", "datasets", "pipelines", "problems")
 def copy_of_the_repository(folder: Path) -> Path:
     """Copy the sources of the site, because a build writes pages of the API beside the others."""
     for name in PARTS:
-        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "api"))
+        shutil.copytree(
+            ROOT / name,
+            folder / name,
+            ignore=shutil.ignore_patterns("__pycache__", "api"),
+        )
     for page in ROOT.glob("*.md"):
         shutil.copy(page, folder)
 
     return folder
 
 
-def build(source: Path, out: Path, *, builder: str = "html") -> subprocess.CompletedProcess[str]:
+def build(
+    source: Path, out: Path, *, builder: str = "html"
+) -> subprocess.CompletedProcess[str]:
     command = [
         sys.executable,
         "-m",
@@ -49,7 +55,9 @@ def build(source: Path, out: Path, *, builder: str = "html") -> subprocess.Compl
         str(source),
         str(out),
     ]
-    return subprocess.run(command, capture_output=True, text=True, timeout=HANGING, check=False)
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=HANGING, check=False
+    )
 
 
 @pytest.fixture(scope="module")
@@ -57,19 +65,26 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Build the site."""
     for library in ("sphinx", "myst_parser", "furo"):
         pytest.importorskip(library)
-    source, out = copy_of_the_repository(tmp_path_factory.mktemp("source")), tmp_path_factory.mktemp("site")
+    source, out = (
+        copy_of_the_repository(tmp_path_factory.mktemp("source")),
+        tmp_path_factory.mktemp("site"),
+    )
     done = build(source, out)
     assert done.returncode == 0, done.stderr
     return out
 
 
 @pytest.mark.extended
-def test_every_page_is_on_the_site_at_its_address_and_in_the_navigation(site: Path) -> None:
+def test_every_page_is_on_the_site_at_its_address_and_in_the_navigation(
+    site: Path,
+) -> None:
     front = (site / "docs" / "index.html").read_text(encoding="utf-8")
     for name, page in list_pages().items():
         address = page_url(page).removeprefix(DOCUMENTATION_URL)
         assert (site / address).is_file(), name
-        assert name == "index" or f'href="{address.removeprefix("docs/")}"' in front, name
+        assert name == "index" or f'href="{address.removeprefix("docs/")}"' in front, (
+            name
+        )
     assert "docs/index.html" in (site / "index.html").read_text(encoding="utf-8")
 
 
@@ -78,18 +93,31 @@ def test_every_tutorial_links_to_its_notebook(site: Path) -> None:
     tutorials = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
     assert len(tutorials) >= 5
     for page in tutorials:
-        text = (site / "docs" / "tutorials" / f"{page.stem}.html").read_text(encoding="utf-8")
+        text = (site / "docs" / "tutorials" / f"{page.stem}.html").read_text(
+            encoding="utf-8"
+        )
         assert f'href="../../notebooks/{page.stem}.ipynb"' in text
         assert (site / "notebooks" / f"{page.stem}.ipynb").is_file()
 
 
 @pytest.mark.extended
 def test_every_public_name_has_a_page_with_its_signature(site: Path) -> None:
-    names = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs" / "reference" / "api.md").read_text(encoding="utf-8"), re.M)
-    pages = {path.stem.rpartition(".")[2]: path for path in (site / "docs" / "reference" / "api").glob("*.html")}
+    names = re.findall(
+        r"^\| `(\w+)` \|",
+        (ROOT / "docs" / "reference" / "api.md").read_text(encoding="utf-8"),
+        re.M,
+    )
+    pages = {
+        path.stem.rpartition(".")[2]: path
+        for path in (site / "docs" / "reference" / "api").glob("*.html")
+    }
     assert set(names) == set(pages)
-    assert 'id="cnpgen.make_dataset"' in pages["make_dataset"].read_text(encoding="utf-8")
-    assert 'id="cnpgen.interop.torch.TensorLoss"' in pages["TensorLoss"].read_text(encoding="utf-8")
+    assert 'id="cnpgen.make_dataset"' in pages["make_dataset"].read_text(
+        encoding="utf-8"
+    )
+    assert 'id="cnpgen.interop.torch.TensorLoss"' in pages["TensorLoss"].read_text(
+        encoding="utf-8"
+    )
     assert "certify" in pages["make_dataset"].read_text(encoding="utf-8")
 
 
@@ -102,14 +130,20 @@ def test_the_search_finds_words_of_pages_and_names(site: Path) -> None:
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("error", ["[gone](gone.md)", "[gone](splines.md#no-such-heading)"])
+@pytest.mark.parametrize(
+    "error", ["[gone](gone.md)", "[gone](splines.md#no-such-heading)"]
+)
 def test_a_broken_link_fails_the_build(error: str, tmp_path: Path) -> None:
     for library in ("sphinx", "myst_parser", "furo"):
         pytest.importorskip(library)
     source = copy_of_the_repository(tmp_path / "source")
-    with (source / "docs" / "concepts" / "scenes.md").open("a", encoding="utf-8") as page:
+    with (source / "docs" / "concepts" / "scenes.md").open(
+        "a", encoding="utf-8"
+    ) as page:
         page.write(f"\n{error}\n")
-    done = build(source, tmp_path / "site", builder="dummy")  # resolves links and writes nothing
+    done = build(
+        source, tmp_path / "site", builder="dummy"
+    )  # resolves links and writes nothing
     assert done.returncode != 0
     assert "scenes.md" in done.stderr
 
@@ -122,17 +156,30 @@ def test_the_check_of_external_links_finds_a_broken_one(tmp_path: Path) -> None:
     (tmp_path / "pages" / "there.html").write_text("<p>here</p>", encoding="utf-8")
     source = copy_of_the_repository(tmp_path / "source")
     with serve(tmp_path / "pages") as address:
-        links = [f"[a]({address}/there.html)", f"[b]({address}/gone.html)", "[c](https://cnpgen.example.org/gone)"]
-        with (source / "docs" / "concepts" / "scenes.md").open("a", encoding="utf-8") as page:
+        links = [
+            f"[a]({address}/there.html)",
+            f"[b]({address}/gone.html)",
+            "[c](https://cnpgen.example.org/gone)",
+        ]
+        with (source / "docs" / "concepts" / "scenes.md").open(
+            "a", encoding="utf-8"
+        ) as page:
             page.write("\n" + " ".join(links) + "\n")
         done = build(source, tmp_path / "links", builder="linkcheck")
-    lines = [json.loads(line) for line in (tmp_path / "links" / "output.json").read_text(encoding="utf-8").splitlines()]
+    lines = [
+        json.loads(line)
+        for line in (tmp_path / "links" / "output.json")
+        .read_text(encoding="utf-8")
+        .splitlines()
+    ]
     status = {line["uri"]: line["status"] for line in lines}
     assert status[f"{address}/there.html"] == "working"
     assert status[f"{address}/gone.html"] == "broken"
     assert status["https://cnpgen.example.org/gone"] == "ignored"
     assert done.returncode != 0
-    outside = {uri for uri in status if "127.0.0.1" not in uri and "example.org" not in uri}
+    outside = {
+        uri for uri in status if "127.0.0.1" not in uri and "example.org" not in uri
+    }
     assert len(outside) > 5
     if has_network():
         assert {uri for uri in outside if status[uri] == "broken"} == set()
@@ -147,8 +194,14 @@ def has_network() -> bool:
     return True
 
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+CHROMIUM = (
+    shutil.which("chromium")
+    or shutil.which("chromium-browser")
+    or shutil.which("google-chrome")
+)
+needs_chromium = pytest.mark.skipif(
+    CHROMIUM is None, reason="no Chromium on this machine"
+)
 MEASURE = """<!DOCTYPE html><title>measure</title><body><pre id="found"></pre><script>
 const measure = async (address, width) => {
   const frame = document.createElement("iframe");
@@ -179,7 +232,9 @@ class _Quiet(SimpleHTTPRequestHandler):
 @contextmanager
 def serve(folder: Path) -> Iterator[str]:
     """Serve a folder; yield its address."""
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(folder))) as server:
+    with ThreadingHTTPServer(
+        ("127.0.0.1", 0), partial(_Quiet, directory=str(folder))
+    ) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_port}"
         server.shutdown()
@@ -192,18 +247,37 @@ def address(site: Path) -> Iterator[str]:
         yield url
 
 
-def chromium(profile: Path, url: str, *options: str, budget: int = 8_000) -> subprocess.CompletedProcess[str]:
+def chromium(
+    profile: Path, url: str, *options: str, budget: int = 8_000
+) -> subprocess.CompletedProcess[str]:
     """Open a page in a browser without a screen."""
-    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    flags += ["--no-first-run", "--disable-background-networking", "--disable-sync", f"--user-data-dir={profile}"]
+    flags = [
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+    ]
+    flags += [
+        "--no-first-run",
+        "--disable-background-networking",
+        "--disable-sync",
+        f"--user-data-dir={profile}",
+    ]
     flags += ["--enable-logging=stderr", "--v=0", f"--virtual-time-budget={budget}"]
     command = [str(CHROMIUM), *flags, *options, url]
-    return subprocess.run(command, capture_output=True, text=True, timeout=HANGING, check=True)
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=HANGING, check=True
+    )
 
 
 def errors(log: str) -> list[str]:
     """Return the messages of a page's console, without the driver's remarks on speed."""
-    return [line for line in log.splitlines() if "CONSOLE" in line and "GL Driver Message" not in line]
+    return [
+        line
+        for line in log.splitlines()
+        if "CONSOLE" in line and "GL Driver Message" not in line
+    ]
 
 
 @pytest.mark.extended
@@ -226,12 +300,24 @@ def test_the_pages_of_the_gallery_run_without_an_error_and_draw_their_scene(
     pages = sorted((site / "gallery").glob("*.html"))
     assert len(pages) >= 4
     for page in pages:
-        picture, url = tmp_path / f"{page.stem}.png", f"{address}/gallery/{page.name}#time=100"
-        done = chromium(tmp_path / "browser", url, f"--screenshot={picture}", "--window-size=1200,700")
+        picture, url = (
+            tmp_path / f"{page.stem}.png",
+            f"{address}/gallery/{page.name}#time=100",
+        )
+        done = chromium(
+            tmp_path / "browser",
+            url,
+            f"--screenshot={picture}",
+            "--window-size=1200,700",
+        )
         assert errors(done.stderr) == [], page.name
         scene = image.imread(picture)[60:560, 20:760, :3]
-        assert (scene.max(axis=2) < 0.85).mean() > 0.03, page.name  # bodies in front of the bright background
-        assert np.ptp(scene, axis=2).max() > 0.2, page.name  # colored frames, objects or obstacles
+        assert (scene.max(axis=2) < 0.85).mean() > 0.03, (
+            page.name
+        )  # bodies in front of the bright background
+        assert np.ptp(scene, axis=2).max() > 0.2, (
+            page.name
+        )  # colored frames, objects or obstacles
         text = chromium(tmp_path / "browser", url, "--dump-dom").stdout
         assert 'data-ready="yes"' in text
         if page.stem != "comparison":  # the plan of the network may be rejected
@@ -240,18 +326,29 @@ def test_the_pages_of_the_gallery_run_without_an_error_and_draw_their_scene(
 
 @pytest.mark.extended
 @needs_chromium
-def test_pages_are_legible_at_1280_and_400_pixels(site: Path, address: str, tmp_path: Path) -> None:
+def test_pages_are_legible_at_1280_and_400_pixels(
+    site: Path, address: str, tmp_path: Path
+) -> None:
     pages = sorted(
-        path.relative_to(site).as_posix() for path in (site / "docs").rglob("*.html") if "api/" not in str(path)
+        path.relative_to(site).as_posix()
+        for path in (site / "docs").rglob("*.html")
+        if "api/" not in str(path)
     )
     assert len(pages) > 35
     (site / "measure.html").write_text(
-        MEASURE.replace("ADDRESSES", json.dumps([f"/{page}" for page in pages])), encoding="utf-8"
+        MEASURE.replace("ADDRESSES", json.dumps([f"/{page}" for page in pages])),
+        encoding="utf-8",
     )
-    text = chromium(tmp_path / "browser", f"{address}/measure.html", "--dump-dom", budget=400_000).stdout
-    measured = json.loads(re.search(r'<pre id="found">(.*?)</pre>', text, re.S)[1].replace("&gt;", ">"))
+    text = chromium(
+        tmp_path / "browser", f"{address}/measure.html", "--dump-dom", budget=400_000
+    ).stdout
+    measured = json.loads(
+        re.search(r'<pre id="found">(.*?)</pre>', text, re.S)[1].replace("&gt;", ">")
+    )
     assert len(measured) == 2 * len(pages)
-    assert [found for found in measured if found["overflow"] > 0] == []  # no horizontal scrolling
+    assert [
+        found for found in measured if found["overflow"] > 0
+    ] == []  # no horizontal scrolling
     assert min(found["size"] for found in measured) >= 14
     assert min(found["text"] for found in measured) > 100
     assert [found["address"] for found in measured if found["pictures"]] == []

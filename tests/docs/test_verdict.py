@@ -9,14 +9,21 @@ from cnpgen.plans.evaluate import evaluate_plans
 from tests.examples.plan_files import plans_of
 from tests.examples.plans import load
 
-PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "verdict-format.md").read_text(encoding="utf-8")
+PAGE = (
+    Path(__file__).parents[2] / "docs" / "reference" / "verdict-format.md"
+).read_text(encoding="utf-8")
 
 
 def documented(after: str) -> set[str]:
     """Return the keys in the first column of the first table after a text."""
     table = re.search(r"\| key \|.*?\n\n", PAGE[PAGE.index(after) :] + "\n\n", re.S)
     assert table
-    return {key for row in table[0].splitlines()[2:] if row for key in re.findall(r"`([^`]+)`", row.split("|")[1])}
+    return {
+        key
+        for row in table[0].splitlines()[2:]
+        if row
+        for key in re.findall(r"`([^`]+)`", row.split("|")[1])
+    }
 
 
 def test_every_key_is_documented() -> None:
@@ -27,9 +34,22 @@ def test_every_key_is_documented() -> None:
     assert documented("\n## JSON") == {"file", "verdicts", *evaluation.summary()}
     assert documented("\nA verdict has these keys") == set(verdict)
     assert documented("\nA margin describes") == set(margin)
-    for name in ("mean", "median", "p95", "max", "violating_plans", "worst_plan", "finished", "broken"):
+    for name in (
+        "mean",
+        "median",
+        "p95",
+        "max",
+        "violating_plans",
+        "worst_plan",
+        "finished",
+        "broken",
+    ):
         assert f"`{name}`" in PAGE
-    assert set(evaluation.summary()["conditions"]["tilt"]) == {"violating_plans", "worst_plan", *margin}
+    assert set(evaluation.summary()["conditions"]["tilt"]) == {
+        "violating_plans",
+        "worst_plan",
+        *margin,
+    }
 
 
 def test_every_metric_and_reason_is_documented() -> None:

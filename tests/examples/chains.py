@@ -18,8 +18,12 @@ def chain(folder: Path, joints: int, *, jerk: bool) -> Problem:
     for k in range(1, joints + 1):
         x, y, z = (int(k % 3 == axis) for axis in range(3))
         parts += [LINK.format(k=k), JOINT.format(k=k, before=k - 1, x=x, y=y, z=z)]
-    (folder / "chain.urdf").write_text(f'<robot name="chain">{"".join(parts)}</robot>', encoding="utf-8")
-    names, base = ([text.format(k=k) for k in range(1, joints + 1)] for text in ('"j{k}"', "0.1"))
+    (folder / "chain.urdf").write_text(
+        f'<robot name="chain">{"".join(parts)}</robot>', encoding="utf-8"
+    )
+    names, base = (
+        [text.format(k=k) for k in range(1, joints + 1)] for text in ('"j{k}"', "0.1")
+    )
     head = f"""name = "chain"
 [robot]
 urdf = "chain.urdf"
@@ -33,7 +37,10 @@ acceleration_cap = "10 rad/s^2"
     uses = (*USES, "joint-jerk") if jerk else USES
     tolerances = ("1e-3 rad" if each == "joint-position" else "0.5 %" for each in uses)
     pairs = zip(uses, tolerances, strict=True)
-    bounded = "".join(f'[[constraint]]\nuse = "{use}"\ntolerance = "{tolerance}"\n' for use, tolerance in pairs)
+    bounded = "".join(
+        f'[[constraint]]\nuse = "{use}"\ntolerance = "{tolerance}"\n'
+        for use, tolerance in pairs
+    )
     path = folder / "problem.toml"
     path.write_text(head + bounded, encoding="utf-8")
     return load_problem(str(path))

@@ -15,7 +15,9 @@ class TipSpeed(Constraint):
     """A bound of the squared speed of the tip, not relative to a limit. Only Python can set ``highest``."""
 
     reason = "tip too fast"
-    tolerance: float = field("how much faster a motion may be", unit="m^2/s^2", default=1e-3, low=0.0)
+    tolerance: float = field(
+        "how much faster a motion may be", unit="m^2/s^2", default=1e-3, low=0.0
+    )
     highest: float = 1.0
 
     def symbolic(self, state: SymbolicState) -> tuple[Condition, ...]:

@@ -13,20 +13,31 @@ from tests.examples.shaped_robot import write_pipeline
 def folder() -> Path | None:
     """The folder in which ``package://example-robot-data`` begins."""
     try:
-        share = Path(str(metadata.distribution("example-robot-data").locate_file("cmeel.prefix/share")))
+        share = Path(
+            str(
+                metadata.distribution("example-robot-data").locate_file(
+                    "cmeel.prefix/share"
+                )
+            )
+        )
     except metadata.PackageNotFoundError:
         return None
     return share if (share / "example-robot-data" / "robots").is_dir() else None
 
 
-needs_robots = pytest.mark.skipif(folder() is None, reason="example-robot-data is not installed")
+needs_robots = pytest.mark.skipif(
+    folder() is None, reason="example-robot-data is not installed"
+)
 SHIPPED = ("panda-cup", "ur5-wipe")  # problems, pipelines and datasets of these robots
 
 
 def with_robots(names: Iterable[str]) -> list[Any]:
     """The names of recipes as parameters of a test, those of robots that are not installed to be skipped."""
     own = (*SHIPPED, "panda-scenes")
-    return [pytest.param(name, marks=needs_robots) if name in own else name for name in names]
+    return [
+        pytest.param(name, marks=needs_robots) if name in own else name
+        for name in names
+    ]
 
 
 PANDA = """
@@ -123,7 +134,11 @@ kind = "sphere"
 position = [0.5, -0.1, 0.65]
 radius = "8 cm"
 """
-CLUTTER = FURNITURE + "".join(CAGE.format(number=i, x=x, y=y) for i, (x, y) in enumerate(BARS, 1)) + PIPES
+CLUTTER = (
+    FURNITURE
+    + "".join(CAGE.format(number=i, x=x, y=y) for i, (x, y) in enumerate(BARS, 1))
+    + PIPES
+)
 START = '["[0.4, 0.7] m", "[-0.4, -0.1] m", "[0.2, 0.6] m"]'
 GOAL = '["[0.4, 0.7] m", "[0.1, 0.4] m", "[0.2, 0.6] m"]'
 GUESS = """[
@@ -134,6 +149,8 @@ GUESS = """[
 def write_panda(where: Path, robot: str = "", obstacles: str = SHELVES) -> Path:
     """Write the problem and its pipeline; return the problem file."""
     joints = ", ".join(f'"panda_joint{number}"' for number in range(1, 8))
-    (where / "problem.toml").write_text(PANDA.format(share=folder(), joints=joints, robot=robot, obstacles=obstacles))
+    (where / "problem.toml").write_text(
+        PANDA.format(share=folder(), joints=joints, robot=robot, obstacles=obstacles)
+    )
     write_pipeline(where, name="panda-shelves", start=START, goal=GOAL, guess=GUESS)
     return where / "problem.toml"

@@ -28,9 +28,15 @@ def edit(folder: Path, file: str, change: Callable[[h5py.File], None]) -> None:
         change(shard)
     record, spec = load_record(folder, task), load_dataset_spec(folder)
     columns, statistics = read_shard(folder / file), record.statistics
-    if len(columns) == len(spec.fields) and all(np.isfinite(values).all() for values in columns.values()):
-        with suppress(CnpgenError, ValueError, IndexError, TypeError):  # of other shapes
+    if len(columns) == len(spec.fields) and all(
+        np.isfinite(values).all() for values in columns.values()
+    ):
+        with suppress(
+            CnpgenError, ValueError, IndexError, TypeError
+        ):  # of other shapes
             statistics = column_statistics(columns, spec.fields)
     size, digest = (folder / file).stat().st_size, file_sha256(folder / file)
-    save_record(folder, task, replace(record, bytes=size, sha256=digest, statistics=statistics))
+    save_record(
+        folder, task, replace(record, bytes=size, sha256=digest, statistics=statistics)
+    )
     finalize(folder, spec)

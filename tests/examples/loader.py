@@ -30,7 +30,9 @@ def make(folder: Path, *, finished: bool = True, **changes: Any) -> Path:
 def columns(split: str = "train", **changes: Any) -> dict[str, NDArray[Any]]:
     """Return all rows of a split of :func:`make`, without reading a file."""
     spec = replace(SPEC, **changes)
-    parts = [make_columns(task, spec.dtype) for task in shards(spec) if task.split == split]
+    parts = [
+        make_columns(task, spec.dtype) for task in shards(spec) if task.split == split
+    ]
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
@@ -41,4 +43,6 @@ def ids(batches: Iterable[Batch]) -> list[list[int]]:
 
 def same(one: Batch, other: Batch) -> bool:
     """Return whether two batches are bitwise equal."""
-    return list(one) == list(other) and all(np.array_equal(one[name], other[name]) for name in one)
+    return list(one) == list(other) and all(
+        np.array_equal(one[name], other[name]) for name in one
+    )

@@ -32,24 +32,38 @@ class Batch:
     obstacle_poses: np.ndarray
 
     def __getitem__(self, rows: Any) -> "Batch":
-        return Batch(self.problem, self.path[rows], self.rate[rows], self.obstacle_poses[rows])
+        return Batch(
+            self.problem, self.path[rows], self.rate[rows], self.obstacle_poses[rows]
+        )
 
     def evaluated(self, of: PlanLoss, **options: Any) -> Any:
         weights = np.linspace(1.0, 2.0, len(of.terms) - 1)
-        return of(self.path, self.rate, **{"weights": weights, "obstacle_poses": self.obstacle_poses, **options})
+        return of(
+            self.path,
+            self.rate,
+            **{"weights": weights, "obstacle_poses": self.obstacle_poses, **options},
+        )
 
 
-def batch(label: str, count: int, by: float = 0.1, seed: int = 0, raised: float = 0.25) -> Batch:
+def batch(
+    label: str, count: int, by: float = 0.1, seed: int = 0, raised: float = 0.25
+) -> Batch:
     """Return a stored plan with its control points moved by up to ``by`` rad, with other rates and obstacles.
 
     Also the ends are moved: at rest, or with an object exactly upright, the loss has kinks.
     """
     plan = load(label)
     random = np.random.default_rng(seed)
-    path = plan.motion.path + by * random.uniform(-1, 1, (count, *plan.motion.path.shape[1:]))
-    rate = plan.motion.rate * random.uniform(0.9, 1.4, (count, plan.motion.rate.shape[1]))
+    path = plan.motion.path + by * random.uniform(
+        -1, 1, (count, *plan.motion.path.shape[1:])
+    )
+    rate = plan.motion.rate * random.uniform(
+        0.9, 1.4, (count, plan.motion.rate.shape[1])
+    )
     obstacle_poses = np.repeat(plan.scene.poses, count, axis=0)
-    obstacle_poses += random.uniform(-0.02, raised, obstacle_poses.shape)  # obstacles that may collide with the arm
+    obstacle_poses += random.uniform(
+        -0.02, raised, obstacle_poses.shape
+    )  # obstacles that may collide with the arm
     return Batch(PROBLEM_OF[label], path, rate, obstacle_poses)
 
 

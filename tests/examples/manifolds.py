@@ -34,7 +34,9 @@ MANIFOLDS = {
 
 def problem_on(name: str) -> Problem:
     """Return the problem of the arm with its joint limits on a manifold, without obstacles and object."""
-    return replace(PROBLEM, constraint=(*LIMITS, *MANIFOLDS[name]), obstacle=(), object=None)
+    return replace(
+        PROBLEM, constraint=(*LIMITS, *MANIFOLDS[name]), obstacle=(), object=None
+    )
 
 
 def ends_on(name: str) -> list[np.ndarray]:
@@ -44,20 +46,37 @@ def ends_on(name: str) -> list[np.ndarray]:
     return [first, on(world, constraints, TIPS[1], first)]
 
 
-def on(world: World, constraints: tuple[Constraint, ...], tip: np.ndarray, start: np.ndarray) -> np.ndarray:
+def on(
+    world: World,
+    constraints: tuple[Constraint, ...],
+    tip: np.ndarray,
+    start: np.ndarray,
+) -> np.ndarray:
     """Find a configuration on the manifolds close to a tip position and to another configuration."""
 
     def violation(q: np.ndarray) -> np.ndarray:
         world.set_state(q, 0 * q, 0 * q, np.zeros(0))
         violations = []
-        for condition in (c for constraint in constraints for c in constraint.measured(world)):
+        for condition in (
+            c for constraint in constraints for c in constraint.measured(world)
+        ):
             g = np.array(condition.g)
-            violations.append(np.maximum(condition.lower - g, 0) + np.maximum(g - condition.upper, 0))
+            violations.append(
+                np.maximum(condition.lower - g, 0) + np.maximum(g - condition.upper, 0)
+            )
         return np.concatenate(violations)
 
     def distance(q: np.ndarray) -> np.ndarray:
-        return np.concatenate([100 * violation(q), world.tip_position - tip, 0.01 * (q - start)])
+        return np.concatenate(
+            [100 * violation(q), world.tip_position - tip, 0.01 * (q - start)]
+        )
 
     bounds = 0.9 * ROBOT.position_lower, 0.9 * ROBOT.position_upper
-    near = least_squares(distance, np.clip(start, *(0.99 * bound for bound in bounds)), bounds=bounds).x
-    return np.asarray(least_squares(violation, near, bounds=bounds, xtol=1e-15, ftol=1e-15, gtol=1e-15).x)
+    near = least_squares(
+        distance, np.clip(start, *(0.99 * bound for bound in bounds)), bounds=bounds
+    ).x
+    return np.asarray(
+        least_squares(
+            violation, near, bounds=bounds, xtol=1e-15, ftol=1e-15, gtol=1e-15
+        ).x
+    )

@@ -28,22 +28,42 @@ class Meshes:
 
     def __init__(self, problem: Problem, robot: Robot, packages: Path) -> None:
         beside = f'filename="{problem.urdf_path.parent}/'
-        text = re.sub(r'filename="(?!package:|/)', beside, problem.urdf_path.read_text())
+        text = re.sub(
+            r'filename="(?!package:|/)', beside, problem.urdf_path.read_text()
+        )
         full = pin.buildModelFromXML(text)
-        geometry = pin.buildGeomFromUrdfString(full, text, pin.COLLISION, package_dirs=[str(packages)])
+        geometry = pin.buildGeomFromUrdfString(
+            full, text, pin.COLLISION, package_dirs=[str(packages)]
+        )
         name_links_uniquely(full)
-        locked = [full.getJointId(name) for name in full.names[1:] if name not in robot.joint_names]
-        self.model, (self.geometry,) = pin.buildReducedModel(full, [geometry], locked, pin.neutral(full))
-        objects = self.geometry.geometryObjects  # places of memory that are given up when objects are added
+        locked = [
+            full.getJointId(name)
+            for name in full.names[1:]
+            if name not in robot.joint_names
+        ]
+        self.model, (self.geometry,) = pin.buildReducedModel(
+            full, [geometry], locked, pin.neutral(full)
+        )
+        objects = (
+            self.geometry.geometryObjects
+        )  # places of memory that are given up when objects are added
         links = [
-            (each.parentJoint, self.model.frames[each.parentFrame].name.removesuffix(LINK_SUFFIX)) for each in objects
+            (
+                each.parentJoint,
+                self.model.frames[each.parentFrame].name.removesuffix(LINK_SUFFIX),
+            )
+            for each in objects
         ]
         moving = [i for i, (joint, _) in enumerate(links) if joint > 0]
         moving += [] if problem.object is None else [self._hold(problem)]
         for obstacle in problem.obstacle:
             self._add(obstacle, moving)
         self.with_obstacles = len(self.geometry.collisionPairs)
-        left_out = {frozenset((pair.first, pair.second)) for pair in robot.shape.pairs if pair.left_out}
+        left_out = {
+            frozenset((pair.first, pair.second))
+            for pair in robot.shape.pairs
+            if pair.left_out
+        }
         for i, (one, name) in enumerate(links):
             for j, (other, its_name) in enumerate(links[:i]):
                 if one != other and frozenset((name, its_name)) not in left_out:
@@ -55,27 +75,41 @@ class Meshes:
     def _hold(self, problem: Problem) -> int:
         """Put the held cuboid about the tip, as the problem's keys say; it may touch what holds it."""
         frame = self.model.frames[self.model.getFrameId(problem.robot.tip)]
-        turn = Rotation.from_euler("xyz", problem.robot.tip_rotation).as_matrix()  # about fixed axes
+        turn = Rotation.from_euler(
+            "xyz", problem.robot.tip_rotation
+        ).as_matrix()  # about fixed axes
         pose = frame.placement * pin.SE3(turn, np.array(problem.robot.tip_offset))
-        held = pin.GeometryObject("what is held", frame.parentJoint, pose, coal.Box(*problem.object.size))
+        held = pin.GeometryObject(
+            "what is held", frame.parentJoint, pose, coal.Box(*problem.object.size)
+        )
         return int(self.geometry.addGeometryObject(held))
 
     def _add(self, obstacle: Obstacle, moving: list[int]) -> None:
         solid, place = coal_obstacle(obstacle)
         pose = pin.SE3(place.getRotation(), place.getTranslation())
-        index = self.geometry.addGeometryObject(pin.GeometryObject(obstacle.name, 0, pose, solid))
+        index = self.geometry.addGeometryObject(
+            pin.GeometryObject(obstacle.name, 0, pose, solid)
+        )
         for each in moving:
             self.geometry.addCollisionPair(pin.CollisionPair(each, index))
 
     def distances(self, q: np.ndarray) -> tuple[float, float]:
         """The smallest distance from obstacles, and between links, at a state [m]."""
-        pin.computeDistances(self.model, self.data, self.geometry, self.results, self._state(q))
+        pin.computeDistances(
+            self.model, self.data, self.geometry, self.results, self._state(q)
+        )
         found = [result.min_distance for result in self.results.distanceResults]
-        return min(found[: self.with_obstacles], default=np.inf), min(found[self.with_obstacles :], default=np.inf)
+        return min(found[: self.with_obstacles], default=np.inf), min(
+            found[self.with_obstacles :], default=np.inf
+        )
 
     def touches(self, q: np.ndarray) -> bool:
         """Return whether any pair collides at a state."""
-        return bool(pin.computeCollisions(self.model, self.data, self.geometry, self.results, self._state(q), True))
+        return bool(
+            pin.computeCollisions(
+                self.model, self.data, self.geometry, self.results, self._state(q), True
+            )
+        )
 
     def _state(self, q: np.ndarray) -> np.ndarray:
         """Return joint positions as Pinocchio's, which are cosine and sine for continuous joints."""
@@ -84,11 +118,23 @@ class Meshes:
 
 def states(plans: Plans, index: int, step: float = 1e-3) -> np.ndarray:
     """Joint positions of a plan every ``step`` seconds [rad], shape (K, n), by SciPy's splines."""
-    path, rate, degree = plans.path_control_points[index], plans.rate_control_points[index], plans.degree
+    path, rate, degree = (
+        plans.path_control_points[index],
+        plans.rate_control_points[index],
+        plans.degree,
+    )
     p, r = (
-        BSpline(np.concatenate([[0] * degree, np.linspace(0, 1, len(c) - degree + 1), [1] * degree]), c, degree)
+        BSpline(
+            np.concatenate(
+                [[0] * degree, np.linspace(0, 1, len(c) - degree + 1), [1] * degree]
+            ),
+            c,
+            degree,
+        )
         for c in (path, rate)
     )
     s = np.linspace(0, 1, 20001)
-    t = np.concatenate([[0], np.cumsum((1 / r(s[:-1]) + 1 / r(s[1:])) / 2 * np.diff(s))])
+    t = np.concatenate(
+        [[0], np.cumsum((1 / r(s[:-1]) + 1 / r(s[1:])) / 2 * np.diff(s))]
+    )
     return np.asarray(p(np.interp(np.arange(0, t[-1], step), t, s)))

@@ -36,7 +36,11 @@ def loaded_problem_of(name: str) -> LoadedProblem:
 
 def config_of(line_projection_steps: int, projection_steps: int) -> ModelConfig:
     """Return a configuration with these numbers of projection steps."""
-    return ModelConfig(path_scale=0.5, line_projection_steps=line_projection_steps, projection_steps=projection_steps)
+    return ModelConfig(
+        path_scale=0.5,
+        line_projection_steps=line_projection_steps,
+        projection_steps=projection_steps,
+    )
 
 
 def interpreted(loaded: LoadedProblem) -> LoadedProblem:
@@ -54,7 +58,9 @@ def quickest(name: str, fixed_at_goal: int = 2) -> LoadedProblem:
 def projection_of(name: str, fixed_at_goal: int = 2) -> Projection:
     """Return the projection of a shipped problem."""
     loaded = quickest(name, fixed_at_goal)
-    return make_projection(loaded.problem, loaded.kernels, steps=1, fixed_at_goal=fixed_at_goal)
+    return make_projection(
+        loaded.problem, loaded.kernels, steps=1, fixed_at_goal=fixed_at_goal
+    )
 
 
 def boundary_of_columns(columns: dict[str, np.ndarray], rows: int) -> Boundary:
@@ -64,10 +70,15 @@ def boundary_of_columns(columns: dict[str, np.ndarray], rows: int) -> Boundary:
 
 def accelerated(boundary: Boundary, scale: float = 1.0, seed: int = 9) -> Boundary:
     """Return the same boundary conditions with accelerations at the goal [rad/s^2]."""
-    return replace(boundary, goal_ddq=scale * np.random.default_rng(seed).normal(size=boundary.goal_q.shape))
+    return replace(
+        boundary,
+        goal_ddq=scale * np.random.default_rng(seed).normal(size=boundary.goal_q.shape),
+    )
 
 
-def architecture_of(loaded: LoadedProblem, rows: Rows, settings: TrainingSettings) -> Architecture:
+def architecture_of(
+    loaded: LoadedProblem, rows: Rows, settings: TrainingSettings
+) -> Architecture:
     return Architecture(
         inputs=rows.features.shape[1],
         hidden=settings.hidden,
@@ -77,31 +88,49 @@ def architecture_of(loaded: LoadedProblem, rows: Rows, settings: TrainingSetting
     )
 
 
-def untrained_model(name: str, boundary: Boundary, *, seed: int = 0, **changes: Any) -> Model:
+def untrained_model(
+    name: str, boundary: Boundary, *, seed: int = 0, **changes: Any
+) -> Model:
     """Return a model with random parameters: its plans meet their boundary conditions, but violate limits."""
     loaded, fixed = loaded_problem_of(name), boundary.fixed_at_goal
-    inference = make_inference_pipeline(loaded, config_of(0, 0), scale_time=False, fixed_at_goal=fixed)
+    inference = make_inference_pipeline(
+        loaded, config_of(0, 0), scale_time=False, fixed_at_goal=fixed
+    )
     rows, features = prepare_rows(boundary, inference.prepare)
     architecture = architecture_of(loaded, rows, SMALL)
     options = {
         "problem": loaded.record,
         "architecture": architecture,
-        "parameters": initial_parameters(architecture, seed=seed, head_scale=0.1, rate_bias=-0.5),
+        "parameters": initial_parameters(
+            architecture, seed=seed, head_scale=0.1, rate_bias=-0.5
+        ),
         "features": features,
-        "config": ModelConfig(path_scale=0.3, line_projection_steps=1, projection_steps=1),
+        "config": ModelConfig(
+            path_scale=0.3, line_projection_steps=1, projection_steps=1
+        ),
         "zero_conditions": zero_conditions(boundary),
     }
     return Model(**{**options, **changes})
 
 
-def learner_of(name: str, boundary: Boundary, *, dtype: str, settings: TrainingSettings) -> tuple[Learner, Rows]:
+def learner_of(
+    name: str, boundary: Boundary, *, dtype: str, settings: TrainingSettings
+) -> tuple[Learner, Rows]:
     """Return a learner and rows, in float32 or float64."""
     loaded, fixed = quickest(name, boundary.fixed_at_goal), boundary.fixed_at_goal
-    inference = make_inference_pipeline(loaded, settings.config, scale_time=False, fixed_at_goal=fixed)
+    inference = make_inference_pipeline(
+        loaded, settings.config, scale_time=False, fixed_at_goal=fixed
+    )
     rows, _ = prepare_rows(boundary, inference.prepare, dtype=dtype)
     loss = PlanLoss(loaded.problem, nodes=settings.nodes, dtype=dtype)
     architecture = architecture_of(loaded, rows, settings)
-    return Learner(architecture, loaded.problem.trajectory, loss, settings, projection_of(name, fixed)), rows
+    return Learner(
+        architecture,
+        loaded.problem.trajectory,
+        loss,
+        settings,
+        projection_of(name, fixed),
+    ), rows
 
 
 def model_path(folder: Path) -> Path:

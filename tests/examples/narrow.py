@@ -25,8 +25,12 @@ position = {}
 size = {}
 """
 # The hulls have a clearance of 1 mm on either side in the slot.
-SLOT = BOXES.format([0.75, 0.0, 0.3478], [0.5, 1.4, 0.1], [0.75, 0.0, 0.571], [0.5, 1.4, 0.1])
-WALL = BOXES.format([0.55, 0.0, 0.4], [0.9, 0.06, 0.8], [-2.0, 0.0, 0.4], [0.1, 0.1, 0.1])
+SLOT = BOXES.format(
+    [0.75, 0.0, 0.3478], [0.5, 1.4, 0.1], [0.75, 0.0, 0.571], [0.5, 1.4, 0.1]
+)
+WALL = BOXES.format(
+    [0.55, 0.0, 0.4], [0.9, 0.06, 0.8], [-2.0, 0.0, 0.4], [0.1, 0.1, 0.1]
+)
 LIMITS = """
 [[constraint]]
 use = "joint-velocity"
@@ -54,4 +58,9 @@ def between(problem: Problem, ends: np.ndarray) -> RefinementTask:
     """Return the task of moving from one configuration to another, from rest to rest."""
     (start, goal), rest = ends[:, None], np.zeros((1, ends.shape[1]))
     boundary = Boundary(start, rest, rest, goal, rest)
-    return RefinementTask(boundary, scene_of(problem, np.zeros((1, 3)), np.zeros((1, 3))), np.zeros(3), np.zeros(3))
+    return RefinementTask(
+        boundary,
+        scene_of(problem, np.zeros((1, 3)), np.zeros((1, 3))),
+        np.zeros(3),
+        np.zeros(3),
+    )

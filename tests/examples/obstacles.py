@@ -16,16 +16,26 @@ KINDS = ("upright", "box", "turned box", "sphere", "cylinder", "capsule", "mesh"
 ROUNDER = 1.3e-3  # of the radius: by how much a cylinder is thinner than the prism that stands for it
 
 
-def draw_obstacle(kind: str, random: np.random.Generator, *, spread: float = 0.1) -> Obstacle:
+def draw_obstacle(
+    kind: str, random: np.random.Generator, *, spread: float = 0.1
+) -> Obstacle:
     """An obstacle of some 10 cm somewhere near the origin."""
     place, turn = tuple(random.normal(0, spread, 3)), tuple(random.uniform(-3, 3, 3))
     size = tuple(random.uniform(0.05, 0.3, 3))
     if kind == "upright":
         (x, y, z), (a, b, c) = place, size
-        return Obstacle(name=kind, x=Range(x, x + a), y=Range(y, y + b), top=z, height=c)
+        return Obstacle(
+            name=kind, x=Range(x, x + a), y=Range(y, y + b), top=z, height=c
+        )
     if kind == "mesh":
         points = random.normal(0, 0.1, (int(random.integers(5, 40)), 3))
-        return Obstacle(name=kind, kind="mesh", mesh=address_of(hull_corners(points)), position=place, rotation=turn)
+        return Obstacle(
+            name=kind,
+            kind="mesh",
+            mesh=address_of(hull_corners(points)),
+            position=place,
+            rotation=turn,
+        )
     about: dict[str, Any] = {
         "box": {"size": size},
         "turned box": {"size": size, "rotation": turn},
@@ -33,15 +43,21 @@ def draw_obstacle(kind: str, random: np.random.Generator, *, spread: float = 0.1
         "cylinder": {"radius": size[0], "length": size[1], "rotation": turn},
         "capsule": {"radius": size[0], "length": size[1], "rotation": turn},
     }[kind]
-    return Obstacle(name=kind, kind=kind.rsplit(maxsplit=1)[-1], position=place, **about)
+    return Obstacle(
+        name=kind, kind=kind.rsplit(maxsplit=1)[-1], position=place, **about
+    )
 
 
 def coal_obstacle(obstacle: Obstacle) -> tuple[Any, Any]:
     """Shape and place of an obstacle as its keys say, with SciPy's rotations."""
     if obstacle.upright:
         x, y, top, height = obstacle.x, obstacle.y, obstacle.top, obstacle.height
-        center = np.array([(x.low + x.high) / 2, (y.low + y.high) / 2, top - height / 2])
-        return coal.Box(x.high - x.low, y.high - y.low, height), coal.Transform3s(np.eye(3), center)
+        center = np.array(
+            [(x.low + x.high) / 2, (y.low + y.high) / 2, top - height / 2]
+        )
+        return coal.Box(x.high - x.low, y.high - y.low, height), coal.Transform3s(
+            np.eye(3), center
+        )
     turn = Rotation.from_euler("xyz", obstacle.rotation).as_matrix()  # about fixed axes
     return _shape(obstacle), coal.Transform3s(turn, np.array(obstacle.position))
 
@@ -74,4 +90,6 @@ def segment(first: np.ndarray, second: np.ndarray) -> tuple[Any, Any]:
     """A segment as Coal's capsule without thickness, and its place."""
     along = second - first
     turn = Rotation.align_vectors([along], [[0, 0, 1]])[0].as_matrix()
-    return coal.Capsule(0.0, float(np.linalg.norm(along))), coal.Transform3s(turn, (first + second) / 2)
+    return coal.Capsule(0.0, float(np.linalg.norm(along))), coal.Transform3s(
+        turn, (first + second) / 2
+    )

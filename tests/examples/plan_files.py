@@ -36,9 +36,16 @@ def remove_checksum(path: Path) -> Path:
 def _still(plan: Plan) -> Plan:
     """The goal is the start: a plan that stays there."""
     here, rest = plan.boundary.goal_q, 0 * plan.boundary.goal_q
-    boundary = replace(plan.boundary, start_q=here, start_dq=rest, start_ddq=rest, goal_dq=rest)
+    boundary = replace(
+        plan.boundary, start_q=here, start_dq=rest, start_ddq=rest, goal_dq=rest
+    )
     path = np.repeat(here[:, None], plan.motion.path.shape[1], axis=1)
-    return replace(plan, boundary=boundary, motion=Motion(path, plan.motion.rate), start_xyz=plan.goal_xyz)
+    return replace(
+        plan,
+        boundary=boundary,
+        motion=Motion(path, plan.motion.rate),
+        start_xyz=plan.goal_xyz,
+    )
 
 
 def _with(plan: Plan, what: str, index: tuple[int, ...], value: float) -> Plan:
@@ -54,10 +61,22 @@ def garbage(label: str = "hit") -> dict[str, tuple[Plan, str]]:
         "right": (plan, "ok"),
         "nan": (_with(plan, "path", (5, 2), np.nan), "not finite"),
         "negative rate": (plan.changed(rate=-plan.motion.rate), "rate not positive"),
-        "a rate that is negative in between": (_with(plan, "rate", (9,), -50.0), "rate not positive"),
-        "zero rate, which takes forever": (plan.changed(rate=0 * plan.motion.rate), "rate not positive"),
-        "infinite rate, which takes no time": (plan.changed(rate=np.inf * plan.motion.rate), "not finite"),
-        "almost no time": (plan.changed(rate=plan.motion.rate * 1e12), "boundary conditions"),
+        "a rate that is negative in between": (
+            _with(plan, "rate", (9,), -50.0),
+            "rate not positive",
+        ),
+        "zero rate, which takes forever": (
+            plan.changed(rate=0 * plan.motion.rate),
+            "rate not positive",
+        ),
+        "infinite rate, which takes no time": (
+            plan.changed(rate=np.inf * plan.motion.rate),
+            "not finite",
+        ),
+        "almost no time": (
+            plan.changed(rate=plan.motion.rate * 1e12),
+            "boundary conditions",
+        ),
         "a year": (plan.changed(rate=plan.motion.rate * 1e-8), "too long"),
         "metres away": (perturbed(plan, 100.0), "joint torque limit"),
         "the goal is the start": (_still(plan), "ok"),

@@ -24,7 +24,10 @@ from cnpgen.trajectory.spline_motion import Motion
 PROBLEMS = {name: load_problem(name) for name in ("airhockey", "heavy-object")}
 ROBOTS = {name: load_robot(problem) for name, problem in PROBLEMS.items()}
 CONTENT = json.loads((Path(__file__).parents[1] / "data" / "plans.json").read_text())
-KNOTS = {count: np.r_[np.zeros(8), np.arange(1, count - 7) / (count - 7), np.ones(8)] for count in (15, 20)}
+KNOTS = {
+    count: np.r_[np.zeros(8), np.arange(1, count - 7) / (count - 7), np.ones(8)]
+    for count in (15, 20)
+}
 
 
 @dataclass(frozen=True)
@@ -40,22 +43,35 @@ class Plan:
 
     @property
     def scene(self) -> Scene:
-        velocity = goal_velocities(self.problem, self.robot, self.boundary.goal_q, self.boundary.goal_dq)
+        velocity = goal_velocities(
+            self.problem, self.robot, self.boundary.goal_q, self.boundary.goal_dq
+        )
         return scene_of(self.problem, self.start_xyz, self.goal_xyz, velocity)
 
     def judged(self, *, early_exit: bool = False, **options: Any) -> Verdict:
         arguments = self.motion, self.boundary, self.scene, self.goal_xyz
-        (verdict,) = Judge(self.problem, self.robot, **options)(*arguments, early_exit=early_exit)
+        (verdict,) = Judge(self.problem, self.robot, **options)(
+            *arguments, early_exit=early_exit
+        )
         return verdict
 
-    def changed(self, *, path: np.ndarray | None = None, rate: np.ndarray | None = None) -> "Plan":
+    def changed(
+        self, *, path: np.ndarray | None = None, rate: np.ndarray | None = None
+    ) -> "Plan":
         old = self.motion
-        return replace(self, motion=Motion(old.path if path is None else path, old.rate if rate is None else rate))
+        return replace(
+            self,
+            motion=Motion(
+                old.path if path is None else path, old.rate if rate is None else rate
+            ),
+        )
 
     def with_constraint(self, kind: str, **changes: Any) -> "Plan":
         """Return the same plan in a problem with one constraint changed."""
         constraints = tuple(
-            replace(constraint, **changes) if type(constraint).__name__ == kind else constraint
+            replace(constraint, **changes)
+            if type(constraint).__name__ == kind
+            else constraint
             for constraint in self.problem.constraint
         )
         return replace(self, problem=replace(self.problem, constraint=constraints))
@@ -63,11 +79,27 @@ class Plan:
 
 def load(label: str) -> Plan:
     content = CONTENT[label]
-    value = {name: np.array(values)[None] for name, values in content.items() if name != "problem"}
-    boundary = Boundary(*(value[name] for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")))
+    value = {
+        name: np.array(values)[None]
+        for name, values in content.items()
+        if name != "problem"
+    }
+    boundary = Boundary(
+        *(
+            value[name]
+            for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
+        )
+    )
     name = content["problem"]
     motion = Motion(value["path"], value["rate"])
-    return Plan(PROBLEMS[name], ROBOTS[name], motion, boundary, value["start_xyz"], value["goal_xyz"])
+    return Plan(
+        PROBLEMS[name],
+        ROBOTS[name],
+        motion,
+        boundary,
+        value["start_xyz"],
+        value["goal_xyz"],
+    )
 
 
 def joined(*plans: Plan) -> tuple[Any, ...]:
@@ -77,16 +109,30 @@ def joined(*plans: Plan) -> tuple[Any, ...]:
         return np.concatenate(values)
 
     names = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
-    boundary = Boundary(*(stack([getattr(plan.boundary, name) for plan in plans]) for name in names))
-    motion = Motion(stack([plan.motion.path for plan in plans]), stack([plan.motion.rate for plan in plans]))
+    boundary = Boundary(
+        *(stack([getattr(plan.boundary, name) for plan in plans]) for name in names)
+    )
+    motion = Motion(
+        stack([plan.motion.path for plan in plans]),
+        stack([plan.motion.rate for plan in plans]),
+    )
     scene = Scene(plans[0].scene.obstacles, stack([plan.scene.poses for plan in plans]))
-    return plans[0].problem, plans[0].robot, motion, boundary, scene, stack([plan.goal_xyz for plan in plans])
+    return (
+        plans[0].problem,
+        plans[0].robot,
+        motion,
+        boundary,
+        scene,
+        stack([plan.goal_xyz for plan in plans]),
+    )
 
 
 def perturbed(plan: Plan, by: float, *, seed: int = 0) -> Plan:
     """Return the plan with its interior control points moved by up to ``by`` rad."""
     path = plan.motion.path.copy()
-    path[:, 3:13] += by * np.random.default_rng(seed).uniform(-1, 1, path[:, 3:13].shape)
+    path[:, 3:13] += by * np.random.default_rng(seed).uniform(
+        -1, 1, path[:, 3:13].shape
+    )
     return plan.changed(path=path)
 
 
@@ -99,8 +145,13 @@ def raised(plan: Plan, by: float) -> Plan:
     for _ in range(20):
         pin.computeJointJacobians(model, data, q)
         error = goal - pin.updateFramePlacement(model, data, frame).translation
-        q = q + np.linalg.pinv(pin.getFrameJacobian(model, data, frame, axes)[:3]) @ error
-    return replace(plan, boundary=replace(plan.boundary, start_q=q[None]), start_xyz=goal[None])
+        q = (
+            q
+            + np.linalg.pinv(pin.getFrameJacobian(model, data, frame, axes)[:3]) @ error
+        )
+    return replace(
+        plan, boundary=replace(plan.boundary, start_q=q[None]), start_xyz=goal[None]
+    )
 
 
 @dataclass(frozen=True)
@@ -132,7 +183,9 @@ def reference_trajectory(plan: Plan, count: int = 4001) -> ReferenceTrajectory:
     jerk += p(s, 1) * (r(s, 2)[:, None] * r0 + r(s, 1)[:, None] ** 2) * r0
     nodes, weights = np.polynomial.legendre.leggauss(5)
     centers, half = (s[1:] + s[:-1]) / 2, np.diff(s)[:, None] / 2
-    t = np.concatenate([[0], np.cumsum((half / r(centers[:, None] + half * nodes)) @ weights)])
+    t = np.concatenate(
+        [[0], np.cumsum((half / r(centers[:, None] + half * nodes)) @ weights)]
+    )
     model, data = plan.robot.model, plan.robot.model.createData()
     tip = model.getFrameId(plan.robot.tip)
     poses, tau = [], []
@@ -142,5 +195,13 @@ def reference_trajectory(plan: Plan, count: int = 4001) -> ReferenceTrajectory:
         poses.append(data.oMf[tip].copy())
     rotation = np.array([pose.rotation for pose in poses])
     return ReferenceTrajectory(
-        s, t, q, dq, ddq, jerk, np.array(tau), np.array([pose.translation for pose in poses]), rotation
+        s,
+        t,
+        q,
+        dq,
+        ddq,
+        jerk,
+        np.array(tau),
+        np.array([pose.translation for pose in poses]),
+        rotation,
     )

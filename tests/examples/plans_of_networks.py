@@ -14,7 +14,10 @@ from tests.examples.models import accelerated
 
 def boundary(problem: str, count: int, seed: int = 0) -> Boundary:
     """Draw boundary conditions near the base configuration, with moving starts and goals."""
-    base, random = np.array(load_problem(problem).robot.home), np.random.default_rng(seed)
+    base, random = (
+        np.array(load_problem(problem).robot.home),
+        np.random.default_rng(seed),
+    )
     draw = lambda scale: scale * random.standard_normal((count, len(base)))  # noqa: E731
     return Boundary(base + draw(0.2), draw(0.3), draw(1.0), base + draw(0.2), draw(0.3))
 
@@ -25,7 +28,9 @@ def boundary_for_layer(layer: BoundaryLayer, count: int) -> Boundary:
     return conditions if layer.goal_acceleration == "free" else accelerated(conditions)
 
 
-def outputs(layer: BoundaryLayer, count: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
+def outputs(
+    layer: BoundaryLayer, count: int, seed: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
     """Draw network outputs."""
     random = np.random.default_rng(seed)
     return (

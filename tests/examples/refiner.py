@@ -16,7 +16,13 @@ from cnpgen.refine.grid_levels import GridLevels
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.grid import make_grid
-from cnpgen.refine.solver.residuals import CostTerm, cost_term_residuals, residual_counts, stage_jacobian, stage_values
+from cnpgen.refine.solver.residuals import (
+    CostTerm,
+    cost_term_residuals,
+    residual_counts,
+    stage_jacobian,
+    stage_values,
+)
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription
 from cnpgen.refine.strategy import PlanChecker, refine_task
 from cnpgen.refine.task import Attempt, RefinementTask
@@ -25,7 +31,9 @@ from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 from tests.examples.plans import PROBLEMS, ROBOTS, Plan
 
-needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+needs_compiler = pytest.mark.skipif(
+    find_compiler() is None, reason="there is no C compiler"
+)
 
 
 def cost_term_of(name: str, weight: float) -> CostTerm:
@@ -35,18 +43,25 @@ def cost_term_of(name: str, weight: float) -> CostTerm:
     return CostTerm(terms)
 
 
-def transcription_of(plan: Plan, points: int, terms: tuple[ObjectiveTerm, ...]) -> Transcription:
+def transcription_of(
+    plan: Plan, points: int, terms: tuple[ObjectiveTerm, ...]
+) -> Transcription:
     """Return the transcription of a plan's problem with an objective, interpreted: faster than compiling."""
     kernels, spec = library(plan.problem.name), plan.problem.trajectory
     stages = [kernels.load(builder) for builder in (stage_values, stage_jacobian)]
     parts: tuple[Any, ...] = ()
     if terms:
         cost_term = CostTerm(terms)
-        residuals = replace(kernels, backend="numpy").load(cost_term_residuals, terms=cost_term.tables)
+        residuals = replace(kernels, backend="numpy").load(
+            cost_term_residuals, terms=cost_term.tables
+        )
         parts = cost_term, residuals, residual_counts(plan.robot, cost_term)
     grid = make_grid(spec, points)
     return Transcription(
-        ResidualKernels(spec, *stages, *parts), grid, boundary=plan.boundary, obstacle_poses=obstacle_poses(plan)
+        ResidualKernels(spec, *stages, *parts),
+        grid,
+        boundary=plan.boundary,
+        obstacle_poses=obstacle_poses(plan),
     )
 
 
@@ -63,12 +78,21 @@ def refiner(name: str, **options: Any) -> Refiner:
 
 
 def refiner_of(
-    problem: Problem, *, spec: TrajectorySpec | None = None, levels: GridLevels | None = None, **options: Any
+    problem: Problem,
+    *,
+    spec: TrajectorySpec | None = None,
+    levels: GridLevels | None = None,
+    **options: Any,
 ) -> Refiner:
     """Return the refiner of a problem with the residuals of the shipped one, by default without a cost term."""
     robot, kernels = ROBOTS[problem.name], library(problem.name)
     return Refiner(
-        problem, robot, kernels=kernels, spec=spec, levels=levels, options=RefineOptions(**{"weight": 0.0, **options})
+        problem,
+        robot,
+        kernels=kernels,
+        spec=spec,
+        levels=levels,
+        options=RefineOptions(**{"weight": 0.0, **options}),
     )
 
 
@@ -76,16 +100,37 @@ def obstacle_poses(plan: Plan) -> np.ndarray:
     return np.asarray(plan.scene.poses[0])
 
 
-def task(plan: Plan, boundary: Boundary | None = None, **input_plan: np.ndarray) -> RefinementTask:
-    return RefinementTask(boundary or plan.boundary, plan.scene, plan.start_xyz[0], plan.goal_xyz[0], **input_plan)
+def task(
+    plan: Plan, boundary: Boundary | None = None, **input_plan: np.ndarray
+) -> RefinementTask:
+    return RefinementTask(
+        boundary or plan.boundary,
+        plan.scene,
+        plan.start_xyz[0],
+        plan.goal_xyz[0],
+        **input_plan,
+    )
 
 
-def verdict(plan: Plan, boundary: Boundary, path: np.ndarray, rate: np.ndarray) -> Verdict:
-    return judge(plan.problem, plan.robot, Motion(path[None], rate[None]), boundary, plan.scene, plan.goal_xyz)[0]
+def verdict(
+    plan: Plan, boundary: Boundary, path: np.ndarray, rate: np.ndarray
+) -> Verdict:
+    return judge(
+        plan.problem,
+        plan.robot,
+        Motion(path[None], rate[None]),
+        boundary,
+        plan.scene,
+        plan.goal_xyz,
+    )[0]
 
 
-def refine(plan: Plan, boundary: Boundary | None = None, **input_plan: np.ndarray) -> Attempt:
-    checker = PlanChecker(plan.problem, plan.robot, degree=plan.problem.trajectory.degree)
+def refine(
+    plan: Plan, boundary: Boundary | None = None, **input_plan: np.ndarray
+) -> Attempt:
+    checker = PlanChecker(
+        plan.problem, plan.robot, degree=plan.problem.trajectory.degree
+    )
     shipped = plan.problem is PROBLEMS[plan.problem.name]
     tool = refiner(plan.problem.name) if shipped else refiner_of(plan.problem)
     return refine_task(tool, checker, task(plan, boundary, **input_plan))

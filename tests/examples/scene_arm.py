@@ -42,7 +42,9 @@ def write_arm(folder: Path) -> Path:
     chain(folder, 7, jerk=False)
     urdf, file = folder / "chain.urdf", folder / "problem.toml"
     urdf.write_text(urdf.read_text().replace("</link>", SPHERE))
-    file.write_text(file.read_text().replace("[limits]", 'geometry = "urdf"\n[limits]') + CLEARANCE)
+    file.write_text(
+        file.read_text().replace("[limits]", 'geometry = "urdf"\n[limits]') + CLEARANCE
+    )
     return file
 
 
@@ -56,10 +58,18 @@ def write_scene_pipeline(folder: Path, text: str = PIPELINE) -> Path:
 
 def obstacles_of(table: SceneTable, scene: int) -> tuple[Obstacle, ...]:
     """The obstacles of one scene of a dataset."""
-    numbers, obstacles = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2}, list[Obstacle]()
+    numbers, obstacles = (
+        {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2},
+        list[Obstacle](),
+    )
     for index in range(int(table.obstacle_count[scene])):
         kind = OBSTACLE_KINDS[int(table.obstacle_kind[scene, index])]
         sizes = table.obstacle_size[scene, index, : numbers[kind]]
-        pose = table.obstacle_position[scene, index], table.obstacle_quaternion[scene, index]
-        obstacles.append(make_obstacle(f"{kind} {index + 1}", kind, sizes, *pose, place="a dataset"))
+        pose = (
+            table.obstacle_position[scene, index],
+            table.obstacle_quaternion[scene, index],
+        )
+        obstacles.append(
+            make_obstacle(f"{kind} {index + 1}", kind, sizes, *pose, place="a dataset")
+        )
     return tuple(obstacles)

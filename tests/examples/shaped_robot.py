@@ -13,8 +13,12 @@ _LYING = 'rpy="0 1.5707963267948966 0"'  # along x
 _WEDGE = '<mesh filename="package://crane/meshes/wedge.stl" scale="0.001 0.001 0.001"/>'
 LINKS = {  # link -> what its <collision> elements hold
     "base": ['<origin xyz="0 0 0.05"/><geometry><box size="0.3 0.3 0.1"/></geometry>'],
-    "turret": ['<origin xyz="0 0 0.1"/><geometry><cylinder radius="0.07" length="0.2"/></geometry>'],
-    "arm": [f'<origin xyz="0.2 0 0" {_LYING}/><geometry><capsule radius="0.05" length="0.3"/></geometry>'],
+    "turret": [
+        '<origin xyz="0 0 0.1"/><geometry><cylinder radius="0.07" length="0.2"/></geometry>'
+    ],
+    "arm": [
+        f'<origin xyz="0.2 0 0" {_LYING}/><geometry><capsule radius="0.05" length="0.3"/></geometry>'
+    ],
     "fore": [f'<origin xyz="0.02 0 0" rpy="0.3 0 0"/><geometry>{_WEDGE}</geometry>'],
     "hand": [
         '<origin xyz="0.05 0 0"/><geometry><sphere radius="0.04"/></geometry>',
@@ -30,8 +34,26 @@ JOINTS = [  # name, type, parent, child, place, axis
     ("grip", "prismatic", "hand", "claw", "0.12 0 0", "1 0 0"),
 ]
 PLANNED = ("swing", "lift", "elbow", "roll")
-WEDGE = np.array([[0, -40, -30], [0, 40, -30], [0, 0, 50], [250, -20, -15], [250, 20, -15], [250, 0, 25.0]])  # mm
-_SIDES = [(0, 2, 1), (3, 4, 5), (0, 1, 4), (0, 4, 3), (1, 2, 5), (1, 5, 4), (2, 0, 3), (2, 3, 5)]
+WEDGE = np.array(
+    [
+        [0, -40, -30],
+        [0, 40, -30],
+        [0, 0, 50],
+        [250, -20, -15],
+        [250, 20, -15],
+        [250, 0, 25.0],
+    ]
+)  # mm
+_SIDES = [
+    (0, 2, 1),
+    (3, 4, 5),
+    (0, 1, 4),
+    (0, 4, 3),
+    (1, 2, 5),
+    (1, 5, 4),
+    (2, 0, 3),
+    (2, 3, 5),
+]
 CLAW = np.array([[0, -0.02, -0.01], [0, 0.02, -0.01], [0, 0, 0.02], [0.06, 0, 0.0]])
 PROBLEM = """
 name = "crane"
@@ -129,9 +151,7 @@ end = "goal"
 
 def urdf(links: dict[str, list[str]] = LINKS) -> str:
     """The text of the URDF."""
-    inertial = (
-        '<inertial><mass value="1"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial>'
-    )
+    inertial = '<inertial><mass value="1"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial>'
     parts = ['<robot name="crane" version="1.2">']
     for link, shapes in links.items():
         parts.append(f'<link name="{link}">{inertial}')
@@ -139,14 +159,18 @@ def urdf(links: dict[str, list[str]] = LINKS) -> str:
         parts.append("</link>")
     for name, kind, parent, child, place, axis in JOINTS:
         limit = '<limit lower="-2.5" upper="2.5" velocity="2" effort="100"/>'
-        parts.append(f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>')
+        parts.append(
+            f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        )
         parts.append(f'<origin xyz="{place}"/><axis xyz="{axis}"/>{limit}</joint>')
     return "\n".join([*parts, "</robot>"])
 
 
 def stl(corners: np.ndarray, sides: list[tuple[int, int, int]]) -> bytes:
     """A mesh as binary STL."""
-    found = [struct.pack("<12fH", 0, 0, 0, *corners[list(side)].ravel(), 0) for side in sides]
+    found = [
+        struct.pack("<12fH", 0, 0, 0, *corners[list(side)].ravel(), 0) for side in sides
+    ]
     return bytes(80) + struct.pack("<I", len(sides)) + b"".join(found)
 
 
@@ -163,12 +187,19 @@ def write_crane(folder: Path, links: dict[str, list[str]] = LINKS) -> Path:
 
 
 def write_problem(
-    folder: Path, *, robot: str = "", obstacles: str = OBSTACLES, clearance: str = "", more: str = SELF
+    folder: Path,
+    *,
+    robot: str = "",
+    obstacles: str = OBSTACLES,
+    clearance: str = "",
+    more: str = SELF,
 ) -> Path:
     """Write the arm and a problem about it; return the problem file."""
     write_crane(folder)
     file = folder / "problem.toml"
-    file.write_text(PROBLEM.format(robot=robot, obstacles=obstacles, clearance=clearance, more=more))
+    file.write_text(
+        PROBLEM.format(robot=robot, obstacles=obstacles, clearance=clearance, more=more)
+    )
     return file
 
 
@@ -184,7 +215,16 @@ def write_pipeline(
 ) -> Path:
     """Write a pipeline of motions from rest to rest for the problem in a folder; return the pipeline file."""
     file = folder / "pipeline.toml"
-    file.write_text(_PIPELINE.format(name=name, start=start, goal=goal, guess=guess, collision=collision, stop=stop))
+    file.write_text(
+        _PIPELINE.format(
+            name=name,
+            start=start,
+            goal=goal,
+            guess=guess,
+            collision=collision,
+            stop=stop,
+        )
+    )
     return file
 
 
@@ -200,7 +240,11 @@ BOXES = np.array(
 
 def box(low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """The triangles of a box, shape (12, 3, 3), facing outwards."""
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low) + low
+    corners = (
+        np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+        * (high - low)
+        + low
+    )
     hull = ConvexHull(corners)
     inwards = np.linalg.det(corners[hull.simplices] - (low + high) / 2) < 0
     sides = np.where(inwards[:, None], hull.simplices[:, ::-1], hull.simplices)
@@ -219,5 +263,7 @@ def arm_of_channels(folder: Path, robot: str = "") -> Problem:
     urdf = folder / "crane" / "crane.urdf"
     wedge = 'package://crane/meshes/wedge.stl" scale="0.001 0.001 0.001"'
     urdf.write_text(urdf.read_text().replace(wedge, 'channel.stl"'))
-    file.write_text(file.read_text().replace('use = "robot-clearance"', 'use = "joint-velocity"'))
+    file.write_text(
+        file.read_text().replace('use = "robot-clearance"', 'use = "joint-velocity"')
+    )
     return load_problem(file)

@@ -9,21 +9,31 @@ from tests.conftest import TINY_SHARD, tiny_recipe
 SHARDS = 4  # of a tiny dataset: 250, 250 and 100 rows of training, 60 of validation
 
 
-def make_tiny(folder: Path, name: str = "airhockey-hit", **options: object) -> MadeDataset:
-    return make_dataset(tiny_recipe(name), folder, **{"shard_size": TINY_SHARD, "workers": 1, **options})
+def make_tiny(
+    folder: Path, name: str = "airhockey-hit", **options: object
+) -> MadeDataset:
+    return make_dataset(
+        tiny_recipe(name), folder, **{"shard_size": TINY_SHARD, "workers": 1, **options}
+    )
 
 
 def digests(folder: Path) -> dict[str, str]:
     """Return shard -> sha256."""
     return {
-        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        path.relative_to(folder).as_posix(): hashlib.sha256(
+            path.read_bytes()
+        ).hexdigest()
         for path in sorted(folder.glob("*/*.h5"))
     }
 
 
 def snapshot(folder: Path) -> dict[str, bytes]:
     """Return file -> content."""
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 def flip(path: Path, where: float = 0.5) -> None:

@@ -42,24 +42,46 @@ def bodies_in(text: str, planned: Sequence[str]) -> list[Body]:
     bodies = []
     for name in planned:
         joint = next(joint for joint in joints if joint.get("name") == name)
-        mass, first, second = _lump(_end(joint, "child"), IDENTITY, links, joints, planned)
-        axis = np.array([1.0, 0, 0] if (found := joint.find("axis")) is None else _floats(found.attrib["xyz"]))
+        mass, first, second = _lump(
+            _end(joint, "child"), IDENTITY, links, joints, planned
+        )
+        axis = np.array(
+            [1.0, 0, 0]
+            if (found := joint.find("axis")) is None
+            else _floats(found.attrib["xyz"])
+        )
         limit = joint.find("limit")
         limits = [0.0] * 4
         if limit is not None:
-            limits = [float(limit.get(key, 0)) for key in ("lower", "upper", "velocity", "effort")]
+            limits = [
+                float(limit.get(key, 0))
+                for key in ("lower", "upper", "velocity", "effort")
+            ]
         placement = _placement_in_planned(joint, joints, planned)
-        bodies.append(Body(mass, first, second, placement, axis / np.linalg.norm(axis), np.array(limits)))
+        bodies.append(
+            Body(
+                mass,
+                first,
+                second,
+                placement,
+                axis / np.linalg.norm(axis),
+                np.array(limits),
+            )
+        )
     return bodies
 
 
-def differences(robot: Robot, bodies: Sequence[Body], *, rtol: float = 1e-9) -> list[str]:
+def differences(
+    robot: Robot, bodies: Sequence[Body], *, rtol: float = 1e-9
+) -> list[str]:
     """List the parts in which the model of a robot differs from bodies."""
     model, found = robot.model, []
     for index, body in enumerate(bodies, start=1):
         inertia, placement = model.inertias[index], model.jointPlacements[index]
         lever = np.array(inertia.lever)
-        about_origin = inertia.inertia + inertia.mass * (lever @ lever * np.eye(3) - np.outer(lever, lever))
+        about_origin = inertia.inertia + inertia.mass * (
+            lever @ lever * np.eye(3) - np.outer(lever, lever)
+        )
         subspace = np.asarray(model.createData().joints[index].S, float).ravel()
         limits = [
             model.lowerPositionLimit[index - 1],
@@ -72,7 +94,10 @@ def differences(robot: Robot, bodies: Sequence[Body], *, rtol: float = 1e-9) -> 
             "mass times center": (inertia.mass * lever, body.mass_center),
             "inertia about the origin": (about_origin, body.inertia),
             "placement": (placement.homogeneous, body.placement),
-            "axis": (subspace[:3] if robot.prismatic[index - 1] else subspace[3:], body.axis),
+            "axis": (
+                subspace[:3] if robot.prismatic[index - 1] else subspace[3:],
+                body.axis,
+            ),
             "limits": (np.array(limits), body.limits),
         }
         for part, (actual, expected) in pairs.items():
@@ -96,35 +121,55 @@ def _pose(element: Element) -> np.ndarray:
     """Return the <origin> of an element, shape (4, 4)."""
     origin, pose = element.find("origin"), np.eye(4)
     if origin is not None:
-        pose[:3, :3] = Rotation.from_euler("xyz", _floats(origin.get("rpy", "0 0 0"))).as_matrix()
+        pose[:3, :3] = Rotation.from_euler(
+            "xyz", _floats(origin.get("rpy", "0 0 0"))
+        ).as_matrix()
         pose[:3, 3] = _floats(origin.get("xyz", "0 0 0"))
     return pose
 
 
-def _lump(link: str, pose: np.ndarray, links: dict, joints: list[Element], planned: Sequence[str]) -> tuple:
+def _lump(
+    link: str,
+    pose: np.ndarray,
+    links: dict,
+    joints: list[Element],
+    planned: Sequence[str],
+) -> tuple:
     """Add up mass and inertia of a link and of all links that are fixed to it."""
     mass, first, second = 0.0, np.zeros(3), np.zeros((3, 3))
     element = links[link].find("inertial")
     if element is not None:
         mass = float(element.find("mass").attrib["value"])
         entries = element.find("inertia")
-        tensor = {key: float(value) for key, value in entries.attrib.items()} if entries is not None else {}
+        tensor = (
+            {key: float(value) for key, value in entries.attrib.items()}
+            if entries is not None
+            else {}
+        )
         rows = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
         matrix = np.array([[tensor.get(key, 0.0) for key in row] for row in rows])
         center = pose @ _pose(element)
         com, rotation = center[:3, 3], center[:3, :3]
         first = mass * com
-        second = rotation @ matrix @ rotation.T + mass * (com @ com * np.eye(3) - np.outer(com, com))
+        second = rotation @ matrix @ rotation.T + mass * (
+            com @ com * np.eye(3) - np.outer(com, com)
+        )
     for joint in joints:
         if _end(joint, "parent") == link and joint.get("name") not in planned:
-            more = _lump(_end(joint, "child"), pose @ _pose(joint), links, joints, planned)
+            more = _lump(
+                _end(joint, "child"), pose @ _pose(joint), links, joints, planned
+            )
             mass, first, second = mass + more[0], first + more[1], second + more[2]
     return mass, first, second
 
 
-def _placement_in_planned(joint: Element, joints: list[Element], planned: Sequence[str]) -> np.ndarray:
+def _placement_in_planned(
+    joint: Element, joints: list[Element], planned: Sequence[str]
+) -> np.ndarray:
     pose, link = _pose(joint), _end(joint, "parent")
-    while (above := next((each for each in joints if _end(each, "child") == link), None)) is not None:
+    while (
+        above := next((each for each in joints if _end(each, "child") == link), None)
+    ) is not None:
         if above.get("name") in planned:
             break
         pose, link = _pose(above) @ pose, _end(above, "parent")

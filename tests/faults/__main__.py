@@ -15,12 +15,39 @@ from tests.faults.subjects import SUBJECTS
 def main() -> int:
     """Run the requested faults."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
-    parser.add_argument("--inputs", metavar="N", type=int, default=0, help="changed files to read")
-    parser.add_argument("--kills", metavar="N", type=int, default=0, help="processes to kill; their runs are resumed")
-    parser.add_argument("--calls", metavar="N", type=int, default=0, help="calls of public functions, wrong arguments")
-    parser.add_argument("--seed", metavar="S", type=int, default=0, help="seed of all faults")
-    parser.add_argument("--first", metavar="I", type=int, default=0, help="number of the first input or run")
-    parser.add_argument("--kind", choices=tuple(SUBJECTS), action="append", help="only files of this kind")
+    parser.add_argument(
+        "--inputs", metavar="N", type=int, default=0, help="changed files to read"
+    )
+    parser.add_argument(
+        "--kills",
+        metavar="N",
+        type=int,
+        default=0,
+        help="processes to kill; their runs are resumed",
+    )
+    parser.add_argument(
+        "--calls",
+        metavar="N",
+        type=int,
+        default=0,
+        help="calls of public functions, wrong arguments",
+    )
+    parser.add_argument(
+        "--seed", metavar="S", type=int, default=0, help="seed of all faults"
+    )
+    parser.add_argument(
+        "--first",
+        metavar="I",
+        type=int,
+        default=0,
+        help="number of the first input or run",
+    )
+    parser.add_argument(
+        "--kind",
+        choices=tuple(SUBJECTS),
+        action="append",
+        help="only files of this kind",
+    )
     arguments = parser.parse_args()
     runs = {inputs: arguments.inputs, kills: arguments.kills, calls: arguments.calls}
     return max((run(arguments) for run, count in runs.items() if count), default=0)
@@ -33,10 +60,14 @@ def inputs(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         first=arguments.first,
         kinds=tuple(arguments.kind or SUBJECTS),
-        progress=lambda done: print(f"{done:,} inputs", flush=True) if done % 1000 == 0 else None,
+        progress=lambda done: (
+            print(f"{done:,} inputs", flush=True) if done % 1000 == 0 else None
+        ),
     )
     for kind in SUBJECTS:
-        print(f"{kind:<10} {outcome.read[kind]:>8,} read {outcome.refused[kind]:>8,} refused")
+        print(
+            f"{kind:<10} {outcome.read[kind]:>8,} read {outcome.refused[kind]:>8,} refused"
+        )
     return _report(outcome.findings)
 
 
@@ -55,9 +86,13 @@ def calls(arguments: argparse.Namespace) -> int:
         arguments.calls,
         seed=arguments.seed,
         first=arguments.first,
-        progress=lambda done: print(f"{done:,} calls", flush=True) if done % 1000 == 0 else None,
+        progress=lambda done: (
+            print(f"{done:,} calls", flush=True) if done % 1000 == 0 else None
+        ),
     )
-    print(f"{len(outcome.functions)} functions: {outcome.returned:,} returned, {outcome.refused:,} refused")
+    print(
+        f"{len(outcome.functions)} functions: {outcome.returned:,} returned, {outcome.refused:,} refused"
+    )
     return _report(outcome.findings)
 
 

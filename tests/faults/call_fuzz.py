@@ -58,7 +58,11 @@ class WrongCall:
 
 
 def fuzz_calls(
-    calls: int, *, seed: int = 0, first: int = 0, progress: Callable[[int], None] | None = None
+    calls: int,
+    *,
+    seed: int = 0,
+    first: int = 0,
+    progress: Callable[[int], None] | None = None,
 ) -> CallOutcome:
     """Call public functions with invalid arguments: every argument in turn, then two at once.
 
@@ -69,7 +73,10 @@ def fuzz_calls(
         progress: Called after every call with the number of calls so far.
     """
     outcome = CallOutcome()
-    with tempfile.TemporaryDirectory(prefix="cnpgen-calls-") as temporary, warnings.catch_warnings():
+    with (
+        tempfile.TemporaryDirectory(prefix="cnpgen-calls-") as temporary,
+        warnings.catch_warnings(),
+    ):
         warnings.simplefilter("ignore")
         folder = Path(temporary)
         (folder / "here").mkdir()
@@ -82,7 +89,9 @@ def fuzz_calls(
     return outcome
 
 
-def _chosen(valid: list[ValidCall], calls: int, seed: int, first: int) -> Iterator[WrongCall]:
+def _chosen(
+    valid: list[ValidCall], calls: int, seed: int, first: int
+) -> Iterator[WrongCall]:
     """Yield calls with one wrong argument in a random order, then calls with two."""
     single = [
         WrongCall(call, {name: value})
@@ -104,16 +113,68 @@ def _chosen(valid: list[ValidCall], calls: int, seed: int, first: int) -> Iterat
 
 def wrong_values(valid: Any) -> list[tuple[str, Any]]:
     """Return wrong types and values for an argument, with names: general ones, and changes of the valid value."""
-    values: list[Any] = [None, "x", "", "a\0b", b"x", True, 0, 1, -1, 2**70, 1.5, -1.5, 1e300, 1j]
-    values += [float("nan"), float("inf"), [], [[]], {}, (), ["x"], [None], {"x": 1}, (1, 2), [0.1, 0.2, 0.3]]
+    values: list[Any] = [
+        None,
+        "x",
+        "",
+        "a\0b",
+        b"x",
+        True,
+        0,
+        1,
+        -1,
+        2**70,
+        1.5,
+        -1.5,
+        1e300,
+        1j,
+    ]
+    values += [
+        float("nan"),
+        float("inf"),
+        [],
+        [[]],
+        {},
+        (),
+        ["x"],
+        [None],
+        {"x": 1},
+        (1, 2),
+        [0.1, 0.2, 0.3],
+    ]
     named = [(repr(value), value) for value in values]
-    named += [("10**15", HUGE), ("np.int64(2)", np.int64(2)), ("np.bool_(True)", np.bool_(True))]
-    named += [("np.float32(0.5)", np.float32(0.5)), ("object()", object()), ("a path", Path("missing"))]
-    named += [(f"zeros{shape}", np.zeros(shape)) for shape in ((), (0,), (1,), (0, 6), (2, 6), (2, 3, 4))]
-    named += [("masked", np.ma.masked_invalid([0.1, np.nan])), ("datetime", np.array(["2026-01-01"], "M8[D]"))]
-    named += [("objects", np.array([object(), None])), ("texts", np.array(["a", "b"])), ("lambda", lambda *_: None)]
-    if isinstance(valid, list | tuple) and valid and all(isinstance(part, np.ndarray) for part in valid):
-        named += [(f"its {name}", (value, *valid[1:])) for name, value in _wrong_arrays(valid[0])]
+    named += [
+        ("10**15", HUGE),
+        ("np.int64(2)", np.int64(2)),
+        ("np.bool_(True)", np.bool_(True)),
+    ]
+    named += [
+        ("np.float32(0.5)", np.float32(0.5)),
+        ("object()", object()),
+        ("a path", Path("missing")),
+    ]
+    named += [
+        (f"zeros{shape}", np.zeros(shape))
+        for shape in ((), (0,), (1,), (0, 6), (2, 6), (2, 3, 4))
+    ]
+    named += [
+        ("masked", np.ma.masked_invalid([0.1, np.nan])),
+        ("datetime", np.array(["2026-01-01"], "M8[D]")),
+    ]
+    named += [
+        ("objects", np.array([object(), None])),
+        ("texts", np.array(["a", "b"])),
+        ("lambda", lambda *_: None),
+    ]
+    if (
+        isinstance(valid, list | tuple)
+        and valid
+        and all(isinstance(part, np.ndarray) for part in valid)
+    ):
+        named += [
+            (f"its {name}", (value, *valid[1:]))
+            for name, value in _wrong_arrays(valid[0])
+        ]
         named += [("it, reversed", valid[::-1]), ("a part of it", valid[:-1])]
     if isinstance(valid, np.ndarray):
         named += [(f"it, {name}", value) for name, value in _wrong_arrays(valid)]
@@ -157,7 +218,10 @@ def _try_call(wrong: WrongCall, outcome: CallOutcome) -> None:
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt):
             raise
-        _add(outcome, f"{wrong}: {type(error).__name__} {str(error)[:120]!r} in {_place(error)}")
+        _add(
+            outcome,
+            f"{wrong}: {type(error).__name__} {str(error)[:120]!r} in {_place(error)}",
+        )
 
 
 def _message_problem(error: CnpgenError, wrong: WrongCall) -> str:
@@ -172,8 +236,16 @@ def _message_problem(error: CnpgenError, wrong: WrongCall) -> str:
 
 def _place(error: BaseException) -> str:
     """Return file and line of the innermost frame of cnpgen."""
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if "/cnpgen/" in frame.filename]
-    return f"{frames[-1].filename.rpartition('/cnpgen/')[2]}:{frames[-1].lineno}" if frames else "no frame"
+    frames = [
+        frame
+        for frame in traceback.extract_tb(error.__traceback__)
+        if "/cnpgen/" in frame.filename
+    ]
+    return (
+        f"{frames[-1].filename.rpartition('/cnpgen/')[2]}:{frames[-1].lineno}"
+        if frames
+        else "no frame"
+    )
 
 
 def _limited_call(wrong: WrongCall) -> None:
@@ -182,7 +254,9 @@ def _limited_call(wrong: WrongCall) -> None:
     before = Path.cwd()
     try:
         with redirect_stdout(StringIO()):
-            result = wrong.call(**{name: value for name, (_, value) in wrong.changes.items()})
+            result = wrong.call(
+                **{name: value for name, (_, value) in wrong.changes.items()}
+            )
             if hasattr(result, "__next__"):
                 for _ in zip(result, range(10), strict=False):
                     pass

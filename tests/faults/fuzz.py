@@ -19,7 +19,10 @@ from cnpgen.errors import CnpgenError
 from tests.faults.good_files import make_good_files
 from tests.faults.subjects import SUBJECTS, Subject, read_quietly
 
-MAX_READ_TIME_S, MAX_EXTRA_BYTES = 10, 2 << 30  # CPU time and memory for reading one file
+MAX_READ_TIME_S, MAX_EXTRA_BYTES = (
+    10,
+    2 << 30,
+)  # CPU time and memory for reading one file
 MAX_HANG_S = 300  # after it, the process is ended: a library hangs and ignores signals
 
 
@@ -66,13 +69,22 @@ def fuzz(
         make_good_files(good)
         with limited_resources():
             for number in range(first, first + inputs):
-                _try(number, seed, kinds[number % len(kinds)], good, Path(temporary) / "given", outcome)
+                _try(
+                    number,
+                    seed,
+                    kinds[number % len(kinds)],
+                    good,
+                    Path(temporary) / "given",
+                    outcome,
+                )
                 if progress is not None:
                     progress(number + 1 - first)
     return outcome
 
 
-def _try(number: int, seed: int, kind: str, good: Path, folder: Path, outcome: Outcome) -> None:
+def _try(
+    number: int, seed: int, kind: str, good: Path, folder: Path, outcome: Outcome
+) -> None:
     """Make one input and read it; a finding is printed at once."""
     draw, subject = Random(f"{seed} {number} {kind}"), SUBJECTS[kind]
     shutil.rmtree(folder, ignore_errors=True)
@@ -83,7 +95,9 @@ def _try(number: int, seed: int, kind: str, good: Path, folder: Path, outcome: O
         outcome.read[kind] += 1
     except CnpgenError as error:
         if not str(error).strip() or len(str(error)) > 20_000:
-            outcome.findings.append(f"{kind} {number}: a message of {len(str(error))} characters")
+            outcome.findings.append(
+                f"{kind} {number}: a message of {len(str(error))} characters"
+            )
         outcome.refused[kind] += 1
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt):
@@ -93,7 +107,9 @@ def _try(number: int, seed: int, kind: str, good: Path, folder: Path, outcome: O
         place = frames[-1].filename
         if own_frames:
             place = f"{own_frames[-1].filename.rpartition('/cnpgen/')[2]}:{own_frames[-1].lineno}"
-        finding = f"{kind} {number}: {type(error).__name__} {str(error)[:120]!r} in {place}"
+        finding = (
+            f"{kind} {number}: {type(error).__name__} {str(error)[:120]!r} in {place}"
+        )
         print(finding, file=sys.stderr, flush=True)
         outcome.findings.append(finding)
 
@@ -116,8 +132,14 @@ def limited_resources() -> Iterator[None]:
         raise TooSlowError(f"{MAX_READ_TIME_S} s")
 
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    before, handler = resource.getrlimit(resource.RLIMIT_AS), signal.signal(signal.SIGPROF, too_slow)
-    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MAX_EXTRA_BYTES, before[1]))
+    before, handler = (
+        resource.getrlimit(resource.RLIMIT_AS),
+        signal.signal(signal.SIGPROF, too_slow),
+    )
+    resource.setrlimit(
+        resource.RLIMIT_AS,
+        (pages * resource.getpagesize() + MAX_EXTRA_BYTES, before[1]),
+    )
     try:
         yield
     finally:

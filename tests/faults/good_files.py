@@ -34,16 +34,27 @@ def tiny_recipe_of(name: str) -> DatasetRecipe:
 
 def make_good_files(folder: Path) -> None:
     """Make a valid file of every kind."""
-    make_dataset(tiny_recipe_of("airhockey-hit"), folder / "set", workers=1, shard_size=24)
+    make_dataset(
+        tiny_recipe_of("airhockey-hit"), folder / "set", workers=1, shard_size=24
+    )
     shutil.copytree(recipes_root() / "problems" / "airhockey", folder / "recipes")
     for kind in ("pipelines", "datasets"):
-        shutil.copy(recipes_root() / kind / "airhockey-hit.toml", folder / "recipes" / f"{kind}.toml")
+        shutil.copy(
+            recipes_root() / kind / "airhockey-hit.toml",
+            folder / "recipes" / f"{kind}.toml",
+        )
     for name, old, new in (
-        ("datasets.toml", 'pipeline = "airhockey-hit"', 'pipeline = "./pipelines.toml"'),
+        (
+            "datasets.toml",
+            'pipeline = "airhockey-hit"',
+            'pipeline = "./pipelines.toml"',
+        ),
         ("pipelines.toml", 'problem = "airhockey"', 'problem = "./problem.toml"'),
     ):
         path = folder / "recipes" / name
-        path.write_text(path.read_text(encoding="utf-8").replace(old, new), encoding="utf-8")
+        path.write_text(
+            path.read_text(encoding="utf-8").replace(old, new), encoding="utf-8"
+        )
     _make_task_files(folder)
     plan = stored_plan("hit")
     save_plans(folder / "plans.h5", plans_of(plan, plan))
@@ -51,12 +62,20 @@ def make_good_files(folder: Path) -> None:
     remove_checksum(folder / "without_checksum.h5")
     columns = read_shard(folder / "set" / "train" / "shard-00000.h5")
     model = untrained_model("airhockey", boundary_of_columns(columns, 20))
-    save_model(folder / "model.h5", replace(model, training={"dataset": {"name": "x"}, "stages": [{"use": "y"}]}))
+    save_model(
+        folder / "model.h5",
+        replace(model, training={"dataset": {"name": "x"}, "stages": [{"use": "y"}]}),
+    )
     state = start_state(np.zeros(10, np.float32), terms=3, steps=10)
     Checkpoints(folder / "checkpoint", IDENTITY).save(state)
     journal = open_journal(folder / "journal", json.dumps(IDENTITY))
     attempt = Attempt(
-        path=np.zeros((15, 6)), rate=np.ones(20), cost=1.0, outcome=Outcome.SOLVED, iterations=3, reason="ok"
+        path=np.zeros((15, 6)),
+        rate=np.ones(20),
+        cost=1.0,
+        outcome=Outcome.SOLVED,
+        iterations=3,
+        reason="ok",
     )
     journal.append([0], [attempt])
     journal.close()
@@ -67,7 +86,10 @@ def _make_task_files(folder: Path) -> None:
     """Make files of tasks and of a benchmark: a suite, boundary conditions, tables of tasks and results."""
     suite = list_recipes("suite")["hits-81"].read_text(encoding="utf-8")
     (folder / "recipes" / "suite.toml").write_text(
-        suite.replace('problem = "airhockey"', 'problem = "./problem.toml"').replace("= 9", "= 2"), encoding="utf-8"
+        suite.replace('problem = "airhockey"', 'problem = "./problem.toml"').replace(
+            "= 9", "= 2"
+        ),
+        encoding="utf-8",
     )
     plan = stored_plan("hit")
     plans = plans_of(plan, plan)
@@ -78,12 +100,25 @@ def _make_task_files(folder: Path) -> None:
         file["sample_id"] = np.arange(2)
         file["hit_angle"] = np.zeros(2)
     with h5py.File(folder / "tasks.h5", "w") as file:
-        file["goal_xyz"], file["hit_angle"] = np.array([[1.0, 0.1], [1.1, -0.1]]), np.zeros(2)
-    (folder / "tasks.csv").write_text("goal_xyz.x,goal_xyz.y,hit_angle\n1.0,0.1,0.0\n1.1,-0.1,0.1\n", encoding="utf-8")
+        file["goal_xyz"], file["hit_angle"] = (
+            np.array([[1.0, 0.1], [1.1, -0.1]]),
+            np.zeros(2),
+        )
+    (folder / "tasks.csv").write_text(
+        "goal_xyz.x,goal_xyz.y,hit_angle\n1.0,0.1,0.0\n1.1,-0.1,0.1\n", encoding="utf-8"
+    )
     results = open_results(folder / "results.jsonl", IDENTITY)
-    for index, answer in enumerate((plans[:1], Trajectory(t=np.arange(3.0), q=np.zeros((3, 6))), None)):
+    for index, answer in enumerate(
+        (plans[:1], Trajectory(t=np.arange(3.0), q=np.zeros((3, 6))), None)
+    ):
         results.append(
-            {"problem": index, "ending": "answered", "planning_s": 0.1, "planning_cpu_s": 0.1, "error": ""}
+            {
+                "problem": index,
+                "ending": "answered",
+                "planning_s": 0.1,
+                "planning_cpu_s": 0.1,
+                "error": "",
+            }
             | {"answer": None if answer is None else answer_to_dict(answer)}
             | {"verdict": {"valid": True, "paper": {"valid": True, "finished": True}}}
             | {"executed": {"nominal": {"scored": True}}}

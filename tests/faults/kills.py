@@ -76,7 +76,15 @@ def _make(folder: Path, workers: int) -> list[str]:
 
 
 def _extend(folder: Path, workers: int) -> list[str]:
-    return ["extend", str(folder / "out"), "--n", "660", "--workers", str(workers), "--quiet"]
+    return [
+        "extend",
+        str(folder / "out"),
+        "--n",
+        "660",
+        "--workers",
+        str(workers),
+        "--quiet",
+    ]
 
 
 def _merge(folder: Path, _workers: int) -> list[str]:
@@ -95,12 +103,36 @@ def _unrefined(shared: Path, folder: Path) -> None:
 
 def _refine(folder: Path, workers: int) -> list[str]:
     options = ["--workers", str(workers), "--quiet"]
-    return ["refine", str(folder / "unrefined.h5"), *options, "-o", str(folder / "plans.h5")]
+    return [
+        "refine",
+        str(folder / "unrefined.h5"),
+        *options,
+        "-o",
+        str(folder / "plans.h5"),
+    ]
 
 
 def _train(folder: Path, _workers: int) -> list[str]:
-    options = ["--steps", "60", "--hidden", "16", "--layers", "2", "--batch-size", "32", "--check", "2", "--quiet"]
-    return ["train", str(folder.parent / "shared" / "small"), *options, "-o", str(folder / "model.h5")]
+    options = [
+        "--steps",
+        "60",
+        "--hidden",
+        "16",
+        "--layers",
+        "2",
+        "--batch-size",
+        "32",
+        "--check",
+        "2",
+        "--quiet",
+    ]
+    return [
+        "train",
+        str(folder.parent / "shared" / "small"),
+        *options,
+        "-o",
+        str(folder / "model.h5"),
+    ]
 
 
 def _dataset(folder: Path) -> object:
@@ -116,7 +148,10 @@ def _plans(folder: Path) -> object:
 
 
 def _refined(folder: Path) -> object:
-    assert sorted(path.name for path in folder.iterdir()) == ["plans.h5", "unrefined.h5"]
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "plans.h5",
+        "unrefined.h5",
+    ]
     return (folder / "plans.h5").read_bytes()
 
 
@@ -139,7 +174,9 @@ KINDS = {
 }
 
 
-def kill(count: int, *, seed: int = 0, first: int = 0, kinds: tuple[str, ...] = tuple(KINDS)) -> Kills:
+def kill(
+    count: int, *, seed: int = 0, first: int = 0, kinds: tuple[str, ...] = tuple(KINDS)
+) -> Kills:
     """Kill runs of commands at random times, resume them, and compare the results with uninterrupted runs.
 
     Args:
@@ -151,7 +188,9 @@ def kill(count: int, *, seed: int = 0, first: int = 0, kinds: tuple[str, ...] = 
     outcome = Kills()
     with tempfile.TemporaryDirectory(prefix="cnpgen-kills-") as place:
         _share(Path(place) / "shared")
-        uninterrupted = {name: _uninterrupted(KINDS[name], Path(place), name) for name in kinds}
+        uninterrupted = {
+            name: _uninterrupted(KINDS[name], Path(place), name) for name in kinds
+        }
         number = first
         while outcome.n_signals < count:
             chosen = random.Random(f"{seed} {number}")
@@ -159,11 +198,15 @@ def kill(count: int, *, seed: int = 0, first: int = 0, kinds: tuple[str, ...] = 
             folder = Path(place) / f"run{number}"
             folder.mkdir()
             try:
-                n_signals, ending = _killed(KINDS[name], folder, chosen, uninterrupted[name])
+                n_signals, ending = _killed(
+                    KINDS[name], folder, chosen, uninterrupted[name]
+                )
                 outcome.runs[f"{name}, {ending}"] += 1
                 outcome.n_signals += n_signals
             except (AssertionError, subprocess.TimeoutExpired) as error:
-                outcome.findings.append(f"seed {seed}, run {number}, {name}: {type(error).__name__} {error}")
+                outcome.findings.append(
+                    f"seed {seed}, run {number}, {name}: {type(error).__name__} {error}"
+                )
                 outcome.n_signals += 1
             shutil.rmtree(folder)
             number += 1
@@ -175,10 +218,30 @@ def _share(shared: Path) -> None:
     shared.mkdir()
     make = ["make-dataset", "airhockey-hit", *SETTINGS, "--workers", "1"]
     _finish([*make, "--n", "330", "--out", str(shared / "small")], (0,))
-    plan = ["plan", str(shared / "small"), "--model", "airhockey-hit", "--n", "12", "-o", str(shared / "unrefined.h5")]
+    plan = [
+        "plan",
+        str(shared / "small"),
+        "--model",
+        "airhockey-hit",
+        "--n",
+        "12",
+        "-o",
+        str(shared / "unrefined.h5"),
+    ]
     _finish(plan, (0, 1))
     for k in range(2):
-        _finish([*make, "--n", "660", "--part", f"{k}/2", "--out", str(shared / f"part{k}")], (0,))
+        _finish(
+            [
+                *make,
+                "--n",
+                "660",
+                "--part",
+                f"{k}/2",
+                "--out",
+                str(shared / f"part{k}"),
+            ],
+            (0,),
+        )
 
 
 def _uninterrupted(kind: Kind, place: Path, name: str) -> tuple[object, float]:
@@ -190,22 +253,40 @@ def _uninterrupted(kind: Kind, place: Path, name: str) -> tuple[object, float]:
     return kind.product(folder), time.monotonic() - begun
 
 
-def _killed(kind: Kind, folder: Path, chosen: random.Random, uninterrupted: tuple[object, float]) -> tuple[int, str]:
+def _killed(
+    kind: Kind, folder: Path, chosen: random.Random, uninterrupted: tuple[object, float]
+) -> tuple[int, str]:
     """Kill a run at least once and resume it; return the number of signals and the last exit code."""
     kind.prepare(folder.parent / "shared", folder)
     expected, seconds = uninterrupted
     n_signals = 0
     for _ in range(chosen.randint(1, MAX_KILLS_PER_RUN)):
         words = kind.words(folder, chosen.choice((1, 2)))
-        with subprocess.Popen(_command(words), start_new_session=True, stderr=subprocess.DEVNULL, stdout=-3) as process:
+        with subprocess.Popen(
+            _command(words),
+            start_new_session=True,
+            stderr=subprocess.DEVNULL,
+            stdout=-3,
+        ) as process:
             with suppress(subprocess.TimeoutExpired):
                 process.wait(chosen.uniform(0.2, seconds))
             if process.poll() is None:
                 _hit(process, chosen)
                 n_signals += 1
             code = process.wait(MAX_RUN_TIME_S)
-        assert code in {0, 1, 3, 130, 143, -signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT}, f"it ended with {code}"
-        if (folder / "plans.h5").exists() or _is_trained(folder):  # the same command would refuse to replace them
+        assert code in {
+            0,
+            1,
+            3,
+            130,
+            143,
+            -signal.SIGKILL,
+            -signal.SIGTERM,
+            -signal.SIGINT,
+        }, f"it ended with {code}"
+        if (folder / "plans.h5").exists() or _is_trained(
+            folder
+        ):  # the same command would refuse to replace them
             break
     else:
         _finish(kind.words(folder, 2), kind.codes)
@@ -246,5 +327,13 @@ def _command(words: list[str]) -> list[str]:
 
 def _finish(words: list[str], codes: tuple[int, ...]) -> None:
     """Run a command to its end."""
-    done = subprocess.run(_command(words), capture_output=True, text=True, check=False, timeout=MAX_RUN_TIME_S)
-    assert done.returncode in codes, f"{words[0]} ended with {done.returncode}: {done.stderr[-300:]}"
+    done = subprocess.run(
+        _command(words),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=MAX_RUN_TIME_S,
+    )
+    assert done.returncode in codes, (
+        f"{words[0]} ended with {done.returncode}: {done.stderr[-300:]}"
+    )

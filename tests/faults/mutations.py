@@ -6,7 +6,22 @@ from random import Random
 from typing import Any
 from xml.etree import ElementTree
 
-NUMBERS = (0, -1, 1, 2, 2**31, 2**63, 10**18, 10**30, -(10**30), 0.5, -0.0, 1e-320, 1e308, -1e308)
+NUMBERS = (
+    0,
+    -1,
+    1,
+    2,
+    2**31,
+    2**63,
+    10**18,
+    10**30,
+    -(10**30),
+    0.5,
+    -0.0,
+    1e-320,
+    1e308,
+    -1e308,
+)
 TEXTS = (
     "",
     "x",
@@ -23,7 +38,22 @@ TEXTS = (
     "\ud800",
 )
 URDF_NUMBERS = (
-    *("1,5", "nan", "inf", "-inf", "0x10", "", " ", "1.5 kg", "1_5", "1d3", "1e999", "1e-320", "1e308", "-1e308"),
+    *(
+        "1,5",
+        "nan",
+        "inf",
+        "-inf",
+        "0x10",
+        "",
+        " ",
+        "1.5 kg",
+        "1_5",
+        "1d3",
+        "1e999",
+        "1e-320",
+        "1e308",
+        "-1e308",
+    ),
     *(
         "-1",
         "0",
@@ -41,10 +71,22 @@ URDF_NUMBERS = (
         "1;2;3",
     ),
 )
-WORDS = (b"\0", b"\xff", b"\xff" * 8, b"\0" * 8, b"GCOL\x01\0\0\0", b"TREE", b"OHDR", b"[" * 5000, b"9" * 5000)
+WORDS = (
+    b"\0",
+    b"\xff",
+    b"\xff" * 8,
+    b"\0" * 8,
+    b"GCOL\x01\0\0\0",
+    b"TREE",
+    b"OHDR",
+    b"[" * 5000,
+    b"9" * 5000,
+)
 
 
-def change_bytes(content: bytes, draw: Random, *, among: list[int] | None = None) -> bytes:
+def change_bytes(
+    content: bytes, draw: Random, *, among: list[int] | None = None
+) -> bytes:
     """Flip, replace, insert, delete or cut off bytes.
 
     Args:
@@ -56,7 +98,11 @@ def change_bytes(content: bytes, draw: Random, *, among: list[int] | None = None
     for _ in range(draw.choice((1, 1, 1, 2, 5, 30))):
         if not data:
             break
-        place = draw.choice(among) if among and draw.random() < 0.8 else draw.randrange(len(data))
+        place = (
+            draw.choice(among)
+            if among and draw.random() < 0.8
+            else draw.randrange(len(data))
+        )
         place = min(place, len(data) - 1)
         how = draw.randrange(12)
         if how < 6:
@@ -82,7 +128,12 @@ def change_text(text: str, draw: Random) -> str:
         index = draw.randrange(len(lines)) if lines else 0
         how = draw.randrange(6)
         if not lines or how == 0:
-            lines.insert(index, draw.choice(lines) if lines and draw.random() < 0.7 else str(draw.choice(TEXTS)))
+            lines.insert(
+                index,
+                draw.choice(lines)
+                if lines and draw.random() < 0.7
+                else str(draw.choice(TEXTS)),
+            )
         elif how == 1:
             del lines[index]
         elif how == 2 and "=" in lines[index]:
@@ -92,11 +143,15 @@ def change_text(text: str, draw: Random) -> str:
             )
         elif how == 3 and "=" in lines[index]:
             key, _, value = lines[index].partition("=")
-            lines[index] = f"{draw.choice(('name', 'use', 'x' * 300, key + '.' + key))} ={value}"
+            lines[index] = (
+                f"{draw.choice(('name', 'use', 'x' * 300, key + '.' + key))} ={value}"
+            )
         elif how == 4:
             at = draw.randrange(len(lines[index]) + 1)
             lines[index] = (
-                lines[index][:at] + draw.choice(('"', "]", "[", "{", "=", ".", "\x00", "9" * 400)) + lines[index][at:]
+                lines[index][:at]
+                + draw.choice(('"', "]", "[", "{", "=", ".", "\x00", "9" * 400))
+                + lines[index][at:]
             )
         else:
             other = draw.randrange(len(lines))
@@ -116,7 +171,9 @@ def change_json(document: Any, draw: Random) -> Any:
         if how == 0:
             del parent[key]
         elif how == 1 and isinstance(parent, list):
-            parent.extend(copy.deepcopy(parent[key]) for _ in range(draw.choice((1, 200))))
+            parent.extend(
+                copy.deepcopy(parent[key]) for _ in range(draw.choice((1, 200)))
+            )
         elif how == 2 and isinstance(parent, dict):
             parent[draw.choice(TEXTS[:-1])] = copy.deepcopy(parent[key])
         elif how == 3:
@@ -124,7 +181,18 @@ def change_json(document: Any, draw: Random) -> Any:
             parent[key] = copy.deepcopy(source[other])
         else:
             parent[key] = draw.choice(
-                (*NUMBERS, *TEXTS[:-1], None, True, [], {}, [[]], [1, "a"], {"a": 1}, _deep(draw))
+                (
+                    *NUMBERS,
+                    *TEXTS[:-1],
+                    None,
+                    True,
+                    [],
+                    {},
+                    [[]],
+                    [1, "a"],
+                    {"a": 1},
+                    _deep(draw),
+                )
             )
     return changed
 
@@ -148,11 +216,19 @@ def change_urdf(text: str, draw: Random) -> str:
         elif how == 3 and element.attrib:
             element.attrib.pop(draw.choice(list(element.attrib)))
         elif how == 4:
-            element.tag = draw.choice(("link", "joint", "mimic", "limit", "x", "inertial"))
+            element.tag = draw.choice(
+                ("link", "joint", "mimic", "limit", "x", "inertial")
+            )
         elif element.attrib:
             name = draw.choice(list(element.attrib))
             others = [item.attrib[name] for item in tree.iter() if name in item.attrib]
-            values = [*others, *map(str, NUMBERS), *(text for text in TEXTS if text.isprintable()), "0 0", "floating"]
+            values = [
+                *others,
+                *map(str, NUMBERS),
+                *(text for text in TEXTS if text.isprintable()),
+                "0 0",
+                "floating",
+            ]
             element.attrib[name] = draw.choice(values)
     return ElementTree.tostring(tree, encoding="unicode")
 
@@ -161,7 +237,12 @@ def changed_number(text: str, draw: Random) -> str:
     """Change a numeric attribute of a link, a joint or an inertia."""
     tree = ElementTree.fromstring(text)
     parts = [*tree.iterfind("link/inertial/*"), *tree.iterfind("joint/*")]
-    numeric = [(item, name) for item in parts for name in item.attrib if item.tag not in ("parent", "child", "mimic")]
+    numeric = [
+        (item, name)
+        for item in parts
+        for name in item.attrib
+        if item.tag not in ("parent", "child", "mimic")
+    ]
     for _ in range(draw.choice((1, 1, 2))):
         element, name = draw.choice(numeric)
         if draw.random() < 0.1:
@@ -183,7 +264,11 @@ def _places(value: Any) -> list[tuple[Any, Any]]:
     found, waiting = [], [value] if isinstance(value, dict | list) else []
     while waiting:
         parent = waiting.pop()
-        entries = list(parent.items()) if isinstance(parent, dict) else list(enumerate(parent))
+        entries = (
+            list(parent.items())
+            if isinstance(parent, dict)
+            else list(enumerate(parent))
+        )
         found += [(parent, key) for key, _ in entries]
         waiting += [item for _, item in entries if isinstance(item, dict | list)]
     return found

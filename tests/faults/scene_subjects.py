@@ -40,7 +40,9 @@ EXPORTED = {  # format -> file or folder
     "parquet": "plans.parquet",
     "lerobot": "lerobot",
 }
-POST = Obstacle(name="post", kind="cylinder", position=(0.5, 0.0, 0.3), radius=0.05, length=0.6)
+POST = Obstacle(
+    name="post", kind="cylinder", position=(0.5, 0.0, 0.3), radius=0.05, length=0.6
+)
 START = np.array([-0.6, 0.0, 0.0, -2.0, 0.0, 2.0, 0.8])
 SCENE_FILES = ("scenes.h5", "moveit", "scene.yaml")
 MAX_JUDGED_SAMPLES = 2_000
@@ -49,7 +51,10 @@ MAX_JUDGED_SAMPLES = 2_000
 def make_scene_files(folder: Path) -> None:
     """Make valid scene files of all formats, exported plans in all formats, and plans among scenes."""
     goal = START + np.array([1.2, *np.zeros(6)])
-    scenes = [SceneProblem(name=name, obstacles=(POST,), start_q=START, goal_q=goal[None]) for name in "ab"]
+    scenes = [
+        SceneProblem(name=name, obstacles=(POST,), start_q=START, goal_q=goal[None])
+        for name in "ab"
+    ]
     save_scenes(folder / "scenes.h5", scenes)
     (folder / "moveit").mkdir()
     (folder / "moveit" / "scene0001.yaml").write_text(SCENE, encoding="utf-8")
@@ -58,19 +63,25 @@ def make_scene_files(folder: Path) -> None:
     plans = scene_plans(load_problem(SCENE_PROBLEM), scenes)
     line = np.linspace(START, goal, plans.path_control_points.shape[1])
     paths, rates = np.stack([line, line]), np.ones_like(plans.rate_control_points)
-    save_plans(folder / "scene_plans.h5", replace(plans, path_control_points=paths, rate_control_points=rates))
+    save_plans(
+        folder / "scene_plans.h5",
+        replace(plans, path_control_points=paths, rate_control_points=rates),
+    )
     remove_checksum(folder / "scene_plans.h5")
     plan, trajectories = stored_plan("hit"), folder / "trajectories"
     trajectories.mkdir()
     for name, file in EXPORTED.items():
         try:
-            export_plans(plans_of(plan, plan), trajectories / file, to=name, rate=EXPORT_RATE_HZ)
+            export_plans(
+                plans_of(plan, plan), trajectories / file, to=name, rate=EXPORT_RATE_HZ
+            )
         except MissingExtraError:
             continue
     rows = [{"t": 0.1 * k, "q": [0.1 * k] * 6} for k in range(4)]
     (trajectories / "rows.json").write_text(json.dumps(rows), encoding="utf-8")
     (trajectories / "columns.yaml").write_text(
-        f"t: {[row['t'] for row in rows]}\nq: {[row['q'] for row in rows]}\n", encoding="utf-8"
+        f"t: {[row['t'] for row in rows]}\nq: {[row['q'] for row in rows]}\n",
+        encoding="utf-8",
     )
 
 
@@ -91,7 +102,9 @@ def change_trajectory(good: Path, folder: Path, draw: Random) -> None:
     target = folder / entry.name
     if entry.is_dir():
         shutil.copytree(entry, target)
-        target = draw.choice([path for path in sorted(target.rglob("*")) if path.is_file()])
+        target = draw.choice(
+            [path for path in sorted(target.rglob("*")) if path.is_file()]
+        )
     else:
         shutil.copy(entry, target)
     change_text_file(target, draw)
@@ -108,9 +121,17 @@ def change_text_file(path: Path, draw: Random) -> None:
         text = json.dumps(change_json(json.loads(text), draw))
     else:
         separator = ": " if path.suffix == ".yaml" else ","
-        if path.suffix == ".yaml" and draw.random() < 0.1:  # a list of itself, and aliases
-            text = text.replace("[", "&x [*x, ", 1) if draw.random() < 0.5 else f"x: &x [1, 2]\ny: [*x, *x]\n{text}"
-        text = change_text(text.replace(separator, f"={separator}"), draw).replace(f"={separator}", separator)
+        if (
+            path.suffix == ".yaml" and draw.random() < 0.1
+        ):  # a list of itself, and aliases
+            text = (
+                text.replace("[", "&x [*x, ", 1)
+                if draw.random() < 0.5
+                else f"x: &x [1, 2]\ny: [*x, *x]\n{text}"
+            )
+        text = change_text(text.replace(separator, f"={separator}"), draw).replace(
+            f"={separator}", separator
+        )
     path.write_text(text, encoding="utf-8", errors="replace")
 
 
@@ -123,15 +144,23 @@ def read_scene(folder: Path, draw: Random) -> None:
         read_all(
             lambda: scene_plans(problem, scenes),
             lambda: save_scenes(folder / "again.h5", scenes),
-            lambda: save_scenes(folder / "again", scenes, joints=load_robot(problem).joint_names),
+            lambda: save_scenes(
+                folder / "again", scenes, joints=load_robot(problem).joint_names
+            ),
         )
 
 
 def read_trajectory(folder: Path, draw: Random) -> None:
     """Read trajectories, judge short ones, and make plans of them."""
     (path,) = folder.iterdir()
-    loaded = load_trajectories(path, "airhockey", rate=draw.choice((None, EXPORT_RATE_HZ)))
-    short = [trajectory for trajectory in loaded.trajectories if len(trajectory.t) <= MAX_JUDGED_SAMPLES][:1]
+    loaded = load_trajectories(
+        path, "airhockey", rate=draw.choice((None, EXPORT_RATE_HZ))
+    )
+    short = [
+        trajectory
+        for trajectory in loaded.trajectories
+        if len(trajectory.t) <= MAX_JUDGED_SAMPLES
+    ][:1]
     if short and draw.random() < 0.1:
         read_all(
             lambda: evaluate_trajectories("airhockey", short, workers=1),
@@ -144,7 +173,10 @@ def read_scene_plans(folder: Path, draw: Random) -> None:
     path = folder / "plans.h5"
     plans = load_plans(path)
     screen(plans)
-    readers: list[Callable[[], Any]] = [lambda: load_boundary_problems(path), lambda: plans.scene.bodies(0)]
+    readers: list[Callable[[], Any]] = [
+        lambda: load_boundary_problems(path),
+        lambda: plans.scene.bodies(0),
+    ]
     if draw.random() < 0.1:
         readers.append(lambda: evaluate_plans(plans[:1], workers=1))
     read_all(*readers)

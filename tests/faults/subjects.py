@@ -55,7 +55,13 @@ from tests.examples.plan_files import plans_of
 from tests.examples.plans import load as stored_plan
 from tests.examples.urdf_reading import bodies_in, differences
 from tests.faults.good_files import IDENTITY
-from tests.faults.mutations import change_bytes, change_json, change_text, change_urdf, changed_number
+from tests.faults.mutations import (
+    change_bytes,
+    change_json,
+    change_text,
+    change_urdf,
+    changed_number,
+)
 from tests.faults.scene_subjects import (
     change_scene,
     change_trajectory,
@@ -93,7 +99,9 @@ class Subject:
     read: Callable[[Path, Random], None]
 
 
-def _change_text_of(find: Callable[[Path, Random], Path], change_content: Callable[[str, Random], str]) -> Change:
+def _change_text_of(
+    find: Callable[[Path, Random], Path], change_content: Callable[[str, Random], str]
+) -> Change:
     """Change one of the texts in the folder of recipes, mostly as a text."""
 
     def change(good: Path, folder: Path, draw: Random) -> None:
@@ -103,7 +111,11 @@ def _change_text_of(find: Callable[[Path, Random], Path], change_content: Callab
         if draw.random() < 0.2:
             path.write_bytes(change_bytes(content, draw))
         else:
-            path.write_text(change_content(content.decode(), draw), encoding="utf-8", errors="replace")
+            path.write_text(
+                change_content(content.decode(), draw),
+                encoding="utf-8",
+                errors="replace",
+            )
 
     return change
 
@@ -148,7 +160,10 @@ def _follow(folder: Path, specification: dict[str, Any]) -> None:
     for name in DOCUMENTS[1:]:
         _save(
             folder / name,
-            {**read_unverified(folder / name), "specification_fingerprint": specification.get("fingerprint")},
+            {
+                **read_unverified(folder / name),
+                "specification_fingerprint": specification.get("fingerprint"),
+            },
         )
 
 
@@ -156,13 +171,25 @@ def _list_again(folder: Path) -> None:
     """Update the digests in the manifest."""
     manifest = read_unverified(folder / "manifest.json")
     for name, entry in manifest["files"].items():
-        entry |= {"sha256": file_sha256(folder / name), "bytes": (folder / name).stat().st_size}
+        entry |= {
+            "sha256": file_sha256(folder / name),
+            "bytes": (folder / name).stat().st_size,
+        }
     for split in manifest["splits"].values():
         for entry in split["shards"]:
             entry["sidecar"]["sha256"] = file_sha256(folder / entry["sidecar"]["file"])
-            entry |= {"sha256": file_sha256(folder / entry["file"]), "bytes": (folder / entry["file"]).stat().st_size}
-    files = ((entry["file"], entry["sha256"]) for split in manifest["splits"].values() for entry in split["shards"])
-    _save(folder / "manifest.json", {**manifest, "fingerprint": data_fingerprint(files)})
+            entry |= {
+                "sha256": file_sha256(folder / entry["file"]),
+                "bytes": (folder / entry["file"]).stat().st_size,
+            }
+    files = (
+        (entry["file"], entry["sha256"])
+        for split in manifest["splits"].values()
+        for entry in split["shards"]
+    )
+    _save(
+        folder / "manifest.json", {**manifest, "fingerprint": data_fingerprint(files)}
+    )
 
 
 def _save(path: Path, document: Mapping[str, Any]) -> None:
@@ -188,21 +215,38 @@ def _change_shard(good: Path, folder: Path, draw: Random) -> None:
     path = folder / "set" / "train" / "shard-00000.h5"
     path.write_bytes(_changed_hdf5(path.read_bytes(), draw))
     sidecar = path.with_suffix(".json")
-    _save(sidecar, {**read_unverified(sidecar), "sha256": file_sha256(path), "bytes": path.stat().st_size})
+    _save(
+        sidecar,
+        {
+            **read_unverified(sidecar),
+            "sha256": file_sha256(path),
+            "bytes": path.stat().st_size,
+        },
+    )
     _list_again(folder / "set")
 
 
 def _changed_hdf5(content: bytes, draw: Random, *, first: int = 0) -> bytes:
     """Change bytes of an HDF5 file, most of them in its headers."""
-    return content[:first] + change_bytes(content[first:], draw, among=_headers(content, first))
+    return content[:first] + change_bytes(
+        content[first:], draw, among=_headers(content, first)
+    )
 
 
 @cache
 def _headers(content: bytes, first: int) -> list[int]:
     """List the positions of a file with many zeros around, as in headers, relative to the first."""
     parts = range(first, len(content), 256)
-    among = [part for part in parts if part < first + 2048 or content[part : part + 256].count(0) > 100]
-    return [place - first for part in among for place in range(part, min(part + 256, len(content)))]
+    among = [
+        part
+        for part in parts
+        if part < first + 2048 or content[part : part + 256].count(0) > 100
+    ]
+    return [
+        place - first
+        for part in among
+        for place in range(part, min(part + 256, len(content)))
+    ]
 
 
 def _read_shard(folder: Path, draw: Random) -> None:
@@ -230,7 +274,11 @@ def _change_plan_file(good: Path, folder: Path, draw: Random) -> None:
     else:
         path.write_bytes(_changed_hdf5(content, draw))
     if draw.random() < 0.3 and path.stat().st_size > HEADER_BYTES:
-        path.write_bytes(with_checksum(path.read_bytes(), kind="cnpgen-plans", version=PLAN_FILE_VERSION))
+        path.write_bytes(
+            with_checksum(
+                path.read_bytes(), kind="cnpgen-plans", version=PLAN_FILE_VERSION
+            )
+        )
 
 
 def _change_values(path: Path, draw: Random) -> None:
@@ -244,7 +292,14 @@ def _change_values(path: Path, draw: Random) -> None:
                 (np.nan, np.inf, -np.inf, 1e308, -1e308, 1e-320, -1e200, 0.0)
             )  # fmt: skip
             del file[name]
-            shapes = (values.shape, values.shape, (*values.shape, 1), values.shape[1:], (0, *values.shape[1:]), (1,))
+            shapes = (
+                values.shape,
+                values.shape,
+                (*values.shape, 1),
+                values.shape[1:],
+                (0, *values.shape[1:]),
+                (1,),
+            )
             stored = draw.choice(("f8", "f4", "i8", "u1", values.dtype))
             with np.errstate(all="ignore"):
                 file[name] = np.resize(values, draw.choice(shapes)).astype(stored)
@@ -254,19 +309,32 @@ def _change_values(path: Path, draw: Random) -> None:
             text = value.decode() if isinstance(value, bytes) else str(value)
             with suppress(ValueError):
                 text = json.dumps(change_json(json.loads(text), draw))
-            odd = (text, text[:-1], np.int64(draw.choice((-1, 0, 3, 10**9))), 1.5, [1, 2], "", "airhockey", "/dev/zero")
+            odd = (
+                text,
+                text[:-1],
+                np.int64(draw.choice((-1, 0, 3, 10**9))),
+                1.5,
+                [1, 2],
+                "",
+                "airhockey",
+                "/dev/zero",
+            )
             file.attrs[key] = draw.choice(odd)
             if key == "problem_recipe" and draw.random() < 0.7:
                 file.attrs[key] = text
                 with suppress(CnpgenError, ValueError):
-                    file.attrs["problem_sha256"] = _comparable(text, file.attrs["problem_urdf"])
+                    file.attrs["problem_sha256"] = _comparable(
+                        text, file.attrs["problem_urdf"]
+                    )
 
 
 def _comparable(recipe: str, urdf: Any) -> str:
     from cnpgen.problems.problem_record import ProblemRecord
 
     with suppress(KeyError, TypeError, AttributeError):
-        return ProblemRecord(recipe, urdf.decode() if isinstance(urdf, bytes) else urdf).comparable_sha256
+        return ProblemRecord(
+            recipe, urdf.decode() if isinstance(urdf, bytes) else urdf
+        ).comparable_sha256
     return canonical_sha256({})
 
 
@@ -289,11 +357,19 @@ def _change_with_checksum(name: str, kind: str, version: int) -> Change:
             path.write_bytes(change_bytes(content, draw))
         elif how < 0.6:
             path.write_bytes(
-                with_checksum(_changed_hdf5(content, draw, first=HEADER_BYTES), kind=kind, version=version)
+                with_checksum(
+                    _changed_hdf5(content, draw, first=HEADER_BYTES),
+                    kind=kind,
+                    version=version,
+                )
             )
         else:
             valid = read_with_checksum(good / name, kind=kind, version=version)
-            path.write_bytes(encode_with_checksum(_changed_content(valid, draw), kind=kind, version=version))
+            path.write_bytes(
+                encode_with_checksum(
+                    _changed_content(valid, draw), kind=kind, version=version
+                )
+            )
 
     return change
 
@@ -306,10 +382,18 @@ def _changed_content(content: Content, draw: Random) -> Content:
         try:
             texts[name] = json.dumps(change_json(json.loads(texts[name]), draw))
         except ValueError:
-            texts[name] = change_text(texts[name], draw).encode(errors="replace").decode()
+            texts[name] = (
+                change_text(texts[name], draw).encode(errors="replace").decode()
+            )
     else:
         name = draw.choice([*arrays])
-        odd = (arrays[name][..., :-1], arrays[name][None], np.zeros(0), np.zeros((2, 2, 2)), arrays[name].astype("i8"))
+        odd = (
+            arrays[name][..., :-1],
+            arrays[name][None],
+            np.zeros(0),
+            np.zeros((2, 2, 2)),
+            arrays[name].astype("i8"),
+        )
         arrays[name] = draw.choice(odd)
         if draw.random() < 0.2:
             del arrays[name]
@@ -333,7 +417,9 @@ def _change_journal(good: Path, folder: Path, draw: Random) -> None:
     if draw.random() < 0.3:
         (folder / "journal").write_bytes(change_bytes(content, draw))
         return
-    begin = content.index(json.dumps(IDENTITY).encode()) + len(json.dumps(IDENTITY))  # of the frame of a plan
+    begin = content.index(json.dumps(IDENTITY).encode()) + len(
+        json.dumps(IDENTITY)
+    )  # of the frame of a plan
     payload = change_bytes(content[begin + 40 :], draw)
     head = len(payload).to_bytes(8, "little") + hashlib.sha256(payload).digest()
     (folder / "journal").write_bytes(content[:begin] + head + payload)
@@ -350,7 +436,10 @@ def _suite_in(folder: Path, draw: Random) -> Path:
 def _read_suite(folder: Path, draw: Random) -> None:
     suite = load_suite(folder / "recipes" / "suite.toml")
     str(suite)
-    if suite.pucks is not None and suite.pucks.rows * suite.pucks.columns <= MAX_FUZZED_PUCKS:
+    if (
+        suite.pucks is not None
+        and suite.pucks.rows * suite.pucks.columns <= MAX_FUZZED_PUCKS
+    ):
         suite.problems(3)
 
 
@@ -379,7 +468,9 @@ def _change_tasks(good: Path, folder: Path, draw: Random) -> None:
     if draw.random() < 0.4:
         path.write_bytes(change_bytes(content, draw))
     elif name == "tasks.csv":
-        lines = change_text(content.decode().replace(",", "=,"), draw).replace("=,", ",")
+        lines = change_text(content.decode().replace(",", "=,"), draw).replace(
+            "=,", ","
+        )
         path.write_text(lines, encoding="utf-8", errors="replace")
     else:
         path.write_bytes(content)
@@ -387,7 +478,9 @@ def _change_tasks(good: Path, folder: Path, draw: Random) -> None:
 
 
 def _read_tasks(folder: Path, draw: Random) -> None:
-    fields = {name: Field(name, "m", name, 3, ("x", "y", "z")) for name in ("goal_xyz",)}
+    fields = {
+        name: Field(name, "m", name, 3, ("x", "y", "z")) for name in ("goal_xyz",)
+    }
     fields["hit_angle"] = Field("hit_angle", "rad", "angle")
     read_tasks(folder / "tasks", fields, flat=True)
 
@@ -395,11 +488,15 @@ def _read_tasks(folder: Path, draw: Random) -> None:
 def _change_results(good: Path, folder: Path, draw: Random) -> None:
     lines = (good / "results.jsonl").read_text(encoding="utf-8").splitlines()
     if draw.random() < 0.2:
-        (folder / "results.jsonl").write_bytes(change_bytes("\n".join(lines).encode(), draw))
+        (folder / "results.jsonl").write_bytes(
+            change_bytes("\n".join(lines).encode(), draw)
+        )
         return
     index = draw.randrange(1, len(lines))
     lines[index] = json.dumps(change_json(json.loads(lines[index]), draw))
-    (folder / "results.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8", errors="replace")
+    (folder / "results.jsonl").write_text(
+        "\n".join(lines) + "\n", encoding="utf-8", errors="replace"
+    )
 
 
 def _read_results(folder: Path, draw: Random) -> None:
@@ -418,16 +515,25 @@ def _change_embedded(good: Path, folder: Path, draw: Random) -> None:
         with h5py.File(folder / name, "r+") as file:
             urdf = file.attrs["problem_urdf"]
             changed = change(urdf.decode() if isinstance(urdf, bytes) else urdf, draw)
-            file.attrs["problem_urdf"] = changed.replace("\0", " ").encode(errors="replace")
+            file.attrs["problem_urdf"] = changed.replace("\0", " ").encode(
+                errors="replace"
+            )
             recipe = file.attrs["problem_recipe"]
             text = recipe.decode() if isinstance(recipe, bytes) else recipe
             with suppress(CnpgenError, ValueError):
-                file.attrs["problem_sha256"] = _comparable(text, file.attrs["problem_urdf"])
+                file.attrs["problem_sha256"] = _comparable(
+                    text, file.attrs["problem_urdf"]
+                )
         return
     content = read_with_checksum(good / name, kind=MODEL_KIND, version=MODEL_VERSION)
     key = next(key for key, text in content.texts.items() if "<robot" in text)
-    changed_content = Content(content.arrays, {**content.texts, key: _with_urdf(content.texts[key], change, draw)})
-    (folder / name).write_bytes(encode_with_checksum(changed_content, kind=MODEL_KIND, version=MODEL_VERSION))
+    changed_content = Content(
+        content.arrays,
+        {**content.texts, key: _with_urdf(content.texts[key], change, draw)},
+    )
+    (folder / name).write_bytes(
+        encode_with_checksum(changed_content, kind=MODEL_KIND, version=MODEL_VERSION)
+    )
 
 
 def _with_urdf(text: str, change: Callable[[str, Random], str], draw: Random) -> str:
@@ -435,7 +541,11 @@ def _with_urdf(text: str, change: Callable[[str, Random], str], draw: Random) ->
     if text.lstrip().startswith("<"):
         return change(text, draw).encode(errors="replace").decode()
     document = json.loads(text)
-    key = next(key for key, value in document.items() if isinstance(value, str) and "<robot" in value)
+    key = next(
+        key
+        for key, value in document.items()
+        if isinstance(value, str) and "<robot" in value
+    )
     return json.dumps({**document, key: change(document[key], draw)})
 
 
@@ -460,8 +570,13 @@ SUBJECTS: dict[str, Subject] = {
     "document": Subject(_change_document, _read_set),
     "shard": Subject(_change_shard, _read_shard),
     "plans": Subject(_change_plans, _read_plans),
-    "model": Subject(_change_with_checksum("model.h5", MODEL_KIND, MODEL_VERSION), _read_model),
-    "checkpoint": Subject(_change_with_checksum("checkpoint", CHECKPOINT_KIND, CHECKPOINT_VERSION), _read_checkpoint),
+    "model": Subject(
+        _change_with_checksum("model.h5", MODEL_KIND, MODEL_VERSION), _read_model
+    ),
+    "checkpoint": Subject(
+        _change_with_checksum("checkpoint", CHECKPOINT_KIND, CHECKPOINT_VERSION),
+        _read_checkpoint,
+    ),
     "journal": Subject(_change_journal, _read_journal),
     "embedded": Subject(_change_embedded, _read_embedded),
     "suite": Subject(_change_text_of(_suite_in, change_text), _read_suite),

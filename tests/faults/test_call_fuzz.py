@@ -25,7 +25,9 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> list[ValidCall]:
     return valid_calls(tmp_path_factory.mktemp("calls"))
 
 
-def test_every_wrong_call_gives_a_result_or_an_error_with_the_name_of_an_argument() -> None:
+def test_every_wrong_call_gives_a_result_or_an_error_with_the_name_of_an_argument() -> (
+    None
+):
     outcome = fuzz_calls(CALLS, seed=2026)
     assert outcome.findings == []
     assert outcome.returned + outcome.refused == CALLS
@@ -40,18 +42,34 @@ def test_every_valid_call_succeeds(valid: list[ValidCall]) -> None:
 
 def test_every_public_callable_has_a_valid_call(valid: list[ValidCall]) -> None:
     names = {call.name for call in valid}
-    public = {name: getattr(module, name) for module in PUBLIC_MODULES for name in module.__all__}
+    public = {
+        name: getattr(module, name)
+        for module in PUBLIC_MODULES
+        for name in module.__all__
+    }
     missing = [
         name
         for name, value in public.items()
-        if callable(value) and name not in names | set(EXCLUDED) and not _is_table(value)
+        if callable(value)
+        and name not in names | set(EXCLUDED)
+        and not _is_table(value)
     ]
     assert missing == []
-    functions = {f"{name}.{method}" for name, value in public.items() for method in _methods(value)}
+    functions = {
+        f"{name}.{method}"
+        for name, value in public.items()
+        for method in _methods(value)
+    }
     excluded = tuple(
-        f"{name}." for name in (*EXCLUDED, "Executed", "Simulation") if name not in {"Dataset", "Benchmark"}
+        f"{name}."
+        for name in (*EXCLUDED, "Executed", "Simulation")
+        if name not in {"Dataset", "Benchmark"}
     )
-    assert [name for name in functions - names if not name.startswith((*excluded, "Model.", "Dataset.scenes"))] == []
+    assert [
+        name
+        for name in functions - names
+        if not name.startswith((*excluded, "Model.", "Dataset.scenes"))
+    ] == []
 
 
 def _is_table(value: Any) -> bool:
@@ -64,12 +82,18 @@ def _is_table(value: Any) -> bool:
 def _methods(value: Any) -> list[str]:
     if not inspect.isclass(value) or _is_table(value):
         return []
-    return [name for name, member in vars(value).items() if inspect.isfunction(member) and not name.startswith("_")]
+    return [
+        name
+        for name, member in vars(value).items()
+        if inspect.isfunction(member) and not name.startswith("_")
+    ]
 
 
 def test_wrong_types_are_found_before_the_call_or_from_its_exception() -> None:
     @checked_arguments
-    def half(n: int, *, scale: float = 1.0, whole: bool = False, text: str | None = None) -> float:
+    def half(
+        n: int, *, scale: float = 1.0, whole: bool = False, text: str | None = None
+    ) -> float:
         return scale * n / 2 if not whole else n // 2
 
     assert half(np.int32(3), scale=np.float32(0.5)) == 0.75
@@ -78,25 +102,37 @@ def test_wrong_types_are_found_before_the_call_or_from_its_exception() -> None:
         with pytest.raises(UsageError, match="must be") as caught:
             half(**{"n": 3, **wrong})
         assert caught.value.argument == next(iter(wrong))
-    with pytest.raises(ZeroDivisionError):  # all types are right: the error is not the caller's
+    with pytest.raises(
+        ZeroDivisionError
+    ):  # all types are right: the error is not the caller's
         checked_arguments(lambda n: 1 / n)(0)
 
 
 def test_masked_arrays_are_refused() -> None:
     masked = np.ma.masked_invalid([0.1, np.nan])
     for values in (masked, [masked, masked]):
-        with pytest.raises(UsageError, match=r"q must not be a masked array: pass filled values"):
+        with pytest.raises(
+            UsageError, match=r"q must not be a masked array: pass filled values"
+        ):
             numbers("q", values)
 
 
-def test_requests_that_exceed_the_memory_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(UsageError, match=r"^n must be smaller: 1,000,000,000,000,000 needs at least .* GB of memory"):
+def test_requests_that_exceed_the_memory_are_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with pytest.raises(
+        UsageError,
+        match=r"^n must be smaller: 1,000,000,000,000,000 needs at least .* GB of memory",
+    ):
         cnpgen.draw_boundary_problems("airhockey-hit", 10**15)
     with pytest.raises(UsageError, match=r"^nodes must be smaller"):
         cnpgen.PlanLoss("airhockey", nodes=10**15)
     monkeypatch.setattr(arguments, "MIN_CHECKED_SIZE", 1000)
     monkeypatch.setattr(arguments, "available_bytes", lambda: 10**6)
-    with pytest.raises(UsageError, match=r"n must be smaller: 100,000 needs at least 0\.\d+ GB of memory, 0\.001 GB"):
+    with pytest.raises(
+        UsageError,
+        match=r"n must be smaller: 100,000 needs at least 0\.\d+ GB of memory, 0\.001 GB",
+    ):
         cnpgen.draw_boundary_problems("airhockey-hit", 100_000)
 
 

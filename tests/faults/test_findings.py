@@ -15,7 +15,14 @@ from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import screen
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
-from cnpgen.scenes import Grasp, SceneError, SceneProblem, load_family, load_scenes, save_scenes
+from cnpgen.scenes import (
+    Grasp,
+    SceneError,
+    SceneProblem,
+    load_family,
+    load_scenes,
+    save_scenes,
+)
 from cnpgen.store.dataset_spec import load_dataset_spec, shards
 from cnpgen.store.inspection import inspect_dataset
 from cnpgen.store.shard_record import load_record
@@ -28,27 +35,39 @@ from tests.examples.store import dataset  # noqa: F401 - a fixture
 
 
 @pytest.mark.parametrize("value", [[], {}, [1], {"a": 1}], ids=str)
-def test_a_list_or_a_table_where_a_number_is_expected(dataset: Path, value: Any) -> None:  # noqa: F811
+def test_a_list_or_a_table_where_a_number_is_expected(
+    dataset: Path,  # noqa: F811
+    value: Any,
+) -> None:
     task = shards(load_dataset_spec(dataset))[0]
     rewritten(dataset / task.sidecar, lambda record: record.update(seconds=value))
     with pytest.raises(DatasetError, match="seconds must be a number, got"):
         load_record(dataset, task)
 
 
-def test_a_histogram_with_one_bin_more_than_those_of_other_shards(dataset: Path) -> None:  # noqa: F811
+def test_a_histogram_with_one_bin_more_than_those_of_other_shards(
+    dataset: Path,  # noqa: F811
+) -> None:
     task = shards(load_dataset_spec(dataset))[0]
     rewritten(
-        dataset / task.sidecar, lambda record: record["statistics"]["clearance"]["histogram"]["counts"][0].append(0)
+        dataset / task.sidecar,
+        lambda record: record["statistics"]["clearance"]["histogram"]["counts"][
+            0
+        ].append(0),
     )
     (problem,) = inspect_dataset(dataset).summary.problems
     assert "a histogram must have shape (1, 64), got (1, 65)" in problem
 
 
-def test_an_archive_whose_damage_a_library_reports_with_the_content_of_the_file(tmp_path: Path) -> None:
+def test_an_archive_whose_damage_a_library_reports_with_the_content_of_the_file(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "plans.npz"
     np.savez(path, q=np.zeros((4000, 7)))
     content = bytearray(path.read_bytes())
-    content[26:28] = (30_000).to_bytes(2, "little")  # the length of the member's name, which zipfile's message repeats
+    content[26:28] = (30_000).to_bytes(
+        2, "little"
+    )  # the length of the member's name, which zipfile's message repeats
     path.write_bytes(content)
     with pytest.raises(UsageError, match="more characters") as caught:
         load_trajectories(path, "airhockey")
@@ -68,7 +87,10 @@ def test_a_link_with_the_name_of_a_fixed_joint(tmp_path: Path, planned: bool) ->
     shutil.copytree(problem.path.parent, tmp_path / "airhockey")
     path = tmp_path / "airhockey" / problem.robot.urdf
     joint = "joint_1" if planned else "joint_7"
-    path.write_text(path.read_text(encoding="utf-8").replace('"link_3"', f'"{joint}"'), encoding="utf-8")
+    path.write_text(
+        path.read_text(encoding="utf-8").replace('"link_3"', f'"{joint}"'),
+        encoding="utf-8",
+    )
     robot = load_robot(load_problem(tmp_path / "airhockey" / "problem.toml"))
     assert robot.capsule_axes == load_robot(problem).capsule_axes
 
@@ -93,11 +115,18 @@ def test_a_rate_whose_differences_are_infinite(tmp_path: Path) -> None:
         (lambda: save_scenes("scenes.h5", [None]), "scenes"),
         (lambda: largest_error({"x": 1}, [0.0, 1.0], [[0.0], [1.0]]), "motion"),
         (lambda: load_trajectories("missing.csv", "airhockey"), "path"),
-        (lambda: SceneProblem(name="a", obstacles=(), start_q=None, goal_q=np.zeros((1, 7))), "start_q"),
+        (
+            lambda: SceneProblem(
+                name="a", obstacles=(), start_q=None, goal_q=np.zeros((1, 7))
+            ),
+            "start_q",
+        ),
         (lambda: Grasp(None, np.ones(3)), "position"),
     ],
 )
-def test_wrong_arguments_of_scenes_and_trajectories_are_named(call: Any, argument: str) -> None:
+def test_wrong_arguments_of_scenes_and_trajectories_are_named(
+    call: Any, argument: str
+) -> None:
     with pytest.raises(UsageError) as caught:
         call()
     assert caught.value.argument == argument
@@ -105,7 +134,11 @@ def test_wrong_arguments_of_scenes_and_trajectories_are_named(call: Any, argumen
 
 def test_empty_states_in_a_scene_of_robometrics(tmp_path: Path) -> None:
     pytest.importorskip("yaml")
-    lines = [line for line in ROBOMETRICS.splitlines() if "start:" not in line and not line.startswith("  - [")]
+    lines = [
+        line
+        for line in ROBOMETRICS.splitlines()
+        if "start:" not in line and not line.startswith("  - [")
+    ]
     (tmp_path / "scene.yaml").write_text("\n".join(lines))
     (scene,) = load_scenes(tmp_path / "scene.yaml")
     assert scene.goal_q.shape == (0, 0)
@@ -124,7 +157,11 @@ def test_numbers_written_as_texts_in_a_trajectory(tmp_path: Path) -> None:
         ("[0.002]", "[]", r"dimensions of the goal region must be positive, got \[\]"),
         ("[0.002]", "[nan]", "dimensions of the goal region must be positive"),
         ("[0.002]", "[-1]", "dimensions of the goal region must be positive"),
-        ("orientation_constraints:", "orientation_constraints: [7]\n    other:", "must be a mapping, got"),
+        (
+            "orientation_constraints:",
+            "orientation_constraints: [7]\n    other:",
+            "must be a mapping, got",
+        ),
     ],
 )
 def test_a_goal_region_without_a_size_and_an_orientation_that_is_a_number(

@@ -25,5 +25,7 @@ def test_files_of_every_kind_are_read_or_refused(outcome: Outcome, kind: str) ->
 
 
 def test_an_input_is_a_function_of_seed_and_index() -> None:
-    first, again = (fuzz(6, seed=3, first=5, kinds=("recipe", "journal")) for _ in range(2))
+    first, again = (
+        fuzz(6, seed=3, first=5, kinds=("recipe", "journal")) for _ in range(2)
+    )
     assert (first.read, first.refused) == (again.read, again.refused)

@@ -60,12 +60,18 @@ class ValidCall:
     @property
     def parameters(self) -> list[inspect.Parameter]:
         """Parameters of the callable."""
-        return [p for p in inspect.signature(self.function).parameters.values() if p.kind != p.VAR_KEYWORD]
+        return [
+            p
+            for p in inspect.signature(self.function).parameters.values()
+            if p.kind != p.VAR_KEYWORD
+        ]
 
     @property
     def names(self) -> list[str]:
         """Names of all parameters and of the keywords of the call."""
-        return list(dict.fromkeys([*(p.name for p in self.parameters), *self.arguments]))
+        return list(
+            dict.fromkeys([*(p.name for p in self.parameters), *self.arguments])
+        )
 
     def __call__(self, **changes: Any) -> Any:
         """Call with some arguments replaced."""
@@ -74,21 +80,33 @@ class ValidCall:
         positional = [
             arguments.pop(name)
             for name, kind in kinds.items()
-            if name in arguments and kind in {inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.VAR_POSITIONAL}
+            if name in arguments
+            and kind
+            in {inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.VAR_POSITIONAL}
         ]
         return self.function(*positional, **arguments)
 
 
 def valid_calls(folder: Path) -> list[ValidCall]:
     """Return a valid call of every public callable; files are made in a folder."""
-    made = cnpgen.make_dataset(tiny_recipe_of("airhockey-hit"), folder / "set", workers=1, shard_size=24)
+    made = cnpgen.make_dataset(
+        tiny_recipe_of("airhockey-hit"), folder / "set", workers=1, shard_size=24
+    )
     dataset = cnpgen.load_dataset(made.folder)
     plan = stored_plan("hit")
-    problem, control = plan.problem, {f"{name}_control_points": getattr(plan.motion, name) for name in ("path", "rate")}
+    problem, control = (
+        plan.problem,
+        {
+            f"{name}_control_points": getattr(plan.motion, name)
+            for name in ("path", "rate")
+        },
+    )
     plan = cnpgen.make_plans(problem, plan.boundary, **control)
     plans = plan[[0, 0]]
     cnpgen.save_plans(folder / "plans.h5", plans)
-    model = untrained_model("airhockey", boundary_of_columns(dataset.arrays("train"), 20))
+    model = untrained_model(
+        "airhockey", boundary_of_columns(dataset.arrays("train"), 20)
+    )
     cnpgen.save_model(folder / "model.h5", model)
     groups = (
         _of_datasets(folder, dataset),
@@ -108,7 +126,11 @@ def valid_calls(folder: Path) -> list[ValidCall]:
 
 def _fields(instance: Any) -> dict[str, Any]:
     """Return the arguments of the constructor of a dataclass instance."""
-    return {entry.name: getattr(instance, entry.name) for entry in fields(instance) if entry.init}
+    return {
+        entry.name: getattr(instance, entry.name)
+        for entry in fields(instance)
+        if entry.init
+    }
 
 
 def _of_datasets(folder: Path, dataset: Any) -> list[ValidCall]:
@@ -116,11 +138,29 @@ def _of_datasets(folder: Path, dataset: Any) -> list[ValidCall]:
     recipe = tiny_recipe_of("airhockey-hit")
     return [
         ValidCall("load_dataset", cnpgen.load_dataset, {"folder": folder / "set"}),
-        ValidCall("inspect_dataset", cnpgen.inspect_dataset, {"folder": folder / "set"}),
-        ValidCall("validate_dataset", cnpgen.validate_dataset, {"folder": folder / "set", "workers": 1}),
-        ValidCall("make_dataset", cnpgen.make_dataset, {"recipe": recipe, "out": folder / "made", "workers": 1}),
-        ValidCall("extend_dataset", cnpgen.extend_dataset, {"folder": folder / "part", "n": 40, "workers": 1}),
-        ValidCall("merge_datasets", cnpgen.merge_datasets, {"parts": [folder / "set"], "out": folder / "merged"}),
+        ValidCall(
+            "inspect_dataset", cnpgen.inspect_dataset, {"folder": folder / "set"}
+        ),
+        ValidCall(
+            "validate_dataset",
+            cnpgen.validate_dataset,
+            {"folder": folder / "set", "workers": 1},
+        ),
+        ValidCall(
+            "make_dataset",
+            cnpgen.make_dataset,
+            {"recipe": recipe, "out": folder / "made", "workers": 1},
+        ),
+        ValidCall(
+            "extend_dataset",
+            cnpgen.extend_dataset,
+            {"folder": folder / "part", "n": 40, "workers": 1},
+        ),
+        ValidCall(
+            "merge_datasets",
+            cnpgen.merge_datasets,
+            {"parts": [folder / "set"], "out": folder / "merged"},
+        ),
         ValidCall("Dataset.__getitem__", dataset.__getitem__, {"split": "train"}),
         ValidCall("Dataset.arrays", dataset.arrays),
         ValidCall("Dataset.batches", dataset.batches, {"batch_size": 4}),
@@ -132,30 +172,49 @@ def _of_datasets(folder: Path, dataset: Any) -> list[ValidCall]:
 
 def _of_problems(problem: Any, plans: Any) -> list[ValidCall]:
     robot, q = cnpgen.RobotModel(problem), plans.boundary.start_q
-    place = {"start_xyz": plans.columns["start_xyz"], "goal_xyz": plans.columns["goal_xyz"]}
+    place = {
+        "start_xyz": plans.columns["start_xyz"],
+        "goal_xyz": plans.columns["goal_xyz"],
+    }
     scene = robot.scene(**place)
     base = robot.home
     goal = plans.columns["goal_xyz"][0]
     return [
         ValidCall("load_problem", cnpgen.load_problem, {"name_or_path": "airhockey"}),
-        ValidCall("draw_boundary_problems", cnpgen.draw_boundary_problems, {"recipe": "airhockey-hit", "n": 2}),
+        ValidCall(
+            "draw_boundary_problems",
+            cnpgen.draw_boundary_problems,
+            {"recipe": "airhockey-hit", "n": 2},
+        ),
         ValidCall(
             "complete",
             cnpgen.complete,
-            {"recipe": "airhockey-hit", "start_q": base, "goal_xyz": goal, "hit_angle": 0.1, "hit_speed_share": 0.5},
+            {
+                "recipe": "airhockey-hit",
+                "start_q": base,
+                "goal_xyz": goal,
+                "hit_angle": 0.1,
+                "hit_speed_share": 0.5,
+            },
         ),
         ValidCall("Problem", cnpgen.Problem, _fields(problem)),
         ValidCall("Problem.validate", problem.validate),
-        ValidCall("Problem.first", problem.first, {"kind": type(problem.constraint[0])}),
+        ValidCall(
+            "Problem.first", problem.first, {"kind": type(problem.constraint[0])}
+        ),
         ValidCall("RobotModel", cnpgen.RobotModel, {"problem": problem}),
         ValidCall("RobotModel.constraint_values", robot.constraint_values, {"q": q}),
         ValidCall("RobotModel.forward_kinematics", robot.forward_kinematics, {"q": q}),
         ValidCall("RobotModel.inverse_dynamics", robot.inverse_dynamics, {"q": q}),
         ValidCall("RobotModel.is_collision_free", robot.is_collision_free, {"q": q}),
         ValidCall("RobotModel.jacobian", robot.jacobian, {"q": q}),
-        ValidCall("RobotModel.min_distance", robot.min_distance, {"q": q, "scene": scene}),
+        ValidCall(
+            "RobotModel.min_distance", robot.min_distance, {"q": q, "scene": scene}
+        ),
         ValidCall("RobotModel.scene", robot.scene, place),
-        ValidCall("Scene", cnpgen.Scene, {"obstacles": scene.obstacles, "poses": scene.poses}),
+        ValidCall(
+            "Scene", cnpgen.Scene, {"obstacles": scene.obstacles, "poses": scene.poses}
+        ),
         ValidCall("Scene.__getitem__", scene.__getitem__, {"index": 0}),
         ValidCall("Scene.bodies", scene.bodies, {"sample": 0}),
     ]
@@ -169,23 +228,45 @@ def _of_trajectories(plans: Any) -> list[ValidCall]:
         ValidCall("Boundary", cnpgen.Boundary, vars(boundary)),
         ValidCall("Boundary.__getitem__", boundary.__getitem__, {"index": slice(0, 1)}),
         ValidCall("Boundary.conditions", boundary.conditions),
-        ValidCall("Boundary.from_batch", cnpgen.Boundary.from_batch, {"batch": vars(boundary), "normalization": None}),
-        ValidCall("Boundary.min_control_points", boundary.min_control_points, {"degree": 7}),
+        ValidCall(
+            "Boundary.from_batch",
+            cnpgen.Boundary.from_batch,
+            {"batch": vars(boundary), "normalization": None},
+        ),
+        ValidCall(
+            "Boundary.min_control_points", boundary.min_control_points, {"degree": 7}
+        ),
         ValidCall("Motion", cnpgen.Motion, {"path": motion.path, "rate": motion.rate}),
         ValidCall("Motion.__getitem__", motion.__getitem__, {"index": 0}),
         ValidCall("Motion.at", motion.at, {"s": np.array([0.0, 0.5])}),
-        ValidCall("Motion.at_times", motion.at_times, {"t": np.array([[0.0, 0.1], [0.0, 0.1]])}),
+        ValidCall(
+            "Motion.at_times",
+            motion.at_times,
+            {"t": np.array([[0.0, 0.1], [0.0, 0.1]])},
+        ),
         ValidCall("Motion.duration", motion.duration),
-        ValidCall("Motion.phase_at", motion.phase_at, {"t": np.array([[0.0, 0.1], [0.0, 0.1]])}),
+        ValidCall(
+            "Motion.phase_at",
+            motion.phase_at,
+            {"t": np.array([[0.0, 0.1], [0.0, 0.1]])},
+        ),
         ValidCall("Motion.runs_forward", motion.runs_forward),
         ValidCall("Motion.time_at", motion.time_at, {"s": np.array([0.0, 0.5])}),
         ValidCall("Motion.time_scaled", motion.time_scaled, {"factor": 2.0}),
         ValidCall(
             "evaluate_trajectories",
             cnpgen.evaluate_trajectories,
-            {"problem": "airhockey", "trajectories": [cnpgen.trajectories.Trajectory(t, q)], "noise": 1e-3},
+            {
+                "problem": "airhockey",
+                "trajectories": [cnpgen.trajectories.Trajectory(t, q)],
+                "noise": 1e-3,
+            },
         ),
-        ValidCall("fit_motion", cnpgen.trajectories.fit_motion, {"t": t, "q": q, "spec": recipes.TrajectorySpec()}),
+        ValidCall(
+            "fit_motion",
+            cnpgen.trajectories.fit_motion,
+            {"t": t, "q": q, "spec": recipes.TrajectorySpec()},
+        ),
     ]
 
 
@@ -198,20 +279,49 @@ def _of_plans(folder: Path, plans: Any) -> list[ValidCall]:
     small = frozenset({"rate"})  # of 10^9 samples a second
     return [
         ValidCall("load_plans", cnpgen.load_plans, {"path": folder / "plans.h5"}),
-        ValidCall("load_boundary_problems", cnpgen.load_boundary_problems, {"path": folder / "set", "n": 2}),
-        ValidCall("save_plans", cnpgen.save_plans, {"path": folder / "saved.h5", "plans": plans}),
-        ValidCall("make_plans", cnpgen.make_plans, {"problem": "airhockey", "boundary": plans.boundary, **control}),
+        ValidCall(
+            "load_boundary_problems",
+            cnpgen.load_boundary_problems,
+            {"path": folder / "set", "n": 2},
+        ),
+        ValidCall(
+            "save_plans",
+            cnpgen.save_plans,
+            {"path": folder / "saved.h5", "plans": plans},
+        ),
+        ValidCall(
+            "make_plans",
+            cnpgen.make_plans,
+            {"problem": "airhockey", "boundary": plans.boundary, **control},
+        ),
         ValidCall("Plans", cnpgen.Plans, _fields(plans)),
         ValidCall("Plans.__getitem__", plans.__getitem__, {"which": 0}),
         ValidCall("Plans.states_at", plans.states_at, {"time": 0.1}),
-        ValidCall("join_plans", cnpgen.join_plans, {"first": plans, "following": plans, "at": np.zeros(len(plans))}),
-        ValidCall("evaluate_plans", cnpgen.evaluate_plans, {"plans": plans[:1], "workers": 1}),
         ValidCall(
-            "export_plans", cnpgen.export_plans, {"plans": plans[:1], "out": folder / "plan.csv", "to": "csv"}, small
+            "join_plans",
+            cnpgen.join_plans,
+            {"first": plans, "following": plans, "at": np.zeros(len(plans))},
+        ),
+        ValidCall(
+            "evaluate_plans", cnpgen.evaluate_plans, {"plans": plans[:1], "workers": 1}
+        ),
+        ValidCall(
+            "export_plans",
+            cnpgen.export_plans,
+            {"plans": plans[:1], "out": folder / "plan.csv", "to": "csv"},
+            small,
         ),
         ValidCall("explain_plans", cnpgen.explain_plans, {"plans": plans[:1]}),
-        ValidCall("refine_plans", cnpgen.refine_plans, {"plans": plans[:1], "options": options, "workers": 1}),
-        ValidCall("solve_plans", cnpgen.solve_plans, {"problems": plans[:0], "options": options, "workers": 1}),
+        ValidCall(
+            "refine_plans",
+            cnpgen.refine_plans,
+            {"plans": plans[:1], "options": options, "workers": 1},
+        ),
+        ValidCall(
+            "solve_plans",
+            cnpgen.solve_plans,
+            {"problems": plans[:0], "options": options, "workers": 1},
+        ),
         ValidCall("RefineOptions", cnpgen.RefineOptions),
         ValidCall("RefineOptions.document", options.document),
     ]
@@ -237,22 +347,47 @@ def _of_planners(folder: Path, model: Any, dataset: Any, plans: Any) -> list[Val
     long_runs = frozenset({"steps", "epochs", "cpu_seconds", "check_rows"})
     settings = cnpgen.TrainingSettings(hidden=8, layers=1, batch_size=8, nodes=16)
     return [
-        ValidCall("load_model", cnpgen.load_model, {"name_or_path": folder / "model.h5"}),
-        ValidCall("save_model", cnpgen.save_model, {"path": folder / "saved_model.h5", "model": model}),
+        ValidCall(
+            "load_model", cnpgen.load_model, {"name_or_path": folder / "model.h5"}
+        ),
+        ValidCall(
+            "save_model",
+            cnpgen.save_model,
+            {"path": folder / "saved_model.h5", "model": model},
+        ),
         ValidCall("Model.outputs", model.outputs, {"tasks": tasks}),
         ValidCall("Planner", cnpgen.Planner, {"model": model, "backend": "numpy"}),
-        ValidCall("Planner.plan", planner.plan, {"start_q": base, "goal_q": base + 0.1}),
-        ValidCall("Planner.plan_batch", planner.plan_batch, {"boundary": rest.boundary}),
-        ValidCall("Planner.replan", planner.replan, {"plans": rest, "time": 0.0, "goal_q": base + 0.2}),
         ValidCall(
-            "plan_hits",
-            cnpgen.plan_hits,
-            {"planner": hits, "state": state, "puck": [1.0, 0.1], "target": [2.4, 0.0], "speed_share": 0.5},
+            "Planner.plan", planner.plan, {"start_q": base, "goal_q": base + 0.1}
+        ),
+        ValidCall(
+            "Planner.plan_batch", planner.plan_batch, {"boundary": rest.boundary}
+        ),
+        ValidCall(
+            "Planner.replan",
+            planner.replan,
+            {"plans": rest, "time": 0.0, "goal_q": base + 0.2},
         ),
         ValidCall(
             "plan_hits",
             cnpgen.plan_hits,
-            {"planner": moving, "state": state, "puck": np.array([1.0, 0.1]), "target": np.array([2.4, 0.0])}
+            {
+                "planner": hits,
+                "state": state,
+                "puck": [1.0, 0.1],
+                "target": [2.4, 0.0],
+                "speed_share": 0.5,
+            },
+        ),
+        ValidCall(
+            "plan_hits",
+            cnpgen.plan_hits,
+            {
+                "planner": moving,
+                "state": state,
+                "puck": np.array([1.0, 0.1]),
+                "target": np.array([2.4, 0.0]),
+            }
             | {
                 "puck_velocity": np.array([-0.3, 0.1]),
                 "meeting_time": 0.9,
@@ -266,7 +401,11 @@ def _of_planners(folder: Path, model: Any, dataset: Any, plans: Any) -> list[Val
         ValidCall(
             "BoundaryLayer.check_shapes",
             layer.check_shapes,
-            {"tasks": tasks, "phi": outputs["phi"].shape, "log_rate": outputs["log_rate"].shape},
+            {
+                "tasks": tasks,
+                "phi": outputs["phi"].shape,
+                "log_rate": outputs["log_rate"].shape,
+            },
         ),
         ValidCall("BoundaryLayer.plans", layer.plans, outputs),
         ValidCall("BoundaryLayer.tasks", layer.tasks, {"boundary": plans.boundary}),
@@ -275,7 +414,13 @@ def _of_planners(folder: Path, model: Any, dataset: Any, plans: Any) -> list[Val
         ValidCall(
             "train_model",
             cnpgen.train_model,
-            {"folder": folder / "set", "out": folder / "trained.h5", "settings": settings, "steps": 1, "workers": 1},
+            {
+                "folder": folder / "set",
+                "out": folder / "trained.h5",
+                "settings": settings,
+                "steps": 1,
+                "workers": 1,
+            },
             long_runs,
         ),
     ]
@@ -291,27 +436,52 @@ def _of_losses(problem: Any, plans: Any) -> list[ValidCall]:
     margins = losses.suggested_margins(problem)
     return [
         ValidCall("PlanLoss", cnpgen.PlanLoss, {"problem": problem}),
-        ValidCall("PlanLoss.__call__", loss.__call__, {**control, "weights": weights, "obstacle_poses": poses}),
-        ValidCall("PlanLoss.checked_weights", loss.checked_weights, {"weights": weights}),
+        ValidCall(
+            "PlanLoss.__call__",
+            loss.__call__,
+            {**control, "weights": weights, "obstacle_poses": poses},
+        ),
+        ValidCall(
+            "PlanLoss.checked_weights", loss.checked_weights, {"weights": weights}
+        ),
         ValidCall(
             "PlanLoss.check_shapes",
             loss.check_shapes,
-            {name: values.shape for name, values in {**control, "obstacle_poses": poses, "weights": weights}.items()},
+            {
+                name: values.shape
+                for name, values in {
+                    **control,
+                    "obstacle_poses": poses,
+                    "weights": weights,
+                }.items()
+            },
         ),
         ValidCall("PlanLoss.load_kernels", loss.load_kernels),
-        ValidCall("PlanLoss.ordered_weights", loss.ordered_weights, {"weights": weights}),
+        ValidCall(
+            "PlanLoss.ordered_weights", loss.ordered_weights, {"weights": weights}
+        ),
         ValidCall("Margins", losses.Margins),
         ValidCall("Margins.tightening", margins.tightening, {"terms": loss.terms[1:]}),
         ValidCall("suggested_margins", losses.suggested_margins, {"problem": problem}),
         ValidCall("Metric", losses.Metric, {"weights": weights, "budgets": budgets}),
         ValidCall("Metric.end_epoch", metric.end_epoch, {"progress": 0.5}),
         ValidCall("Metric.load_state", metric.load_state, {"state": metric.state()}),
-        ValidCall("Metric.observe", metric.observe, {"terms": np.ones((3, len(weights))), "progress": 0.5}),
+        ValidCall(
+            "Metric.observe",
+            metric.observe,
+            {"terms": np.ones((3, len(weights))), "progress": 0.5},
+        ),
         ValidCall("Metric.state", metric.state),
         ValidCall("Metric.weights", metric.weights, {"progress": 0.5}),
         ValidCall("MetricSettings", losses.MetricSettings),
-        ValidCall("MetricSettings.grown", losses.MetricSettings().grown, {"progress": 0.5}),
-        ValidCall("suggested_weights", losses.suggested_weights, {"problem": problem, "weights0": weights}),
+        ValidCall(
+            "MetricSettings.grown", losses.MetricSettings().grown, {"progress": 0.5}
+        ),
+        ValidCall(
+            "suggested_weights",
+            losses.suggested_weights,
+            {"problem": problem, "weights0": weights},
+        ),
         ValidCall("rotating_shift", losses.rotating_shift, {"step": 3}),
     ]
 
@@ -324,24 +494,42 @@ def _of_benchmark(folder: Path, problem: Any, plans: Any) -> list[ValidCall]:
     scenario = benchmark.load_suite("replan").replanning
     prefix = benchmark.ExecutedPrefix(plans.motion, plans.duration / 2)
     return [
-        ValidCall("ReplanningScenario", benchmark.ReplanningScenario, _fields(scenario)),
+        ValidCall(
+            "ReplanningScenario", benchmark.ReplanningScenario, _fields(scenario)
+        ),
         ValidCall("ReplanningScenario.validate", scenario.validate),
         ValidCall("load_suite", benchmark.load_suite, {"name_or_path": "hits-81"}),
         ValidCall("Suite", benchmark.Suite, _fields(suite)),
         ValidCall("Suite.validate", suite.validate),
         ValidCall("Suite.problems", suite.problems, {"n": 1}),
-        ValidCall("SampledProblems", benchmark.SampledProblems, {"recipe": "airhockey-hit"}),
-        ValidCall("SceneFileProblems", benchmark.SceneFileProblems, {"file": "scenes.h5", "robot": "panda"}),
+        ValidCall(
+            "SampledProblems", benchmark.SampledProblems, {"recipe": "airhockey-hit"}
+        ),
+        ValidCall(
+            "SceneFileProblems",
+            benchmark.SceneFileProblems,
+            {"file": "scenes.h5", "robot": "panda"},
+        ),
         ValidCall("Pucks", benchmark.Pucks, _fields(suite.pucks)),
         ValidCall("Pucks.validate", suite.pucks.validate),
         ValidCall("Pucks.positions", suite.pucks.positions),
         ValidCall("Plant", benchmark.Plant, {"name": "mine", "title": "mine"}),
         ValidCall("Setting", benchmark.Setting, {"problem": plans.problem}),
-        ValidCall("Setting.random", benchmark.Setting(plans.problem).random, {"problem": plans}),
+        ValidCall(
+            "Setting.random",
+            benchmark.Setting(plans.problem).random,
+            {"problem": plans},
+        ),
         ValidCall(
             "run_benchmark",
             benchmark.run_benchmark,
-            {"suite": "hits-81", "folder": folder / "ran", "planners": ["cnpgen"], "n": 1, "workers": 1},
+            {
+                "suite": "hits-81",
+                "folder": folder / "ran",
+                "planners": ["cnpgen"],
+                "n": 1,
+                "workers": 1,
+            },
             frozenset({"n", "repeat"}),  # large ones are valid and run the whole suite
         ),
         ValidCall("Benchmark.summary", ran.summary),
@@ -352,16 +540,28 @@ def _of_benchmark(folder: Path, problem: Any, plans: Any) -> list[ValidCall]:
             frozenset({"video"}),
         ),
         ValidCall(
-            "save_benchmark_tables", benchmark.save_benchmark_tables, {"benchmark": ran, "folder": folder / "ran"}
+            "save_benchmark_tables",
+            benchmark.save_benchmark_tables,
+            {"benchmark": ran, "folder": folder / "ran"},
         ),
         ValidCall(
-            "save_benchmark_figures", benchmark.save_benchmark_figures, {"benchmark": ran, "folder": folder / "ran"}
+            "save_benchmark_figures",
+            benchmark.save_benchmark_figures,
+            {"benchmark": ran, "folder": folder / "ran"},
         ),
-        ValidCall("simulate_plans", benchmark.simulate_plans, {"plans": plans[:0], "workers": 1}),
+        ValidCall(
+            "simulate_plans",
+            benchmark.simulate_plans,
+            {"plans": plans[:0], "workers": 1},
+        ),
         ValidCall("Trajectory", benchmark.Trajectory, {"t": path.t, "q": path.q}),
         ValidCall("Trajectory.states", path.states, {"t": np.array([0.1, 0.5])}),
         ValidCall("Trajectory.jerks", path.jerks, {"t": np.array([0.1, 0.5])}),
-        ValidCall("ExecutedPrefix", benchmark.ExecutedPrefix, {"motion": prefix.motion, "until": prefix.until}),
+        ValidCall(
+            "ExecutedPrefix",
+            benchmark.ExecutedPrefix,
+            {"motion": prefix.motion, "until": prefix.until},
+        ),
         ValidCall("ExecutedPrefix.__getitem__", prefix.__getitem__, {"index": 0}),
     ]
 
@@ -371,15 +571,27 @@ def _of_recipes(problem: Any) -> list[ValidCall]:
     stored = record_problem(problem)
     return [
         ValidCall("list_recipes", recipes.list_recipes, {"kind": "dataset"}),
-        ValidCall("load_dataset_recipe", recipes.load_dataset_recipe, {"name_or_path": "airhockey-hit"}),
-        ValidCall("load_pipeline", recipes.load_pipeline, {"name_or_path": "airhockey-hit"}),
+        ValidCall(
+            "load_dataset_recipe",
+            recipes.load_dataset_recipe,
+            {"name_or_path": "airhockey-hit"},
+        ),
+        ValidCall(
+            "load_pipeline", recipes.load_pipeline, {"name_or_path": "airhockey-hit"}
+        ),
         ValidCall("DatasetRecipe", recipes.DatasetRecipe, _fields(recipe)),
         ValidCall("Pipeline", recipes.Pipeline, _fields(recipe.pipeline)),
         ValidCall("Pipeline.validate", recipe.pipeline.validate),
-        ValidCall("ProblemRecord", recipes.ProblemRecord, {"recipe": stored.recipe, "urdf": stored.urdf}),
+        ValidCall(
+            "ProblemRecord",
+            recipes.ProblemRecord,
+            {"recipe": stored.recipe, "urdf": stored.urdf},
+        ),
         ValidCall("ProblemRecord.differences", stored.differences, {"other": stored}),
         ValidCall("ProblemRecord.restored", stored.restored),
-        ValidCall("ProblemRecord.tip_positions", stored.tip_positions, {"q": np.zeros((2, 6))}),
+        ValidCall(
+            "ProblemRecord.tip_positions", stored.tip_positions, {"q": np.zeros((2, 6))}
+        ),
     ]
 
 
@@ -387,21 +599,45 @@ def _of_scenes(folder: Path) -> list[ValidCall]:
     problem = cnpgen.load_problem("heavy-object")
     start = np.array([-0.6, 0.0, 0.0, -1.5, 0.0, 1.2, 0.8])
     goal = start + np.array([0.4, *np.zeros(6)])
-    post = recipes.Obstacle(name="post", kind="cylinder", position=(0.0, 0.9, 0.3), radius=0.05, length=0.6)
-    scene = scenes.SceneProblem(name="post", obstacles=(post,), start_q=start, goal_q=goal[None])
+    post = recipes.Obstacle(
+        name="post", kind="cylinder", position=(0.0, 0.9, 0.3), radius=0.05, length=0.6
+    )
+    scene = scenes.SceneProblem(
+        name="post", obstacles=(post,), start_q=start, goal_q=goal[None]
+    )
     scenes.save_scenes(folder / "scenes.h5", [scene])
     grasp = scenes.Grasp(np.array([0.5, 0.2, 0.3]), np.array([0.0, 0.0, -1.0]))
     return [
         ValidCall("load_scenes", scenes.load_scenes, {"path": folder / "scenes.h5"}),
-        ValidCall("save_scenes", scenes.save_scenes, {"path": folder / "saved_scenes.h5", "scenes": [scene]}),
-        ValidCall("scene_plans", scenes.scene_plans, {"problem": problem, "scenes": [scene]}),
+        ValidCall(
+            "save_scenes",
+            scenes.save_scenes,
+            {"path": folder / "saved_scenes.h5", "scenes": [scene]},
+        ),
+        ValidCall(
+            "scene_plans", scenes.scene_plans, {"problem": problem, "scenes": [scene]}
+        ),
         ValidCall("load_family", scenes.load_family, {"name": "tabletop"}),
         ValidCall("observe", scenes.observe, {"scenes": [scene], "kind": "tokens"}),
         ValidCall("scene_bodies", scenes.scene_bodies, {"scenes": [scene]}),
-        ValidCall("BatchObserver", scenes.BatchObserver, {"kind": "tokens", "scenes": lambda _: [scene]}),
-        ValidCall("obstacles_of_points", scenes.obstacles_of_points, {"points": np.eye(3), "radius": 0.01}),
-        ValidCall("make_mesh", scenes.make_mesh, {"name": "rock", "points": np.eye(4, 3)}),
-        ValidCall("GoalPose", scenes.GoalPose, {"frame": "", "position": start[:3], "rotation": np.eye(3)}),
+        ValidCall(
+            "BatchObserver",
+            scenes.BatchObserver,
+            {"kind": "tokens", "scenes": lambda _: [scene]},
+        ),
+        ValidCall(
+            "obstacles_of_points",
+            scenes.obstacles_of_points,
+            {"points": np.eye(3), "radius": 0.01},
+        ),
+        ValidCall(
+            "make_mesh", scenes.make_mesh, {"name": "rock", "points": np.eye(4, 3)}
+        ),
+        ValidCall(
+            "GoalPose",
+            scenes.GoalPose,
+            {"frame": "", "position": start[:3], "rotation": np.eye(3)},
+        ),
         ValidCall("Grasp", scenes.Grasp, _fields(grasp)),
         ValidCall("Layout", scenes.Layout, {"obstacles": (post,), "grasps": (grasp,)}),
         ValidCall("SceneProblem", scenes.SceneProblem, _fields(scene)),
@@ -415,14 +651,20 @@ def _of_sampled(folder: Path, problem: Any, plans: Any) -> list[ValidCall]:
     fitted = plans.motion[[0]]
     return [
         ValidCall(
-            "load_trajectories", trajectories.load_trajectories, {"path": folder / "exported", "problem": problem}
+            "load_trajectories",
+            trajectories.load_trajectories,
+            {"path": folder / "exported", "problem": problem},
         ),
         ValidCall(
             "import_trajectories",
             trajectories.import_trajectories,
             {"problem": problem, "trajectories": [sampled]},
         ),
-        ValidCall("largest_error", trajectories.largest_error, {"motion": fitted, "t": sampled.t, "q": sampled.q}),
+        ValidCall(
+            "largest_error",
+            trajectories.largest_error,
+            {"motion": fitted, "t": sampled.t, "q": sampled.q},
+        ),
     ]
 
 
@@ -434,9 +676,17 @@ def _of_runtime() -> list[ValidCall]:
     return [
         ValidCall("PlanRuntime", results.PlanRuntime, {"planner": planner, "q": base}),
         ValidCall("PlanRuntime.state_at", runtime.state_at, {"time": 0.0}),
-        ValidCall("PlanRuntime.set_point", results.PlanRuntime(planner, base).set_point, {"time": 0.0}),
+        ValidCall(
+            "PlanRuntime.set_point",
+            results.PlanRuntime(planner, base).set_point,
+            {"time": 0.0},
+        ),
         ValidCall("PlanRuntime.switch", runtime.switch, {"plan": plan, "at": 0.0}),
         ValidCall("PlanRuntime.stop", runtime.stop, {"at": 0.0}),
-        ValidCall("PlanRuntime.replan", runtime.replan, {"make_plan": lambda *_: plan, "at": 0.0}),
+        ValidCall(
+            "PlanRuntime.replan",
+            runtime.replan,
+            {"make_plan": lambda *_: plan, "at": 0.0},
+        ),
         ValidCall("PlanRuntime.close", runtime.close),
     ]

@@ -27,24 +27,57 @@ def _boundary_with(plan: Plan, value: float) -> Plan:
 
 GARBAGE: dict[str, tuple[Callable[[Plan], Plan], str | None]] = {
     "nan in the path": (lambda plan: _with(plan, "path", (5, 2), np.nan), "not finite"),
-    "inf in the path": (lambda plan: _with(plan, "path", (0, 0), -np.inf), "not finite"),
+    "inf in the path": (
+        lambda plan: _with(plan, "path", (0, 0), -np.inf),
+        "not finite",
+    ),
     "nan in the rate": (lambda plan: _with(plan, "rate", (7,), np.nan), "not finite"),
     "inf in the rate": (lambda plan: _with(plan, "rate", (7,), np.inf), "not finite"),
     "nan in the boundary": (lambda plan: _boundary_with(plan, np.nan), "not finite"),
-    "nan as the goal": (lambda plan: replace(plan, goal_xyz=plan.goal_xyz * np.nan), "not finite"),
-    "no rate": (lambda plan: plan.changed(rate=0 * plan.motion.rate), "rate not positive"),
-    "backwards": (lambda plan: plan.changed(rate=-plan.motion.rate), "rate not positive"),
-    "partly backwards": (lambda plan: _with(plan, "rate", (9,), -50.0), "rate not positive"),
-    "zero rate at the goal": (lambda plan: _with(plan, "rate", (19,), 0.0), "rate not positive"),
-    "a control point below 0, r above": (lambda plan: _with(plan, "rate", (9,), -0.1), None),
-    "a very slow rate": (lambda plan: plan.changed(rate=plan.motion.rate * 1e-7), "too long"),
-    "an infinite duration": (lambda plan: plan.changed(rate=plan.motion.rate * 1e-306), "too long"),
+    "nan as the goal": (
+        lambda plan: replace(plan, goal_xyz=plan.goal_xyz * np.nan),
+        "not finite",
+    ),
+    "no rate": (
+        lambda plan: plan.changed(rate=0 * plan.motion.rate),
+        "rate not positive",
+    ),
+    "backwards": (
+        lambda plan: plan.changed(rate=-plan.motion.rate),
+        "rate not positive",
+    ),
+    "partly backwards": (
+        lambda plan: _with(plan, "rate", (9,), -50.0),
+        "rate not positive",
+    ),
+    "zero rate at the goal": (
+        lambda plan: _with(plan, "rate", (19,), 0.0),
+        "rate not positive",
+    ),
+    "a control point below 0, r above": (
+        lambda plan: _with(plan, "rate", (9,), -0.1),
+        None,
+    ),
+    "a very slow rate": (
+        lambda plan: plan.changed(rate=plan.motion.rate * 1e-7),
+        "too long",
+    ),
+    "an infinite duration": (
+        lambda plan: plan.changed(rate=plan.motion.rate * 1e-306),
+        "too long",
+    ),
     "a very fast rate": (lambda plan: plan.changed(rate=plan.motion.rate * 1e12), None),
-    "an overflowing rate": (lambda plan: plan.changed(rate=plan.motion.rate * 1e300), "not finite"),
+    "an overflowing rate": (
+        lambda plan: plan.changed(rate=plan.motion.rate * 1e300),
+        "not finite",
+    ),
     "meters of error": (lambda plan: perturbed(plan, 100.0), None),
     "very large control points": (lambda plan: perturbed(plan, 1e150), None),
     "squares that overflow": (lambda plan: perturbed(plan, 1e300), None),
-    "a path of zeros": (lambda plan: plan.changed(path=0 * plan.motion.path), "boundary conditions"),
+    "a path of zeros": (
+        lambda plan: plan.changed(path=0 * plan.motion.path),
+        "boundary conditions",
+    ),
     "very large speeds": (lambda plan: _with(plan, "rate", (10,), 1e200), None),
 }
 
@@ -88,8 +121,12 @@ def test_invalid_inputs_do_not_change_the_other_verdicts(label):
         lambda plan: plan.changed(path=plan.motion.path[:, :7]),
         lambda plan: plan.changed(rate=plan.motion.rate[0]),
         lambda plan: plan.changed(rate=np.ones((2, 20))),
-        lambda plan: replace(plan, boundary=replace(plan.boundary, start_ddq=np.zeros((1, 7)))),
-        lambda plan: replace(plan, boundary=replace(plan.boundary, goal_ddq=np.zeros((3, 6)))),
+        lambda plan: replace(
+            plan, boundary=replace(plan.boundary, start_ddq=np.zeros((1, 7)))
+        ),
+        lambda plan: replace(
+            plan, boundary=replace(plan.boundary, goal_ddq=np.zeros((3, 6)))
+        ),
     ],
 )
 def test_shapes_that_do_not_match_raise_a_usage_error(change):
@@ -99,5 +136,7 @@ def test_shapes_that_do_not_match_raise_a_usage_error(change):
 
 @pytest.mark.parametrize("step", [0.0, -1e-3, np.nan, np.inf, 0.0101, 5.0])
 def test_a_time_step_must_be_positive_and_short_enough(step):
-    with pytest.raises(UsageError, match=r"time step must be above 0 and at most 0\.01 s, got"):
+    with pytest.raises(
+        UsageError, match=r"time step must be above 0 and at most 0\.01 s, got"
+    ):
         load("hit").judged(step=step)

@@ -7,7 +7,14 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cnpgen.judges.rows.hits import HitRule, _gradients, hit_rule, judge_goals, repeated_fraction, speed_fractions
+from cnpgen.judges.rows.hits import (
+    HitRule,
+    _gradients,
+    hit_rule,
+    judge_goals,
+    repeated_fraction,
+    speed_fractions,
+)
 from cnpgen.judges.rows.verify import verify_rows
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
@@ -16,14 +23,21 @@ from tests.conftest import columns_of
 PROBLEM = load_problem("airhockey")
 ROBOT = load_robot(PROBLEM)
 FRAME = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-RULES = {"airhockey-hit": HitRule("base", 0.5), "airhockey-replan": HitRule("start", 0.2)}
+RULES = {
+    "airhockey-hit": HitRule("base", 0.5),
+    "airhockey-replan": HitRule("start", 0.2),
+}
 ROWS = 60
 
 Columns = dict[str, np.ndarray]
 
 
 def jacobian(q: np.ndarray) -> np.ndarray:
-    return np.array(pin.computeFrameJacobian(ROBOT.model, ROBOT.model.createData(), q, ROBOT.tip_frame, FRAME)[:3])
+    return np.array(
+        pin.computeFrameJacobian(
+            ROBOT.model, ROBOT.model.createData(), q, ROBOT.tip_frame, FRAME
+        )[:3]
+    )
 
 
 def value(q: np.ndarray, home: np.ndarray, angle: float) -> float:
@@ -33,7 +47,10 @@ def value(q: np.ndarray, home: np.ndarray, angle: float) -> float:
 
 @pytest.fixture(params=RULES)
 def rows(request: pytest.FixtureRequest, tiny: Callable) -> tuple[Columns, HitRule]:
-    columns = {name: values[:ROWS].copy() for name, values in columns_of(tiny(request.param)).items()}
+    columns = {
+        name: values[:ROWS].copy()
+        for name, values in columns_of(tiny(request.param)).items()
+    }
     return columns, RULES[request.param]
 
 
@@ -51,7 +68,8 @@ def test_the_gradient_agrees_with_differences_up_to_rows_of_the_jacobian() -> No
         q, home = (ROBOT.base + random.uniform(-0.5, 0.5, ROBOT.n) for _ in range(2))
         angle, step = random.uniform(-1, 1), 1e-6
         differences = [
-            (value(q + e, home, angle) - value(q - e, home, angle)) / (2 * step) for e in step * np.eye(ROBOT.n)
+            (value(q + e, home, angle) - value(q - e, home, angle)) / (2 * step)
+            for e in step * np.eye(ROBOT.n)
         ]
         (J,), (gradient,) = _gradients(ROBOT, q[None], home[None], direction(angle))
         np.testing.assert_array_equal(J, jacobian(q))
@@ -63,7 +81,9 @@ def test_the_goals_of_datasets_pass(rows: tuple[Columns, HitRule]) -> None:
     columns, rule = rows
     report = verify_rows(PROBLEM, ROBOT, columns, rule=rule)
     assert report.ok
-    assert {"hitting configuration", "hitting velocity"} <= {check.name for check in report.checks}
+    assert {"hitting configuration", "hitting velocity"} <= {
+        check.name for check in report.checks
+    }
     assert repeated_fraction(speed_fractions(columns), "float64") == (0, 0.0)
 
 
@@ -73,7 +93,9 @@ def test_without_a_rule_goals_are_not_checked(rows: tuple[Columns, HitRule]) -> 
     assert not {"hitting configuration", "hitting velocity"} & names
 
 
-def test_another_configuration_with_the_same_tip_position_is_reported(rows: tuple[Columns, HitRule]) -> None:
+def test_another_configuration_with_the_same_tip_position_is_reported(
+    rows: tuple[Columns, HitRule],
+) -> None:
     """The arm moves in its null space, and all dependent fields are recomputed."""
     columns, rule = rows
     for row in range(ROWS):
@@ -82,12 +104,18 @@ def test_another_configuration_with_the_same_tip_position_is_reported(rows: tupl
             step = np.linalg.svd(jacobian(q))[2][-1]
             q = q + 1e-4 * step * np.sign(step[0])
             for _ in range(3):
-                pin.framesForwardKinematics(ROBOT.model, data := ROBOT.model.createData(), q)
+                pin.framesForwardKinematics(
+                    ROBOT.model, data := ROBOT.model.createData(), q
+                )
                 q = q - np.linalg.pinv(jacobian(q)) @ (
                     data.oMf[ROBOT.tip_frame].translation - columns["goal_xyz"][row]
                 )  # fmt: skip
         columns["goal_q"][row] = q
-    columns = {name: values for name, values in columns.items() if not name.startswith(("hit_speed", "goal_dq"))}
+    columns = {
+        name: values
+        for name, values in columns.items()
+        if not name.startswith(("hit_speed", "goal_dq"))
+    }
     columns["goal_dq"] = np.zeros((ROWS, ROBOT.n))
     report = verify_rows(PROBLEM, ROBOT, columns, rule=HitRule(rule.near))
     (failed,) = report.failed
@@ -108,17 +136,23 @@ def test_f_may_increase_towards_an_active_joint_limit() -> None:
     (J,), (gradient,) = _gradients(ROBOT, q[None], q[None], direction(0.3))
     columns = {"goal_q": q[None], "start_q": q[None], "hit_angle": np.array([[0.3]])}
     free = [0, 1, 3]  # as many as tip coordinates, so f cannot increase along them
-    projected = gradient - J.T @ np.linalg.lstsq(J[:, free].T, gradient[free], rcond=None)[0]
+    projected = (
+        gradient - J.T @ np.linalg.lstsq(J[:, free].T, gradient[free], rcond=None)[0]
+    )
     for outwards in (True, False):
         lower, upper = ROBOT.position_lower.copy(), ROBOT.position_upper.copy()
         for joint in set(range(ROBOT.n)) - set(free):
             (upper if (projected[joint] > 0) == outwards else lower)[joint] = q[joint]
         robot = replace(ROBOT, position_lower=lower, position_upper=upper)
-        ((check, _),) = judge_goals(robot, HitRule("start"), columns, np.arange(1), "float64")
+        ((check, _),) = judge_goals(
+            robot, HitRule("start"), columns, np.arange(1), "float64"
+        )
         assert check.n_failed == (0 if outwards else 1)
 
 
-def test_a_hit_that_is_not_a_fraction_of_the_fastest_is_reported(rows: tuple[Columns, HitRule]) -> None:
+def test_a_hit_that_is_not_a_fraction_of_the_fastest_is_reported(
+    rows: tuple[Columns, HitRule],
+) -> None:
     """The same tip speed with other joint velocities, of which it is not the largest multiple."""
     columns, rule = rows
     slow = np.flatnonzero(columns["hit_speed"] < 0.8 * columns["hit_speed_max"])
@@ -127,13 +161,19 @@ def test_a_hit_that_is_not_a_fraction_of_the_fastest_is_reported(rows: tuple[Col
     columns["goal_dq"][row] = np.linalg.pinv(J) @ (J @ columns["goal_dq"][row])
     columns["goal_dq"][row] += 0.9 * np.linalg.svd(J)[2][-1]
     report = verify_rows(PROBLEM, ROBOT, columns, rule=rule)
-    assert {check.name: check.worst_row for check in report.failed} == {"hitting velocity": row}
+    assert {check.name: check.worst_row for check in report.failed} == {
+        "hitting velocity": row
+    }
 
 
-def test_a_slower_hit_is_reported_if_all_hits_are_at_full_speed(rows: tuple[Columns, HitRule]) -> None:
+def test_a_slower_hit_is_reported_if_all_hits_are_at_full_speed(
+    rows: tuple[Columns, HitRule],
+) -> None:
     columns, _ = rows
     slow = np.flatnonzero(columns["hit_speed"] < columns["hit_speed_max"])
-    judged = judge_goals(ROBOT, HitRule(full_speed=1.0), wide(columns), np.arange(ROWS), "float64")
+    judged = judge_goals(
+        ROBOT, HitRule(full_speed=1.0), wide(columns), np.arange(ROWS), "float64"
+    )
     assert judged[0][1].tolist() == slow.tolist()
 
 
@@ -142,7 +182,10 @@ def test_hits_with_halved_speeds_are_reported(dtype: str) -> None:
     random = np.random.default_rng(1)
     highest = random.uniform(0.5, 2.0, 20_000)
     fraction = np.where(random.random(20_000) < 0.3, 1.0, random.random(20_000))
-    speeds = {"hit_speed_max": highest.astype(dtype), "hit_speed": (fraction * highest).astype(dtype)}
+    speeds = {
+        "hit_speed_max": highest.astype(dtype),
+        "hit_speed": (fraction * highest).astype(dtype),
+    }
     assert repeated_fraction(speed_fractions(speeds), dtype) == (0, 0.0)
     speeds["hit_speed"] = (speeds["hit_speed"] * 0.5).astype(dtype)
     count, value_ = repeated_fraction(speed_fractions(speeds), dtype)
@@ -151,6 +194,9 @@ def test_hits_with_halved_speeds_are_reported(dtype: str) -> None:
 
 
 def test_the_rule_is_read_from_the_recorded_stages() -> None:
-    stages = [{"use": "hitting-configuration", "near": "start"}, {"use": "hitting-velocity", "full_speed": 0.25}]
+    stages = [
+        {"use": "hitting-configuration", "near": "start"},
+        {"use": "hitting-velocity", "full_speed": 0.25},
+    ]
     assert hit_rule(stages) == HitRule("start", 0.25)
     assert hit_rule([{"use": "at-rest"}, {}]) == HitRule("", None)

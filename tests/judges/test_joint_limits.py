@@ -19,9 +19,10 @@ def violations(plan: Plan, quantity: str, count: int) -> tuple[np.ndarray, np.nd
     values = getattr(reference_trajectory(plan, count), NAMES[quantity]).T
     robot = plan.robot
     if quantity == "position":
-        return np.maximum(robot.position_lower[:, None] - values, values - robot.position_upper[:, None]), np.ones(
-            robot.n
-        )
+        return np.maximum(
+            robot.position_lower[:, None] - values,
+            values - robot.position_upper[:, None],
+        ), np.ones(robot.n)
     limit = getattr(robot, f"{quantity}_limit")
     return np.abs(values) - limit[:, None], limit
 
@@ -29,7 +30,9 @@ def violations(plan: Plan, quantity: str, count: int) -> tuple[np.ndarray, np.nd
 @pytest.mark.parametrize("label", some(["replan", "transport", "hit"], 1))
 @pytest.mark.parametrize("quantity", NAMES)
 @pytest.mark.parametrize("by", some([0.2, 0.0]))
-def test_the_margin_of_a_limit_agrees_with_a_very_fine_grid(label: str, quantity: str, by: float) -> None:
+def test_the_margin_of_a_limit_agrees_with_a_very_fine_grid(
+    label: str, quantity: str, by: float
+) -> None:
     plan = perturbed(jerk_limited_plan(label), by, seed=2)
     margin = plan.judged().margins[f"joint {quantity}"]
     found, scale = violations(plan, quantity, 20001)
@@ -41,7 +44,9 @@ def test_the_margin_of_a_limit_agrees_with_a_very_fine_grid(label: str, quantity
         <= found[joint].max() + 1e-3 * margin.tolerance
     )
     exact = reference_trajectory(plan)
-    assert margin.time == pytest.approx(np.interp(margin.phase, exact.s, exact.t), abs=1e-5)
+    assert margin.time == pytest.approx(
+        np.interp(margin.phase, exact.s, exact.t), abs=1e-5
+    )
 
 
 @pytest.mark.slow
@@ -52,16 +57,24 @@ def test_violations_between_samples_count() -> None:
         found, scale = violations(plan, quantity, 200_001)
         worst = (found / scale[:, None]).max()
         for more, wanted in ((1e-6, False), (-1e-6, True)):
-            judged = plan.with_constraint(f"Joint{quantity.capitalize()}", tolerance=worst - more)
+            judged = plan.with_constraint(
+                f"Joint{quantity.capitalize()}", tolerance=worst - more
+            )
             for step in (1e-2, 1e-3):
-                assert judged.judged(step=step).margins[f"joint {quantity}"].ok is wanted
+                assert (
+                    judged.judged(step=step).margins[f"joint {quantity}"].ok is wanted
+                )
 
 
-def test_a_subclass_of_a_limit_in_another_package_is_sampled_instead_of_proven() -> None:
+def test_a_subclass_of_a_limit_in_another_package_is_sampled_instead_of_proven() -> (
+    None
+):
     class Mine(JointAcceleration):
         reason = "mine"
 
-    ours = next(c for c in load("hit").problem.constraint if type(c) is JointAcceleration)
+    ours = next(
+        c for c in load("hit").problem.constraint if type(c) is JointAcceleration
+    )
     torque = next(c for c in load("hit").problem.constraint if type(c) is JointTorque)
     assert is_proven(ours)
     assert not is_proven(torque)
@@ -69,7 +82,9 @@ def test_a_subclass_of_a_limit_in_another_package_is_sampled_instead_of_proven()
 
 
 def test_the_largest_violation_is_found_with_a_tolerance_of_zero() -> None:
-    plan = perturbed(load("replan"), 0.05, seed=3).with_constraint("JointVelocity", tolerance=0.0)
+    plan = perturbed(load("replan"), 0.05, seed=3).with_constraint(
+        "JointVelocity", tolerance=0.0
+    )
     margin = plan.judged().margins["joint velocity"]
     found, scale = violations(plan, "velocity", 20001)
     worst = found[np.argmax((found / scale[:, None]).max(axis=1))].max()

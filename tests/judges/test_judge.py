@@ -42,7 +42,11 @@ def test_a_valid_plan_passes(label):
     assert verdict.paper.broken == ()
     assert all(margin.ok for margin in verdict.margins.values())
     assert verdict.worst is not None
-    assert verdict.worst.severity == max(margin.severity for margin in verdict.margins.values()) <= 1
+    assert (
+        verdict.worst.severity
+        == max(margin.severity for margin in verdict.margins.values())
+        <= 1
+    )
 
 
 @pytest.mark.parametrize("label", ["hit", "replan", "transport"])
@@ -62,18 +66,30 @@ def test_a_motion_may_start_off_the_table_but_must_reach_it_early():
 
 
 def test_verdicts_do_not_depend_on_the_order_of_plans():
-    plans = [load("hit"), load("replan"), perturbed(load("hit"), 0.3), perturbed(load("replan"), 0.05)]
+    plans = [
+        load("hit"),
+        load("replan"),
+        perturbed(load("hit"), 0.3),
+        perturbed(load("replan"), 0.05),
+    ]
     forwards, backwards = judge(*joined(*plans)), judge(*joined(*plans[::-1]))
     single = [plan.judged() for plan in plans]
-    assert [verdict.to_dict() for verdict in forwards] == [verdict.to_dict() for verdict in backwards[::-1]]
-    assert [verdict.to_dict() for verdict in forwards] == [verdict.to_dict() for verdict in single]
+    assert [verdict.to_dict() for verdict in forwards] == [
+        verdict.to_dict() for verdict in backwards[::-1]
+    ]
+    assert [verdict.to_dict() for verdict in forwards] == [
+        verdict.to_dict() for verdict in single
+    ]
 
 
 def test_an_empty_batch_has_no_verdicts():
     empty = Boundary(*(np.zeros((0, 6)) for _ in range(5)))
     motion, xyz = Motion(np.zeros((0, 15, 6)), np.zeros((0, 20))), np.zeros((0, 3))
     scene = scene_of(PROBLEMS["airhockey"], xyz, xyz, xyz)
-    assert judge(PROBLEMS["airhockey"], ROBOTS["airhockey"], motion, empty, scene, xyz) == []
+    assert (
+        judge(PROBLEMS["airhockey"], ROBOTS["airhockey"], motion, empty, scene, xyz)
+        == []
+    )
 
 
 # --- violations ------------------------------------------------------------------------------------------------------
@@ -83,47 +99,67 @@ def violations(plan: Plan, seen: ReferenceTrajectory) -> dict[str, np.ndarray]:
     """Compute the violation of every condition independently, shape (count, values)."""
     robot = plan.robot
     found = {
-        "joint position": np.maximum(robot.position_lower - seen.q, seen.q - robot.position_upper),
+        "joint position": np.maximum(
+            robot.position_lower - seen.q, seen.q - robot.position_upper
+        ),
         "joint velocity": np.abs(seen.dq) - robot.velocity_limit,
         "joint acceleration": np.abs(seen.ddq) - robot.acceleration_limit,
         "joint torque": np.abs(seen.tau) - robot.torque_limit,
     }
     if plan.problem.name == "airhockey":
         low, high = np.array([0.6, -0.45]), np.array([2.0, 0.45])
-        found["table rectangle"] = np.maximum(low - seen.tip[:, :2], seen.tip[:, :2] - high)
+        found["table rectangle"] = np.maximum(
+            low - seen.tip[:, :2], seen.tip[:, :2] - high
+        )
         open_for = np.clip((0.3 - seen.s) / 0.2, 0, 1) * abs(seen.tip[0, 2] - 0.16)
         found["table height"] = (np.abs(seen.tip[:, 2] - 0.16) - open_for)[:, None]
     else:
-        found["tilt"] = np.arctan2(np.linalg.norm(seen.rotation[:, :2, 2], axis=1), seen.rotation[:, 2, 2])[:, None]
+        found["tilt"] = np.arctan2(
+            np.linalg.norm(seen.rotation[:, :2, 2], axis=1), seen.rotation[:, 2, 2]
+        )[:, None]
     return found
 
 
 @pytest.mark.parametrize("by", [0.003, 0.03, 0.3, 2.0])
 @pytest.mark.parametrize("label", ["hit", "replan", "transport"])
-def test_every_margin_of_a_perturbed_plan_agrees_with_an_independent_evaluation(label, by):
+def test_every_margin_of_a_perturbed_plan_agrees_with_an_independent_evaluation(
+    label, by
+):
     plan = perturbed(load(label), by)
     verdict, seen = plan.judged(), reference_trajectory(plan)
     broken = []
     for name, violation in violations(plan, seen).items():
         margin = verdict.margins[name]
-        tolerance = margin.tolerance if name not in ("joint velocity", "joint acceleration", "joint torque") else None
+        tolerance = (
+            margin.tolerance
+            if name not in ("joint velocity", "joint acceleration", "joint torque")
+            else None
+        )
         ratio = violation / (tolerance or _relative(plan, name))
         k, part = np.unravel_index(np.argmax(ratio), ratio.shape)
         assert margin.severity == pytest.approx(ratio.max(), rel=2e-3, abs=2e-3), name
-        assert margin.violation == pytest.approx(violation[k, part], rel=2e-3, abs=1e-5), name
+        assert margin.violation == pytest.approx(
+            violation[k, part], rel=2e-3, abs=1e-5
+        ), name
         at = np.interp(margin.time, seen.t, ratio.max(axis=1))
         assert at == pytest.approx(ratio.max(), rel=5e-3, abs=5e-3), name
-        assert np.interp(margin.time, seen.t, seen.s) == pytest.approx(margin.phase, abs=1e-6)
+        assert np.interp(margin.time, seen.t, seen.s) == pytest.approx(
+            margin.phase, abs=1e-6
+        )
         assert margin.ok == (margin.severity <= 1)
         broken += [name] if ratio.max() > 1 else []
     assert not verdict.valid
     assert verdict.worst is not None
     assert verdict.worst.name in {*broken, "robot clearance", "object contact"}
-    assert verdict.worst.severity == max(margin.severity for margin in verdict.margins.values())
+    assert verdict.worst.severity == max(
+        margin.severity for margin in verdict.margins.values()
+    )
 
 
 def _relative(plan: Plan, name: str) -> np.ndarray:
-    ratio = {"joint velocity": 2e-3, "joint acceleration": 5e-3, "joint torque": 5e-3}[name]
+    ratio = {"joint velocity": 2e-3, "joint acceleration": 5e-3, "joint torque": 5e-3}[
+        name
+    ]
     return ratio * getattr(plan.robot, f"{name[6:]}_limit")
 
 
@@ -138,7 +174,9 @@ def test_distances_from_the_pedestals_agree_with_coal_at_every_state(label, by):
     )
     segments, objects = [], []
 
-    def distances(q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> tuple[float, float]:
+    def distances(
+        q: np.ndarray, dq: np.ndarray, ddq: np.ndarray
+    ) -> tuple[float, float]:
         world.set_state(q, dq, ddq, poses)
         return min(world.segment_distances()), min(world.object_distances())
 
@@ -155,12 +193,17 @@ def test_distances_from_the_pedestals_agree_with_coal_at_every_state(label, by):
         assert margin.value == pytest.approx(there, abs=1e-8)
         assert margin.violation == pytest.approx(bound - margin.value, abs=1e-12)
         assert min(found) > margin.value - 1e-5  # no deeper state exists
-        assert np.interp(margin.phase, seen.s, found) == pytest.approx(margin.value, abs=2e-3 * (1 + 10 * by))
+        assert np.interp(margin.phase, seen.s, found) == pytest.approx(
+            margin.value, abs=2e-3 * (1 + 10 * by)
+        )
 
 
 def _limit(name: str, factor: float) -> Callable[[Plan], Plan]:
     def change(plan: Plan) -> Plan:
-        return replace(plan, robot=replace(plan.robot, **{name: factor * getattr(plan.robot, name)}))
+        return replace(
+            plan,
+            robot=replace(plan.robot, **{name: factor * getattr(plan.robot, name)}),
+        )
 
     return change
 
@@ -169,21 +212,57 @@ def _torque_limited(plan: Plan) -> Plan:
     """Return the plan with torque limits close to its torques."""
     largest = np.abs(reference_trajectory(plan, 401).tau).max(axis=0)
     return replace(
-        plan, robot=replace(plan.robot, torque_limit=1.5 * largest * np.array([1, 0.6, 1, 1, 1, 1, 1])[: plan.robot.n])
+        plan,
+        robot=replace(
+            plan.robot,
+            torque_limit=1.5
+            * largest
+            * np.array([1, 0.6, 1, 1, 1, 1, 1])[: plan.robot.n],
+        ),
     )
 
 
 @pytest.mark.parametrize(
     ("label", "reason", "name", "change"),
     [
-        ("replan", "joint position limit", "joint position", _limit("position_upper", 0.6)),
-        ("hit", "joint velocity limit", "joint velocity", _limit("velocity_limit", 0.9)),
-        ("hit", "joint acceleration limit", "joint acceleration", _limit("acceleration_limit", 0.9)),
+        (
+            "replan",
+            "joint position limit",
+            "joint position",
+            _limit("position_upper", 0.6),
+        ),
+        (
+            "hit",
+            "joint velocity limit",
+            "joint velocity",
+            _limit("velocity_limit", 0.9),
+        ),
+        (
+            "hit",
+            "joint acceleration limit",
+            "joint acceleration",
+            _limit("acceleration_limit", 0.9),
+        ),
         ("replan", "joint torque limit", "joint torque", _torque_limited),
         ("transport", "joint torque limit", "joint torque", _torque_limited),
-        ("hit", "off the table", "table height", lambda plan: plan.with_constraint("Table", tolerance=2e-4)),
-        ("hit", "off the table", "table height", lambda plan: plan.with_constraint("Table", z=0.163)),
-        ("transport", "not vertical", "tilt", lambda plan: plan.with_constraint("Vertical", tolerance=1e-3)),
+        (
+            "hit",
+            "off the table",
+            "table height",
+            lambda plan: plan.with_constraint("Table", tolerance=2e-4),
+        ),
+        (
+            "hit",
+            "off the table",
+            "table height",
+            lambda plan: plan.with_constraint("Table", z=0.163),
+        ),
+        (
+            "transport",
+            "not vertical",
+            "tilt",
+            lambda plan: plan.with_constraint("Vertical", tolerance=1e-3),
+        ),
         (
             "transport",
             "robot in collision",
@@ -206,7 +285,9 @@ def test_a_violated_constraint_is_named(label, reason, name, change):
     assert verdict.reason == reason
     assert verdict.worst is not None
     assert verdict.worst.name == name
-    assert [other for other, margin in verdict.margins.items() if not margin.ok] == [name]
+    assert [other for other, margin in verdict.margins.items() if not margin.ok] == [
+        name
+    ]
     assert str(verdict.worst).startswith(name)
 
 
@@ -214,7 +295,9 @@ def test_the_joint_that_violates_a_limit_is_named():
     plan = load("hit")
     limit = plan.robot.velocity_limit.copy()
     limit[2] *= 0.5
-    worst = replace(plan, robot=replace(plan.robot, velocity_limit=limit)).judged().worst
+    worst = (
+        replace(plan, robot=replace(plan.robot, velocity_limit=limit)).judged().worst
+    )
     assert worst is not None
     assert worst.part == "joint_3"
     assert abs(worst.bound) == limit[2]
@@ -235,21 +318,31 @@ def test_a_violated_boundary_condition_is_the_reason(field, by, name):
     plan = load("replan")
     changed = getattr(plan.boundary, field).copy()
     changed[0, 4] += by
-    verdict = replace(plan, boundary=replace(plan.boundary, **{field: changed})).judged()
+    verdict = replace(
+        plan, boundary=replace(plan.boundary, **{field: changed})
+    ).judged()
     assert verdict.reason == Reason.BOUNDARY
     worst = verdict.worst
     assert worst is not None
     assert (worst.name, worst.part) == (name, "joint_5")
     assert worst.violation == pytest.approx(abs(by), rel=1e-4)
     assert worst.phase == (0.0 if field.startswith("start") else 1.0)
-    assert worst.time == pytest.approx(0.0 if field.startswith("start") else verdict.metrics.duration)
+    assert worst.time == pytest.approx(
+        0.0 if field.startswith("start") else verdict.metrics.duration
+    )
 
 
 def test_a_goal_acceleration_counts_only_if_it_is_prescribed():
     plan = load("hit")
     acceleration = plan.motion.at(np.array([1.0])).ddq[:, 0]
-    assert replace(plan, boundary=replace(plan.boundary, goal_ddq=acceleration)).judged().valid
-    missed = replace(plan, boundary=replace(plan.boundary, goal_ddq=acceleration + 1e-3)).judged()
+    assert (
+        replace(plan, boundary=replace(plan.boundary, goal_ddq=acceleration))
+        .judged()
+        .valid
+    )
+    missed = replace(
+        plan, boundary=replace(plan.boundary, goal_ddq=acceleration + 1e-3)
+    ).judged()
     assert missed.reason == Reason.BOUNDARY
 
 
@@ -259,13 +352,18 @@ def test_a_narrow_maximum_between_the_points_of_a_uniform_grid_is_found():
     rate = plan.motion.rate / 3
     rate[:, 0] *= 6
     spiked = plan.changed(rate=rate)
-    coarse = np.abs(spiked.motion.at(np.linspace(0, 1, 100)).ddq[0]) / plan.robot.acceleration_limit
+    coarse = (
+        np.abs(spiked.motion.at(np.linspace(0, 1, 100)).ddq[0])
+        / plan.robot.acceleration_limit
+    )
     assert coarse.max() < 0.9
     verdict = spiked.judged()
     assert verdict.reason == "joint acceleration limit"
     assert verdict.worst is not None
     assert 0.003 < verdict.worst.phase < 0.006
-    assert abs(verdict.worst.value / verdict.worst.bound) == pytest.approx(1.667, abs=0.005)
+    assert abs(verdict.worst.value / verdict.worst.bound) == pytest.approx(
+        1.667, abs=0.005
+    )
 
 
 def test_the_same_narrow_maximum_at_the_goal_is_found():
@@ -290,8 +388,14 @@ def test_a_fast_passage_between_two_time_steps_is_found():
 
 def test_two_constraints_with_the_same_name_are_both_reported():
     plan = load("hit")
-    table = next(constraint for constraint in plan.problem.constraint if isinstance(constraint, Table))
-    both = replace(plan.problem, constraint=(*plan.problem.constraint, replace(table, z=0.17)))
+    table = next(
+        constraint
+        for constraint in plan.problem.constraint
+        if isinstance(constraint, Table)
+    )
+    both = replace(
+        plan.problem, constraint=(*plan.problem.constraint, replace(table, z=0.17))
+    )
     verdict = replace(plan, problem=both).judged()
     assert verdict.margins["table height"].ok
     assert verdict.margins["table height 2"].violation == pytest.approx(0.01, abs=1e-3)
@@ -311,15 +415,19 @@ class Constant(Constraint):
 
     def measured(self, world: Any) -> tuple[Condition, ...]:
         high = np.array([1.0])
-        return Condition("constant", "1", [self.value], -high, high, "limit"), Condition(
-            "no", "1", [], -high[:0], high[:0], "limit"
-        )
+        return Condition(
+            "constant", "1", [self.value], -high, high, "limit"
+        ), Condition("no", "1", [], -high[:0], high[:0], "limit")
 
 
-@pytest.mark.parametrize(("value", "severity"), [(0.0, -1e200), (1.0, 0.0), (1.5, 5e199), (np.nan, np.inf)])
+@pytest.mark.parametrize(
+    ("value", "severity"), [(0.0, -1e200), (1.0, 0.0), (1.5, 5e199), (np.nan, np.inf)]
+)
 def test_a_constraint_without_tolerance_and_with_one_number_is_judged(value, severity):
     plan = load("hit")
-    verdict = replace(plan, problem=replace(plan.problem, constraint=(Constant(value=value),))).judged()
+    verdict = replace(
+        plan, problem=replace(plan.problem, constraint=(Constant(value=value),))
+    ).judged()
     assert verdict.margins["constant"].severity == pytest.approx(severity)
     assert "no" not in verdict.margins
     assert verdict.reason == ("constant" if severity > 1 else "ok")

@@ -13,10 +13,17 @@ def names(problem_name: str) -> dict[str, list[str]]:
     """Return condition -> names of its values."""
     problem, world = (
         PROBLEMS[problem_name],
-        World(ROBOTS[problem_name], PROBLEMS[problem_name].obstacle, PROBLEMS[problem_name].object_size),
+        World(
+            ROBOTS[problem_name],
+            PROBLEMS[problem_name].obstacle,
+            PROBLEMS[problem_name].object_size,
+        ),
     )
     return {
-        condition.name: [name_part(problem, constraint, condition, part) for part in range(len(condition.g))]
+        condition.name: [
+            name_part(problem, constraint, condition, part)
+            for part in range(len(condition.g))
+        ]
         for constraint in problem.constraint
         for condition in constraint.measured(world)
     }
@@ -35,13 +42,16 @@ def test_obstacles_are_named_in_the_order_of_measurement() -> None:
     named = names("heavy-object")
     assert named["object contact"] == ["pedestal-1", "pedestal-2"]
     assert named["robot clearance"] == [
-        f"segment {segment}, pedestal-{number}" for segment in (1, 2, 3) for number in (1, 2)
+        f"segment {segment}, pedestal-{number}"
+        for segment in (1, 2, 3)
+        for number in (1, 2)
     ]
     assert named["tilt"] == ["x", "y"]
 
 
 @pytest.mark.parametrize(
-    ("label", "name", "obstacle"), [("transport", "start", "pedestal-1"), ("dragging", "goal", "pedestal-2")]
+    ("label", "name", "obstacle"),
+    [("transport", "start", "pedestal-1"), ("dragging", "goal", "pedestal-2")],
 )
 def test_the_closest_obstacle_is_named(label: str, name: str, obstacle: str) -> None:
     """The object is lowered by 2 cm into the pedestal on which it stands."""
@@ -50,7 +60,9 @@ def test_the_closest_obstacle_is_named(label: str, name: str, obstacle: str) -> 
     low[name == "goal"][0, 2] += 0.02
     (margin,) = [
         margin
-        for key, margin in type(plan)(plan.problem, plan.robot, plan.motion, plan.boundary, *low)
+        for key, margin in type(plan)(
+            plan.problem, plan.robot, plan.motion, plan.boundary, *low
+        )
         .judged()
         .margins.items()
         if key == "object contact"

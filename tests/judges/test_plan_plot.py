@@ -53,7 +53,9 @@ def bounding_box(patch: Any) -> Any:
     return patch.get_path().get_extents(patch.get_patch_transform())
 
 
-def test_jerks_are_drawn_if_they_are_limited(tmp_path: Path, drawn: "list[Figure]") -> None:
+def test_jerks_are_drawn_if_they_are_limited(
+    tmp_path: Path, drawn: "list[Figure]"
+) -> None:
     plan = jerk_limited_plan("hit")
     draw(plan, tmp_path / "a.png")
     draw(load("hit"), tmp_path / "b.png")
@@ -62,7 +64,9 @@ def test_jerks_are_drawn_if_they_are_limited(tmp_path: Path, drawn: "list[Figure
     assert "jerk [% of limit]" not in free
     seen = limited["jerk [% of limit]"].lines[0]
     t = reference_trajectory(plan)
-    share = 100 * np.interp(seen.get_xdata(), t.t, t.jerk[:, 0]) / plan.robot.jerk_limit[0]
+    share = (
+        100 * np.interp(seen.get_xdata(), t.t, t.jerk[:, 0]) / plan.robot.jerk_limit[0]
+    )
     np.testing.assert_allclose(seen.get_ydata(), share, atol=0.01 * np.abs(share).max())
 
 
@@ -70,7 +74,10 @@ def test_jerks_are_drawn_if_they_are_limited(tmp_path: Path, drawn: "list[Figure
     ("label", "suffix"),
     [
         *some([("hit", "png"), ("transport", "pdf"), ("hit", "svg")], 1, "slow"),
-        *(pytest.param(*each, marks=again) for each in (("transport", "png"), ("hit", "pdf"), ("transport", "svg"))),
+        *(
+            pytest.param(*each, marks=again)
+            for each in (("transport", "png"), ("hit", "pdf"), ("transport", "svg"))
+        ),
     ],
 )
 def test_a_plan_is_drawn(label, suffix, tmp_path):
@@ -90,28 +97,42 @@ def test_joints_are_drawn_relative_to_their_limits_over_time(label, drawn):
     }
     for name, share in shares.items():
         lines = axes[f"{name} [% of limit]"].get_lines()
-        for line, values, joint in zip(lines, share.T, plan.robot.joint_names, strict=False):
+        for line, values, joint in zip(
+            lines, share.T, plan.robot.joint_names, strict=False
+        ):
             assert line.get_label() == joint
             expected = np.interp(line.get_xdata(), seen.t, values)
             np.testing.assert_allclose(line.get_ydata(), 100 * expected, atol=0.5)
-    position = np.array([line.get_ydata() for line in axes["position [% of limit]"].get_lines()[: plan.robot.n]])
+    position = np.array(
+        [
+            line.get_ydata()
+            for line in axes["position [% of limit]"].get_lines()[: plan.robot.n]
+        ]
+    )
     center, half = (
         plan.robot.position_upper + plan.robot.position_lower,
         plan.robot.position_upper - plan.robot.position_lower,
     )
-    np.testing.assert_allclose(position[:, 0], 100 * (2 * seen.q[0] - center) / half, atol=1e-9)
+    np.testing.assert_allclose(
+        position[:, 0], 100 * (2 * seen.q[0] - center) / half, atol=1e-9
+    )
 
 
 def test_the_tip_is_drawn_over_the_table_with_the_valid_height(drawn):
     plan = load("hit")
     draw(plan, Path("plan.png"))
     axes, seen = axes_of(drawn[0]), reference_trajectory(plan, 2001)
-    above, beside = axes["tip over the table, one dot per 20 ms"], axes["z above the table [mm]"]
+    above, beside = (
+        axes["tip over the table, one dot per 20 ms"],
+        axes["z above the table [mm]"],
+    )
     assert above.patches[0].get_bbox().bounds == pytest.approx((0.6, -0.45, 1.4, 0.9))
     x, y = above.get_lines()[0].get_data()
     np.testing.assert_allclose([x[-1], y[-1]], seen.tip[-1, :2], atol=1e-9)
     t, z = beside.get_lines()[0].get_data()
-    np.testing.assert_allclose(z, 1e3 * (np.interp(t, seen.t, seen.tip[:, 2]) - 0.16), atol=1e-3)
+    np.testing.assert_allclose(
+        z, 1e3 * (np.interp(t, seen.t, seen.tip[:, 2]) - 0.16), atol=1e-3
+    )
     low, high = beside.collections[0].get_datalim(beside.transData).intervaly
     assert high == -low == pytest.approx(1 + 1e3 * abs(seen.tip[0, 2] - 0.16))
 
@@ -121,14 +142,20 @@ def test_a_transport_is_drawn_from_the_side_and_from_above(drawn):
     draw(plan, Path("plan.png"))
     axes, seen = axes_of(drawn[0]), reference_trajectory(plan, 2001)
     poses = [plan.start_xyz[0, 2] - 0.15, plan.goal_xyz[0, 2] - 0.15]
-    assert [bounding_box(patch).y1 for patch in axes["side view"].patches] == pytest.approx(poses)
+    assert [
+        bounding_box(patch).y1 for patch in axes["side view"].patches
+    ] == pytest.approx(poses)
     assert [bounding_box(patch).bounds for patch in axes["top view"].patches] == [
         pytest.approx((-0.6, 0.2, 0.3, 0.4)),
         pytest.approx((0.3, 0.2, 0.3, 0.4)),
     ]
     for view, (across, up) in (("side view", (1, 2)), ("top view", (1, 0))):
-        goal = next(line for line in axes[view].get_lines() if line.get_label() == "goal")
-        np.testing.assert_allclose(np.ravel(goal.get_data()), seen.tip[-1, [across, up]], atol=1e-9)
+        goal = next(
+            line for line in axes[view].get_lines() if line.get_label() == "goal"
+        )
+        np.testing.assert_allclose(
+            np.ravel(goal.get_data()), seen.tip[-1, [across, up]], atol=1e-9
+        )
 
 
 def test_the_arm_of_a_transport_is_as_wide_as_its_capsules(drawn):
@@ -140,7 +167,9 @@ def test_the_arm_of_a_transport_is_as_wide_as_its_capsules(drawn):
         for area in areas:
             points = area.get_paths()[0].vertices
             inside = 2 * 0.14 * np.cos(np.pi / 32)
-            assert np.ptp(points, axis=0).min() >= inside  # a circle of 14 cm at either end
+            assert (
+                np.ptp(points, axis=0).min() >= inside
+            )  # a circle of 14 cm at either end
 
 
 @pytest.mark.slow
@@ -153,19 +182,28 @@ def test_an_arm_with_link_geometry_is_drawn_by_its_parts(drawn, tmp_path):
     areas = axes_of(drawn[0])["top view"].collections
     assert len(areas) == 7 * len(robot.shape.convex_parts)
     base = areas[0].get_paths()[0].vertices
-    np.testing.assert_allclose([base.min(axis=0), base.max(axis=0)], [[-0.15, -0.15], [0.15, 0.15]], atol=1e-9)
+    np.testing.assert_allclose(
+        [base.min(axis=0), base.max(axis=0)], [[-0.15, -0.15], [0.15, 0.15]], atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("label", some(["hit", "transport"], 1, "slow"))
 def test_legends_are_complete_and_do_not_overlap_axes(label, drawn):
     plan = load(label)
-    long = replace(plan.robot, joint_names=tuple(f"a_rather_long_name_of_joint_{i}" for i in range(plan.robot.n)))
+    long = replace(
+        plan.robot,
+        joint_names=tuple(
+            f"a_rather_long_name_of_joint_{i}" for i in range(plan.robot.n)
+        ),
+    )
     vars(long).update(model=plan.robot.model)  # with the original joint names
     plot_plan(plan.problem, long, plan.motion, 0, Path("plan.png"))
     figure = drawn[0]
     figure.draw_without_rendering()
     axes = [axis.get_window_extent() for part in figure.subfigs for axis in part.axes]
-    legends = [legend.get_window_extent() for part in figure.subfigs for legend in part.legends]
+    legends = [
+        legend.get_window_extent() for part in figure.subfigs for legend in part.legends
+    ]
     assert len(legends) == 2
     for legend in legends:
         assert figure.bbox.x0 <= legend.x0 < legend.x1 <= figure.bbox.x1
@@ -174,7 +212,9 @@ def test_legends_are_complete_and_do_not_overlap_axes(label, drawn):
     assert not any(axis.get_legend() for part in figure.subfigs for axis in part.axes)
 
 
-def test_obstacles_are_drawn_at_the_poses_of_the_task_and_the_note_is_in_the_title(drawn):
+def test_obstacles_are_drawn_at_the_poses_of_the_task_and_the_note_is_in_the_title(
+    drawn,
+):
     plan = load("transport")
     plot_plan(
         plan.problem,
@@ -185,15 +225,23 @@ def test_obstacles_are_drawn_at_the_poses_of_the_task_and_the_note_is_in_the_tit
         scene=Scene(tuple(plan.problem.obstacle), np.array([[0.1, 0.2]])),
         note="not valid",
     )
-    assert [bounding_box(patch).y1 for patch in axes_of(drawn[0])["side view"].patches] == pytest.approx([0.1, 0.2])
-    assert drawn[0].get_suptitle() == f"heavy-object, plan 0: {plan.motion.duration()[0]:.3f} s\nnot valid"
+    assert [
+        bounding_box(patch).y1 for patch in axes_of(drawn[0])["side view"].patches
+    ] == pytest.approx([0.1, 0.2])
+    assert (
+        drawn[0].get_suptitle()
+        == f"heavy-object, plan 0: {plan.motion.duration()[0]:.3f} s\nnot valid"
+    )
 
 
 @pytest.mark.parametrize(
     ("label", "by"),
     [
         *some([("hit", 1.0), ("transport", 1e3), ("hit", 1e150)], 0, "slow"),
-        *(pytest.param(*each, marks=again) for each in (("transport", 1.0), ("hit", 1e3), ("transport", 1e150))),
+        *(
+            pytest.param(*each, marks=again)
+            for each in (("transport", 1.0), ("hit", 1e3), ("transport", 1e150))
+        ),
     ],
 )
 def test_a_plan_outside_its_limits_is_drawn(label, by, tmp_path):
@@ -242,23 +290,47 @@ def test_the_error_without_matplotlib_names_the_extra(tmp_path, monkeypatch):
 def test_obstacles_of_every_kind_are_drawn_at_their_poses(drawn):
     plan, random = load("transport"), np.random.default_rng(1)
     obstacles = tuple(draw_obstacle(kind, random) for kind in KINDS)
-    plot_plan(replace(plan.problem, obstacle=obstacles), plan.robot, plan.motion, 0, Path("plan.png"))
+    plot_plan(
+        replace(plan.problem, obstacle=obstacles),
+        plan.robot,
+        plan.motion,
+        0,
+        Path("plan.png"),
+    )
     axes, poses = axes_of(drawn[0]), place_obstacles(obstacles)
     for title, up in (("side view", 2), ("top view", 0)):
         boxes = [bounding_box(patch) for patch in axes[title].patches]
         for solid, found in zip(solids_of(obstacles, poses), boxes, strict=True):
-            np.testing.assert_allclose([found.min, found.max], [solid.low[[1, up]], solid.high[[1, up]]], atol=2e-3)
+            np.testing.assert_allclose(
+                [found.min, found.max],
+                [solid.low[[1, up]], solid.high[[1, up]]],
+                atol=2e-3,
+            )
 
 
 def marks(axis: Any) -> list[tuple[float, float]]:
     """Return the marked violations of an axis."""
-    return [tuple(np.ravel(line.get_data())) for line in axis.get_lines() if line.get_label() == "violation"]
+    return [
+        tuple(np.ravel(line.get_data()))
+        for line in axis.get_lines()
+        if line.get_label() == "violation"
+    ]
 
 
-def test_violations_of_joints_and_conditions_are_marked_at_their_times(drawn: "list[Figure]") -> None:
+def test_violations_of_joints_and_conditions_are_marked_at_their_times(
+    drawn: "list[Figure]",
+) -> None:
     plan = perturbed(load("transport"), 0.2)
     verdict = plan.judged()
-    plot_plan(plan.problem, plan.robot, plan.motion, 0, Path("plan.png"), scene=plan.scene, verdict=verdict)
+    plot_plan(
+        plan.problem,
+        plan.robot,
+        plan.motion,
+        0,
+        Path("plan.png"),
+        scene=plan.scene,
+        verdict=verdict,
+    )
     axes = axes_of(drawn[0])
     titles = {
         "joint velocity": "velocity [% of limit]",
@@ -270,16 +342,30 @@ def test_violations_of_joints_and_conditions_are_marked_at_their_times(drawn: "l
     assert {"joint velocity", "tilt", "object contact"} <= violated
     for name, title in titles.items():
         margin, marked = verdict.margins[name], marks(axes[title])
-        assert [time for time, _ in marked] == ([pytest.approx(margin.time)] if name in violated else [])
+        assert [time for time, _ in marked] == (
+            [pytest.approx(margin.time)] if name in violated else []
+        )
     (tilt,) = marks(axes["tilt\n[deg]"])
     assert tilt[1] == pytest.approx(np.degrees(verdict.margins["tilt"].value), rel=1e-3)
-    (outside,) = (line for line in axes["tilt\n[deg]"].get_lines() if line.get_label() == "_violated")
+    (outside,) = (
+        line
+        for line in axes["tilt\n[deg]"].get_lines()
+        if line.get_label() == "_violated"
+    )
     assert np.nanmin(outside.get_ydata()) > 1.8
 
 
 def test_a_valid_plan_has_no_marks(drawn: "list[Figure]") -> None:
     plan = load("hit")
-    plot_plan(plan.problem, plan.robot, plan.motion, 0, Path("plan.png"), scene=plan.scene, verdict=plan.judged())
+    plot_plan(
+        plan.problem,
+        plan.robot,
+        plan.motion,
+        0,
+        Path("plan.png"),
+        scene=plan.scene,
+        verdict=plan.judged(),
+    )
     axes = axes_of(drawn[0])
     assert "puck distance\n[mm]" in axes
     assert not any(marks(axis) for axis in axes.values())

@@ -61,10 +61,16 @@ def test_the_maximum_duration_does_not_depend_on_the_step(step: float) -> None:
 
 def test_a_coarser_step_takes_fewer_samples():
     plan = load("transport")
-    assert plan.judged(step=4e-3).samples < plan.judged().samples < plan.judged(step=5e-4).samples
+    assert (
+        plan.judged(step=4e-3).samples
+        < plan.judged().samples
+        < plan.judged(step=5e-4).samples
+    )
 
 
-def test_early_exit_phases_are_in_every_span_near_both_ends_and_at_additional_phases() -> None:
+def test_early_exit_phases_are_in_every_span_near_both_ends_and_at_additional_phases() -> (
+    None
+):
     phases = early_exit_phases(13, frozenset([0.1234])).s
     assert (phases[0], phases[-1]) == (0, 1)
     assert np.all(np.diff(phases) > 0)
@@ -80,4 +86,8 @@ def test_early_exit_phases_are_in_every_span_near_both_ends_and_at_additional_ph
 def test_a_table_of_few_cells_gives_the_same_times(label: str) -> None:
     motion, phases = load(label).motion, early_exit_phases(13).s
     exact = motion.time_at(phases)[0]
-    np.testing.assert_allclose(times(phases, time_table(motion.rate[0], 7, cells=EARLY_EXIT_CELLS)), exact, atol=2e-4)
+    np.testing.assert_allclose(
+        times(phases, time_table(motion.rate[0], 7, cells=EARLY_EXIT_CELLS)),
+        exact,
+        atol=2e-4,
+    )

@@ -17,11 +17,16 @@ PHASES = np.linspace(0, 1, 200)
 
 @pytest.mark.parametrize("error", [np.deg2rad(0.05), np.deg2rad(1.0)])
 @pytest.mark.parametrize("label", ["hit", "transport"])
-def test_no_state_within_the_tube_violates_more_than_the_verdict_states(label: str, error: float) -> None:
+def test_no_state_within_the_tube_violates_more_than_the_verdict_states(
+    label: str, error: float
+) -> None:
     plan, random = load(label), np.random.default_rng(11)
     exact, tube = plan.judged(), plan.judged(tracking_error=error)
     world = PathWorld(plan.robot, plan.problem.obstacle, plan.problem.object_size)
-    states, poses = evaluate_trajectory(plan.motion, PHASES, jerk=False), plan.scene.poses[0]
+    states, poses = (
+        evaluate_trajectory(plan.motion, PHASES, jerk=False),
+        plan.scene.poses[0],
+    )
     checked = set()
     for _ in range(20):
         offset = error * random.uniform(-1, 1, states.q.shape)
@@ -30,13 +35,21 @@ def test_no_state_within_the_tube_violates_more_than_the_verdict_states(label: s
             if isinstance(constraint, ObjectContact):
                 continue  # the object stands on the pedestals
             for condition in constraint.judged(world):
-                if condition.name not in tube.margins or not is_widened(exact, tube, condition.name):
+                if condition.name not in tube.margins or not is_widened(
+                    exact, tube, condition.name
+                ):
                     continue
-                g = np.array([np.broadcast_to(value, len(PHASES)) for value in condition.g])
-                relaxation = constraint.bound_relaxation(condition, PHASES, plan.start_xyz[0])
+                g = np.array(
+                    [np.broadcast_to(value, len(PHASES)) for value in condition.g]
+                )
+                relaxation = constraint.bound_relaxation(
+                    condition, PHASES, plan.start_xyz[0]
+                )
                 below = (condition.lower[:, None] - g - relaxation).max()
                 above = (g - condition.upper[:, None] - relaxation).max()
-                assert max(below, above) <= tube.margins[condition.name].violation + 1e-9
+                assert (
+                    max(below, above) <= tube.margins[condition.name].violation + 1e-9
+                )
                 checked.add(condition.name)
     assert len(checked) >= 2
 
@@ -50,9 +63,16 @@ def is_widened(exact: Verdict, tube: Verdict, name: str) -> bool:
 def test_only_conditions_of_positions_change(label: str) -> None:
     plan = load(label)
     exact, tube = plan.judged(), plan.judged(tracking_error=0.01)
-    for name in ("joint velocity", "joint acceleration", "joint torque", "boundary velocity"):
+    for name in (
+        "joint velocity",
+        "joint acceleration",
+        "joint torque",
+        "boundary velocity",
+    ):
         assert tube.margins[name] == exact.margins[name]
-    assert {name for name in tube.margins if is_widened(exact, tube, name)} >= {"joint position"}
+    assert {name for name in tube.margins if is_widened(exact, tube, name)} >= {
+        "joint position"
+    }
 
 
 def test_position_limits_are_exact_for_every_joint() -> None:
@@ -65,17 +85,23 @@ def test_position_limits_are_exact_for_every_joint() -> None:
     assert margin.violation <= before.violation + error.max() + 1e-9
 
 
-def test_distances_change_by_at_most_the_displacement_and_contact_with_the_support_is_legal() -> None:
+def test_distances_change_by_at_most_the_displacement_and_contact_with_the_support_is_legal() -> (
+    None
+):
     plan, error = load("transport"), np.deg2rad(0.5)
     exact, tube = plan.judged(), plan.judged(tracking_error=error)
     names = {
         condition.name
         for constraint in plan.problem.constraint
         if is_contact(constraint)
-        for condition in constraint.measured(PathWorld(plan.robot, plan.problem.obstacle, plan.problem.object_size))
+        for condition in constraint.measured(
+            PathWorld(plan.robot, plan.problem.obstacle, plan.problem.object_size)
+        )
     }
     assert {"robot clearance", "object contact", "object clearance"} <= names
-    assert tube.margins["object contact"].violation == pytest.approx(exact.margins["object contact"].violation)
+    assert tube.margins["object contact"].violation == pytest.approx(
+        exact.margins["object contact"].violation
+    )
     for name in ("robot clearance", "object clearance"):
         change = tube.margins[name].violation - exact.margins[name].violation
         assert 0 < change <= error * plan.robot.n * plan.robot.reach * 1.2

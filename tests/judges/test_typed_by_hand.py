@@ -34,9 +34,14 @@ ACCELERATION = np.minimum(10 * VELOCITY, 20.0)
 def placements(q: Array) -> list[tuple[Array, Array]]:
     """Compute rotations (N, 3, 3) and origins (N, 3) of the seven joint frames, for q of shape (N, 6 or 7)."""
     rotation, origin, frames = np.eye(3), np.zeros(3), []
-    for (offset, angles), turn in zip(JOINTS, np.hstack([q, np.zeros((len(q), 7 - q.shape[1]))]).T, strict=True):
+    for (offset, angles), turn in zip(
+        JOINTS, np.hstack([q, np.zeros((len(q), 7 - q.shape[1]))]).T, strict=True
+    ):
         origin = origin + rotation @ np.array(offset, float)
-        fixed, moved = Rotation.from_euler("xyz", angles), Rotation.from_euler("z", turn[:, None])
+        fixed, moved = (
+            Rotation.from_euler("xyz", angles),
+            Rotation.from_euler("z", turn[:, None]),
+        )
         rotation = rotation @ fixed.as_matrix() @ moved.as_matrix()
         frames.append((rotation, origin))
     return frames
@@ -63,7 +68,9 @@ def test_hits_are_within_the_planning_limits_of_the_data_sheet(hits):
         assert np.all(np.abs(hits[f"{end}_q"]) <= POSITION[:6] * (1 + 1e-12))
         assert np.all(np.abs(hits[f"{end}_dq"]) <= VELOCITY[:6] * (1 + 1e-12))
     assert np.all(np.abs(hits["start_ddq"]) <= ACCELERATION[:6] * (1 + 1e-12))
-    assert np.abs(hits["goal_dq"] / VELOCITY[:6]).max() > 0.999999  # and no lower limit was used for them
+    assert (
+        np.abs(hits["goal_dq"] / VELOCITY[:6]).max() > 0.999999
+    )  # and no lower limit was used for them
 
 
 def test_the_mallet_is_on_the_table_at_the_stored_position(hits):
@@ -72,14 +79,20 @@ def test_the_mallet_is_on_the_table_at_the_stored_position(hits):
         assert np.abs(position - hits[f"{end}_xyz"]).max() < 1e-8
         assert np.all((position[:, 0] > 0.6 - 1e-8) & (position[:, 0] < 2.0 + 1e-8))
         assert np.all(np.abs(position[:, 1]) < 0.45 + 1e-8)
-        assert np.abs(position[:, 2] - 0.16).max() < (0.005 + 1e-8 if end == "start" else 1e-8)
+        assert np.abs(position[:, 2] - 0.16).max() < (
+            0.005 + 1e-8 if end == "start" else 1e-8
+        )
 
 
 def test_the_mallet_moves_along_the_hit_and_not_up_or_down(hits):
     step, angle = 1e-6, hits["hit_angle"]
-    velocity = [tip(hits["goal_q"] + sign * step * hits["goal_dq"], 0.585) for sign in (1, -1)]
+    velocity = [
+        tip(hits["goal_q"] + sign * step * hits["goal_dq"], 0.585) for sign in (1, -1)
+    ]
     velocity = (velocity[0] - velocity[1]) / (2 * step)
-    expected = hits["hit_speed"][:, None] * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    expected = hits["hit_speed"][:, None] * np.stack(
+        [np.cos(angle), np.sin(angle), 0 * angle], axis=1
+    )
     assert np.abs(velocity - expected).max() < 1e-8
     assert hits["hit_speed"].max() > 1.0
 
@@ -93,7 +106,12 @@ def test_the_object_is_upright_between_literal_positions(carries):
         up = (rotation @ Rotation.from_euler("x", -HALF_PI).as_matrix())[:, :, 2]
         assert np.abs(center - carries[f"{end}_xyz"]).max() < 1e-8
         assert np.abs(up - [0, 0, 1]).max() < 1e-8
-        assert np.all((center[:, 0] >= 0.2) & (center[:, 0] <= 0.6) & (center[:, 1] >= low) & (center[:, 1] <= high))
+        assert np.all(
+            (center[:, 0] >= 0.2)
+            & (center[:, 0] <= 0.6)
+            & (center[:, 1] >= low)
+            & (center[:, 1] <= high)
+        )
 
 
 def test_the_arm_keeps_clear_of_the_literal_pedestals(carries):
@@ -101,8 +119,19 @@ def test_the_arm_keeps_clear_of_the_literal_pedestals(carries):
     nearest = np.inf
     for q in (carries["start_q"], carries["goal_q"]):
         origins = [origin for _, origin in placements(q)]
-        line = [np.broadcast_to(origins[1], (len(q), 3)), origins[3], origins[5], tip(q, 0.17)]  # shoulder to object
-        points = np.array([a + share * (b - a) for a, b in pairwise(line) for share in np.linspace(0, 1, 51)])
+        line = [
+            np.broadcast_to(origins[1], (len(q), 3)),
+            origins[3],
+            origins[5],
+            tip(q, 0.17),
+        ]  # shoulder to object
+        points = np.array(
+            [
+                a + share * (b - a)
+                for a, b in pairwise(line)
+                for share in np.linspace(0, 1, 51)
+            ]
+        )
         for end, (low, high) in (("start", (-0.6, -0.3)), ("goal", (0.3, 0.6))):
             top = carries[f"{end}_xyz"][:, 2] - 0.15
             offsets = [

@@ -24,7 +24,11 @@ from cnpgen.kernels import library as library_module
 from cnpgen.kernels.compiled_kernel import CompiledKernel, compile_tape
 from cnpgen.kernels.compiler import find_compiler, vector_flags
 from cnpgen.kernels.emit import emit
-from cnpgen.kernels.interpreted_kernel import POINTS_PER_BLOCK, InterpretedKernel, MappedKernel
+from cnpgen.kernels.interpreted_kernel import (
+    POINTS_PER_BLOCK,
+    InterpretedKernel,
+    MappedKernel,
+)
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.kernels.parallel_compilation import CompilerPool
@@ -72,7 +76,22 @@ REFERENCE: dict[str, Callable[..., Array]] = {
     "NE": lambda a, b: 1.0 * (a != b), "AND": lambda a, b: 1.0 * ((a != 0) & (b != 0)),
     "OR": lambda a, b: 1.0 * ((a != 0) | (b != 0)), "IF_ELSE_ZERO": lambda a, b: np.where(a != 0, b, 0.0),
 }  # fmt: skip
-SPECIAL = [0.0, -0.0, 1.0, -1.0, 2.5, -2.5, math.inf, -math.inf, math.nan, 1e-3, -7.25, 9e4, 1e-310, 5e-324]
+SPECIAL = [
+    0.0,
+    -0.0,
+    1.0,
+    -1.0,
+    2.5,
+    -2.5,
+    math.inf,
+    -math.inf,
+    math.nan,
+    1e-3,
+    -7.25,
+    9e4,
+    1e-310,
+    5e-324,
+]
 BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
 
 
@@ -80,21 +99,33 @@ def ulps(found: Array, expected: Array) -> Array:
     """Return the distance in units in the last place of ``expected``; 0 for two nans or two equal infinities."""
     with np.errstate(invalid="ignore"):
         same = (found == expected) | (np.isnan(found) & np.isnan(expected))
-        return np.where(same, 0.0, np.abs(found - expected) / np.spacing(np.abs(expected)))
+        return np.where(
+            same, 0.0, np.abs(found - expected) / np.spacing(np.abs(expected))
+        )
 
 
-def kernel_of(function: ca.Function, backend: str, folder: Path, loop: Loop | None = None) -> Kernel:
+def kernel_of(
+    function: ca.Function, backend: str, folder: Path, loop: Loop | None = None
+) -> Kernel:
     tape = tape_from_function(function, loop)
     if backend == "casadi":
         return MappedKernel(tape, function)
-    return InterpretedKernel(tape) if backend == "numpy" else CompiledKernel(tape, compile_tape(tape, folder), folder)
+    return (
+        InterpretedKernel(tape)
+        if backend == "numpy"
+        else CompiledKernel(tape, compile_tape(tape, folder), folder)
+    )
 
 
 @pytest.fixture(scope="module")
 def operations() -> ca.Function:
     """Build a function with every operation of a tape, applied to the same two numbers."""
     a, b = ca.SX.sym("a"), ca.SX.sym("b")
-    return ca.Function("operations", [a, b], [f(a) for f in UNARY.values()] + [f(a, b) for f in BINARY.values()])
+    return ca.Function(
+        "operations",
+        [a, b],
+        [f(a) for f in UNARY.values()] + [f(a, b) for f in BINARY.values()],
+    )
 
 
 @pytest.fixture(scope="module")
@@ -107,13 +138,23 @@ def operands() -> Array:
 
 
 @pytest.fixture(scope="module")
-def evaluated(operations: ca.Function, operands: Array, cache_folder: Path) -> dict[str, dict[str, Array]]:
+def evaluated(
+    operations: ca.Function, operands: Array, cache_folder: Path
+) -> dict[str, dict[str, Array]]:
     """Backend -> operation -> results."""
     backends = ["numpy", "casadi", *(["compiled"] if find_compiler() else [])]
-    kernels = {backend: kernel_of(operations, backend, cache_folder) for backend in backends}
+    kernels = {
+        backend: kernel_of(operations, backend, cache_folder) for backend in backends
+    }
     names = [*UNARY, *BINARY]
     return {
-        backend: dict(zip(names, [row[0] for row in kernel(operands[:1], operands[1:])], strict=True))
+        backend: dict(
+            zip(
+                names,
+                [row[0] for row in kernel(operands[:1], operands[1:])],
+                strict=True,
+            )
+        )
         for backend, kernel in kernels.items()
     }
 
@@ -126,24 +167,40 @@ def test_all_operations_of_a_tape_are_tested(operations):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("name", [*UNARY, *BINARY])
-def test_operations_follow_ieee_754_on_random_and_special_numbers(evaluated, operands, backend, name):
+def test_operations_follow_ieee_754_on_random_and_special_numbers(
+    evaluated, operands, backend, name
+):
     with np.errstate(all="ignore"):
         expected = REFERENCE[name](*operands[: 1 if name in UNARY else 2])
     allowed = 2.0 if name in ("SIN", "COS", "EXP") else 0.0
     wrong = np.flatnonzero(ulps(evaluated[backend][name], expected) > allowed)
-    assert len(wrong) == 0, [(*operands[:, k], evaluated[backend][name][k], expected[k]) for k in wrong[:5]]
+    assert len(wrong) == 0, [
+        (*operands[:, k], evaluated[backend][name][k], expected[k]) for k in wrong[:5]
+    ]
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_sine_and_cosine_are_within_2_ulp_up_to_1e5_also_next_to_their_zeros(cache_folder, backend):
+def test_sine_and_cosine_are_within_2_ulp_up_to_1e5_also_next_to_their_zeros(
+    cache_folder, backend
+):
     random = np.random.default_rng(1)
     turns = np.arange(-70_000, 70_000, 7) * (np.pi / 2)
-    neighbors = np.concatenate([np.nextafter(turns, side) for side in (-np.inf, np.inf)])
+    neighbors = np.concatenate(
+        [np.nextafter(turns, side) for side in (-np.inf, np.inf)]
+    )
     angles = np.concatenate(
-        [random.uniform(-10, 10, 20_000), random.uniform(-1e5, 1e5, 20_000), turns, neighbors, 1e5 - np.arange(100.0)]
+        [
+            random.uniform(-10, 10, 20_000),
+            random.uniform(-1e5, 1e5, 20_000),
+            turns,
+            neighbors,
+            1e5 - np.arange(100.0),
+        ]
     )
     x = ca.SX.sym("x")
-    kernel = kernel_of(ca.Function("sincos", [x], [ca.sin(x), ca.cos(x)]), backend, cache_folder)
+    kernel = kernel_of(
+        ca.Function("sincos", [x], [ca.sin(x), ca.cos(x)]), backend, cache_folder
+    )
     sine, cosine = kernel(angles[None])
     assert ulps(sine[0], np.sin(angles)).max() <= 2
     assert ulps(cosine[0], np.cos(angles)).max() <= 2
@@ -153,18 +210,31 @@ def test_sine_and_cosine_are_within_2_ulp_up_to_1e5_also_next_to_their_zeros(cac
 def mixed() -> ca.Function:
     """Build a function with two arguments and two results, constants among them."""
     x, p = ca.SX.sym("x", 3), ca.SX.sym("p", 2)
-    first = ca.vertcat(ca.sin(x[0]) * p[1], x[1] / (1 + p[0] ** 2), 2.5, ca.fmax(x[2], p[0]))
-    return ca.Function("mixed", [x, p], [first, ca.if_else(x[0] < p[0], x[1] - x[2], ca.sqrt(x[0] ** 2))])
+    first = ca.vertcat(
+        ca.sin(x[0]) * p[1], x[1] / (1 + p[0] ** 2), 2.5, ca.fmax(x[2], p[0])
+    )
+    return ca.Function(
+        "mixed",
+        [x, p],
+        [first, ca.if_else(x[0] < p[0], x[1] - x[2], ca.sqrt(x[0] ** 2))],
+    )
 
 
 def mixed_in_numpy(x: Array, p: Array) -> list[Array]:
-    first = [np.sin(x[0]) * p[1], x[1] / (1 + p[0] ** 2), np.full(x.shape[1], 2.5), np.maximum(x[2], p[0])]
+    first = [
+        np.sin(x[0]) * p[1],
+        x[1] / (1 + p[0] ** 2),
+        np.full(x.shape[1], 2.5),
+        np.maximum(x[2], p[0]),
+    ]
     return [np.array(first), np.where(x[0] < p[0], x[1] - x[2], np.abs(x[0]))[None]]
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 5, 7, 8, 9, POINTS_PER_BLOCK + 1])
-def test_batches_of_any_size_are_evaluated_lane_by_lane(mixed, cache_folder, backend, n):
+def test_batches_of_any_size_are_evaluated_lane_by_lane(
+    mixed, cache_folder, backend, n
+):
     kernel = kernel_of(mixed, backend, cache_folder)
     random = np.random.default_rng(n)
     x, p = random.normal(size=(3, n)), random.normal(size=(2, n))
@@ -203,14 +273,18 @@ def test_rows_of_arguments_may_have_any_stride(mixed, cache_folder, backend):
     [
         pytest.param((np.zeros((3, 4)),), id="one missing"),
         pytest.param((np.zeros((2, 4)), np.zeros((2, 4))), id="wrong width"),
-        pytest.param((np.zeros((3, 4)), np.zeros((2, 5))), id="different numbers of lanes"),
+        pytest.param(
+            (np.zeros((3, 4)), np.zeros((2, 5))), id="different numbers of lanes"
+        ),
         pytest.param((np.zeros((3, 4), np.float32), np.zeros((2, 4))), id="float32"),
         pytest.param((np.zeros((3, 4), ">f8"), np.zeros((2, 4))), id="big endian"),
         pytest.param((np.zeros((4, 3)).T, np.zeros((2, 4))), id="rows not contiguous"),
         pytest.param((np.zeros(12), np.zeros((2, 4))), id="one dimension"),
     ],
 )
-def test_arguments_of_a_wrong_shape_or_type_are_refused(mixed, cache_folder, backend, arguments):
+def test_arguments_of_a_wrong_shape_or_type_are_refused(
+    mixed, cache_folder, backend, arguments
+):
     with pytest.raises(ValueError, match="mixed"):
         kernel_of(mixed, backend, cache_folder)(*arguments)
 
@@ -222,20 +296,26 @@ def test_arguments_may_be_read_only_or_unaligned(mixed, cache_folder):
     assert not stored.flags.aligned
     assert not stored.flags.writeable
     kernel = kernel_of(mixed, "compiled", cache_folder)
-    for found, expected in zip(kernel(stored[:3], stored[3:]), kernel(whole[:3], whole[3:]), strict=True):
+    for found, expected in zip(
+        kernel(stored[:3], stored[3:]), kernel(whole[:3], whole[3:]), strict=True
+    ):
         np.testing.assert_array_equal(found, expected)
 
 
 @needs_compiler
 def test_objects_other_than_arrays_are_refused_by_compiled_kernels(mixed, cache_folder):
     array = np.zeros((3, 4))
-    alike = SimpleNamespace(shape=array.shape, dtype=array.dtype, strides=array.strides, size=array.size)
+    alike = SimpleNamespace(
+        shape=array.shape, dtype=array.dtype, strides=array.strides, size=array.size
+    )
     with pytest.raises(ValueError, match="mixed: arguments must be NumPy arrays"):
         kernel_of(mixed, "compiled", cache_folder)(alike, np.zeros((2, 4)))
 
 
 @needs_compiler
-def test_threads_that_share_a_compiled_kernel_get_their_own_results(mixed, cache_folder):
+def test_threads_that_share_a_compiled_kernel_get_their_own_results(
+    mixed, cache_folder
+):
     kernel = kernel_of(mixed, "compiled", cache_folder)
     x, p = np.random.default_rng(9).normal(size=(2, 3, 400_000))
     expected = kernel(x, p[:2])
@@ -263,7 +343,9 @@ def root() -> ca.Function:
     """Build Heron's iteration for the square root of p; the second state counts the steps."""
     x, p = ca.SX.sym("x", 2), ca.SX.sym("p")
     error = ca.fabs(x[0] * x[0] - p)
-    return ca.Function("heron", [x, p], [ca.vertcat(0.5 * (x[0] + p / x[0]), x[1] + 1), error])
+    return ca.Function(
+        "heron", [x, p], [ca.vertcat(0.5 * (x[0] + p / x[0]), x[1] + 1), error]
+    )
 
 
 def heron(x: float, p: float) -> tuple[float, float, float]:
@@ -286,10 +368,14 @@ def root_lanes(n: int) -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_loop_iterates_each_lane_to_convergence_plus_one_step(root, cache_folder, backend):
+def test_a_loop_iterates_each_lane_to_convergence_plus_one_step(
+    root, cache_folder, backend
+):
     x, p = root_lanes(100)
     state, error = kernel_of(root, backend, cache_folder, ROOT)(x, p)
-    expected = np.array([heron(*lane) for lane in zip(x[0].tolist(), p[0].tolist(), strict=True)]).T
+    expected = np.array(
+        [heron(*lane) for lane in zip(x[0].tolist(), p[0].tolist(), strict=True)]
+    ).T
     np.testing.assert_array_equal(state[1], expected[1])
     assert len(set(expected[1])) > 3
     np.testing.assert_allclose(state[0], expected[0], rtol=1e-12)
@@ -297,7 +383,9 @@ def test_a_loop_iterates_each_lane_to_convergence_plus_one_step(root, cache_fold
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_lane_that_does_not_converge_stops_at_the_limit_with_its_error(root, cache_folder, backend):
+def test_a_lane_that_does_not_converge_stops_at_the_limit_with_its_error(
+    root, cache_folder, backend
+):
     state, error = kernel_of(root, backend, cache_folder, ROOT)(*root_lanes(30))
     lost = np.flatnonzero(~(error[0] < ROOT.tolerance))
     assert set(lost) == {k for k in range(30) if k % 11 in (2, 5)}
@@ -306,7 +394,9 @@ def test_a_lane_that_does_not_converge_stops_at_the_limit_with_its_error(root, c
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("n", [0, 1, 3, 8, 9, 61])
-def test_lanes_of_a_loop_do_not_depend_on_their_neighbors(root, cache_folder, backend, n):
+def test_lanes_of_a_loop_do_not_depend_on_their_neighbors(
+    root, cache_folder, backend, n
+):
     kernel = kernel_of(root, backend, cache_folder, ROOT)
     x, p = root_lanes(61)
     whole = kernel(x, p)
@@ -316,25 +406,50 @@ def test_lanes_of_a_loop_do_not_depend_on_their_neighbors(root, cache_folder, ba
         np.testing.assert_array_equal(one, other[:, order])
 
 
-@pytest.mark.parametrize("backend", [pytest.param("compiled", marks=needs_compiler), "numpy"])
+@pytest.mark.parametrize(
+    "backend", [pytest.param("compiled", marks=needs_compiler), "numpy"]
+)
 @pytest.mark.parametrize("kind", ["inverse kinematics", "hitting configuration"])
-def test_solvers_give_the_same_bits_in_any_order_of_lanes(prepare: Prepare, backend, kind):
+def test_solvers_give_the_same_bits_in_any_order_of_lanes(
+    prepare: Prepare, backend, kind
+):
     from cnpgen.pipelines.stages import hitting_newton, ik
 
-    kernels, robot = prepare("airhockey-replan", backend).context.kernels, prepare("airhockey-replan").context.robot
+    kernels, robot = (
+        prepare("airhockey-replan", backend).context.kernels,
+        prepare("airhockey-replan").context.robot,
+    )
     random = np.random.default_rng(7)
-    q = random.uniform([-0.6, 0.5, -0.7, -0.7, -0.4, 0.4], [0.6, 1.4, 0.7, -0.4, 0.4, 1.9], (203, 6)).T.copy()
+    q = random.uniform(
+        [-0.6, 0.5, -0.7, -0.7, -0.4, 0.4], [0.6, 1.4, 0.7, -0.4, 0.4, 1.9], (203, 6)
+    ).T.copy()
     p = random.uniform([0.6, -0.45, 0.16], [1.3, 0.45, 0.16], (203, 3)).T.copy()
     angle = random.uniform(-np.pi, np.pi, 203)
     if kind == "inverse kinematics":
-        kernel = kernels.load(ik.ik_step, Loop(ik.IK_TOLERANCE, ik.MAX_IK_STEPS), vertical=False, max_step=0.4)
+        kernel = kernels.load(
+            ik.ik_step,
+            Loop(ik.IK_TOLERANCE, ik.MAX_IK_STEPS),
+            vertical=False,
+            max_step=0.4,
+        )
         arguments = [q, p]
     else:
-        loop = Loop(hitting_newton.NEWTON_TOLERANCE_RAD, hitting_newton.MAX_NEWTON_STEPS)
+        loop = Loop(
+            hitting_newton.NEWTON_TOLERANCE_RAD, hitting_newton.MAX_NEWTON_STEPS
+        )
         kernel = kernels.load(hitting_newton.newton_step, loop)
-        arguments = [q, p, np.stack([np.cos(angle), np.sin(angle)]), np.repeat(robot.home[:, None], 203, axis=1)]
+        arguments = [
+            q,
+            p,
+            np.stack([np.cos(angle), np.sin(angle)]),
+            np.repeat(robot.home[:, None], 203, axis=1),
+        ]
     whole = kernel(*arguments)
-    for order in (random.permutation(203), np.arange(202, -1, -1), random.permutation(203)[:77]):
+    for order in (
+        random.permutation(203),
+        np.arange(202, -1, -1),
+        random.permutation(203)[:77],
+    ):
         again = kernel(*(np.ascontiguousarray(x[:, order]) for x in arguments))
         for one, other in zip(again, whole, strict=True):
             np.testing.assert_array_equal(one, other[:, order])
@@ -363,7 +478,10 @@ def test_a_function_that_is_built_twice_gives_the_same_bytes(prepare):
     from cnpgen.pipelines.stages.ik import ik_step
 
     robot = prepare("heavy-object").context.robot
-    first, second = (tape_from_function(ik_step(robot, vertical=True, max_step=0.8)).to_bytes() for _ in range(2))
+    first, second = (
+        tape_from_function(ik_step(robot, vertical=True, max_step=0.8)).to_bytes()
+        for _ in range(2)
+    )
     assert first == second
 
 
@@ -399,9 +517,15 @@ def test_sparse_arguments_and_results_are_refused():
 def test_constants_may_be_infinite_or_nan(cache_folder, backend):
     x = ca.SX.sym("x")
     constants = [math.inf, -math.inf, math.nan, 0.1, -1e300, 5e-324]
-    kernel = kernel_of(ca.Function("constants", [x], [ca.vertcat(*constants), x]), backend, cache_folder)
+    kernel = kernel_of(
+        ca.Function("constants", [x], [ca.vertcat(*constants), x]),
+        backend,
+        cache_folder,
+    )
     found, _ = kernel(np.zeros((1, 5)))
-    np.testing.assert_array_equal(found, np.repeat(np.array(constants)[:, None], 5, axis=1))
+    np.testing.assert_array_equal(
+        found, np.repeat(np.array(constants)[:, None], 5, axis=1)
+    )
 
 
 # --- emitted C --------------------------------------------------------------------------------------------------------
@@ -417,7 +541,16 @@ def machine_flags() -> set[str]:
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="instruction sets of x86-64")
 @pytest.mark.parametrize(
     ("march", "needs"),
-    some([("x86-64", ""), ("sandybridge", "avx"), ("haswell", "avx2"), ("skylake-avx512", "avx512f")], 1, "slow"),
+    some(
+        [
+            ("x86-64", ""),
+            ("sandybridge", "avx"),
+            ("haswell", "avx2"),
+            ("skylake-avx512", "avx512f"),
+        ],
+        1,
+        "slow",
+    ),
 )
 def test_the_emitted_c_compiles_for_every_vector_width_and_gives_the_same_numbers(
     prepare: Prepare, tmp_path, monkeypatch, march, needs
@@ -430,11 +563,17 @@ def test_the_emitted_c_compiles_for_every_vector_width_and_gives_the_same_number
     reference = replace(library, backend="numpy")
     random = np.random.default_rng(8)
     n = 203
-    q = random.uniform([-0.6, 0.5, -0.7, -0.7, -0.4, 0.4], [0.6, 1.4, 0.7, -0.4, 0.4, 1.9], (n, 6)).T.copy()
+    q = random.uniform(
+        [-0.6, 0.5, -0.7, -0.7, -0.4, 0.4], [0.6, 1.4, 0.7, -0.4, 0.4, 1.9], (n, 6)
+    ).T.copy()
     p = random.uniform([0.6, -0.45, 0.16], [1.3, 0.45, 0.16], (n, 3)).T.copy()
     dq, u = random.uniform(-1, 1, (2, 6, n))
     cases = [
-        ((ik.ik_step, Loop(ik.IK_TOLERANCE, ik.MAX_IK_STEPS)), {"vertical": False, "max_step": 0.4}, [q, p]),
+        (
+            (ik.ik_step, Loop(ik.IK_TOLERANCE, ik.MAX_IK_STEPS)),
+            {"vertical": False, "max_step": 0.4},
+            [q, p],
+        ),
         ((motion.table_acceleration,), {}, [q, dq, u, random.random((1, n))]),
     ]
     for builder, parameters, arguments in cases:
@@ -443,19 +582,37 @@ def test_the_emitted_c_compiles_for_every_vector_width_and_gives_the_same_number
         if needs and needs not in machine_flags():
             continue
         found = CompiledKernel(expected.tape, path, tmp_path)(*arguments)
-        converged = np.ones(n, bool) if expected.tape.loop is None else found[1][0] < expected.tape.loop.tolerance
+        converged = (
+            np.ones(n, bool)
+            if expected.tape.loop is None
+            else found[1][0] < expected.tape.loop.tolerance
+        )
         assert converged.mean() > 0.9
         np.testing.assert_allclose(
-            found[0][:, converged], expected(*arguments)[0][:, converged], rtol=1e-12, atol=1e-12, err_msg=march
+            found[0][:, converged],
+            expected(*arguments)[0][:, converged],
+            rtol=1e-12,
+            atol=1e-12,
+            err_msg=march,
         )
 
 
 @needs_compiler
-@pytest.mark.skipif(not compiler.shutil.which("aarch64-linux-gnu-gcc"), reason="no cross compiler for aarch64")
+@pytest.mark.skipif(
+    not compiler.shutil.which("aarch64-linux-gnu-gcc"),
+    reason="no cross compiler for aarch64",
+)
 def test_the_emitted_c_compiles_for_aarch64(operations, tmp_path):
     source = tmp_path / "operations.c"
     source.write_text(emit(tape_from_function(operations)))
-    command = ["aarch64-linux-gnu-gcc", *compiler.COMPILER_FLAGS, str(source), "-o", str(tmp_path / "k.so"), "-lm"]
+    command = [
+        "aarch64-linux-gnu-gcc",
+        *compiler.COMPILER_FLAGS,
+        str(source),
+        "-o",
+        str(tmp_path / "k.so"),
+        "-lm",
+    ]
     subprocess.run(command, check=True)
 
 
@@ -471,7 +628,9 @@ def doubling(*, factor: float = 2.0) -> ca.Function:
     return ca.Function("doubling", [x], [factor * x])
 
 
-def library_in(folder: Path, backend: str = "compiled", identity: str = "problem") -> KernelLibrary:
+def library_in(
+    folder: Path, backend: str = "compiled", identity: str = "problem"
+) -> KernelLibrary:
     return KernelLibrary(backend, folder, identity)  # type: ignore[arg-type]
 
 
@@ -501,7 +660,9 @@ def test_any_change_in_the_package_of_a_plug_in_changes_its_kernels(tmp_path):
     for factor in ("2.0", "3.0"):
         (tmp_path / "mine" / "helper.py").write_text(f"FACTOR = {factor}")
         command = [sys.executable, "-B", "-c", use]
-        done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=True, cwd=tmp_path
+        )
         assert done.stdout.strip() == factor
 
 
@@ -509,7 +670,9 @@ def test_a_changed_limit_of_a_problem_changes_its_kernels(prepare: Prepare):
     pipeline = prepare("airhockey-hit").pipeline
     problem = pipeline.problem
     slower = replace(problem, limits=replace(problem.limits, velocity_scale=0.1))
-    block = prepare(replace(pipeline, problem=slower), "numpy").block(1, "train", 0, stop=50)
+    block = prepare(replace(pipeline, problem=slower), "numpy").block(
+        1, "train", 0, stop=50
+    )
     limit = prepare("airhockey-hit").context.robot.rated_velocity * 0.1
     assert np.all(np.abs(block.columns["goal_dq"]) <= limit[:, None] * (1 + 1e-12))
 
@@ -520,7 +683,9 @@ def test_a_damaged_cached_tape_is_built_again(tmp_path, damage):
     (path,) = (tmp_path / "tape").iterdir()
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
-    path.write_bytes({"cut off": data[: len(data) // 2], "empty": b"", "flipped": data}[damage])
+    path.write_bytes(
+        {"cut off": data[: len(data) // 2], "empty": b"", "flipped": data}[damage]
+    )
     BUILT.clear()
     (result,) = library_in(tmp_path, "numpy").load(doubling)(np.ones((1, 3)))
     np.testing.assert_array_equal(result, 2.0)
@@ -556,10 +721,20 @@ print("rebuilt")
 
 @pytest.mark.slow
 @needs_compiler
-def test_a_damaged_library_is_compiled_again_and_does_not_crash_the_interpreter(root, tmp_path):
+def test_a_damaged_library_is_compiled_again_and_does_not_crash_the_interpreter(
+    root, tmp_path
+):
     (tmp_path / "tape").write_bytes(tape_from_function(root, ROOT).to_bytes())
-    command = [sys.executable, "-c", DAMAGED_LIBRARY, str(tmp_path / "tape"), str(tmp_path / "cache")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=repository())
+    command = [
+        sys.executable,
+        "-c",
+        DAMAGED_LIBRARY,
+        str(tmp_path / "tape"),
+        str(tmp_path / "cache"),
+    ]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, cwd=repository()
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout == "rebuilt\n"
 
@@ -568,8 +743,13 @@ def test_a_damaged_library_is_compiled_again_and_does_not_crash_the_interpreter(
 def test_a_library_without_a_kernel_is_a_machine_error(root, tmp_path):
     source, library = tmp_path / "empty.c", tmp_path / "empty.so"
     source.write_text("int nothing;\n")
-    subprocess.run([find_compiler(), "-shared", "-fPIC", str(source), "-o", str(library)], check=True)
-    with pytest.raises(MachineError, match=r"cannot load the compiled kernel .*empty\.so"):
+    subprocess.run(
+        [find_compiler(), "-shared", "-fPIC", str(source), "-o", str(library)],
+        check=True,
+    )
+    with pytest.raises(
+        MachineError, match=r"cannot load the compiled kernel .*empty\.so"
+    ):
         CompiledKernel(tape_from_function(root, ROOT), library, tmp_path)
 
 
@@ -588,20 +768,30 @@ def compilers(monkeypatch) -> list[Path]:
 
 
 @needs_compiler
-def test_a_library_is_compiled_once_for_many_concurrent_processes(root, tmp_path, compilers):
+def test_a_library_is_compiled_once_for_many_concurrent_processes(
+    root, tmp_path, compilers
+):
     tape = tape_from_function(root, ROOT)
     with ThreadPoolExecutor(3) as pool:
         paths = set(pool.map(lambda _: compile_tape(tape, tmp_path), range(3)))
     assert len(paths) == len(compilers) == 1
-    assert [path.name for path in (tmp_path / "lib").iterdir()] == [path.name for path in paths]
+    assert [path.name for path in (tmp_path / "lib").iterdir()] == [
+        path.name for path in paths
+    ]
     assert compile_tape(tape, tmp_path) in paths
     assert len(compilers) == 1
 
 
 @needs_compiler
-def test_the_wait_for_a_stopped_compilation_ends_at_the_time_limit(root, tmp_path, monkeypatch):
+def test_the_wait_for_a_stopped_compilation_ends_at_the_time_limit(
+    root, tmp_path, monkeypatch
+):
     tape = tape_from_function(root, ROOT)
-    lock = tmp_path / "lib" / f".{compiled_kernel.library_file_stem(tape, find_compiler())}.lock"
+    lock = (
+        tmp_path
+        / "lib"
+        / f".{compiled_kernel.library_file_stem(tape, find_compiler())}.lock"
+    )
     make_private_folder(lock.parent)
     monkeypatch.setattr("cnpgen.store.files.cache_folder.MAX_LOCK_WAIT_S", 0.1)
     with exclusive_lock(lock):
@@ -627,23 +817,34 @@ print("casadi" in sys.modules)
 """
 
 
-@pytest.mark.parametrize("backend", some([pytest.param("compiled", marks=needs_compiler), "numpy"], 1, "slow"))
+@pytest.mark.parametrize(
+    "backend",
+    some([pytest.param("compiled", marks=needs_compiler), "numpy"], 1, "slow"),
+)
 def test_a_warm_start_does_not_import_casadi(prepare: Prepare, backend):
     for name in ("airhockey-hit", "airhockey-replan", "heavy-object"):
         prepare(name, backend)
     command = [sys.executable, "-c", WARM_START, backend]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=repository())
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=True, cwd=repository()
+    )
     assert done.stdout == "False\n"
 
 
-def test_kernels_of_a_pipeline_restored_from_a_plan_are_those_of_its_files(prepare: Prepare, tmp_path, monkeypatch):
+def test_kernels_of_a_pipeline_restored_from_a_plan_are_those_of_its_files(
+    prepare: Prepare, tmp_path, monkeypatch
+):
     from cnpgen.make.recipe import load_dataset_recipe, restore_dataset_recipe
     from cnpgen.problems.problem import resolved
 
     recipe = load_dataset_recipe("airhockey-hit")
     prepare("airhockey-hit")
-    restored = restore_dataset_recipe(resolved(recipe), recipe.pipeline.problem.urdf_path.read_text(), tmp_path)
-    monkeypatch.setattr(library_module, "tape_from_function", lambda *_: pytest.fail("built again"))
+    restored = restore_dataset_recipe(
+        resolved(recipe), recipe.pipeline.problem.urdf_path.read_text(), tmp_path
+    )
+    monkeypatch.setattr(
+        library_module, "tape_from_function", lambda *_: pytest.fail("built again")
+    )
     prepare(restored.pipeline)
 
 
@@ -651,7 +852,9 @@ def test_kernels_of_a_pipeline_restored_from_a_plan_are_those_of_its_files(prepa
 
 
 @pytest.fixture
-def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fresh_compiler: None) -> Path:
+def own_cache(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fresh_compiler: None
+) -> Path:
     monkeypatch.setenv("CNPGEN_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
 
@@ -674,21 +877,29 @@ BROKEN = {
     "fails": ("CC", "/bin/false", "/bin/false does not run"),
     "makes nothing": ("CC", "/bin/true", "/bin/true failed with exit code 0"),
     "does not exist": ("CC", "/nowhere/cc", "no C compiler found"),
-    "does not exist, with options": ("CC", "/nowhere/cc -O2", "no C compiler found: CC is '/nowhere/cc -O2'"),
+    "does not exist, with options": (
+        "CC",
+        "/nowhere/cc -O2",
+        "no C compiler found: CC is '/nowhere/cc -O2'",
+    ),
     "is not quoted right": ("CC", "cc '-O2", "no C compiler found: CC is"),
     "is not installed": ("PATH", "", "no C compiler found"),
 }
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
-def test_a_compiler_that_hangs_is_killed_with_its_child_processes(own_cache, monkeypatch, tmp_path):
+def test_a_compiler_that_hangs_is_killed_with_its_child_processes(
+    own_cache, monkeypatch, tmp_path
+):
     hanging = tmp_path / "cc"
     hanging.write_text(f"#!/bin/sh\nsleep 1000 &\necho $! > {tmp_path}/child\nwait\n")
     hanging.chmod(0o755)
     monkeypatch.setenv("CC", str(hanging))
     monkeypatch.setattr(compiler, "MAX_VERSION_TIME_S", 0.5)
     begun = time.monotonic()
-    with pytest.raises(MachineError, match=r"cc took more than 0\.5 s to print its version"):
+    with pytest.raises(
+        MachineError, match=r"cc took more than 0\.5 s to print its version"
+    ):
         choose_backend("compiled")
     assert time.monotonic() - begun < HANGING / 10
     child = int((tmp_path / "child").read_text())
@@ -702,7 +913,9 @@ def hanging_compiler(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Make a compiler that hangs, except for its version; return the file with its child process."""
     hanging = folder / "cc"
     version = 'if [ "$1" = --version ]; then echo fake 1.0; exit; fi'
-    hanging.write_text(f"#!/bin/sh\n{version}\nsleep 1000 &\necho $! > {folder}/child\ncat\nwait\n")
+    hanging.write_text(
+        f"#!/bin/sh\n{version}\nsleep 1000 &\necho $! > {folder}/child\ncat\nwait\n"
+    )
     hanging.chmod(0o755)
     monkeypatch.setenv("CC", str(hanging))
     return folder / "child"
@@ -716,13 +929,27 @@ def ended(child: Path) -> bool:
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
-def test_a_compilation_that_hangs_is_announced_and_killed(own_cache, monkeypatch, tmp_path, caplog):
+def test_a_compilation_that_hangs_is_announced_and_killed(
+    own_cache, monkeypatch, tmp_path, caplog
+):
     child = hanging_compiler(tmp_path, monkeypatch)
-    for name, value in {"MIN_COMPILE_LIMIT_S": 1.0, "LIMIT_S_PER_BYTE": 0.0, "NOTICE_AFTER_S": 0.3}.items():
+    for name, value in {
+        "MIN_COMPILE_LIMIT_S": 1.0,
+        "LIMIT_S_PER_BYTE": 0.0,
+        "NOTICE_AFTER_S": 0.3,
+    }.items():
         monkeypatch.setattr(compiler, name, value)
-    with caplog.at_level("INFO"), pytest.raises(MachineError, match=r"cc took more than 1 s for selftest\.c: set CC"):
+    with (
+        caplog.at_level("INFO"),
+        pytest.raises(
+            MachineError, match=r"cc took more than 1 s for selftest\.c: set CC"
+        ),
+    ):
         choose_backend("compiled")
-    assert any("has taken 0.3 s for selftest.c; it is ended after 1 s" in text for text in caplog.messages)
+    assert any(
+        "has taken 0.3 s for selftest.c; it is ended after 1 s" in text
+        for text in caplog.messages
+    )
     assert ended(child)
     backend, _, (warning,) = chosen_with_warnings()
     assert backend == "numpy"
@@ -730,7 +957,9 @@ def test_a_compilation_that_hangs_is_announced_and_killed(own_cache, monkeypatch
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
-def test_an_interruption_ends_the_compilers_of_all_threads(root, own_cache, monkeypatch, tmp_path):
+def test_an_interruption_ends_the_compilers_of_all_threads(
+    root, own_cache, monkeypatch, tmp_path
+):
     child = hanging_compiler(tmp_path, monkeypatch)
     pool, tape = CompilerPool(own_cache), tape_from_function(root, ROOT)
 
@@ -751,29 +980,46 @@ def test_an_interruption_ends_the_compilers_of_all_threads(root, own_cache, monk
 
 @needs_compiler
 @pytest.mark.parametrize("command", ["'{cc}' -g", "{cc} -DNAME='two words'", "{cc}"])
-def test_cc_may_be_a_path_with_spaces_and_options(root, own_cache, monkeypatch, tmp_path, command):
+def test_cc_may_be_a_path_with_spaces_and_options(
+    root, own_cache, monkeypatch, tmp_path, command
+):
     """Check wrappers such as ccache: CC="ccache gcc"."""
-    path = tmp_path / "my compilers" / "cc" if "'{cc}'" in command or command == "{cc}" else tmp_path / "cc"
+    path = (
+        tmp_path / "my compilers" / "cc"
+        if "'{cc}'" in command or command == "{cc}"
+        else tmp_path / "cc"
+    )
     path.parent.mkdir(exist_ok=True)
-    path.write_text(f'#!/bin/sh\nprintf "%s|" "$@" >> "{tmp_path}/seen"\nexec {find_compiler()} "$@"\n')
+    path.write_text(
+        f'#!/bin/sh\nprintf "%s|" "$@" >> "{tmp_path}/seen"\nexec {find_compiler()} "$@"\n'
+    )
     path.chmod(0o755)
     compiler.find_compiler.cache_clear()
     monkeypatch.setenv("CC", command.format(cc=path))
     assert chosen_with_warnings() == ("compiled", own_cache, [])
     seen = (tmp_path / "seen").read_text()
-    assert {"'{cc}' -g": "-g|", "{cc} -DNAME='two words'": "-DNAME=two words|", "{cc}": "--version|"}[command] in seen
+    assert {
+        "'{cc}' -g": "-g|",
+        "{cc} -DNAME='two words'": "-DNAME=two words|",
+        "{cc}": "--version|",
+    }[command] in seen
     assert "-shared|" in seen
 
 
 @needs_compiler
 def test_compiler_options_are_part_of_the_cache_key_of_a_library(root, own_cache):
     tape = tape_from_function(root, ROOT)
-    stems = {compiled_kernel.library_file_stem(tape, find_compiler() + options) for options in ("", " -O3", " -O3 -g")}
+    stems = {
+        compiled_kernel.library_file_stem(tape, find_compiler() + options)
+        for options in ("", " -O3", " -O3 -g")
+    }
     assert len(stems) == 3
 
 
 @pytest.mark.parametrize("what", BROKEN)
-def test_without_a_working_compiler_numpy_runs_after_one_warning(own_cache, monkeypatch, what):
+def test_without_a_working_compiler_numpy_runs_after_one_warning(
+    own_cache, monkeypatch, what
+):
     name, value, text = BROKEN[what]
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setenv(name, value)
@@ -785,7 +1031,9 @@ def test_without_a_working_compiler_numpy_runs_after_one_warning(own_cache, monk
 
 
 @pytest.mark.parametrize("what", BROKEN)
-def test_without_a_working_compiler_the_compiled_backend_is_a_machine_error(own_cache, monkeypatch, what):
+def test_without_a_working_compiler_the_compiled_backend_is_a_machine_error(
+    own_cache, monkeypatch, what
+):
     name, value, text = BROKEN[what]
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setenv(name, value)
@@ -795,7 +1043,9 @@ def test_without_a_working_compiler_the_compiled_backend_is_a_machine_error(own_
 
 @needs_compiler
 def test_a_compiler_that_generates_wrong_code_is_detected(own_cache, monkeypatch):
-    monkeypatch.setattr(library_module, "CompiledKernel", lambda tape, _path, _folder: lambda x: [x])
+    monkeypatch.setattr(
+        library_module, "CompiledKernel", lambda tape, _path, _folder: lambda x: [x]
+    )
     with pytest.raises(MachineError, match="wrong code"):
         choose_backend("compiled")
 
@@ -825,7 +1075,10 @@ def test_a_cached_tape_has_the_read_permissions_of_the_umask(tmp_path):
 
 
 def test_unknown_backends_are_refused(own_cache):
-    with pytest.raises(UsageError, match="'cuda' does not exist: expected one of compiled, numpy, casadi"):
+    with pytest.raises(
+        UsageError,
+        match="'cuda' does not exist: expected one of compiled, numpy, casadi",
+    ):
         choose_backend("cuda")
 
 

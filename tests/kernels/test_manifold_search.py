@@ -36,28 +36,47 @@ class Setting:
     """The crane beside a wall, whose tip stays at a height."""
 
     def __init__(self, folder, obstacles):
-        self.problem = load_problem(write_problem(folder, obstacles=obstacles, more=LEVEL))
+        self.problem = load_problem(
+            write_problem(folder, obstacles=obstacles, more=LEVEL)
+        )
         self.robot = load_robot(self.problem)
-        self.tool, self.poses = Refiner(self.problem, self.robot), place_obstacles(self.problem.obstacle)
+        self.tool, self.poses = (
+            Refiner(self.problem, self.robot),
+            place_obstacles(self.problem.obstacle),
+        )
         self.ends = [self.level(q) for q in BESIDE_WALL]
         self.manifold = self.tool.manifold(between(self.problem, np.array(self.ends)))
 
     def height(self, q):
         """Height of the tip by Pinocchio [m]."""
-        world, zero = World(self.robot, self.problem.obstacle, None), np.zeros(self.robot.n)
+        world, zero = (
+            World(self.robot, self.problem.obstacle, None),
+            np.zeros(self.robot.n),
+        )
         world.set_state(q, zero, zero, self.poses)
         return world.tip_position[2]
 
     def level(self, q, height=HEIGHT_M):
         """Project a state onto a height with SciPy."""
-        return least_squares(lambda x: [1e3 * (self.height(x) - height), *(1e-3 * (x - q))], q, xtol=1e-15).x
+        return least_squares(
+            lambda x: [1e3 * (self.height(x) - height), *(1e-3 * (x - q))],
+            q,
+            xtol=1e-15,
+        ).x
 
     def search(self, seed=0, ends=None, **settings):
         box = self.robot.position_lower, self.robot.position_upper
-        chosen = TreeSettings(0.0, 0.0, **{"spacing": SPACING, "max_nodes": 20_000} | settings)
+        chosen = TreeSettings(
+            0.0, 0.0, **{"spacing": SPACING, "max_nodes": 20_000} | settings
+        )
         checker = self.tool.hulls.placed_checker(self.poses)
-        limit, ends = self.robot.velocity_limit, tuple(self.ends if ends is None else ends)
-        return find_tree_path(checker, ends, box, limit, chosen, seed=seed, manifold=self.manifold)
+        limit, ends = (
+            self.robot.velocity_limit,
+            tuple(self.ends if ends is None else ends),
+        )
+        return find_tree_path(
+            checker, ends, box, limit, chosen, seed=seed, manifold=self.manifold
+        )
 
 
 @pytest.fixture(scope="module")
@@ -73,19 +92,33 @@ def test_paths_keep_the_height_and_are_clear_by_coal(setting, margin):
     assert np.abs(np.diff(path, axis=0)).max() <= 3 * SPACING
     assert (path >= setting.robot.position_lower).all()
     assert (path <= setting.robot.position_upper).all()
-    distances = Hulls(setting.problem, setting.robot).measure(path[1:-1].T.copy(), setting.poses)[0].min(axis=1)
-    away = np.minimum(*(np.abs(path[1:-1] - end).max(axis=1) for end in setting.ends)) > 0.3
+    distances = (
+        Hulls(setting.problem, setting.robot)
+        .measure(path[1:-1].T.copy(), setting.poses)[0]
+        .min(axis=1)
+    )
+    away = (
+        np.minimum(*(np.abs(path[1:-1] - end).max(axis=1) for end in setting.ends))
+        > 0.3
+    )
     assert distances.min() >= -1e-6
     assert distances[away].min() >= margin - 1e-6
     line = np.linspace(*setting.ends, 100)
-    assert not Hulls(setting.problem, setting.robot).clear_states(line.T.copy(), setting.poses).all()
+    assert (
+        not Hulls(setting.problem, setting.robot)
+        .clear_states(line.T.copy(), setting.poses)
+        .all()
+    )
 
 
 def test_paths_are_reproducible_and_shortened(setting):
     paths = [setting.search(seed=seed) for seed in (0, 0, 1)]
     assert np.array_equal(paths[0], paths[1])
     assert not np.array_equal(paths[0], paths[2])
-    counts = [np.mean([len(setting.search(seed=seed, shortcuts=n)) for seed in range(6)]) for n in (0, 200)]
+    counts = [
+        np.mean([len(setting.search(seed=seed, shortcuts=n)) for seed in range(6)])
+        for n in (0, 200)
+    ]
     assert counts[1] < 0.9 * counts[0]
 
 
@@ -102,10 +135,18 @@ def test_a_start_off_the_manifold_is_left(setting):
 
 
 def test_a_motion_around_a_wall_keeps_the_height(setting):
-    checker = PlanChecker(setting.problem, setting.robot, degree=setting.tool.spec.degree)
-    found = refine_task(setting.tool, checker, between(setting.problem, np.array(setting.ends)))
+    checker = PlanChecker(
+        setting.problem, setting.robot, degree=setting.tool.spec.degree
+    )
+    found = refine_task(
+        setting.tool, checker, between(setting.problem, np.array(setting.ends))
+    )
     assert found.valid
-    states = Motion(found.path[None], found.rate[None], setting.tool.spec.degree).at(np.linspace(0, 1, 400)).q[0]
+    states = (
+        Motion(found.path[None], found.rate[None], setting.tool.spec.degree)
+        .at(np.linspace(0, 1, 400))
+        .q[0]
+    )
     assert max(abs(setting.height(q) - HEIGHT_M) for q in states) < 1e-3
     assert np.abs(states[:, 0]).min() < 0.05  # it passes the wall
 

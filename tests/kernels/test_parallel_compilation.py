@@ -43,7 +43,9 @@ def test_kernels_are_ready_after_the_block_and_correct(tmp_path, compiled):
         kernels = {k: library.load(power, exponent=k) for k in (2, 3, 4)}
     assert len(compiled) == len(list((tmp_path / "lib").glob("power-*.so"))) == 3
     for k, kernel in kernels.items():
-        np.testing.assert_allclose(kernel(np.array([[1.0, 2.0, 3.0]]))[0], [[1.0, 2.0**k, 3.0**k]], rtol=1e-15)
+        np.testing.assert_allclose(
+            kernel(np.array([[1.0, 2.0, 3.0]]))[0], [[1.0, 2.0**k, 3.0**k]], rtol=1e-15
+        )
 
 
 def test_an_early_call_waits_for_the_compilation(tmp_path):

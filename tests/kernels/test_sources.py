@@ -23,7 +23,9 @@ WITHOUT_EFFECT = {
     "cnpgen.store": "how columns are described and files are written",
 }
 MODULES = {
-    ".".join(path.relative_to(PACKAGE_FOLDER.parent).with_suffix("").parts).removesuffix(".__init__"): path
+    ".".join(
+        path.relative_to(PACKAGE_FOLDER.parent).with_suffix("").parts
+    ).removesuffix(".__init__"): path
     for path in PACKAGE_FOLDER.rglob("*.py")
 }
 
@@ -32,7 +34,11 @@ MODULES = {
 def imports(module: str) -> set[str]:
     """Return the modules of the package that a module imports at run time, also inside functions."""
     tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
-    blocks = [node for node in ast.walk(tree) if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)]
+    blocks = [
+        node
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
+    ]
     typing_only = {id(node) for block in blocks for node in ast.walk(block)}
     found: set[str] = set()
     for node in ast.walk(tree):
@@ -41,7 +47,9 @@ def imports(module: str) -> set[str]:
         if isinstance(node, ast.Import):
             found.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
-            found.update([node.module, *(f"{node.module}.{alias.name}" for alias in node.names)])
+            found.update(
+                [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+            )
     return found & MODULES.keys()
 
 
@@ -60,8 +68,12 @@ def makes_functions(module: str) -> bool:
     text = MODULES[module].read_text(encoding="utf-8")
     if "Function(" not in text:
         return False
-    calls = (node.func for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call))
-    return any(isinstance(call, ast.Attribute) and call.attr == "Function" for call in calls)
+    calls = (
+        node.func for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call)
+    )
+    return any(
+        isinstance(call, ast.Attribute) and call.attr == "Function" for call in calls
+    )
 
 
 BUILDERS = sorted(filter(makes_functions, MODULES))
@@ -69,23 +81,39 @@ BUILDERS = sorted(filter(makes_functions, MODULES))
 
 def test_the_builders_of_every_package_are_found() -> None:
     assert {name.split(".")[1] for name in BUILDERS} == {
-        *("benchmark", "losses", "pipelines", "planner", "refine", "kernels", "problems"),
+        *(
+            "benchmark",
+            "losses",
+            "pipelines",
+            "planner",
+            "refine",
+            "kernels",
+            "problems",
+        ),
     }
 
 
 @pytest.mark.parametrize("module", BUILDERS)
 def test_all_imports_of_a_builder_are_in_the_key_of_its_tapes(module: str) -> None:
-    hashed = tuple(f"cnpgen.{package}" for package in (*BUILDER_PACKAGES, module.split(".")[1]))
+    hashed = tuple(
+        f"cnpgen.{package}" for package in (*BUILDER_PACKAGES, module.split(".")[1])
+    )
     covered = tuple(f"{package}." for package in (*hashed, *WITHOUT_EFFECT))
-    missing = sorted(name for name in closure(module) if not f"{name}.".startswith(covered))
-    assert not missing, f"{module} imports {missing}, whose changes would not change its tapes"
+    missing = sorted(
+        name for name in closure(module) if not f"{name}.".startswith(covered)
+    )
+    assert not missing, (
+        f"{module} imports {missing}, whose changes would not change its tapes"
+    )
 
 
 @pytest.fixture
 def copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return a copy of the package's source that replaces it in digests."""
     folder = tmp_path / "cnpgen"
-    shutil.copytree(PACKAGE_FOLDER, folder, ignore=shutil.ignore_patterns("__pycache__", "*.so"))
+    shutil.copytree(
+        PACKAGE_FOLDER, folder, ignore=shutil.ignore_patterns("__pycache__", "*.so")
+    )
     monkeypatch.setattr(library_module, "PACKAGE_FOLDER", folder)
     return folder
 
@@ -93,11 +121,16 @@ def copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def tapes(folder: Path) -> set[str]:
     """Return the names of the cached tapes after loading a kernel with the present source."""
     library_module._digest_of.cache_clear()
-    KernelLibrary("numpy", folder, "problem", {"robot": load_robot(load_problem("airhockey"))}).load(tip_state)
+    KernelLibrary(
+        "numpy", folder, "problem", {"robot": load_robot(load_problem("airhockey"))}
+    ).load(tip_state)
     return {path.name for path in (folder / "tape").iterdir()}
 
 
-@pytest.mark.parametrize("changed", ["problems/constraints/joint.py", "pipelines/stages/reach.py", "robots/chain.py"])
+@pytest.mark.parametrize(
+    "changed",
+    ["problems/constraints/joint.py", "pipelines/stages/reach.py", "robots/chain.py"],
+)
 def test_a_change_in_a_subfolder_of_a_package_changes_the_key_of_a_tape(
     copy: Path, tmp_path: Path, changed: str
 ) -> None:
@@ -108,7 +141,9 @@ def test_a_change_in_a_subfolder_of_a_package_changes_the_key_of_a_tape(
     assert len(tapes(tmp_path)) == 2
 
 
-def test_a_change_that_no_builder_imports_changes_no_key(copy: Path, tmp_path: Path) -> None:
+def test_a_change_that_no_builder_imports_changes_no_key(
+    copy: Path, tmp_path: Path
+) -> None:
     before = tapes(tmp_path)
     (copy / "cli" / "main.py").write_text("")
     (copy / "losses" / "metric.py").write_text("")

@@ -5,8 +5,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from cnpgen.kernels.collision.collision_checker import CollisionChecker, load_collision_library
-from cnpgen.kernels.collision.tree_search import TreeSettings, estimated_duration, find_tree_path
+from cnpgen.kernels.collision.collision_checker import (
+    CollisionChecker,
+    load_collision_library,
+)
+from cnpgen.kernels.collision.tree_search import (
+    TreeSettings,
+    estimated_duration,
+    find_tree_path,
+)
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.refine.solver.hulls import Hulls
@@ -21,7 +28,10 @@ pytestmark = needs_compiler
 def setting(tmp_path_factory):
     problem = narrow(tmp_path_factory.mktemp("wall"), WALL)
     robot = load_robot(problem)
-    checker = CollisionChecker(load_collision_library(KernelLibrary(*choose_backend("compiled"), "", {})), robot)
+    checker = CollisionChecker(
+        load_collision_library(KernelLibrary(*choose_backend("compiled"), "", {})),
+        robot,
+    )
     checker.place(problem.obstacle, place_obstacles(problem.obstacle))
     return problem, robot, checker
 
@@ -30,13 +40,19 @@ def search(setting, ends=BESIDE_WALL, seed=0, **settings):
     _, robot, checker = setting
     box = robot.position_lower, robot.position_upper
     return find_tree_path(
-        checker, tuple(ends), box, robot.velocity_limit, TreeSettings(0.0, 0.0, **settings), seed=seed
+        checker,
+        tuple(ends),
+        box,
+        robot.velocity_limit,
+        TreeSettings(0.0, 0.0, **settings),
+        seed=seed,
     )
 
 
 def along(path: np.ndarray, step: float = 0.01) -> np.ndarray:
     lines = [
-        a[:, None] + (b - a)[:, None] * np.linspace(0, 1, int(np.abs(b - a).max() / step) + 2)
+        a[:, None]
+        + (b - a)[:, None] * np.linspace(0, 1, int(np.abs(b - a).max() / step) + 2)
         for a, b in pairwise(path)
     ]
     return np.concatenate(lines, axis=1)
@@ -50,10 +66,17 @@ def test_paths_around_a_wall_are_clear_by_coal(setting, margin):
     np.testing.assert_array_equal(path[[0, -1]], BESIDE_WALL)
     q, poses = along(path), place_obstacles(problem.obstacle)
     distances = Hulls(problem, robot).measure(q, poses)[0].min(axis=1)
-    away = np.minimum(*(np.abs(q.T - end).max(axis=1) for end in BESIDE_WALL)) > TreeSettings(0.0, 0.0).margin_ramp
+    away = (
+        np.minimum(*(np.abs(q.T - end).max(axis=1) for end in BESIDE_WALL))
+        > TreeSettings(0.0, 0.0).margin_ramp
+    )
     assert distances.min() > -0.004  # between checked states
     assert distances[away].min() > margin - 0.004
-    assert not Hulls(problem, robot).clear_states(np.linspace(*BESIDE_WALL, 100).T.copy(), poses).all()
+    assert (
+        not Hulls(problem, robot)
+        .clear_states(np.linspace(*BESIDE_WALL, 100).T.copy(), poses)
+        .all()
+    )
 
 
 def test_paths_are_reproducible(setting):
@@ -70,7 +93,11 @@ def test_the_search_ends_with_enough_nodes(setting):
 def test_shortcuts_reduce_the_estimated_duration(setting):
     velocity = setting[1].velocity_limit
     durations = [
-        [estimated_duration(search(setting, seed=s, shortcuts=n), velocity) for s in range(8)] for n in (0, 100)
+        [
+            estimated_duration(search(setting, seed=s, shortcuts=n), velocity)
+            for s in range(8)
+        ]
+        for n in (0, 100)
     ]
     assert np.mean(durations[1]) < np.mean(durations[0])
 

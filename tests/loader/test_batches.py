@@ -32,21 +32,33 @@ SIZES = {  # rows and rows per shard
 
 
 @pytest.fixture(scope="module", params=SIZES)
-def dataset(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def dataset(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Dataset:
     splits, shard_size = SIZES[request.param]
-    return load_dataset(make(tmp_path_factory.mktemp("loader"), splits=splits, shard_size=shard_size))
+    return load_dataset(
+        make(tmp_path_factory.mktemp("loader"), splits=splits, shard_size=shard_size)
+    )
 
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     splits, shard_size = SIZES["last shard short"]
-    return load_dataset(make(tmp_path_factory.mktemp("loader"), splits=splits, shard_size=shard_size))
+    return load_dataset(
+        make(tmp_path_factory.mktemp("loader"), splits=splits, shard_size=shard_size)
+    )
 
 
 @pytest.fixture(autouse=True, params=["kept in memory", "read in every epoch"])
-def _small_windows(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+def _small_windows(
+    monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
     monkeypatch.setattr(windows, "WINDOW_ROWS", 20)
-    monkeypatch.setattr(windows, "MAX_IN_MEMORY_BYTES", 1 << 20 if request.param == "kept in memory" else 0)
+    monkeypatch.setattr(
+        windows,
+        "MAX_IN_MEMORY_BYTES",
+        1 << 20 if request.param == "kept in memory" else 0,
+    )
 
 
 def cases(dataset: Dataset, count: int = 12) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -61,7 +73,9 @@ def cases(dataset: Dataset, count: int = 12) -> Iterator[tuple[str, dict[str, An
             split,
             {
                 "batch_size": batch_size,
-                "world": 1 if not drop_last and 0 < rows % batch_size < world else world,  # refused, see below
+                "world": 1
+                if not drop_last and 0 < rows % batch_size < world
+                else world,  # refused, see below
                 "drop_last": drop_last,
                 "seed": int(random.integers(5)),
                 "epoch": int(random.integers(3)),
@@ -76,26 +90,42 @@ def test_every_row_is_returned_once_per_epoch(dataset: Dataset) -> None:
         batches = dataset.batches(split=split, fields=ALL, **options | {"world": 1})
         found = list(batches)
         rows = np.concatenate([batch["sample_id"] for batch in found])
-        dropped = dataset.splits[split] % options["batch_size"] if options["drop_last"] else 0
+        dropped = (
+            dataset.splits[split] % options["batch_size"] if options["drop_last"] else 0
+        )
         assert len(found) == len(batches)
         assert len(set(rows.tolist())) == len(rows) == dataset.splits[split] - dropped
         for batch in found:
             for name, values in batch.items():
-                assert np.array_equal(values, everything[name][batch["sample_id"]].astype(values.dtype))
+                assert np.array_equal(
+                    values, everything[name][batch["sample_id"]].astype(values.dtype)
+                )
 
 
 def test_only_the_last_batch_may_be_incomplete(dataset: Dataset) -> None:
     for split, options in cases(dataset):
-        sizes = [batch.rows for batch in dataset.batches(split=split, **options | {"world": 1})]
+        sizes = [
+            batch.rows
+            for batch in dataset.batches(split=split, **options | {"world": 1})
+        ]
         assert set(sizes[:-1]) <= {options["batch_size"]}
-        assert sizes[-1] == options["batch_size"] if options["drop_last"] else 0 < sizes[-1] <= options["batch_size"]
+        assert (
+            sizes[-1] == options["batch_size"]
+            if options["drop_last"]
+            else 0 < sizes[-1] <= options["batch_size"]
+        )
 
 
-def test_the_batches_of_all_ranks_together_are_those_of_one_rank(dataset: Dataset) -> None:
+def test_the_batches_of_all_ranks_together_are_those_of_one_rank(
+    dataset: Dataset,
+) -> None:
     for split, options in cases(dataset):
         world = options["world"]
         whole = list(dataset.batches(split=split, fields=ALL, **options | {"world": 1}))
-        ranks = [list(dataset.batches(split=split, fields=ALL, rank=r, **options)) for r in range(world)]
+        ranks = [
+            list(dataset.batches(split=split, fields=ALL, rank=r, **options))
+            for r in range(world)
+        ]
         assert {len(rank) for rank in ranks} == {len(whole)}
         for number, batch in enumerate(whole):
             for rank in range(world):
@@ -113,10 +143,15 @@ def test_a_resumed_run_equals_the_uninterrupted_run(dataset: Dataset) -> None:
             first = dataset.batches(split=split, fields=ALL, **options)
             head = take(first, cut)
             state = json.loads(json.dumps(first.state()))
-            second = dataset.batches(split=split, fields=ALL, **options | {"seed": 99, "epoch": 7})
+            second = dataset.batches(
+                split=split, fields=ALL, **options | {"seed": 99, "epoch": 7}
+            )
             second.load_state(state)
             tail = take(second, 2 * batches - cut)
-            assert all(same(one, other) for one, other in zip(head + tail, expected, strict=True))
+            assert all(
+                same(one, other)
+                for one, other in zip(head + tail, expected, strict=True)
+            )
 
 
 def take(batches: Any, count: int) -> list[Batch]:
@@ -130,7 +165,9 @@ def take(batches: Any, count: int) -> list[Batch]:
     return found
 
 
-def test_the_state_is_the_same_on_every_rank_and_may_be_loaded_with_another_world(plain: Dataset) -> None:
+def test_the_state_is_the_same_on_every_rank_and_may_be_loaded_with_another_world(
+    plain: Dataset,
+) -> None:
     ranks = [plain.batches(6, rank=rank, world=3, fields=ALL) for rank in range(3)]
     for rank in ranks:
         take(rank, 4)
@@ -157,29 +194,45 @@ def test_the_state_is_a_small_dict(plain: Dataset) -> None:
     }
 
 
-def test_the_state_after_a_number_of_used_batches_is_computed_without_reading_them(plain: Dataset) -> None:
+def test_the_state_after_a_number_of_used_batches_is_computed_without_reading_them(
+    plain: Dataset,
+) -> None:
     for drop_last in (True, False):
-        batches, ahead = plain.batches(8, epoch=1, drop_last=drop_last), plain.batches(8, drop_last=drop_last)
+        batches, ahead = (
+            plain.batches(8, epoch=1, drop_last=drop_last),
+            plain.batches(8, drop_last=drop_last),
+        )
         for used in range(len(batches)):
             assert ahead.state(epoch=1, batch=used) == batches.state()
             take(batches, 1)
         assert ahead.state(epoch=1, batch=len(batches)) == batches.state()
         assert (batches.state()["epoch"], batches.state()["row"]) == (2, 0)
-        with pytest.raises(UsageError, match=r"batch must be at most \d, the number of batches of an epoch, got 8"):
+        with pytest.raises(
+            UsageError,
+            match=r"batch must be at most \d, the number of batches of an epoch, got 8",
+        ):
             ahead.state(batch=8)
 
 
 def test_shapes_and_types_are_known_before_the_first_batch(plain: Dataset) -> None:
     batches = plain.batches(8, fields=ALL, dtype="float64")
     (batch, *_) = batches
-    assert batches.signature == {name: (values.shape[1:], values.dtype) for name, values in batch.items()}
+    assert batches.signature == {
+        name: (values.shape[1:], values.dtype) for name, values in batch.items()
+    }
 
 
-def test_an_abandoned_loop_continues_and_a_finished_one_starts_the_next_epoch(plain: Dataset) -> None:
+def test_an_abandoned_loop_continues_and_a_finished_one_starts_the_next_epoch(
+    plain: Dataset,
+) -> None:
     batches = plain.batches(10, fields=ALL)
     assert ids(take(batches, 2)) + ids(batches) == ids(plain.batches(10, fields=ALL))
     assert batches.epoch == 1
-    assert ids(batches) == ids(plain.batches(10, fields=ALL, epoch=1)) != ids(plain.batches(10, fields=ALL))
+    assert (
+        ids(batches)
+        == ids(plain.batches(10, fields=ALL, epoch=1))
+        != ids(plain.batches(10, fields=ALL))
+    )
     batches.epoch = 0
     assert ids(batches) == ids(plain.batches(10, fields=ALL))
 
@@ -188,10 +241,14 @@ def test_taking_exactly_all_batches_of_an_epoch_ends_it(plain: Dataset) -> None:
     batches = plain.batches(10, fields=ALL)
     for epoch in range(3):
         assert batches.epoch == epoch
-        assert ids(islice(batches, len(batches))) == ids(plain.batches(10, fields=ALL, epoch=epoch))
+        assert ids(islice(batches, len(batches))) == ids(
+            plain.batches(10, fields=ALL, epoch=epoch)
+        )
 
 
-def test_a_state_that_leaves_no_batch_of_another_size_leads_to_the_next_epoch(plain: Dataset) -> None:
+def test_a_state_that_leaves_no_batch_of_another_size_leads_to_the_next_epoch(
+    plain: Dataset,
+) -> None:
     small, large = plain.batches(10, fields=ALL), plain.batches(25, fields=ALL)
     take(small, 4)
     large.load_state(small.state())
@@ -219,7 +276,9 @@ def test_a_batch_owns_its_arrays(plain: Dataset) -> None:
         assert all(np.array_equal(one[name], other[name]) for name in ALL)
 
 
-def test_fields_are_views_of_one_packed_table_in_the_requested_order(plain: Dataset) -> None:
+def test_fields_are_views_of_one_packed_table_in_the_requested_order(
+    plain: Dataset,
+) -> None:
     batch = next(iter(plain.batches(8, fields=["clearance", "sample_id", "start_q"])))
     assert list(batch) == ["clearance", "sample_id", "start_q"]
     assert batch.table.shape == (8, 4)
@@ -228,7 +287,9 @@ def test_fields_are_views_of_one_packed_table_in_the_requested_order(plain: Data
     assert batch.columns == {"clearance": slice(0, 1), "start_q": slice(1, 4)}
     assert batch["clearance"].shape == (8,)
     assert batch["start_q"].shape == (8, 3)
-    assert all(np.shares_memory(batch[name], batch.table) for name in ("clearance", "start_q"))
+    assert all(
+        np.shares_memory(batch[name], batch.table) for name in ("clearance", "start_q")
+    )
     assert batch["sample_id"].dtype == np.int64
     assert dict(batch).keys() == {"clearance", "sample_id", "start_q"}
 
@@ -244,7 +305,9 @@ def test_float_fields_have_the_requested_type(plain: Dataset, dtype: Any) -> Non
     rows = columns(splits=SIZES["last shard short"][0], shard_size=16)
     for batch in plain.batches(16, fields=ALL, normalize=False, dtype=dtype):
         assert batch.table.dtype == dtype
-        assert np.array_equal(batch["start_q"], rows["start_q"][batch["sample_id"]].astype(dtype))
+        assert np.array_equal(
+            batch["start_q"], rows["start_q"][batch["sample_id"]].astype(dtype)
+        )
 
 
 def test_batches_of_float32_shards_have_the_requested_type(tmp_path: Path) -> None:
@@ -257,15 +320,24 @@ def test_batches_of_float32_shards_have_the_requested_type(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("stored", ["float32", "float64"])
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_batches_and_rows_are_normalized_to_identical_values(tmp_path: Path, stored: str, dtype: str) -> None:
+def test_batches_and_rows_are_normalized_to_identical_values(
+    tmp_path: Path, stored: str, dtype: str
+) -> None:
     dataset = load_dataset(make(tmp_path, dtype=stored))
     (batch,) = dataset.batches(50, fields=ALL, dtype=dtype)
-    rows = dataset.rows("train", batch["sample_id"], fields=ALL, normalize=True, dtype=dtype)
+    rows = dataset.rows(
+        "train", batch["sample_id"], fields=ALL, normalize=True, dtype=dtype
+    )
     assert all(np.array_equal(rows[name], values) for name, values in batch.items())
 
 
-def test_a_batch_size_above_the_number_of_rows_needs_drop_last_false(plain: Dataset) -> None:
-    with pytest.raises(UsageError, match=r"batch_size 51 is more than the 50 rows of split 'train'; drop_last=False"):
+def test_a_batch_size_above_the_number_of_rows_needs_drop_last_false(
+    plain: Dataset,
+) -> None:
+    with pytest.raises(
+        UsageError,
+        match=r"batch_size 51 is more than the 50 rows of split 'train'; drop_last=False",
+    ):
         plain.batches(51)
     (batch,) = plain.batches(51, drop_last=False)
     assert batch.rows == 50
@@ -275,8 +347,12 @@ def test_a_last_batch_without_rows_for_a_rank_is_refused(plain: Dataset) -> None
     message = "the last batch of 50 rows has 2 for 3 ranks: omit it with drop_last=True"
     with pytest.raises(UsageError, match=message):
         plain.batches(6, world=3, drop_last=False)
-    assert [batch.rows for batch in plain.batches(48, world=2, rank=1, drop_last=False)] == [24, 1]
-    batches = plain.batches(9, world=3, drop_last=False)  # 50 = 5 x 9 + 5, but 46 = 5 x 9 + 1
+    assert [
+        batch.rows for batch in plain.batches(48, world=2, rank=1, drop_last=False)
+    ] == [24, 1]
+    batches = plain.batches(
+        9, world=3, drop_last=False
+    )  # 50 = 5 x 9 + 5, but 46 = 5 x 9 + 1
     with pytest.raises(UsageError, match="has 1 for 3 ranks"):
         batches.load_state(batches.state() | {"row": 4})
     assert batches.state()["row"] == 0
@@ -294,8 +370,14 @@ def test_a_last_batch_without_rows_for_a_rank_is_refused(plain: Dataset) -> None
         ({"epoch": "1"}, "epoch must be an integer from 0 on, got '1'"),
         ({"dtype": "float16"}, "dtype must be one of float32, float64, got 'float16'"),
         ({"dtype": "flaot32"}, "dtype must be one of float32, float64, got 'flaot32'"),
-        ({"normalize": "yes"}, "normalize must be True, False or the normalization of a dataset, got 'yes'"),
-        ({"normalize": 1}, "normalize must be True, False or the normalization of a dataset, got 1"),
+        (
+            {"normalize": "yes"},
+            "normalize must be True, False or the normalization of a dataset, got 'yes'",
+        ),
+        (
+            {"normalize": 1},
+            "normalize must be True, False or the normalization of a dataset, got 1",
+        ),
         ({"shuffle": "no"}, "shuffle must be True or False, got 'no'"),
         ({"drop_last": 0}, "drop_last must be True or False, got 0"),
         ({"fields": "start_q"}, r"write \['start_q'\]"),
@@ -303,26 +385,37 @@ def test_a_last_batch_without_rows_for_a_rank_is_refused(plain: Dataset) -> None
         ({"fields": ["start_q", "start_q"]}, "one or more different names"),
     ],
 )
-def test_invalid_arguments_are_refused(plain: Dataset, options: dict[str, Any], message: str) -> None:
+def test_invalid_arguments_are_refused(
+    plain: Dataset, options: dict[str, Any], message: str
+) -> None:
     with pytest.raises(UsageError, match=message):
         plain.batches(**{"batch_size": 8} | options)
 
 
-def test_unknown_splits_and_fields_are_refused_with_the_nearest_name(plain: Dataset) -> None:
+def test_unknown_splits_and_fields_are_refused_with_the_nearest_name(
+    plain: Dataset,
+) -> None:
     with pytest.raises(
-        DatasetError, match=r"no split 'valid' \(did you mean 'validation'\?\), only train, validation, test$"
+        DatasetError,
+        match=r"no split 'valid' \(did you mean 'validation'\?\), only train, validation, test$",
     ):
         plain.batches(8, split="valid")
-    with pytest.raises(DatasetError, match=r"no field 'start_dq'.*did you mean 'start_q'"):
+    with pytest.raises(
+        DatasetError, match=r"no field 'start_dq'.*did you mean 'start_q'"
+    ):
         plain.batches(8, fields=["start_dq"])
 
 
-def test_the_state_of_another_dataset_or_split_is_refused(plain: Dataset, tmp_path: Path) -> None:
+def test_the_state_of_another_dataset_or_split_is_refused(
+    plain: Dataset, tmp_path: Path
+) -> None:
     other = load_dataset(make(tmp_path, seed=8))
     batches = plain.batches(8)
     with pytest.raises(DatasetError, match="of another dataset: fingerprint"):
         batches.load_state(other.batches(8).state())
-    with pytest.raises(DatasetError, match="of another dataset: split 'validation', here 'train'"):
+    with pytest.raises(
+        DatasetError, match="of another dataset: split 'validation', here 'train'"
+    ):
         batches.load_state(plain.batches(8, split="validation").state())
 
 
@@ -336,7 +429,9 @@ def test_the_state_of_another_dataset_or_split_is_refused(plain: Dataset, tmp_pa
         ({"epoch": None}, "epoch must be an integer"),
     ],
 )
-def test_invalid_states_are_refused(plain: Dataset, change: dict[str, Any], message: str) -> None:
+def test_invalid_states_are_refused(
+    plain: Dataset, change: dict[str, Any], message: str
+) -> None:
     batches = plain.batches(8)
     with pytest.raises((DatasetError, UsageError), match=message):
         batches.load_state(batches.state() | change)
@@ -348,17 +443,25 @@ def test_invalid_states_are_refused(plain: Dataset, change: dict[str, Any], mess
         batches.load_state(lacking)
 
 
-def test_resuming_does_not_read_previous_windows(plain: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    epoch = windows.Order("train", tuple(shard.rows for shard in plain.shards["train"]), 0, 0)
+def test_resuming_does_not_read_previous_windows(
+    plain: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    epoch = windows.Order(
+        "train", tuple(shard.rows for shard in plain.shards["train"]), 0, 0
+    )
     assert len(epoch.windows) > 1
     batches = plain.batches(2)
     batches.load_state(batches.state() | {"row": epoch.windows[-1].first})
     read = record_reads(monkeypatch)
     next(iter(batches))
-    assert {shard.path for shard, _, _ in read} == {plain.shards["train"][i].path for i in epoch.windows[-1].shards}
+    assert {shard.path for shard, _, _ in read} == {
+        plain.shards["train"][i].path for i in epoch.windows[-1].shards
+    }
 
 
-def test_the_next_window_is_read_ahead_by_one_thread_at_a_time(plain: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_next_window_is_read_ahead_by_one_thread_at_a_time(
+    plain: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     running, most, original = [], [], windows.pack
 
     def counted(*arguments: Any, **options: Any) -> Any:
@@ -391,12 +494,18 @@ def test_a_split_that_fits_is_read_once_and_a_larger_one_in_every_epoch(
         read = record_reads(monkeypatch)
         batches = plain.batches(10, fields=["goal_p", "sample_id"])
         found = [ids(batches) for _ in range(3)]
-        assert found == [ids(plain.batches(10, fields=ALL, epoch=epoch)) for epoch in range(3)]
+        assert found == [
+            ids(plain.batches(10, fields=ALL, epoch=epoch)) for epoch in range(3)
+        ]
         mine = [shard.path for shard, fields, _ in read if fields == 2]
-        assert sorted(mine) == sorted(shard.path for shard in plain.shards["train"] * times)
+        assert sorted(mine) == sorted(
+            shard.path for shard in plain.shards["train"] * times
+        )
 
 
-def record_reads(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Shard, int, threading.Thread]]:
+def record_reads(
+    monkeypatch: pytest.MonkeyPatch,
+) -> list[tuple[Shard, int, threading.Thread]]:
     """Note which shards are read, how many fields of them, and by which thread."""
     found, original = [], ShardReader.read
 

@@ -56,12 +56,23 @@ def test_the_repr_is_one_line(dataset: Dataset) -> None:
     batch = next(iter(batches))
     layout = "start_q[3], goal_p[2], clearance, sample_id"
     assert repr(batch) == f"<batch of 8 rows, float32: {layout}>"
-    assert repr(batches) == f"<batches of 8 of the 50 rows of split 'train', at seed 3, epoch 0, row 8: {layout}>"
-    assert repr(dataset["validation"]) == "<10 rows of split 'validation': start_q[3], goal_p[2]>"
-    assert repr(dataset.normalization) == "<means and deviations of start_q, goal_p, clearance>"
+    assert (
+        repr(batches)
+        == f"<batches of 8 of the 50 rows of split 'train', at seed 3, epoch 0, row 8: {layout}>"
+    )
+    assert (
+        repr(dataset["validation"])
+        == "<10 rows of split 'validation': start_q[3], goal_p[2]>"
+    )
+    assert (
+        repr(dataset.normalization)
+        == "<means and deviations of start_q, goal_p, clearance>"
+    )
 
 
-def test_an_unknown_split_is_refused_and_the_existing_ones_are_named(dataset: Dataset, folder: Path) -> None:
+def test_an_unknown_split_is_refused_and_the_existing_ones_are_named(
+    dataset: Dataset, folder: Path
+) -> None:
     message = "has no split 'val'.*only train, validation"
     for read in (
         lambda: dataset["val"],
@@ -79,7 +90,10 @@ def test_an_unknown_split_is_refused_and_the_existing_ones_are_named(dataset: Da
 
 
 def test_the_problem_of_a_dataset_is_that_of_its_recipe(tiny) -> None:
-    found, problem = cnpgen.load_dataset(tiny("airhockey-hit")).problem, load_problem("airhockey")
+    found, problem = (
+        cnpgen.load_dataset(tiny("airhockey-hit")).problem,
+        load_problem("airhockey"),
+    )
     assert as_record(found) == record_problem(problem)
     assert as_problem(found).identity == problem.identity
     assert found.urdf == problem.urdf_path.read_text()
@@ -87,40 +101,72 @@ def test_the_problem_of_a_dataset_is_that_of_its_recipe(tiny) -> None:
 
 
 def test_a_dataset_without_a_problem_is_refused(dataset: Dataset) -> None:
-    with pytest.raises(DatasetError, match=r"two-shards does not contain the problem: pipeline\.problem is missing"):
+    with pytest.raises(
+        DatasetError,
+        match=r"two-shards does not contain the problem: pipeline\.problem is missing",
+    ):
         _ = dataset.problem
 
 
 @pytest.mark.extended
 @pytest.mark.parametrize("library", ["polars", "pandas"])
-def test_a_frame_has_a_column_per_joint_and_axis(dataset: Dataset, library: str) -> None:
+def test_a_frame_has_a_column_per_joint_and_axis(
+    dataset: Dataset, library: str
+) -> None:
     pytest.importorskip(library)
     table, rows = dataset.frame("train", fields=ALL, library=library), columns()
-    named = [("start_q", "j1"), ("start_q", "j2"), ("start_q", "j3"), ("goal_p", "x"), ("goal_p", "y")]
-    assert list(table.columns) == [*(".".join(pair) for pair in named), "clearance", "sample_id"]
+    named = [
+        ("start_q", "j1"),
+        ("start_q", "j2"),
+        ("start_q", "j3"),
+        ("goal_p", "x"),
+        ("goal_p", "y"),
+    ]
+    assert list(table.columns) == [
+        *(".".join(pair) for pair in named),
+        "clearance",
+        "sample_id",
+    ]
     assert table.shape == (50, 7)
     for place, (name, column) in enumerate(named):
-        assert np.array_equal(table[f"{name}.{column}"].to_numpy(), rows[name][:, place - 3 * (name == "goal_p")])
+        assert np.array_equal(
+            table[f"{name}.{column}"].to_numpy(),
+            rows[name][:, place - 3 * (name == "goal_p")],
+        )
     assert np.array_equal(table["clearance"].to_numpy(), rows["clearance"])
     assert table["sample_id"].to_numpy().dtype == np.int64
     assert type(table).__module__.startswith(library)
-    assert list(dataset.frame("validation", library=library).columns) == list(table.columns)[:5]
+    assert (
+        list(dataset.frame("validation", library=library).columns)
+        == list(table.columns)[:5]
+    )
 
 
 @pytest.mark.extended
 def test_a_frame_of_pandas_contains_its_units(dataset: Dataset) -> None:
     pytest.importorskip("pandas")
-    units = dataset.frame("train", fields=["goal_p", "clearance"], library="pandas").attrs["units"]
+    units = dataset.frame(
+        "train", fields=["goal_p", "clearance"], library="pandas"
+    ).attrs["units"]
     assert units == {"goal_p.x": "m", "goal_p.y": "m", "clearance": "m"}
 
 
-def test_a_frame_of_another_library_or_of_none_is_refused(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(UsageError, match="library must be one of polars, pandas, got 'spark'"):
+def test_a_frame_of_another_library_or_of_none_is_refused(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(
+        UsageError, match="library must be one of polars, pandas, got 'spark'"
+    ):
         dataset.frame("train", library="spark")
     monkeypatch.setattr("cnpgen.loader.dataset.find_spec", lambda name: None)
-    with pytest.raises(MachineError, match=r"a frame needs polars or pandas, .* pip install 'cnpgen\[polars\]'"):
+    with pytest.raises(
+        MachineError,
+        match=r"a frame needs polars or pandas, .* pip install 'cnpgen\[polars\]'",
+    ):
         dataset.frame("train")
-    with pytest.raises(MachineError, match=r"a frame needs pandas, .* pip install 'cnpgen\[pandas\]'"):
+    with pytest.raises(
+        MachineError, match=r"a frame needs pandas, .* pip install 'cnpgen\[pandas\]'"
+    ):
         dataset.frame("train", library="pandas")
 
 
@@ -134,7 +180,10 @@ def test_arrays_contain_all_rows_in_their_stored_type(dataset: Dataset) -> None:
         assert np.array_equal(found[name], values)
         assert found[name].dtype == values.dtype
         assert found[name].flags.c_contiguous
-    assert list(dataset.arrays()) == ["start_q", "goal_p"]  # no diagnostics, no integers
+    assert list(dataset.arrays()) == [
+        "start_q",
+        "goal_p",
+    ]  # no diagnostics, no integers
 
 
 def test_arrays_are_normalized_and_converted_on_request(dataset: Dataset) -> None:
@@ -147,8 +196,12 @@ def test_arrays_are_normalized_and_converted_on_request(dataset: Dataset) -> Non
     assert np.array_equal(found["sample_id"], raw["sample_id"])
 
 
-@pytest.mark.parametrize("indices", [[0], [49, 0, 31, 32, 33, 5, 5], [-1, -50, 3], np.arange(50)[::-7], []])
-def test_rows_are_returned_in_the_order_of_the_indices(dataset: Dataset, indices: list[int]) -> None:
+@pytest.mark.parametrize(
+    "indices", [[0], [49, 0, 31, 32, 33, 5, 5], [-1, -50, 3], np.arange(50)[::-7], []]
+)
+def test_rows_are_returned_in_the_order_of_the_indices(
+    dataset: Dataset, indices: list[int]
+) -> None:
     found = dataset.rows("train", indices, fields=ALL)
     for name, values in columns().items():
         assert np.array_equal(found[name], values[np.array(indices, int)])
@@ -167,20 +220,28 @@ def test_a_split_is_a_sequence_of_rows(dataset: Dataset) -> None:
 
 
 @pytest.mark.parametrize("row", [50, -51, [3, 50]])
-def test_an_invalid_row_index_is_an_index_error_and_a_cnpgen_error(dataset: Dataset, row: int | list[int]) -> None:
-    with pytest.raises(RowError, match=r"split 'train' has 50 rows, there is no row (50|-51)"):
+def test_an_invalid_row_index_is_an_index_error_and_a_cnpgen_error(
+    dataset: Dataset, row: int | list[int]
+) -> None:
+    with pytest.raises(
+        RowError, match=r"split 'train' has 50 rows, there is no row (50|-51)"
+    ):
         dataset["train"][row]
     assert issubclass(RowError, IndexError)
     assert issubclass(RowError, cnpgen.CnpgenError)
 
 
 @pytest.mark.parametrize("indices", [[0.5], [[1, 2]], np.ones(50, bool), ["a"]])
-def test_indices_that_are_not_integers_are_refused(dataset: Dataset, indices: list[float]) -> None:
+def test_indices_that_are_not_integers_are_refused(
+    dataset: Dataset, indices: list[float]
+) -> None:
     with pytest.raises(UsageError, match="indices must be a list of integers"):
         dataset.rows("train", indices)
 
 
-def test_the_number_of_mapped_shards_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_mapped_shards_is_bounded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(shard_reader, "MAX_MEMORY_MAPS", 3)
     dataset = load_dataset(make(tmp_path, splits={"train": 50}, shard_size=10))
     rows = columns(splits={"train": 50}, shard_size=10)["start_q"]
@@ -193,7 +254,10 @@ def test_a_made_dataset_is_loaded(tiny) -> None:
     dataset = cnpgen.load_dataset(tiny("airhockey-hit"))
     batches = dataset.batches(200)
     tables = np.concatenate([batch.table for batch in batches])
-    assert tables.shape == (600, sum(part.stop - part.start for part in next(iter(batches)).columns.values()))
+    assert tables.shape == (
+        600,
+        sum(part.stop - part.start for part in next(iter(batches)).columns.values()),
+    )
     assert np.isfinite(tables).all()
     assert np.abs(tables.mean(0)).max() < 1e-5
     constant = np.ptp(tables, axis=0) == 0
@@ -211,10 +275,14 @@ def test_an_unfinished_dataset_is_refused_unless_allowed(tmp_path: Path) -> None
         load_dataset(tmp_path)
     dataset = load_dataset(tmp_path, allow_incomplete=True)
     assert dataset.splits == {"train": 18, "validation": 0}
-    assert [sorted(batch) for batch in ids(dataset.batches(18, fields=ALL))] == [list(range(32, 50))]
+    assert [sorted(batch) for batch in ids(dataset.batches(18, fields=ALL))] == [
+        list(range(32, 50))
+    ]
     assert dataset["train"][0]["start_q"].tolist() == columns()["start_q"][32].tolist()
     rows = columns()["start_q"][32:]
-    assert np.allclose(dataset.normalization.mean["start_q"], rows.mean(0), rtol=0, atol=1e-15)  # type: ignore[union-attr]
+    assert np.allclose(
+        dataset.normalization.mean["start_q"], rows.mean(0), rtol=0, atol=1e-15
+    )  # type: ignore[union-attr]
     with pytest.raises(UsageError, match="more than the 0 rows"):
         dataset.batches(1, split="validation")
     assert list(dataset.batches(1, split="validation", drop_last=False)) == []
@@ -225,12 +293,27 @@ def test_a_dataset_without_training_rows_needs_the_normalization_of_another_one(
     dataset: Dataset, tmp_path: Path
 ) -> None:
     lonely = load_dataset(make(tmp_path, splits={"test": 9}))
-    with pytest.raises(DatasetError, match="no training rows for the normalization; pass normalize=False"):
+    with pytest.raises(
+        DatasetError,
+        match="no training rows for the normalization; pass normalize=False",
+    ):
         lonely.batches(3, split="test")
-    raw = np.concatenate([b["start_q"] for b in lonely.batches(3, split="test", normalize=False, shuffle=False)])
-    borrowed = lonely.batches(3, split="test", normalize=dataset.normalization, shuffle=False)
+    raw = np.concatenate(
+        [
+            b["start_q"]
+            for b in lonely.batches(3, split="test", normalize=False, shuffle=False)
+        ]
+    )
+    borrowed = lonely.batches(
+        3, split="test", normalize=dataset.normalization, shuffle=False
+    )
     expected = (raw - columns()["start_q"].mean(0)) / columns()["start_q"].std(0)
-    assert np.allclose(np.concatenate([batch["start_q"] for batch in borrowed]), expected, rtol=0, atol=1e-6)
+    assert np.allclose(
+        np.concatenate([batch["start_q"] for batch in borrowed]),
+        expected,
+        rtol=0,
+        atol=1e-6,
+    )
 
 
 @pytest.mark.parametrize("option", ["allow_incomplete", "verify"])
@@ -240,25 +323,39 @@ def test_options_must_be_bools(tmp_path: Path, option: str) -> None:
 
 
 def test_folders_without_a_dataset_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"is not a dataset of cnpgen: it has no specification\.json$"):
+    with pytest.raises(
+        UsageError, match=r"is not a dataset of cnpgen: it has no specification\.json$"
+    ):
         load_dataset(tmp_path)
-    with pytest.raises(UsageError, match="nowhere is not there, expected the folder of a dataset"):
+    with pytest.raises(
+        UsageError, match="nowhere is not there, expected the folder of a dataset"
+    ):
         load_dataset(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize("damage", ["missing", "cut off"])
-def test_missing_and_cut_off_shards_are_detected_when_the_dataset_is_opened(copy: Path, damage: str) -> None:
+def test_missing_and_cut_off_shards_are_detected_when_the_dataset_is_opened(
+    copy: Path, damage: str
+) -> None:
     path = copy / "train" / "shard-00000.h5"
     if damage == "missing":
         path.unlink()
     else:
         path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(DatasetError, match=r"is damaged: .*shard-00000\.h5 (is missing|has \d+ bytes instead of)"):
+    with pytest.raises(
+        DatasetError,
+        match=r"is damaged: .*shard-00000\.h5 (is missing|has \d+ bytes instead of)",
+    ):
         load_dataset(copy)
     dataset = load_dataset(copy, allow_incomplete=True)
     assert dataset.splits == {"train": 18, "validation": 10}
-    assert [sorted(batch) for batch in ids(dataset.batches(18, fields=ALL))] == [list(range(32, 50))]
-    assert dataset.fingerprint != load_dataset(copy, allow_incomplete=True).spec.fingerprint
+    assert [sorted(batch) for batch in ids(dataset.batches(18, fields=ALL))] == [
+        list(range(32, 50))
+    ]
+    assert (
+        dataset.fingerprint
+        != load_dataset(copy, allow_incomplete=True).spec.fingerprint
+    )
 
 
 def test_a_changed_byte_is_detected_when_the_shard_is_read(copy: Path) -> None:
@@ -267,20 +364,30 @@ def test_a_changed_byte_is_detected_when_the_shard_is_read(copy: Path) -> None:
     content[(read_placements(path)[0]["start_q"].offset or 0) + 3] ^= 1
     path.write_bytes(content)
     dataset = load_dataset(copy)
-    with pytest.raises(DatasetError, match=r"shard-00001\.h5 is damaged: its sha256 is not the recorded one"):
+    with pytest.raises(
+        DatasetError,
+        match=r"shard-00001\.h5 is damaged: its sha256 is not the recorded one",
+    ):
         list(dataset.batches(10))
     with pytest.raises(DatasetError, match="sha256"):
         dataset["train"][-1]
-    assert len(dataset["train"][:32]["start_q"]) == 32  # the other shard is as good as it was
+    assert (
+        len(dataset["train"][:32]["start_q"]) == 32
+    )  # the other shard is as good as it was
     assert len(list(load_dataset(copy, verify=False).batches(10))) == 5
 
 
 @pytest.mark.parametrize("verify", [True, False])
-def test_a_shard_of_another_dataset_is_detected(copy: Path, tmp_path: Path, verify: bool) -> None:
+def test_a_shard_of_another_dataset_is_detected(
+    copy: Path, tmp_path: Path, verify: bool
+) -> None:
     other = make(tmp_path / "other", splits={"train": 64})
     shutil.copy(other / "train" / "shard-00000.h5", copy / "train" / "shard-00000.h5")
     dataset = load_dataset(copy, verify=verify)
-    with pytest.raises(DatasetError, match="sha256" if verify else "of another dataset or another position"):
+    with pytest.raises(
+        DatasetError,
+        match="sha256" if verify else "of another dataset or another position",
+    ):
         dataset["train"][0]
 
 
@@ -302,14 +409,21 @@ def test_a_damaged_document_is_refused(copy: Path, name: str) -> None:
         load_dataset(copy)
 
 
-def test_statistics_of_another_specification_are_refused(copy: Path, tmp_path: Path) -> None:
+def test_statistics_of_another_specification_are_refused(
+    copy: Path, tmp_path: Path
+) -> None:
     other = make(tmp_path / "other", seed=3)
     shutil.copy(other / "stats.json", copy / "stats.json")
-    with pytest.raises(DatasetError, match=r"stats\.json is of another specification than specification\.json"):
+    with pytest.raises(
+        DatasetError,
+        match=r"stats\.json is of another specification than specification\.json",
+    ):
         load_dataset(copy)
 
 
-def test_another_dataset_has_another_fingerprint(dataset: Dataset, tmp_path: Path) -> None:
+def test_another_dataset_has_another_fingerprint(
+    dataset: Dataset, tmp_path: Path
+) -> None:
     again = load_dataset(make(tmp_path / "again"))
     other = load_dataset(make(tmp_path / "other", seed=3))
     assert dataset.fingerprint == again.fingerprint != other.fingerprint

@@ -18,10 +18,14 @@ def test_a_permutation_contains_every_index_once(size: int) -> None:
 
 
 def test_every_permutation_is_equally_likely() -> None:
-    counts = Counter(tuple(permutation(4, seed=0, key=(draw,)).tolist()) for draw in range(4800))
+    counts = Counter(
+        tuple(permutation(4, seed=0, key=(draw,)).tolist()) for draw in range(4800)
+    )
     assert set(counts) == set(permutations(range(4)))
     statistic = sum((count - 200) ** 2 / 200 for count in counts.values())
-    assert statistic < 49.7  # chi-squared with 23 degrees of freedom: 1 in 1000 are above
+    assert (
+        statistic < 49.7
+    )  # chi-squared with 23 degrees of freedom: 1 in 1000 are above
 
 
 def test_the_order_of_a_released_version_does_not_change() -> None:
@@ -32,14 +36,18 @@ def test_the_order_of_a_released_version_does_not_change() -> None:
     assert epoch.rows_of(0).tolist() == [2, 1, 5, 7, 6, 0, 3, 4]
 
 
-@pytest.mark.parametrize("shard_rows", [(), (5,), (16, 16, 16, 7), (1,) * 40, (300, 1), (64,) * 9])
+@pytest.mark.parametrize(
+    "shard_rows", [(), (5,), (16, 16, 16, 7), (1,) * 40, (300, 1), (64,) * 9]
+)
 @pytest.mark.parametrize("shuffle", [True, False])
 def test_the_windows_of_an_epoch_hold_every_shard_once(
     monkeypatch: pytest.MonkeyPatch, shard_rows: tuple[int, ...], shuffle: bool
 ) -> None:
     monkeypatch.setattr(windows, "WINDOW_ROWS", 64)
     found = Order("train", shard_rows, 0, 0, shuffle)
-    assert sorted(shard for window in found.windows for shard in window.shards) == list(range(len(shard_rows)))
+    assert sorted(shard for window in found.windows for shard in window.shards) == list(
+        range(len(shard_rows))
+    )
     first = 0
     for index, window in enumerate(found.windows):
         assert window.first == first
@@ -53,16 +61,23 @@ def test_a_window_has_about_the_rows_it_should(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(windows, "WINDOW_ROWS", 64)
     found = Order("train", (16,) * 37, 0, 0).windows
     assert {window.rows for window in found} == {64, 80}
-    assert [len(Order("train", (16,) * shards, 0, 0).windows) for shards in (1, 4, 5, 6, 7, 8)] == [1, 1, 1, 2, 2, 2]
+    assert [
+        len(Order("train", (16,) * shards, 0, 0).windows)
+        for shards in (1, 4, 5, 6, 7, 8)
+    ] == [1, 1, 1, 2, 2, 2]
 
 
 @pytest.mark.parametrize(("rows", "count"), [(393_215, 1), (393_216, 2)])
-def test_a_split_is_shuffled_uniformly_up_to_the_documented_size(rows: int, count: int) -> None:
+def test_a_split_is_shuffled_uniformly_up_to_the_documented_size(
+    rows: int, count: int
+) -> None:
     shards = (4096,) * (rows // 4096) + ((rows % 4096,) if rows % 4096 else ())
     assert len(Order("train", shards, 0, 0).windows) == count
 
 
-def test_without_shuffling_rows_are_in_their_stored_order(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_shuffling_rows_are_in_their_stored_order(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(windows, "WINDOW_ROWS", 10)
     found = Order("train", (8, 8, 8), 5, 1, shuffle=False)
     assert [window.shards for window in found.windows] == [(0, 1), (2,)]
@@ -71,18 +86,25 @@ def test_without_shuffling_rows_are_in_their_stored_order(monkeypatch: pytest.Mo
 
 def test_seed_epoch_split_and_window_each_change_the_order() -> None:
     base = Order("train", (200,), 0, 0)
-    others = [Order("train", (200,), 1, 0), Order("train", (200,), 0, 1), Order("validation", (200,), 0, 0)]
+    others = [
+        Order("train", (200,), 1, 0),
+        Order("train", (200,), 0, 1),
+        Order("validation", (200,), 0, 0),
+    ]
     for other in others:
         assert not np.array_equal(base.rows_of(0), other.rows_of(0))
     assert np.array_equal(base.rows_of(0), Order("train", (200,), 0, 0).rows_of(0))
 
 
-def test_windows_of_one_epoch_are_shuffled_differently(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_windows_of_one_epoch_are_shuffled_differently(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(windows, "WINDOW_ROWS", 100)
     found = Order("train", (100, 100), 0, 0)
     assert not np.array_equal(found.rows_of(0), found.rows_of(1))
     distributions = {
-        tuple(window.shards for window in Order("train", (100,) * 8, 0, epoch).windows) for epoch in range(5)
+        tuple(window.shards for window in Order("train", (100,) * 8, 0, epoch).windows)
+        for epoch in range(5)
     }
     assert len(distributions) == 5  # the shards are distributed again in every epoch
 

@@ -24,9 +24,15 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 @pytest.fixture(autouse=True, params=["kept in memory", "read in every epoch"])
-def _small_windows(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+def _small_windows(
+    monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
     monkeypatch.setattr(windows, "WINDOW_ROWS", 16)
-    monkeypatch.setattr(windows, "MAX_IN_MEMORY_BYTES", 1 << 20 if request.param == "kept in memory" else 0)
+    monkeypatch.setattr(
+        windows,
+        "MAX_IN_MEMORY_BYTES",
+        1 << 20 if request.param == "kept in memory" else 0,
+    )
 
 
 def remaining_ids(batches: Batches) -> list[list[int]]:
@@ -43,11 +49,15 @@ def test_a_pickled_loader_continues_at_its_position(dataset: Dataset) -> None:
     assert batches.epoch == 0
 
 
-def test_a_pickled_dataset_is_small_and_works_although_it_had_mapped_shards(dataset: Dataset) -> None:
+def test_a_pickled_dataset_is_small_and_works_although_it_had_mapped_shards(
+    dataset: Dataset,
+) -> None:
     dataset.arrays("train")
     content = pickle.dumps(dataset)
     assert len(content) < 50_000
-    assert np.array_equal(pickle.loads(content)["train"][7]["start_q"], dataset["train"][7]["start_q"])
+    assert np.array_equal(
+        pickle.loads(content)["train"][7]["start_q"], dataset["train"][7]["start_q"]
+    )
 
 
 def test_a_spawned_process_continues_at_the_position_of_its_parent(
@@ -58,13 +68,17 @@ def test_a_spawned_process_continues_at_the_position_of_its_parent(
     loop = iter(batches)
     head = [next(loop)["sample_id"].tolist() for _ in range(3)]
     with multiprocessing.get_context("spawn").Pool(1) as pool:
-        assert head + pool.apply(remaining_ids, (batches,)) == ids(dataset.batches(5, fields=ALL))
+        assert head + pool.apply(remaining_ids, (batches,)) == ids(
+            dataset.batches(5, fields=ALL)
+        )
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
 @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
 @pytest.mark.parametrize("taken", [0, 1, 3])
-def test_a_forked_loop_continues_in_both_processes(dataset: Dataset, taken: int) -> None:
+def test_a_forked_loop_continues_in_both_processes(
+    dataset: Dataset, taken: int
+) -> None:
     expected = ids(dataset.batches(5, fields=ALL))
     loop = (batch["sample_id"].tolist() for batch in dataset.batches(5, fields=ALL))
     head = [next(loop) for _ in range(taken)]
@@ -94,7 +108,10 @@ def test_many_threads_read_the_same_dataset(dataset: Dataset) -> None:
     random = np.random.default_rng(0)
     wanted = [random.integers(50, size=20) for _ in range(40)]
     with ThreadPoolExecutor(8) as pool:
-        loops = [pool.submit(remaining_ids, dataset.batches(5, fields=ALL)) for _ in range(20)]
+        loops = [
+            pool.submit(remaining_ids, dataset.batches(5, fields=ALL))
+            for _ in range(20)
+        ]
         reads = [pool.submit(dataset.rows, "train", rows) for rows in wanted]
         assert all(loop.result() == expected for loop in loops)
         for rows, read in zip(wanted, reads, strict=True):

@@ -34,15 +34,25 @@ def rewritten(shard: Shard, **options: Any) -> Shard:
     with h5py.File(shard.path, "w") as file:
         file.attrs.update(attributes)
         for name, values in content.items():
-            dtype = values.dtype.newbyteorder(">") if options.get("swapped") else values.dtype
-            extra = {"chunks": True, "compression": "gzip"} if options.get("compressed") else {}
+            dtype = (
+                values.dtype.newbyteorder(">")
+                if options.get("swapped")
+                else values.dtype
+            )
+            extra = (
+                {"chunks": True, "compression": "gzip"}
+                if options.get("compressed")
+                else {}
+            )
             file.create_dataset(name, data=values.astype(dtype), **extra)
     return replace(shard, size=shard.path.stat().st_size)
 
 
 def test_fields_are_mapped_into_memory_and_cannot_be_written_to(shard: Shard) -> None:
     reader = ShardReader(verify=True)
-    assert all(values.flags.owndata for values in reader.map(shard, FIELDS).values())  # read, to check all values
+    assert all(
+        values.flags.owndata for values in reader.map(shard, FIELDS).values()
+    )  # read, to check all values
     found = reader.map(shard, FIELDS)
     for name, values in ROWS.items():
         assert np.array_equal(found[name], values)
@@ -50,8 +60,13 @@ def test_fields_are_mapped_into_memory_and_cannot_be_written_to(shard: Shard) ->
         assert not found[name].flags.writeable
 
 
-@pytest.mark.parametrize("options", [{"swapped": True}, {"compressed": True}, {"compressed": True, "swapped": True}])
-def test_fields_that_cannot_be_mapped_are_read(shard: Shard, options: dict[str, bool]) -> None:
+@pytest.mark.parametrize(
+    "options",
+    [{"swapped": True}, {"compressed": True}, {"compressed": True, "swapped": True}],
+)
+def test_fields_that_cannot_be_mapped_are_read(
+    shard: Shard, options: dict[str, bool]
+) -> None:
     reader, shard = ShardReader(verify=False), rewritten(shard, **options)
     reader.map(shard, FIELDS)
     found = reader.map(shard, FIELDS)
@@ -60,7 +75,9 @@ def test_fields_that_cannot_be_mapped_are_read(shard: Shard, options: dict[str, 
         assert np.array_equal(found[name], values)
 
 
-def test_a_file_system_without_memory_maps_is_read(shard: Shard, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_system_without_memory_maps_is_read(
+    shard: Shard, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(*_arguments: Any, **_options: Any) -> None:
         raise OSError(19, "No such device")
 
@@ -78,7 +95,12 @@ def test_batches_of_shards_that_cannot_be_mapped_are_the_same(tmp_path: Path) ->
         split: tuple(rewritten(s, compressed=True, swapped=True) for s in part)
         for split, part in dataset.shards.items()
     }
-    found = [batch.table for batch in replace(dataset, shards=changed, reader=ShardReader(verify=False)).batches(10)]
+    found = [
+        batch.table
+        for batch in replace(
+            dataset, shards=changed, reader=ShardReader(verify=False)
+        ).batches(10)
+    ]
     assert np.array_equal(found, expected)
 
 
@@ -99,7 +121,9 @@ def test_the_oldest_memory_maps_are_dropped_above_the_maximum(tmp_path: Path) ->
 def test_a_shard_is_checked_once(shard: Shard, monkeypatch: pytest.MonkeyPatch) -> None:
     counted = []
     original = shard_reader.file_sha256
-    monkeypatch.setattr(shard_reader, "file_sha256", lambda path: counted.append(path) or original(path))
+    monkeypatch.setattr(
+        shard_reader, "file_sha256", lambda path: counted.append(path) or original(path)
+    )
     reader = ShardReader(verify=True)
     for _ in range(3):
         reader.read(shard, FIELDS)

@@ -11,9 +11,14 @@ from tests.examples.losses import Batch, batch, huber, loss, states
 from tests.examples.plans import PROBLEMS, ROBOTS, load
 
 
-@pytest.mark.parametrize(("rule", "shift"), [("cosine", 0.0), ("cosine", 0.45), ("cosine", 0.99), ("gauss", 0.0)])
+@pytest.mark.parametrize(
+    ("rule", "shift"),
+    [("cosine", 0.0), ("cosine", 0.45), ("cosine", 0.99), ("gauss", 0.0)],
+)
 @pytest.mark.parametrize("nodes", [1, 8, 64])
-def test_nodes_are_ascending_within_the_phase_and_weights_sum_to_one(rule, shift, nodes):
+def test_nodes_are_ascending_within_the_phase_and_weights_sum_to_one(
+    rule, shift, nodes
+):
     s, weights = quadrature(rule, nodes, shift)
     assert s.shape == weights.shape == (nodes,)
     assert (s >= 0).all()
@@ -42,7 +47,10 @@ def test_gauss_integrates_polynomials_exactly():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("uniform", 64), "expected one of cosine, gauss; between uniform nodes the ends of r hide violations"),
+        (
+            ("uniform", 64),
+            "expected one of cosine, gauss; between uniform nodes the ends of r hide violations",
+        ),
         (("cosin", 64), r"did you mean 'cosine'\?"),
         (("cosine", 0), "must be an integer from 1 on, got 0"),
         (("cosine", 64.5), "must be an integer from 1 on, got 64.5"),
@@ -62,7 +70,14 @@ def test_shifts_rotate_and_put_no_node_on_an_end():
     assert len(set(shifts)) == 8
     assert all(quadrature("cosine", 32, shift)[0][0] > 0 for shift in shifts)
     assert [rotating_shift(step, 1) for step in range(3)] == [0.0, 0.0, 0.0]
-    together = np.sort(np.concatenate([np.arccos(1 - 2 * quadrature("cosine", 32, shift)[0]) for shift in shifts[:8]]))
+    together = np.sort(
+        np.concatenate(
+            [
+                np.arccos(1 - 2 * quadrature("cosine", 32, shift)[0])
+                for shift in shifts[:8]
+            ]
+        )
+    )
     np.testing.assert_allclose(np.diff(together), np.pi / (8 * 32), rtol=1e-6)
 
 
@@ -70,9 +85,13 @@ def test_the_table_has_the_derivatives_of_both_splines():
     spec = PROBLEMS["airhockey"].trajectory
     table = basis_table(spec, "cosine", 12, 0.25, "float64")
     for order in range(3):
-        np.testing.assert_array_equal(table.path[12 * order : 12 * (order + 1)], basis(table.s, 15, 7, order))
+        np.testing.assert_array_equal(
+            table.path[12 * order : 12 * (order + 1)], basis(table.s, 15, 7, order)
+        )
     for order in range(2):
-        np.testing.assert_array_equal(table.rate[12 * order : 12 * (order + 1)], basis(table.s, 20, 7, order))
+        np.testing.assert_array_equal(
+            table.rate[12 * order : 12 * (order + 1)], basis(table.s, 20, 7, order)
+        )
 
 
 # Relative errors of 64 nodes against 4096, on plans with 0.1 rad of noise on every control point.
@@ -86,7 +105,9 @@ def test_64_nodes_are_within_a_few_percent_of_4096(label, rule):
     np.testing.assert_allclose(found.total, fine.total, rtol=0.02)
     for name in ("path_gradient", "rate_gradient"):
         a, b = (getattr(value, name).reshape(8, -1) for value in (found, fine))
-        assert np.median(np.linalg.norm(a - b, axis=1) / np.linalg.norm(b, axis=1)) < 0.1
+        assert (
+            np.median(np.linalg.norm(a - b, axis=1) / np.linalg.norm(b, axis=1)) < 0.1
+        )
 
 
 def test_the_average_over_shifts_reduces_the_error():
@@ -95,9 +116,14 @@ def test_the_average_over_shifts_reduces_the_error():
     of = loss("airhockey", nodes=32)
 
     def error(gradients: list[np.ndarray]) -> float:
-        return float(np.linalg.norm(np.mean(gradients, axis=0) - fine) / np.linalg.norm(fine))
+        return float(
+            np.linalg.norm(np.mean(gradients, axis=0) - fine) / np.linalg.norm(fine)
+        )
 
-    turns = [given.evaluated(of, shift=rotating_shift(step)).path_gradient for step in range(8)]
+    turns = [
+        given.evaluated(of, shift=rotating_shift(step)).path_gradient
+        for step in range(8)
+    ]
     assert error(turns) < 0.3 * error(turns[:1])
 
 
@@ -109,15 +135,24 @@ def spiked() -> Batch:
     plan = load("hit")
     rate = plan.motion.rate.copy()
     rate[:, -1] *= 10
-    path = assemble(plan.boundary, plan.motion.path[:, 3:13], rate, plan.problem.trajectory)
+    path = assemble(
+        plan.boundary, plan.motion.path[:, 3:13], rate, plan.problem.trajectory
+    )
     return Batch("airhockey", path, rate, plan.scene.poses)
 
 
-def acceleration_loss(given: Batch, s: np.ndarray, weights: np.ndarray) -> tuple[float, np.ndarray]:
+def acceleration_loss(
+    given: Batch, s: np.ndarray, weights: np.ndarray
+) -> tuple[float, np.ndarray]:
     """Return the acceleration term from SciPy's splines, and |ddq| relative to its limit at every node."""
-    limit, at = ROBOTS["airhockey"].acceleration_limit, states(given.path[0], given.rate[0], s)
+    limit, at = (
+        ROBOTS["airhockey"].acceleration_limit,
+        states(given.path[0], given.rate[0], s),
+    )
     excess = np.maximum(np.abs(at.ddq) - limit, 0)
-    return float((weights / at.rate) @ huber(excess).sum(axis=1)), (np.abs(at.ddq) / limit).max(axis=1)
+    return float((weights / at.rate) @ huber(excess).sum(axis=1)), (
+        np.abs(at.ddq) / limit
+    ).max(axis=1)
 
 
 def test_an_acceleration_peak_in_the_last_percent_of_the_phase_is_detected():
@@ -126,10 +161,14 @@ def test_an_acceleration_peak_in_the_last_percent_of_the_phase_is_detected():
     truth, peak = acceleration_loss(given, s, weights)
     assert peak.max() > 100
     assert s[peak > 25].min() > 0.985
-    between = acceleration_loss(given, (np.arange(64) + 0.5) / 64, np.full(64, 1 / 64))[0]
+    between = acceleration_loss(given, (np.arange(64) + 0.5) / 64, np.full(64, 1 / 64))[
+        0
+    ]
     with_ends = acceleration_loss(given, np.linspace(0, 1, 64), np.full(64, 1 / 64))[0]
     assert between < 0.6 * truth
     assert with_ends > 2 * truth
     for rule in ("cosine", "gauss"):
-        seen = given.evaluated(loss("airhockey", rule=rule)).terms[0, of.terms.index("joint-acceleration")]
+        seen = given.evaluated(loss("airhockey", rule=rule)).terms[
+            0, of.terms.index("joint-acceleration")
+        ]
         assert seen == pytest.approx(truth, rel=0.02)

@@ -42,8 +42,12 @@ ROOT = Path(__file__).parents[2]
 
 def test_what_cannot_be_meant_is_refused_before_anything_is_made(tmp_path):
     wrong = {
-        "engine 'dusk' does not exist: expected one of loky, dask, ray (did you mean 'dask'?)": {"engine": "dusk"},
-        "the address 'host:1' is that of a cluster: choose engine= dask or ray": {"address": "host:1"},
+        "engine 'dusk' does not exist: expected one of loky, dask, ray (did you mean 'dask'?)": {
+            "engine": "dusk"
+        },
+        "the address 'host:1' is that of a cluster: choose engine= dask or ray": {
+            "address": "host:1"
+        },
         "workers must be an integer from 1 on, got 0": {"engine": "dask", "workers": 0},
     }
     for text, options in wrong.items():
@@ -65,21 +69,37 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_that_shares_work_takes_the_options_and_says_them_in_errors(tiny, tmp_path, capsys, command):
-    cnpgen.save_plans(tmp_path / "plans.h5", cnpgen.load_boundary_problems(tiny("airhockey-hit"), n=2))
-    places = {"out": tmp_path / "out.h5", "tiny": tiny("airhockey-hit"), "plans": tmp_path / "plans.h5"}
+def test_every_command_that_shares_work_takes_the_options_and_says_them_in_errors(
+    tiny, tmp_path, capsys, command
+):
+    cnpgen.save_plans(
+        tmp_path / "plans.h5", cnpgen.load_boundary_problems(tiny("airhockey-hit"), n=2)
+    )
+    places = {
+        "out": tmp_path / "out.h5",
+        "tiny": tiny("airhockey-hit"),
+        "plans": tmp_path / "plans.h5",
+    }
     words = [command, *(word.format(**places) for word in COMMANDS[command])]
     assert main([*words, "--address", "a:1"]) == 2
-    assert capsys.readouterr().err.endswith("is that of a cluster: choose --engine dask or ray\n")
+    assert capsys.readouterr().err.endswith(
+        "is that of a cluster: choose --engine dask or ray\n"
+    )
     assert not (tmp_path / "out.h5").exists()
     assert main([*words, "--engine", "dusk"]) == 2
-    assert "--engine: expected one of loky, dask, ray, got 'dusk' (did you mean 'dask'?)" in capsys.readouterr().err
+    assert (
+        "--engine: expected one of loky, dask, ray, got 'dusk' (did you mean 'dask'?)"
+        in capsys.readouterr().err
+    )
 
 
 def test_a_missing_package_is_named_with_what_installs_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with (
-        pytest.raises(MachineError, match=r"ray cannot be imported .*: pip install 'cnpgen\[ray\]'"),
+        pytest.raises(
+            MachineError,
+            match=r"ray cannot be imported .*: pip install 'cnpgen\[ray\]'",
+        ),
         assembled(Engine("ray"), 1),
     ):
         pass
@@ -87,12 +107,25 @@ def test_a_missing_package_is_named_with_what_installs_it(monkeypatch):
 
 @pytest.mark.parametrize(
     ("engine", "quick", "size"),
-    [(Engine("loky", None, 2), False, 2), (Engine("loky", None, 2), True, 2), (Engine(), True, 1)],
+    [
+        (Engine("loky", None, 2), False, 2),
+        (Engine("loky", None, 2), True, 2),
+        (Engine(), True, 1),
+    ],
 )
-def test_processes_of_this_machine_are_as_many_as_were_asked_for_or_one_for_little(engine, quick, size):
+def test_processes_of_this_machine_are_as_many_as_were_asked_for_or_one_for_little(
+    engine, quick, size
+):
     with assembled(engine, 10, quick=quick) as pool:
         assert (pool.size, pool.is_remote) == (size, False)
-        assert list(pool.distribute(abs, range(-3, 3), ordered=True)) == [3, 2, 1, 0, 1, 2]
+        assert list(pool.distribute(abs, range(-3, 3), ordered=True)) == [
+            3,
+            2,
+            1,
+            0,
+            1,
+            2,
+        ]
 
 
 # --- what any cluster is asked for ------------------------------------------------------------------------------------
@@ -149,7 +182,9 @@ def test_what_ends_the_workers_says_what_to_do():
 
 
 def test_that_nobody_works_is_said_again_after_twice_the_time(monkeypatch, caplog):
-    looks = iter([2, *[0] * 6, 2, 2, 2, 2, 2])  # the first one asks how many tasks to give
+    looks = iter(
+        [2, *[0] * 6, 2, 2, 2, 2, 2]
+    )  # the first one asks how many tasks to give
     now = [0.0]
 
     def look() -> int:
@@ -166,10 +201,14 @@ def test_that_nobody_works_is_said_again_after_twice_the_time(monkeypatch, caplo
     ]
 
 
-def test_a_machine_elsewhere_needs_nothing_but_the_folder_and_refuses_to_make_other_rows(tmp_path, monkeypatch):
+def test_a_machine_elsewhere_needs_nothing_but_the_folder_and_refuses_to_make_other_rows(
+    tmp_path, monkeypatch
+):
     recipe = tiny_recipe("airhockey-hit")
     folder = tmp_path / "out"
-    job = resolve(recipe, find_workspace(folder), shard_size=TINY_SHARD, backend="numpy")
+    job = resolve(
+        recipe, find_workspace(folder), shard_size=TINY_SHARD, backend="numpy"
+    )
     theirs = pickle.loads(pickle.dumps(_without_local_paths(job)))
     assert theirs.pipeline is theirs.cache_folder is None
     monkeypatch.chdir(tmp_path)
@@ -179,7 +218,9 @@ def test_a_machine_elsewhere_needs_nothing_but_the_folder_and_refuses_to_make_ot
     _PREPARED.clear()
     for change in ({"revision": 1}, {"recipe_sha256": "0" * 64}):
         other = replace(theirs, spec=replace(job.spec, **change))
-        with pytest.raises(MachineError, match="has another version of cnpgen, or of a plug-in"):
+        with pytest.raises(
+            MachineError, match="has another version of cnpgen, or of a plug-in"
+        ):
             list(make_shards(other, shards(job.spec)[-1:]))
 
 
@@ -195,24 +236,32 @@ def test_a_machine_elsewhere_needs_nothing_but_the_folder_and_refuses_to_make_ot
     ],
 )
 def test_an_address_of_another_form_is_refused_at_once(engine, address):
-    with pytest.raises(UsageError, match=rf"address must be the address of a {engine} cluster, such as") as caught:
+    with pytest.raises(
+        UsageError, match=rf"address must be the address of a {engine} cluster, such as"
+    ) as caught:
         Engine(engine, address)
     assert caught.value.argument == "address"
-    for valid in {"dask": ("tcp://a:1", "tls://10.0.0.1:8786", "a:1"), "ray": ("auto", "a.b:6379", "ray://a:1")}[
-        engine
-    ]:
+    for valid in {
+        "dask": ("tcp://a:1", "tls://10.0.0.1:8786", "a:1"),
+        "ray": ("auto", "a.b:6379", "ray://a:1"),
+    }[engine]:
         Engine(engine, valid)
 
 
 @pytest.mark.parametrize("engine", ["dask", "ray"])
-def test_an_address_where_nobody_listens_is_one_sentence_within_seconds(engine, monkeypatch):
+def test_an_address_where_nobody_listens_is_one_sentence_within_seconds(
+    engine, monkeypatch
+):
     monkeypatch.setattr(clusters.importlib, "import_module", lambda _name: None)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
     begun = time.monotonic()
     with (
-        pytest.raises(MachineError, match=rf"^cannot reach the {engine} cluster at {address}: Connection refused$"),
+        pytest.raises(
+            MachineError,
+            match=rf"^cannot reach the {engine} cluster at {address}: Connection refused$",
+        ),
         assembled(Engine(engine, address), 1),
     ):
         pass
@@ -228,7 +277,9 @@ def test_the_answer_of_another_service_is_one_sentence(monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"127.0.0.1:{server.getsockname()[1]}"
         with (
-            pytest.raises(MachineError, match=f"^cannot reach the dask cluster at {address}: "),
+            pytest.raises(
+                MachineError, match=f"^cannot reach the dask cluster at {address}: "
+            ),
             assembled(Engine("dask", address), 1),
         ):
             pass
@@ -238,10 +289,17 @@ def test_ray_without_tokens_is_refused_for_local_clusters(monkeypatch):
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
     monkeypatch.setenv("RAY_AUTH_TOKEN", "replaced below, and restored after the test")
     monkeypatch.setattr(clusters.importlib.metadata, "version", lambda _name: "2.51.3")
-    with pytest.raises(MachineError, match=r"^ray 2.51.3 starts clusters without authentication: .* 'ray>=2.52'"):
+    with pytest.raises(
+        MachineError,
+        match=r"^ray 2.51.3 starts clusters without authentication: .* 'ray>=2.52'",
+    ):
         clusters._prepare_ray()
-    monkeypatch.setattr(clusters.importlib.metadata, "version", lambda _name: "2.52.0rc1")
-    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(is_initialized=lambda: False))
+    monkeypatch.setattr(
+        clusters.importlib.metadata, "version", lambda _name: "2.52.0rc1"
+    )
+    monkeypatch.setitem(
+        sys.modules, "ray", SimpleNamespace(is_initialized=lambda: False)
+    )
     with pytest.raises(MachineError, match="ray was imported without a token"):
         clusters._prepare_ray()
     monkeypatch.delitem(sys.modules, "ray")
@@ -261,9 +319,19 @@ def start(tmp_path) -> Iterator[Callable[..., subprocess.Popen]]:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
 
     def run(kind: str, *options: str) -> subprocess.Popen:
-        command = [sys.executable, "-m", f"distributed.cli.dask_{kind}", "--scheduler-file", str(tmp_path / "file")]
+        command = [
+            sys.executable,
+            "-m",
+            f"distributed.cli.dask_{kind}",
+            "--scheduler-file",
+            str(tmp_path / "file"),
+        ]
         with (tmp_path / f"{kind}-{len(started)}.log").open("w") as log:
-            started.append(subprocess.Popen([*command, *options], cwd=elsewhere, env=environment, stderr=log))
+            started.append(
+                subprocess.Popen(
+                    [*command, *options], cwd=elsewhere, env=environment, stderr=log
+                )
+            )
         return started[-1]
 
     run.started = started
@@ -279,7 +347,15 @@ def scheduler(start, tmp_path) -> str:
     import json
 
     pytest.importorskip("distributed")
-    start("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--no-jupyter")
+    start(
+        "scheduler",
+        "--host",
+        "127.0.0.1",
+        "--port",
+        "0",
+        "--no-dashboard",
+        "--no-jupyter",
+    )
     deadline = time.monotonic() + HANGING
     while not (tmp_path / "file").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -293,12 +369,22 @@ def require(name: str) -> None:
         pytest.skip(f"{package} is not installed")
 
 
-WORKER = ("worker", "--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1")
+WORKER = (
+    "worker",
+    "--nthreads",
+    "1",
+    "--no-nanny",
+    "--no-dashboard",
+    "--host",
+    "127.0.0.1",
+)
 
 
 @pytest.mark.extended
 @pytest.mark.filterwarnings("default")  # of dask's own
-def test_a_dataset_is_made_by_two_workers_of_dask_of_which_one_is_killed(tiny, tmp_path, monkeypatch, start, scheduler):
+def test_a_dataset_is_made_by_two_workers_of_dask_of_which_one_is_killed(
+    tiny, tmp_path, monkeypatch, start, scheduler
+):
     workers = [start(*WORKER) for _ in range(2)]
     monkeypatch.chdir(tmp_path)
     made = make_tiny(
@@ -313,7 +399,9 @@ def test_a_dataset_is_made_by_two_workers_of_dask_of_which_one_is_killed(tiny, t
     make_tiny(tmp_path / "uncut", shard_size=50)
     assert digests(tmp_path / "out") == digests(tmp_path / "uncut")
     assert not list((tmp_path / "elsewhere").glob("out*"))
-    report = validate_dataset("out", deep=True, regenerate=1, engine="dask", address=scheduler)
+    report = validate_dataset(
+        "out", deep=True, regenerate=1, engine="dask", address=scheduler
+    )
     assert report.ok
     assert report.deep.rows == 660
 
@@ -336,9 +424,19 @@ def test_that_the_last_worker_of_dask_is_gone_is_said_until_another_one_comes(
     logger = logging.getLogger("cnpgen.addons.clusters.clusters")
     logger.addHandler(Starter())
     kill = {"progress": lambda *_: first.kill()}
-    made = make_tiny(tmp_path / "out", engine="dask", address=scheduler, workers=None, shard_size=50, **kill)
+    made = make_tiny(
+        tmp_path / "out",
+        engine="dask",
+        address=scheduler,
+        workers=None,
+        shard_size=50,
+        **kill,
+    )
     assert made.complete
-    assert f"the dask cluster at {scheduler} has had no worker for 2 s; waiting for one" in caplog.text
+    assert (
+        f"the dask cluster at {scheduler} has had no worker for 2 s; waiting for one"
+        in caplog.text
+    )
 
 
 def end_workers(_task: int) -> None:
@@ -376,7 +474,9 @@ except Exception as error:
     print("refused", type(error).__name__)
 """,
 }
-STRANGER_TIME_S = 20  # after it, a stranger is ended: ray repeats refused calls for minutes
+STRANGER_TIME_S = (
+    20  # after it, a stranger is ended: ray repeats refused calls for minutes
+)
 
 
 @pytest.mark.extended
@@ -387,15 +487,26 @@ def test_a_local_cluster_is_on_loopback_and_runs_no_task_of_another_process(name
     with assembled(Engine(name, None, 1), 3) as pool:
         assert list(pool.distribute(abs, [-3])) == [3]
         processes = [psutil.Process(), *psutil.Process().children(recursive=True)]
-        listening = {c.laddr for p in processes for c in p.net_connections("tcp") if c.status == psutil.CONN_LISTEN}
-        assert {laddr.ip.removeprefix("::ffff:") for laddr in listening} == {"127.0.0.1"}
+        listening = {
+            c.laddr
+            for p in processes
+            for c in p.net_connections("tcp")
+            if c.status == psutil.CONN_LISTEN
+        }
+        assert {laddr.ip.removeprefix("::ffff:") for laddr in listening} == {
+            "127.0.0.1"
+        }
         if name == "dask":
             address = pool._client.scheduler.address
             assert address.startswith("tls://")
         else:
             address = sys.modules["ray"].get_runtime_context().gcs_address
         program = f"ADDRESS = {address.rpartition('/')[2]!r}\n{STRANGERS[name]}"
-        environment = {key: value for key, value in os.environ.items() if not key.startswith("RAY_")}
+        environment = {
+            key: value
+            for key, value in os.environ.items()
+            if not key.startswith("RAY_")
+        }
         stranger = subprocess.Popen(
             [sys.executable, "-c", program],
             stdout=subprocess.PIPE,
@@ -414,7 +525,17 @@ def test_a_local_cluster_is_on_loopback_and_runs_no_task_of_another_process(name
 
 def command_of(name: str, out: Path, *options: str) -> subprocess.Popen:
     """Start a command that takes long, on an engine."""
-    words = ["make-dataset", "airhockey-hit", "--n", "4e7", "--shard-size", "4096", "--engine", name, *options]
+    words = [
+        "make-dataset",
+        "airhockey-hit",
+        "--n",
+        "4e7",
+        "--shard-size",
+        "4096",
+        "--engine",
+        name,
+        *options,
+    ]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
     return subprocess.Popen(
         [sys.executable, "-m", "cnpgen", *words, "--quiet", "--out", str(out)],
@@ -446,7 +567,11 @@ def test_sigterm_ends_a_command_with_143_under_each_engine(tmp_path, name):
     process = command_of(name, tmp_path / "out", "--workers", "2")
     wait_for_shards(tmp_path / "out")
     process.terminate()
-    assert error_of(process).splitlines()[-1].startswith("cnpgen: terminated: finished shards are kept")
+    assert (
+        error_of(process)
+        .splitlines()[-1]
+        .startswith("cnpgen: terminated: finished shards are kept")
+    )
     assert process.returncode == 143
 
 
@@ -458,7 +583,9 @@ def test_a_killed_scheduler_of_dask_is_one_sentence(tmp_path, start, scheduler):
     wait_for_shards(tmp_path / "out")
     start.started[0].kill()
     (line,) = error_of(process).splitlines()
-    assert line.startswith(f"cnpgen: error: the connection to the dask cluster at {scheduler} is lost: the shards")
+    assert line.startswith(
+        f"cnpgen: error: the connection to the dask cluster at {scheduler} is lost: the shards"
+    )
     assert process.returncode == MachineError.exit_code
 
 
@@ -467,9 +594,17 @@ def test_a_killed_head_of_ray_is_one_sentence(tmp_path):
     require("ray")
     process = command_of("ray", tmp_path / "out", "--workers", "2")
     wait_for_shards(tmp_path / "out")
-    (head,) = [p for p in psutil.Process(process.pid).children(recursive=True) if p.name() == "gcs_server"]
+    (head,) = [
+        p
+        for p in psutil.Process(process.pid).children(recursive=True)
+        if p.name() == "gcs_server"
+    ]
     head.kill()
-    assert error_of(process).splitlines()[-1].startswith("cnpgen: error: cannot reach the ray cluster on this machine")
+    assert (
+        error_of(process)
+        .splitlines()[-1]
+        .startswith("cnpgen: error: cannot reach the ray cluster on this machine")
+    )
     assert process.returncode == MachineError.exit_code
 
 
@@ -479,10 +614,14 @@ def refuse(_task: int) -> None:
 
 @pytest.mark.extended
 @pytest.mark.filterwarnings("default")
-def test_ray_makes_the_same_bytes_and_gives_the_task_of_a_dead_worker_to_another(tiny, tmp_path):
+def test_ray_makes_the_same_bytes_and_gives_the_task_of_a_dead_worker_to_another(
+    tiny, tmp_path
+):
     require("ray")
     with assembled(Engine("ray", None, 2), 6) as pool:
-        assert sorted(pool.distribute(partial(die_once, tmp_path / "died"), range(6))) == list(range(6))
+        assert sorted(
+            pool.distribute(partial(die_once, tmp_path / "died"), range(6))
+        ) == list(range(6))
         assert (tmp_path / "died").exists()
         with pytest.raises(UsageError, match=r"^not this one$"):
             list(pool.distribute(refuse, range(3)))
@@ -499,6 +638,12 @@ def test_plans_are_the_same_whichever_engine_makes_them(tmp_path, name):
     require(name)
     problems = cnpgen.draw_boundary_problems("airhockey-hit", 6, seed=3)
     here = cnpgen.solve_plans(problems, workers=1)
-    there = cnpgen.solve_plans(problems, workers=2, engine=name, journal=tmp_path / "journal")
-    np.testing.assert_array_equal(there.plans.path_control_points, here.plans.path_control_points)
-    np.testing.assert_array_equal(there.plans.rate_control_points, here.plans.rate_control_points)
+    there = cnpgen.solve_plans(
+        problems, workers=2, engine=name, journal=tmp_path / "journal"
+    )
+    np.testing.assert_array_equal(
+        there.plans.path_control_points, here.plans.path_control_points
+    )
+    np.testing.assert_array_equal(
+        there.plans.rate_control_points, here.plans.rate_control_points
+    )

@@ -39,7 +39,9 @@ def test_the_echo_of_a_signal_waits_too_and_a_later_one_does_not(monkeypatch):
 
 
 def test_handlers_are_as_before_where_no_signal_came_or_the_block_failed():
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {
+        number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)
+    }
     with signals_deferred() as waiting:
         assert waiting.number is None
     with pytest.raises(ValueError, match="of the block"), signals_deferred():
@@ -107,5 +109,11 @@ with signals_deferred():
     print("to the end", flush=True)
 print("not reached")
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGTERM, "to the end\n", "")
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (
+        -signal.SIGTERM,
+        "to the end\n",
+        "",
+    )

@@ -32,7 +32,9 @@ def two_threads() -> Iterator[None]:
 
 def counts() -> set[int]:
     """Return the number of threads of the BLAS libraries."""
-    return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
+    return {
+        each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"
+    }
 
 
 def test_there_is_one_thread_inside_and_as_many_as_before_outside() -> None:
@@ -89,15 +91,21 @@ def loss_call() -> None:
 
 
 def omega_call() -> None:
-    omega = BoundaryLayer(AIRHOCKEY, line_projection_steps=0, projection_steps=0, backend="numpy")
+    omega = BoundaryLayer(
+        AIRHOCKEY, line_projection_steps=0, projection_steps=0, backend="numpy"
+    )
     tasks = omega.tasks(boundary())
     phi, log_rate = np.zeros((3, omega.path_outputs)), np.zeros((3, omega.rate_outputs))
     points = omega(tasks, phi, log_rate)
-    omega.vjp(tasks, phi, log_rate, path_gradient=points.path, rate_gradient=points.rate)
+    omega.vjp(
+        tasks, phi, log_rate, path_gradient=points.path, rate_gradient=points.rate
+    )
 
 
 def planner_call() -> None:
-    Planner(untrained_model("airhockey", boundary()), backend="numpy").plan_batch(boundary())
+    Planner(untrained_model("airhockey", boundary()), backend="numpy").plan_batch(
+        boundary()
+    )
 
 
 @pytest.mark.parametrize(
@@ -110,7 +118,11 @@ def planner_call() -> None:
     ],
 )
 def test_loss_omega_and_planner_compute_with_one_thread(
-    call: Callable[[], None], where: object, name: str, times: int, monkeypatch: pytest.MonkeyPatch
+    call: Callable[[], None],
+    where: object,
+    name: str,
+    times: int,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     found: list[set[int]] = []
     inner = getattr(where, name)

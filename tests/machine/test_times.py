@@ -40,6 +40,9 @@ def test_processes_that_share_the_work_compute_side_by_side() -> None:
 
 def test_times_are_said_in_words_and_in_json() -> None:
     times = Times(preparing=170.12345, computing=7.6, waiting=0.5)
-    assert str(times) == "178.2 s (170.1 s preparing and compiling, 7.6 s computing, 0.5 s waiting)"
+    assert (
+        str(times)
+        == "178.2 s (170.1 s preparing and compiling, 7.6 s computing, 0.5 s waiting)"
+    )
     assert times.rounded() == {"preparing": 170.123, "computing": 7.6, "waiting": 0.5}
     assert NO_TIME.passed == 0.0

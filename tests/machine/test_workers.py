@@ -105,8 +105,12 @@ if __name__ == "__main__":
 def test_a_worker_that_is_killed_while_it_sends_a_long_result_keeps_nobody_waiting():
     """It never does: what is long goes through a file. Else the parent would wait for the other half for ever."""
     command = [sys.executable, "-c", KILLED_WHILE_SENDING]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=HANGING, check=False)
-    assert (done.returncode, done.stdout) == (0, "[100000, 100000, 100000] 100000\n"), done.stderr
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=HANGING, check=False
+    )
+    assert (done.returncode, done.stdout) == (0, "[100000, 100000, 100000] 100000\n"), (
+        done.stderr
+    )
 
 
 def long_or_short(size: int) -> bytes:
@@ -116,7 +120,9 @@ def long_or_short(size: int) -> bytes:
 
 
 @pytest.mark.slow
-def test_results_of_any_length_come_back_and_leave_no_file_behind(monkeypatch, tmp_path):
+def test_results_of_any_length_come_back_and_leave_no_file_behind(
+    monkeypatch, tmp_path
+):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     sizes = [0, 1000, 2000, 2040, 2048, 2100, 4096, 16_384, 70_000, 3_000_000]
     assert list(map(len, distribute(long_or_short, sizes, 2, ordered=True))) == sizes
@@ -143,7 +149,9 @@ list(distribute(long_or_short, [5, -10, 7], 2))
 @pytest.mark.slow
 def test_an_abort_between_submission_and_dispatch_ends_with_the_error_of_the_task():
     command = [sys.executable, "-c", ABORTED_TASK]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=HANGING)
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=HANGING
+    )
     assert done.returncode == 1
     assert "DatasetError: xxxxxxxxxx" in done.stderr
     assert "KeyError" not in done.stderr
@@ -156,11 +164,23 @@ def test_what_a_killed_process_leaves_is_tidied_up_without_a_word(tmp_path):
     command = [sys.executable, "-c", KILLED]
     environment = os.environ | {"TMPDIR": str(tmp_path)}
     with subprocess.Popen(
-        command, cwd=ROOT, env=environment, stdin=pipe, stdout=pipe, stderr=pipe, text=True
+        command,
+        cwd=ROOT,
+        env=environment,
+        stdin=pipe,
+        stdout=pipe,
+        stderr=pipe,
+        text=True,
     ) as process:
-        said = process.communicate("go on\ndie\n", timeout=HANGING)  # until the helpers are gone, too
+        said = process.communicate(
+            "go on\ndie\n", timeout=HANGING
+        )  # until the helpers are gone, too
     assert (process.returncode, *said) == (-signal.SIGKILL, "", "")
-    assert not [path for path in Path("/dev/shm").iterdir() if f"loky-{process.pid}-" in path.name]
+    assert not [
+        path
+        for path in Path("/dev/shm").iterdir()
+        if f"loky-{process.pid}-" in path.name
+    ]
     assert not list(tmp_path.iterdir())
     assert sys.warnoptions == options
 
@@ -179,7 +199,9 @@ def die(_task: int) -> None:
 
 
 def test_a_dead_worker_is_a_machine_error_with_a_hint():
-    with pytest.raises(MachineError, match=r"^a worker died \(killed, or out of memory\): try again$"):
+    with pytest.raises(
+        MachineError, match=r"^a worker died \(killed, or out of memory\): try again$"
+    ):
         list(distribute(die, range(4), 2, hint=": try again"))
 
 
@@ -232,20 +254,30 @@ if __name__ == "__main__":
 
 def alive(pid: int) -> bool:
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+        return (
+            Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+        )
     except OSError:
         return False
 
 
 @linux
-@pytest.mark.parametrize("number", some([signal.SIGKILL, signal.SIGTERM, signal.SIGHUP]))
+@pytest.mark.parametrize(
+    "number", some([signal.SIGKILL, signal.SIGTERM, signal.SIGHUP])
+)
 def test_workers_end_soon_after_their_parent_whatever_they_are_doing(tmp_path, number):
     if signal.getsignal(number) is signal.SIG_IGN:
         pytest.skip("the tests run under nohup, and so do those that they start")
     (tmp_path / "child.py").write_text(CHILD)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
     command = [sys.executable, str(tmp_path / "child.py")]
-    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:
+    with subprocess.Popen(
+        command,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as child:
         workers = {int(child.stdout.readline()) for _ in range(2)}
         assert all(map(alive, workers))
         child.send_signal(number)
@@ -260,7 +292,9 @@ def test_workers_end_soon_after_their_parent_whatever_they_are_doing(tmp_path, n
 # --- other backends ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("backend", some(["threading", "sequential", "multiprocessing"], 1, "slow"))
+@pytest.mark.parametrize(
+    "backend", some(["threading", "sequential", "multiprocessing"], 1, "slow")
+)
 def test_other_backends_make_the_same_bytes(tiny, tmp_path, backend):
     with joblib.parallel_config(backend=backend):
         make_tiny(tmp_path / "out", workers=4, shard_size=250)
@@ -286,7 +320,9 @@ def test_a_backend_that_knows_only_lists_is_given_a_few_tasks_at_a_time():
 def cluster():
     """Dask's scheduler and two workers, each a process."""
     distributed = pytest.importorskip("distributed")
-    local = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
+    local = distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None
+    )
     with local as cluster, distributed.Client(cluster) as client:
         yield client
 
@@ -335,5 +371,7 @@ def die_once(marker: Path, task: int) -> int:
 @pytest.mark.filterwarnings("default")
 def test_dask_gives_the_task_of_a_dead_worker_to_another(tmp_path, cluster):
     with joblib.parallel_config(backend="dask"):
-        assert sorted(distribute(partial(die_once, tmp_path / "died"), range(6), 2)) == list(range(6))
+        assert sorted(
+            distribute(partial(die_once, tmp_path / "died"), range(6), 2)
+        ) == list(range(6))
     assert (tmp_path / "died").exists()

@@ -38,7 +38,9 @@ ROWS = 12
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("certified") / "hits"
-    return make_dataset("airhockey-hit", out, n=ROWS, certify=True, workers=1, shard_size=8).folder
+    return make_dataset(
+        "airhockey-hit", out, n=ROWS, certify=True, workers=1, shard_size=8
+    ).folder
 
 
 def test_every_row_holds_a_plan_that_deep_validation_judges(folder: Path) -> None:
@@ -58,25 +60,42 @@ def test_every_row_holds_a_plan_that_deep_validation_judges(folder: Path) -> Non
 def test_the_plans_are_those_that_solve_finds(folder: Path) -> None:
     problem = load_dataset_recipe("airhockey-hit").pipeline.problem
     rows = open_dataset(folder).read("validation")
-    unsolved = {name: values for name, values in rows.items() if not name.endswith("control_points")}
+    unsolved = {
+        name: values
+        for name, values in rows.items()
+        if not name.endswith("control_points")
+    }
     found = refine_plans(plans_of_rows(record_problem(problem), unsolved)).plans
-    np.testing.assert_array_equal(found.path_control_points.reshape(len(found), -1), rows["path_control_points"])
+    np.testing.assert_array_equal(
+        found.path_control_points.reshape(len(found), -1), rows["path_control_points"]
+    )
 
 
-def test_rows_are_read_with_their_plans_and_these_are_as_good_as_refined(folder: Path, tmp_path: Path) -> None:
+def test_rows_are_read_with_their_plans_and_these_are_as_good_as_refined(
+    folder: Path, tmp_path: Path
+) -> None:
     plans = load_boundary_problems(folder)
     assert evaluate_plans(plans, workers=1).valid.all()
-    np.testing.assert_allclose(plans.duration, open_dataset(folder).read("train")["duration"], rtol=1e-12)
+    np.testing.assert_allclose(
+        plans.duration, open_dataset(folder).read("train")["duration"], rtol=1e-12
+    )
     found = refine_plans(plans, workers=1)
     assert found.valid.all()
     assert (found.plans.duration <= plans.duration * (1 + 2e-3)).all()
     save_plans(tmp_path / "stored.h5", plans)
-    assert load_plans(tmp_path / "stored.h5").source == "dataset airhockey-hit-certified, seed 20261121, split train"
+    assert (
+        load_plans(tmp_path / "stored.h5").source
+        == "dataset airhockey-hit-certified, seed 20261121, split train"
+    )
 
 
 @pytest.mark.parametrize("model", [None, "airhockey-hit"])
-def test_a_round_whose_draws_are_all_rejected_needs_no_plans(model: str | None, prepare: Prepare) -> None:
-    prepared = prepare(certified(load_dataset_recipe("airhockey-hit"), model=model).pipeline)
+def test_a_round_whose_draws_are_all_rejected_needs_no_plans(
+    model: str | None, prepare: Prepare
+) -> None:
+    prepared = prepare(
+        certified(load_dataset_recipe("airhockey-hit"), model=model).pipeline
+    )
     (*_, (_, plan)), candidates = prepared._stages, run_stages(prepared, 4)
     candidates.reject(np.zeros(len(candidates.alive), bool), "all of them")
     plan(candidates, np.random.default_rng(0))
@@ -88,14 +107,20 @@ def test_a_round_whose_draws_are_all_rejected_needs_no_plans(model: str | None, 
 @pytest.mark.slow
 def test_workers_and_interruptions_change_no_byte(folder: Path, tmp_path: Path) -> None:
     again = tmp_path / "again"
-    make_dataset("airhockey-hit", again, n=ROWS, certify=True, part=(1, 2), shard_size=8)
+    make_dataset(
+        "airhockey-hit", again, n=ROWS, certify=True, part=(1, 2), shard_size=8
+    )
     make_dataset("airhockey-hit", again, n=ROWS, certify=True, workers=2, shard_size=8)
     shards = sorted(path.relative_to(folder) for path in folder.rglob("*.h5"))
-    assert [file_sha256(folder / name) for name in shards] == [file_sha256(again / name) for name in shards]
+    assert [file_sha256(folder / name) for name in shards] == [
+        file_sha256(again / name) for name in shards
+    ]
 
 
 @pytest.mark.slow
-def test_samples_without_a_plan_are_counted_under_their_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_samples_without_a_plan_are_counted_under_their_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     solve, count = engine.refine_task, itertools.count()
 
     def fail_at_every_third(*arguments: Any) -> Attempt:
@@ -119,7 +144,10 @@ def test_a_plan_that_does_not_hold_is_found(folder: Path, tmp_path: Path) -> Non
     path[3, 40] += 0.1
     found = check_plans(problem, robot, rows | {"path_control_points": path})
     assert (found.judged, found.valid) == (11, 10)
-    assert "1 of 11 plans are not valid, the first one is that of row 3" in found.problems[0]
+    assert (
+        "1 of 11 plans are not valid, the first one is that of row 3"
+        in found.problems[0]
+    )
     wrong = check_plans(problem, robot, rows | {"duration": 2 * rows["duration"]})
     assert wrong.problems == ("stored durations differ from those of the plans",)
     assert check_plans(problem, robot, {"start_q": rows["start_q"]}) == PlanCheck()
@@ -128,12 +156,27 @@ def test_a_plan_that_does_not_hold_is_found(folder: Path, tmp_path: Path) -> Non
 def test_float32_is_refused_since_plans_would_miss_their_ends(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["make-dataset", "airhockey-hit", "-o", str(tmp_path / "out"), "--certify", "--dtype", "float32"]) == 2
+    assert (
+        main(
+            [
+                "make-dataset",
+                "airhockey-hit",
+                "-o",
+                str(tmp_path / "out"),
+                "--certify",
+                "--dtype",
+                "float32",
+            ]
+        )
+        == 2
+    )
     assert capsys.readouterr().err == (
         "cnpgen: error: --certify stores plans, which are exact in float64 only: leave out --dtype float32\n"
     )
     with pytest.raises(RecipeError, match="float64"):
-        make_dataset("airhockey-hit", tmp_path / "out", n=4, certify=True, dtype="float32")
+        make_dataset(
+            "airhockey-hit", tmp_path / "out", n=4, certify=True, dtype="float32"
+        )
 
 
 def test_certifying_adds_one_stage_and_a_name_and_only_once() -> None:
@@ -145,9 +188,26 @@ def test_certifying_adds_one_stage_and_a_name_and_only_once() -> None:
 
 
 @pytest.mark.slow
-def test_the_command_makes_a_certified_dataset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_makes_a_certified_dataset(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "out"
-    assert main(["make-dataset", "heavy-object", "--n", "2", "--certify", "--out", str(out), "--workers", "1"]) == 0
+    assert (
+        main(
+            [
+                "make-dataset",
+                "heavy-object",
+                "--n",
+                "2",
+                "--certify",
+                "--out",
+                str(out),
+                "--workers",
+                "1",
+            ]
+        )
+        == 0
+    )
     assert main(["show", "airhockey-hit"]) == 0
     assert main(["validate", str(out), "--deep"]) == 0
     shutil.rmtree(out)
@@ -158,7 +218,13 @@ def test_the_command_makes_a_certified_dataset(tmp_path: Path, capsys: pytest.Ca
 def from_planner(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("planned") / "hits"
     return make_dataset(
-        "airhockey-hit", out, n=ROWS, certify=True, model="airhockey-hit", workers=1, shard_size=8
+        "airhockey-hit",
+        out,
+        n=ROWS,
+        certify=True,
+        model="airhockey-hit",
+        workers=1,
+        shard_size=8,
     ).folder
 
 
@@ -182,13 +248,22 @@ def test_plans_that_begin_with_a_planners_are_judged_alike_and_made_again_alike(
 
 @pytest.mark.slow
 def test_transports_begin_with_a_planners_plans_too(tmp_path: Path) -> None:
-    made = make_dataset("heavy-object", tmp_path / "out", n=3, certify=True, model="heavy-object", workers=1)
+    made = make_dataset(
+        "heavy-object",
+        tmp_path / "out",
+        n=3,
+        certify=True,
+        model="heavy-object",
+        workers=1,
+    )
     assert len(open_dataset(made.folder).read("train")["duration"]) == 3
 
 
 def test_recipes_without_a_planner_are_written_as_before() -> None:
     recipe = load_dataset_recipe("airhockey-hit")
-    assert resolved(certified(recipe))["pipeline"]["stage"][-1] == {"use": "certified-plan"}
+    assert resolved(certified(recipe))["pipeline"]["stage"][-1] == {
+        "use": "certified-plan"
+    }
 
 
 def test_another_model_under_the_name_is_refused(tmp_path: Path) -> None:
@@ -196,15 +271,38 @@ def test_another_model_under_the_name_is_refused(tmp_path: Path) -> None:
     shutil.copy(shipped_models()["airhockey-hit"], mine)
     recipe = certified(load_dataset_recipe("airhockey-hit"), model=mine)
     shutil.copy(shipped_models()["airhockey-replan"], mine)
-    with pytest.raises(RecipeError, match=r"sha256: the file of model '.*mine\.h5' has"):
+    with pytest.raises(
+        RecipeError, match=r"sha256: the file of model '.*mine\.h5' has"
+    ):
         make_dataset(recipe, tmp_path / "out", n=4, workers=1)
 
 
-def test_a_planner_is_for_certifying(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_planner_is_for_certifying(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(UsageError, match="certify=True"):
         make_dataset("airhockey-hit", tmp_path / "out", n=4, model="airhockey-hit")
-    assert main(["make-dataset", "airhockey-hit", "-o", str(tmp_path / "out"), "--model", "airhockey-hit"]) == 2
+    assert (
+        main(
+            [
+                "make-dataset",
+                "airhockey-hit",
+                "-o",
+                str(tmp_path / "out"),
+                "--model",
+                "airhockey-hit",
+            ]
+        )
+        == 2
+    )
     assert "--model needs --certify" in capsys.readouterr().err
-    command = ["make-dataset", "airhockey-hit", "--certify", "--model", "airhockey-hot", "--dry-run"]
+    command = [
+        "make-dataset",
+        "airhockey-hit",
+        "--certify",
+        "--model",
+        "airhockey-hot",
+        "--dry-run",
+    ]
     assert main(command) == 2
     assert "unknown model 'airhockey-hot'" in capsys.readouterr().err

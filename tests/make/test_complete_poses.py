@@ -19,13 +19,19 @@ from cnpgen.refine.task import Attempt, Outcome
 from tests.examples.shaped_robot import SELF, write_problem
 
 VELOCITY = '[[constraint]]\nuse = "joint-velocity"\ntolerance = "0.2 %"\n'
-GOALS = [[0.4, 0.4, 0.5], [3.0, 0.0, 0.3], [0.0, 0.0, 0.32]]  # m; the second is out of reach, the third in the arm
+GOALS = [
+    [0.4, 0.4, 0.5],
+    [3.0, 0.0, 0.3],
+    [0.0, 0.0, 0.32],
+]  # m; the second is out of reach, the third in the arm
 OUT_OF_REACH = "no inverse kinematics of the goal"
 
 
 @pytest.fixture(scope="module")
 def crane(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_problem(tmp_path_factory.mktemp("crane"), obstacles="", more=SELF + VELOCITY)
+    return write_problem(
+        tmp_path_factory.mktemp("crane"), obstacles="", more=SELF + VELOCITY
+    )
 
 
 @pytest.fixture(scope="module")
@@ -36,12 +42,20 @@ def problem(crane: Path) -> Problem:
 def quaternion(rotation: np.ndarray) -> list[float]:
     """Return the quaternion w, x, y, z of a rotation matrix by less than half a turn."""
     w = np.sqrt(1 + np.trace(rotation)) / 2
-    skew = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
+    skew = np.array(
+        [
+            rotation[2, 1] - rotation[1, 2],
+            rotation[0, 2] - rotation[2, 0],
+            rotation[1, 0] - rotation[0, 1],
+        ]
+    )
     return [w, *(skew / (4 * w))]
 
 
 def test_a_task_has_several_goal_states_with_its_pose(problem: Problem) -> None:
-    found = cnpgen.complete(problem, goal_xyz=GOALS[:2], goal_xyz_tolerance=[0.0, 0.0, 0.02])
+    found = cnpgen.complete(
+        problem, goal_xyz=GOALS[:2], goal_xyz_tolerance=[0.0, 0.0, 0.02]
+    )
     assert found.reasons == ("", OUT_OF_REACH)
     assert len(found) == 1
     plans = found.plans
@@ -52,7 +66,9 @@ def test_a_task_has_several_goal_states_with_its_pose(problem: Problem) -> None:
     assert error[:, :2].max() < 1e-5
     assert error[:, 2].max() < 0.02 + 1e-5
     assert (np.diff(min_durations(plans)) >= 0).all()
-    difference = np.abs(plans.boundary.goal_q[:, None] - plans.boundary.goal_q).max(axis=2)
+    difference = np.abs(plans.boundary.goal_q[:, None] - plans.boundary.goal_q).max(
+        axis=2
+    )
     assert difference[~np.eye(len(plans), dtype=bool)].min() > 0.29
 
 
@@ -60,22 +76,34 @@ def test_goal_states_meet_the_constraints_of_the_problem(tmp_path: Path) -> None
     more = SELF + VELOCITY + '[[constraint]]\nuse = "vertical"\ntolerance = "2 deg"\n'
     problem = cnpgen.load_problem(write_problem(tmp_path, obstacles="", more=more))
     level, tilted = np.array([[0.7, -0.6, 0.6, 0.0], [0.7, -0.6, 1.0, 0.0]])
-    positions, rotations = cnpgen.RobotModel(problem).forward_kinematics(np.array([level, tilted]))
+    positions, rotations = cnpgen.RobotModel(problem).forward_kinematics(
+        np.array([level, tilted])
+    )
     task = {"start_q": [0.0, -0.6, 0.6, 0.0], "goal_rotation_tolerance": [0, 0, 3.15]}
-    found = cnpgen.complete(problem, **task, goal_xyz=positions, goal_wxyz=[quaternion(each) for each in rotations])
+    found = cnpgen.complete(
+        problem,
+        **task,
+        goal_xyz=positions,
+        goal_wxyz=[quaternion(each) for each in rotations],
+    )
     assert found.reasons == ("", "all goal states in collision or off a constraint")
     for q in found.plans.boundary.goal_q:
         assert abs(q[1] + q[2]) < np.deg2rad(2)
     start = [0.0, -0.6, 0.9, 0.0]
     found = cnpgen.complete(problem, **task | {"start_q": start}, goal_xyz=positions[0])
-    assert found.reasons == ("start in collision, outside its limits or off a constraint",)
+    assert found.reasons == (
+        "start in collision, outside its limits or off a constraint",
+    )
 
 
 def test_tolerances_in_degrees_are_refused(problem: Problem) -> None:
     with pytest.raises(
-        UsageError, match=r"at most 25.13 rad, got .* in task 0; 180 rad is 10313 deg; did you mean 180 deg"
+        UsageError,
+        match=r"at most 25.13 rad, got .* in task 0; 180 rad is 10313 deg; did you mean 180 deg",
     ):
-        cnpgen.complete(problem, goal_xyz=GOALS[0], goal_rotation_tolerance=[0.0, 0.0, 180.0])
+        cnpgen.complete(
+            problem, goal_xyz=GOALS[0], goal_rotation_tolerance=[0.0, 0.0, 180.0]
+        )
 
 
 def test_a_quaternion_is_met_and_pi_frees_an_axis(problem: Problem) -> None:
@@ -84,7 +112,9 @@ def test_a_quaternion_is_met_and_pi_frees_an_axis(problem: Problem) -> None:
     (rotation,) = model.forward_kinematics(aim.boundary.goal_q)[1]
     task = {"goal_xyz": GOALS[0], "goal_wxyz": quaternion(rotation)}
     exact = cnpgen.complete(problem, **task).plans
-    free = cnpgen.complete(problem, **task, goal_rotation_tolerance=[np.pi, 0.0, 0.0]).plans
+    free = cnpgen.complete(
+        problem, **task, goal_rotation_tolerance=[np.pi, 0.0, 0.0]
+    ).plans
     poses = model.forward_kinematics(exact.boundary.goal_q)[1]
     assert np.abs(poses - rotation).max() < 1e-4
     axes = model.forward_kinematics(free.boundary.goal_q)[1][:, :, 0]
@@ -95,24 +125,36 @@ def test_a_quaternion_is_met_and_pi_frees_an_axis(problem: Problem) -> None:
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        ({"goal_q": [0.0] * 4}, r"has no column to give 'goal_q'.*only start_q, goal_xyz, goal_wxyz"),
+        (
+            {"goal_q": [0.0] * 4},
+            r"has no column to give 'goal_q'.*only start_q, goal_xyz, goal_wxyz",
+        ),
         ({"start_q": [0.0] * 4}, "must give goal_xyz"),
         (
             {"goal_xyz": GOALS[0], "goal_wxyz": [0.0] * 4},
             "goal_wxyz quaternion .* is zero, expected length 1 in task 0",
         ),
-        ({"goal_xyz": GOALS[0], "goal_xyz_tolerance": [-1, 0, 0]}, "goal_xyz_tolerance must not be negative"),
+        (
+            {"goal_xyz": GOALS[0], "goal_xyz_tolerance": [-1, 0, 0]},
+            "goal_xyz_tolerance must not be negative",
+        ),
         ({"goal_xyz": [400, 400, 500]}, "did you mean 400 mm = 0.4 m"),
     ],
 )
-def test_wrong_columns_are_refused(problem: Problem, columns: dict[str, list[float]], message: str) -> None:
+def test_wrong_columns_are_refused(
+    problem: Problem, columns: dict[str, list[float]], message: str
+) -> None:
     with pytest.raises(UsageError, match=message):
         cnpgen.complete(problem, **columns)
 
 
-def test_the_command_takes_tables_of_poses(crane: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_takes_tables_of_poses(
+    crane: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     table, out = tmp_path / "tasks.csv", tmp_path / "problems.h5"
-    table.write_text("goal_xyz.x,goal_xyz.y,goal_xyz.z\n0.4,0.4,0.5\n3,0,0.3\n", encoding="utf-8")
+    table.write_text(
+        "goal_xyz.x,goal_xyz.y,goal_xyz.z\n0.4,0.4,0.5\n3,0,0.3\n", encoding="utf-8"
+    )
     assert main(["complete", str(crane), str(table), "-o", str(out)]) == 0
     captured = capsys.readouterr()
     assert "1 of 2 tasks completed" in captured.err
@@ -129,11 +171,21 @@ def refined(cost: dict[int, float]) -> Callable[..., Refinement]:
 
     def refine(plans: Plans, **_: object) -> Refinement:
         results = []
-        for plan, row in zip(plans, plans.columns["row"].astype(int).tolist(), strict=True):
+        for plan, row in zip(
+            plans, plans.columns["row"].astype(int).tolist(), strict=True
+        ):
             path, rate = plan.path_control_points[0], plan.rate_control_points[0]
             reason = "ok" if row in cost else "robot in collision"
             value = cost.get(row, np.inf)
-            results.append(Attempt(path=path, rate=rate, cost=value, outcome=Outcome.SOLVED, reason=reason))
+            results.append(
+                Attempt(
+                    path=path,
+                    rate=rate,
+                    cost=value,
+                    outcome=Outcome.SOLVED,
+                    reason=reason,
+                )
+            )
         return Refinement(plans, plans, tuple(results))
 
     return refine
@@ -141,7 +193,9 @@ def refined(cost: dict[int, float]) -> Callable[..., Refinement]:
 
 def test_the_best_valid_motion_to_any_goal_state_is_chosen(problem: Problem) -> None:
     plans = cnpgen.complete(problem, goal_xyz=[GOALS[0], [0.4, -0.4, 0.5]]).plans
-    plans = replace(plans, columns={**plans.columns, "row": np.arange(len(plans), dtype=float)})
+    plans = replace(
+        plans, columns={**plans.columns, "row": np.arange(len(plans), dtype=float)}
+    )
     counts, bounds = np.bincount(plans.sample_id), min_durations(plans)
     assert (counts >= 3).all()
     first, second = 0, int(counts[0])
@@ -156,14 +210,18 @@ def test_the_best_valid_motion_to_any_goal_state_is_chosen(problem: Problem) -> 
     assert chosen.plans.columns["row"].tolist() == [first + 1, second + 1]
     assert chosen.valid.all()
     assert np.sum(reported, axis=0).tolist() == [2, 2]
-    fast = dict.fromkeys(range(len(plans)), bounds[first + 1] * 0.999)  # later goal states cannot be nearer
+    fast = dict.fromkeys(
+        range(len(plans)), bounds[first + 1] * 0.999
+    )  # later goal states cannot be nearer
     tried = list[int]()
 
     def refine(rows: Plans, **options: object) -> Refinement:
         tried.extend(rows.columns["row"].astype(int).tolist())
         return refined(fast)(rows, **options)
 
-    refine_goal_options(plans[plans.sample_id == 0], refine, journal=None, begin=None, progress=None)
+    refine_goal_options(
+        plans[plans.sample_id == 0], refine, journal=None, begin=None, progress=None
+    )
     assert tried == [first]
 
 
@@ -175,8 +233,13 @@ def test_tasks_with_goal_poses_are_solved(problem: Problem) -> None:
     assert solved.valid.all()
     for row in range(2):
         options = completed.plans[completed.plans.sample_id == row]
-        single = replace(options, columns={k: v for k, v in options.columns.items() if k != "goal_option"})
-        assert solved.plans.duration[row] == pytest.approx(cnpgen.solve_plans(single, workers=1).plans.duration.min())
+        single = replace(
+            options,
+            columns={k: v for k, v in options.columns.items() if k != "goal_option"},
+        )
+        assert solved.plans.duration[row] == pytest.approx(
+            cnpgen.solve_plans(single, workers=1).plans.duration.min()
+        )
 
 
 def test_unplanned_tasks_can_be_filled_in_place(problem: Problem) -> None:
@@ -186,6 +249,11 @@ def test_unplanned_tasks_can_be_filled_in_place(problem: Problem) -> None:
 
 
 def test_tasks_with_one_number_are_refused_instead_of_merged(problem: Problem) -> None:
-    first, second = (cnpgen.complete(problem, goal_xyz=goal).plans for goal in (GOALS[0], [0.4, 0.3, 0.5]))
-    with pytest.raises(UsageError, match=r"plans have several tasks with the sample_id 0"):
+    first, second = (
+        cnpgen.complete(problem, goal_xyz=goal).plans
+        for goal in (GOALS[0], [0.4, 0.3, 0.5])
+    )
+    with pytest.raises(
+        UsageError, match=r"plans have several tasks with the sample_id 0"
+    ):
         cnpgen.solve_plans(concatenate([first, second]), workers=1)

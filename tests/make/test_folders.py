@@ -43,19 +43,28 @@ def test_another_dataset_in_the_folder_is_refused_and_not_touched(folder, what):
         pytest.skip("this is the only backend here")
     before = snapshot(folder)
     words = what.replace("_", " ")
-    with pytest.raises(UsageError, match=f"holds another dataset .*{words} .* instead of .*force=True"):
+    with pytest.raises(
+        UsageError, match=f"holds another dataset .*{words} .* instead of .*force=True"
+    ):
         make_tiny(folder, **CHANGES[what])
     assert snapshot(folder) == before
 
 
 def test_another_recipe_in_the_folder_is_refused_and_not_touched(folder):
     before = snapshot(folder)
-    with pytest.raises(UsageError, match=r"holds another dataset \(name airhockey-hit instead of heavy-object"):
+    with pytest.raises(
+        UsageError,
+        match=r"holds another dataset \(name airhockey-hit instead of heavy-object",
+    ):
         make_tiny(folder, "heavy-object")
     changed = tiny_recipe("airhockey-hit")
     stages = changed.pipeline.stage
-    changed = replace(changed, pipeline=replace(changed.pipeline, stage=(*stages, stages[-1])))
-    with pytest.raises(UsageError, match=r"holds another dataset \(another recipe\); choose"):
+    changed = replace(
+        changed, pipeline=replace(changed.pipeline, stage=(*stages, stages[-1]))
+    )
+    with pytest.raises(
+        UsageError, match=r"holds another dataset \(another recipe\); choose"
+    ):
         make_dataset(changed, folder, workers=1, shard_size=TINY_SHARD)
     assert snapshot(folder) == before
 
@@ -64,7 +73,9 @@ def test_a_corrected_title_is_the_same_dataset(folder):
     before = snapshot(folder)
     changed = tiny_recipe("airhockey-hit")
     problem = replace(changed.pipeline.problem, title="other words")
-    changed = replace(changed, pipeline=replace(changed.pipeline, title="corrected", problem=problem))
+    changed = replace(
+        changed, pipeline=replace(changed.pipeline, title="corrected", problem=problem)
+    )
     made = make_dataset(changed, folder, workers=1)
     assert (made.made, made.complete) == (0, True)
     assert snapshot(folder) == before
@@ -76,10 +87,19 @@ def test_another_size_is_refused_with_what_can_be_done(folder, rows):
     with pytest.raises(UsageError) as caught:
         make_dataset(tiny_recipe("airhockey-hit"), folder, n=rows, workers=1)
     text = str(caught.value)
-    assert "holds this dataset with 660 rows (train 600, validation 60), not with" in text
-    assert f"{rows:,} rows (train {rows * 10 // 11:,}, validation {rows // 11:,})" in text
-    extend = "extend_dataset or 'cnpgen extend' adds the rows, or " if rows > 660 else ""
-    assert f"the common rows are the same: {extend}choose another out=, or replace it with force=True" in text
+    assert (
+        "holds this dataset with 660 rows (train 600, validation 60), not with" in text
+    )
+    assert (
+        f"{rows:,} rows (train {rows * 10 // 11:,}, validation {rows // 11:,})" in text
+    )
+    extend = (
+        "extend_dataset or 'cnpgen extend' adds the rows, or " if rows > 660 else ""
+    )
+    assert (
+        f"the common rows are the same: {extend}choose another out=, or replace it with force=True"
+        in text
+    )
     assert snapshot(folder) == before
 
 
@@ -87,7 +107,11 @@ def test_force_replaces_another_dataset(folder):
     made = make_tiny(folder, "airhockey-replan", force=True, shard_size=400)
     assert made.complete
     assert validate_dataset(folder).ok
-    assert sorted(digests(folder)) == ["train/shard-00000.h5", "train/shard-00001.h5", "validation/shard-00000.h5"]
+    assert sorted(digests(folder)) == [
+        "train/shard-00000.h5",
+        "train/shard-00001.h5",
+        "validation/shard-00000.h5",
+    ]
 
 
 # --- specifications without shards ----------------------------------------------------------------------------------
@@ -107,7 +131,9 @@ def hopeless(monkeypatch) -> None:
 
 
 @pytest.mark.slow
-def test_a_recipe_that_accepts_nothing_does_not_block_the_folder_for_the_corrected_one(tmp_path, monkeypatch):
+def test_a_recipe_that_accepts_nothing_does_not_block_the_folder_for_the_corrected_one(
+    tmp_path, monkeypatch
+):
     hopeless(monkeypatch)
     with pytest.raises(RecipeError, match=r"0 of .* candidates were accepted"):
         make_tiny(tmp_path / "out", seed=1, shard_size=77)
@@ -139,16 +165,27 @@ def test_a_damaged_specification_with_rows_is_refused_unless_forced(folder, cont
     else:
         (folder / "specification.json").write_bytes(content)
     before = snapshot(folder)
-    with pytest.raises(DatasetError, match=r"specification.json is damaged: .*; force=True replaces the whole dataset"):
+    with pytest.raises(
+        DatasetError,
+        match=r"specification.json is damaged: .*; force=True replaces the whole dataset",
+    ):
         make_tiny(folder)
     assert snapshot(folder) == before
     assert make_tiny(folder, force=True).complete
     assert validate_dataset(folder).ok
 
 
-def test_force_works_where_the_specification_is_damaged_and_a_record_or_all_documents_are_lost(folder):
+def test_force_works_where_the_specification_is_damaged_and_a_record_or_all_documents_are_lost(
+    folder,
+):
     (folder / "specification.json").write_bytes(b"")
-    for name in ("manifest.json", "stats.json", "README.md", "croissant.json", "validation/shard-00000.json"):
+    for name in (
+        "manifest.json",
+        "stats.json",
+        "README.md",
+        "croissant.json",
+        "validation/shard-00000.json",
+    ):
         (folder / name).unlink()
     assert make_tiny(folder, force=True).complete
     assert validate_dataset(folder).ok
@@ -156,7 +193,10 @@ def test_force_works_where_the_specification_is_damaged_and_a_record_or_all_docu
 
 def test_force_works_where_the_specification_is_lost(folder):
     (folder / "specification.json").unlink()
-    with pytest.raises(DatasetError, match=r"specification.json is missing; force=True replaces the whole dataset"):
+    with pytest.raises(
+        DatasetError,
+        match=r"specification.json is missing; force=True replaces the whole dataset",
+    ):
         make_tiny(folder)
     assert make_tiny(folder, force=True).complete
     assert validate_dataset(folder).ok
@@ -176,7 +216,9 @@ def test_a_folder_that_is_no_dataset_is_refused_and_not_touched(tmp_path, force,
     if spec is not None:
         (tmp_path / "specification.json").write_text(spec)
     before = snapshot(tmp_path)
-    with pytest.raises(UsageError, match="not empty and not a dataset of cnpgen; choose another out="):
+    with pytest.raises(
+        UsageError, match="not empty and not a dataset of cnpgen; choose another out="
+    ):
         make_tiny(tmp_path, force=force)
     assert snapshot(tmp_path) == before
 
@@ -189,7 +231,10 @@ def test_no_other_path_hides_the_content_of_a_folder(tmp_path):
     assert snapshot(tmp_path) == {"mine/README.md": b"mine"}
 
 
-@pytest.mark.parametrize("name", ["train/notes.txt", "thesis.tex", "train/shard-1.h5", "train/shard-00000.h5.bak"])
+@pytest.mark.parametrize(
+    "name",
+    ["train/notes.txt", "thesis.tex", "train/shard-1.h5", "train/shard-00000.h5.bak"],
+)
 def test_force_does_not_delete_a_dataset_with_foreign_files(folder, name):
     (folder / name).write_text("mine")
     before = snapshot(folder)
@@ -201,7 +246,9 @@ def test_force_does_not_delete_a_dataset_with_foreign_files(folder, name):
 def test_force_does_not_follow_a_link_out_of_the_folder(folder, tmp_path):
     shutil.move(folder / "train", tmp_path / "precious")
     (folder / "train").symlink_to(tmp_path / "precious")
-    with pytest.raises(UsageError, match="train is a link that leads outside the folder of the dataset"):
+    with pytest.raises(
+        UsageError, match="train is a link that leads outside the folder of the dataset"
+    ):
         make_tiny(folder, seed=3, force=True)
     assert len(list((tmp_path / "precious").iterdir())) == 6
 
@@ -216,7 +263,9 @@ def test_a_deletion_that_is_cut_off_leaves_what_force_can_delete(folder, monkeyp
         unlink(self, missing_ok=missing_ok)
 
     monkeypatch.setattr(Path, "unlink", refuse)
-    with pytest.raises(MachineError, match=r"cannot delete from .*: Input/output error"):
+    with pytest.raises(
+        MachineError, match=r"cannot delete from .*: Input/output error"
+    ):
         make_tiny(folder, seed=3, force=True)
     monkeypatch.undo()
     assert not (folder / "manifest.json").exists()
@@ -229,7 +278,19 @@ def test_a_deletion_that_is_cut_off_leaves_what_force_can_delete(folder, monkeyp
 
 def refused(capsys, out: str) -> tuple[int, str]:
     """Try to make a dataset in a place; return the exit code and the only line."""
-    code = main(["make-dataset", "airhockey-hit", "--n", "100", "--workers", "1", "--quiet", "--out", out])
+    code = main(
+        [
+            "make-dataset",
+            "airhockey-hit",
+            "--n",
+            "100",
+            "--workers",
+            "1",
+            "--quiet",
+            "--out",
+            out,
+        ]
+    )
     said = capsys.readouterr()
     (line,) = said.err.splitlines()
     assert said.out == ""
@@ -240,9 +301,18 @@ def refused(capsys, out: str) -> tuple[int, str]:
 def test_a_place_where_no_folder_can_be_is_one_line_with_what_to_do(tmp_path, capsys):
     (tmp_path / "file").write_text("mine")
     expected = {
-        "": (2, "the argument after '--out' is empty: is it an unset variable of the shell?"),
-        str(tmp_path / "file"): (2, "file is a file, not a folder; choose another --out"),
-        str(tmp_path / "file" / "below" / "it"): (2, "file is a file, not a folder; choose another --out"),
+        "": (
+            2,
+            "the argument after '--out' is empty: is it an unset variable of the shell?",
+        ),
+        str(tmp_path / "file"): (
+            2,
+            "file is a file, not a folder; choose another --out",
+        ),
+        str(tmp_path / "file" / "below" / "it"): (
+            2,
+            "file is a file, not a folder; choose another --out",
+        ),
         str(tmp_path / ("x" * 300)): (3, "File name too long; choose a shorter name"),
     }
     for out, (code, text) in expected.items():
@@ -262,12 +332,16 @@ def test_a_place_that_the_system_does_not_give_is_a_machine_error(capsys):
 
 
 @pytest.mark.usefixtures("file_permissions")
-def test_a_read_only_folder_is_a_machine_error_before_any_work_is_done(tmp_path, capsys, monkeypatch):
+def test_a_read_only_folder_is_a_machine_error_before_any_work_is_done(
+    tmp_path, capsys, monkeypatch
+):
     tmp_path.chmod(0o555)
     monkeypatch.setattr("cnpgen.make.make_dataset.resolve", None)
     code, line = refused(capsys, str(tmp_path / "new"))
     assert code == 3
-    assert line.endswith("new: Permission denied; choose a folder that you may write to")
+    assert line.endswith(
+        "new: Permission denied; choose a folder that you may write to"
+    )
     assert not list(tmp_path.iterdir())
 
 
@@ -277,8 +351,19 @@ def disk(tmp_path: Path) -> Iterator[Callable[..., None]]:
     (tmp_path / "disk").mkdir()
 
     def mount(*options: str) -> None:
-        command = ["mount", "-t", "tmpfs", "-o", ",".join(["size=8m", *options]), "tmpfs", str(tmp_path / "disk")]
-        if shutil.which("mount") is None or subprocess.run(command, capture_output=True, check=False).returncode:
+        command = [
+            "mount",
+            "-t",
+            "tmpfs",
+            "-o",
+            ",".join(["size=8m", *options]),
+            "tmpfs",
+            str(tmp_path / "disk"),
+        ]
+        if (
+            shutil.which("mount") is None
+            or subprocess.run(command, capture_output=True, check=False).returncode
+        ):
             pytest.skip("this user cannot mount a file system")
 
     mount()
@@ -286,9 +371,20 @@ def disk(tmp_path: Path) -> Iterator[Callable[..., None]]:
     subprocess.run(["umount", str(tmp_path / "disk")], check=True)
 
 
-def test_a_finished_dataset_on_read_only_storage_is_left_as_it_is(tmp_path, disk, capsys):
+def test_a_finished_dataset_on_read_only_storage_is_left_as_it_is(
+    tmp_path, disk, capsys
+):
     out = str(tmp_path / "disk" / "out")
-    command = ["make-dataset", "airhockey-hit", "--n", "100", "--workers", "1", "--out", out]
+    command = [
+        "make-dataset",
+        "airhockey-hit",
+        "--n",
+        "100",
+        "--workers",
+        "1",
+        "--out",
+        out,
+    ]
     assert main(command) == 0
     disk("remount", "ro")
     before = snapshot(Path(out))
@@ -298,18 +394,26 @@ def test_a_finished_dataset_on_read_only_storage_is_left_as_it_is(tmp_path, disk
     for other in (out + "2", str(tmp_path / "disk" / "a" / "b")):
         code, line = refused(capsys, other)
         assert code == 3
-        assert line == f"cnpgen: error: cannot write {other}: Read-only file system; choose another folder"
+        assert (
+            line
+            == f"cnpgen: error: cannot write {other}: Read-only file system; choose another folder"
+        )
     assert snapshot(Path(out)) == before
 
 
-def test_a_folder_that_is_deleted_while_the_dataset_is_made_is_said_to_be_that(tmp_path):
+def test_a_folder_that_is_deleted_while_the_dataset_is_made_is_said_to_be_that(
+    tmp_path,
+):
     out = tmp_path / "out"
     with pytest.raises(
-        MachineError, match=rf"^{out}: it was deleted or moved while the dataset was made; make it again$"
+        MachineError,
+        match=rf"^{out}: it was deleted or moved while the dataset was made; make it again$",
     ):
         make_tiny(out, progress=lambda *_: shutil.rmtree(out))
     assert not out.exists()
-    with pytest.raises(MachineError, match=r": its specification\.json was deleted or moved"):
+    with pytest.raises(
+        MachineError, match=r": its specification\.json was deleted or moved"
+    ):
         make_tiny(out, progress=lambda *_: (out / "specification.json").unlink())
 
 
@@ -321,8 +425,20 @@ def test_a_folder_whose_name_is_not_utf_8_is_like_any_other(tiny, tmp_path):
     assert digests(out) == digests(tiny("airhockey-hit"))
     assert validate_dataset(out, deep=True).ok
     assert make_tiny(out).made == 0
-    assert 'load_dataset("./d\ufffd")' in (out / "README.md").read_text(encoding="utf-8")
-    command = [sys.executable, "-m", "cnpgen", "make-dataset", "airhockey-hit", "--n", "50", "-o", "e\udcff"]
+    assert 'load_dataset("./d\ufffd")' in (out / "README.md").read_text(
+        encoding="utf-8"
+    )
+    command = [
+        sys.executable,
+        "-m",
+        "cnpgen",
+        "make-dataset",
+        "airhockey-hit",
+        "--n",
+        "50",
+        "-o",
+        "e\udcff",
+    ]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, check=False)
     assert (done.returncode, done.stdout) == (0, b"e\\udcff\n"), done.stderr
     assert cnpgen.load_dataset(tmp_path / os.fsdecode(b"e\xff")).arrays("train")
@@ -331,19 +447,30 @@ def test_a_folder_whose_name_is_not_utf_8_is_like_any_other(tiny, tmp_path):
 WRONG = {
     "n": ({"n": 0}, "n must be an integer from 1 to 1000000000000, got 0"),
     "negative n": ({"n": -5}, "n must be an integer from 1 to 1000000000000, got -5"),
-    "seed": ({"seed": -1}, "seed must be an integer from 0 to 9223372036854775807, got -1"),
+    "seed": (
+        {"seed": -1},
+        "seed must be an integer from 0 to 9223372036854775807, got -1",
+    ),
     "shard size": ({"shard_size": 0}, "shard_size must be an integer from 1 on, got 0"),
-    "dtype": ({"dtype": "float16"}, "dtype must be 'float64' or 'float32', got 'float16'"),
+    "dtype": (
+        {"dtype": "float16"},
+        "dtype must be 'float64' or 'float32', got 'float16'",
+    ),
     "backend": ({"backend": "cuda"}, "backend 'cuda' does not exist"),
     "workers": ({"workers": 0}, "workers must be an integer from 1 on, got 0"),
-    "part outside the last": ({"part": (2, 2)}, "part must be K/M with 0 <= K < M, got 2/2|--force would delete"),
+    "part outside the last": (
+        {"part": (2, 2)},
+        "part must be K/M with 0 <= K < M, got 2/2|--force would delete",
+    ),
     "part of nothing": ({"part": (0, 0)}, "part must be K/M|--force would delete"),
 }
 
 
 @pytest.mark.parametrize("force", [False, True])
 @pytest.mark.parametrize("what", WRONG)
-def test_arguments_that_make_no_sense_are_refused_before_anything_is_touched(folder, what, force):
+def test_arguments_that_make_no_sense_are_refused_before_anything_is_touched(
+    folder, what, force
+):
     before = snapshot(folder)
     options, text = WRONG[what]
     with pytest.raises(UsageError, match=text):

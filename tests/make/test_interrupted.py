@@ -33,15 +33,23 @@ class Interrupted(Exception):
 
 
 def times(folder: Path) -> dict[str, int]:
-    return {path.name + path.parent.name: path.stat().st_mtime_ns for path in folder.glob("*/*.h5")}
+    return {
+        path.name + path.parent.name: path.stat().st_mtime_ns
+        for path in folder.glob("*/*.h5")
+    }
 
 
 @pytest.mark.parametrize(
     ("error", "workers"),
     [(KeyboardInterrupt, 2), (Interrupted, 1)]
-    + [pytest.param(*each, marks=pytest.mark.extended) for each in ((KeyboardInterrupt, 1), (Interrupted, 2))],
+    + [
+        pytest.param(*each, marks=pytest.mark.extended)
+        for each in ((KeyboardInterrupt, 1), (Interrupted, 2))
+    ],
 )
-def test_an_interrupted_dataset_is_finished_with_the_same_bytes(tiny, tmp_path, workers, error):
+def test_an_interrupted_dataset_is_finished_with_the_same_bytes(
+    tiny, tmp_path, workers, error
+):
     folder = tmp_path / "out"
 
     def interrupt(_rows: int, _sampling: SamplingStatistics | None) -> None:
@@ -77,10 +85,14 @@ if __name__ == "__main__":
 
 
 @contextmanager
-def running(folder: Path, *, workers: int, shard_size: int = TINY_SHARD) -> Iterator[subprocess.Popen]:
+def running(
+    folder: Path, *, workers: int, shard_size: int = TINY_SHARD
+) -> Iterator[subprocess.Popen]:
     """Run make_dataset in another process, which waits after every shard; it has finished one."""
     command = [sys.executable, "-c", CHILD, str(folder), str(workers), str(shard_size)]
-    with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout.readline().strip().isdigit()
         try:
             yield process
@@ -112,15 +124,22 @@ def test_a_killed_worker_is_a_machine_error_that_says_to_go_on(tmp_path):
 
     def kill(_rows: int, _sampling: SamplingStatistics | None) -> None:
         if not killed:
-            names = {pid: Path(f"/proc/{pid}/cmdline").read_text() for pid in descendants(os.getpid())}
+            names = {
+                pid: Path(f"/proc/{pid}/cmdline").read_text()
+                for pid in descendants(os.getpid())
+            }
             killed.extend(pid for pid, name in names.items() if "popen_loky" in name)
             for pid in killed:
                 os.kill(pid, signal.SIGKILL)
 
-    recipe = replace(load_dataset_recipe("airhockey-hit"), splits={"train": 12_000, "validation": 1000})
+    recipe = replace(
+        load_dataset_recipe("airhockey-hit"),
+        splits={"train": 12_000, "validation": 1000},
+    )
     folder = tmp_path / "out"
     with pytest.raises(
-        MachineError, match=r"a worker died .*finished are safe in .*run make_dataset or 'cnpgen make-dataset' again"
+        MachineError,
+        match=r"a worker died .*finished are safe in .*run make_dataset or 'cnpgen make-dataset' again",
     ):
         make_dataset(recipe, folder, shard_size=1000, workers=2, progress=kill)
     assert len(killed) == 2
@@ -130,8 +149,12 @@ def test_a_killed_worker_is_a_machine_error_that_says_to_go_on(tmp_path):
     assert digests(folder) == digests(tmp_path / "uncut")
 
 
-@pytest.mark.parametrize("number", some([errno.ENOSPC, errno.EDQUOT, errno.EROFS], 1, "slow"))
-def test_a_full_disk_is_a_machine_error_and_the_dataset_is_finished_later(tiny, tmp_path, monkeypatch, number):
+@pytest.mark.parametrize(
+    "number", some([errno.ENOSPC, errno.EDQUOT, errno.EROFS], 1, "slow")
+)
+def test_a_full_disk_is_a_machine_error_and_the_dataset_is_finished_later(
+    tiny, tmp_path, monkeypatch, number
+):
     folder, calls, flush = tmp_path / "out", [], os.fsync
 
     def full(descriptor: int) -> None:
@@ -156,7 +179,10 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     disk = tmp_path / "disk"
     disk.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(disk)]
-    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True, check=False).returncode:
+    if (
+        shutil.which("mount") is None
+        or subprocess.run(mount, capture_output=True, check=False).returncode
+    ):
         pytest.skip("this user cannot mount a small file system")
     try:
         yield disk
@@ -167,7 +193,9 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def test_a_disk_that_is_really_full_loses_nothing(tiny, small_disk):
     folder = small_disk / "out"
     (small_disk / "ballast").write_bytes(bytes(750_000))
-    with pytest.raises(MachineError, match="No space left on device; free some space and try again"):
+    with pytest.raises(
+        MachineError, match="No space left on device; free some space and try again"
+    ):
         make_tiny(folder)
     assert not (folder / MANIFEST).exists()
     assert not list(folder.rglob("*.tmp"))
@@ -182,9 +210,17 @@ def test_another_dataset_in_the_same_folder_meanwhile_stops_the_first(tmp_path):
     folder = tmp_path / "out"
 
     def replace_it(_rows: int, _sampling: SamplingStatistics | None) -> None:
-        make_dataset(tiny_recipe("airhockey-replan"), folder, shard_size=400, workers=1, force=True)
+        make_dataset(
+            tiny_recipe("airhockey-replan"),
+            folder,
+            shard_size=400,
+            workers=1,
+            force=True,
+        )
 
-    with pytest.raises(UsageError, match="was replaced by another dataset while this one was made"):
+    with pytest.raises(
+        UsageError, match="was replaced by another dataset while this one was made"
+    ):
         make_tiny(folder, progress=replace_it)
     assert validate_dataset(folder).ok
     np.testing.assert_equal(len(columns_of(folder)["start_q"]), 600)

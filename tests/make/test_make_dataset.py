@@ -37,23 +37,34 @@ from tests.examples.tiny_datasets import SHARDS, digests, make_tiny, snapshot
 
 
 @pytest.mark.parametrize("name", some(SHIPPED, 1, "slow"))
-def test_one_worker_and_two_make_the_same_bytes(tiny: Callable[[str], Path], tmp_path, name):
+def test_one_worker_and_two_make_the_same_bytes(
+    tiny: Callable[[str], Path], tmp_path, name
+):
     made = make_tiny(tmp_path / "two", name, workers=2)
     assert (made.made, made.complete) == (660, True)
     assert digests(tmp_path / "two") == digests(tiny(name))
     assert len(digests(tiny(name))) == SHARDS
-    assert load_manifest(tmp_path / "two")["fingerprint"] == load_manifest(tiny(name))["fingerprint"]
+    assert (
+        load_manifest(tmp_path / "two")["fingerprint"]
+        == load_manifest(tiny(name))["fingerprint"]
+    )
 
 
-def test_a_fixed_date_makes_equal_manifests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fixed_date_makes_equal_manifests(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1795651200")
     folders = [
-        make_dataset("airhockey-hit", tmp_path / str(workers) / "hits", n=20, workers=workers).folder
+        make_dataset(
+            "airhockey-hit", tmp_path / str(workers) / "hits", n=20, workers=workers
+        ).folder
         for workers in (1, 2)
     ]
     first, second = (Path(folder, "manifest.json").read_bytes() for folder in folders)
     assert first == second
-    record = json.loads(Path(folders[0], "train", "shard-00000.json").read_text(encoding="utf-8"))
+    record = json.loads(
+        Path(folders[0], "train", "shard-00000.json").read_text(encoding="utf-8")
+    )
     assert (record["started"], record["seconds"]) == ("2026-11-26T00:00:00+00:00", 0.0)
 
 
@@ -73,21 +84,33 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("size", some([5001, 4096], 1, "slow") + some([20_000, 3000], 0))
+@pytest.mark.parametrize(
+    "size", some([5001, 4096], 1, "slow") + some([20_000, 3000], 0)
+)
 def test_rows_do_not_depend_on_the_size_of_the_shards(large, tmp_path, size):
-    make_dataset("airhockey-replan", tmp_path / "other", n=20_000, shard_size=size, workers=1)
+    make_dataset(
+        "airhockey-replan", tmp_path / "other", n=20_000, shard_size=size, workers=1
+    )
     for split in ("train", "validation"):
-        found, expected = columns_of(tmp_path / "other", split), columns_of(large, split)
+        found, expected = (
+            columns_of(tmp_path / "other", split),
+            columns_of(large, split),
+        )
         assert found.keys() == expected.keys()
         for name, values in expected.items():
             np.testing.assert_array_equal(found[name], values, err_msg=name)
-    one, other = (load_manifest(folder)["yield"] for folder in (large, tmp_path / "other"))
+    one, other = (
+        load_manifest(folder)["yield"] for folder in (large, tmp_path / "other")
+    )
     assert one == other
 
 
 def test_fewer_rows_are_the_first_of_each_split(large, tmp_path):
     make_dataset("airhockey-replan", tmp_path / "few", n=1000, workers=1)
-    assert load_dataset_spec(tmp_path / "few").splits == {"train": 934, "validation": 66}
+    assert load_dataset_spec(tmp_path / "few").splits == {
+        "train": 934,
+        "validation": 66,
+    }
     for split, rows in (("train", 934), ("validation", 66)):
         few, many = columns_of(tmp_path / "few", split), columns_of(large, split)
         for name, values in few.items():
@@ -98,11 +121,16 @@ def test_fewer_rows_are_the_first_of_each_split(large, tmp_path):
 def problems_of(columns: dict[str, np.ndarray]) -> set[bytes]:
     """The boundary states of every row, as what they are stored as."""
     names = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
-    return {row.tobytes() for row in np.concatenate([columns[name] for name in names], axis=1)}
+    return {
+        row.tobytes()
+        for row in np.concatenate([columns[name] for name in names], axis=1)
+    }
 
 
 def test_splits_share_no_row(large):
-    train, validation = (problems_of(columns_of(large, split)) for split in ("train", "validation"))
+    train, validation = (
+        problems_of(columns_of(large, split)) for split in ("train", "validation")
+    )
     assert len(train) + len(validation) == 20_000
     assert not train & validation
 
@@ -115,15 +143,21 @@ def test_another_seed_makes_other_rows(tiny: Callable[[str], Path], tmp_path):
 
 def test_a_pipeline_without_a_dataset_recipe_can_be_made(tmp_path):
     made = make_dataset("airhockey-hit", tmp_path / "a", n=50, workers=1)
-    as_pipeline = make_dataset(list_recipes("pipeline")["airhockey-hit"], tmp_path / "b", n=50, workers=1)
+    as_pipeline = make_dataset(
+        list_recipes("pipeline")["airhockey-hit"], tmp_path / "b", n=50, workers=1
+    )
     assert as_pipeline.spec.splits == {"train": 45, "validation": 5}
     assert made.complete
     assert as_pipeline.complete
 
 
-def test_the_default_folder_is_named_after_the_dataset_and_its_major_version(tmp_path, monkeypatch):
+def test_the_default_folder_is_named_after_the_dataset_and_its_major_version(
+    tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
-    assert make_dataset(tiny_recipe("airhockey-hit", version="3.1.4"), workers=1).folder == Path("airhockey-hit-v3")
+    assert make_dataset(
+        tiny_recipe("airhockey-hit", version="3.1.4"), workers=1
+    ).folder == Path("airhockey-hit-v3")
     assert (tmp_path / "airhockey-hit-v3" / MANIFEST).is_file()
 
 
@@ -136,7 +170,11 @@ def test_planning_writes_nothing(tmp_path):
 def test_progress_is_told_of_every_shard_and_its_draws(tmp_path):
     seen: list[tuple[int, SamplingStatistics]] = []
     begun: list[tuple[str, Path, int, int]] = []
-    make_tiny(tmp_path / "out", progress=lambda *x: seen.append(x), begin=lambda *x: begun.append(x))
+    make_tiny(
+        tmp_path / "out",
+        progress=lambda *x: seen.append(x),
+        begin=lambda *x: begun.append(x),
+    )
     assert [rows for rows, _ in seen] == [250, 250, 100, 60]
     assert all(sampling.accepted == rows for rows, sampling in seen)
     assert begun == [("making", tmp_path / "out", 660, 0)]
@@ -146,21 +184,36 @@ def test_progress_is_told_of_every_shard_and_its_draws(tmp_path):
 
 def test_attempts_of_a_dataset_sum_to_the_draws_of_its_manifest(large):
     manifest = load_manifest(large)
-    attempts = [int(columns_of(large, split)["attempts"].sum()) for split in ("train", "validation")]
+    attempts = [
+        int(columns_of(large, split)["attempts"].sum())
+        for split in ("train", "validation")
+    ]
     assert sum(attempts) == manifest["yield"]["tried"]
-    assert manifest["yield"]["tried"] == 20_000 + sum(manifest["yield"]["rejections"].values())
+    assert manifest["yield"]["tried"] == 20_000 + sum(
+        manifest["yield"]["rejections"].values()
+    )
 
 
 # --- parts of a job array ---------------------------------------------------------------------------------------------
 
 
-def test_all_parts_of_a_job_array_make_the_dataset_and_the_last_one_finishes_it(tiny, tmp_path):
+def test_all_parts_of_a_job_array_make_the_dataset_and_the_last_one_finishes_it(
+    tiny, tmp_path
+):
     folder = tmp_path / "out"
     first = make_tiny(folder, part=(0, 2))
-    assert (first.made, first.complete, first.rows) == (500, False, {"train": 500, "validation": 0})
+    assert (first.made, first.complete, first.rows) == (
+        500,
+        False,
+        {"train": 500, "validation": 0},
+    )
     assert not (folder / MANIFEST).exists()
     second = make_tiny(folder, part=(1, 2))
-    assert (second.made, second.complete, second.rows) == (160, True, {"train": 100, "validation": 60})
+    assert (second.made, second.complete, second.rows) == (
+        160,
+        True,
+        {"train": 100, "validation": 60},
+    )
     assert digests(folder) == digests(tiny("airhockey-hit"))
     assert validate_dataset(folder).ok
 
@@ -176,7 +229,9 @@ def test_parts_share_no_shard_and_leave_none(job, m):
 def test_force_would_delete_what_other_parts_made(tiny, tmp_path):
     folder = Path(shutil.copytree(tiny("airhockey-hit"), tmp_path / "out"))
     before = snapshot(folder)
-    with pytest.raises(UsageError, match="force=True would delete what the other parts have made"):
+    with pytest.raises(
+        UsageError, match="force=True would delete what the other parts have made"
+    ):
         make_tiny(folder, part=(0, 2), force=True)
     assert snapshot(folder) == before
 
@@ -198,11 +253,19 @@ def test_a_shard_that_pinocchio_disagrees_with_is_not_written(tmp_path, monkeypa
             yield columns, sampling, scenes
 
     monkeypatch.setattr(make, "shard_columns", wrong)
-    with pytest.raises(MachineError, match=r"row 249 of split 'train' fails Pinocchio's check .*try another backend="):
+    with pytest.raises(
+        MachineError,
+        match=r"row 249 of split 'train' fails Pinocchio's check .*try another backend=",
+    ):
         make_tiny(tmp_path / "out")
     assert not digests(tmp_path / "out")
-    monkeypatch.setattr(make, "package_of", lambda _group, kind: "my-hits" if kind is StartIK else "")
-    with pytest.raises(MachineError, match="what my-hits samples or solves is not what it measures, or the"):
+    monkeypatch.setattr(
+        make, "package_of", lambda _group, kind: "my-hits" if kind is StartIK else ""
+    )
+    with pytest.raises(
+        MachineError,
+        match="what my-hits samples or solves is not what it measures, or the",
+    ):
         make_tiny(tmp_path / "out")
 
 
@@ -218,7 +281,9 @@ def test_the_worst_violation_of_every_check_is_recorded(tiny):
 @pytest.fixture(scope="module")
 def job(tmp_path_factory: pytest.TempPathFactory) -> Job:
     folder = tmp_path_factory.mktemp("job") / "out"
-    job = resolve(tiny_recipe("airhockey-hit"), find_workspace(folder), shard_size=TINY_SHARD)
+    job = resolve(
+        tiny_recipe("airhockey-hit"), find_workspace(folder), shard_size=TINY_SHARD
+    )
     open_workspace(job.folder, job.spec)
     return job
 
@@ -240,12 +305,21 @@ def test_shards_are_the_rows_of_their_blocks_made_together_or_with_gaps(job):
     blocks = [prepared.block(spec.seed, "train", index) for index in range(3)]
     tasks = [task for task in shards(spec) if task.index != 3]
     assert {task.first_row // BLOCK_ROWS for task in tasks} == {0, 1, 2}
-    for task, (columns, sampling, _) in zip(tasks, shard_columns(prepared, spec, tasks), strict=True):
+    for task, (columns, sampling, _) in zip(
+        tasks, shard_columns(prepared, spec, tasks), strict=True
+    ):
         rows = slice(task.first_row, task.first_row + task.rows)
         for name, values in columns.items():
-            expected = np.concatenate([block.columns[name] for block in blocks], axis=1)[:, rows].T
-            np.testing.assert_array_equal(values, expected if values.ndim == 2 else expected[:, 0])
-        assert (sampling.accepted, sampling.tried) == (task.rows, columns["attempts"].sum())
+            expected = np.concatenate(
+                [block.columns[name] for block in blocks], axis=1
+            )[:, rows].T
+            np.testing.assert_array_equal(
+                values, expected if values.ndim == 2 else expected[:, 0]
+            )
+        assert (sampling.accepted, sampling.tried) == (
+            task.rows,
+            columns["attempts"].sum(),
+        )
 
 
 @pytest.fixture
@@ -265,7 +339,10 @@ def rounds(monkeypatch) -> Counter:
 @pytest.mark.slow
 @pytest.mark.parametrize("size", some([500, 512, 4095]))
 def test_a_block_is_drawn_once_however_small_the_shards(tmp_path, rounds, size):
-    recipe = replace(load_dataset_recipe("airhockey-hit"), splits={"train": 2 * BLOCK_ROWS, "validation": 600})
+    recipe = replace(
+        load_dataset_recipe("airhockey-hit"),
+        splits={"train": 2 * BLOCK_ROWS, "validation": 600},
+    )
     made = make_dataset(recipe, tmp_path / "out", shard_size=size, workers=1)
     drawn = sum(rounds.values())
     assert made.complete
@@ -274,12 +351,19 @@ def test_a_block_is_drawn_once_however_small_the_shards(tmp_path, rounds, size):
 
 @pytest.mark.slow
 def test_small_shards_have_the_rows_and_counts_of_large_ones(large, tmp_path):
-    make_dataset("airhockey-replan", tmp_path / "small", n=20_000, shard_size=500, workers=2)
+    make_dataset(
+        "airhockey-replan", tmp_path / "small", n=20_000, shard_size=500, workers=2
+    )
     for split in ("train", "validation"):
-        found, expected = columns_of(tmp_path / "small", split), columns_of(large, split)
+        found, expected = (
+            columns_of(tmp_path / "small", split),
+            columns_of(large, split),
+        )
         for name, values in expected.items():
             np.testing.assert_array_equal(found[name], values, err_msg=name)
-    one, other = (load_manifest(folder)["yield"] for folder in (large, tmp_path / "small"))
+    one, other = (
+        load_manifest(folder)["yield"] for folder in (large, tmp_path / "small")
+    )
     assert one == other
 
 
@@ -294,8 +378,14 @@ def test_a_second_process_is_started_for_many_rows_or_slow_ones_only(job):
 
 @pytest.mark.parametrize("size", [64, 1000, 4096, 5000, 8192, 100_000])
 @pytest.mark.parametrize("workers", [1, 2, 16])
-def test_runs_are_the_shards_in_order_and_long_enough_to_share_blocks(job, size, workers):
-    spec = replace(job.spec, splits={"train": 100_000, "validation": 5000, "test": 0}, shard_size=size)
+def test_runs_are_the_shards_in_order_and_long_enough_to_share_blocks(
+    job, size, workers
+):
+    spec = replace(
+        job.spec,
+        splits={"train": 100_000, "validation": 5000, "test": 0},
+        shard_size=size,
+    )
     tasks = shards(spec)
     groups = runs(spec, tasks, workers)
     assert [task for group in groups for task in group] == tasks

@@ -32,23 +32,36 @@ def parts(made, tmp_path) -> list[Path]:
 def test_parts_become_the_dataset_that_was_made_at_once(tiny, made, tmp_path):
     before, said = [snapshot(part) for part in made], []
     merged = cnpgen.merge_datasets(
-        made, tmp_path / "out", begin=lambda *x: said.append(x), progress=lambda *x: said.append(x)
+        made,
+        tmp_path / "out",
+        begin=lambda *x: said.append(x),
+        progress=lambda *x: said.append(x),
     )
     assert merged.complete
     assert merged.rows == {"train": 600, "validation": 60}
     assert merged.made == 660
-    assert said == [("merging", tmp_path / "out", 660, 0), (250, None), (250, None), (100, None), (60, None)]
+    assert said == [
+        ("merging", tmp_path / "out", 660, 0),
+        (250, None),
+        (250, None),
+        (100, None),
+        (60, None),
+    ]
     assert digests(tmp_path / "out") == digests(tiny("airhockey-hit"))
     assert [snapshot(part) for part in made] == before
     assert validate_dataset(tmp_path / "out", deep=True, regenerate=2).ok
     assert not (tmp_path / "out" / "_work").exists()
     for name in ("specification.json", "stats.json"):
-        assert (tmp_path / "out" / name).read_bytes() == (tiny("airhockey-hit") / name).read_bytes()
+        assert (tmp_path / "out" / name).read_bytes() == (
+            tiny("airhockey-hit") / name
+        ).read_bytes()
 
 
 def test_the_card_has_the_notes_of_the_shipped_recipe(tiny, made, tmp_path):
     merge_datasets(made, tmp_path / "airhockey-hit")
-    assert (tmp_path / "airhockey-hit" / "README.md").read_bytes() == (tiny("airhockey-hit") / "README.md").read_bytes()
+    assert (tmp_path / "airhockey-hit" / "README.md").read_bytes() == (
+        tiny("airhockey-hit") / "README.md"
+    ).read_bytes()
 
 
 def test_a_merged_dataset_is_left_as_it_is(made, tmp_path):
@@ -92,10 +105,22 @@ def refused(parts: list[Path], out: Path, error: type[Exception], text: str) -> 
 
 def test_gaps_overlaps_and_damage_are_refused_by_name(parts, tmp_path):
     out = tmp_path / "out"
-    refused(parts[:1], out, DatasetError, "no part has train/shard-00001.h5, train/shard-00002.h5, validation/shard-0")
-    refused(parts[1:], out, DatasetError, "no part has train/shard-00000.h5: make the missing shards first")
+    refused(
+        parts[:1],
+        out,
+        DatasetError,
+        "no part has train/shard-00001.h5, train/shard-00002.h5, validation/shard-0",
+    )
+    refused(
+        parts[1:],
+        out,
+        DatasetError,
+        "no part has train/shard-00000.h5: make the missing shards first",
+    )
     twice = shutil.copytree(parts[0], tmp_path / "twice")
-    text = f"{parts[0]} and {twice} both have train/shard-00000.h5: parts must not overlap"
+    text = (
+        f"{parts[0]} and {twice} both have train/shard-00000.h5: parts must not overlap"
+    )
     refused([*parts, twice], out, UsageError, text)
     flip(parts[0] / "train" / "shard-00000.h5")
     text = f"{parts[0]}/train/shard-00000.h5 was changed: its sha256 is not the recorded one"
@@ -109,7 +134,10 @@ def test_gaps_overlaps_and_damage_are_refused_by_name(parts, tmp_path):
             ({"seed": 3}, "seed 3 instead of 2026"),
             ({"dtype": "float32"}, "dtype float32 instead of float64"),
             ({"name": "airhockey-replan"}, "another recipe"),
-            ({"n": 700}, "{'train': 637, 'validation': 63} rows instead of {'train': 600, 'validation': 60}"),
+            (
+                {"n": 700},
+                "{'train': 637, 'validation': 63} rows instead of {'train': 600, 'validation': 60}",
+            ),
         ],
         1,
         "slow",
@@ -117,7 +145,9 @@ def test_gaps_overlaps_and_damage_are_refused_by_name(parts, tmp_path):
 )
 def test_a_part_of_another_dataset_is_refused_by_name(made, tmp_path, options, text):
     other = make_tiny(tmp_path / "other", part=(2, 3), **options).folder
-    with pytest.raises(UsageError, match=re.escape(f"{other} is of another dataset than {made[0]}: ")) as caught:
+    with pytest.raises(
+        UsageError, match=re.escape(f"{other} is of another dataset than {made[0]}: ")
+    ) as caught:
         merge_datasets([*made[:2], other], tmp_path / "out")
     assert text in str(caught.value)
     assert not (tmp_path / "out").exists()
@@ -127,7 +157,9 @@ def test_places_that_hold_no_dataset_or_another_one_are_refused(made, tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(UsageError, match="empty is not a dataset of cnpgen"):
         merge_datasets([*made, tmp_path / "empty"], tmp_path / "out")
-    with pytest.raises(UsageError, match="is not there, expected the folder of a dataset"):
+    with pytest.raises(
+        UsageError, match="is not there, expected the folder of a dataset"
+    ):
         merge_datasets([tmp_path / "nothing"], tmp_path / "out")
     with pytest.raises(UsageError, match="parts must name at least one folder"):
         merge_datasets([], tmp_path / "out")

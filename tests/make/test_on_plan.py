@@ -29,8 +29,14 @@ from cnpgen.validate.validate_dataset import validate_dataset
 from tests.conftest import Arm, Prepare, run_stages
 
 MODEL = "airhockey-replan"
-OFF = {"q": 2e-3, "dq": 2e-2, "ddq": 2.0}  # rad, rad/s, rad/s^2: what a plan may be off the table by, in joints
-STILL = StartOnPlan(model=MODEL, sha256=model_sha256(MODEL), moved=1.0, times=Range(0.4, 0.4))
+OFF = {
+    "q": 2e-3,
+    "dq": 2e-2,
+    "ddq": 2.0,
+}  # rad, rad/s, rad/s^2: what a plan may be off the table by, in joints
+STILL = StartOnPlan(
+    model=MODEL, sha256=model_sha256(MODEL), moved=1.0, times=Range(0.4, 0.4)
+)
 
 
 @pytest.fixture(scope="module")
@@ -61,11 +67,15 @@ def test_starts_are_where_the_motions_are_and_exactly_on_the_table(first) -> Non
     found = moved(first, STILL)
     plans = Planner(MODEL).plan_batch(boundary_of(candidates))
     expected, arm = plans.states_at(0.4 * plans.duration), Arm(prepared.context.robot)
-    for name, values, off in zip(("start_q", "start_dq", "start_ddq"), expected, OFF.values(), strict=True):
+    for name, values, off in zip(
+        ("start_q", "start_dq", "start_ddq"), expected, OFF.values(), strict=True
+    ):
         assert np.median(np.abs(found[name].T - values).max(axis=1)) < off / 4
         assert (np.abs(found[name].T - values).max(axis=1) < off).mean() > 0.95
     for i in range(40):
-        q, dq, ddq = (found[name][:, i] for name in ("start_q", "start_dq", "start_ddq"))
+        q, dq, ddq = (
+            found[name][:, i] for name in ("start_q", "start_dq", "start_ddq")
+        )
         position = arm.pose(q).translation
         assert position[2] == pytest.approx(0.16, abs=1e-10)
         np.testing.assert_allclose(position, found["start_xyz"][:, i], atol=1e-10)
@@ -82,17 +92,30 @@ def test_a_share_of_the_starts_stays(first) -> None:
 
 
 def test_many_starts_are_on_one_refined_motion_whose_goal_they_may_keep(first) -> None:
-    candidates, found = first[1], moved(first, replace(STILL, refined=1.0, times=Range(0.05, 0.95)))
-    goals = found["planned_goal_q"]
-    assert len(np.unique(goals, axis=1).T) == -(-goals.shape[1] // STATES_PER_REFINED_PLAN)
-    np.testing.assert_array_equal(
-        goals[:, :STATES_PER_REFINED_PLAN], np.repeat(candidates["goal_q"][:, :1], STATES_PER_REFINED_PLAN, axis=1)
+    candidates, found = (
+        first[1],
+        moved(first, replace(STILL, refined=1.0, times=Range(0.05, 0.95))),
     )
-    np.testing.assert_array_equal(found["planned_home_q"][:, 0], candidates["start_q"][:, 0])
-    used = np.abs(found["start_ddq"]).max(axis=1) / first[0].context.robot.acceleration_limit
+    goals = found["planned_goal_q"]
+    assert len(np.unique(goals, axis=1).T) == -(
+        -goals.shape[1] // STATES_PER_REFINED_PLAN
+    )
+    np.testing.assert_array_equal(
+        goals[:, :STATES_PER_REFINED_PLAN],
+        np.repeat(candidates["goal_q"][:, :1], STATES_PER_REFINED_PLAN, axis=1),
+    )
+    np.testing.assert_array_equal(
+        found["planned_home_q"][:, 0], candidates["start_q"][:, 0]
+    )
+    used = (
+        np.abs(found["start_ddq"]).max(axis=1)
+        / first[0].context.robot.acceleration_limit
+    )
     assert used.max() > 0.98  # refined motions use what there is
     found["home_q"] = candidates["start_q"]
-    GoalOfPlan(share=1.0).prepare(first[0].context)(found, random_generator(0, "train", 0))
+    GoalOfPlan(share=1.0).prepare(first[0].context)(
+        found, random_generator(0, "train", 0)
+    )
     for name in GOAL:
         np.testing.assert_array_equal(found[name], found[of_plan(name)])
 
@@ -123,19 +146,39 @@ def test_goals_that_many_rows_have_are_not_taken_for_hits_with_reduced_speed() -
 
 def test_tasks_keep_their_start_and_their_goal() -> None:
     old = draw_boundary_problems(MODEL, 4, seed=1)
-    ends = {name: getattr(old.boundary, name) for name in ("start_q", "start_dq", "start_ddq")}
-    asked = {"goal_xyz": old.columns["goal_xyz"], "hit_angle": old.columns["hit_angle"], "hit_speed_share": 0.5}
-    one, other = (complete(name, **ends, **asked) for name in (MODEL, "airhockey-online"))
+    ends = {
+        name: getattr(old.boundary, name)
+        for name in ("start_q", "start_dq", "start_ddq")
+    }
+    asked = {
+        "goal_xyz": old.columns["goal_xyz"],
+        "hit_angle": old.columns["hit_angle"],
+        "hit_speed_share": 0.5,
+    }
+    one, other = (
+        complete(name, **ends, **asked) for name in (MODEL, "airhockey-online")
+    )
     assert len(other.plans) == 4
     np.testing.assert_array_equal(other.plans.boundary.start_q, old.boundary.start_q)
     same = np.isin(other.plans.sample_id, one.plans.sample_id)
-    np.testing.assert_allclose(other.plans.boundary.goal_q[same], one.plans.boundary.goal_q, atol=1e-12)
+    np.testing.assert_allclose(
+        other.plans.boundary.goal_q[same], one.plans.boundary.goal_q, atol=1e-12
+    )
 
 
 def test_of_the_first_hit_tasks_need_nothing() -> None:
     pipeline = load_dataset_recipe("airhockey-online").pipeline
-    completion = Completion(pipeline, load_context(pipeline.problem, *choose_backend(None)), ["goal_xyz", "hit_angle"])
+    completion = Completion(
+        pipeline,
+        load_context(pipeline.problem, *choose_backend(None)),
+        ["goal_xyz", "hit_angle"],
+    )
     labels = [label for label, _ in completion._stages]
     assert "5. hitting-configuration" not in labels
     assert "7. braking-reach" not in labels
-    assert {"2. start-ik", "3. table-velocity", "13. hitting-configuration", "16. braking-reach"} <= set(labels)
+    assert {
+        "2. start-ik",
+        "3. table-velocity",
+        "13. hitting-configuration",
+        "16. braking-reach",
+    } <= set(labels)

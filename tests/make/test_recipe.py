@@ -9,7 +9,13 @@ from pathlib import Path
 import pytest
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.make.recipe import DatasetRecipe, load_dataset_recipe, load_notes, recipe_digest, split_rows
+from cnpgen.make.recipe import (
+    DatasetRecipe,
+    load_dataset_recipe,
+    load_notes,
+    recipe_digest,
+    split_rows,
+)
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.problems.problem import Problem, resolved
 from cnpgen.problems.problem_file import load_problem
@@ -25,16 +31,36 @@ from tests.examples.stages import Roll
 def recipe(tmp_path):
     (tmp_path / "arm.urdf").write_text("<robot name='arm'/>")
     robot = RobotSpec(urdf="arm.urdf", joints=("a", "b"), tip="hand", base=(0.0, 0.0))
-    problem = Problem(name="arm", robot=robot, limits=LimitSpec(), path=tmp_path / "problem.toml")
-    pipeline = Pipeline(name="arm", problem=problem, stage=(Roll(size=Range(0.0, 1.0)),), path=tmp_path / "arm.toml")
-    return DatasetRecipe(name="arm", pipeline=pipeline, splits={"train": 80, "validation": 10, "test": 10})
+    problem = Problem(
+        name="arm", robot=robot, limits=LimitSpec(), path=tmp_path / "problem.toml"
+    )
+    pipeline = Pipeline(
+        name="arm",
+        problem=problem,
+        stage=(Roll(size=Range(0.0, 1.0)),),
+        path=tmp_path / "arm.toml",
+    )
+    return DatasetRecipe(
+        name="arm",
+        pipeline=pipeline,
+        splits={"train": 80, "validation": 10, "test": 10},
+    )
 
 
 def with_splits(recipe: DatasetRecipe, rows: Iterable[int]) -> DatasetRecipe:
     return replace(recipe, splits=dict(zip("abcdefgh", rows, strict=False)))
 
 
-SPLITS = [(1,), (90, 10), (80, 10, 10), (1, 1, 1), (1, 45, 45), (7, 3, 3, 1), (1, 1000, 2), (19000, 1000)]
+SPLITS = [
+    (1,),
+    (90, 10),
+    (80, 10, 10),
+    (1, 1, 1),
+    (1, 45, 45),
+    (7, 3, 3, 1),
+    (1, 1000, 2),
+    (19000, 1000),
+]
 
 
 @pytest.mark.parametrize("rows", SPLITS)
@@ -62,7 +88,10 @@ def test_every_split_is_within_its_share(recipe, rows):
     total = sum(rows)
     for n in (1, 5, 17, 999):
         now = split_rows(recipe, n)
-        assert all(now.get(name, 0) >= n * share // total for name, share in recipe.splits.items())
+        assert all(
+            now.get(name, 0) >= n * share // total
+            for name, share in recipe.splits.items()
+        )
 
 
 def test_a_split_without_rows_is_left_out_and_the_order_is_kept(recipe):
@@ -97,14 +126,23 @@ def test_the_digest_ignores_what_does_not_change_the_rows_of_a_seed(recipe, tmp_
     digest = recipe_digest(recipe)
     assert len(digest) == 64
     assert recipe_digest(recipe.pipeline) == digest
-    assert recipe_digest(replace(recipe, title="x", seed=7, splits={"a": 1}, version="2.0.0", name="x")) == digest
+    assert (
+        recipe_digest(
+            replace(
+                recipe, title="x", seed=7, splits={"a": 1}, version="2.0.0", name="x"
+            )
+        )
+        == digest
+    )
     moved = tmp_path / "elsewhere"
     moved.mkdir()
     (moved / "renamed.urdf").write_bytes((tmp_path / "arm.urdf").read_bytes())
     problem = recipe.pipeline.problem
     robot = replace(problem.robot, urdf="renamed.urdf")
     problem = replace(problem, title="x", path=moved / "other.toml", robot=robot)
-    assert recipe_digest(changed(recipe, title="x", path=moved, problem=problem)) == digest
+    assert (
+        recipe_digest(changed(recipe, title="x", path=moved, problem=problem)) == digest
+    )
 
 
 def test_the_digest_changes_with_stages_problem_and_urdf(recipe, tmp_path):
@@ -113,10 +151,16 @@ def test_the_digest_changes_with_stages_problem_and_urdf(recipe, tmp_path):
     others = {
         recipe_digest(changed(recipe, stage=(Roll(size=Range(0.0, 2.0)),))),
         recipe_digest(changed(recipe, stage=recipe.pipeline.stage * 2)),
-        recipe_digest(changed(recipe, problem=replace(problem, limits=LimitSpec(velocity_scale=0.5)))),
+        recipe_digest(
+            changed(
+                recipe, problem=replace(problem, limits=LimitSpec(velocity_scale=0.5))
+            )
+        ),
     }
     (tmp_path / "arm.urdf").write_text("<robot name='leg'/>")
-    assert recipe_digest(recipe) == digest  # the URDF is read once: all of a problem is of one text
+    assert (
+        recipe_digest(recipe) == digest
+    )  # the URDF is read once: all of a problem is of one text
     others.add(recipe_digest(changed(recipe, problem=replace(problem))))
     assert len(others | {digest}) == 5
 
@@ -135,10 +179,13 @@ def test_a_joint_is_planned_once():
 
 
 @pytest.mark.parametrize(
-    ("top", "below", "keys"), [(0.5, "", []), (None, "start", []), (None, "", ["top"]), (0.5, "goal", ["top"])]
+    ("top", "below", "keys"),
+    [(0.5, "", []), (None, "start", []), (None, "", ["top"]), (0.5, "goal", ["top"])],
 )
 def test_an_obstacle_has_either_a_top_or_an_object_on_it(top, below, keys):
-    obstacle = Obstacle(name="box", x=Range(0.0, 1.0), y=Range(0.0, 1.0), top=top, below=below)
+    obstacle = Obstacle(
+        name="box", x=Range(0.0, 1.0), y=Range(0.0, 1.0), top=top, below=below
+    )
     assert [key for key, _ in obstacle.validate()] == keys
 
 
@@ -157,14 +204,20 @@ def test_a_spline_has_more_control_points_than_its_degree(count, keys):
 def test_every_shipped_dataset_loads_and_resolves(name):
     recipe = load_dataset_recipe(name)
     assert recipe.name == name
-    assert all(":" not in stage["use"] for stage in resolved(recipe)["pipeline"]["stage"])
+    assert all(
+        ":" not in stage["use"] for stage in resolved(recipe)["pipeline"]["stage"]
+    )
     assert split_rows(recipe, sum(recipe.splits.values())) == recipe.splits
 
 
 def thin_object(folder: Path, size: str) -> Path:
     """The shipped heavy object with other edge lengths."""
     shipped = list_recipes("problem")["heavy-object"]
-    text = shipped.read_text().replace('urdf = "', f'urdf = "{shipped.parent}/').replace("[0.2, 0.2, 0.3] m", size)
+    text = (
+        shipped.read_text()
+        .replace('urdf = "', f'urdf = "{shipped.parent}/')
+        .replace("[0.2, 0.2, 0.3] m", size)
+    )
     (folder / "problem.toml").write_text(text)
     return folder / "problem.toml"
 
@@ -173,9 +226,10 @@ def thin_object(folder: Path, size: str) -> Path:
 def test_there_are_not_more_of_anything_than_kernels_can_be_compiled_for(recipe, key):
     whole = recipe.pipeline if key == "stage" else load_problem("heavy-object")
     many = replace(whole, **{key: getattr(whole, key)[:1] * 101})
-    assert [(where, text.partition(" of them")[0].partition(" stages")[0]) for where, text in many.validate()] == [
-        (key, "there are 101")
-    ]
+    assert [
+        (where, text.partition(" of them")[0].partition(" stages")[0])
+        for where, text in many.validate()
+    ] == [(key, "there are 101")]
     assert list(replace(whole, **{key: getattr(whole, key)[:1] * 100}).validate()) == []
 
 
@@ -188,23 +242,43 @@ def test_notes_that_are_a_link_to_another_folder_are_not_passed_on(tmp_path):
         (folder / "hits.toml").write_text(shipped.read_text())
         (folder / "notes.txt").write_text("what I saw")
         (folder / "hits.md").symlink_to(target)
-    with pytest.raises(RecipeError, match=r"hits.md: is a link that leads to another folder"):
+    with pytest.raises(
+        RecipeError, match=r"hits.md: is a link that leads to another folder"
+    ):
         load_notes(load_dataset_recipe(tmp_path / "theirs" / "hits.toml"))
-    assert load_notes(load_dataset_recipe(tmp_path / "mine" / "hits.toml")) == "what I saw"
+    assert (
+        load_notes(load_dataset_recipe(tmp_path / "mine" / "hits.toml")) == "what I saw"
+    )
 
 
 def test_an_object_must_be_thicker_than_its_contacts_may_be_deep(tmp_path):
-    with pytest.raises(RecipeError, match=r"object: is 0.002 m thin, where contacts 0.001 m deep are legal"):
+    with pytest.raises(
+        RecipeError,
+        match=r"object: is 0.002 m thin, where contacts 0.001 m deep are legal",
+    ):
         load_problem(thin_object(tmp_path, "[200, 200, 2] mm"))
-    assert load_problem(thin_object(tmp_path, "[200, 200, 2.1] mm")).object.size[2] == 0.0021
+    assert (
+        load_problem(thin_object(tmp_path, "[200, 200, 2.1] mm")).object.size[2]
+        == 0.0021
+    )
 
 
-@pytest.mark.parametrize(("name", "key"), [("airhockey", "table"), ("heavy-object", "vertical")])
-def test_no_motion_can_be_asked_to_hold_an_equality_with_a_tolerance_of_zero(tmp_path, name, key):
+@pytest.mark.parametrize(
+    ("name", "key"), [("airhockey", "table"), ("heavy-object", "vertical")]
+)
+def test_no_motion_can_be_asked_to_hold_an_equality_with_a_tolerance_of_zero(
+    tmp_path, name, key
+):
     path = tmp_path / "problem.toml"
     shipped = load_problem(name)
     text = shipped.path.read_text().replace(shipped.robot.urdf, str(shipped.urdf_path))
     head, rest = text.split(f'use = "{key}"')
-    path.write_text(f'{head}use = "{key}"' + re.sub(r"(?m)^tolerance = .*$", "tolerance = 0", rest, count=1))
-    with pytest.raises(RecipeError, match=r"tolerance: 0\.0 m?(rad)? is too small, expected at least 1e-09"):
+    path.write_text(
+        f'{head}use = "{key}"'
+        + re.sub(r"(?m)^tolerance = .*$", "tolerance = 0", rest, count=1)
+    )
+    with pytest.raises(
+        RecipeError,
+        match=r"tolerance: 0\.0 m?(rad)? is too small, expected at least 1e-09",
+    ):
         load_problem(path)

@@ -14,7 +14,15 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.scenes.scene_problem import make_mesh
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.solid import place_obstacles, solids_of
-from cnpgen.scenes import GoalPose, SceneError, SceneProblem, load_scenes, save_scenes, scene_plans, solve_scenes
+from cnpgen.scenes import (
+    GoalPose,
+    SceneError,
+    SceneProblem,
+    load_scenes,
+    save_scenes,
+    scene_plans,
+    solve_scenes,
+)
 from cnpgen.world.pose_ik import PoseKinematics
 from tests.examples.shaped_robot import SELF, write_problem
 
@@ -26,21 +34,35 @@ use = "joint-acceleration"
 tolerance = "0.5 %"
 """
 START, GOAL = np.array([-0.9, -0.5, 0.9, 0.0]), np.array([0.9, -0.5, 0.9, 0.0])
-POST = Obstacle(name="post", kind="cylinder", position=(0.6, 0.0, 0.25), radius=0.04, length=0.5)
-BOARD = Obstacle(name="board", kind="box", position=(0.0, 0.8, 0.4), size=(1.0, 0.05, 0.8), rotation=(0.0, 0.0, 0.2))
+POST = Obstacle(
+    name="post", kind="cylinder", position=(0.6, 0.0, 0.25), radius=0.04, length=0.5
+)
+BOARD = Obstacle(
+    name="board",
+    kind="box",
+    position=(0.0, 0.8, 0.4),
+    size=(1.0, 0.05, 0.8),
+    rotation=(0.0, 0.0, 0.2),
+)
 BALL = Obstacle(name="ball", kind="sphere", position=(-0.5, -0.3, 0.5), radius=0.1)
-CORNERS = np.array([[-0.1, -0.1, 0.0], [0.1, -0.1, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.5]])
+CORNERS = np.array(
+    [[-0.1, -0.1, 0.0], [0.1, -0.1, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.5]]
+)
 WEDGE = make_mesh("wedge", CORNERS, np.array([0.6, 0.0, 0.0]), np.eye(3), place="")
 SCENES = [
     SceneProblem(name="post", obstacles=(POST,), start_q=START, goal_q=GOAL[None]),
-    SceneProblem(name="all", obstacles=(BALL, BOARD, POST), start_q=START, goal_q=GOAL[None]),
+    SceneProblem(
+        name="all", obstacles=(BALL, BOARD, POST), start_q=START, goal_q=GOAL[None]
+    ),
     SceneProblem(name="free", obstacles=(), start_q=START, goal_q=GOAL[None]),
 ]
 
 
 @pytest.fixture
 def crane(tmp_path: Path) -> Path:
-    return write_problem(tmp_path, obstacles="", more=SELF + LIMITS).rename(tmp_path / "crane.toml")
+    return write_problem(tmp_path, obstacles="", more=SELF + LIMITS).rename(
+        tmp_path / "crane.toml"
+    )
 
 
 def test_scenes_become_boundary_problems_of_one_problem(crane: Path) -> None:
@@ -53,15 +75,25 @@ def test_scenes_become_boundary_problems_of_one_problem(crane: Path) -> None:
         wanted = solids_of(scene.obstacles, place_obstacles(scene.obstacles))
         assert len(placed) == len(wanted)
         for body in wanted:
-            same = min(placed, key=lambda other, body=body: float(np.abs(other.low - body.low).max()))
+            same = min(
+                placed,
+                key=lambda other, body=body: float(np.abs(other.low - body.low).max()),
+            )
             assert same.low == pytest.approx(body.low, abs=1e-12)
             assert same.high == pytest.approx(body.high, abs=1e-12)
     assert plans.boundary.start_q == pytest.approx(np.tile(START, (3, 1)))
-    others = scene_plans(problem, [replace(SCENES[0], obstacles=(replace(POST, position=(0.5, 0.1, 0.3)),))])
-    assert others.problem == scene_plans(problem, SCENES[:1]).problem  # kernels depend on the numbers of obstacles only
+    others = scene_plans(
+        problem,
+        [replace(SCENES[0], obstacles=(replace(POST, position=(0.5, 0.1, 0.3)),))],
+    )
+    assert (
+        others.problem == scene_plans(problem, SCENES[:1]).problem
+    )  # kernels depend on the numbers of obstacles only
 
 
-def test_new_scenes_read_neither_the_urdf_nor_the_robot_again(crane: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_new_scenes_read_neither_the_urdf_nor_the_robot_again(
+    crane: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     problem = cnpgen.load_problem(crane)
     first = scene_plans(problem, SCENES[:1])
 
@@ -71,7 +103,9 @@ def test_new_scenes_read_neither_the_urdf_nor_the_robot_again(crane: Path, monke
     monkeypatch.setattr("cnpgen.problems.problem.read_urdf", refused)
     monkeypatch.setattr("cnpgen.problems.load_robot.reduced_model", refused)
     assert scene_plans(problem, SCENES[:1]).problem == first.problem
-    assert scene_plans(problem, SCENES).problem != first.problem  # more places for obstacles
+    assert (
+        scene_plans(problem, SCENES).problem != first.problem
+    )  # more places for obstacles
 
 
 def test_joints_are_ordered_by_name_and_checked(crane: Path) -> None:
@@ -84,15 +118,23 @@ def test_joints_are_ordered_by_name_and_checked(crane: Path) -> None:
     assert plans.boundary.goal_q[0] == pytest.approx(GOAL)
     with pytest.raises(SceneError, match="scene 'post' has no joint 'swing'"):
         scene_plans(problem, [replace(scene, joint_names=(*names[:4], "slew"))])
-    with pytest.raises(SceneError, match="scene 'post' has 5 joint positions at the start, the robot has 4"):
+    with pytest.raises(
+        SceneError,
+        match="scene 'post' has 5 joint positions at the start, the robot has 4",
+    ):
         scene_plans(problem, [replace(scene, joint_names=())])
-    with pytest.raises(SceneError, match=r"scene 'post': lift is 2\.7000 rad at the goal, outside of its limits"):
+    with pytest.raises(
+        SceneError,
+        match=r"scene 'post': lift is 2\.7000 rad at the goal, outside of its limits",
+    ):
         scene_plans(problem, [replace(SCENES[0], goal_q=np.array([[0, 2.7, 0, 0]]))])
 
 
 def test_problems_that_ignore_obstacles_are_refused(tmp_path: Path) -> None:
     file = write_problem(tmp_path, obstacles="", more=SELF)
-    file.write_text(file.read_text().replace('use = "robot-clearance"', 'use = "joint-velocity"'))
+    file.write_text(
+        file.read_text().replace('use = "robot-clearance"', 'use = "joint-velocity"')
+    )
     with pytest.raises(UsageError, match="no constraint robot-clearance"):
         scene_plans(cnpgen.load_problem(file), SCENES)
 
@@ -104,26 +146,50 @@ def test_scenes_are_solved_and_judged(crane: Path, tmp_path: Path) -> None:
     position, rotation, _ = PoseKinematics(robot).evaluate(GOAL[:, None])
     pose = GoalPose("hand", position[0], rotation[0])
     inside = replace(SCENES[0], name="inside", goal_q=np.array([[0.0, -0.5, 0.9, 0.0]]))
-    several = replace(SCENES[0], name="several", goal_q=np.array([inside.goal_q[0], GOAL, START + 0.1]))
+    several = replace(
+        SCENES[0],
+        name="several",
+        goal_q=np.array([inside.goal_q[0], GOAL, START + 0.1]),
+    )
     posed = replace(SCENES[0], name="posed", goal_q=np.zeros((0, 4)), goal_pose=pose)
     meshed = replace(SCENES[1], name="meshed", obstacles=(WEDGE, BALL))
-    solved = solve_scenes(problem, [SCENES[0], inside, several, posed, meshed], workers=1)
+    solved = solve_scenes(
+        problem, [SCENES[0], inside, several, posed, meshed], workers=1
+    )
     assert solved.valid.tolist() == [True, False, True, True, True]
-    (wedge,) = [body for body in solved.plans.scene.bodies(4) if len(body.corners) == 4 and body.position[2] > -10]
+    (wedge,) = [
+        body
+        for body in solved.plans.scene.bodies(4)
+        if len(body.corners) == 4 and body.position[2] > -10
+    ]
     assert wedge.low[:2] == pytest.approx([0.5, -0.1])
-    assert cnpgen.evaluate_plans(solved.plans, workers=1).valid.tolist() == solved.valid.tolist()
-    assert solved.plans.boundary.goal_q[2] == pytest.approx(START + 0.1)  # the nearest goal that is free
-    reached, turned, _ = PoseKinematics(robot).evaluate(solved.plans.boundary.goal_q[3][:, None])
+    assert (
+        cnpgen.evaluate_plans(solved.plans, workers=1).valid.tolist()
+        == solved.valid.tolist()
+    )
+    assert solved.plans.boundary.goal_q[2] == pytest.approx(
+        START + 0.1
+    )  # the nearest goal that is free
+    reached, turned, _ = PoseKinematics(robot).evaluate(
+        solved.plans.boundary.goal_q[3][:, None]
+    )
     assert reached[0] == pytest.approx(pose.position, abs=1e-5)
     assert turned[0] == pytest.approx(pose.rotation, abs=1e-5)
     (failure,) = solved.summary()["not_valid"]
     assert failure["scene"] == "inside"
     assert failure["finding"] == "infeasible"
-    assert "at the goal robot clearance of fore, post is" in failure["explanation"]  # as the scene names it
+    assert (
+        "at the goal robot clearance of fore, post is" in failure["explanation"]
+    )  # as the scene names it
     model = cnpgen.RobotModel(solved.plans.problem)
     states = solved.plans.motion.at(np.linspace(0, 1, 300))
     for index in np.flatnonzero(solved.valid):
-        assert model.min_distance(states.q[index], scene=solved.plans.scene[int(index)]).min() > -1e-4
+        assert (
+            model.min_distance(
+                states.q[index], scene=solved.plans.scene[int(index)]
+            ).min()
+            > -1e-4
+        )
 
 
 def test_a_scene_whose_goal_pose_is_out_of_reach_is_not_solved(crane: Path) -> None:
@@ -138,11 +204,22 @@ def test_a_scene_whose_goal_pose_is_out_of_reach_is_not_solved(crane: Path) -> N
 
 
 @pytest.mark.slow
-def test_the_command_solves_scenes(crane: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_solves_scenes(
+    crane: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     inside = replace(SCENES[0], name="inside", goal_q=np.array([[0.0, -0.5, 0.9, 0.0]]))
     save_scenes(tmp_path / "scenes.h5", [*SCENES[:1], inside])
     out = tmp_path / "plans.h5"
-    call = ["solve", str(tmp_path / "scenes.h5"), "--robot", str(crane), "-o", str(out), "--workers", "1"]
+    call = [
+        "solve",
+        str(tmp_path / "scenes.h5"),
+        "--robot",
+        str(crane),
+        "-o",
+        str(out),
+        "--workers",
+        "1",
+    ]
     assert main(call) == 1
     assert "scene 'inside'" in capsys.readouterr().err
     assert cnpgen.load_plans(out).status.tolist() == [1, 2]
@@ -151,7 +228,9 @@ def test_the_command_solves_scenes(crane: Path, tmp_path: Path, capsys: pytest.C
     assert len(cnpgen.load_plans(out)) == 1
 
 
-def test_the_command_names_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_names_what_is_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     save_scenes(tmp_path / "scenes.h5", SCENES[:1])
     assert main(["solve", str(tmp_path / "scenes.h5")]) == 2
     assert "--robot" in capsys.readouterr().err

@@ -16,20 +16,32 @@ from tests.conftest import SHIPPED, Prepare, needs_compiler, run_stages, some
 
 BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
 NO_NUMBERS = [
-    *(pytest.param("compiled", value, marks=needs_compiler) for value in (np.nan, np.inf, -np.inf)),
+    *(
+        pytest.param("compiled", value, marks=needs_compiler)
+        for value in (np.nan, np.inf, -np.inf)
+    ),
     *(("numpy", value) for value in (np.nan, np.inf, -np.inf)),
     ("casadi", np.nan),
-    *(pytest.param("casadi", value, marks=pytest.mark.extended) for value in (np.inf, -np.inf)),
+    *(
+        pytest.param("casadi", value, marks=pytest.mark.extended)
+        for value in (np.inf, -np.inf)
+    ),
 ]
-STATES = [f"{end}_{what}" for end in ("start", "goal") for what in ("q", "dq", "ddq", "xyz")]
+STATES = [
+    f"{end}_{what}" for end in ("start", "goal") for what in ("q", "dq", "ddq", "xyz")
+]
 
 
-def judged(prepared: PreparedPipeline, candidates: CandidateBatch, **changes: np.ndarray) -> CandidateBatch:
+def judged(
+    prepared: PreparedPipeline, candidates: CandidateBatch, **changes: np.ndarray
+) -> CandidateBatch:
     """Copy the remaining candidates, change some columns and run the acceptance check."""
     again = CandidateBatch(len(candidates.alive))
     for name, values in candidates.columns.items():
         again[name] = changes.get(name, values).copy()
-    acceptance(prepared.context, set(candidates.columns))(again, random_generator(0, "train", 0))
+    acceptance(prepared.context, set(candidates.columns))(
+        again, random_generator(0, "train", 0)
+    )
     return again
 
 
@@ -45,35 +57,52 @@ def clear_of_object(prepared: PreparedPipeline, q: np.ndarray) -> np.ndarray:
     return world.pairs("held object").clear_states(1e-3)
 
 
-def with_margins(prepared: PreparedPipeline, candidates: CandidateBatch) -> CandidateBatch:
+def with_margins(
+    prepared: PreparedPipeline, candidates: CandidateBatch
+) -> CandidateBatch:
     """Keep candidates with a margin to every limit, so that one small change violates one constraint."""
     robot = prepared.context.robot
     for end in ("start", "goal"):
         margin = np.minimum(
-            candidates[f"{end}_q"].T - robot.position_lower, robot.position_upper - candidates[f"{end}_q"].T
+            candidates[f"{end}_q"].T - robot.position_lower,
+            robot.position_upper - candidates[f"{end}_q"].T,
         )
         candidates.reject(margin.min(1) > 1e-3, "on a joint limit")
         if f"{end}_clearance" in candidates.columns:
-            candidates.reject(candidates[f"{end}_clearance"][0] > 7e-3, "close to a pedestal")
+            candidates.reject(
+                candidates[f"{end}_clearance"][0] > 7e-3, "close to a pedestal"
+            )
         if prepared.context.problem.object is not None:
-            candidates.reject(clear_of_object(prepared, candidates[f"{end}_q"]), "object in collision with the robot")
+            candidates.reject(
+                clear_of_object(prepared, candidates[f"{end}_q"]),
+                "object in collision with the robot",
+            )
     return candidates
 
 
 @pytest.fixture(scope="module")
 def batches(prepare: Prepare) -> dict[str, tuple[PreparedPipeline, CandidateBatch]]:
     return {
-        name: (prepare(name), with_margins(prepare(name), run_stages(prepare(name), 250, seed=111))) for name in SHIPPED
+        name: (
+            prepare(name),
+            with_margins(prepare(name), run_stages(prepare(name), 250, seed=111)),
+        )
+        for name in SHIPPED
     }
 
 
 @pytest.mark.parametrize("backend", some(BACKENDS, 1, "slow"))
 @pytest.mark.parametrize("name", SHIPPED)
-def test_candidates_of_the_stages_are_accepted(prepare: Prepare, batches, name, backend):
+def test_candidates_of_the_stages_are_accepted(
+    prepare: Prepare, batches, name, backend
+):
     _, candidates = batches[name]
     again = judged(prepare(name, backend), candidates)
     assert len(again.alive) == again.size > 40
-    reasons = [each.boundary_reason or each.reason for each in prepare(name).context.problem.constraint]
+    reasons = [
+        each.boundary_reason or each.reason
+        for each in prepare(name).context.problem.constraint
+    ]
     extra = ["hit not along its direction"] if name.startswith("airhockey") else []
     assert again.reasons == [*reasons, "tip not at its position", *extra]
 
@@ -110,24 +139,40 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("name", "column", "row", "amount", "reason"), WRONG)
-def test_one_wrong_value_is_rejected_under_its_constraint(batches, name, column, row, amount, reason):
+def test_one_wrong_value_is_rejected_under_its_constraint(
+    batches, name, column, row, amount, reason
+):
     prepared, candidates = batches[name]
     changed = candidates[column].copy()
     changed[row] += amount
     again = judged(prepared, candidates, **{column: changed})
     assert len(again.alive) == 0
-    expected = {"off the table", "tip not at its position"} if reason == "vertical or misplaced" else {reason}
+    expected = (
+        {"off the table", "tip not at its position"}
+        if reason == "vertical or misplaced"
+        else {reason}
+    )
     assert (
-        sampling(again) <= expected | {"joint torque limit"} if column == "start_ddq" else sampling(again) <= expected
+        sampling(again) <= expected | {"joint torque limit"}
+        if column == "start_ddq"
+        else sampling(again) <= expected
     )
 
 
 @pytest.mark.parametrize(("backend", "value"), NO_NUMBERS)
 @pytest.mark.parametrize("name", some(SHIPPED, 1, "slow"))
-def test_a_non_finite_value_in_any_column_is_rejected(prepare: Prepare, batches, name, backend, value):
+def test_a_non_finite_value_in_any_column_is_rejected(
+    prepare: Prepare, batches, name, backend, value
+):
     _, candidates = batches[name]
-    columns = [column for column in [*STATES, "hit_angle", "hit_speed"] if column in candidates.columns]
-    places = [(column, row) for column in columns for row in range(len(candidates[column]))]
+    columns = [
+        column
+        for column in [*STATES, "hit_angle", "hit_speed"]
+        if column in candidates.columns
+    ]
+    places = [
+        (column, row) for column in columns for row in range(len(candidates[column]))
+    ]
     assert len(places) <= len(candidates.alive)
     changes = {column: candidates[column].copy() for column in columns}
     for draw, (column, row) in enumerate(places):
@@ -138,14 +183,25 @@ def test_a_non_finite_value_in_any_column_is_rejected(prepare: Prepare, batches,
     assert len(again.alive) == again.size - len(places)
 
 
-@pytest.mark.parametrize(("lower", "upper"), [(-np.inf, 1.0), (-1.0, np.inf), (-1.0, 1.0)])
+@pytest.mark.parametrize(
+    ("lower", "upper"), [(-np.inf, 1.0), (-1.0, np.inf), (-1.0, 1.0)]
+)
 def test_nan_violates_a_one_sided_bound(lower, upper):
     x = ca.SX.sym("x")
-    condition = Condition("x", "m", [x], np.array([lower]), np.array([upper]), "position")
+    condition = Condition(
+        "x", "m", [x], np.array([lower]), np.array([upper]), "position"
+    )
     count = ca.Function("unmet", [x], [unmet(condition, np.array([1e-6]))])
-    assert [float(count(value)) for value in (0.0, 1 + 9e-7, -1 - 9e-7)] == [0.0, 0.0, 0.0]
+    assert [float(count(value)) for value in (0.0, 1 + 9e-7, -1 - 9e-7)] == [
+        0.0,
+        0.0,
+        0.0,
+    ]
     assert float(count(np.nan)) > 0
-    assert [float(count(value)) > 0 for value in (1.6, -1.6)] == [bool(upper < 1.6), bool(lower > -1.6)]
+    assert [float(count(value)) > 0 for value in (1.6, -1.6)] == [
+        bool(upper < 1.6),
+        bool(lower > -1.6),
+    ]
 
 
 @pytest.mark.slow
@@ -153,7 +209,13 @@ def test_torques_outside_their_limits_are_rejected(prepare: Prepare, batches):
     for name in ("airhockey-replan", "heavy-object"):
         prepared, candidates = batches[name]
         limits = replace(prepared.context.problem.limits, torque_scale=0.01)
-        weak = prepare(replace(prepared.pipeline, problem=replace(prepared.context.problem, limits=limits)), "numpy")
+        weak = prepare(
+            replace(
+                prepared.pipeline,
+                problem=replace(prepared.context.problem, limits=limits),
+            ),
+            "numpy",
+        )
         again = judged(weak, candidates)
         assert len(again.alive) < 0.1 * again.size
         assert sampling(again) == {"joint torque limit"}
@@ -163,8 +225,12 @@ def test_reasons_have_the_order_of_the_problem_s_constraints(batches):
     """A row that violates two constraints is counted once, under the first."""
     prepared, candidates = batches["airhockey-replan"]
     q, dq = candidates["start_q"] + 10.0, candidates["start_dq"] + 10.0
-    assert sampling(judged(prepared, candidates, start_q=q, start_dq=dq)) == {"joint position limit"}
-    assert sampling(judged(prepared, candidates, start_dq=dq)) == {"joint velocity limit"}
+    assert sampling(judged(prepared, candidates, start_q=q, start_dq=dq)) == {
+        "joint position limit"
+    }
+    assert sampling(judged(prepared, candidates, start_dq=dq)) == {
+        "joint velocity limit"
+    }
 
 
 @pytest.mark.parametrize("name", some(SHIPPED, 1, "slow"))
@@ -172,8 +238,12 @@ def test_float32_rows_are_checked_as_stored(prepare: Prepare, name):
     block = prepare(name, dtype="float32").block(5, "train", 0, stop=300)
     for field, values in block.columns.items():
         if field not in ("attempts", "sample_id"):
-            np.testing.assert_array_equal(values, values.astype(np.float32).astype(np.float64))
+            np.testing.assert_array_equal(
+                values, values.astype(np.float32).astype(np.float64)
+            )
     robot = prepare(name).context.robot
     for end in ("start", "goal"):
-        assert np.all(np.abs(block.columns[f"{end}_dq"]) <= robot.velocity_limit[:, None])
+        assert np.all(
+            np.abs(block.columns[f"{end}_dq"]) <= robot.velocity_limit[:, None]
+        )
         assert np.all(block.columns[f"{end}_q"] <= robot.position_upper[:, None])

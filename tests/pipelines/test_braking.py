@@ -23,12 +23,24 @@ from cnpgen.pipelines.stages.reach import (
 from cnpgen.pipelines.stages.stage import CandidateBatch
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.catalogue import list_recipes
-from tests.conftest import Arm, Prepare, needs_compiler, run_stages, some, without_stages
+from tests.conftest import (
+    Arm,
+    Prepare,
+    needs_compiler,
+    run_stages,
+    some,
+    without_stages,
+)
 
 Array = np.ndarray
 BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
 DRAWS = 1500
-EDGES = [(0, 1, "x", "high"), (0, -1, "x", "low"), (1, 1, "y", "high"), (1, -1, "y", "low")]
+EDGES = [
+    (0, 1, "x", "high"),
+    (0, -1, "x", "low"),
+    (1, 1, "y", "high"),
+    (1, -1, "y", "low"),
+]
 
 
 @dataclass
@@ -49,28 +61,48 @@ def rollout(arm: Arm, robot, table: Table, case: Case) -> float:
         jacobian = arm.jacobian(q)[:3]
         position, velocity = np.array(arm.pose(q).translation), arm.velocity(q, dq)
         bias = arm.acceleration(q, dq, np.zeros_like(q))
-        speed, overshoot_m = case.side * velocity[case.axis], case.side * (position[case.axis] - case.edge)
+        speed, overshoot_m = (
+            case.side * velocity[case.axis],
+            case.side * (position[case.axis] - case.edge),
+        )
         if speed <= 0:
             return overshoot_m
-        height = -bias[2] - 0.5 * velocity[2] / BRAKING_STEP_S - 0.1 * (position[2] - table.z) / BRAKING_STEP_S**2
-        low = np.maximum(-robot.acceleration_limit, (-robot.velocity_limit - dq) / BRAKING_STEP_S)
-        high = np.minimum(robot.acceleration_limit, (robot.velocity_limit - dq) / BRAKING_STEP_S)
+        height = (
+            -bias[2]
+            - 0.5 * velocity[2] / BRAKING_STEP_S
+            - 0.1 * (position[2] - table.z) / BRAKING_STEP_S**2
+        )
+        low = np.maximum(
+            -robot.acceleration_limit, (-robot.velocity_limit - dq) / BRAKING_STEP_S
+        )
+        high = np.minimum(
+            robot.acceleration_limit, (robot.velocity_limit - dq) / BRAKING_STEP_S
+        )
         along = case.side * jacobian[case.axis]
         best = linprog(
-            along, A_eq=jacobian[2:], b_eq=[height], bounds=list(zip(low, high, strict=True)), method="highs"
+            along,
+            A_eq=jacobian[2:],
+            b_eq=[height],
+            bounds=list(zip(low, high, strict=True)),
+            method="highs",
         )
         assert best.status == 0
         deceleration = -(along @ best.x + case.side * bias[case.axis])
         if deceleration > 0 and speed <= deceleration * BRAKING_STEP_S:
             return overshoot_m + 0.5 * speed**2 / deceleration
-        q, dq = q + BRAKING_STEP_S * (dq + 0.5 * BRAKING_STEP_S * best.x), dq + BRAKING_STEP_S * best.x
+        q, dq = (
+            q + BRAKING_STEP_S * (dq + 0.5 * BRAKING_STEP_S * best.x),
+            dq + BRAKING_STEP_S * best.x,
+        )
     return math.inf
 
 
 @pytest.fixture(scope="module")
 def fast(prepare: Prepare) -> tuple[PreparedPipeline, CandidateBatch]:
     """Moving starts and goals of a pipeline without a reach rule."""
-    prepared = prepare(without_stages(prepare("airhockey-replan").pipeline, "BallisticReach"))
+    prepared = prepare(
+        without_stages(prepare("airhockey-replan").pipeline, "BallisticReach")
+    )
     return prepared, run_stages(prepared, DRAWS, seed=81)
 
 
@@ -81,22 +113,34 @@ def suspects(fast: tuple[PreparedPipeline, CandidateBatch]) -> list[Case]:
     table, arm = prepared.context.constraint(Table), Arm(prepared.context.robot)
     cases = []
     for end, sign in (("start", 1.0), ("goal", -1.0)):
-        for q, dq in zip(candidates[f"{end}_q"].T, sign * candidates[f"{end}_dq"].T, strict=True):
+        for q, dq in zip(
+            candidates[f"{end}_q"].T, sign * candidates[f"{end}_dq"].T, strict=True
+        ):
             position, velocity = np.array(arm.pose(q).translation), arm.velocity(q, dq)
             for axis, side, name, bound in EDGES:
                 edge = getattr(getattr(table, name), bound)
-                if side * velocity[axis] > 0 and side * (position[axis] + LOOKAHEAD_S * velocity[axis] - edge) > 0:
+                if (
+                    side * velocity[axis] > 0
+                    and side * (position[axis] + LOOKAHEAD_S * velocity[axis] - edge)
+                    > 0
+                ):
                     cases.append(Case(q, dq, axis, side, edge))
     return cases
 
 
 def kernels(prepared: PreparedPipeline, backend: str, kernels_of):
     table, library = prepared.context.constraint(Table), kernels_of(prepared, backend)
-    return table, library.load(tip_state), library.load(braking_step, Loop(0.5, MAX_BRAKING_STEPS), height=table.z)
+    return (
+        table,
+        library.load(tip_state),
+        library.load(braking_step, Loop(0.5, MAX_BRAKING_STEPS), height=table.z),
+    )
 
 
 @pytest.mark.parametrize("backend", some(BACKENDS, 1, "slow"))
-def test_braking_agrees_with_an_independent_roll_out(fast, suspects, kernels_of, backend):
+def test_braking_agrees_with_an_independent_roll_out(
+    fast, suspects, kernels_of, backend
+):
     prepared, _ = fast
     table, _, brake = kernels(prepared, backend, kernels_of)
     arm = Arm(prepared.context.robot)
@@ -137,17 +181,28 @@ def test_states_that_skip_the_roll_out_can_brake(fast, kernels_of, fastest):
 def one(prepared: PreparedPipeline, q: Array, dq: Array) -> CandidateBatch:
     """Return a batch of one candidate that starts with dq and ends at rest."""
     candidates = CandidateBatch(1)
-    for name, values in (("start_q", q), ("start_dq", dq), ("goal_q", q), ("goal_dq", 0 * dq)):
+    for name, values in (
+        ("start_q", q),
+        ("start_dq", dq),
+        ("goal_q", q),
+        ("goal_dq", 0 * dq),
+    ):
         candidates[name] = values[:, None].copy()
-    BrakingReach().prepare(prepared.context)(candidates, random_generator(0, "train", 0))
+    BrakingReach().prepare(prepared.context)(
+        candidates, random_generator(0, "train", 0)
+    )
     return candidates
 
 
 def test_slow_states_pass_and_fast_states_at_the_edge_are_rejected(fast):
     prepared, candidates = fast
     robot, arm = prepared.context.robot, Arm(prepared.context.robot)
-    at_edge = candidates["start_q"][:, np.argmax(candidates["start_xyz"][1])]  # about a millimetre from y = 0.45
-    in_center = candidates["start_q"][:, np.argmin(np.abs(candidates["start_xyz"] - [[0.95], [0.0], [0.16]]).sum(0))]
+    at_edge = candidates["start_q"][
+        :, np.argmax(candidates["start_xyz"][1])
+    ]  # about a millimetre from y = 0.45
+    in_center = candidates["start_q"][
+        :, np.argmin(np.abs(candidates["start_xyz"] - [[0.95], [0.0], [0.16]]).sum(0))
+    ]
     for q in (at_edge, in_center):
         assert len(one(prepared, q, np.zeros(6)).alive) == 1
     jacobian = arm.jacobian(at_edge)[:3]
@@ -168,7 +223,9 @@ def test_a_goal_is_a_start_reversed_in_time(fast):
         moving = CandidateBatch(q.shape[1])
         moving[f"{start}_q"], moving[f"{start}_dq"] = q, dq if start == "start" else -dq
         moving[f"{goal}_q"], moving[f"{goal}_dq"] = q, 0 * dq
-        BrakingReach().prepare(prepared.context)(moving, random_generator(0, "train", 0))
+        BrakingReach().prepare(prepared.context)(
+            moving, random_generator(0, "train", 0)
+        )
         ends.append(moving.alive)
     np.testing.assert_array_equal(*ends)
     assert 0 < q.shape[1] - len(ends[0]) < 0.2 * q.shape[1]
@@ -177,13 +234,17 @@ def test_a_goal_is_a_start_reversed_in_time(fast):
 def test_the_margin_is_a_distance_before_the_edge(fast, kernels_of, fastest):
     prepared, candidates = fast
     table, tip, brake = kernels(prepared, fastest, kernels_of)
-    excess = overshoot(tip, brake, table, candidates["start_q"], candidates["start_dq"], margin=0.02)
+    excess = overshoot(
+        tip, brake, table, candidates["start_q"], candidates["start_dq"], margin=0.02
+    )
     for margin in (0.0, 1e-3, 0.02):
         again = CandidateBatch(candidates["start_q"].shape[1])
         for name in ("start_q", "start_dq", "goal_q"):
             again[name] = candidates[name]
         again["goal_dq"] = 0 * candidates["goal_dq"]
-        BrakingReach(margin=margin).prepare(prepared.context)(again, random_generator(0, "train", 0))
+        BrakingReach(margin=margin).prepare(prepared.context)(
+            again, random_generator(0, "train", 0)
+        )
         np.testing.assert_array_equal(again.alive, np.flatnonzero(excess <= -margin))
     assert np.sum((excess > -0.02) & (excess <= 0)) > 0
 
@@ -193,17 +254,29 @@ def braking_variant(folder: Path, name: str) -> Path:
     head, *stages = list_recipes("pipeline")[name].read_text().split("[[stage]]")
     kept = [stage for stage in stages if "ballistic-reach" not in stage]
     path = folder / f"{name}-braking.toml"
-    path.write_text("[[stage]]".join([head, *kept, '\nuse = "braking-reach"\nmargin = "1 mm"\n']))
+    path.write_text(
+        "[[stage]]".join([head, *kept, '\nuse = "braking-reach"\nmargin = "1 mm"\n'])
+    )
     return path
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["airhockey-hit", "airhockey-replan"])
-def test_braking_reach_rejects_fewer_candidates_than_the_ballistic_rule(prepare: Prepare, tmp_path, name):
-    braking = prepare(load_pipeline(braking_variant(tmp_path, name)), "numpy").block(1, "train", 0, stop=1200).sampling
+def test_braking_reach_rejects_fewer_candidates_than_the_ballistic_rule(
+    prepare: Prepare, tmp_path, name
+):
+    braking = (
+        prepare(load_pipeline(braking_variant(tmp_path, name)), "numpy")
+        .block(1, "train", 0, stop=1200)
+        .sampling
+    )
     ballistic = prepare(name).block(1, "train", 0, stop=1200).sampling
     lost = [
-        sum(count for reason, count in sampling.rejections.items() if "leaves the table" in reason or "brake" in reason)
+        sum(
+            count
+            for reason, count in sampling.rejections.items()
+            if "leaves the table" in reason or "brake" in reason
+        )
         for sampling in (braking, ballistic)
     ]
     assert braking.accepted == ballistic.accepted == 1200

@@ -30,12 +30,16 @@ class Search:
 
     def value(self, q: Array) -> float:
         gain = self.arm.jacobian(q)[:3].T @ self.direction
-        return float(gain @ gain - np.sum(((self.home - q) / self.robot.rated_velocity) ** 2))
+        return float(
+            gain @ gain - np.sum(((self.home - q) / self.robot.rated_velocity) ** 2)
+        )
 
     def gradient(self, q: Array) -> Array:
         """By d^2 p / dq_j dq_k = z_j x J_k for j <= k."""
         jacobian = self.arm.jacobian(q)
-        second = np.cross(jacobian[3:].T[:, None], jacobian[:3].T[None]) @ self.direction
+        second = (
+            np.cross(jacobian[3:].T[:, None], jacobian[:3].T[None]) @ self.direction
+        )
         second = np.triu(second) + np.triu(second, 1).T
         gain = jacobian[:3].T @ self.direction
         return 2 * second @ gain + 2 * (self.home - q) / self.robot.rated_velocity**2
@@ -53,21 +57,33 @@ class Search:
         return found.x if np.linalg.norm(self.miss(found.x)) < 1e-7 else None
 
 
-@pytest.fixture(scope="module", params=some(["airhockey-hit", "airhockey-replan"], 1, "slow"))
-def solved(request: pytest.FixtureRequest, prepare: Prepare) -> list[tuple[Search, Array, Array]]:
+@pytest.fixture(
+    scope="module", params=some(["airhockey-hit", "airhockey-replan"], 1, "slow")
+)
+def solved(
+    request: pytest.FixtureRequest, prepare: Prepare
+) -> list[tuple[Search, Array, Array]]:
     """Searches, their initial guesses by inverse kinematics, and our solutions."""
     prepared = prepare(request.param)
     robot, arm = prepared.context.robot, Arm(prepared.context.robot)
     candidates = run_stages(prepared, 80, seed=41, until="HittingConfiguration")
     n = len(candidates.alive)
-    home = np.repeat(robot.home[:, None], n, axis=1) if request.param == "airhockey-hit" else candidates["start_q"]
-    first = prepared.context.kernels.load(ik_step, Loop(IK_TOLERANCE, MAX_IK_STEPS), vertical=False, max_step=0.4)
+    home = (
+        np.repeat(robot.home[:, None], n, axis=1)
+        if request.param == "airhockey-hit"
+        else candidates["start_q"]
+    )
+    first = prepared.context.kernels.load(
+        ik_step, Loop(IK_TOLERANCE, MAX_IK_STEPS), vertical=False, max_step=0.4
+    )
     guess, _ = first(home, candidates["goal_xyz"])
     angle = candidates["hit_angle"][0]
     direction = np.stack([np.cos(angle), np.sin(angle), np.zeros(n)])
     return [
         (
-            Search(robot, arm, candidates["goal_xyz"][:, k], direction[:, k], home[:, k]),
+            Search(
+                robot, arm, candidates["goal_xyz"][:, k], direction[:, k], home[:, k]
+            ),
             guess[:, k],
             candidates["goal_q"][:, k],
         )
@@ -88,7 +104,8 @@ def test_our_gradient_of_the_objective_is_right(solved):
     search, guess, _ = solved[0]
     step = 1e-6
     numeric = [
-        (search.value(guess + step * e) - search.value(guess - step * e)) / (2 * step) for e in np.eye(len(guess))
+        (search.value(guess + step * e) - search.value(guess - step * e)) / (2 * step)
+        for e in np.eye(len(guess))
     ]
     np.testing.assert_allclose(search.gradient(guess), numeric, atol=1e-7)
 
@@ -99,7 +116,11 @@ def test_slsqp_finds_no_better_optimum_from_the_same_initial_guess(solved):
     for search, guess, ours in solved:
         theirs = search.slsqp(guess)
         if theirs is not None:
-            assert search.value(ours) >= search.value(theirs) - 1e-6, (ours, theirs, search)
+            assert search.value(ours) >= search.value(theirs) - 1e-6, (
+                ours,
+                theirs,
+                search,
+            )
             same += bool(np.abs(ours - theirs).max() < 1e-4)
     assert same > 0.9 * DRAWS
 
@@ -113,7 +134,11 @@ def test_slsqp_finds_no_better_optimum_from_other_initial_guesses(solved):
             theirs = search.slsqp(start)
             if theirs is not None:
                 reached += 1
-                assert search.value(ours) >= search.value(theirs) - 1e-6, (ours, theirs, search)
+                assert search.value(ours) >= search.value(theirs) - 1e-6, (
+                    ours,
+                    theirs,
+                    search,
+                )
     assert reached > 3 * DRAWS
 
 
@@ -136,21 +161,29 @@ def test_the_projected_gradient_vanishes_and_the_projected_hessian_is_negative(s
             return search.gradient(q) - search.arm.jacobian(q)[:3].T @ multiplier
 
         hessian = [
-            (lagrangian_gradient(ours + 1e-6 * e) - lagrangian_gradient(ours - 1e-6 * e)) / 2e-6
+            (
+                lagrangian_gradient(ours + 1e-6 * e)
+                - lagrangian_gradient(ours - 1e-6 * e)
+            )
+            / 2e-6
             for e in np.eye(len(ours))
         ]
         assert np.linalg.eigvalsh(null.T @ np.array(hessian) @ null).max() < 0
 
 
 def test_the_search_improves_on_the_inverse_kinematics(solved):
-    gains = np.array([search.value(ours) - search.value(guess) for search, guess, ours in solved])
+    gains = np.array(
+        [search.value(ours) - search.value(guess) for search, guess, ours in solved]
+    )
     assert gains.min() > -1e-9
     assert np.mean(gains > 1e-3) > 0.9
 
 
 @pytest.mark.parametrize("name", ["airhockey-hit", "airhockey-replan"])
 def test_almost_no_candidate_is_rejected(prepare, name):
-    candidates = run_stages(prepare(name), 20_000, seed=43, until="HittingConfiguration")
+    candidates = run_stages(
+        prepare(name), 20_000, seed=43, until="HittingConfiguration"
+    )
     lost = [
         np.sum(candidates.outcome == 1 + k)
         for k, text in enumerate(candidates.reasons)
@@ -163,7 +196,11 @@ def test_eliminated_joints_move_the_tip_in_all_directions_near_the_base(prepare)
     robot = prepare("airhockey-hit").context.robot
     arm, joints, random = Arm(robot), basic_joints(robot), np.random.default_rng(44)
     for _ in range(200):
-        q = np.clip(robot.home + random.uniform(-0.5, 0.5, robot.n), robot.position_lower, robot.position_upper)
+        q = np.clip(
+            robot.home + random.uniform(-0.5, 0.5, robot.n),
+            robot.position_lower,
+            robot.position_upper,
+        )
         assert abs(np.linalg.det(arm.jacobian(q)[:3, joints])) > 1e-3
 
 
@@ -173,7 +210,9 @@ def test_no_step_exceeds_the_maximum(prepare):
     kernel = prepared.context.kernels.load(newton_step)
     angle = candidates["hit_angle"]
     direction = np.concatenate([np.cos(angle), np.sin(angle)])
-    following, length = kernel(candidates["start_q"], candidates["goal_xyz"], direction, candidates["start_q"])
+    following, length = kernel(
+        candidates["start_q"], candidates["goal_xyz"], direction, candidates["start_q"]
+    )
     moved = np.linalg.norm(following - candidates["start_q"], axis=0)
     assert moved.max() <= 0.6 + 1e-12
     np.testing.assert_allclose(moved, np.minimum(length[0], 0.6), rtol=1e-9)
@@ -190,12 +229,19 @@ def test_no_candidate_is_rejected_at_a_joint_limit(prepare):
     prepared = prepare("airhockey-replan")
     robot, limited = prepared.context.robot, 0
     for seed in range(3):
-        candidates = run_stages(prepared, 20_000, seed=seed, until="HittingConfiguration")
+        candidates = run_stages(
+            prepared, 20_000, seed=seed, until="HittingConfiguration"
+        )
         assert (
-            np.count_nonzero(candidates.outcome == 1 + candidates.reasons.index("joint position limit at the goal"))
+            np.count_nonzero(
+                candidates.outcome
+                == 1 + candidates.reasons.index("joint position limit at the goal")
+            )
             == 0
         )
-        limited += np.count_nonzero((sides(robot, candidates["goal_q"].T) != 0).any(axis=1))
+        limited += np.count_nonzero(
+            (sides(robot, candidates["goal_q"].T) != 0).any(axis=1)
+        )
     assert limited >= 3
 
 
@@ -203,19 +249,44 @@ def test_no_candidate_is_rejected_at_a_joint_limit(prepare):
 def cramped(prepare: Prepare) -> list[tuple[Search, Array]]:
     """Searches of an arm that may move each joint 0.6 rad only, and our optima that are on a limit."""
     context = prepare("airhockey-replan").context
-    base, low, high = context.robot.home, context.robot.position_lower, context.robot.position_upper
-    robot = replace(
-        context.robot, position_lower=np.maximum(low, base - 0.6), position_upper=np.minimum(high, base + 0.6)
+    base, low, high = (
+        context.robot.home,
+        context.robot.position_lower,
+        context.robot.position_upper,
     )
-    kernels = replace(context.kernels, identity="cramped", arguments={**context.kernels.arguments, "robot": robot})
-    candidates = run_stages(prepare("airhockey-replan"), 1500, seed=46, until="HitAngleInCone")
-    candidates.reject((np.abs(sides(robot, candidates["start_q"].T)) < 2).all(axis=1), "elsewhere")
-    HittingConfiguration(near="start").prepare(replace(context, robot=robot, kernels=kernels))(candidates, None)
+    robot = replace(
+        context.robot,
+        position_lower=np.maximum(low, base - 0.6),
+        position_upper=np.minimum(high, base + 0.6),
+    )
+    kernels = replace(
+        context.kernels,
+        identity="cramped",
+        arguments={**context.kernels.arguments, "robot": robot},
+    )
+    candidates = run_stages(
+        prepare("airhockey-replan"), 1500, seed=46, until="HitAngleInCone"
+    )
+    candidates.reject(
+        (np.abs(sides(robot, candidates["start_q"].T)) < 2).all(axis=1), "elsewhere"
+    )
+    HittingConfiguration(near="start").prepare(
+        replace(context, robot=robot, kernels=kernels)
+    )(candidates, None)
     angle, q, arm = candidates["hit_angle"][0], candidates["goal_q"], Arm(robot)
     direction = np.stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
     on_limit = (sides(robot, q.T) != 0).any(axis=1)
     return [
-        (Search(robot, arm, candidates["goal_xyz"][:, k], direction[:, k], candidates["start_q"][:, k]), q[:, k])
+        (
+            Search(
+                robot,
+                arm,
+                candidates["goal_xyz"][:, k],
+                direction[:, k],
+                candidates["start_q"][:, k],
+            ),
+            q[:, k],
+        )
         for k in np.flatnonzero(on_limit)
     ]
 
@@ -228,17 +299,25 @@ def test_optima_on_limits_agree_with_slsqp(cramped):
         for start in [ours, *other_starts(search)]:
             theirs = search.slsqp(start)
             if theirs is not None:
-                assert search.value(ours) >= search.value(theirs) - 1e-6, (ours, theirs, search)
+                assert search.value(ours) >= search.value(theirs) - 1e-6, (
+                    ours,
+                    theirs,
+                    search,
+                )
                 same += bool(np.abs(ours - theirs).max() < 1e-4)
     assert same > 60
 
 
-def test_the_gradient_points_outwards_for_joints_on_limits_and_vanishes_for_the_others(cramped):
+def test_the_gradient_points_outwards_for_joints_on_limits_and_vanishes_for_the_others(
+    cramped,
+):
     held = []
     for search, ours in cramped:
         jacobian, gradient = search.arm.jacobian(ours)[:3], search.gradient(ours)
         side = sides(search.robot, ours)
-        multiplier = np.linalg.lstsq(jacobian[:, side == 0].T, gradient[side == 0], rcond=None)[0]
+        multiplier = np.linalg.lstsq(
+            jacobian[:, side == 0].T, gradient[side == 0], rcond=None
+        )[0]
         pull = gradient - jacobian.T @ multiplier
         assert np.abs(pull[side == 0]).max() < 1e-7
         assert (side * pull)[side != 0].min() > 0

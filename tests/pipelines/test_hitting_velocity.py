@@ -12,30 +12,70 @@ from tests.conftest import Arm, Prepare, needs_compiler, run_stages, some
 
 Array = np.ndarray
 HALF = np.sqrt(0.5)
-AXES = [np.array(d) for d in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (HALF, HALF), (HALF, -HALF))]
+AXES = [
+    np.array(d)
+    for d in (
+        (1.0, 0.0),
+        (-1.0, 0.0),
+        (0.0, 1.0),
+        (0.0, -1.0),
+        (HALF, HALF),
+        (HALF, -HALF),
+    )
+]
 BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
 
 
 def any_direction(random: np.random.Generator, count: int) -> list[Array]:
-    return [np.array([np.cos(angle), np.sin(angle)]) for angle in random.uniform(-np.pi, np.pi, count)]
+    return [
+        np.array([np.cos(angle), np.sin(angle)])
+        for angle in random.uniform(-np.pi, np.pi, count)
+    ]
 
 
 def states(kind: str, robot) -> list[tuple[Array, Array]]:
     """Pairs (q, d) of a kind."""
     random = np.random.default_rng(51)
-    poses = [random.uniform(robot.position_lower, robot.position_upper) for _ in range(60)]
+    poses = [
+        random.uniform(robot.position_lower, robot.position_upper) for _ in range(60)
+    ]
     if kind == "base":
         exact = np.where(np.arange(6) % 2 == 0, 0.0, robot.home)
-        return [(q, d) for q in (robot.home, exact) for d in AXES + any_direction(random, 20)]
+        return [
+            (q, d)
+            for q in (robot.home, exact)
+            for d in AXES + any_direction(random, 20)
+        ]
     if kind == "anywhere":
         return [(q, d) for q in poses for d in AXES[:3] + any_direction(random, 3)]
-    if kind == "in a vertical plane":  # q1 = q3 = q5 = 0: the joints' axes are parallel in pairs
+    if (
+        kind == "in a vertical plane"
+    ):  # q1 = q3 = q5 = 0: the joints' axes are parallel in pairs
         flat = [np.where(np.arange(6) % 2 == 0, 0.0, q) for q in poses]
         return [(q, d) for q in flat for d in AXES + any_direction(random, 2)]
-    zeros = [[2, 4], [0, 2], [2], [4], [0], [1], [3], [5], [2, 3], [3, 4]]  # kind == "some joints at zero"
-    straight = [np.where(np.isin(np.arange(6), zeros[k % len(zeros)]), 0.0, q) for k, q in enumerate(poses)]
-    turned = [np.where(np.arange(6) == k % 6, (-1) ** k * np.pi / 2, q) for k, q in enumerate(poses)]
-    return [(q, d) for q in straight + turned for d in AXES[:4] + any_direction(random, 1)]
+    zeros = [
+        [2, 4],
+        [0, 2],
+        [2],
+        [4],
+        [0],
+        [1],
+        [3],
+        [5],
+        [2, 3],
+        [3, 4],
+    ]  # kind == "some joints at zero"
+    straight = [
+        np.where(np.isin(np.arange(6), zeros[k % len(zeros)]), 0.0, q)
+        for k, q in enumerate(poses)
+    ]
+    turned = [
+        np.where(np.arange(6) == k % 6, (-1) ** k * np.pi / 2, q)
+        for k, q in enumerate(poses)
+    ]
+    return [
+        (q, d) for q in straight + turned for d in AXES[:4] + any_direction(random, 1)
+    ]
 
 
 KINDS = ["base", "anywhere", "in a vertical plane", "some joints at zero"]
@@ -51,7 +91,11 @@ class Program:
 
     def highs(self) -> float:
         bounds = list(zip(-self.limit, self.limit, strict=True))
-        return -float(linprog(-self.a, A_eq=self.b, b_eq=[0, 0], bounds=bounds, method="highs").fun)
+        return -float(
+            linprog(
+                -self.a, A_eq=self.b, b_eq=[0, 0], bounds=bounds, method="highs"
+            ).fun
+        )
 
 
 def programs(robot, cases: list[tuple[Array, Array]]) -> list[Program]:
@@ -59,11 +103,19 @@ def programs(robot, cases: list[tuple[Array, Array]]) -> list[Program]:
     made = []
     for q, d in cases:
         x, y, z = arm.jacobian(q)[:3]
-        made.append(Program(d[0] * x + d[1] * y, np.array([d[0] * y - d[1] * x, z]), robot.velocity_limit))
+        made.append(
+            Program(
+                d[0] * x + d[1] * y,
+                np.array([d[0] * y - d[1] * x, z]),
+                robot.velocity_limit,
+            )
+        )
     return made
 
 
-def solve(prepared, backend: str, cases: list[tuple[Array, Array]], kernels_of) -> tuple[Array, Array]:
+def solve(
+    prepared, backend: str, cases: list[tuple[Array, Array]], kernels_of
+) -> tuple[Array, Array]:
     kernel = kernels_of(prepared, backend).load(hitting_velocity, min_speed=0.0)
     q, d = (np.array(column).T.copy() for column in zip(*cases, strict=True))
     velocity, speed, _ = kernel(q, d)
@@ -72,14 +124,18 @@ def solve(prepared, backend: str, cases: list[tuple[Array, Array]], kernels_of) 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("kind", some(KINDS, 1, "slow"))
-def test_velocities_agree_with_the_optimum_of_highs(prepare: Prepare, kernels_of, kind, backend):
+def test_velocities_agree_with_the_optimum_of_highs(
+    prepare: Prepare, kernels_of, kind, backend
+):
     prepared = prepare("airhockey-hit")
     cases = states(kind, prepared.context.robot)
     if backend != "compiled":
         cases = cases[::4]
     velocities, speeds = solve(prepared, backend, cases, kernels_of)
     problems = programs(prepared.context.robot, cases)
-    for case, program, v, speed in zip(cases, problems, velocities, speeds, strict=True):
+    for case, program, v, speed in zip(
+        cases, problems, velocities, speeds, strict=True
+    ):
         best = program.highs()
         assert speed == pytest.approx(best, rel=1e-9, abs=1e-12), case
         assert program.a @ v == pytest.approx(best, rel=1e-9, abs=1e-12), case
@@ -96,8 +152,12 @@ def test_there_are_more_than_500_states_and_many_are_degenerate(prepare: Prepare
         assert np.abs(odd).max() < 1e-12  # three columns of the equations are parallel
 
 
-@pytest.mark.parametrize("offset", some([1e-13, 1e-11, 1e-9, 1e-7, 1e-5, 1e-3], 1, "slow"))
-def test_almost_degenerate_states_are_optimal_by_duality(prepare: Prepare, kernels_of, fastest, offset):
+@pytest.mark.parametrize(
+    "offset", some([1e-13, 1e-11, 1e-9, 1e-7, 1e-5, 1e-3], 1, "slow")
+)
+def test_almost_degenerate_states_are_optimal_by_duality(
+    prepare: Prepare, kernels_of, fastest, offset
+):
     """HiGHS' own tolerance is too coarse here: what a feasible v reaches and no v can exceed is the optimum.
 
     ``speed`` is the value of the dual, an upper bound. Across the hit the tip is as still as the rows must be.
@@ -109,7 +169,9 @@ def test_almost_degenerate_states_are_optimal_by_duality(prepare: Prepare, kerne
         for q, d in states("in a vertical plane", robot)[::3]
     ]
     velocities, speeds = solve(prepared, fastest, cases, kernels_of)
-    for case, program, v, speed in zip(cases, programs(robot, cases), velocities, speeds, strict=True):
+    for case, program, v, speed in zip(
+        cases, programs(robot, cases), velocities, speeds, strict=True
+    ):
         assert program.a @ v == pytest.approx(speed, rel=1e-9), case
         assert np.all(np.abs(v) <= program.limit * (1 + 1e-12)), case
         assert np.abs(program.b @ v).max() < 1e-9, case
@@ -139,14 +201,21 @@ def test_full_speed_hits_are_on_a_limit(prepare: Prepare):
     prepared = prepare("airhockey-replan")
     candidates = run_stages(prepared, 3000, seed=54, until="HittingVelocity")
     full = candidates["hit_speed"][0] == candidates["hit_speed_max"][0]
-    ratio = np.abs(candidates["goal_dq"]) / prepared.context.robot.velocity_limit[:, None]
+    ratio = (
+        np.abs(candidates["goal_dq"]) / prepared.context.robot.velocity_limit[:, None]
+    )
     np.testing.assert_allclose(ratio.max(0)[full], 1.0, rtol=1e-12)
 
 
 def stage_on(prepared, q: Array, angle: float) -> CandidateBatch:
     candidates = CandidateBatch(1)
-    candidates["goal_q"], candidates["hit_angle"] = q[:, None].copy(), np.array([[angle]])
-    HittingVelocity(full_speed=1.0).prepare(prepared.context)(candidates, np.random.default_rng(0))
+    candidates["goal_q"], candidates["hit_angle"] = (
+        q[:, None].copy(),
+        np.array([[angle]]),
+    )
+    HittingVelocity(full_speed=1.0).prepare(prepared.context)(
+        candidates, np.random.default_rng(0)
+    )
     return candidates
 
 
@@ -156,7 +225,9 @@ def test_a_stretched_arm_that_cannot_move_along_the_hit_is_rejected(prepare: Pre
     for q in (np.zeros(6), np.array([0.0, np.pi / 4, 0.0, 0.0, 0.0, 0.0])):
         for angle in (0.0, np.pi / 2, 1.0):
             candidates = stage_on(prepared, q, angle)
-            assert all(np.isfinite(values).all() for values in candidates.columns.values()), (q, angle)
+            assert all(
+                np.isfinite(values).all() for values in candidates.columns.values()
+            ), (q, angle)
 
 
 def test_hits_below_the_minimum_speed_are_rejected(prepare: Prepare):
@@ -164,7 +235,12 @@ def test_hits_below_the_minimum_speed_are_rejected(prepare: Prepare):
     robot = prepared.context.robot
     assert len(stage_on(prepared, robot.home, 0.0).alive) == 1
     candidates = CandidateBatch(1)
-    candidates["goal_q"], candidates["hit_angle"] = robot.home[:, None].copy(), np.zeros((1, 1))
-    HittingVelocity(full_speed=1.0, min_speed=10.0).prepare(prepared.context)(candidates, np.random.default_rng(0))
+    candidates["goal_q"], candidates["hit_angle"] = (
+        robot.home[:, None].copy(),
+        np.zeros((1, 1)),
+    )
+    HittingVelocity(full_speed=1.0, min_speed=10.0).prepare(prepared.context)(
+        candidates, np.random.default_rng(0)
+    )
     assert candidates.reasons == ["no hitting velocity"]
     assert len(candidates.alive) == 0

@@ -37,17 +37,30 @@ def after(prepared, candidates: CandidateBatch, stage) -> CandidateBatch:
     return found
 
 
-def test_a_home_is_the_start_the_base_or_a_configuration_at_a_random_position(started) -> None:
+def test_a_home_is_the_start_the_base_or_a_configuration_at_a_random_position(
+    started,
+) -> None:
     prepared, candidates = started
-    guess = next(stage for stage in prepared.pipeline.stage if type(stage).__name__ == "StartIK").guess
-    found = after(prepared, candidates, Home(at_start=0.5, at_base=0.2, position=BOX, guess=guess))
+    guess = next(
+        stage for stage in prepared.pipeline.stage if type(stage).__name__ == "StartIK"
+    ).guess
+    found = after(
+        prepared, candidates, Home(at_start=0.5, at_base=0.2, position=BOX, guess=guess)
+    )
     start = (found["home_q"] == found["start_q"]).all(axis=0)
     base = (found["home_q"] == prepared.context.robot.home[:, None]).all(axis=0)
     assert start.mean() == pytest.approx(0.5, abs=0.04)
     assert base.mean() == pytest.approx(0.2, abs=0.04)
     arm = Arm(prepared.context.robot)
-    for i in np.flatnonzero(~(start | base))[:50].tolist() + np.flatnonzero(base)[:3].tolist():
-        np.testing.assert_allclose(arm.pose(found["home_q"][:, i]).translation, found["home_xyz"][:, i], atol=1e-9)
+    for i in (
+        np.flatnonzero(~(start | base))[:50].tolist()
+        + np.flatnonzero(base)[:3].tolist()
+    ):
+        np.testing.assert_allclose(
+            arm.pose(found["home_q"][:, i]).translation,
+            found["home_xyz"][:, i],
+            atol=1e-9,
+        )
     elsewhere = found["home_xyz"][:, ~(start | base)]
     np.testing.assert_allclose(elsewhere[2], 0.16, atol=1e-9)
     assert elsewhere[0].min() < 0.65
@@ -59,14 +72,21 @@ def test_the_home_of_a_task_is_its_start(started) -> None:
     tasks = TaskBatch(len(candidates.alive))
     for name in ("start_q", "start_xyz"):
         tasks[name] = candidates[name]
-    Home(at_start=0.0, position=BOX).complete(prepared.context, ["start_q"])(tasks, random_generator(0, "train", 0))
+    Home(at_start=0.0, position=BOX).complete(prepared.context, ["start_q"])(
+        tasks, random_generator(0, "train", 0)
+    )
     np.testing.assert_array_equal(tasks["home_q"], candidates["start_q"])
     np.testing.assert_array_equal(tasks["home_xyz"], candidates["start_xyz"])
 
 
 def test_fractions_with_a_sum_above_one_are_a_mistake() -> None:
     errors: list[str] = []
-    table = {"use": "home", "at_start": 0.7, "at_base": 0.4, "position": ["[0.6, 1.3] m", "[-0.4, 0.4] m", "0.16 m"]}
+    table = {
+        "use": "home",
+        "at_start": 0.7,
+        "at_base": 0.4,
+        "position": ["[0.6, 1.3] m", "[-0.4, 0.4] m", "0.16 m"],
+    }
     read_kind(registry.STAGES, table, RecipeLocation("x.toml"), errors)
     assert "must not be more than 1 together, got 1.1" in errors[0]
 
@@ -89,5 +109,9 @@ def test_a_cone_may_be_about_the_line_from_home(started) -> None:
     stage = HitAngleInCone(half_angle=0.0)
     line = candidates["goal_xyz"] - candidates["home_xyz"]
     found = after(prepared, candidates, replace(stage, origin="home"))["hit_angle"][0]
-    np.testing.assert_allclose(np.cos(found - np.arctan2(line[1], line[0])), 1.0, atol=1e-12)
-    assert np.abs(found - after(prepared, candidates, stage)["hit_angle"][0]).max() > 0.1
+    np.testing.assert_allclose(
+        np.cos(found - np.arctan2(line[1], line[0])), 1.0, atol=1e-12
+    )
+    assert (
+        np.abs(found - after(prepared, candidates, stage)["hit_angle"][0]).max() > 0.1
+    )

@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import RecipeError
-from cnpgen.pipelines.prepared import Block, PreparedPipeline, as_stored, random_generator
+from cnpgen.pipelines.prepared import (
+    Block,
+    PreparedPipeline,
+    as_stored,
+    random_generator,
+)
 from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS, CandidateBatch
 from cnpgen.problems.constraints.link_clearance import ObjectClearance
@@ -29,17 +34,23 @@ def whole(prepared: PreparedPipeline) -> Block:
     return prepared.block(SEED, "train", 0)
 
 
-def assert_same_columns(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
+def assert_same_columns(
+    found: dict[str, np.ndarray], expected: dict[str, np.ndarray]
+) -> None:
     assert list(found) == list(expected)
     for name, values in expected.items():
         np.testing.assert_array_equal(found[name], values, err_msg=name)
 
 
-def assert_same_sampling(found: SamplingStatistics, expected: SamplingStatistics) -> None:
+def assert_same_sampling(
+    found: SamplingStatistics, expected: SamplingStatistics
+) -> None:
     assert (found.tried, found.accepted) == (expected.tried, expected.accepted)
     assert dict(found.rejections) == dict(expected.rejections)
     for name, density in expected.densities.items():
-        np.testing.assert_array_equal(found.densities[name].candidates, density.candidates)
+        np.testing.assert_array_equal(
+            found.densities[name].candidates, density.candidates
+        )
         np.testing.assert_array_equal(found.densities[name].accepted, density.accepted)
 
 
@@ -49,7 +60,9 @@ def test_a_block_is_reproducible_bit_for_bit(prepared, whole):
     assert_same_sampling(again.sampling, whole.sampling)
 
 
-@pytest.mark.parametrize("other", [(SEED + 1, "train", 0), (SEED, "validation", 0), (SEED, "train", 1)])
+@pytest.mark.parametrize(
+    "other", [(SEED + 1, "train", 0), (SEED, "validation", 0), (SEED, "train", 1)]
+)
 def test_blocks_of_another_seed_split_or_index_share_no_row(prepared, whole, other):
     columns = prepared.block(*other, stop=500).columns
     assert not np.isin(columns["goal_xyz"][0], whole.columns["goal_xyz"][0]).any()
@@ -66,7 +79,9 @@ def test_every_stage_accepts_a_batch_without_remaining_candidates(prepared):
         for _, work in prepared._stages[emptied:]:
             work(candidates, random)
         prepared._accept(candidates, random)
-        assert {candidates[field.name].shape[1] for field in prepared.fields[:-2]} == {0}
+        assert {candidates[field.name].shape[1] for field in prepared.fields[:-2]} == {
+            0
+        }
 
 
 def chunks(
@@ -77,25 +92,45 @@ def chunks(
         prepared.block(SEED, "train", index, first=first, stop=stop)
         for first, stop in zip([0, *cuts], [*cuts, BLOCK_ROWS], strict=True)
     ]
-    columns = {name: np.concatenate([part.columns[name] for part in made], axis=1) for name in made[0].columns}
+    columns = {
+        name: np.concatenate([part.columns[name] for part in made], axis=1)
+        for name in made[0].columns
+    }
     return columns, merge_sampling([part.sampling for part in made])
 
 
 @pytest.mark.parametrize(
-    "cuts", some([[1], [4095], [100, 1000, 3000], [2048], list(range(512, 4096, 512)), [17, 18]], 2, "slow")
+    "cuts",
+    some(
+        [[1], [4095], [100, 1000, 3000], [2048], list(range(512, 4096, 512)), [17, 18]],
+        2,
+        "slow",
+    ),
 )
-def test_chunks_of_a_block_have_its_rows_and_its_total_statistics(prepared, whole, cuts):
+def test_chunks_of_a_block_have_its_rows_and_its_total_statistics(
+    prepared, whole, cuts
+):
     columns, sampling = chunks(prepared, cuts)
     assert_same_columns(columns, whole.columns)
     assert_same_sampling(sampling, whole.sampling)
 
 
 def test_chunks_computed_together_equal_chunks_computed_one_by_one(prepared, whole):
-    ranges = [(0, 1), (1, 64), (64, 1500), (1700, 1701), (3000, BLOCK_ROWS)]  # with gaps
+    ranges = [
+        (0, 1),
+        (1, 64),
+        (64, 1500),
+        (1700, 1701),
+        (3000, BLOCK_ROWS),
+    ]  # with gaps
     drawn = []
     run = PreparedPipeline._sample_batch
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(PreparedPipeline, "_sample_batch", lambda *x: (drawn.append(x[2]), run(*x))[1])
+        patch.setattr(
+            PreparedPipeline,
+            "_sample_batch",
+            lambda *x: (drawn.append(x[2]), run(*x))[1],
+        )
         together = list(prepared.chunks(SEED, "train", 0, ranges))
     assert sum(drawn) < 1.3 * whole.sampling.tried + 300
     assert len(together) == len(ranges)
@@ -110,7 +145,9 @@ def batch_ends(prepared: PreparedPipeline, index: int) -> tuple[list[int], list[
     sizes, tails = [], []
     run = PreparedPipeline._sample_batch
 
-    def noted(self: PreparedPipeline, random: np.random.Generator, size: int) -> CandidateBatch:
+    def noted(
+        self: PreparedPipeline, random: np.random.Generator, size: int
+    ) -> CandidateBatch:
         candidates = run(self, random, size)
         sizes.append(len(candidates.alive))
         tails.append(candidates.size - 1 - int(candidates.alive[-1]))
@@ -123,7 +160,9 @@ def batch_ends(prepared: PreparedPipeline, index: int) -> tuple[list[int], list[
 
 
 @pytest.mark.slow
-def test_a_chunk_that_begins_with_a_batch_counts_the_last_rejections_of_the_previous_batch(prepare: Prepare):
+def test_a_chunk_that_begins_with_a_batch_counts_the_last_rejections_of_the_previous_batch(
+    prepare: Prepare,
+):
     prepared = prepare("heavy-object")
     tested = 0
     for index in range(20):
@@ -131,7 +170,10 @@ def test_a_chunk_that_begins_with_a_batch_counts_the_last_rejections_of_the_prev
         if tails[0] == 0 or tested == 3:
             continue
         tested += 1
-        whole, (columns, sampling) = prepared.block(SEED, "train", index), chunks(prepared, [ends[0]], index)
+        whole, (columns, sampling) = (
+            prepared.block(SEED, "train", index),
+            chunks(prepared, [ends[0]], index),
+        )
         assert_same_columns(columns, whole.columns)
         assert_same_sampling(sampling, whole.sampling)
     assert tested == 3
@@ -140,7 +182,10 @@ def test_a_chunk_that_begins_with_a_batch_counts_the_last_rejections_of_the_prev
 def test_a_shorter_block_is_the_beginning_of_a_longer_one(prepared, whole):
     for stop in (1, 7, 1500, 2900):
         short = prepared.block(SEED, "train", 0, stop=stop)
-        assert_same_columns(short.columns, {name: values[:, :stop] for name, values in whole.columns.items()})
+        assert_same_columns(
+            short.columns,
+            {name: values[:, :stop] for name, values in whole.columns.items()},
+        )
         assert short.sampling.accepted == stop
         assert short.sampling.tried == whole.columns["attempts"][0, :stop].sum()
 
@@ -167,7 +212,9 @@ def test_attempts_count_the_candidates_between_rows_across_batches(prepared, who
     sampling: list[int] = []
     run = PreparedPipeline._sample_batch
 
-    def noted(self: PreparedPipeline, random: np.random.Generator, size: int) -> CandidateBatch:
+    def noted(
+        self: PreparedPipeline, random: np.random.Generator, size: int
+    ) -> CandidateBatch:
         candidates = run(self, random, size)
         sampling.extend(candidates.outcome.tolist())
         return candidates
@@ -176,12 +223,19 @@ def test_attempts_count_the_candidates_between_rows_across_batches(prepared, who
         patch.setattr(PreparedPipeline, "_sample_batch", noted)
         prepared.block(SEED, "train", 0)
     accepted = np.flatnonzero(np.array(sampling) == 0)[:BLOCK_ROWS]
-    np.testing.assert_array_equal(whole.columns["attempts"][0], np.diff(accepted, prepend=-1))
+    np.testing.assert_array_equal(
+        whole.columns["attempts"][0], np.diff(accepted, prepend=-1)
+    )
 
 
-def test_every_reason_of_stages_and_constraints_is_listed_even_without_rejections(prepared, whole):
+def test_every_reason_of_stages_and_constraints_is_listed_even_without_rejections(
+    prepared, whole
+):
     reasons = list(whole.sampling.rejections)
-    constraints = [each.boundary_reason or each.reason for each in prepared.context.problem.constraint]
+    constraints = [
+        each.boundary_reason or each.reason
+        for each in prepared.context.problem.constraint
+    ]
     assert reasons[0] == "too close together"
     assert [reason for reason in reasons if reason in constraints] == constraints
     assert "tip not at its position" in reasons
@@ -194,28 +248,47 @@ def test_density_maps_count_every_candidate_and_every_row(prepared, whole):
         assert density.candidates.sum() == whole.sampling.tried
         assert density.accepted.sum() == BLOCK_ROWS
         x, y, _ = whole.columns[name]
-        expected, _, _ = np.histogram2d(x, y, density.accepted.shape, [density.x, density.y])
-        np.testing.assert_allclose(density.accepted, expected, atol=2)  # a candidate on the line between two cells
+        expected, _, _ = np.histogram2d(
+            x, y, density.accepted.shape, [density.x, density.y]
+        )
+        np.testing.assert_allclose(
+            density.accepted, expected, atol=2
+        )  # a candidate on the line between two cells
 
 
 @pytest.mark.parametrize("name", some(SHIPPED, 1, "slow"))
-def test_the_acceptance_check_rejects_no_candidate_of_the_stages(prepare: Prepare, name):
+def test_the_acceptance_check_rejects_no_candidate_of_the_stages(
+    prepare: Prepare, name
+):
     """The stages are exact; the acceptance check guards against unforeseen errors.
 
     No stage measures the distance between object and arm, so the check rejects these candidates.
     """
     prepared = prepare(name)
-    sampling = merge_sampling([prepared.block(SEED, "test", index).sampling for index in range(8)])
+    sampling = merge_sampling(
+        [prepared.block(SEED, "test", index).sampling for index in range(8)]
+    )
     constraints = prepared.context.problem.constraint
-    gate = [constraint.reason for constraint in constraints if not isinstance(constraint, ObjectClearance)]
+    gate = [
+        constraint.reason
+        for constraint in constraints
+        if not isinstance(constraint, ObjectClearance)
+    ]
     gate += ["tip not at its position", "hit not along its direction"]
-    assert {reason: count for reason, count in sampling.rejections.items() if reason in gate and count} == {}
+    assert {
+        reason: count
+        for reason, count in sampling.rejections.items()
+        if reason in gate and count
+    } == {}
 
 
-def test_a_pipeline_without_accepted_candidates_raises_an_error_with_the_reasons(prepare: Prepare):
+def test_a_pipeline_without_accepted_candidates_raises_an_error_with_the_reasons(
+    prepare: Prepare,
+):
     pipeline = prepare("airhockey-hit").pipeline
     stages = [
-        replace(stage, min_speed=100.0) if isinstance(stage, HittingVelocity) else stage for stage in pipeline.stage
+        replace(stage, min_speed=100.0) if isinstance(stage, HittingVelocity) else stage
+        for stage in pipeline.stage
     ]
     prepared = prepare(replace(pipeline, stage=tuple(stages)))
     text = (
@@ -234,10 +307,16 @@ def same_round(prepared: PreparedPipeline, size: int) -> CandidateBatch:
 
 
 @pytest.mark.parametrize("name", some(SHIPPED, 1, "slow"))
-@pytest.mark.parametrize(("backend", "size"), [pytest.param("compiled", 6000, marks=needs_compiler), ("casadi", 300)])
+@pytest.mark.parametrize(
+    ("backend", "size"),
+    [pytest.param("compiled", 6000, marks=needs_compiler), ("casadi", 300)],
+)
 def test_backends_agree_on_the_same_candidates(prepare: Prepare, name, backend, size):
     """Exceptions are candidates close to a rejection limit and searches with two equal optima."""
-    one, other = same_round(prepare(name, "numpy"), size), same_round(prepare(name, backend), size)
+    one, other = (
+        same_round(prepare(name, "numpy"), size),
+        same_round(prepare(name, backend), size),
+    )
     flipped = np.setxor1d(one.alive, other.alive)
     assert len(flipped) <= 2
     assert set(one.reasons) == set(other.reasons)
@@ -256,9 +335,19 @@ def test_backends_agree_on_the_same_candidates(prepare: Prepare, name, backend, 
 
 def test_rounding_to_float32_never_violates_a_limit(prepare: Prepare):
     robot = prepare("heavy-object").context.robot
-    field = Field("x", "rad", "", 7, valid_min=tuple(robot.position_lower), valid_max=tuple(robot.position_upper))
+    field = Field(
+        "x",
+        "rad",
+        "",
+        7,
+        valid_min=tuple(robot.position_lower),
+        valid_max=tuple(robot.position_upper),
+    )
     low, high = robot.position_lower[:, None], robot.position_upper[:, None]
-    inside = np.concatenate([low, high, np.nextafter(low, 0), np.nextafter(high, 0), 0.5 * (low + high)], axis=1)
+    inside = np.concatenate(
+        [low, high, np.nextafter(low, 0), np.nextafter(high, 0), 0.5 * (low + high)],
+        axis=1,
+    )
     stored = as_stored(inside, field)
     np.testing.assert_array_equal(stored, stored.astype(np.float32))
     assert np.all(low <= stored)
@@ -269,12 +358,16 @@ def test_rounding_to_float32_never_violates_a_limit(prepare: Prepare):
 def test_values_outside_a_limit_stay_outside_after_rounding(prepare: Prepare):
     field = Field("x", "rad", "", 1, valid_min=(-1 / 3,), valid_max=(1 / 3,))
     outside = np.array([[-0.34, 0.34, np.nan]])
-    np.testing.assert_array_equal(as_stored(outside, field), outside.astype(np.float32).astype(float))
+    np.testing.assert_array_equal(
+        as_stored(outside, field), outside.astype(np.float32).astype(float)
+    )
 
 
 def test_fields_without_limits_are_rounded_to_the_nearest(prepare: Prepare):
     values = np.random.default_rng(0).normal(size=(2, 50))
-    np.testing.assert_array_equal(as_stored(values, Field("x", "m", "", 2)), values.astype(np.float32))
+    np.testing.assert_array_equal(
+        as_stored(values, Field("x", "m", "", 2)), values.astype(np.float32)
+    )
 
 
 # --- fields -----------------------------------------------------------------------------------------------------------
@@ -294,13 +387,23 @@ def test_values_are_within_the_limits_that_their_fields_state(prepared, whole):
     for field in prepared.fields:
         values = whole.columns[field.name]
         if field.valid_min is not None:
-            assert np.all(values >= np.array(field.valid_min)[:, None] - 1e-14), field.name
+            assert np.all(values >= np.array(field.valid_min)[:, None] - 1e-14), (
+                field.name
+            )
         if field.valid_max is not None:
-            assert np.all(values <= np.array(field.valid_max)[:, None] + 1e-14), field.name
+            assert np.all(values <= np.array(field.valid_max)[:, None] + 1e-14), (
+                field.name
+            )
 
 
 def test_random_numbers_depend_on_seed_split_and_block():
     draw = partial(lambda *key: random_generator(*key).random(4).tolist())
-    keys = [(0, "train", 0), (1, "train", 0), (0, "validation", 0), (0, "train", 1), (2**63, "train", 0)]
+    keys = [
+        (0, "train", 0),
+        (1, "train", 0),
+        (0, "validation", 0),
+        (0, "train", 1),
+        (2**63, "train", 0),
+    ]
     assert len({tuple(draw(*key)) for key in keys}) == len(keys)
     assert draw(*keys[0]) == draw(*keys[0])

@@ -26,9 +26,15 @@ from tests.examples.shaped_robot import KINDS, OBSTACLES, write_pipeline, write_
 COLLISION = '[[stage]]\nuse = "collision"\nend = "start"\njudge = "segments"\n'
 
 
-@pytest.fixture(scope="module", params=some([OBSTACLES, KINDS], 1, "slow"), ids=["boxes", "kinds"])
-def problem(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Problem:
-    return load_problem(write_problem(tmp_path_factory.mktemp("crane"), obstacles=request.param))
+@pytest.fixture(
+    scope="module", params=some([OBSTACLES, KINDS], 1, "slow"), ids=["boxes", "kinds"]
+)
+def problem(
+    tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
+) -> Problem:
+    return load_problem(
+        write_problem(tmp_path_factory.mktemp("crane"), obstacles=request.param)
+    )
 
 
 def poses_of(context: Context, count: int) -> np.ndarray:
@@ -45,46 +51,74 @@ def context(problem: Problem, cache_folder: Path) -> Context:
 def drawn(context: Context) -> np.ndarray:
     """Random configurations, shape (n, N)."""
     robot = context.robot
-    return np.random.default_rng(1).uniform(robot.position_lower, robot.position_upper, (600, robot.n)).T.copy()
+    return (
+        np.random.default_rng(1)
+        .uniform(robot.position_lower, robot.position_upper, (600, robot.n))
+        .T.copy()
+    )
 
 
 def measured(context: Context, drawn: np.ndarray) -> np.ndarray:
     """Return the minimum distances of every state [m]: from obstacles, between links."""
-    world, zero, found = World(context.robot, context.problem.obstacle), np.zeros(context.robot.n), []
+    world, zero, found = (
+        World(context.robot, context.problem.obstacle),
+        np.zeros(context.robot.n),
+        [],
+    )
     for q in drawn.T:
         world.set_state(q.copy(), zero, zero, place_obstacles(context.problem.obstacle))
         found.append((min(world.shape_distances()), min(world.self_distances())))
     return np.array(found).T
 
 
-def test_convex_parts_decide_states_without_capsule_clearance_only(context, drawn, monkeypatch):
+def test_convex_parts_decide_states_without_capsule_clearance_only(
+    context, drawn, monkeypatch
+):
     decide, checked_counts = narrow_phase_of(context, "start"), []
     obstacle_poses, still = poses_of(context, drawn.shape[1]), np.zeros_like(drawn)
     real = PathWorld.set_path
-    monkeypatch.setattr(PathWorld, "set_path", lambda *x: (checked_counts.append(x[1].shape[1]), real(*x))[1])
-    broken = decide((drawn, still, still), obstacle_poses, np.ones(drawn.shape[1], bool), None)
+    monkeypatch.setattr(
+        PathWorld,
+        "set_path",
+        lambda *x: (checked_counts.append(x[1].shape[1]), real(*x))[1],
+    )
+    broken = decide(
+        (drawn, still, still), obstacle_poses, np.ones(drawn.shape[1], bool), None
+    )
     assert all(0.1 < states / drawn.shape[1] < 0.9 for states in checked_counts)
     assert len(checked_counts) == 2  # obstacles, and the robot itself
     monkeypatch.undo()
     distances = measured(context, drawn)
     names = [type(each).__name__ for each in context.problem.constraint]
-    np.testing.assert_array_equal(broken[names.index("RobotClearance")], distances[0] < -1e-8)
-    np.testing.assert_array_equal(broken[names.index("SelfClearance")], distances[1] < -1e-8)
+    np.testing.assert_array_equal(
+        broken[names.index("RobotClearance")], distances[0] < -1e-8
+    )
+    np.testing.assert_array_equal(
+        broken[names.index("SelfClearance")], distances[1] < -1e-8
+    )
     assert not broken[names.index("JointPosition")].any()
-    (doubts,) = context.kernels.load(narrow_phase, end="start", dtype="float64")(drawn, still, still, obstacle_poses)
+    (doubts,) = context.kernels.load(narrow_phase, end="start", dtype="float64")(
+        drawn, still, still, obstacle_poses
+    )
     saved = (doubts[names.index("RobotClearance")] > 0) & (distances[0] > 0)
     assert saved.sum() > 10  # states that capsules alone would reject
 
 
-def test_states_with_different_obstacle_poses_are_checked_one_by_one(context, drawn, monkeypatch):
+def test_states_with_different_obstacle_poses_are_checked_one_by_one(
+    context, drawn, monkeypatch
+):
     few = drawn[:, :60].copy()
     obstacle_poses, still = poses_of(context, 60), np.zeros_like(few)
     other = obstacle_poses.copy()
     other[1, 0] += 1.0
     all_states = np.ones(60, bool)
-    together = narrow_phase_of(context, "start")((few, still, still), obstacle_poses, all_states, None)
+    together = narrow_phase_of(context, "start")(
+        (few, still, still), obstacle_poses, all_states, None
+    )
     monkeypatch.setattr(RobotClearance, "met", None)
-    alone = narrow_phase_of(context, "start")((few, still, still), other, all_states, None)
+    alone = narrow_phase_of(context, "start")(
+        (few, still, still), other, all_states, None
+    )
     np.testing.assert_array_equal(alone[:, 1:], together[:, 1:])
     assert alone.any()
 
@@ -101,12 +135,22 @@ def test_a_robot_without_a_shape_needs_no_narrow_phase(prepare: Prepare):
 
 
 @pytest.mark.parametrize("judge", ["segments", "coal"])  # the arm holds nothing
-def test_the_collision_stage_keeps_states_without_collision_of_convex_parts(context, drawn, judge):
+def test_the_collision_stage_keeps_states_without_collision_of_convex_parts(
+    context, drawn, judge
+):
     candidates = CandidateBatch(drawn.shape[1])
-    candidates["start_q"], candidates["start_xyz"], candidates["goal_xyz"] = drawn, drawn[:3], drawn[:3]
-    Collision(end="start", judge=judge).prepare(context)(candidates, random_generator(0, "train", 0))
+    candidates["start_q"], candidates["start_xyz"], candidates["goal_xyz"] = (
+        drawn,
+        drawn[:3],
+        drawn[:3],
+    )
+    Collision(end="start", judge=judge).prepare(context)(
+        candidates, random_generator(0, "train", 0)
+    )
     distance = measured(context, drawn)[0]
-    sure = np.abs(distance) > 5e-4  # Coal's answer with its usual tolerance is not exact
+    sure = (
+        np.abs(distance) > 5e-4
+    )  # Coal's answer with its usual tolerance is not exact
     kept = np.isin(np.arange(drawn.shape[1]), candidates.alive)
     np.testing.assert_array_equal(kept[sure], (distance > 0)[sure])
     assert candidates.reasons == ["arm in collision at the start"]
@@ -131,7 +175,10 @@ def test_scenes_with_obstacles_of_the_same_kinds_share_kernels(tmp_path: Path):
         problem = load_problem(write_problem(tmp_path / str(number), obstacles=text))
         robot = load_robot(problem)
         found.append(
-            [tape_from_function(build(robot, problem)).to_bytes() for build in (capsule_clearance, stage_values)]
+            [
+                tape_from_function(build(robot, problem)).to_bytes()
+                for build in (capsule_clearance, stage_values)
+            ]
         )
     assert found[0] == found[1]
 
@@ -139,7 +186,9 @@ def test_scenes_with_obstacles_of_the_same_kinds_share_kernels(tmp_path: Path):
 @pytest.mark.slow
 @pytest.mark.parametrize("collision", ["", COLLISION])
 @pytest.mark.parametrize("obstacles", [OBSTACLES, KINDS], ids=["boxes", "kinds"])
-def test_rows_of_such_a_problem_pass_the_check_by_pinocchio_and_coal(tmp_path, prepare: Prepare, collision, obstacles):
+def test_rows_of_such_a_problem_pass_the_check_by_pinocchio_and_coal(
+    tmp_path, prepare: Prepare, collision, obstacles
+):
     write_problem(tmp_path, obstacles=obstacles)
     pipeline = load_pipeline(write_pipeline(tmp_path, collision=collision))
     prepared: PreparedPipeline = prepare(pipeline, "numpy")
@@ -147,6 +196,8 @@ def test_rows_of_such_a_problem_pass_the_check_by_pinocchio_and_coal(tmp_path, p
     columns = {name: values.T for name, values in block.columns.items()}
     report = verify_rows(prepared.context.problem, prepared.context.robot, columns)
     assert report.ok, report.failed
-    assert {"robot clearance", "self clearance"} <= {check.name for check in report.checks}
+    assert {"robot clearance", "self clearance"} <= {
+        check.name for check in report.checks
+    }
     candidates = run_stages(prepared, 400, seed=1)
     assert "start_clearance" not in candidates.columns

@@ -24,11 +24,18 @@ def test_moved_obstacles_have_the_same_tapes(tmp_path):
     problem = load_problem(write_problem(tmp_path, obstacles=KINDS, more=SELF + HELD))
     wall, ball, *others = problem.obstacle
     moved = problem.with_obstacles(
-        (replace(wall, position=(0.6, 0.1, 0.2)), replace(ball, radius=0.05, name="other"), *others)
+        (
+            replace(wall, position=(0.6, 0.1, 0.2)),
+            replace(ball, radius=0.05, name="other"),
+            *others,
+        )
     )
     assert moved.identity != problem.identity
     assert moved.structure == problem.structure
-    libraries = [problem_kernels(each, load_robot(each), *choose_backend("numpy")) for each in (problem, moved)]
+    libraries = [
+        problem_kernels(each, load_robot(each), *choose_backend("numpy"))
+        for each in (problem, moved)
+    ]
     unmet = {"needs": 2, "exact": True, "hitting": False}
     for builder, parameters in (
         (narrow_phase, {"end": "start", "dtype": "float32"}),
@@ -36,5 +43,7 @@ def test_moved_obstacles_have_the_same_tapes(tmp_path):
         (capsule_axes_distance, {}),
         (capsule_clearance, {}),
     ):
-        one, two = (library.tape(builder, **parameters).to_bytes() for library in libraries)
+        one, two = (
+            library.tape(builder, **parameters).to_bytes() for library in libraries
+        )
         assert one == two, builder

@@ -39,7 +39,11 @@ def with_stage(kind: type[plugins.Stage], monkeypatch: pytest.MonkeyPatch):
     from cnpgen.schema import registry
 
     known = registry.name_of
-    monkeypatch.setattr(registry, "name_of", lambda group, cls: "again" if cls is kind else known(group, cls))
+    monkeypatch.setattr(
+        registry,
+        "name_of",
+        lambda group, cls: "again" if cls is kind else known(group, cls),
+    )
     pipeline = load_pipeline("airhockey-hit")
     return replace(pipeline, stage=(*pipeline.stage, kind()))
 
@@ -47,7 +51,9 @@ def with_stage(kind: type[plugins.Stage], monkeypatch: pytest.MonkeyPatch):
 def test_a_stage_that_changes_unit_and_width_of_a_field_raises_an_error(
     prepare: Prepare, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    kind = overwriting(unit="furlong", width=2, names=("a", "b"), valid_min=None, valid_max=None)
+    kind = overwriting(
+        unit="furlong", width=2, names=("a", "b"), valid_min=None, valid_max=None
+    )
     pipeline = with_stage(kind, monkeypatch)
     with pytest.raises(RecipeError) as caught:
         prepare(pipeline)
@@ -59,11 +65,17 @@ def test_a_stage_that_changes_unit_and_width_of_a_field_raises_an_error(
     assert re.search(text, error)
 
 
-@pytest.mark.parametrize(("key", "value"), [("dtype", "int64"), ("frame", "table"), ("names", tuple("abcdef"))])
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("dtype", "int64"), ("frame", "table"), ("names", tuple("abcdef"))],
+)
 def test_a_stage_may_not_redefine_a_field(
     prepare: Prepare, monkeypatch: pytest.MonkeyPatch, key: str, value: object
 ) -> None:
-    with pytest.raises(RecipeError, match=rf"\(again\): declares start_q as {key} .*, but stage \d+ \(.*\) before it"):
+    with pytest.raises(
+        RecipeError,
+        match=rf"\(again\): declares start_q as {key} .*, but stage \d+ \(.*\) before it",
+    ):
         prepare(with_stage(overwriting(**{key: value}), monkeypatch))
 
 

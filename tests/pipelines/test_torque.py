@@ -13,13 +13,23 @@ BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("name", ["heavy-object", "airhockey-hit"])
-def test_the_ratio_is_the_largest_gravity_torque_by_its_limit(prepare: Prepare, kernels_of, name, backend):
+def test_the_ratio_is_the_largest_gravity_torque_by_its_limit(
+    prepare: Prepare, kernels_of, name, backend
+):
     prepared = prepare(name)
-    robot, arm, random = prepared.context.robot, Arm(prepared.context.robot), np.random.default_rng(101)
-    q = random.uniform(robot.position_lower, robot.position_upper, (300, robot.n)).T.copy()
+    robot, arm, random = (
+        prepared.context.robot,
+        Arm(prepared.context.robot),
+        np.random.default_rng(101),
+    )
+    q = random.uniform(
+        robot.position_lower, robot.position_upper, (300, robot.n)
+    ).T.copy()
     (ratio,) = kernels_of(prepared, backend).load(torque_ratio)(q)
     zero = np.zeros(robot.n)
-    expected = [np.max(np.abs(arm.torque(x, zero, zero)) / robot.torque_limit) for x in q.T]
+    expected = [
+        np.max(np.abs(arm.torque(x, zero, zero)) / robot.torque_limit) for x in q.T
+    ]
     np.testing.assert_allclose(ratio[0], expected, rtol=1e-12)
 
 
@@ -37,15 +47,24 @@ def test_torque_ratios_of_accepted_rows_are_stored_and_at_most_one(prepare: Prep
     candidates = run_stages(prepared, 1500, seed=102)
     robot, arm, zero = prepared.context.robot, Arm(prepared.context.robot), np.zeros(7)
     for end in ("start", "goal"):
-        expected = [np.max(np.abs(arm.torque(q, zero, zero)) / robot.torque_limit) for q in candidates[f"{end}_q"].T]
-        np.testing.assert_allclose(candidates[f"{end}_torque_ratio"][0], expected, rtol=1e-12)
+        expected = [
+            np.max(np.abs(arm.torque(q, zero, zero)) / robot.torque_limit)
+            for q in candidates[f"{end}_q"].T
+        ]
+        np.testing.assert_allclose(
+            candidates[f"{end}_torque_ratio"][0], expected, rtol=1e-12
+        )
         assert 0.3 < max(expected) <= 1
 
 
 @pytest.mark.slow
-def test_configurations_above_the_torque_limit_are_rejected_and_counted(prepare: Prepare):
+def test_configurations_above_the_torque_limit_are_rejected_and_counted(
+    prepare: Prepare,
+):
     pipeline = prepare("heavy-object").pipeline
-    problem = replace(pipeline.problem, limits=replace(pipeline.problem.limits, torque_scale=0.35))
+    problem = replace(
+        pipeline.problem, limits=replace(pipeline.problem.limits, torque_scale=0.35)
+    )
     prepared = prepare(replace(pipeline, problem=problem), "numpy")
     candidates = run_stages(prepared, 1500, seed=102)
     counts = np.bincount(candidates.outcome, minlength=1 + len(candidates.reasons))[1:]
@@ -55,7 +74,9 @@ def test_configurations_above_the_torque_limit_are_rejected_and_counted(prepare:
     robot, arm, zero = prepared.context.robot, Arm(prepared.context.robot), np.zeros(7)
     for end in ("start", "goal"):
         for q in candidates[f"{end}_q"].T:
-            assert np.all(np.abs(arm.torque(q, zero, zero)) <= robot.torque_limit * (1 + 1e-12))
+            assert np.all(
+                np.abs(arm.torque(q, zero, zero)) <= robot.torque_limit * (1 + 1e-12)
+            )
 
 
 @pytest.mark.parametrize("end", ["start", "goal"])

@@ -5,7 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cnpgen.planner.network.features import USUAL, count_features, feature_blocks, fit_features, raw_features
+from cnpgen.planner.network.features import (
+    USUAL,
+    count_features,
+    feature_blocks,
+    fit_features,
+    raw_features,
+)
 from tests.planner.test_control_points import tasks
 
 
@@ -18,7 +24,10 @@ def test_features_of_the_rows_they_were_fitted_to_have_mean_zero_and_deviation_o
 
 def test_mean_and_deviation_of_parts_equal_those_of_the_whole():
     given = tasks()
-    whole, parts = fit_features([given]), fit_features(given.take(rows) for rows in (slice(0, 1), slice(1, None)))
+    whole, parts = (
+        fit_features([given]),
+        fit_features(given.take(rows) for rows in (slice(0, 1), slice(1, None))),
+    )
     np.testing.assert_allclose(parts.mean, whole.mean, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(parts.scale, whole.scale, rtol=1e-9)
 
@@ -59,7 +68,9 @@ def test_the_parameters_of_a_problem_are_features_if_there_are_any():
     parameters = np.arange(2.0 * len(given)).reshape(-1, 2)
     given = replace(given, boundary=replace(given.boundary, parameters=parameters))
     assert feature_blocks(given.boundary) == (*USUAL, "parameters")
-    np.testing.assert_array_equal(raw_features(given, (*USUAL, "parameters"))[:, -2:], parameters)
+    np.testing.assert_array_equal(
+        raw_features(given, (*USUAL, "parameters"))[:, -2:], parameters
+    )
     assert count_features((*USUAL, "parameters"), 7, 2) == count_features(USUAL, 7) + 2
 
 

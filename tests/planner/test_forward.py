@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import UsageError
-from cnpgen.planner.network.architecture import Activations, Architecture, backward, forward, initial_parameters
+from cnpgen.planner.network.architecture import (
+    Activations,
+    Architecture,
+    backward,
+    forward,
+    initial_parameters,
+)
 
 SMALL = Architecture(inputs=5, hidden=7, layers=3, path_outputs=6, rate_outputs=4)
 
@@ -15,9 +21,14 @@ def random_parameters(architecture: Architecture, seed: int = 0) -> np.ndarray:
 
 def test_the_layers_share_the_vector_of_parameters_without_gap_or_overlap():
     numbers = np.arange(SMALL.n_parameters)
-    found = np.concatenate([part.ravel() for layer in SMALL.split(numbers) for part in layer])
+    found = np.concatenate(
+        [part.ravel() for layer in SMALL.split(numbers) for part in layer]
+    )
     np.testing.assert_array_equal(np.sort(found), numbers)
-    assert SMALL.n_parameters == (5 + 1) * 7 + 2 * (7 + 1) * 7 + (7 + 1) * 7 + (7 + 1) * 6 + (7 + 1) * 4
+    assert (
+        SMALL.n_parameters
+        == (5 + 1) * 7 + 2 * (7 + 1) * 7 + (7 + 1) * 7 + (7 + 1) * 6 + (7 + 1) * 4
+    )
 
 
 def test_the_network_is_a_tanh_trunk_with_a_tanh_head_and_a_linear_one():
@@ -26,7 +37,12 @@ def test_the_network_is_a_tanh_trunk_with_a_tanh_head_and_a_linear_one():
     weights = SMALL.split(parameters)
     h = x
     for weight, bias in weights[:3]:
-        h = np.array([np.tanh(sum(h[i] * weight[i, j] for i in range(len(h))) + bias[j]) for j in range(7)])
+        h = np.array(
+            [
+                np.tanh(sum(h[i] * weight[i, j] for i in range(len(h))) + bias[j])
+                for j in range(7)
+            ]
+        )
     (wh, bh), (wp, bp), (wr, br) = weights[3:]
     path, rate = np.tanh(np.tanh(h @ wh + bh) @ wp + bp), h @ wr + br
     given = forward(weights, x[None])
@@ -36,9 +52,15 @@ def test_the_network_is_a_tanh_trunk_with_a_tanh_head_and_a_linear_one():
 
 @pytest.mark.parametrize("layers", [1, 4])
 def test_the_gradient_of_every_parameter_is_that_of_finite_differences(layers):
-    architecture = Architecture(inputs=4, hidden=5, layers=layers, path_outputs=3, rate_outputs=2)
+    architecture = Architecture(
+        inputs=4, hidden=5, layers=layers, path_outputs=3, rate_outputs=2
+    )
     parameters, random = random_parameters(architecture), np.random.default_rng(2)
-    x, a, b = random.normal(size=(6, 4)), random.normal(size=(6, 3)), random.normal(size=(6, 2))
+    x, a, b = (
+        random.normal(size=(6, 4)),
+        random.normal(size=(6, 3)),
+        random.normal(size=(6, 2)),
+    )
 
     def scalar(parameters: np.ndarray) -> float:
         given = forward(architecture.split(parameters), x)
@@ -47,7 +69,9 @@ def test_the_gradient_of_every_parameter_is_that_of_finite_differences(layers):
     gradient = np.full_like(parameters, np.nan)
     weights = architecture.split(parameters)
     out = architecture.split(gradient)
-    backward(weights, forward(weights, x), path_gradient=a, log_rate_gradient=b, out=out)
+    backward(
+        weights, forward(weights, x), path_gradient=a, log_rate_gradient=b, out=out
+    )
     for i in range(len(parameters)):
         step = np.zeros_like(parameters)
         step[i] = 1e-6
@@ -56,7 +80,10 @@ def test_the_gradient_of_every_parameter_is_that_of_finite_differences(layers):
 
 
 def test_float32_stays_float32_and_differs_from_float64_by_rounding_only():
-    parameters, x = random_parameters(SMALL), np.random.default_rng(3).normal(size=(9, 5))
+    parameters, x = (
+        random_parameters(SMALL),
+        np.random.default_rng(3).normal(size=(9, 5)),
+    )
     exact = forward(SMALL.split(parameters), x)
     rounded = forward(SMALL.split(parameters.astype(np.float32)), x.astype(np.float32))
     for name in ("path", "log_rate"):
@@ -66,7 +93,10 @@ def test_float32_stays_float32_and_differs_from_float64_by_rounding_only():
 
 
 def test_rows_are_independent():
-    parameters, x = random_parameters(SMALL), np.random.default_rng(4).normal(size=(5, 5))
+    parameters, x = (
+        random_parameters(SMALL),
+        np.random.default_rng(4).normal(size=(5, 5)),
+    )
     together = forward(SMALL.split(parameters), x)
     for i in range(5):
         alone = forward(SMALL.split(parameters), x[i : i + 1])
@@ -76,7 +106,10 @@ def test_rows_are_independent():
 def first(seed: int, **changes: float) -> Activations:
     options = {"head_scale": 0.1, "rate_bias": -0.5, **changes}
     parameters = initial_parameters(SMALL, seed=seed, **options)
-    return forward(SMALL.split(parameters), np.random.default_rng(5).normal(size=(50, 5)).astype(np.float32))
+    return forward(
+        SMALL.split(parameters),
+        np.random.default_rng(5).normal(size=(50, 5)).astype(np.float32),
+    )
 
 
 def test_an_untrained_network_plans_nearly_straight_at_a_nearly_constant_rate():
@@ -91,5 +124,7 @@ def test_initial_parameters_depend_on_the_seed_only():
 
 
 def test_a_network_without_layers_raises_an_error():
-    with pytest.raises(UsageError, match="layers of a network must be at least 1, got 0"):
+    with pytest.raises(
+        UsageError, match="layers of a network must be at least 1, got 0"
+    ):
         Architecture(inputs=5, hidden=7, layers=0, path_outputs=6, rate_outputs=4)

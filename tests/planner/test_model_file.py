@@ -14,15 +14,25 @@ from cnpgen.planner import model_file
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import find_model, load_model, save_model
 from cnpgen.planner.network.features import STATES
-from cnpgen.store.files.checksum_file import Content, encode_with_checksum, read_with_checksum
+from cnpgen.store.files.checksum_file import (
+    Content,
+    encode_with_checksum,
+    read_with_checksum,
+)
 from tests.conftest import columns_of
 from tests.examples.models import boundary_of_columns, untrained_model
 
 
 @pytest.fixture(scope="module")
 def model(tiny) -> Model:
-    made = untrained_model("airhockey", boundary_of_columns(columns_of(tiny("airhockey-hit")), 20))
-    return replace(made, training={"command": "cnpgen train", "score": {"valid": 0.5}}, log='{"step": 1}\n')
+    made = untrained_model(
+        "airhockey", boundary_of_columns(columns_of(tiny("airhockey-hit")), 20)
+    )
+    return replace(
+        made,
+        training={"command": "cnpgen train", "score": {"valid": 0.5}},
+        log='{"step": 1}\n',
+    )
 
 
 def test_a_loaded_model_equals_the_saved_one(model, tmp_path):
@@ -37,38 +47,71 @@ def test_a_loaded_model_equals_the_saved_one(model, tmp_path):
     assert found.problem.comparable_sha256 == model.problem.comparable_sha256
 
 
-def test_a_model_file_contains_the_expected_time_unless_it_is_the_default(model, tmp_path):
+def test_a_model_file_contains_the_expected_time_unless_it_is_the_default(
+    model, tmp_path
+):
     save_model(tmp_path / "m.h5", model)
-    stored = json.loads(read_with_checksum(tmp_path / "m.h5", kind="cnpgen-model", version=2).texts["description"])
+    stored = json.loads(
+        read_with_checksum(tmp_path / "m.h5", kind="cnpgen-model", version=2).texts[
+            "description"
+        ]
+    )
     assert "expected_time" not in stored["config"]
     reach = replace(model, config=replace(model.config, expected_time="reach"))
     save_model(tmp_path / "r.h5", reach)
     assert load_model(tmp_path / "r.h5").config == reach.config
-    save_model(tmp_path / "w.h5", replace(model, config=replace(model.config, expected_time="soon")))
-    with pytest.raises(DatasetError, match="expected_time must be one of distance, reach, travel, got 'soon'"):
+    save_model(
+        tmp_path / "w.h5",
+        replace(model, config=replace(model.config, expected_time="soon")),
+    )
+    with pytest.raises(
+        DatasetError,
+        match="expected_time must be one of distance, reach, travel, got 'soon'",
+    ):
         load_model(tmp_path / "w.h5")
 
 
-def test_a_model_file_contains_options_after_the_network_unless_they_are_defaults(model, tmp_path):
+def test_a_model_file_contains_options_after_the_network_unless_they_are_defaults(
+    model, tmp_path
+):
     save_model(tmp_path / "m.h5", model)
-    stored = json.loads(read_with_checksum(tmp_path / "m.h5", kind="cnpgen-model", version=2).texts["description"])[
-        "config"
-    ]
+    stored = json.loads(
+        read_with_checksum(tmp_path / "m.h5", kind="cnpgen-model", version=2).texts[
+            "description"
+        ]
+    )["config"]
     assert set(stored) == {"path_scale", "line_projection_steps", "projection_steps"}
-    both = replace(model, config=replace(model.config, time_parametrized=True, within_limits=True, projection_steps=0))
+    both = replace(
+        model,
+        config=replace(
+            model.config, time_parametrized=True, within_limits=True, projection_steps=0
+        ),
+    )
     save_model(tmp_path / "b.h5", both)
     assert load_model(tmp_path / "b.h5").config == both.config
-    save_model(tmp_path / "w.h5", replace(model, config=replace(model.config, time_parametrized="often")))
-    with pytest.raises(DatasetError, match="time_parametrized must be true or false, got 'often'"):
+    save_model(
+        tmp_path / "w.h5",
+        replace(model, config=replace(model.config, time_parametrized="often")),
+    )
+    with pytest.raises(
+        DatasetError, match="time_parametrized must be true or false, got 'often'"
+    ):
         load_model(tmp_path / "w.h5")
 
 
 def test_a_loaded_model_has_its_via_points(model, tmp_path):
-    configurations = tuple(map(tuple, np.random.default_rng(0).uniform(-1, 1, (2, 6)).tolist()))
-    with_configurations = replace(model, config=replace(model.config, via_points=configurations))
+    configurations = tuple(
+        map(tuple, np.random.default_rng(0).uniform(-1, 1, (2, 6)).tolist())
+    )
+    with_configurations = replace(
+        model, config=replace(model.config, via_points=configurations)
+    )
     save_model(tmp_path / "c.h5", with_configurations)
     assert load_model(tmp_path / "c.h5").config == with_configurations.config
-    save_model(tmp_path / "w.h5", replace(model, config=replace(model.config, via_points=((0.1, 0.2),))))
+    save_model(
+        tmp_path / "w.h5",
+        replace(model, config=replace(model.config, via_points=((0.1, 0.2),))),
+    )
     with pytest.raises(DatasetError, match="via points must be 6 numbers each"):
         load_model(tmp_path / "w.h5")
 
@@ -90,7 +133,10 @@ def test_any_hdf5_reader_opens_a_model_and_finds_the_layers_by_name(model, tmp_p
 def test_any_changed_bit_raises_an_error(model, tmp_path):
     save_model(tmp_path / "m.h5", model)
     whole = (tmp_path / "m.h5").read_bytes()
-    used = [*range(80), *np.random.default_rng(0).integers(512, len(whole), 60).tolist()]
+    used = [
+        *range(80),
+        *np.random.default_rng(0).integers(512, len(whole), 60).tolist(),
+    ]
     for place in used:
         data = bytearray(whole)
         data[place] ^= 1 << (place % 8)
@@ -109,12 +155,16 @@ def test_a_truncated_model_raises_an_error(model, tmp_path, size):
 
 
 @pytest.mark.parametrize("place", [3, 9, 20, 40, 200])
-def test_a_model_with_a_changed_first_block_is_reported_as_damaged(model, tmp_path, place):
+def test_a_model_with_a_changed_first_block_is_reported_as_damaged(
+    model, tmp_path, place
+):
     save_model(tmp_path / "m.h5", model)
     data = bytearray((tmp_path / "m.h5").read_bytes())
     data[place] ^= 0x10 if place != 9 else 0x02  # "mmdel"
     (tmp_path / "m.h5").write_bytes(data)
-    with pytest.raises(DatasetError, match=r"m\.h5 is damaged: its first 512 bytes were changed$"):
+    with pytest.raises(
+        DatasetError, match=r"m\.h5 is damaged: its first 512 bytes were changed$"
+    ):
         load_model(tmp_path / "m.h5")
 
 
@@ -122,10 +172,16 @@ def test_missing_files_and_files_of_other_kinds_are_named(tmp_path, tiny):
     with pytest.raises(UsageError, match=r"none\.h5 is not there, expected a model"):
         load_model(tmp_path / "none.h5")
     shard = next(tiny("airhockey-hit").rglob("*.h5"))
-    with pytest.raises(UsageError, match="is a shard of a dataset, expected a model of cnpgen"):
+    with pytest.raises(
+        UsageError, match="is a shard of a dataset, expected a model of cnpgen"
+    ):
         load_model(shard)
     other = tmp_path / "other.h5"
-    other.write_bytes(encode_with_checksum(Content({}, {"a": "b"}), kind="cnpgen-checkpoint", version=1))
+    other.write_bytes(
+        encode_with_checksum(
+            Content({}, {"a": "b"}), kind="cnpgen-checkpoint", version=1
+        )
+    )
     with pytest.raises(UsageError, match="is a checkpoint of cnpgen, expected a model"):
         load_model(other)
 
@@ -133,13 +189,24 @@ def test_missing_files_and_files_of_other_kinds_are_named(tmp_path, tiny):
 @pytest.mark.parametrize(("version", "remedy"), [(99, "upgrade"), (1, "make it again")])
 def test_other_format_versions_are_named(tmp_path, version, remedy):
     path = tmp_path / "other.h5"
-    path.write_bytes(encode_with_checksum(Content({}, {}), kind=model_file.MODEL_KIND, version=version))
-    with pytest.raises(DatasetError, match=rf"format version {version}, this cnpgen reads version 2.*{remedy}"):
+    path.write_bytes(
+        encode_with_checksum(
+            Content({}, {}), kind=model_file.MODEL_KIND, version=version
+        )
+    )
+    with pytest.raises(
+        DatasetError,
+        match=rf"format version {version}, this cnpgen reads version 2.*{remedy}",
+    ):
         load_model(path)
 
 
-@pytest.mark.parametrize("change", ["fewer joints", "unknown features", "no description"])
-def test_inconsistent_content_with_a_valid_checksum_raises_an_error(model, tmp_path, change):
+@pytest.mark.parametrize(
+    "change", ["fewer joints", "unknown features", "no description"]
+)
+def test_inconsistent_content_with_a_valid_checksum_raises_an_error(
+    model, tmp_path, change
+):
     content = model_file.model_content(model)
     arrays, texts = dict(content.arrays), dict(content.texts)
     if change == "fewer joints":
@@ -149,7 +216,11 @@ def test_inconsistent_content_with_a_valid_checksum_raises_an_error(model, tmp_p
     else:
         del texts["description"]
     path = tmp_path / "odd.h5"
-    path.write_bytes(encode_with_checksum(Content(arrays, texts), kind=model_file.MODEL_KIND, version=2))
+    path.write_bytes(
+        encode_with_checksum(
+            Content(arrays, texts), kind=model_file.MODEL_KIND, version=2
+        )
+    )
     with pytest.raises(DatasetError, match="does not fit this version"):
         load_model(path)
 
@@ -193,14 +264,20 @@ FORGERIES = {
 
 
 @pytest.mark.parametrize("forgery", FORGERIES)
-def test_the_description_of_a_model_is_checked_against_its_arrays(model, tmp_path, forgery):
+def test_the_description_of_a_model_is_checked_against_its_arrays(
+    model, tmp_path, forgery
+):
     forge, message = FORGERIES[forgery]
     content = model_file.model_content(model)
     arrays, texts = dict(content.arrays), dict(content.texts)
     texts.pop("log") if forgery == "no text" else None
     forge(arrays, texts)
     path = tmp_path / "forged.h5"
-    path.write_bytes(encode_with_checksum(Content(arrays, texts), kind=model_file.MODEL_KIND, version=2))
+    path.write_bytes(
+        encode_with_checksum(
+            Content(arrays, texts), kind=model_file.MODEL_KIND, version=2
+        )
+    )
     started = time.process_time()
     with pytest.raises(DatasetError, match=rf"forged\.h5 .*{message}"):
         load_model(path)
@@ -220,24 +297,39 @@ def test_any_changed_bit_of_the_first_block_raises_an_error(model, tmp_path):
 
 def test_an_empty_text_and_a_scalar_are_restored(tmp_path):
     path = tmp_path / "x.h5"
-    path.write_bytes(encode_with_checksum(Content({"a": np.array(1.5)}, {"t": ""}), kind="cnpgen-thing", version=1))
+    path.write_bytes(
+        encode_with_checksum(
+            Content({"a": np.array(1.5)}, {"t": ""}), kind="cnpgen-thing", version=1
+        )
+    )
     found = read_with_checksum(path, kind="cnpgen-thing", version=1)
     assert found.texts == {"t": ""}
     assert found.arrays["a"] == 1.5
 
 
 def test_shipped_models_are_found_by_name_and_others_by_path(tmp_path, monkeypatch):
-    monkeypatch.setattr(model_file, "shipped_models", lambda: {"airhockey-hit": Path("/somewhere/airhockey-hit.h5")})
+    monkeypatch.setattr(
+        model_file,
+        "shipped_models",
+        lambda: {"airhockey-hit": Path("/somewhere/airhockey-hit.h5")},
+    )
     assert find_model("airhockey-hit") == Path("/somewhere/airhockey-hit.h5")
     (tmp_path / "mine").touch()
     assert find_model(tmp_path / "mine") == tmp_path / "mine"
-    with pytest.raises(UsageError, match=r"mine\.h5 is not there, expected a model of cnpgen"):
+    with pytest.raises(
+        UsageError, match=r"mine\.h5 is not there, expected a model of cnpgen"
+    ):
         find_model("mine.h5")
-    with pytest.raises(UsageError, match=r"unknown model 'airhockey-hot' \(did you mean 'airhockey-hit'\?\)"):
+    with pytest.raises(
+        UsageError,
+        match=r"unknown model 'airhockey-hot' \(did you mean 'airhockey-hit'\?\)",
+    ):
         find_model("airhockey-hot")
 
 
-@pytest.mark.parametrize("path", model_file.shipped_models().values(), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", model_file.shipped_models().values(), ids=lambda path: path.stem
+)
 def test_every_shipped_model_is_small_intact_and_documented(path):
     assert path.stat().st_size <= 3e6
     model = load_model(path)
@@ -247,6 +339,8 @@ def test_every_shipped_model_is_small_intact_and_documented(path):
 
 
 def test_a_forged_header_raises_a_cnpgen_error(tmp_path):
-    (tmp_path / "m.h5").write_bytes(b"cnpgen-model 2\nsha256 " + b"0" * 64 + b"\n" + bytes(600))
+    (tmp_path / "m.h5").write_bytes(
+        b"cnpgen-model 2\nsha256 " + b"0" * 64 + b"\n" + bytes(600)
+    )
     with pytest.raises(CnpgenError):
         load_model(tmp_path / "m.h5")

@@ -25,7 +25,9 @@ def model(tiny: Tiny) -> Model:
     folder = tiny("airhockey-replan")
     dataset = open_training_data(folder).describe()
     training = {"dataset": dataset, "stages": load_dataset(folder).spec.stages}
-    return untrained_model("airhockey", boundary_of_columns(columns_of(folder), 20), training=training)
+    return untrained_model(
+        "airhockey", boundary_of_columns(columns_of(folder), 20), training=training
+    )
 
 
 def write(path: Path, joints: int = 6, **attributes: str) -> Path:
@@ -50,31 +52,52 @@ def test_a_shard_is_the_rows_of_its_dataset(tiny, model):
 def test_a_shard_is_rejected_like_its_dataset(tiny, model):
     with pytest.raises(DatasetError, match="drawn in another way"):
         read_file(shard(tiny("airhockey-hit")), model)
-    assert len(read_file(shard(tiny("airhockey-hit")), model, other=True).sample_id) == 250
+    assert (
+        len(read_file(shard(tiny("airhockey-hit")), model, other=True).sample_id) == 250
+    )
     for other in (False, True):
-        with pytest.raises(DatasetError, match=r"plans for 'airhockey', but .* is of 'heavy-object'"):
+        with pytest.raises(
+            DatasetError, match=r"plans for 'airhockey', but .* is of 'heavy-object'"
+        ):
             read_file(shard(tiny("heavy-object")), model, other=other)
 
 
-def test_a_shard_without_its_dataset_is_identified_by_the_digest_of_its_recipe(tiny, tmp_path, model):
-    mine, hit = (shutil.copy(shard(tiny(name)), tmp_path / name) for name in ("airhockey-replan", "airhockey-hit"))
+def test_a_shard_without_its_dataset_is_identified_by_the_digest_of_its_recipe(
+    tiny, tmp_path, model
+):
+    mine, hit = (
+        shutil.copy(shard(tiny(name)), tmp_path / name)
+        for name in ("airhockey-replan", "airhockey-hit")
+    )
     assert len(read_file(Path(mine), model).sample_id) == 250
-    with pytest.raises(DatasetError, match="drawn by another recipe than the model's training rows"):
+    with pytest.raises(
+        DatasetError, match="drawn by another recipe than the model's training rows"
+    ):
         read_file(Path(hit), model)
     assert len(read_file(Path(hit), model, other=True).sample_id) == 250
 
 
 def test_a_file_of_another_problem_is_rejected(tmp_path, model):
-    with pytest.raises(DatasetError, match=r"plans for 'airhockey', but .* is of 'heavy-object': they differ in"):
+    with pytest.raises(
+        DatasetError,
+        match=r"plans for 'airhockey', but .* is of 'heavy-object': they differ in",
+    ):
         read_file(write(tmp_path / "a.h5", problem="heavy-object"), model)
     with pytest.raises(DatasetError, match=r"attribute 'problem'.*airhokey"):
         read_file(write(tmp_path / "b.h5", problem="airhokey"), model)
     with pytest.raises(DatasetError, match="of another problem than the model"):
         read_file(write(tmp_path / "c.h5", problem_sha256="0" * 64), model)
-    text = {"problem_recipe": "{}", "problem_urdf": "", "problem_sha256": model.problem.comparable_sha256}
+    text = {
+        "problem_recipe": "{}",
+        "problem_urdf": "",
+        "problem_sha256": model.problem.comparable_sha256,
+    }
     with pytest.raises(DatasetError, match="problem_recipe is not that of a problem"):
         read_file(write(tmp_path / "d.h5", **text), model)
-    assert len(read_file(write(tmp_path / "e.h5", problem="airhockey"), model).sample_id) == 2
+    assert (
+        len(read_file(write(tmp_path / "e.h5", problem="airhockey"), model).sample_id)
+        == 2
+    )
     assert len(read_file(write(tmp_path / "f.h5"), model).sample_id) == 2
 
 
@@ -82,7 +105,9 @@ def test_prescribed_goal_accelerations_raise_an_error(tmp_path, model):
     path = write(tmp_path / "a.h5", problem="airhockey")
     with h5py.File(path, "a") as file:
         file["goal_ddq"] = np.full((2, 6), 3.0)
-    with pytest.raises(DatasetError, match=r"prescribes goal accelerations \(goal_ddq\)"):
+    with pytest.raises(
+        DatasetError, match=r"prescribes goal accelerations \(goal_ddq\)"
+    ):
         read_file(path, model)
 
 
@@ -95,5 +120,7 @@ def test_sample_ids_that_are_not_integers_raise_an_error(tmp_path, model):
     path = write(tmp_path / "a.h5")
     with h5py.File(path, "a") as file:
         file["sample_id"] = np.array([0.5, 1.0])
-    with pytest.raises(DatasetError, match="sample_id must hold 2 integers, got float64"):
+    with pytest.raises(
+        DatasetError, match="sample_id must hold 2 integers, got float64"
+    ):
         read_file(path, model)

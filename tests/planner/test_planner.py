@@ -32,7 +32,11 @@ def planner(rows) -> Planner:
 
 def planned(planner: Planner, rows: Boundary):
     return planner.plan(
-        rows.start_q, rows.goal_q, start_dq=rows.start_dq, start_ddq=rows.start_ddq, goal_dq=rows.goal_dq
+        rows.start_q,
+        rows.goal_q,
+        start_dq=rows.start_dq,
+        start_ddq=rows.start_ddq,
+        goal_dq=rows.goal_dq,
     )
 
 
@@ -50,8 +54,12 @@ def test_a_plan_is_the_same_alone_and_in_a_batch(planner, rows):
     for i in (0, 7, 39):
         one = planned(planner, rows[i])
         assert len(one) == 1
-        np.testing.assert_allclose(one.path_control_points[0], many.path_control_points[i], atol=1e-5)
-        np.testing.assert_allclose(one.rate_control_points[0], many.rate_control_points[i], rtol=1e-5)
+        np.testing.assert_allclose(
+            one.path_control_points[0], many.path_control_points[i], atol=1e-5
+        )
+        np.testing.assert_allclose(
+            one.rate_control_points[0], many.rate_control_points[i], rtol=1e-5
+        )
 
 
 def test_missing_velocities_and_accelerations_are_zero(planner, rows):
@@ -67,15 +75,24 @@ def test_missing_velocities_and_accelerations_are_zero(planner, rows):
 def test_tip_positions_are_those_of_pinocchio(planner, rows):
     plans = planned(planner, rows)
     for end, q in (("start", rows.start_q), ("goal", rows.goal_q)):
-        np.testing.assert_allclose(plans.columns[f"{end}_xyz"], plans.problem.tip_positions(q), atol=1e-12)
+        np.testing.assert_allclose(
+            plans.columns[f"{end}_xyz"], plans.problem.tip_positions(q), atol=1e-12
+        )
 
 
 @pytest.mark.parametrize("part", some([0.1, 0.6, 0.9, 0.99], 1, "slow"))
-def test_replanning_to_an_unchanged_goal_never_takes_longer_than_the_remaining_trajectory(part):
-    planner, rows = Planner("airhockey-replan"), draw_boundary_problems("airhockey-replan", 8, seed=21).boundary
+def test_replanning_to_an_unchanged_goal_never_takes_longer_than_the_remaining_trajectory(
+    part,
+):
+    planner, rows = (
+        Planner("airhockey-replan"),
+        draw_boundary_problems("airhockey-replan", 8, seed=21).boundary,
+    )
     old = refine_plans(planner.plan_batch(rows), workers=1).plans
     left = (1 - part) * old.duration
-    new = planner.replan(old, part * old.duration, goal_q=rows.goal_q, goal_dq=rows.goal_dq)
+    new = planner.replan(
+        old, part * old.duration, goal_q=rows.goal_q, goal_dq=rows.goal_dq
+    )
     assert (new.duration <= left * (1 + 1e-12)).all()
     assert evaluate_plans(new, workers=1).valid.all()
     alone = planner.plan_batch(new.boundary)
@@ -84,7 +101,9 @@ def test_replanning_to_an_unchanged_goal_never_takes_longer_than_the_remaining_t
     np.testing.assert_allclose(new.duration[~reused], alone.duration[~reused])
     states, times = old.motion.at_times, np.linspace(0, 1, 50) * left[:, None]
     np.testing.assert_allclose(
-        new.motion.at_times(times).q[reused], states(times + part * old.duration[:, None]).q[reused], atol=1e-4
+        new.motion.at_times(times).q[reused],
+        states(times + part * old.duration[:, None]).q[reused],
+        atol=1e-4,
     )
 
 
@@ -92,16 +111,25 @@ def test_a_changed_goal_is_planned_by_the_network_alone(planner, rows):
     old = planned(planner, rows)
     when = 0.9 * old.duration
     for shift in (1e-6, 0.1):
-        new = planner.replan(old, when, goal_q=rows.goal_q + shift, goal_dq=rows.goal_dq)
-        np.testing.assert_array_equal(new.path_control_points, planner.plan_batch(new.boundary).path_control_points)
+        new = planner.replan(
+            old, when, goal_q=rows.goal_q + shift, goal_dq=rows.goal_dq
+        )
+        np.testing.assert_array_equal(
+            new.path_control_points,
+            planner.plan_batch(new.boundary).path_control_points,
+        )
 
 
 def test_one_plan_can_be_replanned_to_several_goals_including_its_own(planner, rows):
     old = planned(planner, rows)[:1]
-    new = planner.replan(old, 0.5 * old.duration, goal_q=rows.goal_q[:3], goal_dq=rows.goal_dq[:3])
+    new = planner.replan(
+        old, 0.5 * old.duration, goal_q=rows.goal_q[:3], goal_dq=rows.goal_dq[:3]
+    )
     assert len(new) == 3
     for row, each in enumerate(new[[k]] for k in range(3)):
-        alone = planner.replan(old, 0.5 * old.duration, goal_q=rows.goal_q[row], goal_dq=rows.goal_dq[row])
+        alone = planner.replan(
+            old, 0.5 * old.duration, goal_q=rows.goal_q[row], goal_dq=rows.goal_dq[row]
+        )
         np.testing.assert_allclose(each.duration, alone.duration, rtol=1e-7)
 
 
@@ -109,10 +137,15 @@ def test_replanning_rejects_plans_of_other_types_and_problems(planner, rows):
     old, goal = planned(planner, rows), {"goal_q": rows.goal_q, "goal_dq": rows.goal_dq}
     with pytest.raises(UsageError, match=r"must be Plans, .* got Boundary"):
         planner.replan(rows, 0.1, **goal)
-    joined = join_plans(old, planner.replan(old, 0.5 * old.duration, **goal), at=0.5 * old.duration)
+    joined = join_plans(
+        old, planner.replan(old, 0.5 * old.duration, **goal), at=0.5 * old.duration
+    )
     with pytest.raises(UsageError, match=r"must be Plans, .* got JoinedPlans"):
         planner.replan(joined, 0.1, **goal)
-    with pytest.raises(UsageError, match="the planner is of 'airhockey', the plans are of 'heavy-object'"):
+    with pytest.raises(
+        UsageError,
+        match="the planner is of 'airhockey', the plans are of 'heavy-object'",
+    ):
         planner.replan(draw_boundary_problems("heavy-object", 2, seed=1), 0.0, **goal)
     with pytest.raises(UsageError, match="goal_q must be from") as caught:
         planner.replan(old, 0.0, goal_q=1e4 * rows.goal_q)
@@ -122,7 +155,9 @@ def test_replanning_rejects_plans_of_other_types_and_problems(planner, rows):
 def test_replanning_is_continuous_in_position_velocity_and_acceleration(planner, rows):
     old = planned(planner, rows)
     when = 0.4 * old.duration
-    new = planner.replan(old, when, goal_q=rows.goal_q[::-1], goal_dq=rows.goal_dq[::-1])
+    new = planner.replan(
+        old, when, goal_q=rows.goal_q[::-1], goal_dq=rows.goal_dq[::-1]
+    )
     before, after = old.states_at(when), new.states_at(0.0)
     for found, expected, scale in zip(after, before, (1, 1, 100), strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-11 * scale)
@@ -137,7 +172,9 @@ def test_a_replanned_hit_continues_the_first_motion(planner, rows):
     """Finite differences of positions and velocities across both switches agree with the states."""
     first = planner.plan(rows.start_q[0], rows.goal_q[1])
     second = planner.replan(first, 0.5 * first.duration, goal_q=rows.goal_q[2])
-    hit = planner.replan(second, 0.5 * second.duration, goal_q=rows.goal_q[3], goal_dq=rows.goal_dq[3])
+    hit = planner.replan(
+        second, 0.5 * second.duration, goal_q=rows.goal_q[3], goal_dq=rows.goal_dq[3]
+    )
     h = 1e-6
     for old, new in ((first, second), (second, hit)):
         switch = 0.5 * old.duration[0]
@@ -147,7 +184,9 @@ def test_a_replanned_hit_continues_the_first_motion(planner, rows):
         np.testing.assert_allclose((dq1 - dq0) / (2 * h), (ddq0 + ddq1) / 2, atol=1e-2)
 
 
-def test_start_and_goal_are_positional_and_velocities_are_keyword_arguments(planner, rows):
+def test_start_and_goal_are_positional_and_velocities_are_keyword_arguments(
+    planner, rows
+):
     plans = planner.plan(rows.start_q, rows.goal_q)
     np.testing.assert_array_equal(plans.boundary.goal_q, rows.goal_q)
     with pytest.raises(TypeError, match="goal_q"):
@@ -156,7 +195,9 @@ def test_start_and_goal_are_positional_and_velocities_are_keyword_arguments(plan
         planner.plan(rows.start_q, rows.goal_q, rows.start_dq)
 
 
-def test_rounding_errors_count_as_rest_so_that_rest_to_rest_plans_can_be_replanned(tiny):
+def test_rounding_errors_count_as_rest_so_that_rest_to_rest_plans_can_be_replanned(
+    tiny,
+):
     """Velocities at the ends of a plan differ from zero by 1e-14: replanning from them must not fail."""
     rest = boundary_of_columns(columns_of(tiny("heavy-object")), 20)
     planner = Planner(untrained_model("heavy-object", rest), backend="numpy")
@@ -164,19 +205,27 @@ def test_rounding_errors_count_as_rest_so_that_rest_to_rest_plans_can_be_replann
     assert np.abs(plans.states_at(0.0)[2]).max() > 0
     again = planner.replan(plans, 0.0, goal_q=rest.goal_q)
     np.testing.assert_array_equal(again.boundary.start_ddq, 0.0)
-    np.testing.assert_allclose(again.path_control_points, plans.path_control_points, atol=1e-5)
+    np.testing.assert_allclose(
+        again.path_control_points, plans.path_control_points, atol=1e-5
+    )
     limit = planner.robot.velocity_limit
     planner.plan(rest.start_q, rest.goal_q, start_dq=0.9e-9 * limit)
     with pytest.raises(UsageError, match="start_dq was zero"):
         planner.plan(rest.start_q, rest.goal_q, start_dq=1.1e-9 * limit)
     q, dq, _ = plans.states_at(plans.duration)
-    np.testing.assert_allclose(planner.plan(q, rest.start_q, start_dq=dq).boundary.start_dq, 0.0, atol=0)
+    np.testing.assert_allclose(
+        planner.plan(q, rest.start_q, start_dq=dq).boundary.start_dq, 0.0, atol=0
+    )
 
 
 def test_a_planner_is_pickled_without_its_kernels(planner, rows):
-    other = pickle.loads(pickle.dumps(Planner(planner.model, scale_time=False, backend="numpy")))
+    other = pickle.loads(
+        pickle.dumps(Planner(planner.model, scale_time=False, backend="numpy"))
+    )
     found = planned(other, rows).path_control_points
-    np.testing.assert_allclose(found, planned(planner, rows).path_control_points, atol=1e-5)
+    np.testing.assert_allclose(
+        found, planned(planner, rows).path_control_points, atol=1e-5
+    )
 
 
 def test_reprs_of_planners_models_and_plans(planner, rows):
@@ -186,26 +235,35 @@ def test_reprs_of_planners_models_and_plans(planner, rows):
     plans = planned(planner, rows)
     assert repr(plans) == "<40 plans of 'airhockey': 40 unknown>"
     status = np.array([1, 1, 2], np.uint8)
-    assert repr(replace(plans[:3], status=status)) == "<3 plans of 'airhockey': 2 valid, 1 invalid>"
+    assert (
+        repr(replace(plans[:3], status=status))
+        == "<3 plans of 'airhockey': 2 valid, 1 invalid>"
+    )
     assert repr(plans[:0]) == "<0 plans of 'airhockey'>"
 
 
 @pytest.mark.parametrize("wrong", [5, None, b"airhockey-hit"])
 def test_an_invalid_model_argument_raises_an_error_with_its_value(wrong):
-    with pytest.raises(UsageError, match=f"a model must be a name or a path, got {wrong!r}"):
+    with pytest.raises(
+        UsageError, match=f"a model must be a name or a path, got {wrong!r}"
+    ):
         Planner(wrong)
 
 
 @pytest.mark.parametrize("time", [[0.1, 0.2], "soon", [[0.1]] * 3])
 def test_a_wrong_number_of_times_raises_an_error(planner, rows, time):
     one = planned(planner, rows[:1])
-    with pytest.raises(UsageError, match="time must be one number or one for each of 1 plans, got"):
+    with pytest.raises(
+        UsageError, match="time must be one number or one for each of 1 plans, got"
+    ):
         planner.replan(one, time, goal_q=rows.goal_q[0])
 
 
 def test_a_time_outside_of_the_plan_raises_an_error(planner, rows):
     plans = planned(planner, rows)
-    with pytest.raises(UsageError, match=r"plan 0 lasts from 0 to .* cannot be evaluated at -0.1 s"):
+    with pytest.raises(
+        UsageError, match=r"plan 0 lasts from 0 to .* cannot be evaluated at -0.1 s"
+    ):
         planner.replan(plans, -0.1, goal_q=rows.goal_q)
     with pytest.raises(UsageError, match="cannot be evaluated at 100 s"):
         plans.states_at(100.0)
@@ -219,7 +277,8 @@ def test_a_rest_to_rest_model_rejects_moving_starts(tiny, rows):
     resting = boundary_of_columns(columns_of(tiny("airhockey-hit")), 20)
     planner = Planner(untrained_model("airhockey", resting))
     with pytest.raises(
-        UsageError, match=r"start_dq was zero in every row that the model was trained on, got .* in plan"
+        UsageError,
+        match=r"start_dq was zero in every row that the model was trained on, got .* in plan",
     ):
         planned(planner, rows)
     assert len(planned(planner, resting)) == 20
@@ -228,13 +287,21 @@ def test_a_rest_to_rest_model_rejects_moving_starts(tiny, rows):
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"goal_q": np.zeros(5)}, r"goal_q must have shape \(6,\) or \(N, 6\), got \(5,\)"),
+        (
+            {"goal_q": np.zeros(5)},
+            r"goal_q must have shape \(6,\) or \(N, 6\), got \(5,\)",
+        ),
         ({"goal_q": np.full(6, np.nan)}, "goal_q must be finite, got .* in row 0"),
         ({"goal_q": ["a"] * 6}, "goal_q must be an array of numbers"),
-        ({"goal_q": np.zeros((3, 6)), "start_dq": np.zeros((2, 6))}, "start_dq has 2 rows, another .* has 3"),
+        (
+            {"goal_q": np.zeros((3, 6)), "start_dq": np.zeros((2, 6))},
+            "start_dq has 2 rows, another .* has 3",
+        ),
     ],
 )
-def test_invalid_boundary_conditions_raise_errors_with_their_name(planner, wrong, message):
+def test_invalid_boundary_conditions_raise_errors_with_their_name(
+    planner, wrong, message
+):
     arguments = {"start_q": np.zeros(6), "goal_q": np.ones(6), **wrong}
     with pytest.raises(UsageError, match=message):
         planner.plan(**arguments)
@@ -253,7 +320,9 @@ def test_no_tasks_give_no_plans(planner, rows):
 def test_plans_are_the_same_on_every_backend(planner, rows, backend):
     other = Planner(planner.model, backend=backend)
     np.testing.assert_allclose(
-        planned(other, rows).path_control_points, planned(planner, rows).path_control_points, atol=1e-5
+        planned(other, rows).path_control_points,
+        planned(planner, rows).path_control_points,
+        atol=1e-5,
     )
 
 
@@ -263,10 +332,17 @@ def test_values_in_degrees_are_refused(planner, rows):
     with pytest.raises(UnitError, match=message) as caught:
         planner.plan(start, rows.goal_q[0])
     assert caught.value.argument == "start_q"
-    with pytest.raises(UnitError, match=r"goal_dq must be from .* rad/s, got 60 rad/s in plan 0 of joint_1"):
-        planner.plan(rows.start_q[0], rows.goal_q[0], goal_dq=np.array([60.0, 0, 0, 0, 0, 0]))
+    with pytest.raises(
+        UnitError,
+        match=r"goal_dq must be from .* rad/s, got 60 rad/s in plan 0 of joint_1",
+    ):
+        planner.plan(
+            rows.start_q[0], rows.goal_q[0], goal_dq=np.array([60.0, 0, 0, 0, 0, 0])
+        )
     with pytest.raises(UnitError, match=message):
         planner.plan_batch(replace(rows[:1], start_q=start[None]))
     with pytest.warns(UserWarning, match=message) as warnings:
         planner.plan(start, rows.goal_q[0], allow_large_angles=True)
-    assert {Path(each.filename).name for each in warnings} == {"test_planner.py"}  # the caller's line
+    assert {Path(each.filename).name for each in warnings} == {
+        "test_planner.py"
+    }  # the caller's line

@@ -36,9 +36,14 @@ FOLDER = Path(__file__).parents[2] / "datasets" / "models"
 def test_a_problem_selects_its_only_shipped_model_and_several_raise_an_error():
     alone = load_model("ur5-wipe")
     assert model_for(alone.problem).training == alone.training
-    with pytest.raises(UsageError, match=r"several shipped models \(heavy-object, heavy-object-anywhere\) for"):
+    with pytest.raises(
+        UsageError,
+        match=r"several shipped models \(heavy-object, heavy-object-anywhere\) for",
+    ):
         Planner(load_model("heavy-object").problem)
-    with pytest.raises(UsageError, match="airhockey-hit, airhockey-online, airhockey-replan"):
+    with pytest.raises(
+        UsageError, match="airhockey-hit, airhockey-online, airhockey-replan"
+    ):
         Planner(record_problem(load_problem("airhockey")))
     other = replace(alone.problem, recipe=alone.problem.recipe.replace("0.1", "0.2"))
     with pytest.raises(UsageError, match="no shipped model for the problem 'ur5-wipe'"):
@@ -57,10 +62,17 @@ def test_a_model_is_small_and_of_the_shipped_problem(name):
 
 
 # Those of the shipped robots: tests/problems/test_shipped_robots.py.
-@pytest.mark.parametrize("name", some([name for name in STRICT if name not in (*SHIPPED, "panda-scenes")], 1, "slow"))
+@pytest.mark.parametrize(
+    "name",
+    some(
+        [name for name in STRICT if name not in (*SHIPPED, "panda-scenes")], 1, "slow"
+    ),
+)
 def test_a_model_reaches_its_recorded_score(name, tiny):
     planner = Planner(name)
-    requests = read_rows(tiny(name), planner.model)  # raises an error if the recipe has changed
+    requests = read_rows(
+        tiny(name), planner.model
+    )  # raises an error if the recipe has changed
     found = evaluate_plans(planner.plan_batch(requests.boundary), workers=1)
     score = planner.model.training["score"]
     assert score["valid"] >= STRICT[name]
@@ -78,7 +90,10 @@ def test_the_planner_of_scenes_plans_in_unseen_scenes():
 
 @pytest.mark.parametrize("name", STRICT)
 def test_the_readme_documents_how_a_model_was_made(name):
-    text, training = (FOLDER / "README.md").read_text(encoding="utf-8"), load_model(name).training
+    text, training = (
+        (FOLDER / "README.md").read_text(encoding="utf-8"),
+        load_model(name).training,
+    )
     assert training["command"] in text
     assert f"--seed {training['dataset']['seed']}" in text
     assert f"{training['score']['valid']:.1%}" in text

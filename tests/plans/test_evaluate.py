@@ -31,16 +31,22 @@ def test_verdicts_are_those_of_judge() -> None:
     assert found.step == 1e-3
 
 
-def test_garbage_gets_an_honest_verdict_and_a_status_and_changes_nothing_beside_it() -> None:
+def test_garbage_gets_an_honest_verdict_and_a_status_and_changes_nothing_beside_it() -> (
+    None
+):
     cases = garbage()
     found = evaluate_plans(plans_of(*(plan for plan, _ in cases.values())))
-    assert [str(verdict.reason) for verdict in found.verdicts] == [reason for _, reason in cases.values()]
+    assert [str(verdict.reason) for verdict in found.verdicts] == [
+        reason for _, reason in cases.values()
+    ]
     status = {
         "ok": PlanStatus.VALID,
         "not finite": PlanStatus.NOT_FINITE,
         "rate not positive": PlanStatus.NOT_FORWARD,
     }
-    assert found.status.tolist() == [status.get(reason, PlanStatus.INVALID) for _, reason in cases.values()]
+    assert found.status.tolist() == [
+        status.get(reason, PlanStatus.INVALID) for _, reason in cases.values()
+    ]
     first, last = told(found.verdicts)[0], told(found.verdicts)[-1]
     assert first == last
 
@@ -59,9 +65,15 @@ def test_plans_in_memory_and_in_a_file_get_one_verdict_where_a_tip_position_was_
     save_plans(tmp_path / "changed.h5", changed)
     with pytest.warns(RuntimeWarning, match=f"changed.h5: {said}"):
         in_file = evaluate_plans(load_plans(tmp_path / "changed.h5"))
-    assert told(in_memory.verdicts) == told(in_file.verdicts) == told(evaluate_plans(right).verdicts)
+    assert (
+        told(in_memory.verdicts)
+        == told(in_file.verdicts)
+        == told(evaluate_plans(right).verdicts)
+    )
     assert in_memory.valid.all()
-    np.testing.assert_allclose(in_memory.plans.columns[f"{end}_xyz"], right.columns[f"{end}_xyz"], atol=1e-12)
+    np.testing.assert_allclose(
+        in_memory.plans.columns[f"{end}_xyz"], right.columns[f"{end}_xyz"], atol=1e-12
+    )
     assert evaluate_plans(right).plans is right
 
 
@@ -70,7 +82,10 @@ def test_processes_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cnpgen.plans.evaluate, "PLANS_PER_VERDICT_TASK", 3)
     plans = plans_of(*(plan for plan, _ in garbage().values()))
     counts: list[int] = []
-    one, two = (evaluate_plans(plans, workers=workers, progress=counts.append) for workers in (1, 2))
+    one, two = (
+        evaluate_plans(plans, workers=workers, progress=counts.append)
+        for workers in (1, 2)
+    )
     assert json.dumps([*one.rows()]) == json.dumps([*two.rows()])
     assert counts == 2 * [3, 3, 3, 2]
 
@@ -87,7 +102,9 @@ def test_tolerances_of_another_problem_file_count(tmp_path: Path) -> None:
     plan = load("hit")
     save_plans(tmp_path / "plans.h5", plans_of(plan))
     strict = plan.with_constraint("Table", tolerance=1e-6).problem
-    assert not evaluate_plans(load_plans(tmp_path / "plans.h5", problem=strict)).valid.any()
+    assert not evaluate_plans(
+        load_plans(tmp_path / "plans.h5", problem=strict)
+    ).valid.any()
 
 
 def test_no_plans_have_no_verdicts() -> None:
@@ -97,7 +114,9 @@ def test_no_plans_have_no_verdicts() -> None:
     assert found.summary()["valid_ratio"] is None
 
 
-@pytest.mark.parametrize("arguments", [{"step": 0.0}, {"step": np.nan}, {"step": "1ms"}, {"workers": 0}])
+@pytest.mark.parametrize(
+    "arguments", [{"step": 0.0}, {"step": np.nan}, {"step": "1ms"}, {"workers": 0}]
+)
 def test_arguments_that_make_no_sense_are_refused(arguments: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match=r"step|workers"):
         evaluate_plans(plans_of(load("hit")), **arguments)
@@ -107,4 +126,7 @@ def test_a_status_can_be_kept_with_the_plans(tmp_path: Path) -> None:
     plans = plans_of(load("hit"), perturbed(load("hit"), 0.05))
     judged = replace(plans, status=evaluate_plans(plans).status)
     save_plans(tmp_path / "judged.h5", judged)
-    assert load_plans(tmp_path / "judged.h5").status.tolist() == [PlanStatus.VALID, PlanStatus.INVALID]
+    assert load_plans(tmp_path / "judged.h5").status.tolist() == [
+        PlanStatus.VALID,
+        PlanStatus.INVALID,
+    ]

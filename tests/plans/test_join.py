@@ -19,7 +19,9 @@ from cnpgen.plans.plans import Plans
 
 
 def unsolved(plans: Plans) -> Plans:
-    return replace(plans, path_control_points=np.full_like(plans.path_control_points, np.nan))
+    return replace(
+        plans, path_control_points=np.full_like(plans.path_control_points, np.nan)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +35,9 @@ def three(planner) -> tuple[Plans, Plans, Plans, np.ndarray, np.ndarray]:
     goals = draw_boundary_problems("airhockey-replan", 3, seed=3).boundary
     first = planner.plan_batch(goals)
     switch = 0.3 * first.duration
-    second = planner.replan(first, switch, goal_q=goals.goal_q[::-1], goal_dq=goals.goal_dq[::-1])
+    second = planner.replan(
+        first, switch, goal_q=goals.goal_q[::-1], goal_dq=goals.goal_dq[::-1]
+    )
     later = 0.5 * second.duration
     third = planner.replan(second, later, goal_q=goals.goal_q, goal_dq=goals.goal_dq)
     return first, second, third, switch, switch + later
@@ -48,9 +52,13 @@ def test_what_is_joined_is_each_plan_in_its_time_and_nowhere_jumps(three):
         (0.5 * (switch + later), second, 0.5 * (later - switch)),
     ):
         states = joined.motion.at_times(time[:, None])
-        for name, expected in zip(("q", "dq", "ddq"), plans.states_at(own), strict=True):
+        for name, expected in zip(
+            ("q", "dq", "ddq"), plans.states_at(own), strict=True
+        ):
             np.testing.assert_allclose(getattr(states, name)[:, 0], expected, atol=1e-9)
-    around = np.stack([switch - 1e-9, switch + 1e-9, later - 1e-9, later + 1e-9], axis=1)
+    around = np.stack(
+        [switch - 1e-9, switch + 1e-9, later - 1e-9, later + 1e-9], axis=1
+    )
     states = joined.motion.at_times(around)
     for values in (states.q, states.dq):
         assert np.abs(np.diff(values, axis=1)[:, [0, 2]]).max() < 1e-6
@@ -63,7 +71,9 @@ def test_what_follows_a_whole_plan_begins_at_its_end(planner):
     first = planner.plan(planner.robot.home, aside)
     end = first.states_at(first.duration)
     second = planner.plan(end[0], planner.robot.home, start_dq=end[1], start_ddq=end[2])
-    np.testing.assert_allclose(join_plans(first, second).duration, first.duration + second.duration)
+    np.testing.assert_allclose(
+        join_plans(first, second).duration, first.duration + second.duration
+    )
 
 
 @pytest.mark.parametrize("share", [0.5, 0.95, 0.999])
@@ -79,12 +89,15 @@ def test_what_is_left_of_a_plan_can_be_joined_to_it_however_short(planner, share
 def test_a_jump_is_refused_with_its_size_place_and_time(three):
     first, second, _, switch, _ = three
     with pytest.raises(
-        UsageError, match=r"plan \d cannot be joined: q jumps by .*e-.* rad at .* s, expected at most 1e-09"
+        UsageError,
+        match=r"plan \d cannot be joined: q jumps by .*e-.* rad at .* s, expected at most 1e-09",
     ):
         join_plans(first, second, at=switch + 1e-6)
     moved = second.path_control_points.copy()
     moved[1, 2] += 1e-8  # the third control point decides the acceleration alone
-    with pytest.raises(UsageError, match=r"plan 1 cannot be joined: ddq jumps by .* rad/s\^2"):
+    with pytest.raises(
+        UsageError, match=r"plan 1 cannot be joined: ddq jumps by .* rad/s\^2"
+    ):
         join_plans(first, replace(second, path_control_points=moved), at=switch)
     moved = second.path_control_points.copy()
     moved[2, 0, 0] = np.nan
@@ -95,16 +108,31 @@ def test_a_jump_is_refused_with_its_size_place_and_time(three):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda first, second, at: (first, second[:2], at), "3 plans are followed by 2"),
-        (lambda first, second, at: (first, second, [0.1, 0.2]), "at must be one number or one for each of 3 plans"),
+        (
+            lambda first, second, at: (first, second[:2], at),
+            "3 plans are followed by 2",
+        ),
+        (
+            lambda first, second, at: (first, second, [0.1, 0.2]),
+            "at must be one number or one for each of 3 plans",
+        ),
         (
             lambda first, second, at: (first, second, 60.0),
             r"plan 0 cannot be cut at 60 s: its last part lasts from 0 to",
         ),
-        (lambda first, second, at: (first, second, -0.1), r"plan 0 cannot be cut at -0.1 s"),
+        (
+            lambda first, second, at: (first, second, -0.1),
+            r"plan 0 cannot be cut at -0.1 s",
+        ),
         (lambda first, second, at: (first, "plans.h5", at), "must be Plans"),
-        (lambda first, second, at: (first, unsolved(second), at), "plan 0 has no control points yet"),
-        (lambda first, second, at: (unsolved(first), second, at), "plan 0 has no control points yet"),
+        (
+            lambda first, second, at: (first, unsolved(second), at),
+            "plan 0 has no control points yet",
+        ),
+        (
+            lambda first, second, at: (unsolved(first), second, at),
+            "plan 0 has no control points yet",
+        ),
     ],
 )
 def test_what_does_not_fit_together_is_refused(three, change, message):
@@ -125,7 +153,9 @@ def test_a_sequence_is_valid_only_if_all_of_its_plans_are(three):
     valid, invalid, unknown = PlanStatus.VALID, PlanStatus.INVALID, PlanStatus.UNKNOWN
     first = replace(first, status=np.array([valid, valid, valid], np.uint8))
     second = replace(second, status=np.array([valid, invalid, unknown], np.uint8))
-    np.testing.assert_array_equal(join_plans(first, second, at=switch).status, [valid, invalid, unknown])
+    np.testing.assert_array_equal(
+        join_plans(first, second, at=switch).status, [valid, invalid, unknown]
+    )
 
 
 def test_a_sequence_is_exported_like_a_plan(three, tmp_path):
@@ -136,11 +166,15 @@ def test_a_sequence_is_exported_like_a_plan(three, tmp_path):
     with np.load(tmp_path / "joined.npz") as data:
         t, q, dq = (data[f"plan_00001_{name}"] for name in ("t", "q", "dq"))
     assert t[-1] == pytest.approx(joined.duration[1])
-    np.testing.assert_allclose(np.diff(q, axis=0)[:-1] / 1e-3, (dq[1:-1] + dq[:-2]) / 2, atol=1e-3)  # one smooth motion
+    np.testing.assert_allclose(
+        np.diff(q, axis=0)[:-1] / 1e-3, (dq[1:-1] + dq[:-2]) / 2, atol=1e-3
+    )  # one smooth motion
     np.testing.assert_allclose(q[-1], second.boundary.goal_q[1], atol=1e-9)
 
 
-def test_the_command_joins_files_and_refuses_jumps(three, tmp_path, monkeypatch, capsys):
+def test_the_command_joins_files_and_refuses_jumps(
+    three, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     first, second, _, switch, _ = three
     save_plans("first.h5", first[1])
@@ -148,7 +182,9 @@ def test_the_command_joins_files_and_refuses_jumps(three, tmp_path, monkeypatch,
     at = repr(float(switch[1]))
     command = ["export", "first.h5", "--to", "csv", "-o", "out", "--join", "second.h5"]
     assert main([*command, "--at", at]) == 0
-    rows = list(csv.reader(Path("out/plan_00000.csv").read_text(encoding="utf-8").splitlines()))
+    rows = list(
+        csv.reader(Path("out/plan_00000.csv").read_text(encoding="utf-8").splitlines())
+    )
     assert float(rows[-1][0]) == pytest.approx(switch[1] + second.duration[1])
     capsys.readouterr()
     assert main([*command, "--at", "1ms", "--force"]) == 2

@@ -18,7 +18,11 @@ from cnpgen.problems.problem_record import open_problem
 from cnpgen.refine.refine_plans import refine_plans, solve_plans
 from tests.conftest import some
 
-MODELS = ("airhockey-online", "heavy-object", "airhockey-replan")  # time-parametrized, scaled in time, with hits
+MODELS = (
+    "airhockey-online",
+    "heavy-object",
+    "airhockey-replan",
+)  # time-parametrized, scaled in time, with hits
 
 
 @pytest.fixture(scope="module", params=some(MODELS, 2, "slow"))
@@ -31,19 +35,30 @@ def none(planner: Planner) -> Plans:
     return planner.plan(np.zeros((0, planner.robot.n)), np.zeros((0, planner.robot.n)))
 
 
-def test_nothing_is_planned_refined_judged_saved_and_joined(planner: Planner, none: Plans, tmp_path: Path) -> None:
+def test_nothing_is_planned_refined_judged_saved_and_joined(
+    planner: Planner, none: Plans, tmp_path: Path
+) -> None:
     assert [len(values) for values in none.states_at(0.1)] == [0, 0, 0]
     assert len(planner.replan(none, 0.1, goal_q=none.boundary.goal_q)) == 0
-    for found in (refine_plans(none), solve_plans(none), refine_plans(none, workers=2, journal=tmp_path / "journal")):
+    for found in (
+        refine_plans(none),
+        solve_plans(none),
+        refine_plans(none, workers=2, journal=tmp_path / "journal"),
+    ):
         assert (len(found.plans), found.summary()["valid"]) == (0, 0)
     assert evaluate_plans(none, workers=2).summary()["valid_ratio"] is None
     problem, robot = open_problem(none.problem)
-    assert judge(problem, robot, none.motion, none.boundary, none.scene, np.zeros((0, 3))) == []
+    assert (
+        judge(problem, robot, none.motion, none.boundary, none.scene, np.zeros((0, 3)))
+        == []
+    )
     save_plans(tmp_path / "none.h5", none)
     assert len(join_plans(none, none, at=[])) == 0
 
 
-def test_what_makes_no_sense_of_nothing_is_refused(planner: Planner, none: Plans, tmp_path: Path) -> None:
+def test_what_makes_no_sense_of_nothing_is_refused(
+    planner: Planner, none: Plans, tmp_path: Path
+) -> None:
     for plans in (none, join_plans(none, none)):
         with pytest.raises(DatasetError, match="none of the 0 plans"):
             export_plans(plans, tmp_path / "out", to="csv")

@@ -47,27 +47,57 @@ DOCS = Path(__file__).parents[2] / "docs" / "reference" / "plan-format.md"
 AIRHOCKEY, HEAVY = load_problem("airhockey"), load_problem("heavy-object")
 RECORD = record_problem(AIRHOCKEY)
 N = 7
-ARRAYS = ("path_control_points", "rate_control_points", "sample_id", "status", "duration")
+ARRAYS = (
+    "path_control_points",
+    "rate_control_points",
+    "sample_id",
+    "status",
+    "duration",
+)
 
 
-def draw_plans(seed: int = 0, *, n: int = N, goal_ddq: bool = False, problem: Any = AIRHOCKEY, **others: Any) -> Plans:
+def draw_plans(
+    seed: int = 0,
+    *,
+    n: int = N,
+    goal_ddq: bool = False,
+    problem: Any = AIRHOCKEY,
+    **others: Any,
+) -> Plans:
     numbers = np.random.default_rng(seed)
     joints, spec = len(problem.robot.joints), problem.trajectory
     parts = numbers.uniform(-1, 1, (6, n, joints))
     boundary = Boundary(*parts[:5], parts[5] if goal_ddq else None)
     rate = np.exp(numbers.normal(0.5, 0.2, (n, spec.rate_control_points)))
     path = assemble(boundary, anchor_line(boundary, rate, spec), rate, spec)
-    return make_plans(problem, boundary, path_control_points=path, rate_control_points=rate, **others)
+    return make_plans(
+        problem, boundary, path_control_points=path, rate_control_points=rate, **others
+    )
 
 
 def assert_equal(one: Plans, other: Plans) -> None:
     for name, values in vars(one.boundary).items():
-        assert np.array_equal(values, getattr(other.boundary, name), equal_nan=True) if values is not None else True
+        assert (
+            np.array_equal(values, getattr(other.boundary, name), equal_nan=True)
+            if values is not None
+            else True
+        )
         assert (values is None) == (getattr(other.boundary, name) is None)
-    for name in ("path_control_points", "rate_control_points", "sample_id", "status", "duration"):
-        assert np.array_equal(getattr(one, name), getattr(other, name), equal_nan=True), name
+    for name in (
+        "path_control_points",
+        "rate_control_points",
+        "sample_id",
+        "status",
+        "duration",
+    ):
+        assert np.array_equal(
+            getattr(one, name), getattr(other, name), equal_nan=True
+        ), name
     assert one.columns.keys() == other.columns.keys()
-    assert all(np.array_equal(values, other.columns[name], equal_nan=True) for name, values in one.columns.items())
+    assert all(
+        np.array_equal(values, other.columns[name], equal_nan=True)
+        for name, values in one.columns.items()
+    )
     assert one.degree == other.degree
     assert one.problem == other.problem
 
@@ -76,12 +106,28 @@ def assert_equal(one: Plans, other: Plans) -> None:
 
 
 @pytest.mark.parametrize("goal_ddq", [False, True])
-@pytest.mark.parametrize("problem", [AIRHOCKEY, HEAVY], ids=["airhockey", "heavy-object"])
-def test_plans_come_back_as_they_were(tmp_path: Path, problem: Any, goal_ddq: bool) -> None:
-    columns = {"hit_angle": np.linspace(-1, 1, N), "puck": np.arange(2.0 * N).reshape(N, 2)}
-    status = [PlanStatus.VALID, PlanStatus.INVALID, *[PlanStatus.UNKNOWN] * (N - 3), PlanStatus.NOT_FORWARD]
+@pytest.mark.parametrize(
+    "problem", [AIRHOCKEY, HEAVY], ids=["airhockey", "heavy-object"]
+)
+def test_plans_come_back_as_they_were(
+    tmp_path: Path, problem: Any, goal_ddq: bool
+) -> None:
+    columns = {
+        "hit_angle": np.linspace(-1, 1, N),
+        "puck": np.arange(2.0 * N).reshape(N, 2),
+    }
+    status = [
+        PlanStatus.VALID,
+        PlanStatus.INVALID,
+        *[PlanStatus.UNKNOWN] * (N - 3),
+        PlanStatus.NOT_FORWARD,
+    ]
     plans = draw_plans(
-        goal_ddq=goal_ddq, problem=problem, columns=columns, sample_id=np.arange(N) * 1000 - 3, status=status
+        goal_ddq=goal_ddq,
+        problem=problem,
+        columns=columns,
+        sample_id=np.arange(N) * 1000 - 3,
+        status=status,
     )
     save_plans(tmp_path / "deep" / "plan.h5", plans)
     found = load_plans(tmp_path / "deep" / "plan.h5", problem=problem)
@@ -90,13 +136,24 @@ def test_plans_come_back_as_they_were(tmp_path: Path, problem: Any, goal_ddq: bo
     assert [item.name for item in (tmp_path / "deep").iterdir()] == ["plan.h5"]
 
 
-def test_equal_plans_are_equal_bytes_whatever_the_order_of_columns_and_the_folder(tmp_path: Path) -> None:
+def test_equal_plans_are_equal_bytes_whatever_the_order_of_columns_and_the_folder(
+    tmp_path: Path,
+) -> None:
     columns = {"b": np.zeros(N), "a": np.ones(N)}
-    plans, turned = (draw_plans(columns=dict(items)) for items in (columns.items(), [*columns.items()][::-1]))
-    for name, item in (("one.h5", plans), ("two.h5", turned), ("sub/three.h5", load_after(tmp_path, plans))):
+    plans, turned = (
+        draw_plans(columns=dict(items))
+        for items in (columns.items(), [*columns.items()][::-1])
+    )
+    for name, item in (
+        ("one.h5", plans),
+        ("two.h5", turned),
+        ("sub/three.h5", load_after(tmp_path, plans)),
+    ):
         save_plans(tmp_path / name, item)
     assert (tmp_path / "one.h5").read_bytes() == (tmp_path / "two.h5").read_bytes()
-    assert (tmp_path / "one.h5").read_bytes() == (tmp_path / "sub" / "three.h5").read_bytes()
+    assert (tmp_path / "one.h5").read_bytes() == (
+        tmp_path / "sub" / "three.h5"
+    ).read_bytes()
     assert str(tmp_path).encode() not in (tmp_path / "one.h5").read_bytes()
 
 
@@ -105,11 +162,19 @@ def load_after(folder: Path, plans: Plans) -> Plans:
     return load_plans(folder / "saved.h5")
 
 
-def test_a_file_needs_no_other_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_needs_no_other_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = tmp_path / "mine"
     shutil.copytree(AIRHOCKEY.path.parent, folder)
-    text = (folder / "problem.toml").read_text(encoding="utf-8").replace('name = "airhockey"', 'name = "mine"')
-    (folder / "problem.toml").write_text(text.replace("velocity_scale = 0.8", "velocity_scale = 0.7"), encoding="utf-8")
+    text = (
+        (folder / "problem.toml")
+        .read_text(encoding="utf-8")
+        .replace('name = "airhockey"', 'name = "mine"')
+    )
+    (folder / "problem.toml").write_text(
+        text.replace("velocity_scale = 0.8", "velocity_scale = 0.7"), encoding="utf-8"
+    )
     problem = load_problem(folder / "problem.toml")
     plans = draw_plans(problem=problem)
     save_plans(tmp_path / "plan.h5", plans)
@@ -119,10 +184,13 @@ def test_a_file_needs_no_other_file(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         robot = load_robot(restored)
         assert restored.name == "mine"
         assert np.allclose(robot.velocity_limit, 0.7 * robot.rated_velocity)
-        assert resolved(restored) == resolved(replace(problem, robot=replace(problem.robot, urdf="robot.urdf")))
+        assert resolved(restored) == resolved(
+            replace(problem, robot=replace(problem.robot, urdf="robot.urdf"))
+        )
     assert found.problem.comparable_sha256 == plans.problem.comparable_sha256
     with pytest.raises(
-        DatasetError, match=r"of problem 'mine', not of 'airhockey': they differ in limits.velocity_scale"
+        DatasetError,
+        match=r"of problem 'mine', not of 'airhockey': they differ in limits.velocity_scale",
     ):
         load_plans(tmp_path / "plan.h5", problem="airhockey")
 
@@ -154,7 +222,9 @@ def test_every_dataset_says_what_it_is(tmp_path: Path) -> None:
 
 
 def test_ten_lines_of_any_trainer_write_a_valid_file(tmp_path: Path) -> None:
-    block = re.findall(r"```python\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.S)[0]
+    block = re.findall(r"```python\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.S)[
+        0
+    ]
     assert "cnpgen" not in block
     assert sum(bool(line.strip()) for line in block.splitlines()) <= 10
     subprocess.run([sys.executable, "-c", block], cwd=tmp_path, check=True)
@@ -177,15 +247,21 @@ def test_ten_lines_of_any_trainer_write_a_valid_file(tmp_path: Path) -> None:
 def write_minimal(path: Path, **changes: Any) -> Path:
     """Write the least that is a plan file, with changes: name -> values, None to leave a dataset out."""
     content: dict[str, Any] = {
-        name: np.zeros((3, 6)) for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
+        name: np.zeros((3, 6))
+        for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
     }
-    content |= {"path_control_points": np.zeros((3, 15, 6)), "rate_control_points": np.ones((3, 20))}
+    content |= {
+        "path_control_points": np.zeros((3, 15, 6)),
+        "rate_control_points": np.ones((3, 20)),
+    }
     attributes = {"problem": "airhockey"} | changes.pop("attributes", {})
     with h5py.File(path, "w") as file:
         for name, values in (content | changes).items():
             if values is not None:
                 file[name] = values
-        file.attrs.update({name: value for name, value in attributes.items() if value is not None})
+        file.attrs.update(
+            {name: value for name, value in attributes.items() if value is not None}
+        )
     return path
 
 
@@ -212,25 +288,38 @@ def test_other_float_types_and_sizes_are_welcome(tmp_path: Path) -> None:
 
 def test_a_problem_beside_the_file_or_in_the_call(tmp_path: Path) -> None:
     shutil.copytree(HEAVY.path.parent, tmp_path / "heavy")
-    fields = {name: np.zeros((3, 7)) for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")}
+    fields = {
+        name: np.zeros((3, 7))
+        for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
+    }
     fields |= {"path_control_points": np.zeros((3, 15, 7))}
-    beside = write_minimal(tmp_path / "a.h5", **fields, attributes={"problem": "heavy/problem.toml"})
+    beside = write_minimal(
+        tmp_path / "a.h5", **fields, attributes={"problem": "heavy/problem.toml"}
+    )
     missing = write_minimal(tmp_path / "b.h5", **fields, attributes={"problem": None})
     assert load_plans(beside).problem.name == "heavy-object"
     assert (
-        load_plans(beside, problem="heavy-object").problem.comparable_sha256 == record_problem(HEAVY).comparable_sha256
+        load_plans(beside, problem="heavy-object").problem.comparable_sha256
+        == record_problem(HEAVY).comparable_sha256
     )
     assert load_plans(missing, problem=HEAVY).problem == record_problem(HEAVY)
-    with pytest.raises(UsageError, match=r"b\.h5 does not name its problem: set its attribute 'problem'"):
+    with pytest.raises(
+        UsageError,
+        match=r"b\.h5 does not name its problem: set its attribute 'problem'",
+    ):
         load_plans(missing)
 
 
-def test_tolerances_of_the_call_count_and_do_not_make_another_problem(tmp_path: Path) -> None:
+def test_tolerances_of_the_call_count_and_do_not_make_another_problem(
+    tmp_path: Path,
+) -> None:
     save_plans(tmp_path / "plan.h5", draw_plans())
     loose = replace(
         AIRHOCKEY,
         name="loose",
-        constraint=tuple(replace(item, tolerance=0.5, budget=1.0) for item in AIRHOCKEY.constraint),
+        constraint=tuple(
+            replace(item, tolerance=0.5, budget=1.0) for item in AIRHOCKEY.constraint
+        ),
     )
     plans = load_plans(tmp_path / "plan.h5", problem=loose)
     with plans.problem.restored() as problem:
@@ -240,17 +329,29 @@ def test_tolerances_of_the_call_count_and_do_not_make_another_problem(tmp_path: 
 @pytest.mark.parametrize(
     ("change", "key"),
     [
-        (lambda p: replace(p, limits=replace(p.limits, torque_scale=0.5)), "limits.torque_scale"),
+        (
+            lambda p: replace(p, limits=replace(p.limits, torque_scale=0.5)),
+            "limits.torque_scale",
+        ),
         (lambda p: replace(p, robot=replace(p.robot, tip="F_link_6")), "robot.tip"),
-        (lambda p: replace(p, constraint=p.constraint[:-2] + p.constraint[-1:]), "constraint.table"),
+        (
+            lambda p: replace(p, constraint=p.constraint[:-2] + p.constraint[-1:]),
+            "constraint.table",
+        ),
     ],
 )
-def test_another_problem_s_file_is_refused(tmp_path: Path, change: Callable[[Any], Any], key: str) -> None:
+def test_another_problem_s_file_is_refused(
+    tmp_path: Path, change: Callable[[Any], Any], key: str
+) -> None:
     save_plans(tmp_path / "plan.h5", draw_plans())
-    with pytest.raises(DatasetError, match=rf"plan\.h5 has plans of problem 'airhockey'.*they differ in {key}$"):
+    with pytest.raises(
+        DatasetError,
+        match=rf"plan\.h5 has plans of problem 'airhockey'.*they differ in {key}$",
+    ):
         load_plans(tmp_path / "plan.h5", problem=change(AIRHOCKEY))
     with pytest.raises(
-        DatasetError, match=r"of problem 'airhockey', not of 'heavy-object': they differ in robot\.joints"
+        DatasetError,
+        match=r"of problem 'airhockey', not of 'heavy-object': they differ in robot\.joints",
     ):
         load_plans(tmp_path / "plan.h5", problem="heavy-object")
 
@@ -258,9 +359,15 @@ def test_another_problem_s_file_is_refused(tmp_path: Path, change: Callable[[Any
 def test_constraints_of_one_kind_all_count() -> None:
     once = json.loads(RECORD.recipe)
     table = next(each for each in once["constraint"] if each["use"] == "table")
-    twice, others = (once | {"constraint": [*once["constraint"], table | {"x": x}]} for x in (table["x"], [0.9, 1.0]))
+    twice, others = (
+        once | {"constraint": [*once["constraint"], table | {"x": x}]}
+        for x in (table["x"], [0.9, 1.0])
+    )
     narrow = once | {"constraint": [table | {"x": [0.9, 1.0]}, *once["constraint"]]}
-    records = [ProblemRecord(json.dumps(each), RECORD.urdf) for each in (once, twice, others, narrow)]
+    records = [
+        ProblemRecord(json.dumps(each), RECORD.urdf)
+        for each in (once, twice, others, narrow)
+    ]
     assert len({record.comparable_sha256 for record in records}) == 4
     assert records[1].differences(records[2]) == ["constraint.table 2.x"]
 
@@ -269,8 +376,15 @@ def test_another_robot_file_is_another_problem() -> None:
     other = ProblemRecord(RECORD.recipe, RECORD.urdf.replace("iiwa14", "iiwa15", 1))
     assert other.urdf != RECORD.urdf
     assert RECORD.differences(other) == ["robot.urdf"]
-    renamed = json.loads(RECORD.recipe) | {"name": "x", "title": "y", "trajectory": {"degree": 5}}
-    assert ProblemRecord(json.dumps(renamed), RECORD.urdf).comparable_sha256 == RECORD.comparable_sha256
+    renamed = json.loads(RECORD.recipe) | {
+        "name": "x",
+        "title": "y",
+        "trajectory": {"degree": 5},
+    }
+    assert (
+        ProblemRecord(json.dumps(renamed), RECORD.urdf).comparable_sha256
+        == RECORD.comparable_sha256
+    )
 
 
 @pytest.mark.parametrize(
@@ -278,55 +392,111 @@ def test_another_robot_file_is_another_problem() -> None:
     [
         ({"start_dq": None}, "lacks start_dq: plans need start_q, start_dq"),
         ({"goal_dq": None, "goal_xyz": np.zeros((3, 3))}, "lacks goal_dq: plans need"),
-        ({"goal_dqq": np.zeros((3, 6))}, r"'goal_dqq' is almost 'goal_ddq', which the file lacks"),
-        ({"rate_control_points": None, "rate_control_pionts": np.ones((3, 20))}, r"did you mean 'rate_control_pionts'"),
-        ({"start_q": np.zeros((3, 7))}, r"start_q must have shape \(3, 6\) .* got \(3, 7\)"),
+        (
+            {"goal_dqq": np.zeros((3, 6))},
+            r"'goal_dqq' is almost 'goal_ddq', which the file lacks",
+        ),
+        (
+            {"rate_control_points": None, "rate_control_pionts": np.ones((3, 20))},
+            r"did you mean 'rate_control_pionts'",
+        ),
+        (
+            {"start_q": np.zeros((3, 7))},
+            r"start_q must have shape \(3, 6\) .* got \(3, 7\)",
+        ),
         ({"goal_q": np.zeros((2, 6))}, r"goal_q must have shape \(3, 6\)"),
         ({"goal_dq": np.zeros(6)}, r"goal_dq must have shape \(3, 6\)"),
         ({"goal_ddq": np.zeros((3, 5))}, r"goal_ddq must have shape \(3, 6\)"),
-        ({"path_control_points": np.zeros((3, 90))}, r"path_control_points must have shape \(N, C, n\), got \(3, 90\)"),
-        ({"path_control_points": np.zeros((3, 15, 7))}, "has 7 joints, but 'airhockey' plans 6"),
+        (
+            {"path_control_points": np.zeros((3, 90))},
+            r"path_control_points must have shape \(N, C, n\), got \(3, 90\)",
+        ),
+        (
+            {"path_control_points": np.zeros((3, 15, 7))},
+            "has 7 joints, but 'airhockey' plans 6",
+        ),
         ({"path_control_points": np.zeros((3, 8, 6))}, "at least 9 of degree 7"),
-        ({"path_control_points": 1.0}, r"path_control_points must have shape \(N, C, n\)"),
-        ({"rate_control_points": np.zeros((3, 7))}, r"rate_control_points must have shape \(3, R\) with R > 7"),
-        ({"rate_control_points": np.zeros((3, 20, 1))}, r"rate_control_points must have shape \(3, R\)"),
+        (
+            {"path_control_points": 1.0},
+            r"path_control_points must have shape \(N, C, n\)",
+        ),
+        (
+            {"rate_control_points": np.zeros((3, 7))},
+            r"rate_control_points must have shape \(3, R\) with R > 7",
+        ),
+        (
+            {"rate_control_points": np.zeros((3, 20, 1))},
+            r"rate_control_points must have shape \(3, R\)",
+        ),
         ({"duration": np.zeros(4)}, r"duration must have shape \(3,\), got \(4,\)"),
         ({"sample_id": np.zeros((3, 1), int)}, r"sample_id must have shape \(3,\)"),
         ({"status": np.zeros(2, int)}, r"status must have shape \(3,\), got \(2,\)"),
         ({"start_xyz": np.zeros((3, 2))}, r"start_xyz must have shape \(3, 3\)"),
-        ({"loss": np.zeros(1000)}, r"loss must have shape \(3,\) or \(3, w\), got \(1000,\)"),
+        (
+            {"loss": np.zeros(1000)},
+            r"loss must have shape \(3,\) or \(3, w\), got \(1000,\)",
+        ),
         ({"loss": np.zeros((3, 2, 2))}, r"loss must have shape \(3,\) or \(3, w\)"),
         ({"loss": 0.5}, r"loss must have shape \(3,\)"),
         ({"start_q": np.zeros((3, 6), int)}, "start_q must hold floats, got int64"),
-        ({"start_q": np.zeros((3, 6), complex)}, "start_q must hold numbers, got complex128"),
+        (
+            {"start_q": np.zeros((3, 6), complex)},
+            "start_q must hold numbers, got complex128",
+        ),
         ({"start_q": np.full((3, 6), b"x")}, r"start_q must hold numbers, got \|S1"),
         ({"sample_id": np.zeros(3)}, "sample_id must hold integers, got float64"),
-        ({"sample_id": np.full(3, 2**63, np.uint64)}, r"sample_id must hold integers below 2\^63, got 9223372036854"),
+        (
+            {"sample_id": np.full(3, 2**63, np.uint64)},
+            r"sample_id must hold integers below 2\^63, got 9223372036854",
+        ),
         ({"names": np.array([b"a", b"b", b"c"])}, "names must hold numbers"),
         (
             {"attributes": {"problem": "airhokey"}},
             "attribute 'problem': unknown problem 'airhokey' .did you mean 'airhockey'",
         ),
-        ({"attributes": {"problem": "no/problem.toml"}}, "no such file: .*problem.toml"),
+        (
+            {"attributes": {"problem": "no/problem.toml"}},
+            "no such file: .*problem.toml",
+        ),
         ({"attributes": {"problem": 3}}, "attribute 'problem' must be a text, got"),
         ({"attributes": {"degree": 7.5}}, "attribute 'degree' must be an integer, got"),
-        ({"attributes": {"degree": 1}}, "degree must be an integer from 3 to 20, got 1"),
+        (
+            {"attributes": {"degree": 1}},
+            "degree must be an integer from 3 to 20, got 1",
+        ),
         ({"attributes": {"degree": [7, 7]}}, "attribute 'degree' must be an integer"),
-        ({"attributes": {"format": "other-plans"}}, "is a other-plans file, not one of plans"),
-        ({"attributes": {"format_version": 2}}, "format version 2, this cnpgen reads 1: upgrade"),
-        ({"attributes": {"problem_recipe": "{}"}}, "has an attribute 'problem_recipe' but no problem_urdf and no"),
+        (
+            {"attributes": {"format": "other-plans"}},
+            "is a other-plans file, not one of plans",
+        ),
+        (
+            {"attributes": {"format_version": 2}},
+            "format version 2, this cnpgen reads 1: upgrade",
+        ),
+        (
+            {"attributes": {"problem_recipe": "{}"}},
+            "has an attribute 'problem_recipe' but no problem_urdf and no",
+        ),
     ],
 )
-def test_wrong_files_are_refused_by_name_and_field(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+def test_wrong_files_are_refused_by_name_and_field(
+    tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
     path = write_minimal(tmp_path / "theirs.h5", **changes)
     with pytest.raises(DatasetError, match=message) as caught:
         load_plans(path)
     assert str(path) in str(caught.value)
 
 
-@pytest.mark.parametrize("recipe", ["{", "[]", "{}", '{"name": 1, "robot": 2, "constraint": 3}', b"\xff\xfe"])
+@pytest.mark.parametrize(
+    "recipe", ["{", "[]", "{}", '{"name": 1, "robot": 2, "constraint": 3}', b"\xff\xfe"]
+)
 def test_a_damaged_problem_is_said(tmp_path: Path, recipe: Any) -> None:
-    texts = {"problem_recipe": recipe, "problem_urdf": "<robot/>", "problem_sha256": "0" * 64}
+    texts = {
+        "problem_recipe": recipe,
+        "problem_urdf": "<robot/>",
+        "problem_sha256": "0" * 64,
+    }
     if isinstance(recipe, bytes):
         texts["problem_recipe"] = np.bytes_(recipe)
     with pytest.raises(DatasetError, match=r"theirs\.h5 is damaged"):
@@ -336,28 +506,49 @@ def test_a_damaged_problem_is_said(tmp_path: Path, recipe: Any) -> None:
 def test_a_changed_problem_is_said(tmp_path: Path) -> None:
     save_plans(tmp_path / "plan.h5", draw_plans())
     with h5py.File(remove_checksum(tmp_path / "plan.h5"), "a") as file:
-        file.attrs["problem_recipe"] = RECORD.recipe.replace('"velocity_scale": 0.8', '"velocity_scale": 0.9')
-    with pytest.raises(DatasetError, match="its problem was changed after it was written"):
+        file.attrs["problem_recipe"] = RECORD.recipe.replace(
+            '"velocity_scale": 0.8', '"velocity_scale": 0.9'
+        )
+    with pytest.raises(
+        DatasetError, match="its problem was changed after it was written"
+    ):
         load_plans(tmp_path / "plan.h5")
 
 
 @pytest.mark.parametrize("end", ["start", "goal"])
-def test_tip_positions_of_a_file_are_those_of_its_joints(tmp_path: Path, end: str) -> None:
+def test_tip_positions_of_a_file_are_those_of_its_joints(
+    tmp_path: Path, end: str
+) -> None:
     plans = load_plans(write_minimal(tmp_path / "right.h5"))
     right, other = plans.columns[f"{end}_xyz"], "goal" if end == "start" else "start"
     stale = right + np.array([[0.0, 0.0, 1e-7], [0.0, 0.2, 0.0], [np.nan, 0.0, 0.0]])
     file = write_minimal(tmp_path / "stale.h5", **{f"{end}_xyz": stale})
-    with pytest.warns(RuntimeWarning, match=f"{end}_xyz of 2 plans is not where {end}_q puts .* plan 1, 0.2 m off"):
+    with pytest.warns(
+        RuntimeWarning,
+        match=f"{end}_xyz of 2 plans is not where {end}_q puts .* plan 1, 0.2 m off",
+    ):
         found = load_plans(file)
-    np.testing.assert_array_equal(found.columns[f"{end}_xyz"], np.concatenate([stale[:1], right[1:]]))
-    np.testing.assert_array_equal(found.columns[f"{other}_xyz"], plans.columns[f"{other}_xyz"])
+    np.testing.assert_array_equal(
+        found.columns[f"{end}_xyz"], np.concatenate([stale[:1], right[1:]])
+    )
+    np.testing.assert_array_equal(
+        found.columns[f"{other}_xyz"], plans.columns[f"{other}_xyz"]
+    )
 
 
 @pytest.mark.parametrize(
     ("name", "shape", "message"),
     [
-        ("path_control_points", (2, 15, 6), r"path_control_points must have shape \(3, C, n\) like the other fields"),
-        ("rate_control_points", (2, 20), r"rate_control_points must have shape \(3, R\) "),
+        (
+            "path_control_points",
+            (2, 15, 6),
+            r"path_control_points must have shape \(3, C, n\) like the other fields",
+        ),
+        (
+            "rate_control_points",
+            (2, 20),
+            r"rate_control_points must have shape \(3, R\) ",
+        ),
         ("goal_q", (4, 6), r"goal_q must have shape \(3, 6\)"),
         ("duration", (2,), r"duration must have shape \(3,\), got \(2,\)"),
         ("loss", (2,), r"loss must have shape \(3,\)"),
@@ -374,18 +565,26 @@ def test_the_field_that_does_not_fit_the_others_is_named(
 def test_a_link_to_nothing_is_damage(tmp_path: Path) -> None:
     with h5py.File(write_minimal(tmp_path / "theirs.h5"), "a") as file:
         file["start_xyz"] = h5py.SoftLink("/nowhere")
-    with pytest.raises(DatasetError, match=r"theirs\.h5 is damaged: its 'start_xyz' is a link"):
+    with pytest.raises(
+        DatasetError, match=r"theirs\.h5 is damaged: its 'start_xyz' is a link"
+    ):
         load_plans(tmp_path / "theirs.h5")
 
 
 def test_missing_and_foreign_files_are_said(tmp_path: Path) -> None:
     (tmp_path / "text.h5").write_bytes(b"hello")
-    with pytest.raises(UsageError, match=r"text\.h5 is a text file, expected a file of plans"):
+    with pytest.raises(
+        UsageError, match=r"text\.h5 is a text file, expected a file of plans"
+    ):
         load_plans(tmp_path / "text.h5")
     (tmp_path / "empty.h5").write_bytes(b"")
-    with pytest.raises(DatasetError, match=r"empty\.h5 is not an HDF5 file.*: it is empty"):
+    with pytest.raises(
+        DatasetError, match=r"empty\.h5 is not an HDF5 file.*: it is empty"
+    ):
         load_plans(tmp_path / "empty.h5")
-    with pytest.raises(UsageError, match=r"none\.h5 is not there, expected a file of plans"):
+    with pytest.raises(
+        UsageError, match=r"none\.h5 is not there, expected a file of plans"
+    ):
         load_plans(tmp_path / "none.h5")
     with pytest.raises(UsageError, match="is a folder, expected a file of plans"):
         load_plans(tmp_path)
@@ -394,10 +593,18 @@ def test_missing_and_foreign_files_are_said(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.* puts the tip:RuntimeWarning")
-@pytest.mark.filterwarnings("ignore:start_|goal_:UserWarning")  # a changed byte may give an implausible angle
-def test_cut_off_and_changed_files_never_give_anything_but_plans_or_an_error(tmp_path: Path) -> None:
+@pytest.mark.filterwarnings(
+    "ignore:start_|goal_:UserWarning"
+)  # a changed byte may give an implausible angle
+def test_cut_off_and_changed_files_never_give_anything_but_plans_or_an_error(
+    tmp_path: Path,
+) -> None:
     save_plans(tmp_path / "plan.h5", draw_plans(columns={"x": np.ones(N)}))
-    content, path, draws = remove_checksum(tmp_path / "plan.h5").read_bytes(), tmp_path / "broken.h5", random.Random(0)
+    content, path, draws = (
+        remove_checksum(tmp_path / "plan.h5").read_bytes(),
+        tmp_path / "broken.h5",
+        random.Random(0),
+    )
     for length in [*range(0, len(content), len(content) // 40), len(content) - 1]:
         path.write_bytes(content[:length])
         with pytest.raises(DatasetError, match=r"broken\.h5"):
@@ -417,17 +624,29 @@ def test_cut_off_and_changed_files_never_give_anything_but_plans_or_an_error(tmp
     assert outcomes[False] > 20
 
 
-def test_a_changed_bit_anywhere_in_a_file_with_a_checksum_is_detected(tmp_path: Path) -> None:
+def test_a_changed_bit_anywhere_in_a_file_with_a_checksum_is_detected(
+    tmp_path: Path,
+) -> None:
     plans = draw_plans()
     save_plans(tmp_path / "plan.h5", plans)
-    content, path, draws = (tmp_path / "plan.h5").read_bytes(), tmp_path / "broken.h5", random.Random(1)
-    for place in [*range(100), *(draws.randrange(len(content)) for _ in range(300)), len(content) - 1]:
+    content, path, draws = (
+        (tmp_path / "plan.h5").read_bytes(),
+        tmp_path / "broken.h5",
+        random.Random(1),
+    )
+    for place in [
+        *range(100),
+        *(draws.randrange(len(content)) for _ in range(300)),
+        len(content) - 1,
+    ]:
         changed = bytearray(content)
         changed[place] ^= 1 << draws.randrange(8)
         path.write_bytes(changed)
         with pytest.raises(DatasetError, match=r"broken\.h5"):
             load_plans(path)
-    path.write_bytes(b"written by another lab, sha256 unknown".ljust(512, b"\0") + content[512:])
+    path.write_bytes(
+        b"written by another lab, sha256 unknown".ljust(512, b"\0") + content[512:]
+    )
     found = load_plans(path)
     assert not found.has_checksum
     assert_equal(found, plans)
@@ -453,8 +672,13 @@ def test_the_reader_says_whether_a_file_has_a_checksum(tmp_path: Path) -> None:
 def test_a_file_of_a_newer_format_asks_for_an_upgrade(tmp_path: Path) -> None:
     save_plans(tmp_path / "plan.h5", draw_plans())
     content = (tmp_path / "plan.h5").read_bytes()
-    (tmp_path / "plan.h5").write_bytes(with_checksum(content, kind="cnpgen-plans", version=2))
-    with pytest.raises(DatasetError, match=r"plan\.h5 has format version 2, this cnpgen reads version 1: upgrade"):
+    (tmp_path / "plan.h5").write_bytes(
+        with_checksum(content, kind="cnpgen-plans", version=2)
+    )
+    with pytest.raises(
+        DatasetError,
+        match=r"plan\.h5 has format version 2, this cnpgen reads version 1: upgrade",
+    ):
         load_plans(tmp_path / "plan.h5")
 
 
@@ -464,13 +688,19 @@ def test_a_file_of_a_newer_format_asks_for_an_upgrade(tmp_path: Path) -> None:
 def garbage() -> Plans:
     """Plans 1 to 8 are each broken in one way; 0 and 9 are good."""
     plans = draw_plans(n=10)
-    path, rate, boundary = plans.path_control_points, plans.rate_control_points, copy.deepcopy(plans.boundary)
+    path, rate, boundary = (
+        plans.path_control_points,
+        plans.rate_control_points,
+        copy.deepcopy(plans.boundary),
+    )
     path[1, 4, 2], path[2, 0, 0], rate[3, 5] = np.nan, np.inf, np.nan
     rate[4], rate[5, 7], rate[6] = -1.0, -50.0, 0.0
     boundary.goal_dq[7, 0] = np.nan
     rate[8] = 1e-320  # positive, but 1 / r is not a number that can be had
     rate[4, 7] = -1e308  # finite, but its differences are not
-    return make_plans(AIRHOCKEY, boundary, path_control_points=path, rate_control_points=rate)
+    return make_plans(
+        AIRHOCKEY, boundary, path_control_points=path, rate_control_points=rate
+    )
 
 
 def test_garbage_values_load_and_are_found_one_by_one(tmp_path: Path) -> None:
@@ -479,13 +709,29 @@ def test_garbage_values_load_and_are_found_one_by_one(tmp_path: Path) -> None:
     found = [PlanStatus(status) for status in screen(plans)]
     finite, forward = PlanStatus.NOT_FINITE, PlanStatus.NOT_FORWARD
     ok = PlanStatus.UNKNOWN
-    assert found == [ok, finite, finite, finite, forward, forward, forward, finite, forward, ok]
+    assert found == [
+        ok,
+        finite,
+        finite,
+        finite,
+        forward,
+        forward,
+        forward,
+        finite,
+        forward,
+        ok,
+    ]
     good = draw_plans(n=10)
     assert np.array_equal(plans.duration[[0, 9]], good.duration[[0, 9]])
-    assert np.array_equal(plans.motion.at(np.linspace(0, 1, 9)).q[9], good.motion.at(np.linspace(0, 1, 9)).q[9])
+    assert np.array_equal(
+        plans.motion.at(np.linspace(0, 1, 9)).q[9],
+        good.motion.at(np.linspace(0, 1, 9)).q[9],
+    )
 
 
-def test_control_points_metres_away_and_a_goal_equal_to_the_start_are_plans(tmp_path: Path) -> None:
+def test_control_points_metres_away_and_a_goal_equal_to_the_start_are_plans(
+    tmp_path: Path,
+) -> None:
     plans = draw_plans()
     plans.path_control_points[0, 5] = 1e6
     plans.boundary.goal_q[1] = plans.boundary.start_q[1]
@@ -504,9 +750,18 @@ def test_a_wrong_duration_in_the_file_is_not_believed(tmp_path: Path) -> None:
     ("attributes", "expected"),
     [
         ({}, ["UNKNOWN", "VALID", "UNKNOWN"]),
-        ({"flag_values": [0, 1, 77], "flag_meanings": "unknown invalid valid"}, ["UNKNOWN", "INVALID", "VALID"]),
-        ({"flag_values": [0, 1, 77], "flag_meanings": "unknown valid gave_up"}, ["UNKNOWN", "VALID", "UNKNOWN"]),
-        ({"flag_values": [77, 78], "flag_meanings": "valid"}, ["UNKNOWN", "UNKNOWN", "VALID"]),
+        (
+            {"flag_values": [0, 1, 77], "flag_meanings": "unknown invalid valid"},
+            ["UNKNOWN", "INVALID", "VALID"],
+        ),
+        (
+            {"flag_values": [0, 1, 77], "flag_meanings": "unknown valid gave_up"},
+            ["UNKNOWN", "VALID", "UNKNOWN"],
+        ),
+        (
+            {"flag_values": [77, 78], "flag_meanings": "valid"},
+            ["UNKNOWN", "UNKNOWN", "VALID"],
+        ),
     ],
 )
 def test_the_numbers_of_a_status_mean_what_the_file_says(
@@ -519,8 +774,12 @@ def test_the_numbers_of_a_status_mean_what_the_file_says(
 
 
 def test_every_status_is_documented() -> None:
-    rows = re.findall(r"^\| (\d) \| `(\w+)` \| (.*) \|$", DOCS.read_text(encoding="utf-8"), re.M)
-    assert rows == [(str(int(status)), status.name.lower(), status.text) for status in PlanStatus]
+    rows = re.findall(
+        r"^\| (\d) \| `(\w+)` \| (.*) \|$", DOCS.read_text(encoding="utf-8"), re.M
+    )
+    assert rows == [
+        (str(int(status)), status.name.lower(), status.text) for status in PlanStatus
+    ]
 
 
 def test_every_status_has_a_text() -> None:
@@ -532,16 +791,28 @@ def test_every_status_has_a_text() -> None:
 
 
 def test_selected_plans_joined_again_are_the_same() -> None:
-    plans = draw_plans(goal_ddq=True, columns={"w": np.arange(2.0 * N).reshape(N, 2)}, sample_id=np.arange(N) + 100)
+    plans = draw_plans(
+        goal_ddq=True,
+        columns={"w": np.arange(2.0 * N).reshape(N, 2)},
+        sample_id=np.arange(N) + 100,
+    )
     mask = np.arange(N) % 2 == 0
     even, odd = plans[mask], plans[~mask]
     assert even.sample_id.tolist() == [100, 102, 104, 106]
-    joined = concatenate([even, odd])[np.argsort(np.r_[np.flatnonzero(mask), np.flatnonzero(~mask)])]
+    joined = concatenate([even, odd])[
+        np.argsort(np.r_[np.flatnonzero(mask), np.flatnonzero(~mask)])
+    ]
     assert_equal(joined, plans)
     assert_equal(concatenate([plans[:2], plans[2:]]), plans)
     assert_equal(concatenate([plans]), plans)
-    parts = [replace(plans, source=source, refined_with="{}") for source in ("a", "", "b", "a")]
-    assert (concatenate(parts).source, concatenate(parts).refined_with) == ("a; b", "{}")
+    parts = [
+        replace(plans, source=source, refined_with="{}")
+        for source in ("a", "", "b", "a")
+    ]
+    assert (concatenate(parts).source, concatenate(parts).refined_with) == (
+        "a; b",
+        "{}",
+    )
     assert not concatenate([plans, *parts]).refined_with
     assert plans[np.array([3, 3, 0])].sample_id.tolist() == [103, 103, 100]
 
@@ -554,7 +825,9 @@ def test_selected_plans_joined_again_are_the_same() -> None:
         ({"columns": {"x": np.zeros(N)}}, "the set of columns is"),
     ],
 )
-def test_plans_that_do_not_fit_are_not_joined(others: dict[str, Any], message: str) -> None:
+def test_plans_that_do_not_fit_are_not_joined(
+    others: dict[str, Any], message: str
+) -> None:
     with pytest.raises(UsageError, match=message):
         concatenate([draw_plans(), draw_plans(**others)])
     with pytest.raises(UsageError, match="no plans to join"):
@@ -564,14 +837,29 @@ def test_plans_that_do_not_fit_are_not_joined(others: dict[str, Any], message: s
 @pytest.mark.parametrize(
     ("which", "message"),
     [
-        (np.ones(3, bool), r"a mask must have shape \(7,\) as there are 7 plans, got \(3,\)"),
+        (
+            np.ones(3, bool),
+            r"a mask must have shape \(7,\) as there are 7 plans, got \(3,\)",
+        ),
         (np.array([0, 7]), "there is no plan 7: 7 plans are numbered from 0"),
         (np.array([-8]), "there is no plan -8"),
         (7, "there is no plan 7"),
-        (np.array([0.0]), r"selected by a number, numbers, a mask or a slice, got float64 of shape \(1,\)"),
-        ([[1, 2]], r"selected by a number, numbers, a mask or a slice, got int64 of shape \(1, 2\)"),
-        (True, r"selected by a number, numbers, a mask or a slice, got bool of shape \(\)"),
-        ("first", r"selected by a number, numbers, a mask or a slice, got <U5 of shape \(\)"),
+        (
+            np.array([0.0]),
+            r"selected by a number, numbers, a mask or a slice, got float64 of shape \(1,\)",
+        ),
+        (
+            [[1, 2]],
+            r"selected by a number, numbers, a mask or a slice, got int64 of shape \(1, 2\)",
+        ),
+        (
+            True,
+            r"selected by a number, numbers, a mask or a slice, got bool of shape \(\)",
+        ),
+        (
+            "first",
+            r"selected by a number, numbers, a mask or a slice, got <U5 of shape \(\)",
+        ),
     ],
 )
 def test_plans_that_are_not_there_cannot_be_selected(which: Any, message: str) -> None:
@@ -593,18 +881,35 @@ def test_plans_that_are_not_there_cannot_be_selected(which: Any, message: str) -
         ((np.arange(N) > 4).tolist(), [5, 6]),
     ],
 )
-def test_everything_that_is_known_of_plans_follows_them_as_numpy_would_have_it(which: Any, numbers: list[int]) -> None:
-    columns = {"w": np.arange(2.0 * N).reshape(N, 2), "refine_outcome": np.arange(N) / 2}
-    given = {"sample_id": np.arange(N) + 100, "status": np.arange(N) % 5, "source": "here"}
-    plans = replace(draw_plans(goal_ddq=True, columns=columns, **given), refined_with="{}")
+def test_everything_that_is_known_of_plans_follows_them_as_numpy_would_have_it(
+    which: Any, numbers: list[int]
+) -> None:
+    columns = {
+        "w": np.arange(2.0 * N).reshape(N, 2),
+        "refine_outcome": np.arange(N) / 2,
+    }
+    given = {
+        "sample_id": np.arange(N) + 100,
+        "status": np.arange(N) % 5,
+        "source": "here",
+    }
+    plans = replace(
+        draw_plans(goal_ddq=True, columns=columns, **given), refined_with="{}"
+    )
     plans.duration  # noqa: B018 - what was computed of all of them must not stay
     found = plans[which]
     assert isinstance(found, Plans)
     assert (found.source, found.refined_with) == ("here", "{}")
     assert set(found.columns) == {"w", "refine_outcome", "start_xyz", "goal_xyz"}
-    parts = plans.boundary.arrays() | plans.columns | {name: getattr(plans, name) for name in ARRAYS}
+    parts = (
+        plans.boundary.arrays()
+        | plans.columns
+        | {name: getattr(plans, name) for name in ARRAYS}
+    )
     for name, values in (
-        found.boundary.arrays() | found.columns | {name: getattr(found, name) for name in ARRAYS}
+        found.boundary.arrays()
+        | found.columns
+        | {name: getattr(found, name) for name in ARRAYS}
     ).items():
         np.testing.assert_array_equal(values, parts[name][numbers], err_msg=name)
     np.testing.assert_array_equal(found.motion.path, plans.motion[numbers].path)
@@ -612,7 +917,9 @@ def test_everything_that_is_known_of_plans_follows_them_as_numpy_would_have_it(w
 
 def test_plans_can_be_gone_through_one_by_one() -> None:
     plans = draw_plans(sample_id=np.arange(N) + 100)
-    assert [(len(each), each.sample_id[0]) for each in plans] == [(1, 100 + index) for index in range(N)]
+    assert [(len(each), each.sample_id[0]) for each in plans] == [
+        (1, 100 + index) for index in range(N)
+    ]
 
 
 def test_no_plans_can_be_selected() -> None:
@@ -620,16 +927,29 @@ def test_no_plans_can_be_selected() -> None:
 
 
 @pytest.mark.parametrize("name", ["start_q", "goal_dq"])
-def test_boundary_conditions_of_other_joints_and_ragged_ones_are_no_plans(name: str) -> None:
+def test_boundary_conditions_of_other_joints_and_ragged_ones_are_no_plans(
+    name: str,
+) -> None:
     plans = draw_plans()
-    points = {each: getattr(plans, each) for each in ("path_control_points", "rate_control_points")}
+    points = {
+        each: getattr(plans, each)
+        for each in ("path_control_points", "rate_control_points")
+    }
     others = replace(plans.boundary, **{name: np.zeros((N, 7))})
-    with pytest.raises(UsageError, match=rf"{name} must have shape \(7, 6\) \(plans, joints\), got \(7, 7\)"):
+    with pytest.raises(
+        UsageError,
+        match=rf"{name} must have shape \(7, 6\) \(plans, joints\), got \(7, 7\)",
+    ):
         make_plans(plans.problem, others, **points)
     with pytest.raises(
-        UsageError, match=f"{name} must be an array of numbers, got list: its rows have different lengths"
+        UsageError,
+        match=f"{name} must be an array of numbers, got list: its rows have different lengths",
     ):
-        make_plans(plans.problem, replace(plans.boundary, **{name: [[1.0], [1.0, 2.0]]}), **points)
+        make_plans(
+            plans.problem,
+            replace(plans.boundary, **{name: [[1.0], [1.0, 2.0]]}),
+            **points,
+        )
 
 
 def test_what_is_not_plans_is_refused_by_name(tmp_path: Path) -> None:
@@ -640,12 +960,17 @@ def test_what_is_not_plans_is_refused_by_name(tmp_path: Path) -> None:
         lambda plans: save_plans(tmp_path / "a.h5", plans),
     ]
     for call in calls:
-        with pytest.raises(UsageError, match=r"must be Plans, as load_plans and make_plans return them.* got str"):
+        with pytest.raises(
+            UsageError,
+            match=r"must be Plans, as load_plans and make_plans return them.* got str",
+        ):
             call("plans.h5")
 
 
 def test_where_plans_are_from_is_kept_in_the_file(tmp_path: Path) -> None:
-    plans = replace(draw_plans(), source="my trainer, seed 3", refined_with='{"solver": "own"}')
+    plans = replace(
+        draw_plans(), source="my trainer, seed 3", refined_with='{"solver": "own"}'
+    )
     save_plans(tmp_path / "a.h5", plans)
     found = load_plans(tmp_path / "a.h5")
     assert (found.source, found.refined_with) == (plans.source, plans.refined_with)
@@ -658,31 +983,49 @@ def test_a_column_may_hold_integers_of_any_size(tmp_path: Path) -> None:
     assert load_plans(path).columns["key"].tolist() == [0.0, 1.0, 2.0**63]
 
 
-def test_a_problem_by_name_that_is_not_the_one_of_the_digest_is_refused(tmp_path: Path) -> None:
+def test_a_problem_by_name_that_is_not_the_one_of_the_digest_is_refused(
+    tmp_path: Path,
+) -> None:
     path = write_minimal(tmp_path / "a.h5", attributes={"problem_sha256": "0" * 64})
-    with pytest.raises(DatasetError, match="is of another 'airhockey': its problem_sha256 is not this one's"):
+    with pytest.raises(
+        DatasetError,
+        match="is of another 'airhockey': its problem_sha256 is not this one's",
+    ):
         load_plans(path)
 
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"sample_id": [0.7, 1.2, 2.9]}, "sample_id must hold integers from .* got float64"),
-        ({"sample_id": np.full(3, 2**63, np.uint64)}, "sample_id must hold integers from .* to 9223372036854775807"),
+        (
+            {"sample_id": [0.7, 1.2, 2.9]},
+            "sample_id must hold integers from .* got float64",
+        ),
+        (
+            {"sample_id": np.full(3, 2**63, np.uint64)},
+            "sample_id must hold integers from .* to 9223372036854775807",
+        ),
         ({"sample_id": ["a", "b", "c"]}, "sample_id must be an array of integers"),
         ({"status": [300, 0, 0]}, "status must hold integers from 0 to 255"),
         ({"degree": 7.5}, "degree must be an integer from 3 to 20, got 7.5"),
         ({"columns": {".": np.zeros(3)}}, "a column cannot be called '.'"),
     ],
 )
-def test_numbers_that_would_change_when_stored_are_refused(wrong: dict[str, Any], message: str) -> None:
+def test_numbers_that_would_change_when_stored_are_refused(
+    wrong: dict[str, Any], message: str
+) -> None:
     plans = draw_plans(3)
-    points = {name: getattr(plans, name) for name in ("path_control_points", "rate_control_points")}
+    points = {
+        name: getattr(plans, name)
+        for name in ("path_control_points", "rate_control_points")
+    }
     with pytest.raises(UsageError, match=message):
         make_plans(plans.problem, plans.boundary, **points, **wrong)
 
 
-@pytest.mark.parametrize("content", [b"precious", b"cnpgen-model 1\n", b"\x89HDF\r\n\x1a\n", "shard"])
+@pytest.mark.parametrize(
+    "content", [b"precious", b"cnpgen-model 1\n", b"\x89HDF\r\n\x1a\n", "shard"]
+)
 def test_only_files_of_plans_are_replaced(tmp_path: Path, content: bytes | str) -> None:
     path = tmp_path / "mine.h5"
     if isinstance(content, str):
@@ -691,16 +1034,25 @@ def test_only_files_of_plans_are_replaced(tmp_path: Path, content: bytes | str) 
     else:
         path.write_bytes(content)
     before = path.read_bytes()
-    with pytest.raises(UsageError, match=r"mine\.h5 is .*not .*of plans: it is not replaced"):
+    with pytest.raises(
+        UsageError, match=r"mine\.h5 is .*not .*of plans: it is not replaced"
+    ):
         save_plans(path, draw_plans())
     assert path.read_bytes() == before
     assert [each.name for each in tmp_path.iterdir()] == ["mine.h5"]
 
 
-def test_plans_of_anybody_and_empty_files_are_replaced_and_folders_are_made(tmp_path: Path) -> None:
+def test_plans_of_anybody_and_empty_files_are_replaced_and_folders_are_made(
+    tmp_path: Path,
+) -> None:
     theirs = write_minimal(tmp_path / "theirs.h5")
     (tmp_path / "empty.h5").touch()
-    for path in (theirs, theirs, tmp_path / "empty.h5", tmp_path / "new" / "folder" / "plans.h5"):
+    for path in (
+        theirs,
+        theirs,
+        tmp_path / "empty.h5",
+        tmp_path / "new" / "folder" / "plans.h5",
+    ):
         save_plans(path, draw_plans())
         assert_equal(load_plans(path), draw_plans())
     with pytest.raises(UsageError, match="new is a folder, expected a file for plans"):
@@ -711,7 +1063,10 @@ def test_a_model_is_said_to_be_one(tmp_path: Path) -> None:
     path = tmp_path / "mine.h5"
     save_model(path, load_model("airhockey-hit"))
     for use in (load_plans, lambda path: save_plans(path, draw_plans())):
-        with pytest.raises(UsageError, match=r"mine\.h5 is a model of cnpgen, (expected a file|not one) of plans"):
+        with pytest.raises(
+            UsageError,
+            match=r"mine\.h5 is a model of cnpgen, (expected a file|not one) of plans",
+        ):
             use(path)
 
 
@@ -762,8 +1117,13 @@ class Tensor:
 
 def test_plans_are_made_of_tensors_that_carry_gradients() -> None:
     plans = draw_plans(goal_ddq=True)
-    boundary = Boundary(**{name: Tensor(part) for name, part in plans.boundary.arrays().items()})
-    given = {name: Tensor(getattr(plans, name)) for name in ("path_control_points", "rate_control_points")}
+    boundary = Boundary(
+        **{name: Tensor(part) for name, part in plans.boundary.arrays().items()}
+    )
+    given = {
+        name: Tensor(getattr(plans, name))
+        for name in ("path_control_points", "rate_control_points")
+    }
     assert_equal(make_plans(AIRHOCKEY, boundary, **given), plans)
 
 
@@ -774,21 +1134,31 @@ def test_plans_are_made_of_arrays_of_jax_and_tensors_of_torch() -> None:
     path, rate = plans.path_control_points, plans.rate_control_points
     with_gradient = torch.tensor(path, requires_grad=True)
     found = make_plans(
-        AIRHOCKEY, plans.boundary, path_control_points=with_gradient, rate_control_points=jnp.asarray(rate)
+        AIRHOCKEY,
+        plans.boundary,
+        path_control_points=with_gradient,
+        rate_control_points=jnp.asarray(rate),
     )
     np.testing.assert_array_equal(found.path_control_points, path)
     np.testing.assert_allclose(found.rate_control_points, rate, rtol=1e-6)
 
 
 @pytest.mark.parametrize("end", ["start_q", "goal_q"])
-def test_joint_positions_in_degrees_are_refused_where_they_come_in(tmp_path: Path, end: str) -> None:
+def test_joint_positions_in_degrees_are_refused_where_they_come_in(
+    tmp_path: Path, end: str
+) -> None:
     plans = draw_plans()
     degrees = getattr(plans.boundary, end).copy()
     degrees[2, 3] = 40.0
     boundary = replace(plans.boundary, **{end: degrees})
-    points = {name: getattr(plans, name) for name in ("path_control_points", "rate_control_points")}
+    points = {
+        name: getattr(plans, name)
+        for name in ("path_control_points", "rate_control_points")
+    }
     message = rf"^{end} must be from -4.19 to 4.19 rad, got 40 rad in plan 2 of joint_4; .* 40 deg = 0.698 rad"
-    with pytest.raises(UnitError, match=message + r"\? allow_large_angles=True accepts such values") as caught:
+    with pytest.raises(
+        UnitError, match=message + r"\? allow_large_angles=True accepts such values"
+    ) as caught:
         make_plans(AIRHOCKEY, boundary, **points)
     assert caught.value.argument == "boundary"
     with pytest.warns(UserWarning, match=message):
@@ -804,12 +1174,24 @@ def test_joint_positions_that_are_only_outside_are_not_suspicious(value: float) 
     q = plans.boundary.start_q.copy()
     q[0, 3] = value
     boundary = replace(plans.boundary, start_q=q)
-    points = {name: getattr(plans, name) for name in ("path_control_points", "rate_control_points")}
-    assert len(make_plans(AIRHOCKEY, boundary, **points)) == N  # warnings are errors in tests
+    points = {
+        name: getattr(plans, name)
+        for name in ("path_control_points", "rate_control_points")
+    }
+    assert (
+        len(make_plans(AIRHOCKEY, boundary, **points)) == N
+    )  # warnings are errors in tests
 
 
 @pytest.mark.parametrize(
-    "problem", ["../heavy/problem.toml", "{tmp}/heavy/problem.toml", "link/problem.toml", "/dev/zero", "/etc/passwd"]
+    "problem",
+    [
+        "../heavy/problem.toml",
+        "{tmp}/heavy/problem.toml",
+        "link/problem.toml",
+        "/dev/zero",
+        "/etc/passwd",
+    ],
 )
 def test_a_problem_in_another_folder_is_not_opened(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, problem: str
@@ -817,15 +1199,22 @@ def test_a_problem_in_another_folder_is_not_opened(
     shutil.copytree(HEAVY.path.parent, tmp_path / "heavy")
     (tmp_path / "theirs").mkdir()
     (tmp_path / "theirs" / "link").symlink_to(tmp_path / "heavy")
-    fields = {name: np.zeros((3, 7)) for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")}
+    fields = {
+        name: np.zeros((3, 7))
+        for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
+    }
     fields |= {"path_control_points": np.zeros((3, 15, 7))}
     attributes = {"problem": problem.format(tmp=tmp_path)}
     path = write_minimal(tmp_path / "theirs" / "a.h5", **fields, attributes=attributes)
     with monkeypatch.context() as patch:
-        patch.setattr("cnpgen.plans.plan_file.load_problem", lambda *_, **__: pytest.fail("opened"))
+        patch.setattr(
+            "cnpgen.plans.plan_file.load_problem",
+            lambda *_, **__: pytest.fail("opened"),
+        )
         for read in (load_plans, load_boundary_problems):
             with pytest.raises(
-                DatasetError, match=r"attribute 'problem' names .*, which is not in the folder of the file"
+                DatasetError,
+                match=r"attribute 'problem' names .*, which is not in the folder of the file",
             ):
                 read(path)
     assert load_plans(path, problem=HEAVY).problem == record_problem(HEAVY)

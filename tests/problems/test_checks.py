@@ -32,7 +32,8 @@ def test_a_file_for_xacro_is_told_from_a_urdf(tmp_path):
     new = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="crane"><xacro:arm side="left"/>'
     found = errors(crane(tmp_path, '<robot name="crane" version="1.2">', new))
     assert (
-        "robot.urdf: crane.urdf is to be read by xacro, expected a URDF: run 'xacro crane.urdf > robot.urdf'" in found
+        "robot.urdf: crane.urdf is to be read by xacro, expected a URDF: run 'xacro crane.urdf > robot.urdf'"
+        in found
     )
 
 
@@ -41,11 +42,20 @@ def test_a_locked_joint_that_cannot_stand_at_zero_is_a_mistake(tmp_path):
     grip = next(name for name, kind, *_ in JOINTS if kind == "prismatic")
     before, after = urdf().split(f'<joint name="{grip}"')
     file = write_problem(tmp_path)
-    text = before + f'<joint name="{grip}"' + after.replace(limit, limit.replace('lower="-2.5"', 'lower="0.1"'))
+    text = (
+        before
+        + f'<joint name="{grip}"'
+        + after.replace(limit, limit.replace('lower="-2.5"', 'lower="0.1"'))
+    )
     (tmp_path / "crane" / "crane.urdf").write_text(text)
-    assert "'grip' is not planned and stays at zero, which is outside of its limits [0.1, 2.5]" in errors(file)
+    assert (
+        "'grip' is not planned and stays at zero, which is outside of its limits [0.1, 2.5]"
+        in errors(file)
+    )
     end = text.index("</joint>", text.index(f'<joint name="{grip}"'))
-    follows = text[:end] + '<mimic joint="other"/>' + text[end:]  # where such a joint stands is checked elsewhere
+    follows = (
+        text[:end] + '<mimic joint="other"/>' + text[end:]
+    )  # where such a joint stands is checked elsewhere
     (tmp_path / "crane" / "crane.urdf").write_text(follows)
     assert load_problem(file).name == "crane"
 
@@ -63,22 +73,37 @@ def test_a_tip_that_is_not_there_is_refused_with_all_frames(tmp_path):
     file = write_problem(tmp_path)
     file.write_text(file.read_text().replace('tip = "hand"', 'tip = "hnad"'))
     found = errors(file)
-    assert "robot.tip: crane.urdf has no frame 'hnad' (did you mean 'hand'?); its frames: base, turret, arm" in found
+    assert (
+        "robot.tip: crane.urdf has no frame 'hnad' (did you mean 'hand'?); its frames: base, turret, arm"
+        in found
+    )
 
 
 def limited(folder: Path, limit: str) -> Path:
     """A problem with a limit, where the URDF allows 2 rad/s and positions of 2.5 rad to either side."""
     file = write_problem(folder)
-    file.write_text(file.read_text(encoding="utf-8").replace("[limits]", f"[limits]\n{limit}"), encoding="utf-8")
+    file.write_text(
+        file.read_text(encoding="utf-8").replace("[limits]", f"[limits]\n{limit}"),
+        encoding="utf-8",
+    )
     return file
 
 
 @pytest.mark.parametrize(
     ("limit", "text"),
     [
-        ("velocity = 80", "limits.velocity: swing: must be from 0 to 20 rad/s, got 80 rad/s; 80 rad/s is 4584 deg/s;"),
-        ("velocity = [2, 2, 115, 2]", "limits.velocity: elbow: must be from 0 to 20 rad/s, got 115 rad/s;"),
-        ("acceleration = 573", "limits.acceleration: swing: must be from 0 to 200 rad/s^2, got 573 rad/s^2;"),
+        (
+            "velocity = 80",
+            "limits.velocity: swing: must be from 0 to 20 rad/s, got 80 rad/s; 80 rad/s is 4584 deg/s;",
+        ),
+        (
+            "velocity = [2, 2, 115, 2]",
+            "limits.velocity: elbow: must be from 0 to 20 rad/s, got 115 rad/s;",
+        ),
+        (
+            "acceleration = 573",
+            "limits.acceleration: swing: must be from 0 to 200 rad/s^2, got 573 rad/s^2;",
+        ),
         (
             'position = ["[-2, 2]", "[-12, 12]", "[-2, 2]", "[-2, 2]"]',
             "position: lift: must be from -5 to 5 rad, got",
@@ -89,7 +114,9 @@ def test_limits_far_above_those_of_the_urdf_are_in_another_unit(tmp_path, limit,
     found = errors(limited(tmp_path, limit))
     assert text in found
     assert "did you mean" in found
-    assert ("'velocity_scale' is a fraction of the URDF's limit" in found) == limit.startswith("velocity")
+    assert (
+        "'velocity_scale' is a fraction of the URDF's limit" in found
+    ) == limit.startswith("velocity")
 
 
 def test_joints_of_transmissions_have_no_limits(tmp_path):
@@ -97,30 +124,61 @@ def test_joints_of_transmissions_have_no_limits(tmp_path):
     file = limited(tmp_path, "velocity = 80")
     (urdf,) = tmp_path.rglob("*.urdf")
     transmission = '<transmission name="t"><joint name="swing"/></transmission></robot>'
-    urdf.write_text(urdf.read_text(encoding="utf-8").replace("</robot>", transmission), encoding="utf-8")
+    urdf.write_text(
+        urdf.read_text(encoding="utf-8").replace("</robot>", transmission),
+        encoding="utf-8",
+    )
     assert "limits.velocity: swing: must be from 0 to 20 rad/s" in errors(file)
 
 
 @pytest.mark.parametrize(
     ("old", "new", "text"),
     [
-        ('scale="0.001 0.001 0.001"', 'scale="1 1 1"', "link 'fore': its collision geometry is 250 m large"),
+        (
+            'scale="0.001 0.001 0.001"',
+            'scale="1 1 1"',
+            "link 'fore': its collision geometry is 250 m large",
+        ),
         (
             'scale="0.001 0.001 0.001"',
             'scale="1e-6 1e-6 1e-6"',
             "geometry is 0.00025 m large, expected 0.001 m or more",
         ),
-        ('xyz="0.4 0 0"', 'xyz="400 0 0"', "the arm is 401 m long, expected 0.01 to 100 m; lengths of a URDF are in m"),
-        ('lower="-2.5" upper="2.5"', 'lower="-143" upper="143"', "25.1 rad, got -143 rad; -143 rad is -8193 deg; did"),
+        (
+            'xyz="0.4 0 0"',
+            'xyz="400 0 0"',
+            "the arm is 401 m long, expected 0.01 to 100 m; lengths of a URDF are in m",
+        ),
+        (
+            'lower="-2.5" upper="2.5"',
+            'lower="-143" upper="143"',
+            "25.1 rad, got -143 rad; -143 rad is -8193 deg; did",
+        ),
         (
             'lower="-2.5" upper="2.5"',
             'lower="2.5" upper="-2.5"',
             "joint 'swing': its limits lower=2.5 and upper=-2.5 are swapped: exch",
         ),
-        ('<mass value="1"/>', '<mass value="1"/><origin xyz="0 90 0"/>', "the center of mass is 90 m away"),
-        ('ixx="0.01"', 'ixx="10000"', "the radius of gyration 70.7 m, the arm 1.02 m long; an <inertial> is in kg, m"),
+        (
+            '<mass value="1"/>',
+            '<mass value="1"/><origin xyz="0 90 0"/>',
+            "the center of mass is 90 m away",
+        ),
+        (
+            'ixx="0.01"',
+            'ixx="10000"',
+            "the radius of gyration 70.7 m, the arm 1.02 m long; an <inertial> is in kg, m",
+        ),
     ],
-    ids=["mesh in mm", "tiny mesh", "joints in mm", "degrees", "swapped", "center in mm", "inertia in g mm^2"],
+    ids=[
+        "mesh in mm",
+        "tiny mesh",
+        "joints in mm",
+        "degrees",
+        "swapped",
+        "center in mm",
+        "inertia in g mm^2",
+    ],
 )
 def test_a_urdf_that_was_changed_later_is_checked_again(tmp_path, old, new, text):
     assert text in errors(crane(tmp_path, old, new))
@@ -128,8 +186,13 @@ def test_a_urdf_that_was_changed_later_is_checked_again(tmp_path, old, new, text
 
 def test_obstacles_far_out_of_reach_are_in_another_unit(tmp_path):
     file = write_problem(tmp_path)
-    file.write_text(file.read_text(encoding="utf-8").replace("x = [0.45, 0.55]", "x = [45, 55]"), encoding="utf-8")
-    text = "obstacle 1: 'wall' is 45 m away, where the arm is 1.02 m long: check its unit"
+    file.write_text(
+        file.read_text(encoding="utf-8").replace("x = [0.45, 0.55]", "x = [45, 55]"),
+        encoding="utf-8",
+    )
+    text = (
+        "obstacle 1: 'wall' is 45 m away, where the arm is 1.02 m long: check its unit"
+    )
     assert text in errors(file)
 
 
@@ -140,18 +203,29 @@ def test_payloads_in_grams_or_millimetres_are_refused(tmp_path):
         "mass = 1\ninertia = [900, 900, 900, 0, 0, 0]": "payload.inertia: a length of 36.7 m from it",
     }.items():
         file = write_problem(tmp_path)
-        content = file.read_text(encoding="utf-8").replace("[robot]", f"[payload]\n{payload}\n[robot]")
+        content = file.read_text(encoding="utf-8").replace(
+            "[robot]", f"[payload]\n{payload}\n[robot]"
+        )
         file.write_text(content, encoding="utf-8")
         assert text in errors(file)
 
 
 def test_obstacles_that_no_constraint_uses_are_refused(tmp_path):
     file = write_problem(tmp_path)
-    file.write_text(file.read_text(encoding="utf-8").replace("robot-clearance", "self-clearance"), encoding="utf-8")
-    assert 'obstacle 1: no constraint uses it: add a [[constraint]] with use = "robot-clearance"' in errors(file)
+    file.write_text(
+        file.read_text(encoding="utf-8").replace("robot-clearance", "self-clearance"),
+        encoding="utf-8",
+    )
+    assert (
+        'obstacle 1: no constraint uses it: add a [[constraint]] with use = "robot-clearance"'
+        in errors(file)
+    )
 
 
-@pytest.mark.parametrize("limit", ["velocity = 19", 'velocity = "80 deg/s"', "acceleration = 190", "torque = 5000"])
+@pytest.mark.parametrize(
+    "limit",
+    ["velocity = 19", 'velocity = "80 deg/s"', "acceleration = 190", "torque = 5000"],
+)
 def test_limits_of_another_motor_are_accepted(tmp_path, limit):
     load_robot(load_problem(limited(tmp_path, limit)))
 
@@ -168,6 +242,13 @@ def test_a_message_lists_at_most_twenty_frames() -> None:
 @pytest.mark.parametrize("use", ['["robot-clearance"]', "[]", "{ a = 1 }", "3"])
 def test_kinds_that_are_no_text_are_errors(tmp_path, use):
     file = write_problem(tmp_path)
-    file.write_text(file.read_text(encoding="utf-8").replace('use = "robot-clearance"', f"use = {use}"), "utf-8")
-    assert "constraint 2.use: expected one of joint-position, " in (text := errors(file))
+    file.write_text(
+        file.read_text(encoding="utf-8").replace(
+            'use = "robot-clearance"', f"use = {use}"
+        ),
+        "utf-8",
+    )
+    assert "constraint 2.use: expected one of joint-position, " in (
+        text := errors(file)
+    )
     assert ", got " in text

@@ -33,7 +33,9 @@ def errors(file: Path) -> list[str]:
         ({"robot": 'geometry = "urdf"', "obstacles": "", "more": ""}, "urdf"),
     ],
 )
-def test_a_robot_that_may_hit_something_has_its_real_shape_unless_it_is_told_otherwise(tmp_path, changes, geometry):
+def test_a_robot_that_may_hit_something_has_its_real_shape_unless_it_is_told_otherwise(
+    tmp_path, changes, geometry
+):
     problem = load_problem(write_problem(tmp_path, **changes))
     assert problem.robot.geometry == geometry
     assert (load_robot(problem).shape is not None) == (geometry == "urdf")
@@ -48,17 +50,37 @@ def test_a_urdf_without_shapes_is_a_line_through_its_joints(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "place", "text"),
     [
-        ({"clearance": RADIUS}, "constraint 2.radius", "the robot has the shape that its URDF gives it, and no radius"),
-        ({"robot": PAPER, "more": ""}, "constraint 2.radius", "missing key, expected a length [m]"),
-        ({"robot": PAPER, "clearance": RADIUS}, "constraint 3", 'needs geometry = "urdf" in [robot]'),
-        ({"robot": f'{PAPER}\nsrdf = "a.srdf"', "more": "", "clearance": RADIUS}, "robot.srdf", "matter with"),
+        (
+            {"clearance": RADIUS},
+            "constraint 2.radius",
+            "the robot has the shape that its URDF gives it, and no radius",
+        ),
+        (
+            {"robot": PAPER, "more": ""},
+            "constraint 2.radius",
+            "missing key, expected a length [m]",
+        ),
+        (
+            {"robot": PAPER, "clearance": RADIUS},
+            "constraint 3",
+            'needs geometry = "urdf" in [robot]',
+        ),
+        (
+            {"robot": f'{PAPER}\nsrdf = "a.srdf"', "more": "", "clearance": RADIUS},
+            "robot.srdf",
+            "matter with",
+        ),
         ({"robot": 'srdf = "a.srdf"'}, "robot.srdf", "no such file: "),
         ({"robot": 'packages = ["nowhere"]'}, "robot.packages", "no such folder: "),
         ({"robot": 'geometry = "urdfs"'}, "robot.geometry", "did you mean 'urdf'?"),
     ],
 )
 def test_what_does_not_go_with_the_shape_is_a_mistake(tmp_path, changes, place, text):
-    (found,) = (each for each in errors(write_problem(tmp_path, **changes)) if each.startswith(f"{place}: "))
+    (found,) = (
+        each
+        for each in errors(write_problem(tmp_path, **changes))
+        if each.startswith(f"{place}: ")
+    )
     assert text in found
 
 
@@ -79,8 +101,12 @@ def test_a_missing_mesh_is_a_mistake_of_the_problem(tmp_path):
 
 def test_packages_are_relative_to_the_problem_file(tmp_path):
     file = write_problem(tmp_path, robot='packages = ["elsewhere"]')
-    shutil.move(tmp_path / "crane" / "meshes", tmp_path / "elsewhere" / "crane" / "meshes")
-    shutil.copytree(tmp_path / "elsewhere" / "crane" / "meshes", tmp_path / "crane" / "meshes")
+    shutil.move(
+        tmp_path / "crane" / "meshes", tmp_path / "elsewhere" / "crane" / "meshes"
+    )
+    shutil.copytree(
+        tmp_path / "elsewhere" / "crane" / "meshes", tmp_path / "crane" / "meshes"
+    )
     (tmp_path / "crane" / "meshes" / "wedge.stl").unlink()
     assert load_robot(load_problem(file)).shape is not None
 
@@ -89,7 +115,9 @@ def test_packages_are_relative_to_the_problem_file(tmp_path):
 def problem(tmp_path: Path) -> Problem:
     srdf = '<robot name="crane"><disable_collisions link1="hand" link2="base" reason="Default"/></robot>'
     (tmp_path / "crane.srdf").write_text(srdf)
-    return load_problem(write_problem(tmp_path, robot='srdf = "crane.srdf"\npackages = ["."]'))
+    return load_problem(
+        write_problem(tmp_path, robot='srdf = "crane.srdf"\npackages = ["."]')
+    )
 
 
 def test_a_record_has_the_shape_without_the_files(problem, tmp_path):
@@ -103,7 +131,9 @@ def test_a_record_has_the_shape_without_the_files(problem, tmp_path):
     assert [piece.vertices.tobytes() for piece in robot.shape.convex_parts] == [
         p.vertices.tobytes() for p in shape.convex_parts
     ]
-    assert record_problem(as_problem(record)).comparable_sha256 == record.comparable_sha256
+    assert (
+        record_problem(as_problem(record)).comparable_sha256 == record.comparable_sha256
+    )
 
 
 def test_a_mesh_that_changes_changes_the_identity(problem, tmp_path):
@@ -121,13 +151,19 @@ def test_shipped_problems_are_written_as_before_there_were_shapes(name):
     content = resolved(problem)
     assert problem.robot.geometry == "paper-capsules"
     assert set(content["robot"]) == {"urdf", "joints", "tip", "base"}
-    kinds = [constraint for constraint in content["constraint"] if constraint["use"] != "object-clearance"]
+    kinds = [
+        constraint
+        for constraint in content["constraint"]
+        if constraint["use"] != "object-clearance"
+    ]
     assert all("distance" not in constraint for constraint in kinds)
     assert load_robot(problem).shape is None
 
 
 def test_keys_that_came_later_are_written_where_they_are_said(tmp_path):
-    content = resolved(load_problem(write_problem(tmp_path, clearance="distance = 0.01")))
+    content = resolved(
+        load_problem(write_problem(tmp_path, clearance="distance = 0.01"))
+    )
     assert content["robot"]["geometry"] == "urdf"
     assert content["constraint"][1]["distance"] == 0.01
     assert SELF.split('"')[1] == content["constraint"][2]["use"]

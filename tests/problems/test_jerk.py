@@ -25,25 +25,41 @@ from tests.examples.plans import PROBLEMS
 JERK = JointJerk(tolerance=0.01)
 
 
-def test_a_problem_gives_one_limit_for_all_joints_or_one_for_each(tmp_path: Path) -> None:
+def test_a_problem_gives_one_limit_for_all_joints_or_one_for_each(
+    tmp_path: Path,
+) -> None:
     shipped = PROBLEMS["airhockey"].path
-    text = shipped.read_text() + '\n[[constraint]]\nuse = "joint-jerk"\ntolerance = "1 %"\n'
-    (tmp_path / "iiwa14_striker.urdf").write_bytes((shipped.parent / "iiwa14_striker.urdf").read_bytes())
+    text = (
+        shipped.read_text()
+        + '\n[[constraint]]\nuse = "joint-jerk"\ntolerance = "1 %"\n'
+    )
+    (tmp_path / "iiwa14_striker.urdf").write_bytes(
+        (shipped.parent / "iiwa14_striker.urdf").read_bytes()
+    )
 
     def limits(jerk: str) -> list[float]:
-        (tmp_path / "problem.toml").write_text(text.replace("[limits]", f"[limits]\njerk = {jerk}"))
+        (tmp_path / "problem.toml").write_text(
+            text.replace("[limits]", f"[limits]\njerk = {jerk}")
+        )
         return load_robot(load_problem(tmp_path / "problem.toml")).jerk_limit.tolist()
 
     assert limits('"500 rad/s^3"') == [500.0] * 6
     assert limits("[1, 2, 3, 4, 5, 6]") == [1, 2, 3, 4, 5, 6]
     np.testing.assert_allclose(limits('"180 deg/s^3"'), np.pi)
-    with pytest.raises(RecipeError, match=r"limits\.jerk: needs one number, or 6, one per planned joint, got 2"):
+    with pytest.raises(
+        RecipeError,
+        match=r"limits\.jerk: needs one number, or 6, one per planned joint, got 2",
+    ):
         limits("[1, 2]")
-    with pytest.raises(RecipeError, match=r"limits\.jerk.*an angular jerk \[rad/s\^3\]"):
+    with pytest.raises(
+        RecipeError, match=r"limits\.jerk.*an angular jerk \[rad/s\^3\]"
+    ):
         limits('"5 rad/s^2"')
 
 
-def test_where_none_are_given_they_are_five_a_second_times_those_of_the_accelerations() -> None:
+def test_where_none_are_given_they_are_five_a_second_times_those_of_the_accelerations() -> (
+    None
+):
     robot = load_robot(PROBLEMS["airhockey"])
     np.testing.assert_array_equal(robot.jerk_limit, 5 * robot.acceleration_limit)
 
@@ -59,9 +75,14 @@ def test_the_jerk_along_a_path_is_the_third_difference_in_time() -> None:
     """Of q(t), by solving ds/dt = r(s) with ever smaller steps: no derivative of a spline in it."""
     random, n, h = np.random.default_rng(2), 3, 2e-3
     knots = [np.r_[np.zeros(8), np.linspace(0, 1, 5)[1:-1], np.ones(8)]] * 2
-    p, r = BSpline(knots[0], random.normal(size=(11, n)), 7), BSpline(knots[1], random.uniform(1, 2, 11), 7)
+    p, r = (
+        BSpline(knots[0], random.normal(size=(11, n)), 7),
+        BSpline(knots[1], random.uniform(1, 2, 11), 7),
+    )
     columns = [ca.SX.sym(f"p{order}", n) for order in (1, 2, 3)], ca.SX.sym("r", 3)
-    _, _, formula = time_derivatives([ca.vertsplit(each) for each in columns[0]], ca.vertsplit(columns[1]))
+    _, _, formula = time_derivatives(
+        [ca.vertsplit(each) for each in columns[0]], ca.vertsplit(columns[1])
+    )
     jerk = ca.Function("jerk", [*columns[0], columns[1]], [ca.vertcat(*formula)])
     for s in (0.2, 0.5, 0.8):
         times, phases = h * np.arange(-2, 3), []
@@ -75,8 +96,15 @@ def test_the_jerk_along_a_path_is_the_third_difference_in_time() -> None:
             phases.append(at)
         q = p(np.array(phases))
         differences = (q[4] - 2 * q[3] + 2 * q[1] - q[0]) / (2 * h**3)
-        found = np.array(jerk(*(p(s, order) for order in (1, 2, 3)), [r(s, order) for order in range(3)])).ravel()
-        np.testing.assert_allclose(found, differences, rtol=2e-2, atol=2e-2 * np.abs(found).max())
+        found = np.array(
+            jerk(
+                *(p(s, order) for order in (1, 2, 3)),
+                [r(s, order) for order in range(3)],
+            )
+        ).ravel()
+        np.testing.assert_allclose(
+            found, differences, rtol=2e-2, atol=2e-2 * np.abs(found).max()
+        )
 
 
 def test_a_path_without_a_third_derivative_has_none() -> None:
@@ -98,12 +126,17 @@ def test_both_forms_state_the_same_limits_of_what_they_are_given() -> None:
     (measured,) = JERK.measured(world)
     np.testing.assert_array_equal(measured.g, values)
     np.testing.assert_array_equal(
-        np.array(ca.Function("g", [column], [ca.vertcat(*symbolic.g)])(values)).ravel(), values
+        np.array(ca.Function("g", [column], [ca.vertcat(*symbolic.g)])(values)).ravel(),
+        values,
     )
     for each in (symbolic, measured):
         np.testing.assert_array_equal(each.upper, robot.jerk_limit)
         np.testing.assert_array_equal(each.lower, -robot.jerk_limit)
-        assert (each.name, each.unit, each.tolerance_kind) == ("joint jerk", "rad/s^3", "limit")
+        assert (each.name, each.unit, each.tolerance_kind) == (
+            "joint jerk",
+            "rad/s^3",
+            "limit",
+        )
     np.testing.assert_allclose(JERK.allowed(measured), 0.01 * robot.jerk_limit)
     assert symbolic_needs(symbolic, ca.SX.sym("dq"), ca.SX.sym("ddq"), column) == 3
 
@@ -112,7 +145,11 @@ def test_a_boundary_state_has_no_jerk_and_meets_the_limits() -> None:
     problem, robot = jerk_limited("airhockey")
     world = World(robot)
     assert JERK.measured(world) == JERK.measured_at(world, "goal") == ()
-    assert JERK.symbolic(state_of(problem, None)) == JERK.symbolic_at(state_of(problem, None), "start") == ()
+    assert (
+        JERK.symbolic(state_of(problem, None))
+        == JERK.symbolic_at(state_of(problem, None), "start")
+        == ()
+    )
 
 
 def test_what_depends_on_the_jerk_is_found_out() -> None:
@@ -126,7 +163,12 @@ def test_residuals_of_a_motion_have_the_jerk_and_its_derivatives() -> None:
     problem, robot = jerk_limited("airhockey")
     n, random = robot.n, np.random.default_rng(4)
     w = np.concatenate([robot.home, random.normal(size=3 * n), [0.9, 0.4, -0.3]])
-    p1, p2, p3, (r, r1, r2) = w[n : 2 * n], w[2 * n : 3 * n], w[3 * n : 4 * n], w[4 * n :]
+    p1, p2, p3, (r, r1, r2) = (
+        w[n : 2 * n],
+        w[2 * n : 3 * n],
+        w[3 * n : 4 * n],
+        w[4 * n :],
+    )
     value = stage_values(robot, problem)
     g, columns = (np.array(part) for part in stage_jacobian(robot, problem)(w, []))
     jacobian = columns.reshape(len(w), -1).T
@@ -135,13 +177,17 @@ def test_residuals_of_a_motion_have_the_jerk_and_its_derivatives() -> None:
     assert not jacobian[:-n, 3 * n : 4 * n].any()
     for column in range(len(w)):
         step = 1e-6 * np.eye(len(w))[column]
-        expected = (np.array(value(w + step, [])) - np.array(value(w - step, []))).ravel() / 2e-6
+        expected = (
+            np.array(value(w + step, [])) - np.array(value(w - step, []))
+        ).ravel() / 2e-6
         np.testing.assert_allclose(jacobian[:, column], expected, rtol=1e-6, atol=1e-6)
 
 
 def test_residuals_of_other_problems_are_of_no_third_derivative() -> None:
     assert PROBLEMS["airhockey"].path_orders == 3
     plain, n = PROBLEMS["airhockey"], 6
-    limited = replace(plain, limits=jerk_limited("airhockey")[0].limits)  # given, and not constrained
+    limited = replace(
+        plain, limits=jerk_limited("airhockey")[0].limits
+    )  # given, and not constrained
     for problem in (plain, limited):
         assert stage_values(load_robot(problem), problem).size1_in(0) == 3 * n + 2

@@ -39,18 +39,23 @@ TABLE_RANGES = ParameterRanges(
     table_y_high=Range(0.35, 0.5),
 )
 UPRIGHT_RANGES = ParameterRanges(
-    upright_roll=Range(-0.1, 0.1), upright_pitch=Range(-0.1, 0.15), upright_tolerance=Range(0.01, 0.06)
+    upright_roll=Range(-0.1, 0.1),
+    upright_pitch=Range(-0.1, 0.15),
+    upright_tolerance=Range(0.01, 0.06),
 )
 TABLES, LOADS = load_problem("airhockey-tables"), load_problem("heavy-object-loads")
 RECTANGLES = replace(TABLES, parameters=TABLE_RANGES)
-OBJECTS = replace(LOADS, parameters=UPRIGHT_RANGES, obstacle=(), constraint=LOADS.constraint[:5])
+OBJECTS = replace(
+    LOADS, parameters=UPRIGHT_RANGES, obstacle=(), constraint=LOADS.constraint[:5]
+)
 WIPE = replace(load_problem("ur5-wipe"), parameters=UPRIGHT_RANGES)
 
 
 def in_range(problem: Problem, angle: float) -> Problem:
     """Return a problem whose axis is free within an angle."""
     constraints = [
-        replace(item, angle=angle, tolerance=0.01) if isinstance(item, Axis) else item for item in problem.constraint
+        replace(item, angle=angle, tolerance=0.01) if isinstance(item, Axis) else item
+        for item in problem.constraint
     ]
     return replace(problem, constraint=tuple(constraints))
 
@@ -58,31 +63,48 @@ def in_range(problem: Problem, angle: float) -> Problem:
 def recipe_of(name: str, problem: Problem) -> DatasetRecipe:
     """Return a shipped dataset for another problem, without collisions."""
     recipe = as_dataset_recipe(name)
-    stages = tuple(stage for stage in recipe.pipeline.stage if not isinstance(stage, Collision))
-    return replace(recipe, pipeline=replace(recipe.pipeline, problem=problem, stage=stages))
+    stages = tuple(
+        stage for stage in recipe.pipeline.stage if not isinstance(stage, Collision)
+    )
+    return replace(
+        recipe, pipeline=replace(recipe.pipeline, problem=problem, stage=stages)
+    )
 
 
 def drawn(problem: Problem, n: int) -> np.ndarray:
     """Return random parameters of a problem, shape (n, width)."""
-    low, high = np.array([(span.low, span.high) for span in problem.parameters.ranges]).T
+    low, high = np.array(
+        [(span.low, span.high) for span in problem.parameters.ranges]
+    ).T
     return np.random.default_rng(7).uniform(low, high, (n, len(low)))
 
 
 def with_values(problem: Problem, values: np.ndarray) -> Problem:
     """Return the problem without parameters that is equal to a problem at some values."""
     named = dict(zip(problem.parameters.names, values.tolist(), strict=True))
-    roll, pitch, tolerance = (named.get(f"upright_{name}") for name in ("roll", "pitch", "tolerance"))
+    roll, pitch, tolerance = (
+        named.get(f"upright_{name}") for name in ("roll", "pitch", "tolerance")
+    )
     constraints = []
     for item in problem.constraint:
         if isinstance(item, Table):
-            x, y = (Range(named[f"table_{side}_low"], named[f"table_{side}_high"]) for side in "xy")
+            x, y = (
+                Range(named[f"table_{side}_low"], named[f"table_{side}_high"])
+                for side in "xy"
+            )
             constraints.append(replace(item, x=x, y=y))
         elif isinstance(item, TipAxis):
             axis, direction = item.directions
             direction = pin.rpy.rpyToMatrix(roll, pitch, 0.0) @ direction
             angle = getattr(item, "angle", 0.0)
-            bounds = {"angle": tolerance, "tolerance": item.tolerance} if angle else {"tolerance": tolerance}
-            constraints.append(Axis(axis=tuple(axis), direction=tuple(direction.tolist()), **bounds))
+            bounds = (
+                {"angle": tolerance, "tolerance": item.tolerance}
+                if angle
+                else {"tolerance": tolerance}
+            )
+            constraints.append(
+                Axis(axis=tuple(axis), direction=tuple(direction.tolist()), **bounds)
+            )
         else:
             constraints.append(item)
     return replace(problem, parameters=NO_PARAMETERS, constraint=tuple(constraints))
@@ -101,23 +123,41 @@ def solved(name: str) -> Plans:
 
 @pytest.mark.parametrize(
     "problem",
-    [RECTANGLES, OBJECTS, *(pytest.param(each, marks=needs_robots) for each in (WIPE, in_range(WIPE, 0.04)))],
+    [
+        RECTANGLES,
+        OBJECTS,
+        *(
+            pytest.param(each, marks=needs_robots)
+            for each in (WIPE, in_range(WIPE, 0.04))
+        ),
+    ],
     ids=lambda each: each.name,
 )
 def test_both_forms_agree_on_motions_and_at_their_ends(problem: Problem) -> None:
     robot, random, n = load_robot(problem), np.random.default_rng(2), 8
-    exact = tuple(item for item in problem.constraint if isinstance(item, Table | TipAxis))
+    exact = tuple(
+        item for item in problem.constraint if isinstance(item, Table | TipAxis)
+    )
     problem = replace(problem, constraint=exact, obstacle=(), object=None)
     model, values = cnpgen.RobotModel(problem, backend="numpy"), drawn(problem, n)
-    q, dq, ddq = (mean + random.uniform(-1, 1, (n, robot.n)) for mean in (robot.home, 0, 0))
+    q, dq, ddq = (
+        mean + random.uniform(-1, 1, (n, robot.n)) for mean in (robot.home, 0, 0)
+    )
     tip = model.forward_kinematics(q)[0]
     scene = model.scene(tip, tip, parameters=values)
     found = model.constraint_values(q, dq, ddq, scene=scene)
     for row in range(n):
         world = World(robot)
         world.set_state(q[row], dq[row], ddq[row], scene.poses[row])
-        expected = [value for item in exact for condition in item.measured(world) for value in condition.g]
-        np.testing.assert_allclose(found.g[row], np.array(expected, float), rtol=1e-9, atol=1e-10)
+        expected = [
+            value
+            for item in exact
+            for condition in item.measured(world)
+            for value in condition.g
+        ]
+        np.testing.assert_allclose(
+            found.g[row], np.array(expected, float), rtol=1e-9, atol=1e-10
+        )
 
 
 @pytest.mark.parametrize("name", ["rectangle", "vertical"])
@@ -130,15 +170,28 @@ def test_samples_plans_and_verdicts_have_their_own_values(name: str) -> None:
         assert all(verdict.valid for verdict in verdicts)
         for row, verdict in enumerate(verdicts):
             own = record_problem(with_values(problem, plans.boundary.parameters[row]))
-            one = replace(plans[row], problem=own, boundary=replace(plans[row].boundary, parameters=None))
+            one = replace(
+                plans[row],
+                problem=own,
+                boundary=replace(plans[row].boundary, parameters=None),
+            )
             (expected,) = cnpgen.evaluate_plans(one).verdicts
             assert expected.valid
-            for margin, other in zip(verdict.margins.values(), expected.margins.values(), strict=True):
+            for margin, other in zip(
+                verdict.margins.values(), expected.margins.values(), strict=True
+            ):
                 assert margin.tolerance == pytest.approx(other.tolerance)
-                assert margin.violation == pytest.approx(other.violation, rel=1e-6, abs=1e-7)
+                assert margin.violation == pytest.approx(
+                    other.violation, rel=1e-6, abs=1e-7
+                )
             assert verdict.paper.valid == expected.paper.valid
-        others = replace(plans, boundary=replace(plans.boundary, parameters=drawn(problem, len(plans))))
-        assert not all(verdict.valid for verdict in cnpgen.evaluate_plans(others).verdicts)
+        others = replace(
+            plans,
+            boundary=replace(plans.boundary, parameters=drawn(problem, len(plans))),
+        )
+        assert not all(
+            verdict.valid for verdict in cnpgen.evaluate_plans(others).verdicts
+        )
 
 
 @pytest.mark.parametrize("form", ["signed", "paper"])
@@ -150,15 +203,31 @@ def test_losses_are_those_of_the_problem_at_these_values(name: str, form: str) -
         boundary, spec = plans.boundary, problem.trajectory
         inner = plans.motion.path[:, 3:-2]
         inner, rate = inner + 0.05 * random.normal(size=inner.shape), plans.motion.rate
-        path, poses, weights = assemble(boundary, inner, rate, spec), plans.scene.poses.copy(), loss.weights0
-        if name == "vertical" and form == "signed":  # the loss of a tilt is relative to the tolerance of the sample
+        path, poses, weights = (
+            assemble(boundary, inner, rate, spec),
+            plans.scene.poses.copy(),
+            loss.weights0,
+        )
+        if (
+            name == "vertical" and form == "signed"
+        ):  # the loss of a tilt is relative to the tolerance of the sample
             poses[:, -1] = problem.nominal_parameters[-1]
-        both = [loss(path, rate, weights=each, obstacle_poses=poses) for each in (weights, 0 * weights)]
+        both = [
+            loss(path, rate, weights=each, obstacle_poses=poses)
+            for each in (weights, 0 * weights)
+        ]
         by_path = random.normal(size=path.shape)
         gradients = [(each.path_gradient * by_path).sum((1, 2)) for each in both]
-        ends = [loss(path + h * by_path, rate, weights=weights, obstacle_poses=poses) for h in (step, -step)]
+        ends = [
+            loss(path + h * by_path, rate, weights=weights, obstacle_poses=poses)
+            for h in (step, -step)
+        ]
         violations = [each.total - each.terms[:, 0] for each in ends]
-        np.testing.assert_allclose(gradients[0] - gradients[1], (violations[0] - violations[1]) / (2 * step), rtol=1e-5)
+        np.testing.assert_allclose(
+            gradients[0] - gradients[1],
+            (violations[0] - violations[1]) / (2 * step),
+            rtol=1e-5,
+        )
         if name == "vertical" and form == "paper":
             return
         for row, values in enumerate(poses[:, -len(problem.parameters) :]):
@@ -174,13 +243,24 @@ def test_a_planner_projects_onto_the_manifold_of_each_sample(tmp_path: Path) -> 
     recipe = recipe_of("heavy-object-loads", OBJECTS)
     cnpgen.make_dataset(recipe, tmp_path / "rows", n=300, workers=1)
     settings = TrainingSettings(hidden=16, line_projection_steps=3, projection_steps=3)
-    cnpgen.train_model(tmp_path / "rows", tmp_path / "m.h5", settings=settings, steps=2, check_rows=3, workers=1)
+    cnpgen.train_model(
+        tmp_path / "rows",
+        tmp_path / "m.h5",
+        settings=settings,
+        steps=2,
+        check_rows=3,
+        workers=1,
+    )
     planner = cnpgen.Planner(tmp_path / "m.h5")
     problems = draw_boundary_problems(recipe, 4, seed=9)
     boundary = problems.boundary
-    plans = planner.plan(boundary.start_q, boundary.goal_q, parameters=boundary.parameters)
+    plans = planner.plan(
+        boundary.start_q, boundary.goal_q, parameters=boundary.parameters
+    )
     assert not np.allclose(boundary.parameters[0], boundary.parameters[1])
-    positions = np.array([plans.states_at(share * plans.duration)[0] for share in np.linspace(0, 1, 20)])
+    positions = np.array(
+        [plans.states_at(share * plans.duration)[0] for share in np.linspace(0, 1, 20)]
+    )
     for row, (roll, pitch, _) in enumerate(boundary.parameters):
         up, q = pin.rpy.rpyToMatrix(roll, pitch, 0.0)[:, 2], positions[:, row].T
         world = PathWorld(planner.robot)
@@ -200,13 +280,29 @@ def test_a_planner_projects_onto_the_manifold_of_each_sample(tmp_path: Path) -> 
             ParameterRanges(upright_roll=Range(-0.1, 0.1)),
             "upright_roll needs one constraint",
         ),
-        (TABLES, ParameterRanges(table_x_low=Range(0.5, 2.1)), "table_x_low must be below table_x_high in all samples"),
-        (TABLES, ParameterRanges(table_y_high=Range(0.5, 0.6)), "table_y_high must include 0.45"),
-        (LOADS, ParameterRanges(upright_tolerance=Range(0.1, 0.2)), "upright_tolerance must include 0.0314159"),
+        (
+            TABLES,
+            ParameterRanges(table_x_low=Range(0.5, 2.1)),
+            "table_x_low must be below table_x_high in all samples",
+        ),
+        (
+            TABLES,
+            ParameterRanges(table_y_high=Range(0.5, 0.6)),
+            "table_y_high must include 0.45",
+        ),
+        (
+            LOADS,
+            ParameterRanges(upright_tolerance=Range(0.1, 0.2)),
+            "upright_tolerance must include 0.0314159",
+        ),
     ],
 )
-def test_recipe_errors_in_ranges_are_named(problem: Problem, ranges: ParameterRanges, text: str) -> None:
-    assert any(text in error for _, error in replace(problem, parameters=ranges).validate())
+def test_recipe_errors_in_ranges_are_named(
+    problem: Problem, ranges: ParameterRanges, text: str
+) -> None:
+    assert any(
+        text in error for _, error in replace(problem, parameters=ranges).validate()
+    )
 
 
 def test_configurations_of_tasks_are_along_the_direction_of_each_sample() -> None:
@@ -216,19 +312,25 @@ def test_configurations_of_tasks_are_along_the_direction_of_each_sample() -> Non
         data = robot.model.createData()
         pin.forwardKinematics(robot.model, data, q)
         R = pin.updateFramePlacement(robot.model, data, robot.tip_frame).rotation
-        np.testing.assert_allclose(R[:, 2], pin.rpy.rpyToMatrix(roll, pitch, 0.0)[:, 2], atol=1e-8)
+        np.testing.assert_allclose(
+            R[:, 2], pin.rpy.rpyToMatrix(roll, pitch, 0.0)[:, 2], atol=1e-8
+        )
 
 
 def test_tasks_are_checked_with_the_rectangle_of_each_sample() -> None:
     backend, folder = choose_backend(None)
     pipeline = recipe_of("airhockey-tables", RECTANGLES).pipeline
-    context = PreparedPipeline(pipeline, backend=backend, cache_folder=folder, dtype="float64").context
+    context = PreparedPipeline(
+        pipeline, backend=backend, cache_folder=folder, dtype="float64"
+    ).context
     columns = {
         "start_xyz": np.array([[0.65], [0.0], [0.16]]),
         "goal_xyz": np.array([[1.0], [0.4], [0.16]]),
         "hit_angle": np.zeros((1, 1)),
         "hit_speed_share": np.full((1, 1), 0.5),
-        "parameters": np.array([[0.6, 2.0, -0.45, y_high] for y_high in (0.45, 0.36, 0.5)]).T,
+        "parameters": np.array(
+            [[0.6, 2.0, -0.45, y_high] for y_high in (0.45, 0.36, 0.5)]
+        ).T,
     }
     tasks = Completion(pipeline, context, list(columns))(columns)
     assert tasks.alive.tolist() == [0, 2]

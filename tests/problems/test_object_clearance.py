@@ -29,7 +29,9 @@ CHECKED_LINKS = [f"link_{number}" for number in range(7)]
 
 
 def random_states(count: int) -> np.ndarray:
-    return np.random.default_rng(5).uniform(ROBOT.position_lower, ROBOT.position_upper, (count, ROBOT.n))
+    return np.random.default_rng(5).uniform(
+        ROBOT.position_lower, ROBOT.position_upper, (count, ROBOT.n)
+    )
 
 
 def distance_of_coal(q: np.ndarray) -> float:
@@ -42,15 +44,32 @@ def distance_of_coal(q: np.ndarray) -> float:
         if part.link in CHECKED_LINKS:
             pose = data.oMf[model.getFrameId(part.link)]
             request, result = coal.DistanceRequest(), coal.DistanceResult()
-            transforms = [coal.Transform3s(each.rotation, each.translation) for each in (pose, tip)]
-            coal.distance(coal_hull(part.vertices), transforms[0], box, transforms[1], request, result)
+            transforms = [
+                coal.Transform3s(each.rotation, each.translation)
+                for each in (pose, tip)
+            ]
+            coal.distance(
+                coal_hull(part.vertices),
+                transforms[0],
+                box,
+                transforms[1],
+                request,
+                result,
+            )
             distances.append(result.min_distance - part.radius)
     return min(distances)
 
 
 def test_measured_distances_are_those_of_coal() -> None:
-    world, zero, overlapping = World(ROBOT, HEAVY.obstacle, HEAVY.object_size), np.zeros(ROBOT.n), 0
-    states, path = random_states(300), PathWorld(ROBOT, HEAVY.obstacle, HEAVY.object_size)
+    world, zero, overlapping = (
+        World(ROBOT, HEAVY.obstacle, HEAVY.object_size),
+        np.zeros(ROBOT.n),
+        0,
+    )
+    states, path = (
+        random_states(300),
+        PathWorld(ROBOT, HEAVY.obstacle, HEAVY.object_size),
+    )
     poses = place_obstacles(HEAVY.obstacle)
     smallest = []
     for q in states:
@@ -72,33 +91,55 @@ def test_measured_distances_are_those_of_coal() -> None:
 
 def test_capsules_of_solvers_are_conservative_and_close() -> None:
     columns = [symbols(name, ROBOT.n) for name in ("q", "dq", "ddq")]
-    (q, dq, ddq), obstacle_poses = [scalars for _, scalars in columns], [0.0] * len(HEAVY.obstacle)
-    state = SymbolicState(ROBOT, q, dq, ddq, obstacle_poses, HEAVY.obstacle, HEAVY.object_size)
+    (q, dq, ddq), obstacle_poses = (
+        [scalars for _, scalars in columns],
+        [0.0] * len(HEAVY.obstacle),
+    )
+    state = SymbolicState(
+        ROBOT, q, dq, ddq, obstacle_poses, HEAVY.obstacle, HEAVY.object_size
+    )
     (condition,) = CLEARANCE.symbolic(state)
     assert condition.sufficient
-    margins = ca.Function("margins", [columns[0][0]], [ca.vertcat(*condition.g) - condition.lower])
+    margins = ca.Function(
+        "margins", [columns[0][0]], [ca.vertcat(*condition.g) - condition.lower]
+    )
     states = random_states(300)
     bound = np.array([float(ca.mmin(margins(each))) for each in states])
     exact = np.array([distance_of_coal(each) for each in states]) - CLEARANCE.distance
     assert np.all(bound[exact < 0] < 0)
     free = exact > 0.01
     assert free.sum() > 100
-    assert np.mean(bound[free] > 0) > 0.97  # close: most free states are free for solvers, too
+    assert (
+        np.mean(bound[free] > 0) > 0.97
+    )  # close: most free states are free for solvers, too
 
 
 def test_gradients_of_capsules_agree_with_differences() -> None:
     columns = [symbols(name, ROBOT.n) for name in ("q", "dq", "ddq")]
-    (q, dq, ddq), obstacle_poses = [scalars for _, scalars in columns], [0.0] * len(HEAVY.obstacle)
-    state = SymbolicState(ROBOT, q, dq, ddq, obstacle_poses, HEAVY.obstacle, HEAVY.object_size)
+    (q, dq, ddq), obstacle_poses = (
+        [scalars for _, scalars in columns],
+        [0.0] * len(HEAVY.obstacle),
+    )
+    state = SymbolicState(
+        ROBOT, q, dq, ddq, obstacle_poses, HEAVY.obstacle, HEAVY.object_size
+    )
     g = ca.vertcat(*CLEARANCE.symbolic(state)[0].g)
     value = ca.Function("g", [columns[0][0]], [g])
-    jacobian = ca.Function("j", [columns[0][0]], [ca.densify(ca.jacobian(g, columns[0][0]))])
+    jacobian = ca.Function(
+        "j", [columns[0][0]], [ca.densify(ca.jacobian(g, columns[0][0]))]
+    )
     close = []
     for at in random_states(40):
         steps = 1e-6 * np.eye(ROBOT.n)
-        differences = np.hstack([np.array(value(at + step) - value(at - step)) / 2e-6 for step in steps])
-        close.append(np.isclose(np.array(jacobian(at)), differences, rtol=1e-4, atol=1e-5).all())
-    assert np.mean(close) >= 0.95  # a step across an edge of the object changes the closest feature
+        differences = np.hstack(
+            [np.array(value(at + step) - value(at - step)) / 2e-6 for step in steps]
+        )
+        close.append(
+            np.isclose(np.array(jacobian(at)), differences, rtol=1e-4, atol=1e-5).all()
+        )
+    assert (
+        np.mean(close) >= 0.95
+    )  # a step across an edge of the object changes the closest feature
 
 
 def problem_text(tmp_path: Path, old: str, new: str) -> Path:
@@ -127,11 +168,21 @@ def test_a_held_object_stays_clear_of_links_by_default(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('touch_links = ["link_7"]', 'touch_links = ["link_77"]', "no link 'link_77' has collision geometry.*link_7"),
-        ('[object]\nsize = "[0.2, 0.2, 0.3] m"', '[object]\nsize = "[0.2, 0.6, 0.3] m"', "overlaps link_5, link_6 in"),
+        (
+            'touch_links = ["link_7"]',
+            'touch_links = ["link_77"]',
+            "no link 'link_77' has collision geometry.*link_7",
+        ),
+        (
+            '[object]\nsize = "[0.2, 0.2, 0.3] m"',
+            '[object]\nsize = "[0.2, 0.6, 0.3] m"',
+            "overlaps link_5, link_6 in",
+        ),
     ],
 )
-def test_mistakes_name_the_links(tmp_path: Path, old: str, new: str, message: str) -> None:
+def test_mistakes_name_the_links(
+    tmp_path: Path, old: str, new: str, message: str
+) -> None:
     problem: Problem = load_problem(problem_text(tmp_path, old, new))
     with pytest.raises(RecipeError, match=message):
         load_robot(problem)

@@ -34,7 +34,9 @@ LOADS, TABLES = load_problem("heavy-object-loads"), load_problem("airhockey-tabl
 
 def drawn(problem: Problem, n: int, seed: int = 0) -> np.ndarray:
     """Return random parameters of a problem, shape (n, width)."""
-    low, high = np.array([(span.low, span.high) for span in problem.parameters.ranges]).T
+    low, high = np.array(
+        [(span.low, span.high) for span in problem.parameters.ranges]
+    ).T
     return np.random.default_rng(seed).uniform(low, high, (n, len(low)))
 
 
@@ -48,11 +50,17 @@ def states(problem: Problem, n: int, seed: int = 0) -> list[np.ndarray]:
     ]
 
 
-def measured(problem: Problem, scene: np.ndarray, state: list[np.ndarray]) -> np.ndarray:
+def measured(
+    problem: Problem, scene: np.ndarray, state: list[np.ndarray]
+) -> np.ndarray:
     """Return all conditions at one state with Pinocchio, shape (m,)."""
     world = World(load_robot(problem), problem.obstacle, problem.object_size)
     world.set_state(*state, scene)
-    parts = [condition for constraint in problem.constraint for condition in constraint.solved(world)]
+    parts = [
+        condition
+        for constraint in problem.constraint
+        for condition in constraint.solved(world)
+    ]
     return np.concatenate([np.array(condition.g, float) for condition in parts])
 
 
@@ -60,7 +68,11 @@ def measured(problem: Problem, scene: np.ndarray, state: list[np.ndarray]) -> np
 @pytest.mark.parametrize("name", NAMES)
 def test_one_kernel_agrees_with_pinocchio_for_all_values(name: str) -> None:
     problem = load_problem(name)
-    exact = tuple(item for item in problem.constraint if not isinstance(item, ObjectClearance | ObjectContact))
+    exact = tuple(
+        item
+        for item in problem.constraint
+        if not isinstance(item, ObjectClearance | ObjectContact)
+    )
     problem = replace(problem, constraint=exact)
     model = cnpgen.RobotModel(problem, backend="numpy")
     values, state = drawn(problem, 12), states(problem, 12)
@@ -76,14 +88,26 @@ def test_one_kernel_agrees_with_pinocchio_for_all_values(name: str) -> None:
 def test_the_load_of_a_sample_is_that_of_a_problem_with_this_payload() -> None:
     (mass,) = drawn(LOADS, 1)[0]
     payload = replace(LOADS.payload, mass=mass)
-    other = load_robot(replace(LOADS, payload=payload, parameters=type(LOADS.parameters)()))
+    other = load_robot(
+        replace(LOADS, payload=payload, parameters=type(LOADS.parameters)())
+    )
     q, dq, ddq = (part.T for part in states(LOADS, 5))
     world = PathWorld(load_robot(LOADS), LOADS.obstacle, LOADS.object_size)
     for value in (9.0, mass):  # the second value replaces the first
-        world.set_path(q, dq, ddq, scene_of(LOADS, *np.zeros((2, 1, 3)), parameters=np.array([[value]])).poses[0])
+        world.set_path(
+            q,
+            dq,
+            ddq,
+            scene_of(LOADS, *np.zeros((2, 1, 3)), parameters=np.array([[value]])).poses[
+                0
+            ],
+        )
         torque = world.torque
     data = other.model.createData()
-    expected = [pin.rnea(other.model, data, *(part[:, k].copy() for part in (q, dq, ddq))) for k in range(5)]
+    expected = [
+        pin.rnea(other.model, data, *(part[:, k].copy() for part in (q, dq, ddq)))
+        for k in range(5)
+    ]
     np.testing.assert_allclose(torque.T, expected, rtol=1e-10)
     assert not np.allclose(torque, PathWorld(other).torque[:, :1])
 
@@ -97,7 +121,9 @@ def test_center_and_inertia_of_the_load_differ_from_sample_to_sample() -> None:
         payload_z=Range(0.0, 0.1),
         payload_inertia=Range(0.5, 2.0),
     )
-    problem = replace(LOADS, payload=nominal, parameters=ranges, constraint=LOADS.constraint[:4])
+    problem = replace(
+        LOADS, payload=nominal, parameters=ranges, constraint=LOADS.constraint[:4]
+    )
     model = cnpgen.RobotModel(problem, backend="numpy")
     values, state = drawn(problem, 6, seed=8), states(problem, 6, seed=8)
     tip = model.forward_kinematics(state[0])[0]
@@ -105,10 +131,14 @@ def test_center_and_inertia_of_the_load_differ_from_sample_to_sample() -> None:
     found = model.constraint_values(*state, scene=scene).g
     for row, (mass, x, y, z, factor) in enumerate(values):
         body = nominal.at({"payload_mass": mass, "payload_inertia": factor})
-        np.testing.assert_allclose(body.inertia_matrix, nominal.inertia_matrix * mass / 12 * factor, rtol=1e-12)
+        np.testing.assert_allclose(
+            body.inertia_matrix, nominal.inertia_matrix * mass / 12 * factor, rtol=1e-12
+        )
         own = replace(body, centre=(x, y, z))
         other = load_robot(replace(problem, payload=own, parameters=type(ranges)()))
-        expected = pin.rnea(other.model, other.model.createData(), *(part[row] for part in state))
+        expected = pin.rnea(
+            other.model, other.model.createData(), *(part[row] for part in state)
+        )
         world = PathWorld(load_robot(problem), LOADS.obstacle, LOADS.object_size)
         world.set_path(*(part[row][:, None] for part in state), scene.poses[row])
         np.testing.assert_allclose(world.torque[:, 0], expected, rtol=1e-10)
@@ -116,11 +146,19 @@ def test_center_and_inertia_of_the_load_differ_from_sample_to_sample() -> None:
 
 
 def test_the_simulator_holds_the_load_of_each_plan() -> None:
-    plans = cnpgen.solve_plans(draw_boundary_problems("heavy-object-loads", 1, seed=4)).plans
+    plans = cnpgen.solve_plans(
+        draw_boundary_problems("heavy-object-loads", 1, seed=4)
+    ).plans
     found = {}
     for mass in (4.0, 14.0):
-        one = replace(plans, boundary=replace(plans.boundary, parameters=np.array([[mass]])))
-        problem = replace(LOADS, payload=replace(LOADS.payload, mass=mass), parameters=type(LOADS.parameters)())
+        one = replace(
+            plans, boundary=replace(plans.boundary, parameters=np.array([[mass]]))
+        )
+        problem = replace(
+            LOADS,
+            payload=replace(LOADS.payload, mass=mass),
+            parameters=type(LOADS.parameters)(),
+        )
         boundary = replace(plans.boundary, parameters=None)
         alone = replace(plans, problem=record_problem(problem), boundary=boundary)
         found[mass] = simulate_plans(one).executed[0]
@@ -129,12 +167,19 @@ def test_the_simulator_holds_the_load_of_each_plan() -> None:
 
 
 def test_the_simulator_moves_the_table_of_each_plan() -> None:
-    plans = cnpgen.solve_plans(draw_boundary_problems("airhockey-tables", 2, seed=1)).plans
+    plans = cnpgen.solve_plans(
+        draw_boundary_problems("airhockey-tables", 2, seed=1)
+    ).plans
     for result in simulate_plans(plans).executed:
         assert result.hit
         assert not result.touched_early
         assert result.plane_error < 5e-4
-    swapped = replace(plans, boundary=replace(plans.boundary, parameters=plans.boundary.parameters[::-1].copy()))
+    swapped = replace(
+        plans,
+        boundary=replace(
+            plans.boundary, parameters=plans.boundary.parameters[::-1].copy()
+        ),
+    )
     assert all(result.plane_error > 5e-3 for result in simulate_plans(swapped).executed)
     with pytest.raises(UsageError, match="the environment's table does not move"):
         simulate_plans(plans, environment="clone")
@@ -143,17 +188,27 @@ def test_the_simulator_moves_the_table_of_each_plan() -> None:
 def test_an_unmoved_table_is_simulated_as_without_parameters() -> None:
     plans = cnpgen.solve_plans(draw_boundary_problems("airhockey-hit", 1, seed=1)).plans
     still = replace(
-        plans, problem=record_problem(TABLES), boundary=replace(plans.boundary, parameters=np.array([[0, 0, 0, 1.0]]))
+        plans,
+        problem=record_problem(TABLES),
+        boundary=replace(plans.boundary, parameters=np.array([[0, 0, 0, 1.0]])),
     )
     assert simulate_plans(still).executed == simulate_plans(plans).executed
 
 
 def test_table_coordinates_are_those_of_pinocchio() -> None:
-    values, positions = drawn(TABLES, 20), np.random.default_rng(1).uniform(-1, 1, (20, 3))
+    values, positions = (
+        drawn(TABLES, 20),
+        np.random.default_rng(1).uniform(-1, 1, (20, 3)),
+    )
     frame = table_frame(TABLES.parameters, TABLES.table_origin, values)
-    np.testing.assert_allclose(frame.to_table(frame.to_world(positions)), positions, atol=1e-14)
+    np.testing.assert_allclose(
+        frame.to_table(frame.to_world(positions)), positions, atol=1e-14
+    )
     for row, (height, roll, pitch, _) in enumerate(values):
-        pose = pin.SE3(pin.rpy.rpyToMatrix(roll, pitch, 0.0), TABLES.table_origin + np.array([0, 0, height]))
+        pose = pin.SE3(
+            pin.rpy.rpyToMatrix(roll, pitch, 0.0),
+            TABLES.table_origin + np.array([0, 0, height]),
+        )
         expected = pose.actInv(positions[row]) + TABLES.table_origin
         np.testing.assert_allclose(frame.to_table(positions)[row], expected, atol=1e-14)
 
@@ -161,7 +216,9 @@ def test_table_coordinates_are_those_of_pinocchio() -> None:
 def test_a_box_contains_the_boxes_on_all_tables() -> None:
     low, high = np.array([0.6, -0.45, 0.16]), np.array([1.3, 0.45, 0.16])
     frame = table_frame(TABLES.parameters, TABLES.table_origin, drawn(TABLES, 4000))
-    corners = frame.to_world(np.where(np.random.default_rng(2).random((4000, 3)) < 0.5, low, high))
+    corners = frame.to_world(
+        np.where(np.random.default_rng(2).random((4000, 3)) < 0.5, low, high)
+    )
     box = moved_box(TABLES.parameters, TABLES.table_origin, low, high)
     assert (box[0] <= corners).all()
     assert (corners <= box[1]).all()
@@ -171,27 +228,49 @@ def test_a_box_contains_the_boxes_on_all_tables() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_gradients_agree_with_finite_differences_at_other_values(name: str) -> None:
     problems = draw_boundary_problems(name, 3, seed=5)
-    loss, random = PlanLoss(name, dtype="float64", nodes=12, backend="numpy"), np.random.default_rng(3)
+    loss, random = (
+        PlanLoss(name, dtype="float64", nodes=12, backend="numpy"),
+        np.random.default_rng(3),
+    )
     spec, boundary = loss.problem.trajectory, problems.boundary
     rate = random.uniform(1.5, 2.0, (3, spec.rate_control_points))
     along = np.linspace(0, 1, 10)[None, :, None]
     inner = boundary.start_q[:, None] * (1 - along) + boundary.goal_q[:, None] * along
-    path = assemble(boundary, inner + 0.05 * random.normal(size=inner.shape), rate, spec)
+    path = assemble(
+        boundary, inner + 0.05 * random.normal(size=inner.shape), rate, spec
+    )
     poses, step = problems.scene.poses, 1e-6
     by_path, by_rate = random.normal(size=path.shape), random.normal(size=rate.shape)
 
     def violation(h: float) -> np.ndarray:
-        value = loss(path + h * by_path, rate + h * by_rate, weights=loss.weights0, obstacle_poses=poses)
+        value = loss(
+            path + h * by_path,
+            rate + h * by_rate,
+            weights=loss.weights0,
+            obstacle_poses=poses,
+        )
         return value.total - value.terms[:, 0]
 
-    both = [loss(path, rate, weights=weights, obstacle_poses=poses) for weights in (loss.weights0, 0 * loss.weights0)]
-    gradients = [(each.path_gradient * by_path).sum((1, 2)) + (each.rate_gradient * by_rate).sum(1) for each in both]
+    both = [
+        loss(path, rate, weights=weights, obstacle_poses=poses)
+        for weights in (loss.weights0, 0 * loss.weights0)
+    ]
+    gradients = [
+        (each.path_gradient * by_path).sum((1, 2))
+        + (each.rate_gradient * by_rate).sum(1)
+        for each in both
+    ]
     np.testing.assert_allclose(
-        gradients[0] - gradients[1], (violation(step) - violation(-step)) / (2 * step), rtol=1e-6
+        gradients[0] - gradients[1],
+        (violation(step) - violation(-step)) / (2 * step),
+        rtol=1e-6,
     )
     other = poses.copy()
     other[:, -len(loss.problem.parameters) :] = boundary.parameters[::-1]
-    assert not np.allclose(loss(path, rate, weights=loss.weights0, obstacle_poses=other).total, both[0].total)
+    assert not np.allclose(
+        loss(path, rate, weights=loss.weights0, obstacle_poses=other).total,
+        both[0].total,
+    )
 
 
 CHANGES = [(NAMES[0], [0.01, 0, 0, 0]), (NAMES[0], [0, 0, 0, -0.2]), (NAMES[1], [9])]
@@ -209,33 +288,64 @@ def test_rows_are_judged_by_their_own_values(name: str, change: list[float]) -> 
 
 def test_plans_need_parameters_of_their_problem() -> None:
     problems = draw_boundary_problems("heavy-object-loads", 3, seed=1)
-    points = {"path_control_points": problems.path_control_points, "rate_control_points": problems.rate_control_points}
-    for parameters, text in ((None, "payload_mass"), (np.zeros((3, 2)), r"\(3, 1\)"), (np.zeros((2, 1)), r"\(3, 1\)")):
+    points = {
+        "path_control_points": problems.path_control_points,
+        "rate_control_points": problems.rate_control_points,
+    }
+    for parameters, text in (
+        (None, "payload_mass"),
+        (np.zeros((3, 2)), r"\(3, 1\)"),
+        (np.zeros((2, 1)), r"\(3, 1\)"),
+    ):
         with pytest.raises(UsageError, match=text):
-            make_plans("heavy-object-loads", replace(problems.boundary, parameters=parameters), **points)
+            make_plans(
+                "heavy-object-loads",
+                replace(problems.boundary, parameters=parameters),
+                **points,
+            )
 
 
 def test_values_are_checked_against_their_ranges() -> None:
-    with pytest.raises(UsageError, match=r"payload_mass must be from 4 to 14, got 15 in row 1"):
+    with pytest.raises(
+        UsageError, match=r"payload_mass must be from 4 to 14, got 15 in row 1"
+    ):
         LOADS.parameters.checked(np.array([[5.0], [15.0]]))
-    with pytest.raises(UsageError, match=r"velocity_factor must be from 0\.5 to 1, got nan"):
+    with pytest.raises(
+        UsageError, match=r"velocity_factor must be from 0\.5 to 1, got nan"
+    ):
         TABLES.parameters.checked(np.array([0, 0, 0, np.nan]))
-    with pytest.raises(UsageError, match=r"shape \(N, 4\) for table_height, table_roll"):
+    with pytest.raises(
+        UsageError, match=r"shape \(N, 4\) for table_height, table_roll"
+    ):
         TABLES.parameters.checked(np.zeros((2, 3)))
 
 
 @pytest.mark.parametrize(
     ("old", "new", "text"),
     [
-        ('payload_mass = "[4, 14] kg"', 'payload_weight = "[4, 14] kg"', "payload_weight"),
+        (
+            'payload_mass = "[4, 14] kg"',
+            'payload_weight = "[4, 14] kg"',
+            "payload_weight",
+        ),
         ('payload_mass = "[4, 14] kg"', 'payload_mass = "[4, 14] m"', "kg"),
         ('payload_mass = "[4, 14] kg"', 'velocity_factor = "[0.5, 2]"', "at most 1"),
-        ('payload_mass = "[4, 14] kg"', 'table_roll = "[-5, 5] deg"', "constraint 'table'"),
-        ('payload_mass = "[4, 14] kg"', 'payload_mass = "[4, 11] kg"', "payload_mass must include 12"),
+        (
+            'payload_mass = "[4, 14] kg"',
+            'table_roll = "[-5, 5] deg"',
+            "constraint 'table'",
+        ),
+        (
+            'payload_mass = "[4, 14] kg"',
+            'payload_mass = "[4, 11] kg"',
+            "payload_mass must include 12",
+        ),
         ("[payload] ", "[trash] ", "payload_mass needs the body"),
     ],
 )
-def test_recipe_errors_in_ranges_are_named(tmp_path: Path, old: str, new: str, text: str) -> None:
+def test_recipe_errors_in_ranges_are_named(
+    tmp_path: Path, old: str, new: str, text: str
+) -> None:
     content = LOADS.path.read_text()
     assert old in content
     (tmp_path / "iiwa14_gripper.urdf").write_text(LOADS.urdf_text)

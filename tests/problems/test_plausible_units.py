@@ -18,7 +18,11 @@ PROBLEMS = {
     ("heavy-object", "object"): {"size": [200, 200, 300]},
     ("airhockey", "table"): {"start_band": 5, "tolerance": 10, "z": 160},
     ("airhockey", "puck-contact"): {"last": 10, "mallet_radius": 48},
-    ("airhockey", "robot"): {"tip_rotation": [0, 90, 0], "tip_offset": [0, 0, 90], "base": [0, 45, 0, -90, 0, 0]},
+    ("airhockey", "robot"): {
+        "tip_rotation": [0, 90, 0],
+        "tip_offset": [0, 0, 90],
+        "base": [0, 45, 0, -90, 0, 0],
+    },
     ("airhockey", "limits"): {"acceleration_cap": 1146},
 }
 PIPELINES = {
@@ -28,22 +32,40 @@ PIPELINES = {
     ("airhockey-replan", "start-ik"): {"guess": [[-30, 30]] * 6, "max_step": 45},
     ("heavy-object-anywhere", "goal-ik"): {"max_change": 165},
     ("airhockey-pucks", "behind-puck"): {"distance": 70},
-    ("heavy-object", "draw-positions"): {"min_distance": 150, "start": [[200, 600], [-400, 400], [0, 100]]},
+    ("heavy-object", "draw-positions"): {
+        "min_distance": 150,
+        "start": [[200, 600], [-400, 400], [0, 100]],
+    },
 }
 
 
 def cases(tables):
-    return [(*place, key, value) for place, keys in tables.items() for key, value in keys.items()]
+    return [
+        (*place, key, value)
+        for place, keys in tables.items()
+        for key, value in keys.items()
+    ]
 
 
 def changed(text: str, table: str, key: str, value: object) -> str:
     """Replace a key of a table or of the array entry that uses a name, or add the key."""
-    heads = [rf"\[{table}\].*\n", rf"\[\[{table}\]\].*\n", rf'\[\[\w+\]\].*\n(?:#.*\n)*use = "{table}".*\n']
+    heads = [
+        rf"\[{table}\].*\n",
+        rf"\[\[{table}\]\].*\n",
+        rf'\[\[\w+\]\].*\n(?:#.*\n)*use = "{table}".*\n',
+    ]
     head = next(found for each in heads if (found := re.search(each, text)))
     end = text.find("\n[", head.end())
     body = text[head.end() : end if end > 0 else len(text)]
-    other = re.sub(rf"^{key} = (\[\n( .*\n)*\]|.*)\n", "", body + "\n", flags=re.MULTILINE)
-    return text[: head.end()] + f"{key} = {value}\n" + other + (text[end:] if end > 0 else "")
+    other = re.sub(
+        rf"^{key} = (\[\n( .*\n)*\]|.*)\n", "", body + "\n", flags=re.MULTILINE
+    )
+    return (
+        text[: head.end()]
+        + f"{key} = {value}\n"
+        + other
+        + (text[end:] if end > 0 else "")
+    )
 
 
 def errors(load, file) -> list[str]:
@@ -53,19 +75,31 @@ def errors(load, file) -> list[str]:
 
 
 @pytest.mark.parametrize(("recipe", "table", "key", "value"), cases(PROBLEMS))
-def test_problems_refuse_quantities_in_another_unit(tmp_path, recipe, table, key, value):
+def test_problems_refuse_quantities_in_another_unit(
+    tmp_path, recipe, table, key, value
+):
     source = find_recipe(("problem",), recipe)
     file = tmp_path / "problem.toml"
     text = changed(source.read_text(encoding="utf-8"), table, key, value)
-    file.write_text(re.sub(r'urdf = "([^:"]*)"', rf'urdf = "{source.parent}/\1"', text), encoding="utf-8")
+    file.write_text(
+        re.sub(r'urdf = "([^:"]*)"', rf'urdf = "{source.parent}/\1"', text),
+        encoding="utf-8",
+    )
     found = errors(lambda path: load_robot(load_problem(path)), file)
     assert any(f"{key}" in each and "did you mean" in each for each in found), found
 
 
 @pytest.mark.parametrize(("recipe", "table", "key", "value"), cases(PIPELINES))
-def test_pipelines_refuse_quantities_in_another_unit(tmp_path, recipe, table, key, value):
+def test_pipelines_refuse_quantities_in_another_unit(
+    tmp_path, recipe, table, key, value
+):
     file = tmp_path / "pipeline.toml"
-    text = changed(find_recipe(("pipeline",), recipe).read_text(encoding="utf-8"), table, key, value)
+    text = changed(
+        find_recipe(("pipeline",), recipe).read_text(encoding="utf-8"),
+        table,
+        key,
+        value,
+    )
     file.write_text(text, encoding="utf-8")
     found = errors(load_pipeline, file)
     assert any(f"{key}" in each and "did you mean" in each for each in found), found

@@ -32,13 +32,19 @@ def test_a_record_is_rebuilt_once_and_its_urdf_stays() -> None:
     problem = as_problem(RECORD)
     assert problem is as_problem(RECORD)
     assert problem.urdf_path.read_text() == RECORD.urdf
-    assert (problem.name, problem.constraint, problem.obstacle) == (HEAVY.name, HEAVY.constraint, HEAVY.obstacle)
+    assert (problem.name, problem.constraint, problem.obstacle) == (
+        HEAVY.name,
+        HEAVY.constraint,
+        HEAVY.obstacle,
+    )
     assert as_record(problem).comparable_sha256 == RECORD.comparable_sha256
     assert as_record(RECORD) is RECORD
 
 
 @pytest.mark.parametrize("name", ["", " ", "joint-position 2"])
-def test_the_digest_of_a_record_with_an_unknown_constraint_exists_and_the_record_is_refused(name: str) -> None:
+def test_the_digest_of_a_record_with_an_unknown_constraint_exists_and_the_record_is_refused(
+    name: str,
+) -> None:
     content = json.loads(RECORD.recipe)
     content["constraint"][1]["use"] = name
     changed = replace(RECORD, recipe=json.dumps(content))
@@ -47,22 +53,34 @@ def test_the_digest_of_a_record_with_an_unknown_constraint_exists_and_the_record
         as_problem(changed)
 
 
-def test_a_problem_in_an_untrusted_file_reads_no_mesh_from_the_disk(tmp_path: Path) -> None:
+def test_a_problem_in_an_untrusted_file_reads_no_mesh_from_the_disk(
+    tmp_path: Path,
+) -> None:
     problem = load_problem(write_problem(tmp_path))
     assert open_problem(record_problem(problem))[1].shape.convex_parts
     outside = problem.urdf_path.read_text()
-    with pytest.raises(RecipeError, match=r"names the mesh 'package://crane/.*', expected its corners in the text"):
+    with pytest.raises(
+        RecipeError,
+        match=r"names the mesh 'package://crane/.*', expected its corners in the text",
+    ):
         open_problem(replace(record_problem(problem), urdf=outside))
 
 
 def test_the_urdf_of_a_rebuilt_problem_is_gone_when_the_process_ends() -> None:
     code = "from cnpgen.problems.problem_record import *; print(as_problem(as_record('airhockey')).urdf_path)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert not Path(done.stdout.strip()).parent.exists()
 
 
-@pytest.mark.parametrize("name", ["heavy-object", "datasets/heavy-object.toml", "pipelines/heavy-object.toml"])
-def test_a_name_or_a_file_leads_to_the_problem(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "name",
+    ["heavy-object", "datasets/heavy-object.toml", "pipelines/heavy-object.toml"],
+)
+def test_a_name_or_a_file_leads_to_the_problem(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(ROOT)
     assert as_problem(name) == HEAVY
     assert as_problem(Path(name) if "/" in name else name) == HEAVY
@@ -76,34 +94,52 @@ def test_the_name_of_a_dataset_gives_its_problem(name: str) -> None:
 def test_what_leads_to_no_problem_is_named(tmp_path: Path) -> None:
     for folder in ("pipelines", "datasets"):
         (tmp_path / folder).mkdir()
-    pipeline, dataset = tmp_path / "pipelines" / "hit.toml", tmp_path / "datasets" / "hit.toml"
+    pipeline, dataset = (
+        tmp_path / "pipelines" / "hit.toml",
+        tmp_path / "datasets" / "hit.toml",
+    )
     shutil.copy(ROOT / "pipelines" / "airhockey-hit.toml", pipeline)
     dataset.write_text('name = "hit"\npipeline = "../pipelines/hit.toml"\n')
     assert as_problem(dataset).name == "airhockey"
     pipeline.write_text('problem = "airhokey"\n')
-    with pytest.raises(RecipeError, match=r"hit\.toml: problem: unknown problem 'airhokey' \(did you mean 'airhockey'"):
+    with pytest.raises(
+        RecipeError,
+        match=r"hit\.toml: problem: unknown problem 'airhokey' \(did you mean 'airhockey'",
+    ):
         as_problem(dataset)
     dataset.write_text("pipeline = 3\n")
-    with pytest.raises(RecipeError, match=r"hit\.toml: pipeline: expected a name or a path, got 3"):
+    with pytest.raises(
+        RecipeError, match=r"hit\.toml: pipeline: expected a name or a path, got 3"
+    ):
         as_problem(dataset)
-    with pytest.raises(RecipeError, match=r"unknown problem, pipeline or dataset 'airhokey-hit' .did you mean 'airho"):
+    with pytest.raises(
+        RecipeError,
+        match=r"unknown problem, pipeline or dataset 'airhokey-hit' .did you mean 'airho",
+    ):
         as_problem("airhokey-hit")
-    with pytest.raises(RecipeError, match="'airhockey-hit': it is the name of a pipeline and a dataset"):
+    with pytest.raises(
+        RecipeError, match="'airhockey-hit': it is the name of a pipeline and a dataset"
+    ):
         load_problem("airhockey-hit")
 
 
-@pytest.mark.parametrize("wrong", [None, 3, b"airhockey", [RECORD] * 50, {"problem": "x" * 5000}])
+@pytest.mark.parametrize(
+    "wrong", [None, 3, b"airhockey", [RECORD] * 50, {"problem": "x" * 5000}]
+)
 def test_what_is_no_problem_is_refused_in_few_words(wrong: object) -> None:
     for use in (PlanLoss, BoundaryLayer, as_record):
         with pytest.raises(
-            UsageError, match="problem must be a Problem, a ProblemRecord, or the name or the"
+            UsageError,
+            match="problem must be a Problem, a ProblemRecord, or the name or the",
         ) as caught:
             use(wrong)  # type: ignore[operator]
         assert len(str(caught.value)) < 200
 
 
 @pytest.mark.parametrize("given", some([RECORD, HEAVY, "heavy-object"], 1, "slow"))
-def test_everything_that_takes_a_problem_takes_what_plans_have_of_it(given: Problem) -> None:
+def test_everything_that_takes_a_problem_takes_what_plans_have_of_it(
+    given: Problem,
+) -> None:
     loss, omega = (
         PlanLoss(given, backend="numpy"),
         BoundaryLayer(given, projection_steps=0, backend="numpy"),
@@ -113,14 +149,27 @@ def test_everything_that_takes_a_problem_takes_what_plans_have_of_it(given: Prob
     tasks = omega.tasks(Boundary(q, zero, zero, q + 0.1, zero))
     phi, log_rate = np.zeros((2, omega.path_outputs)), np.zeros((2, omega.rate_outputs))
     plans = omega.plans(tasks, phi, log_rate)
-    obstacle_poses = scene_of(as_problem(given), plans.columns["start_xyz"], plans.columns["goal_xyz"]).poses
+    obstacle_poses = scene_of(
+        as_problem(given), plans.columns["start_xyz"], plans.columns["goal_xyz"]
+    ).poses
     np.testing.assert_array_equal(obstacle_poses, tasks.scene.poses)
     arrays = plans.path_control_points, plans.rate_control_points
     found = loss(*arrays, weights=loss.weights0, obstacle_poses=obstacle_poses)
-    expected = PlanLoss(HEAVY, backend="numpy")(*arrays, weights=loss.weights0, obstacle_poses=obstacle_poses)
+    expected = PlanLoss(HEAVY, backend="numpy")(
+        *arrays, weights=loss.weights0, obstacle_poses=obstacle_poses
+    )
     np.testing.assert_array_equal(found.total, expected.total)
-    again = make_plans(given, plans.boundary, path_control_points=arrays[0], rate_control_points=arrays[1])
-    assert again.problem.comparable_sha256 == plans.problem.comparable_sha256 == RECORD.comparable_sha256
+    again = make_plans(
+        given,
+        plans.boundary,
+        path_control_points=arrays[0],
+        rate_control_points=arrays[1],
+    )
+    assert (
+        again.problem.comparable_sha256
+        == plans.problem.comparable_sha256
+        == RECORD.comparable_sha256
+    )
 
 
 def test_a_loss_of_a_record_can_be_sent_to_other_processes() -> None:

@@ -48,10 +48,19 @@ def violation(points: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("form", ["motion", "start"])
 def test_symbolic_and_measured_forms_agree(form):
-    names = [symbols(name, 6) for name in ("q", "dq", "ddq")] + [symbols("obstacle_poses", 4)]
-    columns, (q, dq, ddq, values) = [column for column, _ in names], [scalars for _, scalars in names]
+    names = [symbols(name, 6) for name in ("q", "dq", "ddq")] + [
+        symbols("obstacle_poses", 4)
+    ]
+    columns, (q, dq, ddq, values) = (
+        [column for column, _ in names],
+        [scalars for _, scalars in names],
+    )
     state = SymbolicState(ROBOT, q, dq, ddq, values, (), None)
-    (symbolic,) = CONTACT.symbolic(state) if form == "motion" else CONTACT.symbolic_at(state, "start")
+    (symbolic,) = (
+        CONTACT.symbolic(state)
+        if form == "motion"
+        else CONTACT.symbolic_at(state, "start")
+    )
     function, world = ca.Function("g", columns, symbolic.g), World(ROBOT)
     random, rest = np.random.default_rng(5), np.zeros(6)
     for _ in range(50):
@@ -60,17 +69,30 @@ def test_symbolic_and_measured_forms_agree(form):
         goal = world.tip_position[:2] + random.normal(scale=0.02, size=2)
         values_now = np.concatenate([goal, goal + 0.07 * HIT])
         world.set_state(q_now, rest, rest, values_now)
-        (measured,) = CONTACT.solved(world) if form == "motion" else CONTACT.measured_at(world, "start")
-        np.testing.assert_allclose(float(function(q_now, rest, rest, values_now)), measured.g[0], atol=1e-9)
+        (measured,) = (
+            CONTACT.solved(world)
+            if form == "motion"
+            else CONTACT.measured_at(world, "start")
+        )
+        np.testing.assert_allclose(
+            float(function(q_now, rest, rest, values_now)), measured.g[0], atol=1e-9
+        )
         np.testing.assert_array_equal(symbolic.lower, measured.lower)
-    assert CONTACT.symbolic_at(state, "goal") == CONTACT.measured_at(world, "goal") == ()
+    assert (
+        CONTACT.symbolic_at(state, "goal") == CONTACT.measured_at(world, "goal") == ()
+    )
 
 
 def test_the_training_form_grows_linearly_with_a_large_violation():
-    names = [symbols(name, 6) for name in ("q", "dq", "ddq")] + [symbols("obstacle_poses", 4)]
+    names = [symbols(name, 6) for name in ("q", "dq", "ddq")] + [
+        symbols("obstacle_poses", 4)
+    ]
     state = SymbolicState(ROBOT, *(scalars for _, scalars in names), (), None)
     (penalized,) = CONTACT.penalized(state)
-    function, rest = ca.Function("g", [names[0][0], names[3][0]], penalized.g), np.zeros(6)
+    function, rest = (
+        ca.Function("g", [names[0][0], names[3][0]], penalized.g),
+        np.zeros(6),
+    )
     world = World(ROBOT)
     world.set_state(ROBOT.base, rest, rest, np.empty(0))
     tip = world.tip_position[:2]
@@ -80,9 +102,13 @@ def test_the_training_form_grows_linearly_with_a_large_violation():
         found = float(function(ROBOT.base, np.concatenate([puck - 0.07 * HIT, puck])))
         violations.append(max(0.0, penalized.lower[0] - found))
         exact = max(0.0, RADII + ADDED_RADIUS_M + TRAINING_MARGIN_M - distance)
-        assert violations[-1] == pytest.approx(exact / np.sqrt(1 + exact / TRAINING_KNEE_M), abs=3e-4)
+        assert violations[-1] == pytest.approx(
+            exact / np.sqrt(1 + exact / TRAINING_KNEE_M), abs=3e-4
+        )
     assert violations[0] > violations[1] > violations[2] == 0.0
-    assert violations[0] ** 2 / violations[1] ** 2 == pytest.approx(0.0519 / 0.0219, rel=0.1)
+    assert violations[0] ** 2 / violations[1] ** 2 == pytest.approx(
+        0.0519 / 0.0219, rel=0.1
+    )
 
 
 def test_a_straight_hit_is_legal_from_any_distance():
@@ -91,43 +117,67 @@ def test_a_straight_hit_is_legal_from_any_distance():
 
 
 def test_legal_contacts_are_near_the_goal_and_behind_the_puck():
-    offsets = np.stack(np.meshgrid(*[np.linspace(-0.02, 0.02, 801)] * 2), axis=-1).reshape(-1, 2)
+    offsets = np.stack(
+        np.meshgrid(*[np.linspace(-0.02, 0.02, 801)] * 2), axis=-1
+    ).reshape(-1, 2)
     points, puck = GOAL + offsets, SCENE[2:]
-    legal_contact = (violation(points) <= 0) & (np.linalg.norm(points - puck, axis=1) < RADII)
+    legal_contact = (violation(points) <= 0) & (
+        np.linalg.norm(points - puck, axis=1) < RADII
+    )
     assert legal_contact.sum() > 100
     from_goal = np.linalg.norm(offsets[legal_contact], axis=1)
-    deep = (violation(points) <= CONTACT.tolerance) & (np.linalg.norm(points - puck, axis=1) < RADII - 5e-5)
+    deep = (violation(points) <= CONTACT.tolerance) & (
+        np.linalg.norm(points - puck, axis=1) < RADII - 5e-5
+    )
     assert np.linalg.norm(offsets[deep], axis=1).max() <= CONTACT.last
     assert from_goal.max() <= CONTACT.last + 1e-3
-    towards = (puck - points[legal_contact]) / np.linalg.norm(puck - points[legal_contact], axis=1)[:, None]
+    towards = (puck - points[legal_contact]) / np.linalg.norm(
+        puck - points[legal_contact], axis=1
+    )[:, None]
     assert np.arccos(np.clip(towards @ HIT, -1, 1)).max() < np.deg2rad(4)
 
 
 def test_an_oblique_approach_and_a_motion_through_the_puck_are_violations():
     for angle, depth in ((0.3, 2e-4), (1.5, 5e-3), (np.pi, 0.05)):
-        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        turn = np.array(
+            [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        )
         points = GOAL - np.linspace(0, 0.2, 2001)[:, None] * (turn @ HIT)
         assert violation(points).max() > depth
 
 
 def test_the_puck_follows_from_the_goal_and_is_out_of_reach_without_a_hit():
-    goal, velocity = np.array([[1.0, 0.1, 0.16]] * 2), np.array([[0.6, -0.8, 0.0], [0.0, 0.0, 0.0]])
+    goal, velocity = (
+        np.array([[1.0, 0.1, 0.16]] * 2),
+        np.array([[0.6, -0.8, 0.0], [0.0, 0.0, 0.0]]),
+    )
     scene = scene_of(AIRHOCKEY, goal, goal, velocity)
-    np.testing.assert_allclose(scene.poses[0], [1.0, 0.1, 1.0 + 0.07 * 0.6, 0.1 - 0.07 * 0.8])
+    np.testing.assert_allclose(
+        scene.poses[0], [1.0, 0.1, 1.0 + 0.07 * 0.6, 0.1 - 0.07 * 0.8]
+    )
     np.testing.assert_array_equal(scene.poses[1], PUCK_OUT_OF_REACH_M)
-    with pytest.raises(UsageError, match="goal_velocity is missing: the problem 'airhockey' needs it"):
+    with pytest.raises(
+        UsageError, match="goal_velocity is missing: the problem 'airhockey' needs it"
+    ):
         scene_of(AIRHOCKEY, goal, goal)
 
 
 def test_goal_velocities_equal_finite_differences():
     random = np.random.default_rng(2)
-    q, dq = ROBOT.base + random.normal(scale=0.2, size=(5, 6)), random.normal(size=(5, 6))
+    q, dq = (
+        ROBOT.base + random.normal(scale=0.2, size=(5, 6)),
+        random.normal(size=(5, 6)),
+    )
     world, step = PathWorld(ROBOT), 1e-6
     tips = []
     for moved in (q + step * dq, q - step * dq):
         world.set_path(moved.T, moved.T, moved.T, np.empty(0))
         tips.append(world.tip_position.T.copy())
-    np.testing.assert_allclose(goal_velocities(AIRHOCKEY, ROBOT, q, dq), (tips[0] - tips[1]) / (2 * step), atol=1e-7)
+    np.testing.assert_allclose(
+        goal_velocities(AIRHOCKEY, ROBOT, q, dq),
+        (tips[0] - tips[1]) / (2 * step),
+        atol=1e-7,
+    )
 
 
 def test_tip_paths_go_around_the_puck_and_end_along_the_hit():
@@ -138,14 +188,18 @@ def test_tip_paths_go_around_the_puck_and_end_along_the_hit():
         behind = np.cos(angle - 0.3) < -0.5  # more than 120 degrees from the hit
         assert len(paths) == 0 if behind else len(paths) in {0, 2}
         for path in paths:
-            dense = np.concatenate([np.linspace(a, b, 50) for a, b in pairwise(path)])[:, :2]
+            dense = np.concatenate([np.linspace(a, b, 50) for a, b in pairwise(path)])[
+                :, :2
+            ]
             outside = np.linalg.norm(dense - GOAL, axis=1) > 0.011
             assert np.linalg.norm(dense[outside] - puck, axis=1).min() > RADII - 1e-4
             np.testing.assert_allclose(path[0], [*start, 0.16])
             np.testing.assert_allclose(path[-1, :2], GOAL)
             last = path[-1, :2] - path[-2, :2]
             np.testing.assert_allclose(last / np.linalg.norm(last), HIT, atol=1e-9)
-    both = CONTACT.initial_tip_paths(SCENE, np.array([*(puck + 0.2 * HIT + 0.01), 0.16]))
+    both = CONTACT.initial_tip_paths(
+        SCENE, np.array([*(puck + 0.2 * HIT + 0.01), 0.16])
+    )
     lengths = [np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in both]
     assert len(lengths) == 2
     assert lengths[0] <= lengths[1]

@@ -39,17 +39,29 @@ def meshes_of(name: str) -> Meshes:
 def touching(name: str, plans: Plans) -> list[int]:
     """Which of some plans touch something."""
     meshes = meshes_of(name)
-    return [index for index in range(len(plans)) if any(meshes.touches(q) for q in states(plans, index))]
+    return [
+        index
+        for index in range(len(plans))
+        if any(meshes.touches(q) for q in states(plans, index))
+    ]
 
 
 def ends_touch(name: str, boundary: Boundary) -> bool:
-    return any(meshes_of(name).touches(q) for q in (*boundary.start_q, *boundary.goal_q))
+    return any(
+        meshes_of(name).touches(q) for q in (*boundary.start_q, *boundary.goal_q)
+    )
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_rows_and_plans_of_the_shipped_planner_touch_nothing(name: str, prepare: Prepare) -> None:
-    columns = prepare(load_pipeline(name), "numpy").block(3, "train", 0, stop=20).columns  # compiling takes minutes
-    boundary = Boundary.from_batch({name: values.T for name, values in columns.items()}, None)
+def test_rows_and_plans_of_the_shipped_planner_touch_nothing(
+    name: str, prepare: Prepare
+) -> None:
+    columns = (
+        prepare(load_pipeline(name), "numpy").block(3, "train", 0, stop=20).columns
+    )  # compiling takes minutes
+    boundary = Boundary.from_batch(
+        {name: values.T for name, values in columns.items()}, None
+    )
     assert not ends_touch(name, boundary)
     plans = Planner(name, backend="numpy").plan_batch(boundary[:6])
     valid = evaluate_plans(plans, workers=1).valid
@@ -59,7 +71,9 @@ def test_rows_and_plans_of_the_shipped_planner_touch_nothing(name: str, prepare:
 
 @pytest.mark.extended
 @pytest.mark.parametrize("name", SHIPPED)
-def test_rows_are_what_pinocchio_and_coal_call_valid_and_touch_nothing(name: str) -> None:
+def test_rows_are_what_pinocchio_and_coal_call_valid_and_touch_nothing(
+    name: str,
+) -> None:
     problem, drawn = load_problem(name), draw_boundary_problems(name, ROWS, seed=4)
     columns = drawn.boundary.conditions() | drawn.columns
     found = verify_rows(problem, load_robot(problem), columns)
@@ -84,7 +98,9 @@ def made(name: str, way: str, where: Path) -> Plans:
 @pytest.mark.extended
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("name", SHIPPED)
-def test_valid_plans_touch_nothing_and_keep_their_limits(name: str, way: str, tmp_path: Path) -> None:
+def test_valid_plans_touch_nothing_and_keep_their_limits(
+    name: str, way: str, tmp_path: Path
+) -> None:
     plans = made(name, way, tmp_path)
     found = plans[evaluate_plans(plans, workers=1).valid]
     assert len(found) >= 0.97 * len(plans)
@@ -103,7 +119,11 @@ def test_the_panda_has_frankas_limits_and_a_cup_of_a_kilogram():
     problem = load_problem("panda-cup")
     robot = load_robot(problem)
     np.testing.assert_array_equal(robot.velocity_limit, [2.175] * 4 + [2.61] * 3)
-    np.testing.assert_array_equal(robot.acceleration_limit, [15, 7.5, 10, 12.5, 15, 20, 20])
-    np.testing.assert_array_equal(robot.jerk_limit, [7500, 3750, 5000, 6250, 7500, 10000, 10000])
+    np.testing.assert_array_equal(
+        robot.acceleration_limit, [15, 7.5, 10, 12.5, 15, 20, 20]
+    )
+    np.testing.assert_array_equal(
+        robot.jerk_limit, [7500, 3750, 5000, 6250, 7500, 10000, 10000]
+    )
     np.testing.assert_array_equal(robot.torque_limit, [87] * 4 + [12] * 3)
     assert problem.payload.mass == 1.0

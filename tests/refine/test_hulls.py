@@ -17,7 +17,11 @@ from cnpgen.refine import attempts, rrt_connect
 from cnpgen.refine import refiner as refiner_module
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.hull_levels import HullFeedback
-from cnpgen.refine.solver.hulls import MEASURED_RANGE_M, Hulls, has_clearance_constraints
+from cnpgen.refine.solver.hulls import (
+    MEASURED_RANGE_M,
+    Hulls,
+    has_clearance_constraints,
+)
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS
 from cnpgen.refine.strategy import PlanChecker, RefinementSearch, refine_task
 from cnpgen.refine.task import Outcome
@@ -26,11 +30,31 @@ from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.world import World
 from tests.conftest import needs_compiler
 from tests.examples.meshes import Meshes
-from tests.examples.narrow import BESIDE_WALL, BOXES, IN_SLOT, LIMITS, SLOT, WALL, between, narrow, refiner
-from tests.examples.shaped_robot import HELD_OBJECT, KINDS, OBSTACLES, SELF, write_problem
+from tests.examples.narrow import (
+    BESIDE_WALL,
+    BOXES,
+    IN_SLOT,
+    LIMITS,
+    SLOT,
+    WALL,
+    between,
+    narrow,
+    refiner,
+)
+from tests.examples.shaped_robot import (
+    HELD_OBJECT,
+    KINDS,
+    OBSTACLES,
+    SELF,
+    write_problem,
+)
 
 STEP = 1e-6  # rad, of finite differences
-CONTACT_TURN_RAD, CONTACT_M, CLOSE_M = 1e-3, 5e-5, 0.01  # the contact is half the tolerance
+CONTACT_TURN_RAD, CONTACT_M, CLOSE_M = (
+    1e-3,
+    5e-5,
+    0.01,
+)  # the contact is half the tolerance
 
 
 @pytest.fixture(params=["coal", pytest.param("compiled", marks=needs_compiler)])
@@ -44,14 +68,23 @@ def library(request):
 def test_gradients_are_those_of_finite_differences(tmp_path, obstacles, library):
     problem = load_problem(write_problem(tmp_path, obstacles=obstacles))
     robot = load_robot(problem)
-    hulls, obstacle_poses = Hulls(problem, robot, library), place_obstacles(problem.obstacle)
-    q = np.random.default_rng(0).uniform(robot.position_lower, robot.position_upper, (40, robot.n)).T.copy()
+    hulls, obstacle_poses = (
+        Hulls(problem, robot, library),
+        place_obstacles(problem.obstacle),
+    )
+    q = (
+        np.random.default_rng(0)
+        .uniform(robot.position_lower, robot.position_upper, (40, robot.n))
+        .T.copy()
+    )
     distances, contacts = hulls.measure(q, obstacle_poses)
     gradients = hulls.gradients(q, distances, contacts)
     compared = 0
     for joint, step in enumerate(STEP * np.eye(robot.n)[..., None]):
         ends = [hulls.measure(q + side * step, obstacle_poses)[0] for side in (1, -1)]
-        near = (np.array([distances, *ends]) < hulls.min_distances + MEASURED_RANGE_M).all(axis=0)
+        near = (
+            np.array([distances, *ends]) < hulls.min_distances + MEASURED_RANGE_M
+        ).all(axis=0)
         found = (ends[0] - ends[1]) / (2 * STEP)
         assert np.abs(found - gradients[joint].T)[near].max() < 1e-6
         compared += near.sum()
@@ -62,7 +95,9 @@ def test_distances_agree_with_meshes(tmp_path, library):
     problem = load_problem(write_problem(tmp_path))
     robot = load_robot(problem)
     hulls, meshes = Hulls(problem, robot, library), Meshes(problem, robot, tmp_path)
-    q = np.random.default_rng(1).uniform(robot.position_lower, robot.position_upper, (400, robot.n))
+    q = np.random.default_rng(1).uniform(
+        robot.position_lower, robot.position_upper, (400, robot.n)
+    )
     obstacle_poses = place_obstacles(problem.obstacle)
     expected = np.array([min(meshes.distances(state)) for state in q])
     found = hulls.measure(q.T.copy(), obstacle_poses)[0].min(axis=1)
@@ -71,7 +106,9 @@ def test_distances_agree_with_meshes(tmp_path, library):
     assert np.abs(found - expected)[in_range].max() < 1e-4  # round parts are prisms
     assert (found[expected > MEASURED_RANGE_M + 1e-4] == MEASURED_RANGE_M).all()
     assert np.array_equal(hulls.clear_states(q.T.copy(), obstacle_poses), found >= 0)
-    assert hulls.violation(q.T.copy(), obstacle_poses) == pytest.approx(-found.min(), abs=1e-9)
+    assert hulls.violation(q.T.copy(), obstacle_poses) == pytest.approx(
+        -found.min(), abs=1e-9
+    )
     allowed = hulls.violation(q.T.copy(), obstacle_poses, above_tolerance=True)
     assert allowed == pytest.approx(-found.min() - 1e-4, abs=1e-9)
 
@@ -80,7 +117,9 @@ def test_distances_of_positions_that_are_not_finite_are_nan(tmp_path, library):
     problem = load_problem(write_problem(tmp_path))
     robot = load_robot(problem)
     q = np.where(np.arange(3) == 1, np.nan, 0.0) + np.zeros((robot.n, 1))
-    assert np.isnan(Hulls(problem, robot, library).measure(q, place_obstacles(problem.obstacle))[0]).all()
+    assert np.isnan(
+        Hulls(problem, robot, library).measure(q, place_obstacles(problem.obstacle))[0]
+    ).all()
 
 
 @needs_compiler
@@ -88,9 +127,17 @@ def test_compiled_rows_are_the_distances_of_hulls_and_their_gradients(tmp_path):
     problem = load_problem(write_problem(tmp_path, obstacles=KINDS))
     robot, tool = load_robot(problem), Refiner(problem, load_robot(problem))
     kernels, poses = tool.residual_kernels, place_obstacles(problem.obstacle)
-    hulls, width, rows = tool.hulls, kernels.values.tape.inputs[0], kernels.values.tape.outputs[0]
+    hulls, width, rows = (
+        tool.hulls,
+        kernels.values.tape.inputs[0],
+        kernels.values.tape.outputs[0],
+    )
     w = np.random.default_rng(0).uniform(0.1, 1.0, (width, 40))
-    q = np.random.default_rng(1).uniform(robot.position_lower, robot.position_upper, (40, robot.n)).T.copy()
+    q = (
+        np.random.default_rng(1)
+        .uniform(robot.position_lower, robot.position_upper, (40, robot.n))
+        .T.copy()
+    )
     w[: robot.n] = q
     with_rows, scene = hulls.row_kernels(kernels, poses), np.zeros((0, 40))
     (values,) = with_rows.values(w, scene)
@@ -98,16 +145,26 @@ def test_compiled_rows_are_the_distances_of_hulls_and_their_gradients(tmp_path):
     own, own_jacobian = kernels.jacobian(w, scene)
     distances, contacts = Hulls(problem, robot).measure(q, poses)  # by Coal
     np.testing.assert_allclose(values[:rows], own, rtol=1e-12)
-    np.testing.assert_allclose(values, again, atol=1e-9)  # initial guesses of GJK differ
+    np.testing.assert_allclose(
+        values, again, atol=1e-9
+    )  # initial guesses of GJK differ
     limited = np.minimum(0.1 * values[rows:].T, hulls.min_distances + MEASURED_RANGE_M)
-    np.testing.assert_allclose(limited, distances, atol=1e-4)  # cylinders are prisms for Coal
+    np.testing.assert_allclose(
+        limited, distances, atol=1e-4
+    )  # cylinders are prisms for Coal
     near = 0.1 * values[rows:] < hulls.min_distances[:, None] + MEASURED_RANGE_M
-    assert (values[rows:][~near] == 100).all()  # so far from their bounds that no solver selects them
+    assert (
+        values[rows:][~near] == 100
+    ).all()  # so far from their bounds that no solver selects them
     jacobian = jacobian.reshape(width, -1, 40)
-    np.testing.assert_allclose(jacobian[:, :rows], own_jacobian.reshape(width, rows, 40), rtol=1e-12)
+    np.testing.assert_allclose(
+        jacobian[:, :rows], own_jacobian.reshape(width, rows, 40), rtol=1e-12
+    )
     measured, contacts = hulls.measure(q, poses)
     gradients = hulls.gradients(q, measured, contacts)
-    np.testing.assert_allclose(0.1 * jacobian[: robot.n, rows:], gradients, atol=1e-4)  # of curved bodies
+    np.testing.assert_allclose(
+        0.1 * jacobian[: robot.n, rows:], gradients, atol=1e-4
+    )  # of curved bodies
     assert not jacobian[robot.n :, rows:].any()
     assert np.abs(gradients).max() > 0.1
 
@@ -136,26 +193,46 @@ tolerance = 1e-3
 
 
 @pytest.mark.parametrize("obstacles", [KINDS, OBSTACLES], ids=["kinds", "boxes"])
-def test_distances_of_the_held_object_are_those_of_the_verdict(tmp_path, obstacles, library):
+def test_distances_of_the_held_object_are_those_of_the_verdict(
+    tmp_path, obstacles, library
+):
     problem = load_problem(write_problem(tmp_path, obstacles=obstacles, more=HELD))
     robot, poses = load_robot(problem), place_obstacles(problem.obstacle)
-    hulls, links = Hulls(problem, robot, library, with_object=True), Hulls(problem, robot, library)
+    hulls, links = (
+        Hulls(problem, robot, library, with_object=True),
+        Hulls(problem, robot, library),
+    )
     count = len(links.min_distances)
-    held, beside = slice(count, count + len(problem.obstacle)), slice(count + len(problem.obstacle), None)
+    held, beside = (
+        slice(count, count + len(problem.obstacle)),
+        slice(count + len(problem.obstacle), None),
+    )
     assert (hulls.min_distances[held] == -0.002).all()
     np.testing.assert_allclose(hulls.tolerances[held], 5e-4)
     assert (hulls.min_distances[beside] == 0.01).all()
     np.testing.assert_allclose(hulls.tolerances[beside], 1e-3)
-    q = np.random.default_rng(3).uniform(robot.position_lower, robot.position_upper, (300, robot.n))
-    world, zero, expected, around = World(robot, problem.obstacle, problem.object_size), np.zeros(robot.n), [], []
+    q = np.random.default_rng(3).uniform(
+        robot.position_lower, robot.position_upper, (300, robot.n)
+    )
+    world, zero, expected, around = (
+        World(robot, problem.obstacle, problem.object_size),
+        np.zeros(robot.n),
+        [],
+        [],
+    )
     for state in q:
         world.set_state(state, zero, zero, poses)
         expected.append(world.object_distances())
         around.append(min(world.held_object_distances()))
     expected, around = np.array(expected), np.array(around)
     found = hulls.measure(q.T.copy(), poses)[0]
-    np.testing.assert_allclose(found[:, : held.start], links.measure(q.T.copy(), poses)[0], atol=1e-12)
-    assert np.abs(found[:, held] - np.minimum(expected, MEASURED_RANGE_M - 0.002)).max() < 1e-4  # prisms
+    np.testing.assert_allclose(
+        found[:, : held.start], links.measure(q.T.copy(), poses)[0], atol=1e-12
+    )
+    assert (
+        np.abs(found[:, held] - np.minimum(expected, MEASURED_RANGE_M - 0.002)).max()
+        < 1e-4
+    )  # prisms
     nearest = found[:, beside].min(axis=1)
     assert np.abs(nearest - np.minimum(around, MEASURED_RANGE_M + 0.01)).max() < 1e-4
     assert (around < 0.01).sum() > 10
@@ -170,12 +247,20 @@ def test_distances_of_the_held_object_are_those_of_the_verdict(tmp_path, obstacl
 @needs_compiler
 def test_an_end_within_the_tolerance_of_a_contact_is_accepted(tmp_path):
     """Both ends hold the object 3 mm deep in a table, where 0 mm are legal and 5 mm accepted."""
-    table = BOXES.format([0.75, 0.0, 0.1], [0.5, 2.0, 0.2], [-2.0, 0.0, 0.4], [0.1, 0.1, 0.1])
-    more = LIMITS + CONTACT_ONLY.replace("depth = 0.002\ntolerance = 5e-4", "depth = 0.0\ntolerance = 5e-3")
+    table = BOXES.format(
+        [0.75, 0.0, 0.1], [0.5, 2.0, 0.2], [-2.0, 0.0, 0.4], [0.1, 0.1, 0.1]
+    )
+    more = LIMITS + CONTACT_ONLY.replace(
+        "depth = 0.002\ntolerance = 5e-4", "depth = 0.0\ntolerance = 5e-3"
+    )
     more = more.replace("[0.08, 0.06, 0.12]", "[0.25, 0.25, 0.25]")
     problem = load_problem(write_problem(tmp_path, obstacles=table, more=more))
     robot, poses = load_robot(problem), place_obstacles(problem.obstacle)
-    tool, world, zero = Refiner(problem, robot), World(robot, problem.obstacle, problem.object_size), np.zeros(4)
+    tool, world, zero = (
+        Refiner(problem, robot),
+        World(robot, problem.obstacle, problem.object_size),
+        np.zeros(4),
+    )
 
     def depth(lift: float) -> float:
         world.set_state(np.array([0.0, lift, 0.9, 0.0]), zero, zero, poses)
@@ -183,7 +268,9 @@ def test_an_end_within_the_tolerance_of_a_contact_is_accepted(tmp_path):
 
     lift = brentq(depth, -0.7, -0.3)
     task = between(problem, np.array([[-0.8, lift, 0.9, 0.0], [0.8, lift, 0.9, 0.0]]))
-    found = refine_task(tool, PlanChecker(problem, robot, degree=tool.spec.degree), task)
+    found = refine_task(
+        tool, PlanChecker(problem, robot, degree=tool.spec.degree), task
+    )
     assert found.valid
     assert found.iterations < 60
     accepted = tool.hulls.accepted_at(np.array([task.boundary.start_q[0]]).T, poses)
@@ -196,7 +283,11 @@ def test_compiled_rows_of_the_held_object_have_its_depth(tmp_path):
     robot = load_robot(problem)
     tool, poses = Refiner(problem, robot), place_obstacles(problem.obstacle)
     kernels, hulls = tool.residual_kernels, tool.hulls
-    q = np.random.default_rng(3).uniform(robot.position_lower, robot.position_upper, (60, robot.n)).T.copy()
+    q = (
+        np.random.default_rng(3)
+        .uniform(robot.position_lower, robot.position_upper, (60, robot.n))
+        .T.copy()
+    )
     w = np.ones((kernels.values.tape.inputs[0], 60))
     w[: robot.n] = q
     rows = kernels.values.tape.outputs[0]
@@ -209,13 +300,22 @@ def test_compiled_rows_of_the_held_object_have_its_depth(tmp_path):
 @needs_compiler
 @pytest.mark.parametrize(
     "more",
-    [SELF, HELD, SELF + LEVEL, HELD + LEVEL, CONTACT_ONLY + LIMITS.partition('[[constraint]]\nuse = "self')[0]],
+    [
+        SELF,
+        HELD,
+        SELF + LEVEL,
+        HELD + LEVEL,
+        CONTACT_ONLY + LIMITS.partition('[[constraint]]\nuse = "self')[0],
+    ],
     ids=["links", "held", "level", "held level", "contact only"],
 )
 def test_scenes_of_a_robot_share_kernels(tmp_path, more):
     problem = load_problem(write_problem(tmp_path, obstacles=KINDS, more=more))
     other = problem.with_obstacles(problem.obstacle[:2])
-    tapes = [Refiner(item, load_robot(item)).residual_kernels.values.tape for item in (problem, other)]
+    tapes = [
+        Refiner(item, load_robot(item)).residual_kernels.values.tape
+        for item in (problem, other)
+    ]
     assert tapes[0].inputs == tapes[1].inputs
     assert tapes[0].to_bytes() == tapes[1].to_bytes()
 
@@ -226,11 +326,15 @@ def test_collisions_between_grid_points_require_more_clearance(tmp_path):
     tool, task = Refiner(problem, load_robot(problem)), between(problem, BESIDE_WALL)
     path, _ = tool.check.transcription(task).unpack(tool.line_guess(task))
     poses, s = task.scene.poses[0], np.linspace(0, 1, 9)
-    assert HullFeedback(tool.spec, s).missing_clearance(path, tool.hulls, poses) is None  # deeper than fed back
+    assert (
+        HullFeedback(tool.spec, s).missing_clearance(path, tool.hulls, poses) is None
+    )  # deeper than fed back
     q = np.linspace(*BESIDE_WALL, 400).T.copy()
     missing = tool.hulls.missing(q, np.zeros(400), poses)
     distances = tool.hulls.measure(q, poses)[0]
-    np.testing.assert_allclose(missing, np.maximum(tool.hulls.min_distances - distances, 0), atol=1e-12)
+    np.testing.assert_allclose(
+        missing, np.maximum(tool.hulls.min_distances - distances, 0), atol=1e-12
+    )
     assert missing.max() > 0.02
 
 
@@ -245,12 +349,17 @@ def test_a_collision_of_the_verdict_becomes_larger_distances_around_its_phase(tm
     assert not extra[:2].any()
     assert not extra[6:].any()
     assert extra[3:5].max() > 0.003
-    collides = tool.hulls.min_distances - tool.hulls.measure(path[[7]].T, poses)[0][0] > 0
+    collides = (
+        tool.hulls.min_distances - tool.hulls.measure(path[[7]].T, poses)[0][0] > 0
+    )
     assert (extra[3][collides] > 0.003).all()
 
 
 def test_large_trees_follow_the_first_ones(monkeypatch):
-    grown, hits = list[TreeSettings](), set[int]()  # hits: numbers of the trees that find a path
+    grown, hits = (
+        list[TreeSettings](),
+        set[int](),
+    )  # hits: numbers of the trees that find a path
 
     def find(checker, ends, box, velocity, settings, *, seed, manifold):
         if not settings.max_extensions:
@@ -259,11 +368,17 @@ def test_large_trees_follow_the_first_ones(monkeypatch):
         return np.zeros((3, 2)) if len(grown) - 1 in hits else None
 
     monkeypatch.setattr(rrt_connect, "find_tree_path", find)
-    robot = SimpleNamespace(position_lower=-np.ones(2), position_upper=np.ones(2), velocity_limit=np.ones(2))
+    robot = SimpleNamespace(
+        position_lower=-np.ones(2), position_upper=np.ones(2), velocity_limit=np.ones(2)
+    )
     space = SimpleNamespace(robot=robot, meets_other_conditions=lambda _: True)
-    hulls = SimpleNamespace(obstacle_distance=0.0, self_distance=0.0, placed_checker=lambda _: None)
+    hulls = SimpleNamespace(
+        obstacle_distance=0.0, self_distance=0.0, placed_checker=lambda _: None
+    )
     boundary = SimpleNamespace(start_q=np.zeros((1, 2)), goal_q=np.ones((1, 2)))
-    task = SimpleNamespace(boundary=boundary, scene=SimpleNamespace(poses=np.zeros((1, 0))))
+    task = SimpleNamespace(
+        boundary=boundary, scene=SimpleNamespace(poses=np.zeros((1, 0)))
+    )
     search = rrt_connect.TreeSearch(task, space, hulls, None)
     cases = (
         ({0, 1, 3}, (12, 0, 12)),  # small trees with every margin find enough paths
@@ -279,7 +394,9 @@ def test_large_trees_follow_the_first_ones(monkeypatch):
         kinds = [(settings.max_extensions, settings.extension) for settings in grown]
         assert kinds == [
             kind
-            for kind, count in zip([(4_000, 1.0), (128_000, 1.0), (128_000, 0.5)], expected, strict=True)
+            for kind, count in zip(
+                [(4_000, 1.0), (128_000, 1.0), (128_000, 0.5)], expected, strict=True
+            )
             for _ in range(count)
         ]
         assert [settings.margin for settings in grown[:4]] == [6e-3, 3e-3, 1e-3, 0.0]
@@ -296,7 +413,9 @@ def test_a_problem_without_a_path_reports_it(tmp_path, monkeypatch):
     tool, task = refiner(problem), between(problem, BESIDE_WALL)
     monkeypatch.setattr(attempts, "path_guesses", lambda *_: iter(()))
     monkeypatch.setattr(attempts, "_from_other_guesses", lambda *_: iter(()))
-    found = refine_task(tool, PlanChecker(problem, load_robot(problem), degree=tool.spec.degree), task)
+    found = refine_task(
+        tool, PlanChecker(problem, load_robot(problem), degree=tool.spec.degree), task
+    )
     assert not found.valid
     assert found.outcome is Outcome.NO_PATH
 
@@ -305,24 +424,35 @@ def test_a_problem_without_a_path_reports_it(tmp_path, monkeypatch):
 @needs_compiler
 def test_no_attempt_is_made_if_an_end_is_inside_an_obstacle(tmp_path):
     problem = narrow(tmp_path, SLOT)
-    tool, inside = refiner(problem), between(problem, np.add(IN_SLOT, [0.0, 0.0, 0.1, 0.0]))
+    tool, inside = (
+        refiner(problem),
+        between(problem, np.add(IN_SLOT, [0.0, 0.0, 0.1, 0.0])),
+    )
     assert attempts.ends_penetrate(tool, inside)
-    found = refine_task(tool, PlanChecker(problem, load_robot(problem), degree=tool.spec.degree), inside)
-    assert found.reason == "robot in collision"  # not that of the attempt, which also exceeds other limits
+    found = refine_task(
+        tool, PlanChecker(problem, load_robot(problem), degree=tool.spec.degree), inside
+    )
+    assert (
+        found.reason == "robot in collision"
+    )  # not that of the attempt, which also exceeds other limits
 
 
 def test_robots_without_a_shape_have_no_hulls(tmp_path):
     shaped = load_problem(write_problem(tmp_path))
     assert has_clearance_constraints(shaped, load_robot(shaped))
     paper = 'geometry = "paper-capsules"'
-    bare = load_problem(write_problem(tmp_path, robot=paper, clearance='radius = "5 cm"', more=""))
+    bare = load_problem(
+        write_problem(tmp_path, robot=paper, clearance='radius = "5 cm"', more="")
+    )
     assert not has_clearance_constraints(bare, load_robot(bare))
 
 
 @pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("compiled", [True, False])
-def test_a_slot_that_is_too_narrow_for_capsules_is_wide_enough_for_hulls(tmp_path, compiled, monkeypatch):
+def test_a_slot_that_is_too_narrow_for_capsules_is_wide_enough_for_hulls(
+    tmp_path, compiled, monkeypatch
+):
     problem = narrow(tmp_path, SLOT)
     if not compiled:
         monkeypatch.setattr(refiner_module, "can_measure_hulls", lambda *_: False)
@@ -341,9 +471,13 @@ def test_a_slot_that_is_too_narrow_for_capsules_is_wide_enough_for_hulls(tmp_pat
     assert found.violation < DEFAULT_SETTINGS.violation_tolerance
     path, rate = tool.check.transcription(task).unpack(found.x)
     assert checker.verdict(task, path, rate).valid
-    states = Motion(path[None], rate[None], tool.spec.degree).at(np.linspace(0, 1, 300)).q[0]
+    states = (
+        Motion(path[None], rate[None], tool.spec.degree).at(np.linspace(0, 1, 300)).q[0]
+    )
     meshes = Meshes(problem, robot, tmp_path)
-    assert min(min(meshes.distances(q)) for q in states) > -1e-4  # the tolerance of the problem
+    assert (
+        min(min(meshes.distances(q)) for q in states) > -1e-4
+    )  # the tolerance of the problem
 
 
 @needs_compiler
@@ -358,15 +492,22 @@ def test_a_contact_of_an_end_does_not_prolong_the_search(tmp_path, monkeypatch):
     start, goal = tool.hulls.measure(ends, task.scene.poses[0])[0].min(axis=1)
     assert goal - start > 1e-4
     constraints = (
-        replace(each, distance=start + CONTACT_M) if isinstance(each, RobotClearance) else each
+        replace(each, distance=start + CONTACT_M)
+        if isinstance(each, RobotClearance)
+        else each
         for each in problem.constraint
     )
     closer = replace(problem, constraint=tuple(constraints))
     vars(closer)["urdf_text"] = problem.urdf_text
-    tool, checker = Refiner(closer, robot), PlanChecker(closer, robot, degree=problem.trajectory.degree)
+    tool, checker = (
+        Refiner(closer, robot),
+        PlanChecker(closer, robot, degree=problem.trajectory.degree),
+    )
     assert tool.accepted_at_ends(task)[0].max() == pytest.approx(CONTACT_M, abs=1e-9)
     assert tool.accepted_at_ends(task)[1].max() == 0
-    monkeypatch.setattr(checker, "strict_verdict", None)  # it would find the contact of the start
+    monkeypatch.setattr(
+        checker, "strict_verdict", None
+    )  # it would find the contact of the start
     assert refine_task(tool, checker, task).valid
 
 
@@ -375,23 +516,38 @@ def test_a_contact_of_an_end_does_not_prolong_the_search(tmp_path, monkeypatch):
 def test_a_contact_within_the_tolerance_is_removed(tmp_path):
     """A plan approaches an obstacle half way; the required distance is larger by half the tolerance."""
     problem = narrow(tmp_path, SLOT)
-    robot, task, degree = load_robot(problem), between(problem, IN_SLOT), problem.trajectory.degree
+    robot, task, degree = (
+        load_robot(problem),
+        between(problem, IN_SLOT),
+        problem.trajectory.degree,
+    )
     tool = Refiner(problem, robot)
     found = refine_task(tool, PlanChecker(problem, robot, degree=degree), task)
     path = found.path.copy()
     path[5:-5, 1] += CONTACT_TURN_RAD
-    q = Motion(path[None], found.rate[None], degree).at(np.linspace(0, 1, 2000)).q[0].T.copy()
-    close = tool.hulls.placed_checker(task.scene.poses[0]).close_bodies(q, CLOSE_M, of_obstacles=True)
+    q = (
+        Motion(path[None], found.rate[None], degree)
+        .at(np.linspace(0, 1, 2000))
+        .q[0]
+        .T.copy()
+    )
+    close = tool.hulls.placed_checker(task.scene.poses[0]).close_bodies(
+        q, CLOSE_M, of_obstacles=True
+    )
     distance = close.distance.min() + CONTACT_M
     constraints = (
-        replace(each, distance=distance) if isinstance(each, RobotClearance) else each for each in problem.constraint
+        replace(each, distance=distance) if isinstance(each, RobotClearance) else each
+        for each in problem.constraint
     )
     larger = replace(problem, constraint=tuple(constraints))
     tool, checker = Refiner(larger, robot), PlanChecker(larger, robot, degree=degree)
     x = tool.check.transcription(task).pack(path, found.rate)
     touching = replace(found, path=path, x=x, violation=1.0)
     assert checker.verdict(task, touching.path, touching.rate).valid
-    assert checker.strict_verdict(task, touching.path, touching.rate).reason == RobotClearance.reason
+    assert (
+        checker.strict_verdict(task, touching.path, touching.rate).reason
+        == RobotClearance.reason
+    )
     search = RefinementSearch(tool, checker, task)
     assert not search.add(touching)
     assert search.continue_rejected(touching)

@@ -38,13 +38,18 @@ tolerance = "0.5 cm/s"
 def solve(label: str) -> tuple[Attempt, float, float]:
     """Solve without input plan; return the plan, its duration [s] and its largest jerk in multiples of the limit."""
     plan = load(label)
-    tool, checker = refiner(plan.problem.name), PlanChecker(plan.problem, plan.robot, degree=7)
+    tool, checker = (
+        refiner(plan.problem.name),
+        PlanChecker(plan.problem, plan.robot, degree=7),
+    )
     found = refine_task(tool, checker, task(plan))
     jerk = verdict(plan, plan.boundary, found.path, found.rate).metrics.jerk
     return found, float(Motion(found.path[None], found.rate[None]).duration()[0]), jerk
 
 
-def test_a_hit_from_a_rising_line_has_less_jerk_and_is_as_fast(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_hit_from_a_rising_line_has_less_jerk_and_is_as_fast(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     found, duration, jerk = solve("hit")
     monkeypatch.setattr(initial_guesses, "rising_line", initial_guesses.straight_line)
     before, straight, harsh = solve("hit")
@@ -54,8 +59,12 @@ def test_a_hit_from_a_rising_line_has_less_jerk_and_is_as_fast(monkeypatch: pyte
     assert duration < 1.002 * straight
 
 
-@pytest.mark.parametrize(("label", "rises"), [("hit", True), ("replan", False), ("transport", False)])
-def test_only_motions_from_rest_that_arrive_moving_start_with_a_rising_rate(label: str, rises: bool) -> None:
+@pytest.mark.parametrize(
+    ("label", "rises"), [("hit", True), ("replan", False), ("transport", False)]
+)
+def test_only_motions_from_rest_that_arrive_moving_start_with_a_rising_rate(
+    label: str, rises: bool
+) -> None:
     plan = load(label)
     arguments = plan.boundary, plan.robot.velocity_limit, plan.problem.trajectory
     (path, rate), (straight, constant) = (
@@ -87,28 +96,43 @@ def test_a_stalled_level_continues_with_a_higher_penalty_where_violations_are_pr
     assert penalties[-1] > sqp.PENALTY_FACTOR
 
 
-def test_a_level_does_not_stall_if_its_initial_guess_violated_less_than_later_iterates() -> None:
+def test_a_level_does_not_stall_if_its_initial_guess_violated_less_than_later_iterates() -> (
+    None
+):
     problems = draw_boundary_problems("airhockey-replan", 96, seed=20266)
     plans = Planner("airhockey-replan").plan_batch(problems.boundary)
     tool = prepare(plans, RefineOptions())
     for problem in (tasks_of(plans)[row] for row in (22, 37, 53)):
         x = tool.input_variables(problem)
         assert x is not None
-        assert tool.run_level(problem, tool.levels.warm, x).violation < sqp.DEFAULT_SETTINGS.violation_tolerance
+        assert (
+            tool.run_level(problem, tool.levels.warm, x).violation
+            < sqp.DEFAULT_SETTINGS.violation_tolerance
+        )
 
 
-def test_if_all_attempts_from_an_input_plan_fail_the_straight_line_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_if_all_attempts_from_an_input_plan_fail_the_straight_line_is_tried(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     plan, tool = load("transport"), refiner("heavy-object")
     run_level = Refiner.run_level
     wrong = plan.motion.path[0] + np.pi
     is_coarse: list[bool] = []
 
     def misleading(
-        self: Refiner, problem: RefinementTask, level: GridLevel, x: np.ndarray, hulls: Hulls | None = None
+        self: Refiner,
+        problem: RefinementTask,
+        level: GridLevel,
+        x: np.ndarray,
+        hulls: Hulls | None = None,
     ) -> Result:
         """Return the initial guess until the straight line is tried."""
         is_coarse.append(level is self.levels.coarse)
-        return run_level(self, problem, level, x, hulls) if any(is_coarse) else Result(x, 0.0, 1.0, 1, True)
+        return (
+            run_level(self, problem, level, x, hulls)
+            if any(is_coarse)
+            else Result(x, 0.0, 1.0, 1, True)
+        )
 
     def none(*_: object) -> Iterator[None]:
         yield from ()
@@ -116,7 +140,11 @@ def test_if_all_attempts_from_an_input_plan_fail_the_straight_line_is_tried(monk
     monkeypatch.setattr(Refiner, "run_level", misleading)
     monkeypatch.setattr(attempts, "_from_other_guesses", none)
     problem = task(plan, path=wrong, rate=plan.motion.rate[0])
-    found = refine_task(tool, PlanChecker(PROBLEMS["heavy-object"], ROBOTS["heavy-object"], degree=7), problem)
+    found = refine_task(
+        tool,
+        PlanChecker(PROBLEMS["heavy-object"], ROBOTS["heavy-object"], degree=7),
+        problem,
+    )
     assert tool.levels.warm is not tool.levels.coarse
     assert is_coarse[0] is False
     assert found.valid
@@ -139,7 +167,9 @@ def test_if_all_attempts_from_an_input_plan_fail_the_straight_line_is_tried(monk
         ),
     ],
 )
-def test_a_transport_that_no_guess_solves_is_solved_from_the_best_attempt(ends: list[list[float]]) -> None:
+def test_a_transport_that_no_guess_solves_is_solved_from_the_best_attempt(
+    ends: list[list[float]],
+) -> None:
     start, goal, rest = np.array(ends[:1]), np.array(ends[1:]), np.zeros((1, 7))
     plans = cnpgen.make_plans(
         "heavy-object",
@@ -154,7 +184,9 @@ def test_a_transport_that_no_guess_solves_is_solved_from_the_best_attempt(ends: 
 @needs_robots
 @pytest.mark.extended  # the kernels of a UR5 in its real shape take half a minute to compile
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_ur5_with_a_slow_tip_solves_all_of_20_problems(tmp_path: Path, seed: int) -> None:
+def test_a_ur5_with_a_slow_tip_solves_all_of_20_problems(
+    tmp_path: Path, seed: int
+) -> None:
     urdf = f"{robots()}/example-robot-data/robots/ur_description/urdf/ur5_joint_limited_robot.urdf"
     assert main(["init", str(tmp_path / "ur5"), "--urdf", urdf, "--tip", "tool0"]) == 0
     with (tmp_path / "ur5" / "problem.toml").open("a", encoding="utf-8") as file:
@@ -162,5 +194,10 @@ def test_a_ur5_with_a_slow_tip_solves_all_of_20_problems(tmp_path: Path, seed: i
     problems = draw_boundary_problems(tmp_path / "ur5" / "pipeline.toml", 20, seed=seed)
     found = cnpgen.solve_plans(problems, workers=1)
     assert found.valid.all()
-    chord = np.linalg.norm(problems.columns["goal_xyz"] - problems.columns["start_xyz"], axis=1) / 0.25
+    chord = (
+        np.linalg.norm(
+            problems.columns["goal_xyz"] - problems.columns["start_xyz"], axis=1
+        )
+        / 0.25
+    )
     assert np.mean(found.plans.duration / chord) < 1.12

@@ -34,7 +34,10 @@ def solved(problems: Plans) -> Plans:
 
 
 def kill_workers(_plans: int, _valid: int) -> None:
-    names = {pid: Path(f"/proc/{pid}/cmdline").read_text() for pid in descendants(os.getpid())}
+    names = {
+        pid: Path(f"/proc/{pid}/cmdline").read_text()
+        for pid in descendants(os.getpid())
+    }
     for pid, name in names.items():
         if "popen_loky" in name:
             os.kill(pid, signal.SIGKILL)
@@ -46,9 +49,17 @@ def test_plans_finished_before_a_worker_was_killed_are_not_made_again(
     problems: Plans, solved: Plans, tmp_path: Path
 ) -> None:
     journal, begun = tmp_path / "journal", []
-    with pytest.raises(MachineError, match=r"a worker died .*journal has the finished plans; the same call"):
+    with pytest.raises(
+        MachineError,
+        match=r"a worker died .*journal has the finished plans; the same call",
+    ):
         refine_plans(problems, workers=2, journal=journal, progress=kill_workers)
-    found = refine_plans(problems, workers=1, journal=journal, begin=lambda *numbers: begun.append(numbers))
+    found = refine_plans(
+        problems,
+        workers=1,
+        journal=journal,
+        begin=lambda *numbers: begun.append(numbers),
+    )
     ((total, there),) = begun
     assert total == N
     assert 1 <= there < N
@@ -57,7 +68,11 @@ def test_plans_finished_before_a_worker_was_killed_are_not_made_again(
 
 @pytest.mark.parametrize("number", some([errno.ENOSPC, errno.EDQUOT], 1, "slow"))
 def test_a_full_disk_is_reported_with_a_remedy_and_earlier_plans_count(
-    problems: Plans, solved: Plans, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+    problems: Plans,
+    solved: Plans,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    number: int,
 ) -> None:
     journal, flush, calls, begun = tmp_path / "journal", os.fsync, [], []
 
@@ -68,10 +83,18 @@ def test_a_full_disk_is_reported_with_a_remedy_and_earlier_plans_count(
         flush(descriptor)
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(MachineError, match=rf"cannot write {journal}: {os.strerror(number)}; .*try again"):
+    with pytest.raises(
+        MachineError,
+        match=rf"cannot write {journal}: {os.strerror(number)}; .*try again",
+    ):
         refine_plans(problems, workers=1, journal=journal)
     monkeypatch.undo()
-    found = refine_plans(problems, workers=1, journal=journal, begin=lambda *numbers: begun.append(numbers))
+    found = refine_plans(
+        problems,
+        workers=1,
+        journal=journal,
+        begin=lambda *numbers: begun.append(numbers),
+    )
     assert begun[0][1] >= 4
     assert same(found.plans, solved)
 
@@ -103,8 +126,13 @@ def test_a_file_that_cannot_grow_is_reported_in_one_line_and_the_same_command_re
     assert checked == f"{given}: the file's checksum is right"
     assert begun == f"refining {given}: {N} plans"
     file = "out.h5.part" if limit < 20_000 else "out.h5"
-    assert error.startswith(f"cnpgen: error: cannot write {tmp_path / file}: File too large; ")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["out.h5.part", "problems.h5"]
+    assert error.startswith(
+        f"cnpgen: error: cannot write {tmp_path / file}: File too large; "
+    )
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "out.h5.part",
+        "problems.h5",
+    ]
     assert main([*words, "--quiet"]) == 0
     assert same(load_plans(out), solved)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out.h5", "problems.h5"]

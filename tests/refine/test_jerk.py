@@ -43,14 +43,23 @@ def test_gradients_of_residuals_with_jerks_are_those_of_finite_differences() -> 
             obstacle_poses=obstacle_poses(plan),
         )
         random = np.random.default_rng(0)
-        x = motion.pack(plan.motion.path[0], plan.motion.rate[0]) + 0.02 * random.normal(size=motion.nx)
+        x = motion.pack(
+            plan.motion.path[0], plan.motion.rate[0]
+        ) + 0.02 * random.normal(size=motion.nx)
         at = motion.evaluate(x)
         k, residual = np.nonzero(np.ones(at.g.shape, bool))
         rows = motion.rows(at, k, residual)
         for column in random.integers(0, motion.nx, 12):
             step = 1e-6 * np.eye(motion.nx)[column]
-            expected = ((motion.value(x + step)[1] - motion.value(x - step)[1]) / 2e-6)[k, residual]
-            np.testing.assert_allclose(rows[:, column], expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max() + 1e-7)
+            expected = ((motion.value(x + step)[1] - motion.value(x - step)[1]) / 2e-6)[
+                k, residual
+            ]
+            np.testing.assert_allclose(
+                rows[:, column],
+                expected,
+                rtol=1e-4,
+                atol=1e-5 * np.abs(expected).max() + 1e-7,
+            )
 
 
 @pytest.mark.slow
@@ -64,19 +73,27 @@ def test_the_residuals_of_jerks_are_those_of_scipy_splines_from_the_start() -> N
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("label", ["hit", pytest.param("transport", marks=pytest.mark.extended)])
-def test_a_plan_meets_jerk_limits_that_the_plan_without_them_violates(label: str) -> None:
+@pytest.mark.parametrize(
+    "label", ["hit", pytest.param("transport", marks=pytest.mark.extended)]
+)
+def test_a_plan_meets_jerk_limits_that_the_plan_without_them_violates(
+    label: str,
+) -> None:
     plan = jerk_limited_plan(label)
     checker = PlanChecker(plan.problem, plan.robot, degree=7)
     found = refine_task(jerk_limited_refiner(plan.problem.name), checker, task(plan))
     assert found.valid, found
     assert found.outcome in {Outcome.SOLVED, Outcome.SOLVED_FINE}
     limit = plan.robot.jerk_limit * (1 + 0.01)
-    smooth = reference_trajectory(plan.changed(path=found.path[None], rate=found.rate[None]), 20_001)
+    smooth = reference_trajectory(
+        plan.changed(path=found.path[None], rate=found.rate[None]), 20_001
+    )
     assert (np.abs(smooth.jerk) <= limit * (1 + 1e-6)).all()
     assert (np.abs(smooth.jerk) / limit).max() > 0.9  # the limits are active
     free = refine(load(label))
-    rough = reference_trajectory(plan.changed(path=free.path[None], rate=free.rate[None]), 20_001)
+    rough = reference_trajectory(
+        plan.changed(path=free.path[None], rate=free.rate[None]), 20_001
+    )
     assert (np.abs(rough.jerk) > 2 * limit).any()
     assert not verdict(plan, plan.boundary, free.path, free.rate).valid
 

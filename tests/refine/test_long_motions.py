@@ -28,15 +28,26 @@ def long_task() -> RefinementTask:
     start, goal = np.array([START]), np.array([GOAL])
     tips = record_problem(problem).tip_positions
     scene = scene_of(problem, tips(start), tips(goal))
-    return RefinementTask(Boundary(start, zero, zero, goal, zero), scene, tips(start)[0], tips(goal)[0])
+    return RefinementTask(
+        Boundary(start, zero, zero, goal, zero), scene, tips(start)[0], tips(goal)[0]
+    )
 
 
 def test_a_motion_of_seconds_does_not_trade_violations_for_time() -> None:
-    assert START[1] == pytest.approx(ROBOTS["heavy-object"].position_upper[1], abs=1e-15)
+    assert START[1] == pytest.approx(
+        ROBOTS["heavy-object"].position_upper[1], abs=1e-15
+    )
     tool, problem = refiner("heavy-object"), long_task()
-    found = refine_task(tool, PlanChecker(PROBLEMS["heavy-object"], ROBOTS["heavy-object"], degree=7), problem)
+    found = refine_task(
+        tool,
+        PlanChecker(PROBLEMS["heavy-object"], ROBOTS["heavy-object"], degree=7),
+        problem,
+    )
     assert found.valid
-    assert found.outcome in {Outcome.SOLVED, Outcome.SOLVED_FINE}  # without another initial guess
+    assert found.outcome in {
+        Outcome.SOLVED,
+        Outcome.SOLVED_FINE,
+    }  # without another initial guess
     assert (
         tool.settings.penalty < found.cost < 3.6
     )  # the initial weight of violations suffices for shipped problems only
@@ -48,14 +59,22 @@ def attempt_after(monkeypatch: pytest.MonkeyPatch, continuations: int):
     problem = task(plan)
     rate = 0.4 * plan.motion.rate[0] + 0.6 / plan.motion.duration()[0]
     x = tool.check.transcription(problem).pack(plan.motion.path[0], rate)
-    monkeypatch.setattr(attempts, "run_coarse_level", lambda *_: Result(x, 0.0, 1.0, 1, True))
+    monkeypatch.setattr(
+        attempts, "run_coarse_level", lambda *_: Result(x, 0.0, 1.0, 1, True)
+    )
     monkeypatch.setattr(refiner_module, "MAX_CONTINUATIONS", continuations)
     found = next(attempts.make_attempts(tool, problem, None))
     path, rate = tool.check.transcription(problem).unpack(found.x)
-    return found, verdict(plan, problem.boundary, path, rate).valid, Motion(path[None], rate[None]).duration()[0]
+    return (
+        found,
+        verdict(plan, problem.boundary, path, rate).valid,
+        Motion(path[None], rate[None]).duration()[0],
+    )
 
 
-def test_a_motion_scaled_in_time_is_optimized_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_motion_scaled_in_time_is_optimized_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     time_scaled, valid, longer = attempt_after(monkeypatch, 0)
     assert time_scaled.outcome is Outcome.TIME_SCALED
     assert valid

@@ -18,18 +18,27 @@ REPEATS = pytest.mark.extended  # similar to a plane and a pose
 MARKS = {"plane": (), "rectangle": REPEATS, "line": REPEATS}  # the others are slow
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=MARKS.get(name, pytest.mark.slow)) for name in MANIFOLDS])
-def test_a_motion_on_a_manifold_is_found_without_input_plan(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=MARKS.get(name, pytest.mark.slow)) for name in MANIFOLDS],
+)
+def test_a_motion_on_a_manifold_is_found_without_input_plan(
+    name: str, tmp_path: Path
+) -> None:
     problem, q, world = problem_on(name), ends_on(name), World(ROBOT, (), None)
     rest, tips = np.zeros((1, ROBOT.n)), []
     for configuration in q:
-        world.set_state(configuration, 0 * configuration, 0 * configuration, np.zeros(0))
+        world.set_state(
+            configuration, 0 * configuration, 0 * configuration, np.zeros(0)
+        )
         tips.append(world.tip_position)
     kernels = problem_kernels(problem, ROBOT, "numpy", tmp_path)
     tool = Refiner(problem, ROBOT, kernels=kernels)
     boundary = Boundary(q[0][None], rest, rest, q[1][None], rest)
     found = refine_task(
-        tool, PlanChecker(problem, ROBOT, degree=7), RefinementTask(boundary, Scene((), np.empty((1, 0))), *tips)
+        tool,
+        PlanChecker(problem, ROBOT, degree=7),
+        RefinementTask(boundary, Scene((), np.empty((1, 0))), *tips),
     )
     assert found.valid, found
     assert np.linalg.norm(tips[1] - tips[0]) > 0.2

@@ -27,9 +27,15 @@ def depth_of_early_contact(plans: Plans, pucks: np.ndarray) -> np.ndarray:
     arm, depths = Arm(open_problem(plans.problem)[1]), []
     s = np.linspace(0, 1, 1500)
     for path, puck in zip(plans.path_control_points, pucks, strict=True):
-        knots = np.r_[np.zeros(8), np.arange(1, len(path) - 7) / (len(path) - 7), np.ones(8)]
-        tip = np.array([arm.pose(q).translation[:2].copy() for q in BSpline(knots, path, 7)(s)])
-        left = np.append(np.cumsum(np.linalg.norm(np.diff(tip, axis=0), axis=1)[::-1])[::-1], 0.0)
+        knots = np.r_[
+            np.zeros(8), np.arange(1, len(path) - 7) / (len(path) - 7), np.ones(8)
+        ]
+        tip = np.array(
+            [arm.pose(q).translation[:2].copy() for q in BSpline(knots, path, 7)(s)]
+        )
+        left = np.append(
+            np.cumsum(np.linalg.norm(np.diff(tip, axis=0), axis=1)[::-1])[::-1], 0.0
+        )
         distance = np.linalg.norm(tip - puck, axis=1)[left > LAST_M]
         depths.append(contact.mallet_radius + contact.puck_radius - distance.min())
     return np.array(depths)
@@ -61,7 +67,9 @@ def test_plans_called_valid_do_not_touch_the_puck_early(hits) -> None:
 
 def test_a_motion_through_the_puck_is_invalid_for_this_reason(hits) -> None:
     through = solve_plans_without_puck(hits[0])
-    verdicts = evaluate_plans(replace(through, problem=hits[0].problem), workers=1).verdicts
+    verdicts = evaluate_plans(
+        replace(through, problem=hits[0].problem), workers=1
+    ).verdicts
     reasons = {verdict.reason for verdict in verdicts}
     assert reasons == {"early contact with the puck"}
 
@@ -69,7 +77,11 @@ def test_a_motion_through_the_puck_is_invalid_for_this_reason(hits) -> None:
 def solve_plans_without_puck(plans: Plans) -> Plans:
     """Solve the same boundary problems without the constraint."""
     problem = load_problem("airhockey")
-    others = tuple(constraint for constraint in problem.constraint if not isinstance(constraint, PuckContact))
+    others = tuple(
+        constraint
+        for constraint in problem.constraint
+        if not isinstance(constraint, PuckContact)
+    )
     record = record_problem(replace(problem, constraint=others))
     found = solve_plans(replace(plans, problem=record), workers=1).plans
     assert evaluate_plans(found, workers=1).valid.all()

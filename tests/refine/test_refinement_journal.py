@@ -38,7 +38,9 @@ def finished_plans(path: Path, identity: str = IDENTITY) -> dict[int, Attempt]:
 def write_journal(path: Path, count: int = 3) -> None:
     journal = open_journal(path, IDENTITY)
     for first in range(0, 2 * count, 2):
-        journal.append([first, first + 1], [random_attempt(first), random_attempt(first + 1)])
+        journal.append(
+            [first, first + 1], [random_attempt(first), random_attempt(first + 1)]
+        )
     journal.close()
 
 
@@ -59,7 +61,9 @@ def test_appended_results_are_read_bit_by_bit(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("lost", [1, 30, 500])
-def test_an_incomplete_record_is_removed_and_later_ones_follow_the_complete_ones(tmp_path: Path, lost: int) -> None:
+def test_an_incomplete_record_is_removed_and_later_ones_follow_the_complete_ones(
+    tmp_path: Path, lost: int
+) -> None:
     path = tmp_path / "part"
     write_journal(path)
     path.write_bytes(path.read_bytes()[:-lost])
@@ -80,7 +84,9 @@ def test_records_from_a_flipped_bit_on_do_not_count(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("length", [0, 7, len(JOURNAL_MAGIC), len(JOURNAL_MAGIC) + 20])
-def test_a_journal_that_ends_in_its_first_line_starts_again(tmp_path: Path, length: int) -> None:
+def test_a_journal_that_ends_in_its_first_line_starts_again(
+    tmp_path: Path, length: int
+) -> None:
     path = tmp_path / "part"
     write_journal(path, 0)
     path.write_bytes(path.read_bytes()[:length])
@@ -95,7 +101,8 @@ def test_the_journal_of_another_run_is_kept_without_discard(tmp_path: Path) -> N
     path = tmp_path / "part"
     write_journal(path)
     with pytest.raises(
-        UsageError, match=r"part holds 6 finished plans of another run \(run one, now two\): discard=True"
+        UsageError,
+        match=r"part holds 6 finished plans of another run \(run one, now two\): discard=True",
     ):
         open_journal(path, '{"run": "two"}')
     assert len(finished_plans(path)) == 6
@@ -122,7 +129,10 @@ def test_two_processes_do_not_share_a_journal(tmp_path: Path) -> None:
 
 
 def test_a_folder_without_write_access_is_named(tmp_path: Path) -> None:
-    with pytest.raises(MachineError, match=r"cannot write .*nowhere.part: .*; choose a folder that can be created"):
+    with pytest.raises(
+        MachineError,
+        match=r"cannot write .*nowhere.part: .*; choose a folder that can be created",
+    ):
         open_journal(tmp_path / "nowhere" / "part", IDENTITY)
 
 
@@ -147,7 +157,9 @@ def test_a_journal_that_another_process_creates_meanwhile_is_not_truncated(
 
 
 @pytest.mark.parametrize(
-    "record", [b"", b"PK\x03\x04", b"no archive", "compressed"], ids=["empty", "cut", "text", "compressed"]
+    "record",
+    [b"", b"PK\x03\x04", b"no archive", "compressed"],
+    ids=["empty", "cut", "text", "compressed"],
 )
 def test_a_record_that_cnpgen_has_not_written_is_refused(tmp_path, record):
     path = tmp_path / "plans.part"
@@ -157,6 +169,10 @@ def test_a_record_that_cnpgen_has_not_written_is_refused(tmp_path, record):
         np.savez_compressed(buffer, words=np.zeros(10**6, np.uint8))
         record = buffer.getvalue()
     with path.open("ab") as file:
-        file.write(len(record).to_bytes(8, "little") + hashlib.sha256(record).digest() + record)
-    with pytest.raises(UsageError, match=r"plans\.part is not a journal that cnpgen has written"):
+        file.write(
+            len(record).to_bytes(8, "little") + hashlib.sha256(record).digest() + record
+        )
+    with pytest.raises(
+        UsageError, match=r"plans\.part is not a journal that cnpgen has written"
+    ):
         open_journal(path, "{}")

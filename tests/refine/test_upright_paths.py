@@ -13,7 +13,13 @@ from cnpgen.problems.problem_record import open_problem
 from cnpgen.refine import attempts
 from cnpgen.refine.options import DEFAULT_OPTIONS
 from cnpgen.refine.refine_engine import prepare, tasks_of
-from cnpgen.refine.rrt_connect import MAX_STATE_SPACING, STATE_SPACING, RestSpace, find_paths, follow_line
+from cnpgen.refine.rrt_connect import (
+    MAX_STATE_SPACING,
+    STATE_SPACING,
+    RestSpace,
+    find_paths,
+    follow_line,
+)
 from cnpgen.refine.task import Outcome
 from cnpgen.world.world import World
 from tests.conftest import needs_compiler
@@ -21,7 +27,10 @@ from tests.conftest import needs_compiler
 pytestmark = needs_compiler
 
 ENDS = json.loads((Path(__file__).parents[1] / "data" / "transports.json").read_text())
-UNSOLVED = ["goals of others", pytest.param("joint on its limit", marks=pytest.mark.slow)]  # from other initial guesses
+UNSOLVED = [
+    "goals of others",
+    pytest.param("joint on its limit", marks=pytest.mark.slow),
+]  # from other initial guesses
 MAX_MIDPOINT_VIOLATION = 1.5  # tolerances, of states between the checked ones
 
 
@@ -37,24 +46,34 @@ def space_of(problems: Plans) -> RestSpace:
 def violations(problems: Plans, states: np.ndarray) -> Iterator[float]:
     """Yield the violations of the problem's constraints at rest in tolerances, by Pinocchio and Coal."""
     problem, robot = open_problem(problems.problem)
-    (task,), world = tasks_of(problems), World(robot, problem.obstacle, problem.object_size)
+    (task,), world = (
+        tasks_of(problems),
+        World(robot, problem.obstacle, problem.object_size),
+    )
     for q in states:
         world.set_state(q, 0 * q, 0 * q, task.scene.poses[0])
         for constraint in problem.constraint:
             for condition in constraint.measured(world):
-                violation = np.maximum(condition.lower - condition.g, condition.g - condition.upper)
+                violation = np.maximum(
+                    condition.lower - condition.g, condition.g - condition.upper
+                )
                 yield float((violation / constraint.allowed(condition)).max())
 
 
 def test_a_path_holds_the_object_upright_and_within_all_limits() -> None:
     problems = transport("tilted on the way")
-    space, ends = space_of(problems), (problems.boundary.start_q[0], problems.boundary.goal_q[0])
+    space, ends = (
+        space_of(problems),
+        (problems.boundary.start_q[0], problems.boundary.goal_q[0]),
+    )
     assert not follow_line(*ends, space.follow)[1]
     path = next(find_paths(*ends, space.robot, space.follow))
     np.testing.assert_allclose(path[[0, -1]], ends, atol=1e-6)
     assert np.abs(np.diff(path, axis=0)).max() <= MAX_STATE_SPACING
     assert max(violations(problems, path)) <= 1
-    assert max(violations(problems, (path[1:] + path[:-1]) / 2)) <= MAX_MIDPOINT_VIOLATION
+    assert (
+        max(violations(problems, (path[1:] + path[:-1]) / 2)) <= MAX_MIDPOINT_VIOLATION
+    )
 
 
 def test_states_off_the_equalities_are_projected_within_the_joint_limits() -> None:
@@ -71,7 +90,10 @@ def test_states_off_the_equalities_are_projected_within_the_joint_limits() -> No
     (vertical,) = (item for item in problem.constraint if item.reason == "not vertical")
     for q in projected.T:
         world.set_state(q, 0 * q, 0 * q, space.scene_poses)
-        assert all(condition.violation() < 0.1 * vertical.tolerance for condition in vertical.measured(world))
+        assert all(
+            condition.violation() < 0.1 * vertical.tolerance
+            for condition in vertical.measured(world)
+        )
 
 
 @pytest.mark.parametrize("label", UNSOLVED)

@@ -26,15 +26,23 @@ def few_states(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 def gap_of(problem: Problem) -> HullGap:
     robot, path = load_robot(problem), problem.urdf_path
-    return measure_hull_gap(read_urdf(path), path, problem.packages, model=robot.model, shape=robot.shape)
+    return measure_hull_gap(
+        read_urdf(path), path, problem.packages, model=robot.model, shape=robot.shape
+    )
 
 
 @pytest.mark.parametrize("robot", ["", "convex_parts = 4"], ids=["hulls", "parts"])
 def test_the_gap_is_that_of_the_judge_and_of_pinocchio(tmp_path, robot):
     problem = arm_of_channels(tmp_path, robot)
     loaded, gap = load_robot(problem), gap_of(arm_of_channels(tmp_path, robot))
-    world, meshes, still = World(loaded), Meshes(problem, loaded, tmp_path), np.zeros(loaded.n)
-    states = np.random.default_rng(0).uniform(loaded.position_lower, loaded.position_upper, (STATES, loaded.n))
+    world, meshes, still = (
+        World(loaded),
+        Meshes(problem, loaded, tmp_path),
+        np.zeros(loaded.n),
+    )
+    states = np.random.default_rng(0).uniform(
+        loaded.position_lower, loaded.position_upper, (STATES, loaded.n)
+    )
     free, accepted = np.zeros(STATES, bool), np.zeros(STATES, bool)
     for k, q in enumerate(states):
         world.set_state(q, still, still, np.zeros(0))

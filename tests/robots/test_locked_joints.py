@@ -21,23 +21,30 @@ locked_positions = [{LIFT}, {GRIP}]
 
 
 def lines(text: str) -> str:
-    return text.replace('joints = ["swing", "lift", "elbow", "roll"]', 'joints = ["swing", "lift", "elbow"]').replace(
-        "[0.0, -0.4, 0.8, 0.0]", "[0.0, -0.4, 0.8]"
-    )
+    return text.replace(
+        'joints = ["swing", "lift", "elbow", "roll"]',
+        'joints = ["swing", "lift", "elbow"]',
+    ).replace("[0.0, -0.4, 0.8, 0.0]", "[0.0, -0.4, 0.8]")
 
 
 def problem_in(folder: Path, locked: str = LOCKED) -> Path:
     file = write_problem(folder, robot=locked, obstacles="", more="")
-    text = lines(file.read_text()).replace('use = "robot-clearance"', 'use = "joint-velocity"')
+    text = lines(file.read_text()).replace(
+        'use = "robot-clearance"', 'use = "joint-velocity"'
+    )
     file.write_text(text)
     return file
 
 
 @pytest.mark.parametrize("rotation", ["0 0 0", "0.3 -0.5 2"])
-def test_the_model_is_that_of_pinocchio_at_the_positions(tmp_path: Path, rotation: str) -> None:
+def test_the_model_is_that_of_pinocchio_at_the_positions(
+    tmp_path: Path, rotation: str
+) -> None:
     file = problem_in(tmp_path)
     path = tmp_path / "crane" / "crane.urdf"
-    text = path.read_text().replace('<origin xyz="0.3 0 0"/>', f'<origin xyz="0.3 0 0" rpy="{rotation}"/>')
+    text = path.read_text().replace(
+        '<origin xyz="0.3 0 0"/>', f'<origin xyz="0.3 0 0" rpy="{rotation}"/>'
+    )
     text = text.replace('<axis xyz="1 0 0"/>', '<axis xyz="0.5 -0.2 0.4"/>')
     path.write_text(text)
     robot = load_robot(load_problem(file))
@@ -50,36 +57,65 @@ def test_the_model_is_that_of_pinocchio_at_the_positions(tmp_path: Path, rotatio
         for link in ("hand", "claw"):
             expected = data.oMf[full.getFrameId(link)]
             found = own.oMf[robot.model.getFrameId(link)]
-            np.testing.assert_allclose(found.homogeneous, expected.homogeneous, atol=1e-12)
+            np.testing.assert_allclose(
+                found.homogeneous, expected.homogeneous, atol=1e-12
+            )
         zero = np.zeros(5)
         torques = pin.rnea(full, data, np.append(q, [LIFT, GRIP]), zero, zero)[:3]
-        np.testing.assert_allclose(pin.rnea(robot.model, own, q, zero[:3], zero[:3]), torques, atol=1e-10)
+        np.testing.assert_allclose(
+            pin.rnea(robot.model, own, q, zero[:3], zero[:3]), torques, atol=1e-10
+        )
 
 
 def test_a_stored_problem_has_the_same_robot(tmp_path: Path) -> None:
     problem = load_problem(problem_in(tmp_path))
     stored, robot = open_problem(record_problem(problem))
     assert stored.urdf_text == problem.urdf_text
-    assert with_locked_joints(problem.urdf_text, {"roll": LIFT}, is_stored=True).count('type="fixed"') >= 2
-    placements = zip(robot.model.jointPlacements, load_robot(problem).model.jointPlacements, strict=True)
-    assert all(np.array_equal(one.homogeneous, two.homogeneous) for one, two in placements)
+    assert (
+        with_locked_joints(problem.urdf_text, {"roll": LIFT}, is_stored=True).count(
+            'type="fixed"'
+        )
+        >= 2
+    )
+    placements = zip(
+        robot.model.jointPlacements,
+        load_robot(problem).model.jointPlacements,
+        strict=True,
+    )
+    assert all(
+        np.array_equal(one.homogeneous, two.homogeneous) for one, two in placements
+    )
 
 
 def test_joints_that_mimic_a_locked_one_follow_it() -> None:
     mimic = '<mimic joint="roll" multiplier="-0.5" offset="0.1"/></joint>\n</robot>'
     text = urdf().replace("</joint>\n</robot>", mimic)
     fixed = with_locked_joints(text, {"roll": LIFT}, is_stored=False)
-    both = with_locked_joints(urdf(), {"roll": LIFT, "grip": 0.1 - 0.5 * LIFT}, is_stored=False)
+    both = with_locked_joints(
+        urdf(), {"roll": LIFT, "grip": 0.1 - 0.5 * LIFT}, is_stored=False
+    )
     assert fixed == both
 
 
 @pytest.mark.parametrize(
     ("locked", "message"),
     [
-        (LOCKED.replace(f"{GRIP}]", "5.0]"), "joint 'grip' is locked at 5 m, outside of its limits -2.5 to 2.5 m"),
-        (LOCKED.replace("grip", "gripp"), "the URDF has no joint 'gripp' .did you mean 'grip'"),
-        (LOCKED.replace(f", {GRIP}]", "]"), "locked_positions: expected 2 numbers, one per locked joint, got 1"),
-        (LOCKED.replace("roll", "lift"), "a joint is planned or locked, got lift in both lists"),
+        (
+            LOCKED.replace(f"{GRIP}]", "5.0]"),
+            "joint 'grip' is locked at 5 m, outside of its limits -2.5 to 2.5 m",
+        ),
+        (
+            LOCKED.replace("grip", "gripp"),
+            "the URDF has no joint 'gripp' .did you mean 'grip'",
+        ),
+        (
+            LOCKED.replace(f", {GRIP}]", "]"),
+            "locked_positions: expected 2 numbers, one per locked joint, got 1",
+        ),
+        (
+            LOCKED.replace("roll", "lift"),
+            "a joint is planned or locked, got lift in both lists",
+        ),
         (LOCKED.replace("roll", "grip"), "each joint can be locked once"),
     ],
 )
@@ -90,14 +126,22 @@ def test_mistakes_are_named(tmp_path: Path, locked: str, message: str) -> None:
 
 def test_quaternions_of_locked_joints_are_refused() -> None:
     """As for other joints; zero angles in their place would turn all links that follow."""
-    joint = urdf().replace('"roll" type="revolute">', '"roll" type="revolute"><origin quat_xyzw="0 0 1 0"/>')
+    joint = urdf().replace(
+        '"roll" type="revolute">',
+        '"roll" type="revolute"><origin quat_xyzw="0 0 1 0"/>',
+    )
     assert joint != urdf()
-    with pytest.raises(RecipeError, match=r"locked_joints: joint 'roll': <origin quat_xyzw=\.\.\.> is not"):
+    with pytest.raises(
+        RecipeError,
+        match=r"locked_joints: joint 'roll': <origin quat_xyzw=\.\.\.> is not",
+    ):
         with_locked_joints(joint, {"roll": 0.1}, is_stored=False)
 
 
 def test_joints_without_a_position_are_refused() -> None:
     with pytest.raises(RecipeError, match="joint 'roll' is fixed and has no position"):
         with_locked_joints(
-            urdf().replace('"roll" type="revolute"', '"roll" type="fixed"'), {"roll": 0.1}, is_stored=False
+            urdf().replace('"roll" type="revolute"', '"roll" type="fixed"'),
+            {"roll": 0.1},
+            is_stored=False,
         )

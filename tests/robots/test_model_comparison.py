@@ -27,7 +27,10 @@ def read_or_refused(name: str, number: int) -> tuple[str, list[str]]:
     problem = load_problem(name)
     urdf = changed_number(problem.urdf_text, Random(f"{name} {number}"))
     try:
-        with ProblemRecord(record_problem(problem).recipe, urdf).restored() as restored, np.errstate(all="ignore"):
+        with (
+            ProblemRecord(record_problem(problem).recipe, urdf).restored() as restored,
+            np.errstate(all="ignore"),
+        ):
             robot = load_robot(restored)
     except RecipeError:
         return "refused", []
@@ -38,7 +41,9 @@ def read_or_refused(name: str, number: int) -> tuple[str, list[str]]:
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_changed_number_is_in_the_model_or_refused(name: str) -> None:
     outcomes = [read_or_refused(name, number) for number in range(N_CHANGES)]
-    assert [(number, found) for number, (_, found) in enumerate(outcomes) if found] == []
+    assert [
+        (number, found) for number, (_, found) in enumerate(outcomes) if found
+    ] == []
     assert {outcome for outcome, _ in outcomes} == {"read", "refused"}
 
 
@@ -49,14 +54,26 @@ def test_the_shipped_urdfs_are_read_as_written(name: str) -> None:
 
 
 CHANGES = {
-    r"the body of joint 'joint_3', of the links .*: Pinocchio reads its mass": lambda model: model.appendBodyToJoint(
-        3, pin.Inertia(1.0, np.zeros(3), np.eye(3)), pin.SE3.Identity()
+    r"the body of joint 'joint_3', of the links .*: Pinocchio reads its mass": lambda model: (
+        model.appendBodyToJoint(
+            3, pin.Inertia(1.0, np.zeros(3), np.eye(3)), pin.SE3.Identity()
+        )
     ),
-    r"joint 'joint_2': Pinocchio reads its <origin>": lambda model: move(model.jointPlacements[2]),
-    r"joint 'joint_2': .* its limit 'effort'": lambda model: model.effortLimit.__setitem__(1, 7.0),
-    r"joint 'joint_2': .* its limit 'upper'": lambda model: model.upperPositionLimit.__setitem__(1, 7.0),
-    r"joint 'joint_2': .* its limit 'velocity'": lambda model: model.velocityLimit.__setitem__(1, 7.0),
-    r"link '.*': Pinocchio reads its placement": lambda model: move(model.frames[model.nframes - 1].placement),
+    r"joint 'joint_2': Pinocchio reads its <origin>": lambda model: move(
+        model.jointPlacements[2]
+    ),
+    r"joint 'joint_2': .* its limit 'effort'": lambda model: (
+        model.effortLimit.__setitem__(1, 7.0)
+    ),
+    r"joint 'joint_2': .* its limit 'upper'": lambda model: (
+        model.upperPositionLimit.__setitem__(1, 7.0)
+    ),
+    r"joint 'joint_2': .* its limit 'velocity'": lambda model: (
+        model.velocityLimit.__setitem__(1, 7.0)
+    ),
+    r"link '.*': Pinocchio reads its placement": lambda model: move(
+        model.frames[model.nframes - 1].placement
+    ),
 }
 
 
@@ -83,4 +100,6 @@ def test_joints_that_are_not_planned_are_part_of_the_body_that_carries_them() ->
     model = reduced_model(robot.urdf, robot.urdf_text, fewer, attached)
     lumped = bodies_in(robot.urdf_text, fewer)[-1]
     assert model.inertias[4].mass == pytest.approx(lumped.mass)
-    np.testing.assert_allclose(model.inertias[4].lever * lumped.mass, lumped.mass_center, atol=1e-12)
+    np.testing.assert_allclose(
+        model.inertias[4].lever * lumped.mass, lumped.mass_center, atol=1e-12
+    )

@@ -30,9 +30,20 @@ def errors(**keys: Any) -> dict[str, str]:
     "keys",
     [
         {"position": HERE, "size": (1.0, 1.0, 1.0)},
-        {"position": HERE, "size": (1.0, 1.0, 1.0), "rotation": (0.1, 0.0, 0.0), "below": "goal"},
+        {
+            "position": HERE,
+            "size": (1.0, 1.0, 1.0),
+            "rotation": (0.1, 0.0, 0.0),
+            "below": "goal",
+        },
         {"kind": "sphere", "position": HERE, "radius": 0.1},
-        {"kind": "cylinder", "position": HERE, "radius": 0.1, "length": 1.0, "rotation": (0.1, 0.0, 0.0)},
+        {
+            "kind": "cylinder",
+            "position": HERE,
+            "radius": 0.1,
+            "length": 1.0,
+            "rotation": (0.1, 0.0, 0.0),
+        },
         {"kind": "capsule", "position": HERE, "radius": 0.1, "length": 1.0},
         {"kind": "mesh", "position": HERE, "mesh": "it.stl", "scale": (1.0, -1.0, 1.0)},
     ],
@@ -47,27 +58,75 @@ def test_what_has_all_that_its_kind_needs_is_an_obstacle(keys: dict[str, Any]) -
 @pytest.mark.parametrize(
     ("keys", "key", "says"),
     [
-        ({"kind": "sphere", "position": HERE, "radius": 0.1, "length": 0.2}, "length", "a sphere has no such key"),
-        ({"kind": "sphere", "position": HERE, "radius": 0.1, "rotation": (1.0, 0, 0)}, "rotation", "a sphere has no"),
-        ({"kind": "mesh", "position": HERE, "mesh": "a", "scale": (1.0, 0.0, 1.0)}, "scale", "must not be 0"),
-        ({"position": HERE, "size": (1.0, 1.0, 1.0), "top": 0.3}, "top", "a box has no such key"),
-        ({"top": 0.3}, "position", "a box and needs 'position' and 'size', or 'x', 'y', 'top' and 'height' in their"),
-        ({"kind": "mesh", "position": HERE, "mesh": "data:application/octet-stream;base64,AAAA"}, "mesh", "buffer"),
+        (
+            {"kind": "sphere", "position": HERE, "radius": 0.1, "length": 0.2},
+            "length",
+            "a sphere has no such key",
+        ),
+        (
+            {
+                "kind": "sphere",
+                "position": HERE,
+                "radius": 0.1,
+                "rotation": (1.0, 0, 0),
+            },
+            "rotation",
+            "a sphere has no",
+        ),
+        (
+            {"kind": "mesh", "position": HERE, "mesh": "a", "scale": (1.0, 0.0, 1.0)},
+            "scale",
+            "must not be 0",
+        ),
+        (
+            {"position": HERE, "size": (1.0, 1.0, 1.0), "top": 0.3},
+            "top",
+            "a box has no such key",
+        ),
+        (
+            {"top": 0.3},
+            "position",
+            "a box and needs 'position' and 'size', or 'x', 'y', 'top' and 'height' in their",
+        ),
+        (
+            {
+                "kind": "mesh",
+                "position": HERE,
+                "mesh": "data:application/octet-stream;base64,AAAA",
+            },
+            "mesh",
+            "buffer",
+        ),
     ],
 )
-def test_what_does_not_go_with_a_kind_is_refused(keys: dict[str, Any], key: str, says: str) -> None:
+def test_what_does_not_go_with_a_kind_is_refused(
+    keys: dict[str, Any], key: str, says: str
+) -> None:
     assert says in errors(**keys)[key]
 
 
 def test_an_upright_box_has_no_pose(tmp_path: Path) -> None:
-    table = "\n".join(['[[obstacle]]\nname = "it"', "x = [0, 1]", "y = [0, 1]", "top = 0.1", "rotation = [0, 0, 1]"])
-    with pytest.raises(RecipeError, match="rotation: an upright box has 'x', 'y', 'top' and 'height': leave this out"):
+    table = "\n".join(
+        [
+            '[[obstacle]]\nname = "it"',
+            "x = [0, 1]",
+            "y = [0, 1]",
+            "top = 0.1",
+            "rotation = [0, 0, 1]",
+        ]
+    )
+    with pytest.raises(
+        RecipeError,
+        match="rotation: an upright box has 'x', 'y', 'top' and 'height': leave this out",
+    ):
         load_problem(write_problem(tmp_path, obstacles=table))
 
 
 def test_kinds_are_where_their_keys_say(tmp_path: Path) -> None:
     problem = load_problem(write_problem(tmp_path, obstacles=KINDS))
-    wall, ball, post, pipe, wedge = solids_of(problem.obstacle, place_obstacles(problem.obstacle))
+    wall, ball, post, pipe, wedge = solids_of(
+        problem.obstacle, place_obstacles(problem.obstacle)
+    )
     assert pose_width(problem.obstacle) == 15 + 4 + 7 + 7 + 12
     turn = Rotation.from_euler("xyz", [0, 0, 20], degrees=True).as_matrix()
     corner = np.array([0.5, 0.0, 0.15]) + turn @ [0.05, 0.25, 0.15]
@@ -94,7 +153,10 @@ def test_a_problem_holds_its_meshes(tmp_path: Path) -> None:
 
 def test_a_missing_mesh_is_reported_with_the_searched_paths(tmp_path: Path) -> None:
     file = write_problem(tmp_path, obstacles=KINDS.replace("wedge.stl", "wegde.stl"))
-    with pytest.raises(RecipeError, match=r"(?s)obstacle 5\.mesh: .*'crane/meshes/wegde\.stl' is missing; searched"):
+    with pytest.raises(
+        RecipeError,
+        match=r"(?s)obstacle 5\.mesh: .*'crane/meshes/wegde\.stl' is missing; searched",
+    ):
         load_problem(file)
     (tmp_path / "crane" / "meshes" / "wegde.stl").write_bytes(b"solid")
     with pytest.raises(RecipeError, match=r"obstacle 5\.mesh: .*wegde\.stl: "):
@@ -102,10 +164,14 @@ def test_a_missing_mesh_is_reported_with_the_searched_paths(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"1234", np.array([np.nan, 0, 0]).tobytes(), np.zeros(4).tobytes()], ids=range(4)
+    "content",
+    [b"", b"1234", np.array([np.nan, 0, 0]).tobytes(), np.zeros(4).tobytes()],
+    ids=range(4),
 )
 def test_corners_that_are_none_are_refused(content: bytes) -> None:
-    address = "data:application/octet-stream;base64," + base64.b64encode(content).decode()
+    address = (
+        "data:application/octet-stream;base64," + base64.b64encode(content).decode()
+    )
     assert "mesh" in errors(kind="mesh", position=HERE, mesh=address)
 
 

@@ -8,7 +8,11 @@ import pytest
 
 import cnpgen
 from cnpgen.cli.main import main
-from cnpgen.robots.plausible_values import UnitError, check_plausible, find_implausible_value
+from cnpgen.robots.plausible_values import (
+    UnitError,
+    check_plausible,
+    find_implausible_value,
+)
 from tests.examples.plans import ROBOTS
 
 ROBOT = ROBOTS["airhockey"]
@@ -26,7 +30,9 @@ BASE = ROBOT.base
         ({"hit_speed": 2000.0}, r"hit_speed .* m/s, got 2000 m/s in task 0; did you mean 2000 mm/s = 2 m/s\?"),
     ],
 )  # fmt: skip
-def test_tasks_in_other_units_are_refused_with_a_suggestion(columns: dict[str, object], message: str) -> None:
+def test_tasks_in_other_units_are_refused_with_a_suggestion(
+    columns: dict[str, object], message: str
+) -> None:
     recipe = "airhockey-replan" if "start_dq" in columns else "airhockey-hit"
     task = {"goal_xyz": [1.0, 0.1], "hit_angle": 0.1, **columns}
     with pytest.raises(UnitError, match=message) as caught:
@@ -35,9 +41,24 @@ def test_tasks_in_other_units_are_refused_with_a_suggestion(columns: dict[str, o
     assert caught.value.exit_code == 2
 
 
-def test_a_table_in_degrees_ends_with_exit_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "tasks.csv").write_text("goal_xyz.x,goal_xyz.y,hit_angle\n1.0,0.1,0.2\n1.0,0.1,15\n")
-    assert main(["complete", "airhockey-hit", str(tmp_path / "tasks.csv"), "-o", str(tmp_path / "a.h5")]) == 2
+def test_a_table_in_degrees_ends_with_exit_code_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "tasks.csv").write_text(
+        "goal_xyz.x,goal_xyz.y,hit_angle\n1.0,0.1,0.2\n1.0,0.1,15\n"
+    )
+    assert (
+        main(
+            [
+                "complete",
+                "airhockey-hit",
+                str(tmp_path / "tasks.csv"),
+                "-o",
+                str(tmp_path / "a.h5"),
+            ]
+        )
+        == 2
+    )
     error = capsys.readouterr().err
     assert "got 15 rad in task 1" in error
     assert "did you mean 15 deg = 0.262 rad?" in error
@@ -48,20 +69,31 @@ def test_a_table_in_degrees_ends_with_exit_code_2(tmp_path: Path, capsys: pytest
 def in_degrees(tmp_path: Path) -> Path:
     path = tmp_path / "degrees.h5"
     with h5py.File(path, "w") as file:
-        file["start_q"], file["goal_q"] = np.rad2deg(BASE)[None], np.rad2deg(BASE + 0.1)[None]
+        file["start_q"], file["goal_q"] = (
+            np.rad2deg(BASE)[None],
+            np.rad2deg(BASE + 0.1)[None],
+        )
     return path
 
 
 def test_boundary_files_in_degrees_are_refused_unless_large_angles_are_allowed(
     in_degrees: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(UnitError, match=r"start_q must be from .* allow_large_angles=True accepts such values"):
+    with pytest.raises(
+        UnitError,
+        match=r"start_q must be from .* allow_large_angles=True accepts such values",
+    ):
         cnpgen.load_boundary_problems(in_degrees, problem="airhockey")
     with pytest.warns(UserWarning, match=r"did you mean .* deg = "):
-        plans = cnpgen.load_boundary_problems(in_degrees, problem="airhockey", allow_large_angles=True)
+        plans = cnpgen.load_boundary_problems(
+            in_degrees, problem="airhockey", allow_large_angles=True
+        )
     np.testing.assert_allclose(plans.boundary.start_q[0], np.rad2deg(BASE))
     out = str(in_degrees.with_name("plans.h5"))
-    for command in (["solve", "--problem", "airhockey"], ["plan", "--model", "airhockey-hit"]):
+    for command in (
+        ["solve", "--problem", "airhockey"],
+        ["plan", "--model", "airhockey-hit"],
+    ):
         assert main([command[0], str(in_degrees), *command[1:], "-o", out]) == 2
         assert "--allow-large-angles accepts such values" in capsys.readouterr().err
 
@@ -70,8 +102,12 @@ def test_hits_in_millimetres_are_refused() -> None:
     planner = cnpgen.Planner("airhockey-hit")
     state = (BASE, np.zeros(6), np.zeros(6))
     for wrong in ({"puck": [1000.0, 100.0]}, {"target": [2400.0, 0.0]}):
-        with pytest.raises(UnitError, match=r"in hit 0; did you mean .* mm = ") as caught:
-            cnpgen.plan_hits(planner, state, **{"puck": [1.0, 0.1], "target": [2.4, 0.0], **wrong})
+        with pytest.raises(
+            UnitError, match=r"in hit 0; did you mean .* mm = "
+        ) as caught:
+            cnpgen.plan_hits(
+                planner, state, **{"puck": [1.0, 0.1], "target": [2.4, 0.0], **wrong}
+            )
         assert caught.value.argument in wrong
 
 
@@ -79,6 +115,16 @@ def test_valid_limits_and_moderate_violations_are_plausible() -> None:
     low, high = ROBOT.position_lower, ROBOT.position_upper
     for values in (low, high, low - 0.4 * (high - low)):
         assert find_implausible_value(ROBOT, "start_q", values[None], "rad") is None
-    check_plausible(ROBOT, {"start_dq": 3 * ROBOT.velocity_limit[None]}, {"start_dq": "rad/s"}, noun="plan")
-    assert find_implausible_value(ROBOT, "goal_q", np.full((1, 6), np.nan), "rad") is None
-    assert find_implausible_value(ROBOT, "hit_speed_share", np.full((1, 1), 1e9), "1") is None
+    check_plausible(
+        ROBOT,
+        {"start_dq": 3 * ROBOT.velocity_limit[None]},
+        {"start_dq": "rad/s"},
+        noun="plan",
+    )
+    assert (
+        find_implausible_value(ROBOT, "goal_q", np.full((1, 6), np.nan), "rad") is None
+    )
+    assert (
+        find_implausible_value(ROBOT, "hit_speed_share", np.full((1, 1), 1e9), "1")
+        is None
+    )

@@ -36,27 +36,46 @@ def mistake_of(problem: Problem) -> str:
     return error
 
 
-@pytest.mark.parametrize("problem", [AIRHOCKEY, HEAVY], ids=lambda problem: problem.name)
+@pytest.mark.parametrize(
+    "problem", [AIRHOCKEY, HEAVY], ids=lambda problem: problem.name
+)
 def test_limits_are_those_of_the_urdf_scaled(problem):
     robot, model = load_robot(problem), load_robot(problem).model
     assert robot.n == len(problem.robot.joints) == model.nq
-    np.testing.assert_allclose(robot.position_lower, model.lowerPositionLimit, rtol=1e-15)
-    np.testing.assert_allclose(robot.position_upper, model.upperPositionLimit, rtol=1e-15)
-    np.testing.assert_allclose(robot.velocity_limit, 0.8 * np.array(model.velocityLimit), rtol=1e-15)
-    np.testing.assert_allclose(robot.torque_limit, 0.8 * np.array(model.effortLimit), rtol=1e-15)
+    np.testing.assert_allclose(
+        robot.position_lower, model.lowerPositionLimit, rtol=1e-15
+    )
+    np.testing.assert_allclose(
+        robot.position_upper, model.upperPositionLimit, rtol=1e-15
+    )
+    np.testing.assert_allclose(
+        robot.velocity_limit, 0.8 * np.array(model.velocityLimit), rtol=1e-15
+    )
+    np.testing.assert_allclose(
+        robot.torque_limit, 0.8 * np.array(model.effortLimit), rtol=1e-15
+    )
     np.testing.assert_array_equal(robot.home, problem.robot.home)
 
 
 def test_acceleration_limit_is_the_rate_times_the_velocity_limit_up_to_the_cap():
-    robot = load_robot(replace(HEAVY, limits=replace(HEAVY.limits, acceleration_rate=10.0, acceleration_cap=15.0)))
-    np.testing.assert_allclose(robot.acceleration_limit, np.minimum(10.0 * robot.velocity_limit, 15.0))
+    robot = load_robot(
+        replace(
+            HEAVY,
+            limits=replace(HEAVY.limits, acceleration_rate=10.0, acceleration_cap=15.0),
+        )
+    )
+    np.testing.assert_allclose(
+        robot.acceleration_limit, np.minimum(10.0 * robot.velocity_limit, 15.0)
+    )
     assert robot.acceleration_limit.max() == 15.0
     assert robot.acceleration_limit.min() < 15.0
 
 
 def test_position_scale_narrows_limits_about_their_center(tmp_path):
     problem = with_urdf(tmp_path, 'lower="-2.9670597283903604"', 'lower="-1.0"')
-    robot = load_robot(replace(problem, limits=replace(problem.limits, position_scale=0.5)))
+    robot = load_robot(
+        replace(problem, limits=replace(problem.limits, position_scale=0.5))
+    )
     center, half = (2.9670597283903604 - 1.0) / 2, (2.9670597283903604 + 1.0) / 4
     assert robot.position_lower[0] == pytest.approx(center - half)
     assert robot.position_upper[0] == pytest.approx(center + half)
@@ -67,7 +86,10 @@ def test_capsule_axes_of_the_heavy_object_are_shoulder_elbow_wrist_object():
     assert robot.capsule_axes == ((1, 3), (3, 5), (5, 7))
     model, data = robot.model, robot.model.createData()
     pin.framesForwardKinematics(model, data, np.linspace(-1, 1, 7))
-    points = [*(data.oMi[i].translation for i in range(1, 8)), data.oMf[model.getFrameId(robot.tip)].translation]
+    points = [
+        *(data.oMi[i].translation for i in range(1, 8)),
+        data.oMf[model.getFrameId(robot.tip)].translation,
+    ]
     lengths = [np.linalg.norm(points[b] - points[a]) for a, b in robot.capsule_axes]
     np.testing.assert_allclose(lengths, [0.42, 0.4, 0.251], atol=1e-12)
 
@@ -100,7 +122,10 @@ def test_unknown_tip_is_named_with_the_nearest_one():
 
 def test_tip_must_be_behind_the_last_planned_joint():
     error = mistake_of(changed(HEAVY, tip="link_4"))
-    assert "robot.tip: frame 'link_4' is not moved by the last planned joint 'joint_7'" in error
+    assert (
+        "robot.tip: frame 'link_4' is not moved by the last planned joint 'joint_7'"
+        in error
+    )
 
 
 def test_joints_must_be_in_the_order_of_the_urdf():
@@ -110,26 +135,45 @@ def test_joints_must_be_in_the_order_of_the_urdf():
 
 
 def test_base_needs_one_value_per_joint():
-    assert "robot.base: needs 7 values, one per planned joint, got 6" in mistake_of(changed(HEAVY, base=(0.0,) * 6))
+    assert "robot.base: needs 7 values, one per planned joint, got 6" in mistake_of(
+        changed(HEAVY, base=(0.0,) * 6)
+    )
 
 
 def test_base_outside_its_limits_names_the_joint_that_is_furthest_out():
     error = mistake_of(changed(HEAVY, base=(0.0, 2.2, 0.0, -2.5, 0.0, 0.0, 0.0)))
-    assert "robot.base: joint_4 = -2.5 rad is outside its planning limits [-2.0944, 2.0944]" in error
+    assert (
+        "robot.base: joint_4 = -2.5 rad is outside its planning limits [-2.0944, 2.0944]"
+        in error
+    )
 
 
 def test_a_tip_below_the_table_is_a_mistake_with_its_height():
-    table = next(each for each in AIRHOCKEY.constraint if type(each).__name__ == "Table")
-    lifted = tuple(replace(each, z=1.0, start_band=0.01) if each is table else each for each in AIRHOCKEY.constraint)
+    table = next(
+        each for each in AIRHOCKEY.constraint if type(each).__name__ == "Table"
+    )
+    lifted = tuple(
+        replace(each, z=1.0, start_band=0.01) if each is table else each
+        for each in AIRHOCKEY.constraint
+    )
     found = mistake_of(replace(AIRHOCKEY, constraint=lifted))
-    assert "robot.base: the tip is 0.84 m below the table, at z = 0.16 m, expected 1 m or more" in found
-    above = tuple(replace(each, z=0.165, start_band=0.01) if each is table else each for each in AIRHOCKEY.constraint)
+    assert (
+        "robot.base: the tip is 0.84 m below the table, at z = 0.16 m, expected 1 m or more"
+        in found
+    )
+    above = tuple(
+        replace(each, z=0.165, start_band=0.01) if each is table else each
+        for each in AIRHOCKEY.constraint
+    )
     load_robot(replace(AIRHOCKEY, constraint=above))  # as far off as motions may start
 
 
 def test_base_on_its_limit_is_inside():
     robot = load_robot(HEAVY)
-    assert load_robot(changed(HEAVY, base=tuple(robot.position_upper))).base[0] == robot.position_upper[0]
+    assert (
+        load_robot(changed(HEAVY, base=tuple(robot.position_upper))).base[0]
+        == robot.position_upper[0]
+    )
 
 
 @pytest.mark.parametrize(
@@ -145,9 +189,21 @@ def test_base_on_its_limit_is_inside():
             'name="joint_3" type="floating"',
             "'joint_3' is a floating joint: only revolute and prismatic joints can be planned",
         ),
-        ('<parent link="link_6"/>', '<parent link="link_4"/>', "'joint_7' is not moved by 'joint_6'"),
-        ('effort="110"', 'effort="0"', "joint_5: the torque limit must be positive and finite, got 0"),
-        ('velocity="1.3089969389957472"', 'velocity="0"', "joint_4: the velocity limit must be positive"),
+        (
+            '<parent link="link_6"/>',
+            '<parent link="link_4"/>',
+            "'joint_7' is not moved by 'joint_6'",
+        ),
+        (
+            'effort="110"',
+            'effort="0"',
+            "joint_5: the torque limit must be positive and finite, got 0",
+        ),
+        (
+            'velocity="1.3089969389957472"',
+            'velocity="0"',
+            "joint_4: the velocity limit must be positive",
+        ),
     ],
     ids=["continuous", "floating", "branching", "no torque", "no velocity"],
 )
@@ -158,7 +214,11 @@ def test_robots_that_cannot_be_planned_are_refused(tmp_path, old, new, expected)
 @pytest.mark.parametrize(
     ("old", "new", "found"),
     [
-        ('upper="2.0943951023931953"', 'upper="-3"', "'joint_2': its limits lower=-2.0944 and upper=-3 are swapped"),
+        (
+            'upper="2.0943951023931953"',
+            'upper="-3"',
+            "'joint_2': its limits lower=-2.0944 and upper=-3 are swapped",
+        ),
         (
             'lower="-2.0943951023931953" upper="2.0943951023931953"',
             "",
@@ -183,12 +243,24 @@ FINGER = """
 @pytest.mark.parametrize(
     ("other", "offset", "expected"),
     [
-        ("joint_6", "0", "'finger_joint' mimics the planned joint 'joint_6', but would stay at zero"),
-        ("other_finger", "0.02", "'finger_joint' mimics 'other_finger' with an offset, but would stay at zero"),
+        (
+            "joint_6",
+            "0",
+            "'finger_joint' mimics the planned joint 'joint_6', but would stay at zero",
+        ),
+        (
+            "other_finger",
+            "0.02",
+            "'finger_joint' mimics 'other_finger' with an offset, but would stay at zero",
+        ),
     ],
 )
-def test_joints_that_mimic_others_and_would_stand_elsewhere_are_refused(tmp_path, other, offset, expected):
-    assert expected in mistake_of(with_urdf(tmp_path, "</robot>", FINGER.format(other=other, offset=offset)))
+def test_joints_that_mimic_others_and_would_stand_elsewhere_are_refused(
+    tmp_path, other, offset, expected
+):
+    assert expected in mistake_of(
+        with_urdf(tmp_path, "</robot>", FINGER.format(other=other, offset=offset))
+    )
 
 
 def test_a_joint_that_mimics_another_cannot_be_planned(tmp_path):
@@ -196,23 +268,42 @@ def test_a_joint_that_mimics_another_cannot_be_planned(tmp_path):
     urdf = HEAVY.urdf_path.read_text()
     at = urdf.index("<axis", urdf.index('name="joint_5"'))
     problem = with_urdf(tmp_path, urdf[at - 40 : at + 5], urdf[at - 40 : at] + mimic)
-    assert "'joint_5' mimics 'joint_2' and cannot be planned by itself" in mistake_of(problem)
+    assert "'joint_5' mimics 'joint_2' and cannot be planned by itself" in mistake_of(
+        problem
+    )
 
 
 def test_a_joint_that_mimics_another_that_stays_at_zero_is_no_obstacle(tmp_path):
-    assert load_robot(with_urdf(tmp_path, "</robot>", FINGER.format(other="other_finger", offset="0"))).n == 7
+    assert (
+        load_robot(
+            with_urdf(
+                tmp_path, "</robot>", FINGER.format(other="other_finger", offset="0")
+            )
+        ).n
+        == 7
+    )
 
 
 def test_continuous_joint_that_is_locked_is_no_obstacle(tmp_path):
-    problem = with_urdf(tmp_path, 'name="joint_7" type="revolute"', 'name="joint_7" type="continuous"')
-    assert load_robot(changed(problem, joints=HEAVY.robot.joints[:6], base=(0.0,) * 6)).n == 6
+    problem = with_urdf(
+        tmp_path, 'name="joint_7" type="revolute"', 'name="joint_7" type="continuous"'
+    )
+    assert (
+        load_robot(changed(problem, joints=HEAVY.robot.joints[:6], base=(0.0,) * 6)).n
+        == 6
+    )
 
 
 @pytest.mark.parametrize("text", ["", "<robot>", "not xml at all"])
 def test_file_that_is_no_urdf_is_named(tmp_path, text):
     (tmp_path / "broken.urdf").write_text(text)
-    problem = changed(replace(HEAVY, path=tmp_path / "problem.toml"), urdf="broken.urdf")
-    assert f"{tmp_path / 'broken.urdf'}: not a URDF that Pinocchio can read" in mistake_of(problem)
+    problem = changed(
+        replace(HEAVY, path=tmp_path / "problem.toml"), urdf="broken.urdf"
+    )
+    assert (
+        f"{tmp_path / 'broken.urdf'}: not a URDF that Pinocchio can read"
+        in mistake_of(problem)
+    )
 
 
 def test_missing_urdf_is_named():

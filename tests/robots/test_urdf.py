@@ -22,9 +22,13 @@ LIMIT = '<limit lower="-1" upper="1" velocity="1" effort="1"/>'
 
 def problem_with(folder: Path, urdf: str | bytes) -> Path:
     """A problem file beside a URDF."""
-    text = SHIPPED.path.read_text(encoding="utf-8").replace(f'"{SHIPPED.robot.urdf}"', '"robot.urdf"')
+    text = SHIPPED.path.read_text(encoding="utf-8").replace(
+        f'"{SHIPPED.robot.urdf}"', '"robot.urdf"'
+    )
     (folder / "problem.toml").write_text(text, encoding="utf-8")
-    (folder / "robot.urdf").write_bytes(urdf.encode() if isinstance(urdf, str) else urdf)
+    (folder / "robot.urdf").write_bytes(
+        urdf.encode() if isinstance(urdf, str) else urdf
+    )
     return folder / "problem.toml"
 
 
@@ -66,7 +70,9 @@ def chain(count: int, kind: str = "fixed") -> str:
     ],
     ids=["chain", "depth", "entities", "latin-1", "a line in a name", "cut off", "empty", "zeros"],
 )  # fmt: skip
-def test_what_no_robot_needs_is_a_mistake_in_the_recipe(tmp_path: Path, urdf: str | bytes, message: str) -> None:
+def test_what_no_robot_needs_is_a_mistake_in_the_recipe(
+    tmp_path: Path, urdf: str | bytes, message: str
+) -> None:
     with pytest.raises(RecipeError, match=rf"robot.urdf.*{message}"):
         load(problem_with(tmp_path, urdf))
 
@@ -84,7 +90,9 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
     path = problem_with(tmp_path, "")
     with (tmp_path / "robot.urdf").open("wb") as file:
         file.truncate(MAX_URDF_BYTES + 1)
-    with pytest.raises(RecipeError, match="has 8,388,609 bytes, expected a URDF of at most 8,388,608"):
+    with pytest.raises(
+        RecipeError, match="has 8,388,609 bytes, expected a URDF of at most 8,388,608"
+    ):
         load(path)
 
 
@@ -107,12 +115,15 @@ def test_what_is_no_file_is_not_read(tmp_path: Path, what: str) -> None:
 
 def test_an_offset_with_a_comma_is_no_number(tmp_path: Path) -> None:
     mimic = '<mimic joint="other" offset="0,5"/>'
-    finger = (
-        f'<link name="f"/><joint name="finger" type="revolute"><parent link="iiwa_link_1"/><child link="f"/>{LIMIT}'
-    )
+    finger = f'<link name="f"/><joint name="finger" type="revolute"><parent link="iiwa_link_1"/><child link="f"/>{LIMIT}'
     link = SHIPPED.urdf_text.split('<link name="')[1].split('"')[0]
-    urdf = shipped_with(("</robot>", f"{finger.replace('iiwa_link_1', link)}{mimic}</joint></robot>"))
-    with pytest.raises(RecipeError, match=r"'finger' mimics 'other' with <mimic offset='0,5'> must be a number"):
+    urdf = shipped_with(
+        ("</robot>", f"{finger.replace('iiwa_link_1', link)}{mimic}</joint></robot>")
+    )
+    with pytest.raises(
+        RecipeError,
+        match=r"'finger' mimics 'other' with <mimic offset='0,5'> must be a number",
+    ):
         load(problem_with(tmp_path, urdf))
 
 
@@ -121,11 +132,19 @@ def test_a_link_may_have_the_name_of_its_joint(tmp_path: Path) -> None:
     usual = load_robot(SHIPPED)
     last, joint = SHIPPED.robot.tip, usual.model.frames[usual.tip_frame].name
     assert joint == last
-    names = [part.split('"')[0] for part in SHIPPED.urdf_text.split('<joint name="')[1:]]
+    names = [
+        part.split('"')[0] for part in SHIPPED.urdf_text.split('<joint name="')[1:]
+    ]
     fixed = next(name for name in reversed(names) if name not in SHIPPED.robot.joints)
-    problem = load(problem_with(tmp_path, shipped_with((f'<joint name="{fixed}"', f'<joint name="{last}"'))))
+    problem = load(
+        problem_with(
+            tmp_path, shipped_with((f'<joint name="{fixed}"', f'<joint name="{last}"'))
+        )
+    )
     robot = load_robot(problem)
-    worlds = [World(each, SHIPPED.obstacle, SHIPPED.object_size) for each in (usual, robot)]
+    worlds = [
+        World(each, SHIPPED.obstacle, SHIPPED.object_size) for each in (usual, robot)
+    ]
     q = np.linspace(-0.5, 0.5, 7)
     for world in worlds:
         world.set_state(q, q, q, np.zeros(2))
@@ -147,7 +166,9 @@ def test_a_link_may_have_the_name_of_any_joint(tmp_path: Path) -> None:
             problem = replace(shipped, path=problem_with(tmp_path, text), robot=there)
             robot = load_robot(problem)
             assert robot.capsule_axes == usual.capsule_axes
-            np.testing.assert_array_equal(robot.chain.tip_translation, usual.chain.tip_translation)
+            np.testing.assert_array_equal(
+                robot.chain.tip_translation, usual.chain.tip_translation
+            )
 
 
 def test_a_tree_as_deep_as_robots_are_is_read() -> None:
@@ -166,7 +187,10 @@ def test_undeclared_prefixes_are_read_as_pinocchio_reads_them(tmp_path: Path) ->
     deep = "<x>" * MAX_DEPTH + "</x>" * MAX_DEPTH
     for wrong, message in (
         (f"<robot>{GAZEBO}{deep}</robot>", "nested elements"),
-        (f'<!DOCTYPE robot [<!ENTITY a "b">]><robot>{GAZEBO}&a;</robot>', "document type"),
+        (
+            f'<!DOCTYPE robot [<!ENTITY a "b">]><robot>{GAZEBO}&a;</robot>',
+            "document type",
+        ),
         (f"<robot>{GAZEBO}", "it is not XML: no element found"),
         (f'<robot>{GAZEBO}<link name="a&#10;b"/></robot>', "control characters"),
     ):

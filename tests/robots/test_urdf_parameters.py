@@ -18,14 +18,32 @@ from tests.examples.plan_files import plans_of
 from tests.examples.plans import load as stored_plan
 
 SHIPPED = load_problem("heavy-object")
-NUMBERS = ("1,5", "nan", "inf", "0x10", "", " 1.5 ", "1.5 kg", "1_5", "1d3", "1e999", "\u0661")
+NUMBERS = (
+    "1,5",
+    "nan",
+    "inf",
+    "0x10",
+    "",
+    " 1.5 ",
+    "1.5 kg",
+    "1_5",
+    "1d3",
+    "1e999",
+    "\u0661",
+)
 
 
-def changed(path: str, attribute: str, value: str, *, urdf: str = SHIPPED.urdf_text) -> str:
+def changed(
+    path: str, attribute: str, value: str, *, urdf: str = SHIPPED.urdf_text
+) -> str:
     """Change an attribute of the last link with an inertia, or of a joint, in the shipped URDF."""
     tree = ElementTree.fromstring(urdf)
     kind = "joint" if path.startswith("joint") else "link"
-    element = [each for each in tree.findall(kind) if each.find(path.partition("/")[2]) is not None][-1]
+    element = [
+        each
+        for each in tree.findall(kind)
+        if each.find(path.partition("/")[2]) is not None
+    ][-1]
     found = element.find(path.partition("/")[2])
     assert found is not None
     found.set(attribute, value)
@@ -56,13 +74,24 @@ def test_a_number_in_another_notation_is_refused_with_its_element_and_value(
         open_problem(record_of(changed(path, attribute, value)))
 
 
-@pytest.mark.parametrize("value", ["0 0,1 0", "0 nan 0", "", "0 0", "0 0 0 0", "0;0;0", "0\xa00 0 0"])
+@pytest.mark.parametrize(
+    "value", ["0 0,1 0", "0 nan 0", "", "0 0", "0 0 0 0", "0;0;0", "0\xa00 0 0"]
+)
 @pytest.mark.parametrize(
     ("path", "attribute"),
-    [("link/inertial/origin", "xyz"), ("link/inertial/origin", "rpy"), ("joint/origin", "xyz"), ("joint/axis", "xyz")],
+    [
+        ("link/inertial/origin", "xyz"),
+        ("link/inertial/origin", "rpy"),
+        ("joint/origin", "xyz"),
+        ("joint/axis", "xyz"),
+    ],
 )
-def test_a_vector_in_another_notation_is_refused(path: str, attribute: str, value: str) -> None:
-    with pytest.raises(RecipeError, match=rf"{attribute}={re.escape(repr(value))}> must be 3 numbers"):
+def test_a_vector_in_another_notation_is_refused(
+    path: str, attribute: str, value: str
+) -> None:
+    with pytest.raises(
+        RecipeError, match=rf"{attribute}={re.escape(repr(value))}> must be 3 numbers"
+    ):
         open_problem(record_of(changed(path, attribute, value)))
 
 
@@ -72,7 +101,9 @@ def test_every_notation_that_pinocchio_reads_is_accepted(value: str) -> None:
     _, usual = open_problem(record_problem(SHIPPED))
     tree = ElementTree.fromstring(SHIPPED.urdf_text)
     mass = float(list(tree.iterfind("link/inertial/mass"))[-1].attrib["value"])
-    total, before = (sum(inertia.mass for inertia in each.model.inertias) for each in (robot, usual))
+    total, before = (
+        sum(inertia.mass for inertia in each.model.inertias) for each in (robot, usual)
+    )
     assert total == pytest.approx(before - mass + float(value))
 
 
@@ -82,15 +113,29 @@ def test_every_notation_that_pinocchio_reads_is_accepted(value: str) -> None:
         (r"<inertial>", "<Inertial>", "<Inertial> is not an element of a URDF"),
         (r"<mass value=[^>]*/>", "", "its <inertial> has no <mass value=...>"),
         (r"(<mass) value", r"\1 weight", "its <inertial> has no <mass value=...>"),
-        (r"(<inertia) ixx=\S+", r"\1", "its <inertia> has no ixx: all of its numbers would be ignored"),
+        (
+            r"(<inertia) ixx=\S+",
+            r"\1",
+            "its <inertia> has no ixx: all of its numbers would be ignored",
+        ),
         (r"(<mass [^>]*/>)", r"\1\1", "it has 2 elements <mass>, expected one"),
-        (r"<axis [^>]*/>", '<axis xyz="0 0 0"/>', "<axis xyz='0 0 0'> has no direction"),
-        (r"<axis [^>]*/>", '<axis xyz="1e-320 0 0"/>', "<axis xyz='1e-320 0 0'> has no direction"),
+        (
+            r"<axis [^>]*/>",
+            '<axis xyz="0 0 0"/>',
+            "<axis xyz='0 0 0'> has no direction",
+        ),
+        (
+            r"<axis [^>]*/>",
+            '<axis xyz="1e-320 0 0"/>',
+            "<axis xyz='1e-320 0 0'> has no direction",
+        ),
         (r"(<origin) ", r'\1 quat_xyzw="0 0 0 1" ', "quat_xyzw=...> is not supported"),
         (r"<mass [^>]*/>", '<mass value="1e-320"/>', "Pinocchio reads|has no mass"),
     ],
 )
-def test_an_element_that_pinocchio_ignores_is_refused(old: str, new: str, message: str) -> None:
+def test_an_element_that_pinocchio_ignores_is_refused(
+    old: str, new: str, message: str
+) -> None:
     text = SHIPPED.urdf_text
     if old == "<inertial>":
         text = text.replace("</inertial>", "</Inertial>")
@@ -101,8 +146,15 @@ def test_an_element_that_pinocchio_ignores_is_refused(old: str, new: str, messag
 
 
 def test_all_mistakes_of_a_file_are_listed_with_its_name(tmp_path: Path) -> None:
-    urdf = changed("joint/limit", "effort", "1,5", urdf=changed("link/inertial/mass", "value", "2,5"))
-    text = SHIPPED.path.read_text(encoding="utf-8").replace(f'"{SHIPPED.robot.urdf}"', '"robot.urdf"')
+    urdf = changed(
+        "joint/limit",
+        "effort",
+        "1,5",
+        urdf=changed("link/inertial/mass", "value", "2,5"),
+    )
+    text = SHIPPED.path.read_text(encoding="utf-8").replace(
+        f'"{SHIPPED.robot.urdf}"', '"robot.urdf"'
+    )
     (tmp_path / "problem.toml").write_text(text, encoding="utf-8")
     (tmp_path / "robot.urdf").write_text(urdf, encoding="utf-8")
     with pytest.raises(RecipeError) as error:
@@ -115,7 +167,10 @@ def test_plans_with_such_a_urdf_are_not_judged(tmp_path: Path) -> None:
     """The file is consistent: its checksum and the hash of its problem are those of the changed URDF."""
     plan = stored_plan("transport")
     plans = plans_of(plan)
-    dropped = ProblemRecord(plans.problem.recipe, re.sub(r'(<mass value=")([^"]*)"', r'\g<1>1,5"', plans.problem.urdf))
+    dropped = ProblemRecord(
+        plans.problem.recipe,
+        re.sub(r'(<mass value=")([^"]*)"', r'\g<1>1,5"', plans.problem.urdf),
+    )
     assert dropped.urdf != plans.problem.urdf
     save_plans(tmp_path / "plans.h5", replace(plans, problem=dropped))
     with pytest.raises(CnpgenError, match="<mass value='1,5'> must be a number"):
@@ -125,8 +180,12 @@ def test_plans_with_such_a_urdf_are_not_judged(tmp_path: Path) -> None:
 def test_joints_and_links_are_read_by_name() -> None:
     tree = ElementTree.fromstring(SHIPPED.urdf_text)
     parameters = urdf_parameters(tree)
-    assert set(parameters.inertias) == {link.get("name") for link in tree.findall("link")}
-    assert {joint.name for joint in parameters.joints.values()} == {each.get("name") for each in tree.findall("joint")}
+    assert set(parameters.inertias) == {
+        link.get("name") for link in tree.findall("link")
+    }
+    assert {joint.name for joint in parameters.joints.values()} == {
+        each.get("name") for each in tree.findall("joint")
+    }
 
 
 @pytest.mark.parametrize("length", [1, 3])

@@ -25,8 +25,12 @@ def test_integers_of_numpy_are_integers(value: Any) -> None:
     assert (found, type(found)) == (3, int)
 
 
-@pytest.mark.parametrize("value", [2, 8, 3.0, "3", None, True, np.bool_(True), np.float64(3), [3]])
-def test_values_that_are_no_integers_or_outside_their_bounds_are_refused(value: object) -> None:
+@pytest.mark.parametrize(
+    "value", [2, 8, 3.0, "3", None, True, np.bool_(True), np.float64(3), [3]]
+)
+def test_values_that_are_no_integers_or_outside_their_bounds_are_refused(
+    value: object,
+) -> None:
     with pytest.raises(UsageError, match=r"^n must be an integer from 3 to 7, got "):
         integer("n", value, least=3, most=7)
 
@@ -37,14 +41,22 @@ def test_numbers_of_numpy_are_numbers(value: Any) -> None:
     assert (found, type(found)) == (0.5, float)
 
 
-@pytest.mark.parametrize("value", ["0.5", None, True, np.nan, np.inf, 1j, np.complex128(1), [0.5], np.array([0.5])])
+@pytest.mark.parametrize(
+    "value",
+    ["0.5", None, True, np.nan, np.inf, 1j, np.complex128(1), [0.5], np.array([0.5])],
+)
 def test_what_is_no_finite_number_is_refused(value: object) -> None:
     with pytest.raises(UsageError, match=r"^x must be a finite number, got "):
         number("x", value)
 
 
-@pytest.mark.parametrize("values", [[1, 2.5], (1, 2.5), np.array([1, 2.5], "f4"), [True, 2.5], np.array([1.0, 2.5])])
-def test_arrays_of_numbers_are_floats_of_the_type_that_was_asked_for(values: Any) -> None:
+@pytest.mark.parametrize(
+    "values",
+    [[1, 2.5], (1, 2.5), np.array([1, 2.5], "f4"), [True, 2.5], np.array([1.0, 2.5])],
+)
+def test_arrays_of_numbers_are_floats_of_the_type_that_was_asked_for(
+    values: Any,
+) -> None:
     for dtype in ("float64", "float32"):
         found = numbers("x", values, dtype)
         assert found.dtype == dtype
@@ -59,11 +71,16 @@ def test_arrays_of_numbers_are_floats_of_the_type_that_was_asked_for(values: Any
         (["1", "2"], "got list: <U1 is no real type"),
         ("fast", "got str"),
         ([1j], "got list: complex128 is no real type"),
-        (np.array(["2026-01-01"], "M8[D]"), r"got ndarray: datetime64\[D\] is no real type"),
+        (
+            np.array(["2026-01-01"], "M8[D]"),
+            r"got ndarray: datetime64\[D\] is no real type",
+        ),
         ([object()], "got list: .*object"),
     ],
 )
-def test_what_is_no_array_of_numbers_is_refused_with_what_it_is(values: Any, why: str) -> None:
+def test_what_is_no_array_of_numbers_is_refused_with_what_it_is(
+    values: Any, why: str
+) -> None:
     with pytest.raises(UsageError, match=f"^x must be an array of numbers, {why}"):
         numbers("x", values)
 
@@ -80,7 +97,9 @@ class Tensor:
 
 def test_a_gradient_is_left_behind_unless_it_must_not_be_lost() -> None:
     assert numbers("x", Tensor()).tolist() == [1.0, 2.0]
-    with pytest.raises(UsageError, match="x must be an array of numbers, got Tensor: it requires grad"):
+    with pytest.raises(
+        UsageError, match="x must be an array of numbers, got Tensor: it requires grad"
+    ):
         numbers("x", Tensor(), differentiable=True)
 
 
@@ -102,7 +121,10 @@ WRONG: dict[str, list[Any]] = {
 }
 
 
-@pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in WRONG.items() for value in values])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [(name, value) for name, values in WRONG.items() for value in values],
+)
 def test_a_wrong_type_is_a_usage_error_that_names_the_argument_and_touches_nothing(
     tmp_path: Path, name: str, value: object
 ) -> None:
@@ -111,9 +133,14 @@ def test_a_wrong_type_is_a_usage_error_that_names_the_argument_and_touches_nothi
     assert not list(tmp_path.iterdir())
 
 
-def test_whole_numbers_of_numpy_give_the_specification_of_python_integers(tmp_path: Path) -> None:
+def test_whole_numbers_of_numpy_give_the_specification_of_python_integers(
+    tmp_path: Path,
+) -> None:
     recipe, place = tiny_recipe("airhockey-hit"), find_workspace(tmp_path)
-    jobs = [resolve(recipe, place, n=kind(50), seed=kind(3), shard_size=kind(20)) for kind in (int, np.int64)]
+    jobs = [
+        resolve(recipe, place, n=kind(50), seed=kind(3), shard_size=kind(20))
+        for kind in (int, np.int64)
+    ]
     assert jobs[0].spec.fingerprint == jobs[1].spec.fingerprint
 
 
@@ -123,32 +150,55 @@ def test_what_names_no_folder_is_refused(out: Any) -> None:
         make_dataset(tiny_recipe("airhockey-hit"), out)
 
 
-@pytest.mark.parametrize("recipe", [None, 7, b"airhockey-hit", {"name": "airhockey-hit"}])
-def test_what_is_no_recipe_is_refused_with_what_is_one(tmp_path: Path, recipe: Any) -> None:
-    with pytest.raises(UsageError, match=r"^recipe must be the name of a dataset .* or a DatasetRecipe, got "):
+@pytest.mark.parametrize(
+    "recipe", [None, 7, b"airhockey-hit", {"name": "airhockey-hit"}]
+)
+def test_what_is_no_recipe_is_refused_with_what_is_one(
+    tmp_path: Path, recipe: Any
+) -> None:
+    with pytest.raises(
+        UsageError,
+        match=r"^recipe must be the name of a dataset .* or a DatasetRecipe, got ",
+    ):
         make_dataset(recipe, tmp_path / "out")
 
 
 def test_a_pipeline_is_refused_with_the_dataset_recipe_to_make_of_it() -> None:
     pipeline = load_pipeline("airhockey-hit")
     with pytest.raises(
-        UsageError, match=r"got a Pipeline: make cnpgen\.recipes\.DatasetRecipe\(name='airhockey-hit', pipeline="
+        UsageError,
+        match=r"got a Pipeline: make cnpgen\.recipes\.DatasetRecipe\(name='airhockey-hit', pipeline=",
     ):
         as_dataset_recipe(pipeline)
-    recipe = DatasetRecipe(name="airhockey-hit", pipeline=pipeline, splits={"train": 1000})
+    recipe = DatasetRecipe(
+        name="airhockey-hit", pipeline=pipeline, splits={"train": 1000}
+    )
     assert as_dataset_recipe(recipe) is recipe
 
 
-@pytest.mark.parametrize(("splits", "said"), [({}, "has no splits"), ({"train": 9.5}, "split 'train' must be an int")])
-def test_splits_that_no_file_could_have_are_refused(tmp_path: Path, splits: Any, said: str) -> None:
+@pytest.mark.parametrize(
+    ("splits", "said"),
+    [({}, "has no splits"), ({"train": 9.5}, "split 'train' must be an int")],
+)
+def test_splits_that_no_file_could_have_are_refused(
+    tmp_path: Path, splits: Any, said: str
+) -> None:
     with pytest.raises(UsageError, match=said):
-        resolve(replace(tiny_recipe("airhockey-hit"), splits=splits), find_workspace(tmp_path), n=50)
+        resolve(
+            replace(tiny_recipe("airhockey-hit"), splits=splits),
+            find_workspace(tmp_path),
+            n=50,
+        )
 
 
 @pytest.mark.parametrize("regenerate", [1.5, "1", True, -1])
-def test_the_number_of_blocks_to_make_again_is_an_integer(tmp_path: Path, regenerate: Any) -> None:
+def test_the_number_of_blocks_to_make_again_is_an_integer(
+    tmp_path: Path, regenerate: Any
+) -> None:
     (tmp_path / "specification.json").write_text('{"format": "cnpgen-plan"}')
-    with pytest.raises(UsageError, match="regenerate must be an integer from 0 on, got "):
+    with pytest.raises(
+        UsageError, match="regenerate must be an integer from 0 on, got "
+    ):
         validate_dataset(tmp_path, regenerate=regenerate)
 
 
@@ -157,7 +207,10 @@ def test_a_source_date_that_is_none_is_refused_before_anything_is_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, epoch: str
 ) -> None:
     monkeypatch.setenv("SOURCE_DATE_EPOCH", epoch)
-    with pytest.raises(UsageError, match=f"SOURCE_DATE_EPOCH must be whole seconds since 1970, got '{epoch}'"):
+    with pytest.raises(
+        UsageError,
+        match=f"SOURCE_DATE_EPOCH must be whole seconds since 1970, got '{epoch}'",
+    ):
         make_tiny(tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
@@ -173,14 +226,22 @@ def test_the_card_beside_a_recipe_is_part_of_the_dataset_s(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("content", [b"caf\xe9", b"one\ntwo\n\xff\xfe"])
-def test_a_card_that_is_not_utf_8_is_named_before_anything_is_made(tmp_path: Path, content: bytes) -> None:
+def test_a_card_that_is_not_utf_8_is_named_before_anything_is_made(
+    tmp_path: Path, content: bytes
+) -> None:
     (tmp_path / "mine.md").write_bytes(content)
     line = content.count(b"\n") + 1
-    with pytest.raises(RecipeError, match=rf"mine\.md: line {line}: not UTF-8: byte 0x(e9|ff)"):
-        make_dataset(tiny_recipe("airhockey-hit", path=tmp_path / "mine.toml"), tmp_path / "out")
+    with pytest.raises(
+        RecipeError, match=rf"mine\.md: line {line}: not UTF-8: byte 0x(e9|ff)"
+    ):
+        make_dataset(
+            tiny_recipe("airhockey-hit", path=tmp_path / "mine.toml"), tmp_path / "out"
+        )
     assert [item.name for item in tmp_path.iterdir()] == ["mine.md"]
 
 
 def test_a_recipe_from_no_file_has_no_card(tmp_path: Path) -> None:
-    recipe = DatasetRecipe(name="own", pipeline=load_pipeline("airhockey-hit"), splits={"train": 20})
+    recipe = DatasetRecipe(
+        name="own", pipeline=load_pipeline("airhockey-hit"), splits={"train": 20}
+    )
     assert make_dataset(recipe, tmp_path / "out", workers=1).complete

@@ -139,19 +139,27 @@ def test_three_correct_files_load(files):
     recipe = load_dataset_recipe(files["dataset"])
     assert (recipe.name, recipe.version, recipe.seed) == ("roll-1k", "1.2.3", 7)
     assert recipe.splits == {"train": 900, "validation": 100}
-    assert recipe.pipeline.stage == (Roll(size=Range(0.01, 0.02)), Roll(size=Range(0.03, 0.03)))
+    assert recipe.pipeline.stage == (
+        Roll(size=Range(0.01, 0.02)),
+        Roll(size=Range(0.03, 0.03)),
+    )
     problem = recipe.pipeline.problem
     assert problem.constraint == (Level(tolerance=0.001), Still(tolerance=0.1))
     assert problem.object is not None
     assert problem.object.size == (0.1, 0.1, 0.2)
     assert problem.urdf_path.read_text() == URDF
-    assert [part.path.is_absolute() for part in (recipe, recipe.pipeline, problem)] == [True] * 3
+    assert [part.path.is_absolute() for part in (recipe, recipe.pipeline, problem)] == [
+        True
+    ] * 3
 
 
 def test_the_kind_of_a_table_is_part_of_the_resolved_recipe(files):
     plain = resolved(load_pipeline(files["pipeline"]))
     assert [stage["use"] for stage in plain["stage"]] == ["roll", "roll"]
-    assert [constraint["use"] for constraint in plain["problem"]["constraint"]] == ["level", "still"]
+    assert [constraint["use"] for constraint in plain["problem"]["constraint"]] == [
+        "level",
+        "still",
+    ]
 
 
 def test_mistakes_of_all_three_files_are_raised_at_once(files):
@@ -181,18 +189,51 @@ def test_mistakes_of_all_three_files_are_raised_at_once(files):
         ('name = "arm"', 'name = "Arm"', "name: 'Arm' does not match"),
         ('name = "arm"', 'name = "-arm"', "name: '-arm' does not match"),
         ('urdf = "arm.urdf"', 'urdf = "ram.urdf"', "robot.urdf: no such file: "),
-        ('base = "[0, 90] deg"', "base = [0]", "robot.base: expected 2 numbers, one per planned joint, got 1"),
-        ('joints = ["a", "b"]', 'joints = ["a", "a"]', "robot.joints: each joint can be planned once, got a"),
-        ('use = "still"', 'use = "level"', "constraint 2.use: there is a constraint 'level' already"),
-        ('use = "still"', 'use = "stil"', "constraint 2.use: unknown constraint 'stil' (did you mean 'still'?)"),
-        ('use = "still"\n', "", "constraint 2.use: missing key, expected one of level, still"),
-        ('below = "start"', 'below = "start"\ntop = 1.0', "obstacle 1.top: obstacle 'pedestal' has both"),
-        ('below = "start"', "", "obstacle 1.top: obstacle 'pedestal' has no height"),
-        ('below = "start"', 'below = "stat"', "obstacle 1.below: expected one of '', 'start', 'goal', got 'stat'"),
-        ('[object]\nsize = "[10, 10, 20] cm"', "", "obstacle 1.below: nothing stands on the obstacle"),
+        (
+            'base = "[0, 90] deg"',
+            "base = [0]",
+            "robot.base: expected 2 numbers, one per planned joint, got 1",
+        ),
+        (
+            'joints = ["a", "b"]',
+            'joints = ["a", "a"]',
+            "robot.joints: each joint can be planned once, got a",
+        ),
+        (
+            'use = "still"',
+            'use = "level"',
+            "constraint 2.use: there is a constraint 'level' already",
+        ),
+        (
+            'use = "still"',
+            'use = "stil"',
+            "constraint 2.use: unknown constraint 'stil' (did you mean 'still'?)",
+        ),
+        (
+            'use = "still"\n',
+            "",
+            "constraint 2.use: missing key, expected one of level, still",
+        ),
         (
             'below = "start"',
-            'below = "goal"\n' + PROBLEM[PROBLEM.index("[[obst") : PROBLEM.index("[[const")],
+            'below = "start"\ntop = 1.0',
+            "obstacle 1.top: obstacle 'pedestal' has both",
+        ),
+        ('below = "start"', "", "obstacle 1.top: obstacle 'pedestal' has no height"),
+        (
+            'below = "start"',
+            'below = "stat"',
+            "obstacle 1.below: expected one of '', 'start', 'goal', got 'stat'",
+        ),
+        (
+            '[object]\nsize = "[10, 10, 20] cm"',
+            "",
+            "obstacle 1.below: nothing stands on the obstacle",
+        ),
+        (
+            'below = "start"',
+            'below = "goal"\n'
+            + PROBLEM[PROBLEM.index("[[obst") : PROBLEM.index("[[const")],
             "obstacle 2.name",
         ),
         ('x = "[0, 1] m"', 'x = "[1, 0] m"', "obstacle 1.x: empty range"),
@@ -201,9 +242,21 @@ def test_mistakes_of_all_three_files_are_raised_at_once(files):
             'x = "[0 1] m"',
             "obstacle 1.x: numbers are separated by commas, got '[0 1] m' (did you mean '[0, 1] m'?)",
         ),
-        ('"a", "b"]', '"a", "bee"]', "robot.joints: arm.urdf has no joint 'bee' that moves"),
-        ('"a", "b"]', '"a", "grip"]', "robot.joints: arm.urdf has no joint 'grip' that moves"),
-        ('tip = "hand"', 'tip = "hnd"', "robot.tip: arm.urdf has no frame 'hnd' (did you mean 'hand'?); its frames: "),
+        (
+            '"a", "b"]',
+            '"a", "bee"]',
+            "robot.joints: arm.urdf has no joint 'bee' that moves",
+        ),
+        (
+            '"a", "b"]',
+            '"a", "grip"]',
+            "robot.joints: arm.urdf has no joint 'grip' that moves",
+        ),
+        (
+            'tip = "hand"',
+            'tip = "hnd"',
+            "robot.tip: arm.urdf has no frame 'hnd' (did you mean 'hand'?); its frames: ",
+        ),
         ('urdf = "arm.urdf"', 'urdf = "arm"', "robot.urdf: no such file: "),
     ],
 )
@@ -221,7 +274,11 @@ def test_a_mistake_does_not_hide_another_one_that_has_nothing_to_do_with_it(file
     edit(files["problem"], 'x = "[0, 1] m"', 'x = "[1, 0] m"')
     edit(files["problem"], 'y = "[0, 1] m"', 'y = "[1, 1] m"')
     edit(files["problem"], 'below = "start"', "")
-    edit(files["problem"], "[limits]", "[trajectory]\npath_control_points = 6\nrate_control_points = 4.5\n[limits]")
+    edit(
+        files["problem"],
+        "[limits]",
+        "[trajectory]\npath_control_points = 6\nrate_control_points = 4.5\n[limits]",
+    )
     keys = [error.split(":")[0] for error in errors_of(load_problem, files["problem"])]
     assert keys == [
         "robot.joints",
@@ -256,18 +313,38 @@ def test_semantic_mistakes_are_reported_along_with_wrong_types(files):
     [
         ('version = "1.2.3"', 'version = "1.2"', "version: '1.2' does not match"),
         ('version = "1.2.3"', 'version = "01.2.3"', "version: '01.2.3' does not match"),
-        ('version = "1.2.3"', 'version = "1.2.3-rc1"', "version: '1.2.3-rc1' does not match"),
+        (
+            'version = "1.2.3"',
+            'version = "1.2.3-rc1"',
+            "version: '1.2.3-rc1' does not match",
+        ),
         ('name = "roll-1k"', 'name = "roll_1k"', "name: 'roll_1k' does not match"),
         ("seed = 7", "seed = -1", "seed: -1 is too small"),
-        ("seed = 7", "seed = 9223372036854775808", "seed: 9223372036854775808 is too large"),
+        (
+            "seed = 7",
+            "seed = 9223372036854775808",
+            "seed: 9223372036854775808 is too large",
+        ),
         ("train = 900", "Train = 900", "splits.Train: the name 'Train' does not match"),
         ("train = 900", "train = 0", "splits.train: 0 is too small"),
         ("train = 900", "train = 1.5", "splits.train: expected an integer"),
         ("train = 900\nvalidation = 100", "", "splits: is empty"),
         ("[splits]\ntrain = 900\nvalidation = 100", "", "splits: missing key"),
-        ('pipeline = "../pipelines/roll.toml"', "pipeline = 3", "pipeline: expected a name or a path, got 3"),
-        ('pipeline = "../pipelines/roll.toml"', 'pipeline = "roll.toml"', "pipeline: no such file: "),
-        ('pipeline = "../pipelines/roll.toml"', 'pipeline = "../pipelines/"', "pipeline: "),
+        (
+            'pipeline = "../pipelines/roll.toml"',
+            "pipeline = 3",
+            "pipeline: expected a name or a path, got 3",
+        ),
+        (
+            'pipeline = "../pipelines/roll.toml"',
+            'pipeline = "roll.toml"',
+            "pipeline: no such file: ",
+        ),
+        (
+            'pipeline = "../pipelines/roll.toml"',
+            'pipeline = "../pipelines/"',
+            "pipeline: ",
+        ),
     ],
 )
 def test_a_mistake_in_a_dataset_is_reported_with_its_key(files, old, new, error):
@@ -289,10 +366,16 @@ def test_a_pipeline_without_stages_is_a_mistake(files, stages):
     ("content", "error"),
     [
         (b'name = "arm"\n\ntitle = \n', "line 3: not valid TOML: Invalid value"),
-        (b'name = "arm"\nname = "leg"\n', "line 2: not valid TOML: Cannot overwrite a value"),
+        (
+            b'name = "arm"\nname = "leg"\n',
+            "line 2: not valid TOML: Cannot overwrite a value",
+        ),
         (b'name = "arm"\n[robot\n', "line 2: not valid TOML: "),
         (b'name = "arm"\njoints = [1,', "line 2: not valid TOML: Invalid value"),
-        (b'name = "arm"\nx = [0 1]', "line 2: not valid TOML: Unclosed array (entries are separated by commas)"),
+        (
+            b'name = "arm"\nx = [0 1]',
+            "line 2: not valid TOML: Unclosed array (entries are separated by commas)",
+        ),
         (b'name = "arm"\ntitle = "\xff"\n', "line 2: not UTF-8: byte 0xff"),
         (b"seed = " + b"9" * 5000, "line 1: not valid TOML: "),
     ],
@@ -306,7 +389,10 @@ def test_a_file_that_is_not_toml_is_a_recipe_error_with_its_line(files, content,
 
 def test_an_empty_file_misses_every_required_key(files):
     files["dataset"].write_text("")
-    keys = [error.split(":")[0] for error in errors_of(load_dataset_recipe, files["dataset"])]
+    keys = [
+        error.split(":")[0]
+        for error in errors_of(load_dataset_recipe, files["dataset"])
+    ]
     assert keys == ["name", "pipeline", "splits"]
 
 
@@ -316,15 +402,25 @@ def test_a_byte_order_mark_is_ignored(files):
 
 
 def test_a_recipe_of_another_kind_is_a_mistake(files):
-    assert errors_of(load_dataset_recipe, files["problem"]) == ["is a problem, expected a dataset or a pipeline"]
-    assert errors_of(load_pipeline, files["dataset"]) == ["is a dataset, expected a pipeline"]
-    assert errors_of(load_problem, files["pipeline"]) == ["is a pipeline, expected a problem"]
+    assert errors_of(load_dataset_recipe, files["problem"]) == [
+        "is a problem, expected a dataset or a pipeline"
+    ]
+    assert errors_of(load_pipeline, files["dataset"]) == [
+        "is a dataset, expected a pipeline"
+    ]
+    assert errors_of(load_problem, files["pipeline"]) == [
+        "is a pipeline, expected a problem"
+    ]
 
 
 def test_a_pipeline_is_wrapped_where_a_dataset_is_expected(shipped):
     for given in ("roll", shipped["pipeline"]):
         recipe = load_dataset_recipe(given)
-        assert (recipe.name, recipe.version, recipe.title) == ("roll", "1.0.0", "Roll a die")
+        assert (recipe.name, recipe.version, recipe.title) == (
+            "roll",
+            "1.0.0",
+            "Roll a die",
+        )
         assert recipe.splits == {"train": 90, "validation": 10}
         assert recipe.pipeline.stage == load_pipeline(given).stage
 
@@ -362,13 +458,18 @@ def test_an_unknown_reference_is_reported_where_it_is_made(shipped):
         ("rol", r"unknown pipeline 'rol' \(did you mean 'roll'\?\); known: roll"),
         ("", "unknown pipeline ''; known: roll"),
         ("arm", "unknown pipeline 'arm': it is the name of a problem; known: roll"),
-        ("roll-1k", "unknown pipeline 'roll-1k': it is the name of a dataset; known: roll"),
+        (
+            "roll-1k",
+            "unknown pipeline 'roll-1k': it is the name of a dataset; known: roll",
+        ),
         ("rolll.toml", r"no such file: rolll.toml \(did you mean 'roll'\?\)"),
         ("some/roll", "no such file: some/roll"),
         ("/", "/ is a folder, expected a .toml file"),
     ],
 )
-def test_a_recipe_that_is_not_there_is_an_error(shipped, text, message, tmp_path, monkeypatch):
+def test_a_recipe_that_is_not_there_is_an_error(
+    shipped, text, message, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(RecipeError, match=message):
         load_pipeline(text)
@@ -382,7 +483,11 @@ def test_a_recipe_that_is_not_there_is_an_error(shipped, text, message, tmp_path
             "airhockey-hit",
             "unknown problem 'airhockey-hit': it is the name of a pipeline and a dataset; ",
         ),
-        (load_pipeline, "airhockey", "unknown pipeline 'airhockey': it is the name of a problem; known: "),
+        (
+            load_pipeline,
+            "airhockey",
+            "unknown pipeline 'airhockey': it is the name of a problem; known: ",
+        ),
         (
             load_dataset_recipe,
             "airhockey",
@@ -413,7 +518,9 @@ def test_a_missing_file_is_not_found_in_the_library_by_its_stem(shipped):
         load_pipeline("nowhere/roll.toml")
 
 
-def test_recipes_are_beside_the_package_in_a_checkout_and_inside_it_in_a_wheel(tmp_path, monkeypatch):
+def test_recipes_are_beside_the_package_in_a_checkout_and_inside_it_in_a_wheel(
+    tmp_path, monkeypatch
+):
     package = tmp_path / "cnpgen"
     package.mkdir()
     monkeypatch.setattr(catalogue, "__file__", str(package / "schema" / "catalogue.py"))

@@ -29,12 +29,18 @@ class Cart:
     colour: str = field("colour", default="red", choices=("red", "green"))
     tilt: Range = field("tilt", unit="rad", default=Range(0.0, 0.0), low=-1.0, high=1.0)
     stops: tuple[Range, ...] = field("where it stops", unit="m", default=())
-    box: tuple[Range, Range] = field("where it may be: x, y", unit="m", default=(Range(0.0, 1.0), Range(0.0, 1.0)))
+    box: tuple[Range, Range] = field(
+        "where it may be: x, y", unit="m", default=(Range(0.0, 1.0), Range(0.0, 1.0))
+    )
     angles: tuple[float, ...] = field("steering angles", unit="rad", default=())
-    size: tuple[float, float, float] = field("size", unit="m", default=(1.0, 1.0, 1.0), low=1e-3)
+    size: tuple[float, float, float] = field(
+        "size", unit="m", default=(1.0, 1.0, 1.0), low=1e-3
+    )
     riders: tuple[str, ...] = field("who rides", default=())
     load: float | None = field("load", unit="kg", default=None)
-    seats: dict[str, int] = field("seats per row", default=None, low=1, pattern="^[a-z]+$")
+    seats: dict[str, int] = field(
+        "seats per row", default=None, low=1, pattern="^[a-z]+$"
+    )
     path: Path = Path()
     digest: str = ""
 
@@ -45,7 +51,9 @@ class Cart:
 
 def read(text: str) -> tuple[Cart | None, list[str]]:
     errors: list[str] = []
-    return parse(Cart, tomllib.loads(text), where=RecipeLocation("cart.toml"), errors=errors), errors
+    return parse(
+        Cart, tomllib.loads(text), where=RecipeLocation("cart.toml"), errors=errors
+    ), errors
 
 
 def errors_of(text: str) -> list[str]:
@@ -152,7 +160,10 @@ def test_every_mistake_is_reported_with_file_and_key():
         ("tilt = [0, 2]", "tilt: 2.0 rad is too large, expected at most 1 rad"),
         ("tilt = [0, 0.5, 1]", "tilt: expected 2 numbers, got 3"),
         ("stops = [0, 1]", "stops: expected a list of ranges, got [0, 1]"),
-        ("stops = '[0, 1] m'", "stops: expected a list, each a range, each end a length [m], got '[0, 1] m'"),
+        (
+            "stops = '[0, 1] m'",
+            "stops: expected a list, each a range, each end a length [m], got '[0, 1] m'",
+        ),
         ("stops = [[0, 1], [3, 2]]", "stops 2: empty range [3, 2]"),
         ("stops = []", "stops: is empty, expected at least one: where it stops"),
         ("box = [[0, 1]]", "box: expected 2 entries, got 1: [[0, 1]]"),
@@ -166,9 +177,18 @@ def test_every_mistake_is_reported_with_file_and_key():
         ("wheel = 3", "wheel: expected a list, each a table, got 3"),
         ("wheel = [3]", "wheel 1: expected a table, got 3"),
         ("front = 3", "front: expected a table, got 3"),
-        ("front = {radius = 1, spokes = 8.0}", "front.spokes: expected an integer, got 8.0"),
-        ("front = {radius = 1, spokes = true}", "front.spokes: expected an integer, got true"),
-        ("front = {radius = 1, spokes = 65}", "front.spokes: 65 is too large, expected at most 64"),
+        (
+            "front = {radius = 1, spokes = 8.0}",
+            "front.spokes: expected an integer, got 8.0",
+        ),
+        (
+            "front = {radius = 1, spokes = true}",
+            "front.spokes: expected an integer, got true",
+        ),
+        (
+            "front = {radius = 1, spokes = 65}",
+            "front.spokes: 65 is too large, expected at most 64",
+        ),
         ("braked = 'yes'", "braked: expected true or false, got 'yes'"),
         ("colour = 3", "colour: expected a string, got 3"),
         ("seats = {}", "seats: is empty"),
@@ -203,7 +223,9 @@ def test_a_value_on_its_bound_is_accepted(text):
 
 
 def test_a_string_must_match_its_pattern():
-    assert read('name = "Cart"')[1] == ["cart.toml: name: 'Cart' does not match ^[a-z]+$: name of the cart"]
+    assert read('name = "Cart"')[1] == [
+        "cart.toml: name: 'Cart' does not match ^[a-z]+$: name of the cart"
+    ]
 
 
 def test_what_is_not_a_table_is_a_mistake():
@@ -222,7 +244,9 @@ def test_a_value_error_of_the_constructor_is_a_mistake():
                 raise ValueError(f"{self.even} is odd")
 
     errors: list[str] = []
-    assert parse(Picky, {"even": 2}, where=RecipeLocation("f"), errors=errors) == Picky(2)
+    assert parse(Picky, {"even": 2}, where=RecipeLocation("f"), errors=errors) == Picky(
+        2
+    )
     assert parse(Picky, {"even": 3}, where=RecipeLocation("f"), errors=errors) is None
     assert errors == ["f: 3 is odd"]
 
@@ -237,7 +261,9 @@ def test_a_value_error_of_the_constructor_is_a_mistake():
         ("load = 200\nxyzzy = 1", ["xyzzy", "load"]),
     ],
 )
-def test_what_a_dataclass_checks_itself_is_checked_as_far_as_other_mistakes_let_it(text, keys):
+def test_what_a_dataclass_checks_itself_is_checked_as_far_as_other_mistakes_let_it(
+    text, keys
+):
     assert [error.split(": ")[1] for error in errors_of(text)] == keys
 
 
@@ -260,16 +286,29 @@ def test_a_reader_replaces_the_table_of_a_type():
 
     errors: list[str] = []
     table = {"name": "cart", "front": "big", "wheel": ["big", "small"]}
-    assert parse(Cart, table, where=RecipeLocation("f"), errors=errors, readers={Wheel: by_size}) is None
+    assert (
+        parse(
+            Cart,
+            table,
+            where=RecipeLocation("f"),
+            errors=errors,
+            readers={Wheel: by_size},
+        )
+        is None
+    )
     assert errors == ["f: wheel 2: no such size"]
     table["wheel"] = ["big"]
-    cart = parse(Cart, table, where=RecipeLocation("f"), errors=[], readers={Wheel: by_size})
+    cart = parse(
+        Cart, table, where=RecipeLocation("f"), errors=[], readers={Wheel: by_size}
+    )
     assert cart is not None
     assert (cart.front, cart.wheel) == (Wheel(radius=1.0), (Wheel(radius=1.0),))
 
 
 def test_earlier_mistakes_do_not_spoil_a_correct_table():
-    assert parse(Wheel, {"radius": 0.5}, where=RecipeLocation("f"), errors=["something else"]) == Wheel(radius=0.5)
+    assert parse(
+        Wheel, {"radius": 0.5}, where=RecipeLocation("f"), errors=["something else"]
+    ) == Wheel(radius=0.5)
 
 
 def test_keys_lists_what_a_table_may_hold():
@@ -281,7 +320,10 @@ def test_keys_lists_what_a_table_may_hold():
     assert listed["load"].hint is float
     assert listed["load"].unit == "kg"
     assert listed["load"].doc == "load"
-    assert [listed[name].expected for name in ("name", "front", "wheel", "braked", "colour", "tilt")] == [
+    assert [
+        listed[name].expected
+        for name in ("name", "front", "wheel", "braked", "colour", "tilt")
+    ] == [
         "a string",
         "a table",
         "a list, each a table",
@@ -303,25 +345,45 @@ def test_to_dict_is_plain_json_and_reads_back_as_the_same_object():
 
 
 def test_to_dict_labels_nested_objects():
-    labelled = to_dict(Cart(name="cart"), label=lambda obj: {"use": "wheel"} if isinstance(obj, Wheel) else {})
+    labelled = to_dict(
+        Cart(name="cart"),
+        label=lambda obj: {"use": "wheel"} if isinstance(obj, Wheel) else {},
+    )
     assert labelled["front"] == {"use": "wheel", "radius": 0.5, "spokes": 32}
     assert "use" not in labelled
 
 
 def test_a_place_names_file_and_key():
     assert (RecipeLocation("f") / "robot" / "base").message("x") == "f: robot.base: x"
-    assert (RecipeLocation("f") / "stage" / 3 / "cone").message("x") == "f: stage 4.cone: x"
+    assert (RecipeLocation("f") / "stage" / 3 / "cone").message(
+        "x"
+    ) == "f: stage 4.cone: x"
     assert RecipeLocation("f").message("x") == "f: x"
 
 
 @pytest.mark.parametrize(
     ("text", "error"),
     [
-        ("angles = [10, 45]", "angles: 45.0 rad is too large, expected at most 25.13 rad; 45 rad is 2578 deg; did you"),
-        ("angles = [-90]", "angles: -90.0 rad is too small, expected at least -25.13 rad; -90 rad is -5157 deg; did"),
-        ("stops = [[0, 250]]", "stops 1: 250.0 m is too large, expected at most 100 m; did you mean 250 mm = 0.25 m?"),
-        ("load = 12000", "load: 12000.0 kg is too large, expected at most 2500 kg; did you mean 12000 g = 12 kg?"),
-        ("tilt = [0, 30]", "tilt: 30.0 rad is too large, expected at most 1 rad; 30 rad is 1719 deg; did you mean 30"),
+        (
+            "angles = [10, 45]",
+            "angles: 45.0 rad is too large, expected at most 25.13 rad; 45 rad is 2578 deg; did you",
+        ),
+        (
+            "angles = [-90]",
+            "angles: -90.0 rad is too small, expected at least -25.13 rad; -90 rad is -5157 deg; did",
+        ),
+        (
+            "stops = [[0, 250]]",
+            "stops 1: 250.0 m is too large, expected at most 100 m; did you mean 250 mm = 0.25 m?",
+        ),
+        (
+            "load = 12000",
+            "load: 12000.0 kg is too large, expected at most 2500 kg; did you mean 12000 g = 12 kg?",
+        ),
+        (
+            "tilt = [0, 30]",
+            "tilt: 30.0 rad is too large, expected at most 1 rad; 30 rad is 1719 deg; did you mean 30",
+        ),
     ],
 )
 def test_values_that_are_probably_in_another_unit_have_a_suggestion(text, error):

@@ -25,9 +25,14 @@ def planner():
 
 def test_a_value_in_another_unit_has_a_suggestion():
     check_range("error", [0.0, 0.5], 0.0, 0.5, "rad")
-    with pytest.raises(UsageError, match=r"from 0 to 0.5 rad, got 2 rad; 2 rad is 115 deg; did you mean 2 deg = 0.034"):
+    with pytest.raises(
+        UsageError,
+        match=r"from 0 to 0.5 rad, got 2 rad; 2 rad is 115 deg; did you mean 2 deg = 0.034",
+    ):
         check_range("error", [0.1, 2.0], 0.0, 0.5, "rad")
-    with pytest.raises(UsageError, match=r"from 0 to 60 s, got 500 s; did you mean 500 ms = 0.5 s\?"):
+    with pytest.raises(
+        UsageError, match=r"from 0 to 60 s, got 500 s; did you mean 500 ms = 0.5 s\?"
+    ):
         check_range("time", 500.0, 0.0, 60.0, "s")
     with pytest.raises(UsageError, match=r"from 0 to 60 s, got nan s$"):
         check_range("time", np.nan, 0.0, 60.0, "s")
@@ -37,11 +42,17 @@ def test_public_functions_check_their_ranges(planner):
     state = (planner.robot.home, *np.zeros((2, planner.robot.n)))
     plans = planner.plan(planner.robot.home, planner.robot.home + 0.1)
     calls = {
-        "meeting_time": lambda: plan_hits(planner, state, [1.0, 0.1], [2.49, 0.0], meeting_time=500),
-        "puck_velocity": lambda: plan_hits(planner, state, [1.0, 0.1], [2.49, 0.0], puck_velocity=[900.0, 0.0]),
+        "meeting_time": lambda: plan_hits(
+            planner, state, [1.0, 0.1], [2.49, 0.0], meeting_time=500
+        ),
+        "puck_velocity": lambda: plan_hits(
+            planner, state, [1.0, 0.1], [2.49, 0.0], puck_velocity=[900.0, 0.0]
+        ),
         "tracking_error": lambda: cnpgen.evaluate_plans(plans, tracking_error=2.0),
         "stay_within": lambda: RefineOptions(stay_within=2.0),
-        "radius": lambda: cnpgen.scenes.obstacles_of_points(np.zeros((1, 3)), radius=5.0),
+        "radius": lambda: cnpgen.scenes.obstacles_of_points(
+            np.zeros((1, 3)), radius=5.0
+        ),
         "field_of_view": lambda: Camera(field_of_view=60.0),
     }
     for argument, call in calls.items():
@@ -68,20 +79,31 @@ def test_names_of_no_recipe_carry_the_argument(call, argument):
 
 def test_views_that_repeat_values_are_compared_with_the_memory(planner):
     q = np.broadcast_to(planner.robot.home, (10**13, planner.robot.n))
-    with pytest.raises(UsageError, match=r"start_q must be smaller: 10,000,000,000,000 needs at least .* GB"):
+    with pytest.raises(
+        UsageError,
+        match=r"start_q must be smaller: 10,000,000,000,000 needs at least .* GB",
+    ):
         planner.plan(q, q)
     with pytest.raises(UsageError, match="goal_xyz must be smaller"):
-        cnpgen.complete("airhockey-hit", goal_xyz=np.broadcast_to([1.0, 0.1], (10**13, 2)))
+        cnpgen.complete(
+            "airhockey-hit", goal_xyz=np.broadcast_to([1.0, 0.1], (10**13, 2))
+        )
 
 
 def test_many_plans_are_compared_with_the_memory(planner, monkeypatch):
     q = np.repeat(planner.robot.home[None], 1000, axis=0)
     monkeypatch.setattr(arguments, "MIN_CHECKED_SIZE", 100)
     monkeypatch.setattr(arguments, "available_bytes", lambda: 100_000)
-    with pytest.raises(UsageError, match=r"start_q must be smaller: 1,000 needs at least"):
+    with pytest.raises(
+        UsageError, match=r"start_q must be smaller: 1,000 needs at least"
+    ):
         planner.plan(q, q)
-    with pytest.raises(UsageError, match=r"boundary must be smaller: 1,000 needs at least"):
-        planner.plan_batch(cnpgen.Boundary(q, *np.zeros((2, *q.shape)), q, np.zeros(q.shape)))
+    with pytest.raises(
+        UsageError, match=r"boundary must be smaller: 1,000 needs at least"
+    ):
+        planner.plan_batch(
+            cnpgen.Boundary(q, *np.zeros((2, *q.shape)), q, np.zeros(q.shape))
+        )
     assert len(numbers("q", q)) == 1000
 
 
@@ -90,7 +112,9 @@ def test_a_failed_allocation_is_an_error_of_the_machine():
     def allocate(n: int) -> None:
         raise MemoryError(f"Unable to allocate {n} GiB")
 
-    with pytest.raises(MachineError, match="out of memory in allocate: Unable to allocate 4 GiB"):
+    with pytest.raises(
+        MachineError, match="out of memory in allocate: Unable to allocate 4 GiB"
+    ):
         allocate(4)
 
 
@@ -98,16 +122,25 @@ def test_stored_recipes_may_have_implausible_values(tmp_path):
     text = find_recipe(("problem",), "heavy-object").read_text(encoding="utf-8")
     source = find_recipe(("problem",), "heavy-object").parent / "iiwa14_object.urdf"
     file = tmp_path / "problem.toml"
-    file.write_text(text.replace('"iiwa14_object.urdf"', f'"{source}"'), encoding="utf-8")
+    file.write_text(
+        text.replace('"iiwa14_object.urdf"', f'"{source}"'), encoding="utf-8"
+    )
     record = record_problem(cnpgen.load_problem(file))
     content = json.loads(record.recipe)
     content["limits"]["acceleration_cap"] = 1e6
-    stored = ProblemRecord(json.dumps(content), record.urdf.replace('upper="2.9670597283903604"', 'upper="30"', 1))
+    stored = ProblemRecord(
+        json.dumps(content),
+        record.urdf.replace('upper="2.9670597283903604"', 'upper="30"', 1),
+    )
     assert stored != record
     problem, robot = open_problem(stored)
     assert problem.limits.acceleration_cap == 1e6
     assert robot.position_upper.max() == 30
-    file.write_text(file.read_text().replace('acceleration_cap = "20 rad/s^2"', "acceleration_cap = 1e6"))
+    file.write_text(
+        file.read_text().replace(
+            'acceleration_cap = "20 rad/s^2"', "acceleration_cap = 1e6"
+        )
+    )
     with pytest.raises(RecipeError, match=r"acceleration_cap: .* too large"):
         cnpgen.load_problem(file)
 
@@ -116,14 +149,23 @@ def test_hints_follow_only_values_without_a_unit(tmp_path):
     file = tmp_path / "problem.toml"
     text = find_recipe(("problem",), "heavy-object").read_text(encoding="utf-8")
     for value, hint in (('"103 deg"', False), ("1.8", True)):
-        file.write_text(text.replace('tolerance = "1.8 deg"', f"tolerance = {value}"), encoding="utf-8")
-        with pytest.raises(RecipeError, match=r"constraint 5.tolerance: 1\.\d+ rad is too large") as caught:
+        file.write_text(
+            text.replace('tolerance = "1.8 deg"', f"tolerance = {value}"),
+            encoding="utf-8",
+        )
+        with pytest.raises(
+            RecipeError, match=r"constraint 5.tolerance: 1\.\d+ rad is too large"
+        ) as caught:
             cnpgen.load_problem(file)
         assert ("did you mean" in str(caught.value)) == hint
 
 
 def test_scenes_have_obstacles_and_poses():
-    with pytest.raises(UsageError, match="obstacles must be a tuple of obstacles, got 3"):
+    with pytest.raises(
+        UsageError, match="obstacles must be a tuple of obstacles, got 3"
+    ):
         Scene(3, np.zeros((1, 3)))
-    with pytest.raises(UsageError, match=r"poses must be an array of shape \(N, width\), got 3"):
+    with pytest.raises(
+        UsageError, match=r"poses must be an array of shape \(N, width\), got 3"
+    ):
         Scene((), 3)

@@ -62,7 +62,9 @@ def register(monkeypatch):
         addons.entry_points.cache_clear()
 
     monkeypatch.setattr("importlib.metadata.entry_points", fake)
-    monkeypatch.setattr(registry, "BUILT_IN", {STAGES: {"roll": f"{__name__}:Roll"}, CONSTRAINTS: {}})
+    monkeypatch.setattr(
+        registry, "BUILT_IN", {STAGES: {"roll": f"{__name__}:Roll"}, CONSTRAINTS: {}}
+    )
     addons.entry_points.cache_clear()
     yield add
     addons.entry_points.cache_clear()
@@ -82,7 +84,10 @@ def test_an_entry_point_adds_a_kind(register):
 
 def test_an_unknown_kind_names_the_nearest_and_all_known_ones(register):
     register(STAGES, "toss", f"{__name__}:Toss")
-    with pytest.raises(RecipeError, match=r"unknown stage 'rol' \(did you mean 'roll'\?\); known: roll, toss"):
+    with pytest.raises(
+        RecipeError,
+        match=r"unknown stage 'rol' \(did you mean 'roll'\?\); known: roll, toss",
+    ):
         load(STAGES, "rol")
 
 
@@ -96,11 +101,17 @@ def test_a_kind_of_the_other_group_is_unknown(register):
     [
         ("no_such_module_of_anyone:Stage", "ModuleNotFoundError"),
         (f"{__name__}:Missing", "AttributeError"),
-        (f"{__name__}:THE_STRING", "is not a subclass of cnpgen.pipelines.stages.stage.Stage, got 'not a class'"),
+        (
+            f"{__name__}:THE_STRING",
+            "is not a subclass of cnpgen.pipelines.stages.stage.Stage, got 'not a class'",
+        ),
         ("builtins:dict", "is not a subclass of cnpgen.pipelines.stages.stage.Stage"),
         (f"{__name__}:Abstract", "Abstract is abstract, it does not define prepare"),
         (f"{__name__}:NotADataclass", "NotADataclass is not a dataclass"),
-        (f"{__name__}:Undeclared", "the field 'loaded' is not declared with cnpgen.plugins.field"),
+        (
+            f"{__name__}:Undeclared",
+            "the field 'loaded' is not declared with cnpgen.plugins.field",
+        ),
     ],
 )
 def test_a_broken_plug_in_is_a_recipe_error(register, value, message):
@@ -111,7 +122,9 @@ def test_a_broken_plug_in_is_a_recipe_error(register, value, message):
     assert load(STAGES, "roll") is Roll
 
 
-def test_a_module_that_raises_while_it_is_imported_is_a_recipe_error(register, tmp_path, monkeypatch):
+def test_a_module_that_raises_while_it_is_imported_is_a_recipe_error(
+    register, tmp_path, monkeypatch
+):
     (tmp_path / "plugin_that_divides.py").write_text("1 / 0\n")
     monkeypatch.syspath_prepend(tmp_path)
     register(STAGES, "divide", "plugin_that_divides:Stage")
@@ -121,7 +134,10 @@ def test_a_module_that_raises_while_it_is_imported_is_a_recipe_error(register, t
 
 def test_a_plug_in_with_the_name_of_a_built_in_kind_is_an_error(register):
     register(STAGES, "roll", f"{__name__}:Toss")
-    with pytest.raises(RecipeError, match=r"stage 'roll' is defined more than once: by cnpgen and by .*:Toss"):
+    with pytest.raises(
+        RecipeError,
+        match=r"stage 'roll' is defined more than once: by cnpgen and by .*:Toss",
+    ):
         load(STAGES, "roll")
     assert names(STAGES) == ("roll",)
 
@@ -136,9 +152,14 @@ def test_two_plug_ins_with_one_name_are_an_error(register):
 def test_who_lacks_a_plug_in_is_told_which_package_to_install(register):
     assert registry.why_missing(STAGES, "roll", "") == ""
     text = registry.why_missing(STAGES, "toss", "dice-stages")
-    assert "stage 'toss' comes from the package 'dice-stages', which is not installed" in text
+    assert (
+        "stage 'toss' comes from the package 'dice-stages', which is not installed"
+        in text
+    )
     assert "pip install dice-stages" in text
-    assert "entry point group 'cnpgen.constraints'" in registry.why_missing(CONSTRAINTS, "toss", "")
+    assert "entry point group 'cnpgen.constraints'" in registry.why_missing(
+        CONSTRAINTS, "toss", ""
+    )
     register(STAGES, "toss", f"{__name__}:Toss")
     assert registry.why_missing(STAGES, "toss", "dice-stages") == ""
 
@@ -146,7 +167,10 @@ def test_who_lacks_a_plug_in_is_told_which_package_to_install(register):
 def test_name_of_is_the_inverse_of_load(register):
     register(STAGES, "broken", f"{__name__}:Missing")
     register(STAGES, "toss", f"{__name__}:Toss")
-    assert [name_of(STAGES, load(STAGES, name)) for name in ("roll", "toss")] == ["roll", "toss"]
+    assert [name_of(STAGES, load(STAGES, name)) for name in ("roll", "toss")] == [
+        "roll",
+        "toss",
+    ]
 
 
 def test_name_of_an_unregistered_class_says_where_it_is(register):

@@ -30,7 +30,9 @@ def errors_of(path: Path) -> list[str]:
         ("a = " + "9" * 5_000, "not valid TOML"),
     ],
 )  # fmt: skip
-def test_a_file_that_would_take_long_is_refused_at_once(tmp_path: Path, text: str, message: str) -> None:
+def test_a_file_that_would_take_long_is_refused_at_once(
+    tmp_path: Path, text: str, message: str
+) -> None:
     path = tmp_path / "recipe.toml"
     path.write_text(text)
     begun = time.process_time()
@@ -50,7 +52,9 @@ def test_texts_with_many_points_are_texts(tmp_path: Path) -> None:
 
 def test_many_unknown_keys_are_counted(tmp_path: Path) -> None:
     path = tmp_path / "recipe.toml"
-    path.write_text("pipeline = 'airhockey-hit'\n" + "".join(f"key{i} = 1\n" for i in range(10_000)))
+    path.write_text(
+        "pipeline = 'airhockey-hit'\n" + "".join(f"key{i} = 1\n" for i in range(10_000))
+    )
     with pytest.raises(RecipeError) as caught:
         load_dataset_recipe(path)
     assert f"{path}: and 9,980 more unknown keys" in caught.value.errors
@@ -68,7 +72,9 @@ def test_many_unknown_keys_are_counted(tmp_path: Path) -> None:
         ('name = "a"\npipeline = "a\\u0000b.toml"', "no such file"),
     ],
 )
-def test_long_names_are_mistakes_that_are_told_in_short(tmp_path: Path, text: str, message: str) -> None:
+def test_long_names_are_mistakes_that_are_told_in_short(
+    tmp_path: Path, text: str, message: str
+) -> None:
     path = tmp_path / "recipe.toml"
     path.write_text(text)
     with pytest.raises(RecipeError, match=message) as caught:

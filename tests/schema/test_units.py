@@ -4,7 +4,13 @@ import math
 
 import pytest
 
-from cnpgen.schema.units import UNITS, dimension, parse_number, parse_numbers, parse_range
+from cnpgen.schema.units import (
+    UNITS,
+    dimension,
+    parse_number,
+    parse_numbers,
+    parse_range,
+)
 
 
 @pytest.mark.parametrize(
@@ -61,7 +67,11 @@ def test_negative_zero_is_zero():
     [
         ("5 mm", "s", r"expected a time \[s\], got '5 mm'"),
         ("5 %", "rad", r"expected an angle \[rad\], got '5 %'"),
-        ("5 mmm", "m", r"unknown unit 'mmm' in '5 mmm', expected a length \[m\] \(did you mean 'mm'\?\)"),
+        (
+            "5 mmm",
+            "m",
+            r"unknown unit 'mmm' in '5 mmm', expected a length \[m\] \(did you mean 'mm'\?\)",
+        ),
         ("5 degs", "rad", r"did you mean 'deg'\?"),
         ("5 N m m", "N m", "unknown unit"),
         ("fast", "1", "expected a number, got 'fast'"),
@@ -128,7 +138,9 @@ def test_a_wrong_list_is_an_error(value, count, message):
 
 
 def test_a_range_is_two_ends_or_one_point():
-    assert parse_range("[-170, 170] deg", "rad") == pytest.approx((-math.radians(170), math.radians(170)))
+    assert parse_range("[-170, 170] deg", "rad") == pytest.approx(
+        (-math.radians(170), math.radians(170))
+    )
     assert parse_range([1, 2], "m") == (1.0, 2.0)
     assert parse_range("16 cm", "m") == (0.16, 0.16)
     assert parse_range(0.16, "m") == (0.16, 0.16)

@@ -28,7 +28,9 @@ def failing(code: int) -> Callable[..., None]:
     return fail
 
 
-def test_a_written_file_is_complete_and_leaves_no_temporary_file(tmp_path: Path) -> None:
+def test_a_written_file_is_complete_and_leaves_no_temporary_file(
+    tmp_path: Path,
+) -> None:
     write_file(tmp_path / "a" / "b.txt", "grün\n")
     write_file(tmp_path / "a" / "b.txt", b"again")
     assert (tmp_path / "a" / "b.txt").read_bytes() == b"again"
@@ -41,7 +43,11 @@ def test_the_file_is_flushed_before_it_is_renamed_and_its_folder_after(
     steps: list[str] = []
     sync, rename = os.fsync, Path.replace
     monkeypatch.setattr(os, "fsync", lambda fd: (steps.append("sync"), sync(fd))[1])
-    monkeypatch.setattr(Path, "replace", lambda self, target: (steps.append("rename"), rename(self, target))[1])
+    monkeypatch.setattr(
+        Path,
+        "replace",
+        lambda self, target: (steps.append("rename"), rename(self, target))[1],
+    )
     write_file(tmp_path / "a", b"x")
     assert steps == ["sync", "rename", "sync"]
 
@@ -54,7 +60,12 @@ def test_a_failing_disk_is_a_machine_error_that_leaves_the_old_file(
     path = tmp_path / "a.txt"
     write_file(path, b"old")
     owner: object = os if step == "fsync" else Path
-    name = {"fsync": "fsync", "write": "write_bytes", "rename": "replace", "mkdir": "mkdir"}[step]
+    name = {
+        "fsync": "fsync",
+        "write": "write_bytes",
+        "rename": "replace",
+        "mkdir": "mkdir",
+    }[step]
     monkeypatch.setattr(owner, name, failing(code))
     with pytest.raises(MachineError) as caught:
         write_file(path, b"new")
@@ -65,13 +76,17 @@ def test_a_failing_disk_is_a_machine_error_that_leaves_the_old_file(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_the_error_for_a_full_disk_has_a_hint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_for_a_full_disk_has_a_hint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(os, "fsync", failing(errno.ENOSPC))
     with pytest.raises(MachineError, match=r"free some space and try again"):
         write_file(tmp_path / "a", b"new")
 
 
-def test_a_write_that_exceeds_the_file_size_limit_leaves_no_file(tmp_path: Path) -> None:
+def test_a_write_that_exceeds_the_file_size_limit_leaves_no_file(
+    tmp_path: Path,
+) -> None:
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     try:
@@ -135,19 +150,29 @@ def test_what_cannot_be_written_is_found_before_it_is_written(tmp_path: Path) ->
     (tmp_path / "old").chmod(0o444)
     (tmp_path / "ro").mkdir(0o555)
     for path in ("old", "ro", "ro/file.h5", "ro/new/file.h5"):
-        with pytest.raises(MachineError, match=rf"cannot write .*{path}: Permission denied; choose a folder"):
+        with pytest.raises(
+            MachineError,
+            match=rf"cannot write .*{path}: Permission denied; choose a folder",
+        ):
             check_writable(tmp_path / path)
-    with pytest.raises(MachineError, match="Not a directory; a file is where a folder should be"):
+    with pytest.raises(
+        MachineError, match="Not a directory; a file is where a folder should be"
+    ):
         check_writable(tmp_path / "old" / "file.h5")
 
 
 @pytest.mark.usefixtures("file_permissions")
 @pytest.mark.parametrize("mode", [0o000, 0o300, 0o600])
-def test_a_folder_that_cannot_be_listed_and_entered_cannot_be_read(tmp_path: Path, mode: int) -> None:
+def test_a_folder_that_cannot_be_listed_and_entered_cannot_be_read(
+    tmp_path: Path, mode: int
+) -> None:
     (tmp_path / "folder").mkdir()
     check_readable(tmp_path / "folder")
     check_readable(tmp_path / "nothing")
     (tmp_path / "folder").chmod(mode)
-    with pytest.raises(MachineError, match=r"cannot read .*: Permission denied; its owner can permit reading it"):
+    with pytest.raises(
+        MachineError,
+        match=r"cannot read .*: Permission denied; its owner can permit reading it",
+    ):
         check_readable(tmp_path / "folder")
     (tmp_path / "folder").chmod(0o700)

@@ -25,7 +25,9 @@ from cnpgen.store.files.cache_folder import (
 )
 from tests.conftest import needs_compiler, some
 
-posix = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="files have no owners here")
+posix = pytest.mark.skipif(
+    not hasattr(os, "geteuid"), reason="files have no owners here"
+)
 BUILT: list[str] = []  # names of functions that were built
 
 FALLBACK = """
@@ -90,17 +92,24 @@ def test_a_writable_folder_is_used_without_a_warning(tmp_path):
 
 
 def test_a_file_at_the_path_of_the_folder_causes_a_warning(unwritable):
-    with pytest.warns(RuntimeWarning, match=rf"cannot write the kernel cache {unwritable.parent} \(Not a directory\)"):
+    with pytest.warns(
+        RuntimeWarning,
+        match=rf"cannot write the kernel cache {unwritable.parent} \(Not a directory\)",
+    ):
         assert usable_cache_folder(unwritable.parent).is_dir()
 
 
 @needs_compiler
-def test_kernels_are_compiled_in_a_temporary_folder_after_one_warning(unwritable, monkeypatch, fresh_compiler):
+def test_kernels_are_compiled_in_a_temporary_folder_after_one_warning(
+    unwritable, monkeypatch, fresh_compiler
+):
     monkeypatch.setenv("CNPGEN_CACHE", str(unwritable))
     with pytest.warns(RuntimeWarning) as caught:
         backend, folder = choose_backend()
     (warning,) = caught
-    assert f"cannot write the kernel cache {unwritable} (Not a directory)" in str(warning.message)
+    assert f"cannot write the kernel cache {unwritable} (Not a directory)" in str(
+        warning.message
+    )
     assert "set CNPGEN_CACHE" in str(warning.message)
     assert backend == "compiled"
     (result,) = KernelLibrary(backend, folder, "test").load(doubling)(np.ones((1, 3)))
@@ -122,7 +131,10 @@ def test_compilation_is_announced_once_and_only_if_it_happens(tmp_path, capsys):
     with notices():
         library.load(doubling)
         library.load(tripling)
-    assert capsys.readouterr().err == "cnpgen: compiling kernels, once per problem and machine\n"
+    assert (
+        capsys.readouterr().err
+        == "cnpgen: compiling kernels, once per problem and machine\n"
+    )
     with notices():
         library.load(doubling)
     assert capsys.readouterr().err == ""
@@ -193,7 +205,10 @@ def test_libraries_are_not_writable_for_others_under_a_permissive_umask(tmp_path
 def refused(folder: Path, why: str) -> None:
     """Check that the folder is refused with the reason and that nothing is written to it."""
     before = sorted(folder.rglob("*"))
-    with pytest.warns(RuntimeWarning, match=f"the kernel cache .* is not used, as .*{why}.*set CNPGEN_CACHE"):
+    with pytest.warns(
+        RuntimeWarning,
+        match=f"the kernel cache .* is not used, as .*{why}.*set CNPGEN_CACHE",
+    ):
         assert usable_cache_folder(folder) != folder
     with pytest.raises(MachineError, match=why):
         KernelLibrary("numpy", folder, "test").load(doubling)
@@ -208,7 +223,9 @@ def test_a_cache_that_is_writable_for_others_is_refused(tmp_path):
         for bits in (0o770, 0o702, 0o1777):
             path.chmod(bits)
             if bits == 0o1777 and path == folder.parent:
-                assert not trust_problem(folder)  # as in /tmp: only owners rename their entries
+                assert not trust_problem(
+                    folder
+                )  # as in /tmp: only owners rename their entries
             else:
                 refused(folder, f"others may write to {path}")
         path.chmod(0o700)
@@ -240,7 +257,9 @@ def test_links_to_the_cache_are_followed_and_links_inside_it_are_refused(tmp_pat
 
 @needs_compiler
 @posix
-@pytest.mark.parametrize("how", some(["open to others", "of another user", "a link"], 1, "slow"))
+@pytest.mark.parametrize(
+    "how", some(["open to others", "of another user", "a link"], 1, "slow")
+)
 @pytest.mark.parametrize("kind", ["lib", "tape"])
 def test_an_untrusted_file_is_ignored_and_replaced(tmp_path, give_away, kind, how):
     folder = tmp_path / "cache"
@@ -267,7 +286,9 @@ def test_an_untrusted_file_is_ignored_and_replaced(tmp_path, give_away, kind, ho
     assert untrusted_files(folder) == []
 
 
-def test_a_file_that_disappears_while_the_cache_is_checked_causes_no_error(tmp_path, monkeypatch):
+def test_a_file_that_disappears_while_the_cache_is_checked_causes_no_error(
+    tmp_path, monkeypatch
+):
     (tmp_path / "tape").mkdir()
     (tmp_path / "tape" / ".unfinished.tmp").write_text("")
     seen = Path.is_symlink
@@ -303,11 +324,21 @@ assert len(list((folder / "lib").iterdir())) == 1
 
 @pytest.mark.slow
 @needs_compiler
-def test_a_read_only_cache_is_read_and_missing_kernels_are_compiled_temporarily(tmp_path):
+def test_a_read_only_cache_is_read_and_missing_kernels_are_compiled_temporarily(
+    tmp_path,
+):
     warm = tmp_path / "warm"
     KernelLibrary("compiled", warm, "test").load(doubling)
     before = sorted(warm.rglob("*"))
-    done = subprocess.run([sys.executable, "-c", READ_ONLY, str(warm)], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", READ_ONLY, str(warm)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
-    assert done.stdout == f"compiling kernels for this run only: the cache {warm} lacks them and is not writable\n"
+    assert (
+        done.stdout
+        == f"compiling kernels for this run only: the cache {warm} lacks them and is not writable\n"
+    )
     assert sorted(warm.rglob("*")) == before

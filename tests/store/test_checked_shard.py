@@ -71,12 +71,21 @@ SHAPES: dict[str, Callable[[np.ndarray], Any]] = {
     "no rows": lambda values: values[:0],
     "one dimension more": lambda values: values[..., None],
     "a number": lambda values: values.reshape(-1)[0],
-    "another type": lambda values: values.astype("f4" if values.dtype.kind == "f" else "f8"),
+    "another type": lambda values: values.astype(
+        "f4" if values.dtype.kind == "f" else "f8"
+    ),
     "integers of 32 bits": lambda values: values.astype("i4"),
 }
 CHANGES: dict[str, Change] = {
-    **{f"{name}: {shape}": with_values(name, change) for name in FIELDS for shape, change in SHAPES.items()},
-    **{f"all: {shape}": with_all_values(SHAPES[shape]) for shape in ("one row more", "one row less")},
+    **{
+        f"{name}: {shape}": with_values(name, change)
+        for name in FIELDS
+        for shape, change in SHAPES.items()
+    },
+    **{
+        f"all: {shape}": with_all_values(SHAPES[shape])
+        for shape in ("one row more", "one row less")
+    },
     "start_q: one column less": with_values("start_q", lambda values: values[:, :-1]),
     "start_q: transposed": with_values("start_q", lambda values: values.T),
     "start_q: nan": with_values("start_q", put((3, 2), np.nan)),
@@ -94,16 +103,33 @@ CHANGES: dict[str, Change] = {
 
 
 READERS: dict[str, Callable[[Path], Any]] = {
-    "arrays": lambda folder: load_dataset(folder).arrays("train", fields=FIELDS)["start_q"][ROWS],
-    "without sha256": lambda folder: load_dataset(folder, verify=False).arrays("train", fields=FIELDS)["start_q"][ROWS],
+    "arrays": lambda folder: load_dataset(folder).arrays("train", fields=FIELDS)[
+        "start_q"
+    ][ROWS],
+    "without sha256": lambda folder: load_dataset(folder, verify=False).arrays(
+        "train", fields=FIELDS
+    )["start_q"][ROWS],
     "batches": lambda folder: np.concatenate(
-        [batch["start_q"] for batch in load_dataset(folder).batches(50, shuffle=False, normalize=False, dtype="f8")]
+        [
+            batch["start_q"]
+            for batch in load_dataset(folder).batches(
+                50, shuffle=False, normalize=False, dtype="f8"
+            )
+        ]
     )[ROWS],
-    "a row": lambda folder: np.array([load_dataset(folder)["train"][row]["start_q"] for row in range(250, 500)]),
-    "boundary problems": lambda folder: load_boundary_problems(folder, start=250, n=250).boundary.start_q,
+    "a row": lambda folder: np.array(
+        [load_dataset(folder)["train"][row]["start_q"] for row in range(250, 500)]
+    ),
+    "boundary problems": lambda folder: (
+        load_boundary_problems(folder, start=250, n=250).boundary.start_q
+    ),
     "a shard": lambda folder: load_boundary_problems(folder / FILE).boundary.start_q,
-    "requests": lambda folder: read_rows(folder, model_of(folder), split="train", other=True).boundary.start_q[ROWS],
-    "store": lambda folder: open_dataset(folder).read("train", start=250, stop=500)["start_q"],
+    "requests": lambda folder: read_rows(
+        folder, model_of(folder), split="train", other=True
+    ).boundary.start_q[ROWS],
+    "store": lambda folder: open_dataset(folder).read("train", start=250, stop=500)[
+        "start_q"
+    ],
 }
 
 
@@ -114,10 +140,14 @@ def model_of(folder: Path) -> Any:
 
 @pytest.fixture(scope="module")
 def original(tiny: Callable[[str], Path]) -> np.ndarray:
-    return open_dataset(tiny("airhockey-hit")).read("train", start=250, stop=500)["start_q"]
+    return open_dataset(tiny("airhockey-hit")).read("train", start=250, stop=500)[
+        "start_q"
+    ]
 
 
-def test_every_reader_returns_the_rows_of_the_shard(damaged: Path, original: np.ndarray) -> None:
+def test_every_reader_returns_the_rows_of_the_shard(
+    damaged: Path, original: np.ndarray
+) -> None:
     for read in READERS.values():
         assert np.array_equal(read(damaged), original)
 
@@ -132,10 +162,18 @@ def test_every_reader_refuses_a_modified_shard(damaged: Path, change: str) -> No
     assert FILE in {finding.file for finding in validate_dataset(damaged).findings}
 
 
-@pytest.mark.parametrize("change", ["start_q: one row more", "goal_q: inf", "sample_id: repeated"])
+@pytest.mark.parametrize(
+    "change", ["start_q: one row more", "goal_q: inf", "sample_id: repeated"]
+)
 def test_merge_refuses_a_modified_shard(tmp_path: Path, change: str) -> None:
     parts = [
-        make_dataset(tiny_recipe("airhockey-hit"), tmp_path / f"part{k}", shard_size=250, workers=1, part=(k, 2)).folder
+        make_dataset(
+            tiny_recipe("airhockey-hit"),
+            tmp_path / f"part{k}",
+            shard_size=250,
+            workers=1,
+            part=(k, 2),
+        ).folder
         for k in range(2)
     ]
     name = next(part for part in parts if (part / FILE).exists())
@@ -151,12 +189,18 @@ def edit_unfinished(folder: Path, change: Change) -> None:
 
 
 @pytest.mark.parametrize("change", ["goal_q: inf", "sample_id: repeated"])
-def test_extend_makes_a_modified_shard_again(damaged: Path, original: np.ndarray, change: str) -> None:
+def test_extend_makes_a_modified_shard_again(
+    damaged: Path, original: np.ndarray, change: str
+) -> None:
     edit(damaged, FILE, CHANGES[change])
-    with pytest.warns(RuntimeWarning, match=r"a shard is damaged and is made again: .*shard-00001"):
+    with pytest.warns(
+        RuntimeWarning, match=r"a shard is damaged and is made again: .*shard-00001"
+    ):
         extend_dataset(damaged, 700, workers=1)
     assert validate_dataset(damaged).ok
-    assert np.array_equal(open_dataset(damaged).read("train", start=250, stop=500)["start_q"], original)
+    assert np.array_equal(
+        open_dataset(damaged).read("train", start=250, stop=500)["start_q"], original
+    )
 
 
 def test_a_sum_that_overflows_is_not_taken_for_infinity(damaged: Path) -> None:
@@ -223,13 +267,22 @@ except CnpgenError as error:
 
 @pytest.mark.parametrize("reader", ["batches", "arrays", "store"])
 @pytest.mark.parametrize("time", ["header", "size", "open"])
-def test_a_shard_that_is_truncated_while_it_is_read_ends_in_an_error(tmp_path: Path, reader: str, time: str) -> None:
+def test_a_shard_that_is_truncated_while_it_is_read_ends_in_an_error(
+    tmp_path: Path, reader: str, time: str
+) -> None:
     """The shard has 8 MB, so that a memory map of its end would be outside the file."""
     folder = made_large(tmp_path / "set")
     done = subprocess.run(
-        [sys.executable, "-c", TRUNCATE, str(folder), time, reader], capture_output=True, text=True, check=False
+        [sys.executable, "-c", TRUNCATE, str(folder), time, reader],
+        capture_output=True,
+        text=True,
+        check=False,
     )
-    assert (done.returncode, done.stderr) == (7, ""), (done.returncode, done.stdout, done.stderr)
+    assert (done.returncode, done.stderr) == (7, ""), (
+        done.returncode,
+        done.stdout,
+        done.stderr,
+    )
     assert "shard-00001.h5" in done.stdout
 
 
@@ -240,12 +293,17 @@ def made_large(folder: Path) -> Path:
 
 
 def test_links_are_refused_by_every_reader(damaged: Path, tmp_path: Path) -> None:
-    task: ShardTask = next(task for task in shards(load_dataset_spec(damaged)) if task.file == FILE)
+    task: ShardTask = next(
+        task for task in shards(load_dataset_spec(damaged)) if task.file == FILE
+    )
     shutil.move(damaged / FILE, tmp_path / "elsewhere.h5")
     (damaged / FILE).symlink_to(tmp_path / "elsewhere.h5")
     for read in READERS.values():
         if read is not READERS["a shard"]:  # a file that the user names
-            with pytest.raises(DatasetError, match="is a link that leads outside the folder of the dataset"):
+            with pytest.raises(
+                DatasetError,
+                match="is a link that leads outside the folder of the dataset",
+            ):
                 read(damaged)
     spec = load_dataset_spec(damaged)
     record = load_record(damaged, task)

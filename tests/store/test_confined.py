@@ -50,27 +50,53 @@ def fewer_shards(manifest: dict[str, Any]) -> None:
     del manifest["splits"]["train"]["shards"][0]
 
 
-@pytest.mark.parametrize("change", [absolute, upwards, elsewhere, more_rows, more_splits, fewer_shards])
-def test_a_manifest_with_other_files_than_the_shards_is_refused(dataset: Path, change: Change) -> None:  # noqa: F811
+@pytest.mark.parametrize(
+    "change", [absolute, upwards, elsewhere, more_rows, more_splits, fewer_shards]
+)
+def test_a_manifest_with_other_files_than_the_shards_is_refused(
+    dataset: Path,  # noqa: F811
+    change: Change,
+) -> None:
     rewritten(dataset / "manifest.json", change)
     for read in (open_dataset, load_dataset):
-        with pytest.raises(DatasetError, match=r"manifest\.json lists other shards than specification\.json"):
+        with pytest.raises(
+            DatasetError,
+            match=r"manifest\.json lists other shards than specification\.json",
+        ):
             read(dataset)
-    assert "lists other shards than specification.json" in {finding.problem for finding in check_dataset(dataset)}
+    assert "lists other shards than specification.json" in {
+        finding.problem for finding in check_dataset(dataset)
+    }
     assert not inspect_dataset(dataset).complete
 
 
-@pytest.mark.parametrize("name", ["train/shard-00000.h5", "train/shard-00000.json", "train"])
-def test_a_link_out_of_the_folder_is_not_followed(dataset: Path, tmp_path: Path, name: str) -> None:  # noqa: F811
+@pytest.mark.parametrize(
+    "name", ["train/shard-00000.h5", "train/shard-00000.json", "train"]
+)
+def test_a_link_out_of_the_folder_is_not_followed(
+    dataset: Path,  # noqa: F811
+    tmp_path: Path,
+    name: str,
+) -> None:
     outside = tmp_path / "outside"
     (dataset / name).rename(outside)
     (dataset / name).symlink_to(outside)
-    found = [finding.file for finding in check_dataset(dataset) if "leads outside" in finding.problem]
+    found = [
+        finding.file
+        for finding in check_dataset(dataset)
+        if "leads outside" in finding.problem
+    ]
     assert found
     assert all(file.startswith("train/shard-0000") for file in found)
     if name != "train/shard-00000.json":
-        for read in (lambda: load_dataset(dataset).arrays("train"), lambda: open_dataset(dataset).read("train")):
-            with pytest.raises(DatasetError, match="is a link that leads outside the folder of the dataset"):
+        for read in (
+            lambda: load_dataset(dataset).arrays("train"),
+            lambda: open_dataset(dataset).read("train"),
+        ):
+            with pytest.raises(
+                DatasetError,
+                match="is a link that leads outside the folder of the dataset",
+            ):
                 read()
 
 
@@ -86,7 +112,12 @@ def many_shards(specification: dict[str, Any]) -> None:
 
 
 def wide_field(specification: dict[str, Any]) -> None:
-    specification["fields"][0] |= {"width": 10**9, "names": [], "valid_min": None, "valid_max": None}
+    specification["fields"][0] |= {
+        "width": 10**9,
+        "names": [],
+        "valid_min": None,
+        "valid_max": None,
+    }
 
 
 def fewer_limits(specification: dict[str, Any]) -> None:
@@ -105,19 +136,30 @@ def path_as_split(specification: dict[str, Any]) -> None:
     specification["splits"] = {"../../train": 50}
 
 
-@pytest.mark.parametrize("change", [many_shards, wide_field, fewer_limits, no_rows, rows_in_words, path_as_split])
-def test_an_impossible_specification_is_refused_at_once(dataset: Path, change: Change) -> None:  # noqa: F811
+@pytest.mark.parametrize(
+    "change",
+    [many_shards, wide_field, fewer_limits, no_rows, rows_in_words, path_as_split],
+)
+def test_an_impossible_specification_is_refused_at_once(
+    dataset: Path,  # noqa: F811
+    change: Change,
+) -> None:
     rewritten(dataset / "specification.json", change)
     begun = time.process_time()
     for read in (load_dataset_spec, open_dataset, load_dataset, inspect_dataset):
         with pytest.raises(DatasetError, match=r"specification\.json is damaged: "):
             read(dataset)
-    assert [finding.file for finding in check_dataset(dataset)] == ["specification.json"]
+    assert [finding.file for finding in check_dataset(dataset)] == [
+        "specification.json"
+    ]
     assert time.process_time() - begun < 1
 
 
 def test_too_many_shards_are_refused() -> None:
-    with pytest.raises(UsageError, match=r"^1,000,000,000 shards of 1 rows are too many, .* a larger shard_size=$"):
+    with pytest.raises(
+        UsageError,
+        match=r"^1,000,000,000 shards of 1 rows are too many, .* a larger shard_size=$",
+    ):
         replace(SPEC, splits={"train": 10**9}, shard_size=1)
 
 
@@ -146,7 +188,9 @@ def other_field(part: dict[str, Any]) -> None:
     part["x"] = part.pop("start_q")
 
 
-@pytest.mark.parametrize("change", [other_columns, uneven, no_rows_in_statistics, ragged, other_field])
+@pytest.mark.parametrize(
+    "change", [other_columns, uneven, no_rows_in_statistics, ragged, other_field]
+)
 def test_statistics_of_other_fields_are_refused(dataset: Path, change: Change) -> None:  # noqa: F811
     rewritten(dataset / "stats.json", lambda stats: change(stats["splits"]["train"]))
     with pytest.raises(DatasetError, match=rf"stats\.json.*({STATISTICS})"):
@@ -160,6 +204,9 @@ def test_statistics_of_other_fields_are_refused(dataset: Path, change: Change) -
 
 def test_a_forged_fingerprint_is_detected(dataset: Path) -> None:  # noqa: F811
     forged = {"fingerprint": canonical_sha256({})}
-    rewritten(dataset / "specification.json", lambda specification: specification.update(forged))
+    rewritten(
+        dataset / "specification.json",
+        lambda specification: specification.update(forged),
+    )
     with pytest.raises(CnpgenError, match="fingerprint does not match"):
         load_dataset_spec(dataset)

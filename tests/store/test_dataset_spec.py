@@ -26,7 +26,9 @@ from cnpgen.store.files.documents import save_document
 from tests.examples.store import SPEC
 
 
-def test_a_specification_round_trips_through_json_disk_and_pickle(tmp_path: Path) -> None:
+def test_a_specification_round_trips_through_json_disk_and_pickle(
+    tmp_path: Path,
+) -> None:
     write_dataset_spec(tmp_path, SPEC)
     assert load_dataset_spec(tmp_path) == SPEC
     assert from_json(json.loads(json.dumps(to_json(SPEC)))) == SPEC
@@ -40,13 +42,19 @@ def test_integer_limits_are_equal_after_reading(tmp_path: Path) -> None:
     assert load_dataset_spec(tmp_path) == spec
 
 
-def test_the_seed_is_stored_as_text_because_json_numbers_of_other_readers_have_53_bits() -> None:
+def test_the_seed_is_stored_as_text_because_json_numbers_of_other_readers_have_53_bits() -> (
+    None
+):
     assert to_json(SPEC)["seed"] == str(2**100 + 7)
 
 
 @pytest.mark.parametrize("key", ["title", "license", "versions", "recipe"])
-def test_settings_that_do_not_change_the_rows_do_not_change_the_fingerprint(key: str) -> None:
-    other: dict[str, Any] = {key: {"cnpgen": "9"} if key in {"versions", "recipe"} else "other"}
+def test_settings_that_do_not_change_the_rows_do_not_change_the_fingerprint(
+    key: str,
+) -> None:
+    other: dict[str, Any] = {
+        key: {"cnpgen": "9"} if key in {"versions", "recipe"} else "other"
+    }
     assert replace(SPEC, **other).fingerprint == SPEC.fingerprint
 
 
@@ -67,19 +75,30 @@ def test_settings_that_do_not_change_the_rows_do_not_change_the_fingerprint(key:
         {"robot": {}},
     ],
 )
-def test_settings_that_change_the_bytes_change_the_fingerprint(change: dict[str, Any]) -> None:
+def test_settings_that_change_the_bytes_change_the_fingerprint(
+    change: dict[str, Any],
+) -> None:
     assert replace(SPEC, **change).fingerprint != SPEC.fingerprint
 
 
 def test_shards_partition_every_split_in_order_and_the_last_one_is_shorter() -> None:
-    found = [(task.split, task.index, task.first_row, task.rows) for task in shards(SPEC)]
-    assert found == [("train", 0, 0, 32), ("train", 1, 32, 18), ("validation", 0, 0, 10)]
+    found = [
+        (task.split, task.index, task.first_row, task.rows) for task in shards(SPEC)
+    ]
+    assert found == [
+        ("train", 0, 0, 32),
+        ("train", 1, 32, 18),
+        ("validation", 0, 0, 10),
+    ]
     assert shards(SPEC)[1].file == "train/shard-00001.h5"
     assert shards(SPEC)[1].sidecar == "train/shard-00001.json"
 
 
 def test_an_empty_split_has_no_shards() -> None:
-    assert {task.split for task in shards(replace(SPEC, splits={"train": 5, "validation": 0}))} == {"train"}
+    assert {
+        task.split
+        for task in shards(replace(SPEC, splits={"train": 5, "validation": 0}))
+    } == {"train"}
 
 
 def test_a_larger_dataset_begins_with_the_shards_of_a_smaller_one() -> None:
@@ -89,20 +108,44 @@ def test_a_larger_dataset_begins_with_the_shards_of_a_smaller_one() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rows", "size"), [(0, 8192), (1, 8192), (120_000, 8192), (500_000, 32768), (10**6, 65536), (10**8, 65536)]
+    ("rows", "size"),
+    [
+        (0, 8192),
+        (1, 8192),
+        (120_000, 8192),
+        (500_000, 32768),
+        (10**6, 65536),
+        (10**8, 65536),
+    ],
 )
-def test_default_shard_sizes_are_powers_of_two_within_bounds(rows: int, size: int) -> None:
+def test_default_shard_sizes_are_powers_of_two_within_bounds(
+    rows: int, size: int
+) -> None:
     assert default_shard_size(rows) == size
 
 
-@pytest.mark.parametrize(("rows", "size"), [(1, 64), (300, 64), (5000, 256), (120_000, 1024)])
+@pytest.mark.parametrize(
+    ("rows", "size"), [(1, 64), (300, 64), (5000, 256), (120_000, 1024)]
+)
 def test_default_shards_of_expensive_samples_are_small(rows: int, size: int) -> None:
     assert default_shard_size(rows, block_rows=64) == size
 
 
 def test_120000_rows_make_15_shards() -> None:
     splits = {"train": 112_000, "validation": 8_000}
-    assert len(shards(replace(SPEC, splits=splits, shard_size=default_shard_size(120_000), block_rows=4096))) == 15
+    assert (
+        len(
+            shards(
+                replace(
+                    SPEC,
+                    splits=splits,
+                    shard_size=default_shard_size(120_000),
+                    block_rows=4096,
+                )
+            )
+        )
+        == 15
+    )
 
 
 @pytest.mark.parametrize(
@@ -119,12 +162,16 @@ def test_120000_rows_make_15_shards() -> None:
         ({"fields": SPEC.fields + SPEC.fields[:1]}, "different names"),
     ],
 )
-def test_invalid_specifications_are_refused(change: dict[str, Any], message: str) -> None:
+def test_invalid_specifications_are_refused(
+    change: dict[str, Any], message: str
+) -> None:
     with pytest.raises(UsageError, match=message):
         replace(SPEC, **change)
 
 
-def test_an_unwritable_folder_is_a_machine_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unwritable_folder_is_a_machine_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(*_arguments: object) -> None:
         raise PermissionError(13, "Permission denied")
 
@@ -147,21 +194,29 @@ def damage(action: Callable[[bytes], bytes], folder: Path) -> None:
     ],
     ids=["empty", "truncated", "flipped"],
 )
-def test_damaged_specifications_are_refused_and_named(tmp_path: Path, action: Callable[[bytes], bytes]) -> None:
+def test_damaged_specifications_are_refused_and_named(
+    tmp_path: Path, action: Callable[[bytes], bytes]
+) -> None:
     write_dataset_spec(tmp_path, SPEC)
     damage(action, tmp_path)
     with pytest.raises(DatasetError, match=r"specification\.json is damaged"):
         load_dataset_spec(tmp_path)
 
 
-def test_missing_newer_and_inconsistent_specifications_are_refused(tmp_path: Path) -> None:
+def test_missing_newer_and_inconsistent_specifications_are_refused(
+    tmp_path: Path,
+) -> None:
     with pytest.raises(DatasetError, match="missing"):
         load_dataset_spec(tmp_path)
     path = tmp_path / "specification.json"
     save_document(path, {"format": "cnpgen-specification", "format_version": 4})
     with pytest.raises(DatasetError, match="upgrade"):
         load_dataset_spec(tmp_path)
-    document = {"format": "cnpgen-specification", "format_version": 3, "fingerprint": SPEC.fingerprint}
+    document = {
+        "format": "cnpgen-specification",
+        "format_version": 3,
+        "fingerprint": SPEC.fingerprint,
+    }
     for change in ({"fields": [{}]}, {"seed": "x"}, {"splits": 3}, {"shard_size": "x"}):
         save_document(path, document | to_json(SPEC) | change)
         with pytest.raises(DatasetError, match="damaged"):
@@ -172,7 +227,8 @@ def test_missing_newer_and_inconsistent_specifications_are_refused(tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    ("content", "version"), [('{"format": "cnpgen-plan", "format_version": 2}', "2"), ("{", "1 or 2")]
+    ("content", "version"),
+    [('{"format": "cnpgen-plan", "format_version": 2}', "2"), ("{", "1 or 2")],
 )
 def test_a_folder_with_a_specification_of_an_older_format_is_refused(
     tmp_path: Path, content: str, version: str
@@ -191,7 +247,10 @@ def test_shard_attributes_identify_the_shard_and_the_seed() -> None:
     assert second["first_sample_id"] == 32
     assert first["root_seed"] == str(2**100 + 7)
     other: DatasetSpec = replace(SPEC, seed=8)
-    assert shard_attributes(other, shards(other)[0])["specification_fingerprint"] != first["specification_fingerprint"]
+    assert (
+        shard_attributes(other, shards(other)[0])["specification_fingerprint"]
+        != first["specification_fingerprint"]
+    )
 
 
 def test_unknown_fields_are_named_with_the_nearest_known_one() -> None:
@@ -200,10 +259,21 @@ def test_unknown_fields_are_named_with_the_nearest_known_one() -> None:
         SPEC.field_named("start_p_q")
 
 
-@pytest.mark.parametrize("recipe", [{}, {"pipeline": 1}, {"pipeline": {"problem": []}}, {"pipeline": {"stage": [1]}}])
-def test_an_incomplete_recipe_is_refused_when_its_problem_or_stages_are_read(recipe: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    "recipe",
+    [{}, {"pipeline": 1}, {"pipeline": {"problem": []}}, {"pipeline": {"stage": [1]}}],
+)
+def test_an_incomplete_recipe_is_refused_when_its_problem_or_stages_are_read(
+    recipe: dict[str, Any],
+) -> None:
     spec = replace(SPEC, recipe=recipe)
-    with pytest.raises(DatasetError, match="the specification of two-shards does not contain the problem: pipeline"):
+    with pytest.raises(
+        DatasetError,
+        match="the specification of two-shards does not contain the problem: pipeline",
+    ):
         _ = spec.problem
-    with pytest.raises(DatasetError, match="the specification of two-shards does not contain the stages: pipeline"):
+    with pytest.raises(
+        DatasetError,
+        match="the specification of two-shards does not contain the stages: pipeline",
+    ):
         _ = spec.stages

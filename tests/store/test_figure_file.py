@@ -9,7 +9,9 @@ from cnpgen.store.files.figure_file import new_figure, save_figure
 
 
 @pytest.mark.parametrize("suffix", ["png", "svg"])
-def test_a_figure_has_its_size_and_the_format_of_its_suffix(tmp_path: Path, suffix: str) -> None:
+def test_a_figure_has_its_size_and_the_format_of_its_suffix(
+    tmp_path: Path, suffix: str
+) -> None:
     figure, path = new_figure(2, 1), tmp_path / f"picture.{suffix}"
     assert tuple(figure.get_size_inches()) == (2, 1)
     save_figure(figure, path)
@@ -18,7 +20,10 @@ def test_a_figure_has_its_size_and_the_format_of_its_suffix(tmp_path: Path, suff
 
 def test_a_figure_that_cannot_be_written_is_a_machine_error(tmp_path: Path) -> None:
     (tmp_path / "no").write_text("a file")
-    with pytest.raises(MachineError, match=r"cannot write .*no/such/folder\.png: .*a file is where a folder should be"):
+    with pytest.raises(
+        MachineError,
+        match=r"cannot write .*no/such/folder\.png: .*a file is where a folder should be",
+    ):
         save_figure(new_figure(1, 1), tmp_path / "no" / "such" / "folder.png")
 
 

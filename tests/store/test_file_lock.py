@@ -24,10 +24,14 @@ with output_lock(Path("out.h5"), Path(sys.argv[1])):
 def test_a_second_process_is_refused_until_the_first_has_ended(tmp_path: Path) -> None:
     lock = tmp_path / "out.lock"
     command = [sys.executable, "-c", HOLD, str(lock)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "locked\n"
-        refused = pytest.raises(UsageError, match=r"^another process is writing .*out\.h5: wait for it")
+        refused = pytest.raises(
+            UsageError, match=r"^another process is writing .*out\.h5: wait for it"
+        )
         with refused, output_lock(tmp_path / "out.h5", lock):
             pass
         process.kill()
@@ -38,7 +42,10 @@ def test_a_second_process_is_refused_until_the_first_has_ended(tmp_path: Path) -
 
 
 def test_an_error_of_the_block_is_raised_unchanged(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError), output_lock(tmp_path / "out.h5", tmp_path / "out.lock"):
+    with (
+        pytest.raises(FileNotFoundError),
+        output_lock(tmp_path / "out.h5", tmp_path / "out.lock"),
+    ):
         raise FileNotFoundError("of the block")
     assert not list(tmp_path.iterdir())
 

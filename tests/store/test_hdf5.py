@@ -13,7 +13,11 @@ import pytest
 import cnpgen
 from cnpgen.errors import DatasetError
 from cnpgen.plans import load_plans
-from cnpgen.store.files.checksum_file import HEADER_BYTES, read_with_checksum, with_checksum
+from cnpgen.store.files.checksum_file import (
+    HEADER_BYTES,
+    read_with_checksum,
+    with_checksum,
+)
 from cnpgen.store.files.hdf5 import open_hdf5
 from cnpgen.store.files.size_limits import MAX_EXPANSION, MIN_EXPANSION_LIMIT_BYTES
 from cnpgen.store.shard import read_placements, read_shard
@@ -26,7 +30,9 @@ SECRET = "the private key of a user"
 def outside(file: Any, folder: Path) -> None:
     private = folder / "private.txt"
     private.write_text(SECRET)
-    file.create_dataset("note", shape=(3, 9), dtype="u1", external=[(str(private), 0, 27)])
+    file.create_dataset(
+        "note", shape=(3, 9), dtype="u1", external=[(str(private), 0, 27)]
+    )
 
 
 def linked_outside(file: Any, folder: Path) -> None:
@@ -76,11 +82,15 @@ def never_written(file: Any, folder: Path) -> None:
 
 
 def packed(file: Any, folder: Path) -> None:
-    file.create_dataset("note", shape=(3, 10**8), dtype="f8", compression="gzip", chunks=(1, 10**6))
+    file.create_dataset(
+        "note", shape=(3, 10**8), dtype="f8", compression="gzip", chunks=(1, 10**6)
+    )
 
 
 def large_chunks(file: Any, folder: Path) -> None:
-    file.create_dataset("note", shape=(3, 1), dtype="f8", chunks=(3, 10**7), maxshape=(3, None))
+    file.create_dataset(
+        "note", shape=(3, 1), dtype="f8", chunks=(3, 10**7), maxshape=(3, None)
+    )
 
 
 def scaled(file: Any, folder: Path) -> None:
@@ -98,15 +108,29 @@ REFUSED: dict[str, tuple[Change, str]] = {
     "tables": (compound, "note must hold numbers, got"),
     "too many dimensions": (many_dimensions, "note must have at most 4 dimensions"),
     "no space": (nothing, "note must have at most 4 dimensions, got None"),
-    "numbers that were not written": (never_written, r"note declares the shape \(1000000000000,\)"),
-    "much out of little": (packed, "note declares the shape .* more than 100 times as many"),
-    "chunks that are larger than what they hold": (large_chunks, "note declares the shape"),
-    "another filter": (scaled, r"note is packed with filter \[6\], expected gzip, shuffle"),
+    "numbers that were not written": (
+        never_written,
+        r"note declares the shape \(1000000000000,\)",
+    ),
+    "much out of little": (
+        packed,
+        "note declares the shape .* more than 100 times as many",
+    ),
+    "chunks that are larger than what they hold": (
+        large_chunks,
+        "note declares the shape",
+    ),
+    "another filter": (
+        scaled,
+        r"note is packed with filter \[6\], expected gzip, shuffle",
+    ),
 }
 
 
 @pytest.mark.parametrize("what", REFUSED)
-def test_datasets_that_are_not_plain_are_refused_and_named(tmp_path: Path, what: str) -> None:
+def test_datasets_that_are_not_plain_are_refused_and_named(
+    tmp_path: Path, what: str
+) -> None:
     change, message = REFUSED[what]
     path = write_minimal(tmp_path / "theirs.h5")
     with h5py.File(path, "a") as file:
@@ -117,7 +141,9 @@ def test_datasets_that_are_not_plain_are_refused_and_named(tmp_path: Path, what:
 
 
 @pytest.mark.parametrize("what", REFUSED)
-def test_datasets_that_are_not_plain_are_refused_in_files_with_a_checksum(tmp_path: Path, what: str) -> None:
+def test_datasets_that_are_not_plain_are_refused_in_files_with_a_checksum(
+    tmp_path: Path, what: str
+) -> None:
     change, message = REFUSED[what]
     path = tmp_path / "model.h5"
     with h5py.File(path, "w", userblock_size=HEADER_BYTES) as file:
@@ -142,7 +168,13 @@ def test_datasets_that_are_not_read_are_not_checked(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "how", [{"compression": "gzip"}, {"compression": "lzf"}, {"shuffle": True, "fletcher32": True}, {"chunks": (1, 2)}]
+    "how",
+    [
+        {"compression": "gzip"},
+        {"compression": "lzf"},
+        {"shuffle": True, "fletcher32": True},
+        {"chunks": (1, 2)},
+    ],
 )
 def test_compressed_datasets_are_read(tmp_path: Path, how: dict[str, Any]) -> None:
     path = write_minimal(tmp_path / "theirs.h5")
@@ -170,42 +202,66 @@ def test_the_size_limit_applies_to_all_datasets_together(tmp_path: Path) -> None
     [["a", "b"], h5py.Empty("f8"), np.zeros(2, [("a", "f8")]), np.array([True])],
     ids=["texts", "nothing", "a table", "yes or no"],
 )
-def test_attributes_other_than_texts_and_numbers_are_refused(tmp_path: Path, value: Any) -> None:
+def test_attributes_other_than_texts_and_numbers_are_refused(
+    tmp_path: Path, value: Any
+) -> None:
     path = write_minimal(tmp_path / "theirs.h5")
     with h5py.File(path, "a") as file:
         file.attrs["degree"] = value
-    with pytest.raises(DatasetError, match="the attribute 'degree' must be a text, a number or a list of numbers"):
+    with pytest.raises(
+        DatasetError,
+        match="the attribute 'degree' must be a text, a number or a list of numbers",
+    ):
         load_plans(path)
 
 
 def test_a_name_that_is_not_utf8_is_damage(tmp_path: Path) -> None:
     path = write_minimal(tmp_path / "theirs.h5")
     with h5py.File(path, "a") as file:
-        h5py.h5d.create(file.id, b"\xff", h5py.h5t.NATIVE_DOUBLE, h5py.h5s.create_simple((3,)))
+        h5py.h5d.create(
+            file.id, b"\xff", h5py.h5t.NATIVE_DOUBLE, h5py.h5s.create_simple((3,))
+        )
     with pytest.raises(DatasetError, match="which is not UTF-8"):
         load_plans(path)
 
 
 def test_a_device_is_not_a_file() -> None:
-    with pytest.raises(DatasetError, match="/dev/zero is not a file"), open_hdf5(Path("/dev/zero")):
+    with (
+        pytest.raises(DatasetError, match="/dev/zero is not a file"),
+        open_hdf5(Path("/dev/zero")),
+    ):
         pass
 
 
 def test_a_huge_sparse_file_is_refused(tmp_path: Path) -> None:
     """A sparse file needs no space on a disk or in an archive."""
-    theirs, has_checksum = write_minimal(tmp_path / "theirs.h5"), tmp_path / "with a checksum.h5"
-    has_checksum.write_bytes(with_checksum(bytes(HEADER_BYTES) + theirs.read_bytes(), kind="cnpgen-plans", version=1))
+    theirs, has_checksum = (
+        write_minimal(tmp_path / "theirs.h5"),
+        tmp_path / "with a checksum.h5",
+    )
+    has_checksum.write_bytes(
+        with_checksum(
+            bytes(HEADER_BYTES) + theirs.read_bytes(), kind="cnpgen-plans", version=1
+        )
+    )
     for path, read in (
         (theirs, load_plans),
         (has_checksum, load_plans),
-        (has_checksum, lambda path: read_with_checksum(path, kind="cnpgen-model", version=1)),
+        (
+            has_checksum,
+            lambda path: read_with_checksum(path, kind="cnpgen-model", version=1),
+        ),
     ):
         os.truncate(path, 1 << 40)
-        with pytest.raises(DatasetError, match=r"has 1,099,511,627,776 bytes, expected at most"):
+        with pytest.raises(
+            DatasetError, match=r"has 1,099,511,627,776 bytes, expected at most"
+        ):
             read(path)
 
 
-def test_heaps_at_the_end_of_a_file_are_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_heaps_at_the_end_of_a_file_are_checked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = write_minimal(tmp_path / "theirs.h5", attributes={"note": "x" * 300})
     content = bytearray(path.read_bytes())
     content[content.index(b"GCOL\x01\0\0\0") + 9] ^= 0x20
@@ -222,12 +278,22 @@ def test_nothing_else_in_the_package_opens_hdf5() -> None:
     texts = {path: path.read_text(encoding="utf-8") for path in package.rglob("*.py")}
     for path, text in texts.items():
         for node in ast.walk(ast.parse(text)) if "h5" in text else ():
-            if isinstance(node, ast.Attribute) and node.attr == "File" and ast.unparse(node.value) == "h5py":
+            if (
+                isinstance(node, ast.Attribute)
+                and node.attr == "File"
+                and ast.unparse(node.value) == "h5py"
+            ):
                 opened.append((path.relative_to(package).as_posix(), node.lineno))
-            if isinstance(node, ast.Attribute) and ast.unparse(node) in {"h5f.open", "h5py.h5f.open"}:
+            if isinstance(node, ast.Attribute) and ast.unparse(node) in {
+                "h5f.open",
+                "h5py.h5f.open",
+            }:
                 opened.append((path.relative_to(package).as_posix(), node.lineno))
             if isinstance(node, ast.ImportFrom) and node.module == "h5py":
-                assert not {alias.name for alias in node.names} & {"File", "h5f"} or path.name == "hdf5.py"
+                assert (
+                    not {alias.name for alias in node.names} & {"File", "h5f"}
+                    or path.name == "hdf5.py"
+                )
     makers = {
         "store/files/checksum_file.py",
         "store/shard.py",

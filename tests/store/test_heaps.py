@@ -16,7 +16,9 @@ from tests.plans.test_plans import write_minimal
 @pytest.fixture
 def file(tmp_path: Path) -> tuple[Path, int]:
     """A file with text attributes, and the position of its global heap."""
-    path = write_minimal(tmp_path / "theirs.h5", attributes={"note": "x" * 300, "other": "y"})
+    path = write_minimal(
+        tmp_path / "theirs.h5", attributes={"note": "x" * 300, "other": "y"}
+    )
     return path, path.read_bytes().index(b"GCOL\x01\0\0\0")
 
 
@@ -32,11 +34,19 @@ def test_undamaged_files_are_read(file: tuple[Path, int]) -> None:
     assert len(load_plans(path)) == 3
 
 
-@pytest.mark.parametrize(("offset", "size"), [(9, b"\x20"), (24, b"\x25"), (24, b"\xff" * 8), (8, b"\xff" * 8)])
-def test_a_heap_with_inconsistent_sizes_is_damage(file: tuple[Path, int], offset: int, size: bytes) -> None:
+@pytest.mark.parametrize(
+    ("offset", "size"),
+    [(9, b"\x20"), (24, b"\x25"), (24, b"\xff" * 8), (8, b"\xff" * 8)],
+)
+def test_a_heap_with_inconsistent_sizes_is_damage(
+    file: tuple[Path, int], offset: int, size: bytes
+) -> None:
     path, begin = file
     changed(path, begin + offset, size)
-    with pytest.raises(DatasetError, match=rf"theirs\.h5 is damaged: its texts at byte {begin} cannot be read"):
+    with pytest.raises(
+        DatasetError,
+        match=rf"theirs\.h5 is damaged: its texts at byte {begin} cannot be read",
+    ):
         load_plans(path)
 
 
@@ -55,5 +65,8 @@ def test_numbers_that_look_like_a_heap_are_numbers(tmp_path: Path) -> None:
 
 def test_an_empty_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "empty.h5").touch()
-    with pytest.raises(DatasetError, match="it is empty"), open_hdf5(tmp_path / "empty.h5"):
+    with (
+        pytest.raises(DatasetError, match="it is empty"),
+        open_hdf5(tmp_path / "empty.h5"),
+    ):
         pass

@@ -39,7 +39,9 @@ def test_rows_and_state_of_a_complete_dataset(hits):
     assert found.complete
     assert found.state == "complete"
     assert found.rows == {"train": 182, "validation": 18}
-    assert found.bytes == sum(path.stat().st_size for path in hits.rglob("*") if path.is_file())
+    assert found.bytes == sum(
+        path.stat().st_size for path in hits.rglob("*") if path.is_file()
+    )
     assert found.seconds > 0
 
 
@@ -54,9 +56,13 @@ def test_other_files_in_the_folder_are_not_counted_in_the_size(hits, tmp_path):
 
 def test_statistics_are_those_of_the_rows(hits):
     found, dataset = inspect_dataset(hits), open_dataset(hits)
-    rows = np.concatenate([dataset.read(split)["goal_q"] for split in ("train", "validation")])
+    rows = np.concatenate(
+        [dataset.read(split)["goal_q"] for split in ("train", "validation")]
+    )
     np.testing.assert_array_equal(found.statistics["goal_q"].minimum, rows.min(axis=0))
-    np.testing.assert_allclose(found.statistics["goal_q"].mean, rows.mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(
+        found.statistics["goal_q"].mean, rows.mean(axis=0), rtol=1e-12
+    )
 
 
 def test_the_inspection_is_frozen(hits):
@@ -69,7 +75,9 @@ def test_the_json_contains_the_whole_inspection(hits):
     content = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert content["complete"] is True
     assert content["rows"]["train"] == {"planned": 182, "stored": 182}
-    assert [item["name"] for item in content["fields"]] == [field.name for field in found.spec.fields]
+    assert [item["name"] for item in content["fields"]] == [
+        field.name for field in found.spec.fields
+    ]
     assert len(content["fields"][0]["mean"]) == 6
     assert content["seed"] == str(found.spec.seed)
     assert content["environments"][0]["numpy"] == np.__version__
@@ -115,7 +123,9 @@ def test_a_complete_dataset_that_lost_a_shard_is_damaged(hits, tmp_path):
 def test_a_changed_document_is_reported_as_damage(hits, tmp_path, name, content):
     folder = Path(shutil.copytree(hits, tmp_path / "damaged"))
     written = (folder / name).read_bytes()
-    (folder / name).write_bytes(written.replace(b'"train"', b'"trian"') if content is None else content)
+    (folder / name).write_bytes(
+        written.replace(b'"train"', b'"trian"') if content is None else content
+    )
     found = inspect_dataset(folder)
     assert not found.complete
     assert found.state.startswith(f"damaged: {name}: ")
@@ -125,14 +135,22 @@ def test_a_changed_document_is_reported_as_damage(hits, tmp_path, name, content)
 
 
 @pytest.mark.parametrize(
-    ("content", "message"), [(None, "specification.json is missing"), (b"{", "specification.json is damaged: ")]
+    ("content", "message"),
+    [
+        (None, "specification.json is missing"),
+        (b"{", "specification.json is damaged: "),
+    ],
 )
-def test_a_dataset_without_a_valid_specification_is_refused_with_a_hint(hits, tmp_path, content, message):
+def test_a_dataset_without_a_valid_specification_is_refused_with_a_hint(
+    hits, tmp_path, content, message
+):
     folder = Path(shutil.copytree(hits, tmp_path / "damaged"))
     (folder / "specification.json").unlink()
     if content is not None:
         (folder / "specification.json").write_bytes(content)
-    with pytest.raises(DatasetError, match=rf"{message}.*; for a remedy run 'cnpgen validate'"):
+    with pytest.raises(
+        DatasetError, match=rf"{message}.*; for a remedy run 'cnpgen validate'"
+    ):
         inspect_dataset(folder)
 
 
@@ -175,9 +193,13 @@ def test_an_unfinished_dataset_is_plotted(unfinished, tmp_path):
 @pytest.mark.slow
 def test_a_density_map_of_a_single_point_is_plotted(hits, tmp_path, monkeypatch):
     found = inspect_dataset(hits)
-    density = DensityMap((0.6, 0.6), (0.0, 0.0), np.zeros((4, 4), np.int64), np.zeros((4, 4), np.int64))
+    density = DensityMap(
+        (0.6, 0.6), (0.0, 0.0), np.zeros((4, 4), np.int64), np.zeros((4, 4), np.int64)
+    )
     monkeypatch.setitem(
-        vars(found.summary), "sampling", SamplingStatistics(tried=0, accepted=0, densities={"start_xyz": density})
+        vars(found.summary),
+        "sampling",
+        SamplingStatistics(tried=0, accepted=0, densities={"start_xyz": density}),
     )
     plot_dataset(found, tmp_path / "point.png")
     assert (tmp_path / "point.png").exists()
@@ -190,12 +212,18 @@ def test_a_dataset_without_rows_cannot_be_plotted(unfinished, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("n_candidates", "cells"), [(200, 2), (2_000, 8), (100_000, 24)])
-def test_cells_of_a_density_map_have_enough_candidates(n_candidates, cells, hits, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("n_candidates", "cells"), [(200, 2), (2_000, 8), (100_000, 24)]
+)
+def test_cells_of_a_density_map_have_enough_candidates(
+    n_candidates, cells, hits, tmp_path, monkeypatch
+):
     from matplotlib.figure import Figure
 
     random = np.random.default_rng(0)
-    candidates = np.bincount(random.integers(0, 24 * 24, n_candidates), minlength=24 * 24).reshape(24, 24)
+    candidates = np.bincount(
+        random.integers(0, 24 * 24, n_candidates), minlength=24 * 24
+    ).reshape(24, 24)
     accepted = random.binomial(candidates, 0.5)
     accepted[:12] = 0  # none of the lower half of x
     density = DensityMap((0.0, 1.0), (0.0, 1.0), candidates, accepted)
@@ -203,10 +231,17 @@ def test_cells_of_a_density_map_have_enough_candidates(n_candidates, cells, hits
     figures: list[Figure] = []
     monkeypatch.setattr(Figure, "savefig", lambda self, path: figures.append(self))
     monkeypatch.setitem(
-        vars(found.summary), "sampling", SamplingStatistics(tried=0, accepted=0, densities={"start_xyz": density})
+        vars(found.summary),
+        "sampling",
+        SamplingStatistics(tried=0, accepted=0, densities={"start_xyz": density}),
     )
     plot_dataset(found, tmp_path / "map.png")
-    (picture,) = (image for part in figures[0].subfigs for axis in part.axes for image in axis.get_images())
+    (picture,) = (
+        image
+        for part in figures[0].subfigs
+        for axis in part.axes
+        for image in axis.get_images()
+    )
     share = picture.get_array().T
     assert share.shape == (cells, cells)
     assert n_candidates / cells**2 >= MIN_CANDIDATES_PER_CELL
@@ -215,7 +250,11 @@ def test_cells_of_a_density_map_have_enough_candidates(n_candidates, cells, hits
     (legend,) = (legend for part in figures[0].subfigs for legend in part.legends)
     figures[0].draw_without_rendering()
     box = legend.get_window_extent()
-    assert not any(box.overlaps(axis.get_window_extent()) for part in figures[0].subfigs for axis in part.axes)
+    assert not any(
+        box.overlaps(axis.get_window_extent())
+        for part in figures[0].subfigs
+        for axis in part.axes
+    )
 
 
 def test_missing_matplotlib_is_a_hint_and_not_a_traceback(hits, tmp_path, monkeypatch):

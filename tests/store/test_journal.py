@@ -27,7 +27,9 @@ def reopened(path: Path) -> list[bytes]:
     return journal.records
 
 
-def test_records_are_read_in_order_and_appended_after_the_last_one(tmp_path: Path) -> None:
+def test_records_are_read_in_order_and_appended_after_the_last_one(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "journal"
     assert written(path, RECORDS).startswith(MAGIC)
     written(path, [b"more"])
@@ -36,12 +38,19 @@ def test_records_are_read_in_order_and_appended_after_the_last_one(tmp_path: Pat
 
 def test_every_truncation_leaves_the_complete_records(tmp_path: Path) -> None:
     path = tmp_path / "journal"
-    ends = [len(written(path, [])), *(len(written(path, [record])) for record in RECORDS)]
+    ends = [
+        len(written(path, [])),
+        *(len(written(path, [record])) for record in RECORDS),
+    ]
     content = path.read_bytes()
     for length in range(len(content)):
         path.write_bytes(content[:length])
-        assert reopened(path) == RECORDS[: max(sum(end <= length for end in ends) - 1, 0)]
-        assert path.stat().st_size == max([ends[0], *(end for end in ends if end <= length)])
+        assert (
+            reopened(path) == RECORDS[: max(sum(end <= length for end in ends) - 1, 0)]
+        )
+        assert path.stat().st_size == max(
+            [ends[0], *(end for end in ends if end <= length)]
+        )
 
 
 def test_records_after_a_damaged_one_are_removed(tmp_path: Path) -> None:
@@ -65,7 +74,9 @@ def test_a_cleared_journal_has_no_records(tmp_path: Path) -> None:
 def test_files_of_other_formats_are_refused_and_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "journal"
     path.write_bytes(b"thesis")
-    with pytest.raises(DatasetError, match="journal does not start with b'cnpgen test-journal"):
+    with pytest.raises(
+        DatasetError, match="journal does not start with b'cnpgen test-journal"
+    ):
         open_journal_file(path, MAGIC)
     assert path.read_bytes() == b"thesis"
 
@@ -87,7 +98,9 @@ def test_a_full_disk_is_a_machine_error_and_the_record_is_not_kept(
 
     journal = open_journal_file(tmp_path / "journal", MAGIC)
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(MachineError, match=r"cannot write .*journal: No space left on device"):
+    with pytest.raises(
+        MachineError, match=r"cannot write .*journal: No space left on device"
+    ):
         journal.append(b"record")
     assert journal.records == []
     journal.close()

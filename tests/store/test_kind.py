@@ -38,7 +38,10 @@ def array() -> bytes:
 
 FILES = {
     "text": (b"start_q, goal_q\n0.1, 0.2\n", ": it seems to be a text file"),
-    "long text": (b"a" + "é".encode() * 1000, ": it seems to be a text file"),  # cut within a character
+    "long text": (
+        b"a" + "é".encode() * 1000,
+        ": it seems to be a text file",
+    ),  # cut within a character
     "npz": (archive(), ": it seems to be a zip archive, as .npz files are"),
     "npy": (array(), ": it seems to be an array of NumPy"),
     "gzip": (gzip.compress(b"1"), ": it seems to be a gzip archive"),
@@ -49,25 +52,37 @@ FILES = {
 
 
 @pytest.mark.parametrize("kind", FILES)
-def test_files_of_other_kinds_are_named_by_their_kind(tmp_path: Path, kind: str) -> None:
+def test_files_of_other_kinds_are_named_by_their_kind(
+    tmp_path: Path, kind: str
+) -> None:
     content, apparent = FILES[kind]
     path = tmp_path / "given.h5"
     path.write_bytes(content)
     assert apparent_kind(path) == apparent
     with pytest.raises(DatasetError) as caught, open_hdf5(path):
         pass
-    assert str(caught.value) == f"{path} is not an HDF5 file, or its beginning is damaged{apparent}"
+    assert (
+        str(caught.value)
+        == f"{path} is not an HDF5 file, or its beginning is damaged{apparent}"
+    )
 
 
-def test_every_reader_names_the_apparent_kind(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_reader_names_the_apparent_kind(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "notes.h5"
     path.write_text("mine")
-    with pytest.raises(DatasetError, match=r"notes\.h5 is not an HDF5 file.*: it seems to be a text file$"):
+    with pytest.raises(
+        DatasetError,
+        match=r"notes\.h5 is not an HDF5 file.*: it seems to be a text file$",
+    ):
         read_shard(path)
     for read in (load_plans, load_model, load_boundary_problems):
         with pytest.raises(UsageError, match=r"notes\.h5 is a text file, expected "):
             read(path)
-    with pytest.raises(DatasetError, match=r"is not a model of cnpgen, .*: it seems to be a text file$"):
+    with pytest.raises(
+        DatasetError, match=r"is not a model of cnpgen, .*: it seems to be a text file$"
+    ):
         read_with_checksum(path, kind="cnpgen-model", version=1)
     assert main(["evaluate", str(path)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
@@ -84,13 +99,19 @@ def test_a_cut_off_hdf5_file_is_reported_as_cut_off(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("read", [load_plans, load_model, load_boundary_problems])
-def test_pipes_are_refused_without_blocking(tmp_path: Path, read: Callable[[Path], object]) -> None:
+def test_pipes_are_refused_without_blocking(
+    tmp_path: Path, read: Callable[[Path], object]
+) -> None:
     os.mkfifo(tmp_path / "given.h5")
-    with pytest.raises(UsageError, match=r"given\.h5 is (a device or a pipe|not there), expected"):
+    with pytest.raises(
+        UsageError, match=r"given\.h5 is (a device or a pipe|not there), expected"
+    ):
         read(tmp_path / "given.h5")
 
 
-def test_a_pipe_in_place_of_the_specification_is_refused_without_blocking(tmp_path: Path) -> None:
+def test_a_pipe_in_place_of_the_specification_is_refused_without_blocking(
+    tmp_path: Path,
+) -> None:
     os.mkfifo(tmp_path / "specification.json")
     for read in (validate_dataset, load_dataset):
         with pytest.raises(UsageError, match="is not a dataset of cnpgen"):
@@ -98,7 +119,9 @@ def test_a_pipe_in_place_of_the_specification_is_refused_without_blocking(tmp_pa
 
 
 @pytest.mark.parametrize("block", [0, 512, 2048])
-def test_hdf5_files_with_a_user_block_are_recognized(tmp_path: Path, block: int) -> None:
+def test_hdf5_files_with_a_user_block_are_recognized(
+    tmp_path: Path, block: int
+) -> None:
     with h5py.File(tmp_path / "theirs.h5", "w", userblock_size=block) as file:
         file["path_control_points"] = file["rate_control_points"] = np.zeros(3)
     assert file_kind(tmp_path / "theirs.h5") == "a file of plans"

@@ -9,7 +9,12 @@ import pytest
 
 from cnpgen.store.files import leftovers
 from cnpgen.store.files.atomic import committing
-from cnpgen.store.files.leftovers import remove_all_temporary, remove_leftovers, remove_leftovers_of, temporary_name
+from cnpgen.store.files.leftovers import (
+    remove_all_temporary,
+    remove_leftovers,
+    remove_leftovers_of,
+    temporary_name,
+)
 from cnpgen.validate.validate_dataset import validate_dataset
 from tests.examples.tiny_datasets import digests, make_tiny
 
@@ -22,7 +27,9 @@ print(temporary_name(sys.argv[1]), end="")
 
 def of_a_dead_process(name: str) -> str:
     """Return the name of a temporary file of a process that has ended."""
-    return subprocess.run([sys.executable, "-c", DEAD, name], capture_output=True, text=True, check=True).stdout
+    return subprocess.run(
+        [sys.executable, "-c", DEAD, name], capture_output=True, text=True, check=True
+    ).stdout
 
 
 @pytest.fixture
@@ -31,7 +38,9 @@ def elsewhere(monkeypatch):
     monkeypatch.setattr(leftovers, "_machine", lambda: "0123456789ab")
 
 
-def test_only_temporary_files_of_dead_processes_of_this_machine_are_removed(tmp_path: Path) -> None:
+def test_only_temporary_files_of_dead_processes_of_this_machine_are_removed(
+    tmp_path: Path,
+) -> None:
     remove_leftovers(tmp_path / "nothing")
     dead, mine = of_a_dead_process("a.h5"), temporary_name("a.h5")
     kept = [mine, ".a.h5.1.2.tmp", ".x.tmp", "log.txt", dead.removesuffix(".tmp")]
@@ -41,10 +50,14 @@ def test_only_temporary_files_of_dead_processes_of_this_machine_are_removed(tmp_
     remove_leftovers(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(kept)
     remove_all_temporary(tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([".x.tmp", "log.txt", dead.removesuffix(".tmp")])
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
+        [".x.tmp", "log.txt", dead.removesuffix(".tmp")]
+    )
 
 
-def test_a_machine_with_a_wrong_clock_does_not_remove_files_of_another_machine(tmp_path, monkeypatch) -> None:
+def test_a_machine_with_a_wrong_clock_does_not_remove_files_of_another_machine(
+    tmp_path, monkeypatch
+) -> None:
     dead = of_a_dead_process("a.h5")
     with committing(tmp_path / "a.h5", tmp_path / "_work") as temporary:
         temporary.write_bytes(b"half")

@@ -28,11 +28,17 @@ def linked(folder: Path, name: str, outside: Path) -> None:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_validate_reports_a_link_out_of_the_dataset(damaged: Path, tmp_path: Path, name: str) -> None:
+def test_validate_reports_a_link_out_of_the_dataset(
+    damaged: Path, tmp_path: Path, name: str
+) -> None:
     linked(damaged, name, tmp_path / "outside")
     report = validate_dataset(damaged)
     assert not report.ok
-    found = [finding.file for finding in report.findings if "leads outside the folder" in finding.problem]
+    found = [
+        finding.file
+        for finding in report.findings
+        if "leads outside the folder" in finding.problem
+    ]
     assert name in found or (name == "train" and SHARD in found)
 
 
@@ -41,18 +47,24 @@ def test_merge_refuses_a_link_out_of_a_part(
     tiny: Callable[[str], Path], damaged: Path, tmp_path: Path, name: str
 ) -> None:
     linked(damaged, name, tmp_path / "outside")
-    with pytest.raises(DatasetError, match=r"leads outside the folder of the dataset; .*cp -rL"):
+    with pytest.raises(
+        DatasetError, match=r"leads outside the folder of the dataset; .*cp -rL"
+    ):
         merge_datasets([damaged], tmp_path / "out")
     assert not list((tmp_path / "out").glob("train/*.h5"))
 
 
 @pytest.mark.parametrize("name", ["train", WORK])
-def test_no_dataset_is_made_through_a_link(damaged: Path, tmp_path: Path, name: str) -> None:
+def test_no_dataset_is_made_through_a_link(
+    damaged: Path, tmp_path: Path, name: str
+) -> None:
     linked(damaged, name, tmp_path / "outside")
     before = sorted(path.name for path in tmp_path.rglob("*"))
     for make in (
         lambda: extend_dataset(damaged, 700, workers=1),
-        lambda: make_dataset(tiny_recipe("airhockey-hit"), damaged, shard_size=250, workers=1),
+        lambda: make_dataset(
+            tiny_recipe("airhockey-hit"), damaged, shard_size=250, workers=1
+        ),
     ):
         with pytest.raises(UsageError, match="leads outside the folder of the dataset"):
             make()

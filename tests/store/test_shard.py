@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 from cnpgen.errors import DatasetError, MachineError
 from cnpgen.store.dataset_spec import shard_attributes, shards
 from cnpgen.store.field import Field
-from cnpgen.store.shard import read_attributes, read_schema, read_shard, storage_dtype, write_shard
+from cnpgen.store.shard import (
+    read_attributes,
+    read_schema,
+    read_shard,
+    storage_dtype,
+    write_shard,
+)
 from tests.examples.store import FIELDS, SPEC, make_columns
 
 TASK = shards(SPEC)[0]
@@ -24,7 +30,9 @@ ATTRIBUTES = shard_attributes(SPEC, TASK)
 
 
 def write(path: Path, *, dtype: str = "float64", **changes: NDArray[Any]) -> int:
-    return write_shard(path, make_columns(TASK, dtype) | changes, FIELDS, ATTRIBUTES, dtype=dtype)
+    return write_shard(
+        path, make_columns(TASK, dtype) | changes, FIELDS, ATTRIBUTES, dtype=dtype
+    )
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
@@ -46,13 +54,21 @@ def test_shards_round_trip(tmp_path: Path, dtype: str) -> None:
 def test_attributes_describe_the_file_and_its_fields(tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
     write(path)
-    assert read_attributes(path) == {"format": "cnpgen-shard", "format_version": 2, **ATTRIBUTES}
+    assert read_attributes(path) == {
+        "format": "cnpgen-shard",
+        "format_version": 2,
+        **ATTRIBUTES,
+    }
     assert read_attributes(path, ["rows", "split"]) == {"rows": 32, "split": "train"}
     schema = read_schema(path)
     start, goal = schema["start_q"].attributes, schema["goal_p"].attributes
     assert schema["start_q"].shape == (32, 3)
     assert schema["start_q"].dtype == np.dtype("<f8")
-    assert (start["units"], start["role"], start["long_name"]) == ("rad", "input", "initial joint positions")
+    assert (start["units"], start["role"], start["long_name"]) == (
+        "rad",
+        "input",
+        "initial joint positions",
+    )
     assert json.loads(start["names"]) == ["j1", "j2", "j3"]
     assert start["valid_max"].tolist() == [2.0, 2.0, 2.0]
     assert goal["frame"] == "world"
@@ -87,11 +103,19 @@ def test_the_bytes_of_a_shard_do_not_depend_on_time_and_place(tmp_path: Path) ->
         ({"start_q": np.zeros((32, 3), ">f8")}, ">f8"),
         ({"sample_id": np.zeros(32)}, "int64"),
         ({"surprise": np.zeros(32)}, "surprise"),
-        ({"clearance": np.array([0.0] * 30 + [np.nan, 0.0])}, "not finite in 1 rows, first in row 30"),
-        ({"start_q": np.full((32, 3), np.inf)}, "not finite in 32 rows, first in row 0"),
+        (
+            {"clearance": np.array([0.0] * 30 + [np.nan, 0.0])},
+            "not finite in 1 rows, first in row 30",
+        ),
+        (
+            {"start_q": np.full((32, 3), np.inf)},
+            "not finite in 32 rows, first in row 0",
+        ),
     ],
 )
-def test_columns_that_do_not_fit_are_refused(tmp_path: Path, changes: dict[str, NDArray[Any]], message: str) -> None:
+def test_columns_that_do_not_fit_are_refused(
+    tmp_path: Path, changes: dict[str, NDArray[Any]], message: str
+) -> None:
     with pytest.raises(DatasetError, match=message):
         write(tmp_path / "a.h5", **changes)
     assert not list(tmp_path.iterdir())
@@ -107,19 +131,35 @@ def test_missing_columns_and_shards_without_rows_are_refused(tmp_path: Path) -> 
         write_shard(tmp_path / "a.h5", nothing, FIELDS, ATTRIBUTES | {"rows": 0})
 
 
-def test_a_full_disk_leaves_neither_shard_nor_temporary_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_leaves_neither_shard_nor_temporary_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(*_arguments: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(MachineError, match=r"shard-00000\.h5: No space left on device; free some space"):
-        write_shard(tmp_path / "shard-00000.h5", make_columns(TASK), FIELDS, ATTRIBUTES, work=tmp_path / "_work")
+    with pytest.raises(
+        MachineError, match=r"shard-00000\.h5: No space left on device; free some space"
+    ):
+        write_shard(
+            tmp_path / "shard-00000.h5",
+            make_columns(TASK),
+            FIELDS,
+            ATTRIBUTES,
+            work=tmp_path / "_work",
+        )
     assert [path.name for path in tmp_path.rglob("*")] == ["_work"]
 
 
-def test_a_shard_that_cannot_be_read_after_writing_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_shard_that_cannot_be_read_after_writing_is_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write_bytes = Path.write_bytes
-    monkeypatch.setattr(Path, "write_bytes", lambda self, content: write_bytes(self, bytes(content)[:-100]))
+    monkeypatch.setattr(
+        Path,
+        "write_bytes",
+        lambda self, content: write_bytes(self, bytes(content)[:-100]),
+    )
     with pytest.raises(DatasetError, match="damaged or cut off"):
         write(tmp_path / "a.h5")
     assert not list(tmp_path.iterdir())
@@ -127,7 +167,12 @@ def test_a_shard_that_cannot_be_read_after_writing_is_removed(tmp_path: Path, mo
 
 @pytest.mark.parametrize(
     "action",
-    [lambda old: b"", lambda old: old[:1000], lambda old: old[:-1], lambda old: bytes(100) + old[100:]],
+    [
+        lambda old: b"",
+        lambda old: old[:1000],
+        lambda old: old[:-1],
+        lambda old: bytes(100) + old[100:],
+    ],
     ids=["empty", "truncated", "one byte short", "overwritten"],
 )
 @pytest.mark.parametrize("read", [read_shard, read_attributes, read_schema])
@@ -138,7 +183,8 @@ def test_damaged_shards_are_refused_by_name(
     write(path)
     path.write_bytes(action(path.read_bytes()))
     with pytest.raises(
-        DatasetError, match=r"shard-00000\.h5 is (damaged or cut off|not an HDF5 file, or its beginning is damaged)"
+        DatasetError,
+        match=r"shard-00000\.h5 is (damaged or cut off|not an HDF5 file, or its beginning is damaged)",
     ):
         read(path)
 
@@ -152,7 +198,9 @@ def test_missing_shards_and_fields_are_refused_by_name(tmp_path: Path) -> None:
         read_shard(path, ["start_dq"])
 
 
-def test_an_unreadable_shard_is_a_machine_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unreadable_shard_is_a_machine_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(*_arguments: object, **_options: object) -> None:
         raise PermissionError(13, "Permission denied")
 

@@ -16,7 +16,12 @@ from cnpgen.store.check import check_dataset
 from cnpgen.store.dataset_spec import shards, write_dataset_spec
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.manifest import finalize
-from cnpgen.store.sampling_statistics import DensityMap, SamplingStatistics, merge_sampling, sampling_from_json
+from cnpgen.store.sampling_statistics import (
+    DensityMap,
+    SamplingStatistics,
+    merge_sampling,
+    sampling_from_json,
+)
 from cnpgen.store.shard_record import (
     commit_shard,
     is_committed,
@@ -26,7 +31,13 @@ from cnpgen.store.shard_record import (
     record_to_json,
     save_record,
 )
-from tests.examples.store import SPEC, make_columns, make_sampling, make_shard, make_shards
+from tests.examples.store import (
+    SPEC,
+    make_columns,
+    make_sampling,
+    make_shard,
+    make_shards,
+)
 
 TASK = shards(SPEC)[0]
 
@@ -48,15 +59,28 @@ def test_making_a_shard_twice_gives_the_same_bytes(tmp_path: Path) -> None:
     assert make_shard(tmp_path, SPEC, TASK).sha256 == first.sha256
 
 
-def test_a_committed_shard_and_its_sidecar_are_not_written_again(tmp_path: Path) -> None:
+def test_a_committed_shard_and_its_sidecar_are_not_written_again(
+    tmp_path: Path,
+) -> None:
     make_shard(tmp_path, SPEC, TASK)
     before = [(tmp_path / name).stat().st_ino for name in (TASK.file, TASK.sidecar)]
-    record = commit_shard(tmp_path, SPEC, TASK, columns=make_columns(TASK), sampling=make_sampling(TASK), seconds=9.0)
+    record = commit_shard(
+        tmp_path,
+        SPEC,
+        TASK,
+        columns=make_columns(TASK),
+        sampling=make_sampling(TASK),
+        seconds=9.0,
+    )
     assert record.seconds == 0.5
-    assert [(tmp_path / name).stat().st_ino for name in (TASK.file, TASK.sidecar)] == before
+    assert [
+        (tmp_path / name).stat().st_ino for name in (TASK.file, TASK.sidecar)
+    ] == before
 
 
-def test_the_shard_is_there_before_its_sidecar(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_shard_is_there_before_its_sidecar(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     sync, calls = os.fsync, iter(range(100))
 
     def full(descriptor: int) -> None:
@@ -74,12 +98,16 @@ def test_the_shard_is_there_before_its_sidecar(tmp_path: Path, monkeypatch: pyte
 def test_unusable_columns_leave_neither_shard_nor_sidecar(tmp_path: Path) -> None:
     columns = make_columns(TASK) | {"clearance": np.full(32, np.nan)}
     with pytest.raises(DatasetError, match="not finite"):
-        commit_shard(tmp_path, SPEC, TASK, columns=columns, sampling=make_sampling(TASK))
+        commit_shard(
+            tmp_path, SPEC, TASK, columns=columns, sampling=make_sampling(TASK)
+        )
     assert not list(tmp_path.rglob("*"))
 
 
 @pytest.mark.parametrize(
-    "flush", [0, 1, 2], ids=["the shard is flushed", "its folder is flushed", "its record is flushed"]
+    "flush",
+    [0, 1, 2],
+    ids=["the shard is flushed", "its folder is flushed", "its record is flushed"],
 )
 def test_a_run_that_finishes_the_dataset_does_not_stop_another_run_while_it_writes_a_shard(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flush: int
@@ -96,7 +124,9 @@ def test_a_run_that_finishes_the_dataset_does_not_stop_another_run_while_it_writ
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", meanwhile)
         columns, sampling = make_columns(TASK), make_sampling(TASK)
-        record = commit_shard(tmp_path, SPEC, TASK, columns=columns, sampling=sampling, seconds=9.0)  # the slower one
+        record = commit_shard(
+            tmp_path, SPEC, TASK, columns=columns, sampling=sampling, seconds=9.0
+        )  # the slower one
     assert record.sha256 == file_sha256(tmp_path / TASK.file)
     assert not list(tmp_path.rglob("*.tmp"))
     assert check_dataset(tmp_path) == []
@@ -104,7 +134,9 @@ def test_a_run_that_finishes_the_dataset_does_not_stop_another_run_while_it_writ
 
 @pytest.mark.parametrize("name", ["train/shard-00000.json", "train/shard-00000.h5"])
 @pytest.mark.parametrize(
-    "action", [lambda old: b"", lambda old: old[:-7], lambda old: old + b"\n"], ids=["empty", "truncated", "longer"]
+    "action",
+    [lambda old: b"", lambda old: old[:-7], lambda old: old + b"\n"],
+    ids=["empty", "truncated", "longer"],
 )
 def test_a_damaged_shard_or_sidecar_is_not_committed(
     tmp_path: Path, name: str, action: Callable[[bytes], bytes]
@@ -124,7 +156,9 @@ def test_a_changed_digit_in_a_sidecar_is_detected(tmp_path: Path) -> None:
         load_record(tmp_path, TASK)
 
 
-def test_missing_shards_and_shards_of_another_specification_are_not_committed(tmp_path: Path) -> None:
+def test_missing_shards_and_shards_of_another_specification_are_not_committed(
+    tmp_path: Path,
+) -> None:
     assert not is_committed(tmp_path, SPEC, TASK)
     make_shard(tmp_path, SPEC, TASK)
     with pytest.raises(DatasetError, match="another specification"):
@@ -136,7 +170,9 @@ def test_missing_shards_and_shards_of_another_specification_are_not_committed(tm
 def test_a_sidecar_of_another_shard_is_refused(tmp_path: Path) -> None:
     make_shards(tmp_path)
     (tmp_path / shards(SPEC)[1].sidecar).replace(tmp_path / TASK.sidecar)
-    with pytest.raises(DatasetError, match="record of another shard: train/shard-00001"):
+    with pytest.raises(
+        DatasetError, match="record of another shard: train/shard-00001"
+    ):
         load_record(tmp_path, TASK)
 
 
@@ -144,7 +180,10 @@ def test_a_sidecar_without_its_keys_is_refused(tmp_path: Path) -> None:
     record = make_shard(tmp_path, SPEC, TASK)
     for change in ({"statistics": {"a": {}}}, {"sampling": {}}, {"sampling": 3}):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("cnpgen.store.shard_record.record_to_json", lambda _, c=change: record_to_json(record) | c)
+            patch.setattr(
+                "cnpgen.store.shard_record.record_to_json",
+                lambda _, c=change: record_to_json(record) | c,
+            )
             save_record(tmp_path, TASK, record)
         with pytest.raises(DatasetError, match="damaged"):
             load_record(tmp_path, TASK)
@@ -163,25 +202,48 @@ def test_sampling_statistics_round_trip_through_json() -> None:
     assert sampling_from_json(json.loads(json.dumps(content))).to_json() == content
 
 
-def test_merged_sampling_statistics_have_summed_counts_the_worst_violation_and_the_order_of_the_pipeline() -> None:
-    grid = DensityMap((0.0, 1.0), (0.0, 1.0), np.ones((2, 2), np.int64), np.zeros((2, 2), np.int64))
+def test_merged_sampling_statistics_have_summed_counts_the_worst_violation_and_the_order_of_the_pipeline() -> (
+    None
+):
+    grid = DensityMap(
+        (0.0, 1.0), (0.0, 1.0), np.ones((2, 2), np.int64), np.zeros((2, 2), np.int64)
+    )
     parts = [
-        SamplingStatistics(tried=5, accepted=2, rejections={"a": 2, "c": 1}, verification={"g": 0.1}),
         SamplingStatistics(
-            tried=9, accepted=3, rejections={"a": 1, "b": 2, "c": 0, "d": 3}, verification={"g": 0.3, "h": 0.2}
+            tried=5, accepted=2, rejections={"a": 2, "c": 1}, verification={"g": 0.1}
         ),
-        SamplingStatistics(tried=2, accepted=1, rejections={"z": 1}, densities={"goal": grid}, verification={"g": 0.2}),
+        SamplingStatistics(
+            tried=9,
+            accepted=3,
+            rejections={"a": 1, "b": 2, "c": 0, "d": 3},
+            verification={"g": 0.3, "h": 0.2},
+        ),
+        SamplingStatistics(
+            tried=2,
+            accepted=1,
+            rejections={"z": 1},
+            densities={"goal": grid},
+            verification={"g": 0.2},
+        ),
         SamplingStatistics(tried=0, accepted=0, densities={"goal": grid}),
     ]
     merged = merge_sampling(parts)
     assert (merged.tried, merged.accepted) == (16, 6)
-    assert list(merged.rejections.items()) == [("z", 1), ("a", 3), ("b", 2), ("c", 1), ("d", 3)]
+    assert list(merged.rejections.items()) == [
+        ("z", 1),
+        ("a", 3),
+        ("b", 2),
+        ("c", 1),
+        ("d", 3),
+    ]
     assert merged.verification == {"g": 0.3, "h": 0.2}
     assert merged.densities["goal"].candidates.tolist() == [[2, 2], [2, 2]]
 
 
 def test_inconsistent_counts_and_non_finite_violations_are_refused() -> None:
-    with pytest.raises(DatasetError, match="5 candidates, but 2 accepted and 2 rejected"):
+    with pytest.raises(
+        DatasetError, match="5 candidates, but 2 accepted and 2 rejected"
+    ):
         SamplingStatistics(tried=5, accepted=2, rejections={"a": 2})
     with pytest.raises(DatasetError, match="'plane' must be a finite number, got nan"):
         SamplingStatistics(tried=1, accepted=1, verification={"plane": float("nan")})

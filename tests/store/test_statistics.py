@@ -21,13 +21,25 @@ from cnpgen.store.statistics import (
 )
 from tests.examples.store import FIELDS, SPEC, make_columns
 
-FIELD = Field("q", "rad", "positions", 4, valid_min=(-3.0, 0.0, 5.0, -1.0), valid_max=(3.0, 1.0, 5.0, 1.0))
+FIELD = Field(
+    "q",
+    "rad",
+    "positions",
+    4,
+    valid_min=(-3.0, 0.0, 5.0, -1.0),
+    valid_max=(3.0, 1.0, 5.0, 1.0),
+)
 
 
 def values(rows: int) -> NDArray[np.float64]:
     """Return columns that are uniform, far from zero, constant, and heavy-tailed outside their limits."""
     random = np.random.default_rng(rows)
-    columns = [random.uniform(-3, 3, rows), 10 + random.random(rows), np.full(rows, 0.1), random.standard_cauchy(rows)]
+    columns = [
+        random.uniform(-3, 3, rows),
+        10 + random.random(rows),
+        np.full(rows, 0.1),
+        random.standard_cauchy(rows),
+    ]
     return np.stack(columns, axis=1)
 
 
@@ -41,7 +53,9 @@ def assert_same(found: FieldStatistics, expected: FieldStatistics) -> None:
     np.testing.assert_allclose(found.m2, expected.m2, rtol=1e-12, atol=1e-20)
 
 
-@pytest.mark.parametrize("cuts", [[], [1], [999], [1, 2, 3], [500], [100, 101, 640], list(range(7, 1000, 7))])
+@pytest.mark.parametrize(
+    "cuts", [[], [1], [999], [1, 2, 3], [500], [100, 101, 640], list(range(7, 1000, 7))]
+)
 def test_merged_statistics_are_those_of_the_concatenation(cuts: Sequence[int]) -> None:
     table = values(1000)
     parts = [field_statistics(part, FIELD) for part in np.split(table, cuts)]
@@ -53,16 +67,22 @@ def test_the_deviation_of_a_narrow_column_far_from_zero_is_accurate() -> None:
     table = 1e6 + np.random.default_rng(0).random((1000, 1))
     field = Field("q", "1", "far", 1)
     parts = [{"q": field_statistics(part, field)} for part in np.split(table, 10)]
-    np.testing.assert_allclose(merge_statistics(parts)["q"].std, table.std(axis=0), rtol=1e-9)
+    np.testing.assert_allclose(
+        merge_statistics(parts)["q"].std, table.std(axis=0), rtol=1e-9
+    )
 
 
 def test_mean_deviation_and_histogram_equal_those_of_numpy() -> None:
     table = values(500)
     found = field_statistics(table, FIELD)
     np.testing.assert_allclose(found.mean, table.mean(axis=0), rtol=1e-13)
-    np.testing.assert_allclose(found.std[[0, 1, 3]], table.std(axis=0)[[0, 1, 3]], rtol=1e-13)
+    np.testing.assert_allclose(
+        found.std[[0, 1, 3]], table.std(axis=0)[[0, 1, 3]], rtol=1e-13
+    )
     assert found.histogram is not None
-    assert np.array_equal(found.histogram[0], np.histogram(table[:, 0], bins=64, range=(-3, 3))[0])
+    assert np.array_equal(
+        found.histogram[0], np.histogram(table[:, 0], bins=64, range=(-3, 3))[0]
+    )
 
 
 def test_histograms_count_values_outside_the_limits_in_the_first_or_last_bin() -> None:
@@ -85,7 +105,11 @@ def test_constant_columns_are_flagged_and_have_no_deviation() -> None:
 
 @pytest.mark.parametrize(
     "field",
-    [replace(FIELD, valid_min=None), replace(FIELD, valid_max=None), replace(FIELD, valid_max=(3.0, 1.0, np.inf, 1.0))],
+    [
+        replace(FIELD, valid_min=None),
+        replace(FIELD, valid_max=None),
+        replace(FIELD, valid_max=(3.0, 1.0, np.inf, 1.0)),
+    ],
 )
 def test_fields_without_finite_limits_have_no_histogram(field: Field) -> None:
     found = field_statistics(values(10), field)
@@ -104,12 +128,16 @@ def test_statistics_survive_json_exactly() -> None:
     assert list(found) == [field.name for field in FIELDS]
     for item in found.values():
         content: dict[str, Any] = item.to_json()
-        assert statistics_from_json(json.loads(json.dumps(content))).to_json() == content
+        assert (
+            statistics_from_json(json.loads(json.dumps(content))).to_json() == content
+        )
 
 
 def test_statistics_of_single_precision_are_computed_in_double() -> None:
     table = np.full((100_000, 4), 0.1, np.float32)
-    np.testing.assert_allclose(field_statistics(table, FIELD).mean, float(np.float32(0.1)), rtol=1e-14)
+    np.testing.assert_allclose(
+        field_statistics(table, FIELD).mean, float(np.float32(0.1)), rtol=1e-14
+    )
 
 
 def test_statistics_of_different_fields_are_not_merged() -> None:

@@ -7,7 +7,9 @@ from cnpgen.training import adam as module
 from cnpgen.training.adam import start_adam
 
 
-def published(first: np.ndarray, gradients: list[np.ndarray], rate: float) -> np.ndarray:
+def published(
+    first: np.ndarray, gradients: list[np.ndarray], rate: float
+) -> np.ndarray:
     """Return the result of Algorithm 1 of Kingma and Ba, with its default constants."""
     x, m, v = first.copy(), np.zeros_like(first), np.zeros_like(first)
     for t, g in enumerate(gradients, 1):
@@ -21,11 +23,16 @@ def published(first: np.ndarray, gradients: list[np.ndarray], rate: float) -> np
 def test_steps_equal_the_published_algorithm_for_any_block_size(monkeypatch, block):
     monkeypatch.setattr(module, "PARAMETERS_PER_BLOCK", block)
     random = np.random.default_rng(0)
-    first, gradients = random.normal(size=50), [random.normal(size=50) for _ in range(30)]
+    first, gradients = (
+        random.normal(size=50),
+        [random.normal(size=50) for _ in range(30)],
+    )
     adam = start_adam(first.copy())
     for gradient in gradients:
         adam.update(gradient, rate=0.01)
-    np.testing.assert_allclose(adam.parameters, published(first, gradients, 0.01), rtol=1e-9)
+    np.testing.assert_allclose(
+        adam.parameters, published(first, gradients, 0.01), rtol=1e-9
+    )
     assert adam.step == 30
 
 
@@ -42,5 +49,10 @@ def test_the_average_follows_the_parameters_quickly_at_first_and_slowly_later():
 def test_float32_stays_float32():
     adam = start_adam(np.ones(5, np.float32))
     adam.update(np.ones(5, np.float32), rate=1e-3)
-    assert {adam.parameters.dtype, adam.average.dtype, adam.first.dtype, adam.second.dtype} == {np.dtype(np.float32)}
+    assert {
+        adam.parameters.dtype,
+        adam.average.dtype,
+        adam.first.dtype,
+        adam.second.dtype,
+    } == {np.dtype(np.float32)}
     np.testing.assert_allclose(adam.parameters, 1 - 1e-3, rtol=1e-5)

@@ -46,7 +46,9 @@ def test_the_order_of_rows_is_a_function_of_seed_and_step():
     order, again = StepRows(64, 8, seed=1), StepRows(64, 8, seed=1)
     steps = [0, 31, 7, 8, 100, 0]  # in any sequence
     for step in steps:
-        np.testing.assert_array_equal(order.batch(step), StepRows(64, 8, seed=1).batch(step))
+        np.testing.assert_array_equal(
+            order.batch(step), StepRows(64, 8, seed=1).batch(step)
+        )
         np.testing.assert_array_equal(order.batch(step), again.batch(step))
     assert (StepRows(64, 8, seed=2).batch(0) != order.batch(0)).any()
 
@@ -67,7 +69,9 @@ def test_nothing_is_clipped_while_most_gradients_are_zero(limit):
 def test_samples_are_clipped_relative_to_the_running_median():
     clipping = Clipping()
     norms = np.array([1.0, 2.0, 3.0, 4.0, 1000.0])
-    np.testing.assert_allclose(clipping.sample_factors(norms, limit=10.0) * norms, [1, 2, 3, 4, 30])
+    np.testing.assert_allclose(
+        clipping.sample_factors(norms, limit=10.0) * norms, [1, 2, 3, 4, 30]
+    )
     clipping.sample_factors(norms * 10, limit=10.0)
     assert clipping.sample == pytest.approx(0.98 * 3 + 0.02 * 30)
 
@@ -83,8 +87,14 @@ def test_a_batch_is_clipped_relative_to_the_running_norm_which_limits_outliers()
 
 def test_without_a_limit_nothing_is_clipped():
     clipping = Clipping()
-    np.testing.assert_array_equal(clipping.sample_factors(np.array([1.0, 1e30]), limit=math.inf), 1.0)
-    assert clipping.batch_factor(1.0, limit=math.inf) == clipping.batch_factor(1e30, limit=math.inf) == 1.0
+    np.testing.assert_array_equal(
+        clipping.sample_factors(np.array([1.0, 1e30]), limit=math.inf), 1.0
+    )
+    assert (
+        clipping.batch_factor(1.0, limit=math.inf)
+        == clipping.batch_factor(1e30, limit=math.inf)
+        == 1.0
+    )
 
 
 SIZES = ("inputs", "hidden", "layers", "path_outputs", "rate_outputs")
@@ -109,10 +119,20 @@ def test_infinite_growth_of_weights_raises_an_error():
 
 @pytest.mark.parametrize(
     "wrong",
-    [{}, {"steps": 5, "epochs": 2}, {"cpu_seconds": 0.0}, {"cpu_seconds": math.inf}, {"steps": 2.5}, {"epochs": "3"}],
+    [
+        {},
+        {"steps": 5, "epochs": 2},
+        {"cpu_seconds": 0.0},
+        {"cpu_seconds": math.inf},
+        {"steps": 2.5},
+        {"epochs": "3"},
+    ],
 )
 def test_a_run_has_exactly_one_length(wrong):
-    with pytest.raises(UsageError, match=r"pass exactly one of|(steps|epochs|cpu_seconds) must be .*, got "):
+    with pytest.raises(
+        UsageError,
+        match=r"pass exactly one of|(steps|epochs|cpu_seconds) must be .*, got ",
+    ):
         Length(**wrong)
 
 
@@ -125,30 +145,50 @@ def test_a_temporary_load_does_not_shorten_a_run(monkeypatch):
         now[0] += 0.5 if 12 <= len(taken) < 30 else 0.001
 
     run = SimpleNamespace(
-        learner=SimpleNamespace(settings=TrainingSettings(), architecture=Architecture(**dict.fromkeys(SIZES, 2))),
+        learner=SimpleNamespace(
+            settings=TrainingSettings(),
+            architecture=Architecture(**dict.fromkeys(SIZES, 2)),
+        ),
         names=("time", "table"),
         metric=Metric([1.0], [0.0]),
         initial_parameters=None,
         step=step,
     )
     monkeypatch.setattr("cnpgen.training.prepare.time.process_time", lambda: now[0])
-    assert begin_run(run, Length(cpu_seconds=10.0)).steps == pytest.approx(10_000, abs=1)  # type: ignore[arg-type]
+    assert begin_run(run, Length(cpu_seconds=10.0)).steps == pytest.approx(
+        10_000, abs=1
+    )  # type: ignore[arg-type]
 
 
 def test_the_papers_metric_uses_the_papers_form_of_the_loss():
-    forms = {name: TrainingSettings(metric=metric).form for name, metric in METRICS.items()}
-    assert forms == {"fixed": "signed", "ramped": "signed", "learned": "paper", "bounded": "signed"}
+    forms = {
+        name: TrainingSettings(metric=metric).form for name, metric in METRICS.items()
+    }
+    assert forms == {
+        "fixed": "signed",
+        "ramped": "signed",
+        "learned": "paper",
+        "bounded": "signed",
+    }
 
 
 def test_every_constraint_of_a_kind_has_the_margin_of_its_kind():
     table, torque = (object.__new__(kind) for kind in (Table, JointTorque))
-    problem = SimpleNamespace(constraint=(table, table, torque, torque, torque, object.__new__(TipSpeed)))
+    problem = SimpleNamespace(
+        constraint=(table, table, torque, torque, torque, object.__new__(TipSpeed))
+    )
     margins = suggested_margins(problem)  # type: ignore[arg-type]
     assert margins.insets == {"table": 1e-3, "table-2": 1e-3}
-    assert margins.factors == {"joint-torque": 0.97, "joint-torque-2": 0.97, "joint-torque-3": 0.97}
+    assert margins.factors == {
+        "joint-torque": 0.97,
+        "joint-torque-2": 0.97,
+        "joint-torque-3": 0.97,
+    }
 
 
-def test_margins_tighten_the_limits_that_they_name_and_no_others(monkeypatch: pytest.MonkeyPatch):
+def test_margins_tighten_the_limits_that_they_name_and_no_others(
+    monkeypatch: pytest.MonkeyPatch,
+):
     from cnpgen.training import prepare
     from tests.examples.models import interpreted, loaded_problem_of
 
@@ -176,14 +216,22 @@ def test_margins_tighten_the_limits_that_they_name_and_no_others(monkeypatch: py
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"margins": {"joint-velocity": 1.5}}, r"margins must be in \(0, 1\] for 'joint-velocity', got 1.5"),
-        ({"expected_time": "soon"}, "expected_time must be one of distance, reach, travel, got 'soon'"),
+        (
+            {"margins": {"joint-velocity": 1.5}},
+            r"margins must be in \(0, 1\] for 'joint-velocity', got 1.5",
+        ),
+        (
+            {"expected_time": "soon"},
+            "expected_time must be one of distance, reach, travel, got 'soon'",
+        ),
         (
             {"iterations": 2, "features": "paper"},
             "expected features 'full' or 'no-scene', got 'paper'",
         ),
     ],
 )
-def test_invalid_margins_and_expected_times_raise_errors(changes: dict[str, Any], message: str):
+def test_invalid_margins_and_expected_times_raise_errors(
+    changes: dict[str, Any], message: str
+):
     with pytest.raises(UsageError, match=message):
         TrainingSettings(**changes)

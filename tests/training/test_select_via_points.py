@@ -14,14 +14,21 @@ from tests.conftest import needs_compiler
 
 
 def test_the_greedy_cover_selects_the_row_with_most_remaining_columns() -> None:
-    repaired = np.array([[1, 1, 0, 0, 0], [0, 1, 1, 1, 0], [1, 0, 0, 0, 0], [0, 0, 0, 0, 0]], bool)
-    assert via_points._greedy_cover(repaired, 3) == [1, 0]  # no row covers the remaining column
+    repaired = np.array(
+        [[1, 1, 0, 0, 0], [0, 1, 1, 1, 0], [1, 0, 0, 0, 0], [0, 0, 0, 0, 0]], bool
+    )
+    assert via_points._greedy_cover(repaired, 3) == [
+        1,
+        0,
+    ]  # no row covers the remaining column
     assert via_points._greedy_cover(repaired, 1) == [1]
 
 
 @pytest.mark.slow  # it compiles for a minute
 @needs_compiler
-def test_selected_via_points_repair_plans_of_other_problems(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_selected_via_points_repair_plans_of_other_problems(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(via_points, "CONFIGURATIONS_TRIED", 40)
     shipped = load_model("heavy-object-anywhere")
     model = replace(shipped, config=replace(shipped.config, via_points=()))
@@ -40,5 +47,8 @@ def test_selected_via_points_repair_plans_of_other_problems(monkeypatch: pytest.
     assert inference.via_points is not None
     plans = [Planner(each).plan_batch(others) for each in (model, chosen)]
     obstacle_poses = plans[0].scene.poses
-    violating = [(inference.via_points.violation(each.motion, obstacle_poses) > 1).sum() for each in plans]
+    violating = [
+        (inference.via_points.violation(each.motion, obstacle_poses) > 1).sum()
+        for each in plans
+    ]
     assert violating[1] < 0.85 * violating[0]

@@ -35,26 +35,43 @@ class CutOffError(Exception):
 
 
 @pytest.fixture
-def train(tiny: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Train:
+def train(
+    tiny: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Train:
     """Train a small model of the hits; with frequent checkpoints and few scored rows."""
     monkeypatch.setattr(checkpoints, "MIN_INTERVAL_S", 0.0)
     monkeypatch.setattr(checkpoints, "INTERVAL_PER_WRITING_TIME", 3.0)
     monkeypatch.setattr("cnpgen.training.train.MAX_SCORED_ROWS", SCORED)
 
     def run(out: str = "model.h5", **options: Any) -> Trained:
-        arguments = {"steps": STEPS, "settings": SMALL, "check_rows": 1, "workers": 1, **options}
+        arguments = {
+            "steps": STEPS,
+            "settings": SMALL,
+            "check_rows": 1,
+            "workers": 1,
+            **options,
+        }
         return train_model(tiny("airhockey-hit"), tmp_path / out, **arguments)
 
     return run
 
 
 @pytest.fixture(scope="module")
-def uncut(tiny: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory) -> Trained:
+def uncut(
+    tiny: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory
+) -> Trained:
     """The model of an uninterrupted run; not to be changed."""
     out = tmp_path_factory.mktemp("uncut") / "model.h5"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("cnpgen.training.train.MAX_SCORED_ROWS", SCORED)
-        return train_model(tiny("airhockey-hit"), out, steps=STEPS, settings=SMALL, check_rows=1, workers=1)
+        return train_model(
+            tiny("airhockey-hit"),
+            out,
+            steps=STEPS,
+            settings=SMALL,
+            check_rows=1,
+            workers=1,
+        )
 
 
 def cut_at(step: int) -> Callable[[Any], None]:
@@ -67,13 +84,20 @@ def cut_at(step: int) -> Callable[[Any], None]:
 
 def lines(model: Model) -> list[dict[str, Any]]:
     """Return the log without times."""
-    return [{k: v for k, v in json.loads(line).items() if k != "seconds"} for line in model.log.splitlines()]
+    return [
+        {k: v for k, v in json.loads(line).items() if k != "seconds"}
+        for line in model.log.splitlines()
+    ]
 
 
 @pytest.mark.parametrize(
-    "metric", some([SMALL.metric, replace(BOUNDED, every="batch")], 1, "slow"), ids=["ramped", "learned"]
+    "metric",
+    some([SMALL.metric, replace(BOUNDED, every="batch")], 1, "slow"),
+    ids=["ramped", "learned"],
 )
-def test_an_interrupted_and_resumed_run_gives_the_parameters_and_log_of_an_uninterrupted_one(train, uncut, metric):
+def test_an_interrupted_and_resumed_run_gives_the_parameters_and_log_of_an_uninterrupted_one(
+    train, uncut, metric
+):
     settings = replace(SMALL, metric=metric)
     whole = uncut if metric == SMALL.metric else train("whole.h5", settings=settings)
     for step in (3, 17, 29):
@@ -95,7 +119,9 @@ def test_the_model_depends_on_the_seed_only(train, uncut):
 
 def test_the_saved_model_is_the_best_validated_one(uncut):
     checks = [record for record in lines(uncut.model) if "validation" in record]
-    best = max(checks, key=lambda record: (record["validation"]["score"], record["step"]))
+    best = max(
+        checks, key=lambda record: (record["validation"]["score"], record["step"])
+    )
     assert len(checks) == 10
     assert uncut.model.training["best_step"] == best["step"]
 
@@ -105,16 +131,32 @@ def test_training_improves_plans(train):
     steps = [record for record in lines(trained.model) if "loss" in record]
     for name in ("joint-acceleration", "joint-torque"):
         assert steps[-1]["terms"][name] < 0.05 * steps[0]["terms"][name]
-    assert steps[-1]["terms"]["table"] < steps[-1]["budgets"]["table"]  # by the projection, from the beginning
+    assert (
+        steps[-1]["terms"]["table"] < steps[-1]["budgets"]["table"]
+    )  # by the projection, from the beginning
     assert trained.score["z_error_mm_s"] < 5
 
 
-def test_the_log_contains_loss_terms_budgets_weights_and_rate_and_is_in_the_model(uncut):
+def test_the_log_contains_loss_terms_budgets_weights_and_rate_and_is_in_the_model(
+    uncut,
+):
     on_disk = uncut.path.with_suffix(".jsonl").read_text()
     assert uncut.model.log == on_disk == load_model(uncut.path).log
     record = json.loads(on_disk.splitlines()[0])
-    assert {"step", "epoch", "learning_rate", "seconds", "loss", "terms", "weights", "budgets", "lost"} <= record.keys()
-    weighted = record["terms"]["time"] + sum(record["terms"][k] * w for k, w in record["weights"].items())
+    assert {
+        "step",
+        "epoch",
+        "learning_rate",
+        "seconds",
+        "loss",
+        "terms",
+        "weights",
+        "budgets",
+        "lost",
+    } <= record.keys()
+    weighted = record["terms"]["time"] + sum(
+        record["terms"][k] * w for k, w in record["weights"].items()
+    )
     assert record["loss"] == pytest.approx(weighted)
     assert not uncut.path.with_suffix(".checkpoint").exists()
 
@@ -122,7 +164,9 @@ def test_the_log_contains_loss_terms_budgets_weights_and_rate_and_is_in_the_mode
 @pytest.mark.slow
 def test_seconds_are_converted_to_steps_before_the_run(train):
     begun = []
-    trained = train(steps=None, cpu_seconds=0.2, begin=lambda state, run: begun.append(state.steps))
+    trained = train(
+        steps=None, cpu_seconds=0.2, begin=lambda state, run: begun.append(state.steps)
+    )
     assert begun == [trained.model.training["steps"]]
     assert 10 < begun[0] < 2000
 
@@ -130,12 +174,22 @@ def test_seconds_are_converted_to_steps_before_the_run(train):
 def test_the_summary_reports_times_by_purpose(train):
     begun = time.perf_counter()
     trained = train()
-    passed, times, training = time.perf_counter() - begun, trained.times, trained.model.training
+    passed, times, training = (
+        time.perf_counter() - begun,
+        trained.times,
+        trained.model.training,
+    )
     assert 0.5 * passed < times.passed <= passed
     assert times.preparing > 0
-    assert times.computing >= 0.9 * (training["cpu_seconds"] + training["validation_cpu_seconds"]) - 0.2
+    assert (
+        times.computing
+        >= 0.9 * (training["cpu_seconds"] + training["validation_cpu_seconds"]) - 0.2
+    )
     text = " ".join(summary(trained).split())
-    assert f"{training['cpu_seconds']:.0f} s of CPU time and {training['validation_cpu_seconds']:.0f} s for" in text
+    assert (
+        f"{training['cpu_seconds']:.0f} s of CPU time and {training['validation_cpu_seconds']:.0f} s for"
+        in text
+    )
     assert f"this run took {times};" in text
 
 
@@ -144,7 +198,9 @@ def test_epochs_are_converted_to_steps(train):
 
 
 @pytest.mark.slow
-def test_a_finished_model_is_returned_and_another_one_is_replaced_only_by_force(train, tmp_path):
+def test_a_finished_model_is_returned_and_another_one_is_replaced_only_by_force(
+    train, tmp_path
+):
     first = train()
     before = (tmp_path / "model.h5").read_bytes()
     again = train(begin=lambda *_: pytest.fail("trained again"))
@@ -156,7 +212,9 @@ def test_a_finished_model_is_returned_and_another_one_is_replaced_only_by_force(
         ({"steps": 31}, r"length\.steps \(30, now 31\)"),
         ({"check_rows": 3}, r"check_rows \(1, now 3\)"),
     ):
-        with pytest.raises(UsageError, match=rf"model\.h5 is another model.*{differs}.*force=True"):
+        with pytest.raises(
+            UsageError, match=rf"model\.h5 is another model.*{differs}.*force=True"
+        ):
             train(**options)
     assert (tmp_path / "model.h5").read_bytes() == before
     assert train(steps=31, force=True).model.training["steps"] == 31
@@ -164,25 +222,39 @@ def test_a_finished_model_is_returned_and_another_one_is_replaced_only_by_force(
 
 @pytest.mark.parametrize("out", ["missing/model.h5", "model", "model.jsonl", "."])
 def test_an_invalid_output_path_raises_an_error_before_any_work(train, out):
-    with pytest.raises(UsageError, match=r"must be a file that ends in \.h5, in a folder that exists"):
+    with pytest.raises(
+        UsageError, match=r"must be a file that ends in \.h5, in a folder that exists"
+    ):
         train(out)
 
 
 def test_a_file_that_is_no_model_is_not_overwritten(train, tmp_path):
     (tmp_path / "model.h5").write_bytes(b"mine")
-    with pytest.raises(UsageError, match=r"model\.h5 exists and is no model.*force=True"):
+    with pytest.raises(
+        UsageError, match=r"model\.h5 exists and is no model.*force=True"
+    ):
         train()
     assert (tmp_path / "model.h5").read_bytes() == b"mine"
 
 
-@pytest.mark.parametrize("wrong", [{"check_rows": 0}, {"steps": 2.5}, {"steps": None, "cpu_seconds": float("inf")}])
+@pytest.mark.parametrize(
+    "wrong",
+    [{"check_rows": 0}, {"steps": 2.5}, {"steps": None, "cpu_seconds": float("inf")}],
+)
 def test_invalid_arguments_of_train_model_raise_errors_with_their_name(train, wrong):
-    with pytest.raises(UsageError, match=r"^(check_rows|steps|cpu_seconds) must be .*, got (0|2\.5|inf)"):
+    with pytest.raises(
+        UsageError,
+        match=r"^(check_rows|steps|cpu_seconds) must be .*, got (0|2\.5|inf)",
+    ):
         train(**wrong)
 
 
 def test_numpy_integers_give_the_same_run(train):
-    train(steps=np.int64(STEPS), settings=replace(SMALL, seed=np.int64(2)), check_rows=np.int32(1))
+    train(
+        steps=np.int64(STEPS),
+        settings=replace(SMALL, seed=np.int64(2)),
+        check_rows=np.int32(1),
+    )
     assert not train(settings=replace(SMALL, seed=2)).made
 
 
@@ -225,7 +297,9 @@ def test_force_resumes_the_same_run_and_discards_the_checkpoint_of_another(train
 def test_the_checkpoint_of_another_run_raises_an_error(train):
     with pytest.raises(CutOffError):
         train(watch=cut_at(5))
-    with pytest.raises(UsageError, match=r"another run.*settings\.learning_rate \(0\.001, now 0\.002\)"):
+    with pytest.raises(
+        UsageError, match=r"another run.*settings\.learning_rate \(0\.001, now 0\.002\)"
+    ):
         train(settings=replace(SMALL, learning_rate=2e-3))
     train(settings=replace(SMALL, learning_rate=2e-3), force=True)
 
@@ -242,7 +316,9 @@ def test_a_damaged_checkpoint_raises_an_error(train, tmp_path):
 
 
 @pytest.mark.slow
-def test_failures_between_the_last_step_and_the_model_leave_one_last_line(train, uncut, tmp_path, monkeypatch):
+def test_failures_between_the_last_step_and_the_model_leave_one_last_line(
+    train, uncut, tmp_path, monkeypatch
+):
     """The last line of the log is written after the last checkpoint, and again if writing the model failed."""
     for _ in range(2):
         with monkeypatch.context() as patch:
@@ -251,7 +327,13 @@ def test_failures_between_the_last_step_and_the_model_leave_one_last_line(train,
                 train("cut.h5")
     cut = train("cut.h5")
     assert lines(cut.model) == lines(uncut.model)
-    assert sum("final" in line for line in (tmp_path / "cut.jsonl").read_text().splitlines()) == 1
+    assert (
+        sum(
+            "final" in line
+            for line in (tmp_path / "cut.jsonl").read_text().splitlines()
+        )
+        == 1
+    )
     np.testing.assert_array_equal(cut.model.parameters, uncut.model.parameters)
 
 
@@ -260,7 +342,9 @@ def dying(*_: Any) -> None:
 
 
 @pytest.mark.parametrize("left", some([None, b"", b'{"step": 1'], 1, "slow"))
-def test_a_resumed_run_has_its_whole_log_even_if_the_file_was_changed(train, uncut, tmp_path, left):
+def test_a_resumed_run_has_its_whole_log_even_if_the_file_was_changed(
+    train, uncut, tmp_path, left
+):
     with pytest.raises(CutOffError):
         train("cut.h5", watch=cut_at(20))
     log = tmp_path / "cut.jsonl"
@@ -282,7 +366,9 @@ def test_the_log_is_replaced_atomically(train, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", some(["model.jsonl", "model.png"], 1, "slow"))
-def test_other_files_beside_the_model_are_not_replaced_without_force(train, tmp_path, name):
+def test_other_files_beside_the_model_are_not_replaced_without_force(
+    train, tmp_path, name
+):
     path = tmp_path / name
     path.write_text('{"step": 1, "my": "data"}\n')
     with pytest.raises(UsageError, match=rf"{name} exists.*replace it with force=True"):
@@ -321,7 +407,9 @@ def test_resuming_with_a_changed_dataset_raises_an_error(train, tmp_path):
     other = tmp_path / "other"
     make_dataset(tiny_recipe("airhockey-hit", seed=7), other, workers=1)
     with pytest.raises(UsageError, match=r"another run.*dataset\.(seed|fingerprint)"):
-        train_model(other, tmp_path / "model.h5", steps=STEPS, settings=SMALL, check_rows=1)
+        train_model(
+            other, tmp_path / "model.h5", steps=STEPS, settings=SMALL, check_rows=1
+        )
 
 
 def test_a_dataset_without_a_second_split_raises_an_error(tmp_path):
@@ -342,7 +430,10 @@ checkpoint.MIN_INTERVAL_S, checkpoint.INTERVAL_PER_WRITING_TIME = 0.0, 3.0
 train_model({str(tiny("airhockey-hit"))!r}, {str(tmp_path / "cut.h5")!r}, steps=300, check_rows=1, workers=1,
     settings=TrainingSettings(hidden=16, layers=2, batch_size=32, nodes=16))
 """
-    path, environment = tmp_path / "cut.checkpoint", {**os.environ, "OMP_NUM_THREADS": "1"}
+    path, environment = (
+        tmp_path / "cut.checkpoint",
+        {**os.environ, "OMP_NUM_THREADS": "1"},
+    )
     with subprocess.Popen([sys.executable, "-c", code], env=environment) as process:
         while not path.exists() and process.poll() is None:
             time.sleep(0.02)
@@ -350,9 +441,13 @@ train_model({str(tiny("airhockey-hit"))!r}, {str(tmp_path / "cut.h5")!r}, steps=
         os.kill(process.pid, signal.SIGKILL)
     assert path.exists()
     begun = []
-    cut = train("cut.h5", steps=300, begin=lambda state, run: begun.append(state.adam.step))
+    cut = train(
+        "cut.h5", steps=300, begin=lambda state, run: begun.append(state.adam.step)
+    )
     assert 0 < begun[0] < 300
-    np.testing.assert_array_equal(cut.model.parameters, train("whole.h5", steps=300).model.parameters)
+    np.testing.assert_array_equal(
+        cut.model.parameters, train("whole.h5", steps=300).model.parameters
+    )
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no locks")
@@ -364,10 +459,20 @@ def test_a_second_training_of_the_same_file_is_refused(train, tiny, tmp_path, fo
     def train_again(record: Any) -> None:
         if not results:
             before = (tmp_path / "model.jsonl").read_bytes()
-            command = ["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "model.h5"), "--steps", "3"]
+            command = [
+                "train",
+                str(tiny("airhockey-hit")),
+                "-o",
+                str(tmp_path / "model.h5"),
+                "--steps",
+                "3",
+            ]
             options = ["--force"] if force else []
             done = subprocess.run(
-                [sys.executable, "-m", "cnpgen", *command, *options], capture_output=True, text=True, check=False
+                [sys.executable, "-m", "cnpgen", *command, *options],
+                capture_output=True,
+                text=True,
+                check=False,
             )
             assert (tmp_path / "model.jsonl").read_bytes() == before
             results.append((done.returncode, done.stderr))
@@ -375,5 +480,8 @@ def test_a_second_training_of_the_same_file_is_refused(train, tiny, tmp_path, fo
     train(watch=train_again)
     ((code, text),) = results
     assert code == 2, text
-    assert f"another process is writing {tmp_path / 'model.h5'}: wait for it, or choose another" in text
+    assert (
+        f"another process is writing {tmp_path / 'model.h5'}: wait for it, or choose another"
+        in text
+    )
     assert not (tmp_path / "model.lock").exists()

@@ -8,14 +8,26 @@ import pytest
 from scipy.interpolate import BSpline
 
 from cnpgen.errors import UsageError
-from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble, goal_points, start_points
+from cnpgen.trajectory.boundary import (
+    Boundary,
+    anchor_line,
+    assemble,
+    goal_points,
+    start_points,
+)
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 N, JOINTS = 5, 6
 
 
-def draw_boundary(random: np.random.Generator, *, goal_ddq: bool, n: int = JOINTS, rows: int = N) -> Boundary:
-    q, dq, ddq = random.uniform(-2, 2, (2, rows, n)), random.uniform(-2, 2, (2, rows, n)), None
+def draw_boundary(
+    random: np.random.Generator, *, goal_ddq: bool, n: int = JOINTS, rows: int = N
+) -> Boundary:
+    q, dq, ddq = (
+        random.uniform(-2, 2, (2, rows, n)),
+        random.uniform(-2, 2, (2, rows, n)),
+        None,
+    )
     ddq = random.uniform(-20, 20, (2, rows, n))
     return Boundary(q[0], dq[0], ddq[0], q[1], dq[1], ddq[1] if goal_ddq else None)
 
@@ -29,17 +41,26 @@ def draw_spec(random: np.random.Generator) -> TrajectorySpec:
     )
 
 
-def end_states(path: np.ndarray, rate: np.ndarray, degree: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def end_states(
+    path: np.ndarray, rate: np.ndarray, degree: int
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Yield q, dq, ddq in time at s = 0 and s = 1 of one motion."""
 
     def spline(control: np.ndarray) -> BSpline:
         inner = np.arange(1, len(control) - degree) / (len(control) - degree)
-        return BSpline(np.r_[[0.0] * (degree + 1), inner, [1.0] * (degree + 1)], control, degree)
+        return BSpline(
+            np.r_[[0.0] * (degree + 1), inner, [1.0] * (degree + 1)], control, degree
+        )
 
     p, r = spline(path), spline(rate)
     for s in (0.0, 1.0):
         dq = p.derivative(1)(s) * r(s)
-        yield p(s), dq, p.derivative(2)(s) * r(s) ** 2 + p.derivative(1)(s) * r.derivative(1)(s) * r(s)
+        yield (
+            p(s),
+            dq,
+            p.derivative(2)(s) * r(s) ** 2
+            + p.derivative(1)(s) * r.derivative(1)(s) * r(s),
+        )
 
 
 @pytest.mark.parametrize("goal_ddq", [False, True])
@@ -48,13 +69,23 @@ def test_boundary_conditions_hold_in_time(seed: int, goal_ddq: bool) -> None:
     random = np.random.default_rng(seed)
     spec, boundary = draw_spec(random), draw_boundary(random, goal_ddq=goal_ddq)
     rate = np.exp(random.normal(0, 0.5, (N, spec.rate_control_points)))
-    interior = random.normal(size=(N, spec.path_control_points - 3 - boundary.fixed_at_goal, JOINTS))
+    interior = random.normal(
+        size=(N, spec.path_control_points - 3 - boundary.fixed_at_goal, JOINTS)
+    )
     path = assemble(boundary, interior, rate, spec)
     assert path.shape == (N, spec.path_control_points, JOINTS)
     for i in range(N):
         start, goal = end_states(path[i], rate[i], spec.degree)
-        expected = [*zip(start, (boundary.start_q[i], boundary.start_dq[i], boundary.start_ddq[i]), strict=True)]
-        expected += [*zip(goal, (boundary.goal_q[i], boundary.goal_dq[i]), strict=False)]
+        expected = [
+            *zip(
+                start,
+                (boundary.start_q[i], boundary.start_dq[i], boundary.start_ddq[i]),
+                strict=True,
+            )
+        ]
+        expected += [
+            *zip(goal, (boundary.goal_q[i], boundary.goal_dq[i]), strict=False)
+        ]
         if boundary.goal_ddq is not None:
             expected.append((goal[2], boundary.goal_ddq[i]))
         for found, wanted in expected:
@@ -67,7 +98,9 @@ def test_the_printed_eta_makes_the_boundary_velocity_too_small_by_c_minus_d() ->
     boundary = draw_boundary(np.random.default_rng(0), goal_ddq=False, rows=1)
     rate = np.full((1, spec.rate_control_points), 2.0)
     path = assemble(boundary, anchor_line(boundary, rate, spec), rate, spec)
-    path[:, 1] = boundary.start_q + boundary.start_dq / (rate[:, :1] * degree * (points - degree) ** 2)  # Appendix A
+    path[:, 1] = boundary.start_q + boundary.start_dq / (
+        rate[:, :1] * degree * (points - degree) ** 2
+    )  # Appendix A
     (_, found, _), _ = end_states(path[0], rate[0], degree)
     assert np.allclose(found * (points - degree), boundary.start_dq[0], rtol=1e-10)
     assert not np.allclose(found, boundary.start_dq[0], rtol=0.5)
@@ -93,7 +126,9 @@ def test_the_anchor_line_agrees_with_the_paper() -> None:
     b = n_start + n_goal + 1
     assert line.shape == (N, points - b + 1, JOINTS)
     for i in range(points - b + 1):
-        expected = path[:, 2] * (1 - i / (points - b)) + path[:, points - n_goal] * i / (points - b)
+        expected = path[:, 2] * (1 - i / (points - b)) + path[
+            :, points - n_goal
+        ] * i / (points - b)
         assert np.abs(path[:, i + n_start] - expected).max() < 1e-14
     assert np.array_equal(path[:, 3], path[:, 2])
     assert np.array_equal(path[:, 12], path[:, 13])
@@ -129,7 +164,9 @@ def test_a_batch_agrees_with_its_single_motions() -> None:
 def test_a_path_of_a_single_span_raises_an_error() -> None:
     boundary = draw_boundary(np.random.default_rng(5), goal_ddq=False)
     spec = TrajectorySpec(degree=7, path_control_points=8, rate_control_points=8)
-    with pytest.raises(UsageError, match="at least 9 path control points of degree 7, got 8"):
+    with pytest.raises(
+        UsageError, match="at least 9 path control points of degree 7, got 8"
+    ):
         start_points(boundary, np.ones((N, 8)), spec)
     assert assemble(boundary, np.zeros((N, 4, JOINTS)), np.ones((N, 8)), TrajectorySpec(
         degree=7, path_control_points=9, rate_control_points=8)).shape == (N, 9, JOINTS)  # fmt: skip
@@ -139,7 +176,12 @@ def test_conditions_of_different_joints_raise_an_error_with_their_names() -> Non
     random = np.random.default_rng(2)
     spec = draw_spec(random)
     rate = np.ones((N, spec.rate_control_points))
-    mixed = replace(draw_boundary(random, goal_ddq=False), goal_q=np.zeros((N, JOINTS + 1)))
+    mixed = replace(
+        draw_boundary(random, goal_ddq=False), goal_q=np.zeros((N, JOINTS + 1))
+    )
     for points in (start_points, goal_points):
-        with pytest.raises(UsageError, match=f"same number of joints, got: start_q {JOINTS}, .*goal_q {JOINTS + 1}"):
+        with pytest.raises(
+            UsageError,
+            match=f"same number of joints, got: start_q {JOINTS}, .*goal_q {JOINTS + 1}",
+        ):
             points(mixed, rate, spec)

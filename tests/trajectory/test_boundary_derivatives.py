@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from cnpgen.trajectory.boundary import Boundary, boundary_derivatives, goal_points, start_points
+from cnpgen.trajectory.boundary import (
+    Boundary,
+    boundary_derivatives,
+    goal_points,
+    start_points,
+)
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 STEP = 1e-6
@@ -16,11 +21,19 @@ def random_boundary(rows: int, n: int, *, goal_ddq: bool, seed: int = 0) -> Boun
 
 
 @pytest.mark.parametrize("goal_ddq", [False, True])
-@pytest.mark.parametrize("spec", [TrajectorySpec(), TrajectorySpec(degree=5, path_control_points=9)])
+@pytest.mark.parametrize(
+    "spec", [TrajectorySpec(), TrajectorySpec(degree=5, path_control_points=9)]
+)
 def test_derivatives_agree_with_finite_differences_and_others_are_zero(spec, goal_ddq):
-    boundary, random = random_boundary(4, 3, goal_ddq=goal_ddq), np.random.default_rng(1)
+    boundary, random = (
+        random_boundary(4, 3, goal_ddq=goal_ddq),
+        np.random.default_rng(1),
+    )
     rate = random.uniform(0.5, 2.0, (4, spec.rate_control_points))
-    listed = {(each.point, each.variable): each.derivative for each in boundary_derivatives(boundary, rate, spec)}
+    listed = {
+        (each.point, each.variable): each.derivative
+        for each in boundary_derivatives(boundary, rate, spec)
+    }
 
     def points(rate: np.ndarray) -> np.ndarray:
         path = np.zeros((4, spec.path_control_points, 3))

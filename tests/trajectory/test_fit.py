@@ -28,7 +28,12 @@ def trapezoid(u: np.ndarray) -> np.ndarray:
     ramp = 0.3
     speed = 1 / (1 - ramp)
     rise, fall = speed * u**2 / (2 * ramp), 1 - speed * (1 - u) ** 2 / (2 * ramp)
-    return TRAVEL * np.where(u < ramp, rise, np.where(u < 1 - ramp, speed * (u - ramp / 2), fall))[:, None]
+    return (
+        TRAVEL
+        * np.where(
+            u < ramp, rise, np.where(u < 1 - ramp, speed * (u - ramp / 2), fall)
+        )[:, None]
+    )
 
 
 def at_rest(q: np.ndarray) -> Boundary:
@@ -39,11 +44,17 @@ def at_rest(q: np.ndarray) -> Boundary:
 def own_motion(seed: int) -> tuple[Motion, Boundary]:
     """Draw a motion of the family, 0.5 s long, with moving ends."""
     random = np.random.default_rng(seed)
-    boundary = Boundary(*random.uniform(-1, 1, (5, 1, 3)) * np.array([1, 1, 5, 1, 1])[:, None, None])
+    boundary = Boundary(
+        *random.uniform(-1, 1, (5, 1, 3)) * np.array([1, 1, 5, 1, 1])[:, None, None]
+    )
     rate = np.exp(np.cumsum(random.normal(0, 0.2, (1, 20)), axis=1))
     rate *= Motion(np.zeros((1, 15, 1)), rate).duration() / 0.5
     along = np.linspace(0, 1, 10)[:, None]
-    interior = boundary.start_q * (1 - along) + boundary.goal_q * along + random.normal(0, 0.1, (1, 10, 3))
+    interior = (
+        boundary.start_q * (1 - along)
+        + boundary.goal_q * along
+        + random.normal(0, 0.1, (1, 10, 3))
+    )
     return Motion(assemble(boundary, interior, rate, SPEC), rate), boundary
 
 
@@ -80,7 +91,9 @@ def test_a_trapezoidal_profile_is_fitted_within_a_milliradian() -> None:
 
 
 @pytest.mark.slow
-def test_rest_at_both_ends_keeps_the_rate_positive_and_uses_few_control_points() -> None:
+def test_rest_at_both_ends_keeps_the_rate_positive_and_uses_few_control_points() -> (
+    None
+):
     t = np.linspace(0, 1.4, 1401)
     q = minimum_jerk((t - 0.5) / 0.4)
     motion = fit_motion(t, q, spec=SPEC)
@@ -99,15 +112,26 @@ def test_a_prescribed_boundary_holds_exactly_for_other_samples(goal_ddq: bool) -
     t = np.linspace(0, 1, 101)
     q = np.column_stack([np.sin(5 * t), np.cos(3 * t), t])
     random = np.random.default_rng(0)
-    parts = [q[:1] + 0.01, *random.uniform(-1, 1, (2, 1, 3)), q[-1:] - 0.01, *random.uniform(-1, 1, (2, 1, 3))]
+    parts = [
+        q[:1] + 0.01,
+        *random.uniform(-1, 1, (2, 1, 3)),
+        q[-1:] - 0.01,
+        *random.uniform(-1, 1, (2, 1, 3)),
+    ]
     boundary = Boundary(*parts[:5], parts[5] if goal_ddq else None)
     motion = fit_motion(t, q, spec=SPEC, boundary=boundary)
     ends, rate = motion.at(np.array([0.0, 1.0])), motion.rate[0]
     assert np.abs(ends.q[0] - [boundary.start_q[0], boundary.goal_q[0]]).max() < 1e-12
-    assert np.abs(ends.dq[0] - [boundary.start_dq[0], boundary.goal_dq[0]]).max() < 1e-10
-    assert np.abs(ends.ddq[0, 0] - boundary.start_ddq[0]).max() < 1e-11 * max(rate[0] ** 2, 10)
+    assert (
+        np.abs(ends.dq[0] - [boundary.start_dq[0], boundary.goal_dq[0]]).max() < 1e-10
+    )
+    assert np.abs(ends.ddq[0, 0] - boundary.start_ddq[0]).max() < 1e-11 * max(
+        rate[0] ** 2, 10
+    )
     if goal_ddq:
-        assert np.abs(ends.ddq[0, 1] - parts[5][0]).max() < 1e-11 * max(rate[-1] ** 2, 10)
+        assert np.abs(ends.ddq[0, 1] - parts[5][0]).max() < 1e-11 * max(
+            rate[-1] ** 2, 10
+        )
 
 
 def test_uneven_and_missing_samples_are_supported() -> None:
@@ -119,7 +143,12 @@ def test_uneven_and_missing_samples_are_supported() -> None:
         motion = fit_motion(t, q, spec=SPEC)
         dense = np.linspace(0, 1, 500)
         assert largest_error(motion, t, q) < 1e-5
-        assert largest_error(motion, dense, np.column_stack([np.sin(4 * dense), np.cos(3 * dense)])) < 2e-3
+        assert (
+            largest_error(
+                motion, dense, np.column_stack([np.sin(4 * dense), np.cos(3 * dense)])
+            )
+            < 2e-3
+        )
 
 
 @pytest.mark.slow
@@ -127,7 +156,10 @@ def test_few_samples_with_velocities_are_connected_by_cubics() -> None:
     from scipy.interpolate import CubicHermiteSpline
 
     t = np.linspace(0, 1, 9)
-    q, dq = np.column_stack([np.sin(4 * t), t**2]), np.column_stack([4 * np.cos(4 * t), 2 * t])
+    q, dq = (
+        np.column_stack([np.sin(4 * t), t**2]),
+        np.column_stack([4 * np.cos(4 * t), 2 * t]),
+    )
     motion = fit_motion(t, q, dq, spec=SPEC)
     dense = np.linspace(0, 1, 500)
     assert largest_error(motion, dense, CubicHermiteSpline(t, q, dq)(dense)) < 3e-4
@@ -143,7 +175,9 @@ def test_few_samples_with_velocities_are_connected_by_cubics() -> None:
         ([2.0, 2.1, 2.3, 2.4, 3.0], [[0.0], [1.0], [0.5], [0.2], [0.9]]),
     ],
 )
-def test_a_handful_of_samples_is_interpolated_smoothly(t: list[float], q: list[list[float]]) -> None:
+def test_a_handful_of_samples_is_interpolated_smoothly(
+    t: list[float], q: list[list[float]]
+) -> None:
     motion = fit_motion(t, q, spec=SPEC)
     assert largest_error(motion, t, q) < 1e-9
     travel = np.abs(np.diff(q, axis=0)).sum()
@@ -173,7 +207,9 @@ def test_a_robot_at_rest_stays_at_rest() -> None:
         TrajectorySpec(degree=7, path_control_points=60, rate_control_points=50),
     ],
 )
-def test_other_degrees_and_numbers_of_control_points_are_supported(spec: TrajectorySpec) -> None:
+def test_other_degrees_and_numbers_of_control_points_are_supported(
+    spec: TrajectorySpec,
+) -> None:
     t = np.linspace(0, 1, 101)
     q = np.column_stack([np.sin(3 * t)])
     motion = fit_motion(t, q, spec=spec)
@@ -223,7 +259,12 @@ T3, Q3 = [0.0, 0.5, 1.0], np.zeros((3, 2))
 @pytest.mark.parametrize(
     ("t", "q", "dq", "message"),
     [
-        ([0.0, 0.5, 0.5], Q3, None, r"t must increase, got 0.5 s in sample 1, then 0.5 s"),
+        (
+            [0.0, 0.5, 0.5],
+            Q3,
+            None,
+            r"t must increase, got 0.5 s in sample 1, then 0.5 s",
+        ),
         ([0.0, 0.7, 0.5], Q3, None, "t must increase, got 0.7 s in sample 1"),
         ([0.0, np.nan, 1.0], Q3, None, "t must be finite, got nan in sample 1"),
         (T3, [[0, 0], [0, 0], [np.inf, 0]], None, "q must be finite, .* in sample 2"),
@@ -232,13 +273,20 @@ T3, Q3 = [0.0, 0.5, 1.0], np.zeros((3, 2))
         (T3, np.zeros(3), None, r"q shape \(K, n\)"),
         ([T3], Q3, None, r"t must have shape \(K,\)"),
         (T3, np.zeros((3, 0)), None, "must have shape"),
-        (T3, Q3, np.zeros((3, 3)), r"dq must have the shape of q, \(3, 2\), got \(3, 3\)"),
+        (
+            T3,
+            Q3,
+            np.zeros((3, 3)),
+            r"dq must have the shape of q, \(3, 2\), got \(3, 3\)",
+        ),
         ([0.0], Q3[:1], None, "at least 2 samples, got 1"),
         ([], np.zeros((0, 2)), None, "at least 2 samples, got 0"),
         (T3, [["a", "b"]] * 3, None, "q must be an array of numbers"),
     ],
 )
-def test_invalid_samples_raise_an_error(t: object, q: object, dq: object, message: str) -> None:
+def test_invalid_samples_raise_an_error(
+    t: object, q: object, dq: object, message: str
+) -> None:
     with pytest.raises(UsageError, match=message):
         fit_motion(t, q, dq, spec=SPEC)
     with pytest.raises(UsageError, match=message):
@@ -248,11 +296,26 @@ def test_invalid_samples_raise_an_error(t: object, q: object, dq: object, messag
 def test_a_boundary_of_a_wrong_shape_raises_an_error() -> None:
     t = np.linspace(0, 1, 20)
     q = np.zeros((20, 3))
-    with pytest.raises(UsageError, match=r"start_q must have shape \(1, 3\), got \(1, 2\)"):
+    with pytest.raises(
+        UsageError, match=r"start_q must have shape \(1, 3\), got \(1, 2\)"
+    ):
         fit_motion(t, q, spec=SPEC, boundary=at_rest(np.zeros((2, 2))))
     with pytest.raises(UsageError, match="start_q must be finite"):
         fit_motion(t, q, spec=SPEC, boundary=at_rest(np.full((2, 3), np.nan)))
     with pytest.raises(UsageError, match="boundary must be an array of numbers"):
-        fit_motion(t, q, spec=SPEC, boundary=replace(at_rest(np.zeros((2, 3))), goal_dq=[["a", 0, 0]]))
-    lists = Boundary(*(values.tolist() for values in vars(at_rest(np.zeros((2, 3)))).values() if values is not None))
-    assert np.array_equal(fit_motion(t, q, spec=SPEC, boundary=lists).path, np.zeros((1, 15, 3)))
+        fit_motion(
+            t,
+            q,
+            spec=SPEC,
+            boundary=replace(at_rest(np.zeros((2, 3))), goal_dq=[["a", 0, 0]]),
+        )
+    lists = Boundary(
+        *(
+            values.tolist()
+            for values in vars(at_rest(np.zeros((2, 3)))).values()
+            if values is not None
+        )
+    )
+    assert np.array_equal(
+        fit_motion(t, q, spec=SPEC, boundary=lists).path, np.zeros((1, 15, 3))
+    )

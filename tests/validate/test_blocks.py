@@ -32,7 +32,10 @@ def problem_of(folder: Path) -> str:
 
 
 def test_the_field_and_the_size_of_a_difference_are_named(different):
-    assert problem_of(different) == "block 0 made again from the seed: start_q differs by 0.001"
+    assert (
+        problem_of(different)
+        == "block 0 made again from the seed: start_q differs by 0.001"
+    )
 
 
 def test_another_revision_of_the_generator_is_an_explanation(different, monkeypatch):
@@ -42,10 +45,16 @@ def test_another_revision_of_the_generator_is_an_explanation(different, monkeypa
 
 
 def test_other_libraries_are_an_explanation(different, monkeypatch):
-    monkeypatch.setattr(validate_dataset, "versions", lambda: {**load_dataset_spec(different).versions, "numpy": "0.1"})
+    monkeypatch.setattr(
+        validate_dataset,
+        "versions",
+        lambda: {**load_dataset_spec(different).versions, "numpy": "0.1"},
+    )
     assert problem_of(different).endswith(f"numpy {np.__version__} -> 0.1)")
 
 
 def test_the_same_code_gives_identical_blocks(damaged):
     spec = load_dataset_spec(damaged)
-    assert regenerate_blocks(damaged, spec, shards(spec), 2) == Regeneration(made=2, blocks=4, identical=2)
+    assert regenerate_blocks(damaged, spec, shards(spec), 2) == Regeneration(
+        made=2, blocks=4, identical=2
+    )

@@ -29,7 +29,11 @@ Columns = dict[str, np.ndarray]
 
 
 def jacobian(q: np.ndarray) -> np.ndarray:
-    return np.array(pin.computeFrameJacobian(ROBOT.model, ROBOT.model.createData(), q, ROBOT.tip_frame, FRAME)[:3])
+    return np.array(
+        pin.computeFrameJacobian(
+            ROBOT.model, ROBOT.model.createData(), q, ROBOT.tip_frame, FRAME
+        )[:3]
+    )
 
 
 def tip(q: np.ndarray) -> np.ndarray:
@@ -64,9 +68,13 @@ def turn_the_arm(columns: Columns) -> None:
     """Goals are taken with another elbow; speeds and their highest values are those of that elbow."""
     for row in range(len(columns["goal_q"])):
         q = columns["goal_q"][row]
-        q = put_at(q + 1e-3 * np.linalg.svd(jacobian(q))[2][-1], columns["goal_xyz"][row])
+        q = put_at(
+            q + 1e-3 * np.linalg.svd(jacobian(q))[2][-1], columns["goal_xyz"][row]
+        )
         J, angle = jacobian(q), columns["hit_angle"][row]
-        highest = highest_speed(J[None], columns["hit_angle"][[row]], ROBOT.velocity_limit)[0]
+        highest = highest_speed(
+            J[None], columns["hit_angle"][[row]], ROBOT.velocity_limit
+        )[0]
         direction = np.array([np.cos(angle), np.sin(angle), 0.0])
         velocity = np.linalg.pinv(J) @ direction
         speed = 0.5 * (ROBOT.velocity_limit / np.abs(velocity)).min()
@@ -86,14 +94,18 @@ def repeat_a_row(columns: Columns) -> None:
 
 
 def sink_into_the_table(columns: Columns) -> None:
-    columns["start_q"][0] = put_at(columns["start_q"][0], columns["start_xyz"][0] - [0, 0, 0.02])
+    columns["start_q"][0] = put_at(
+        columns["start_q"][0], columns["start_xyz"][0] - [0, 0, 0.02]
+    )
     columns["start_xyz"][0] -= [0, 0, 0.02]
 
 
 def start_elsewhere(columns: Columns) -> None:
     """Starts are drawn by the forger, at the same places and with joints that are none of the pipeline's."""
     for row, q in enumerate(columns["start_q"]):
-        columns["start_q"][row] = put_at(q + 0.05 * np.linalg.svd(jacobian(q))[2][-1], columns["start_xyz"][row])
+        columns["start_q"][row] = put_at(
+            q + 0.05 * np.linalg.svd(jacobian(q))[2][-1], columns["start_xyz"][row]
+        )
 
 
 def give_starts_other_goals(columns: Columns) -> None:
@@ -133,7 +145,9 @@ FORGERIES = (
 @pytest.fixture(scope="module")
 def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
     recipe = replace(load_dataset_recipe("airhockey-hit"), splits={"train": 100})
-    return make_dataset(recipe, tmp_path_factory.mktemp("honest") / "set", workers=1).folder
+    return make_dataset(
+        recipe, tmp_path_factory.mktemp("honest") / "set", workers=1
+    ).folder
 
 
 def forged(honest: Path, folder: Path, forge: Callable[[Columns], None]) -> Path:
@@ -145,8 +159,14 @@ def forged(honest: Path, folder: Path, forge: Callable[[Columns], None]) -> Path
         columns = {name: values.copy() for name, values in columns.items()}
         forge(columns)
         (folder / task.sidecar).unlink()
-        about = {"started": record.started, "seconds": record.seconds, "versions": record.versions}
-        commit_shard(folder, spec, task, columns=columns, sampling=record.sampling, **about)
+        about = {
+            "started": record.started,
+            "seconds": record.seconds,
+            "versions": record.versions,
+        }
+        commit_shard(
+            folder, spec, task, columns=columns, sampling=record.sampling, **about
+        )
     finalize(folder, spec)
     return folder
 
@@ -155,8 +175,12 @@ def test_the_original_dataset_is_valid(honest: Path) -> None:
     assert validate_dataset(honest, deep=True, regenerate=1, workers=1).ok
 
 
-@pytest.mark.parametrize("forgery", some(FORGERIES, 2, "slow"), ids=lambda forgery: forgery.forge.__name__)
-def test_forgeries_are_detected_by_the_expected_checks(honest: Path, tmp_path: Path, forgery: Forgery) -> None:
+@pytest.mark.parametrize(
+    "forgery", some(FORGERIES, 2, "slow"), ids=lambda forgery: forgery.forge.__name__
+)
+def test_forgeries_are_detected_by_the_expected_checks(
+    honest: Path, tmp_path: Path, forgery: Forgery
+) -> None:
     folder = forged(honest, tmp_path / "set", forgery.forge)
     assert validate_dataset(folder).ok
     assert validate_dataset(folder, deep=True, workers=1).ok is not forgery.deep
@@ -167,5 +191,6 @@ def test_the_documentation_has_these_counts() -> None:
     text = re.sub(r"\s+", " ", PAGE.read_text(encoding="utf-8"))
     detected = sum(forgery.deep for forgery in FORGERIES)
     assert (
-        f"`validate` detects 0 of {len(FORGERIES)} forged datasets, `--deep` {detected} and `--regenerate` all" in text
+        f"`validate` detects 0 of {len(FORGERIES)} forged datasets, `--deep` {detected} and `--regenerate` all"
+        in text
     )

@@ -39,10 +39,12 @@ def test_this_machine_has_no_problems():
 
 
 def test_every_dependency_is_checked():
-    declared = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert sorted(machine.PROJECTS.get(name, name) for name in machine.REQUIRED_MODULES) == sorted(
-        re.split("[<>=]", item)[0] for item in declared["dependencies"]
-    )
+    declared = tomllib.loads(
+        (Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8")
+    )["project"]
+    assert sorted(
+        machine.PROJECTS.get(name, name) for name in machine.REQUIRED_MODULES
+    ) == sorted(re.split("[<>=]", item)[0] for item in declared["dependencies"])
 
 
 def test_the_report_is_frozen_and_converts_to_json():
@@ -76,7 +78,11 @@ def _import_failing(monkeypatch, broken, error):
 
 
 def test_a_missing_library_is_named_with_its_project(monkeypatch):
-    _import_failing(monkeypatch, "pinocchio", ModuleNotFoundError("No module named 'pinocchio'", name="pinocchio"))
+    _import_failing(
+        monkeypatch,
+        "pinocchio",
+        ModuleNotFoundError("No module named 'pinocchio'", name="pinocchio"),
+    )
     report = check_machine()
     assert report.libraries["pin"] == "missing"
     assert report.problems[0].startswith("pin is not installed: run '")
@@ -105,11 +111,18 @@ def test_a_deleted_working_directory_is_a_note(monkeypatch, tmp_path):
     report = check_machine()
     assert report.ok
     assert report.free_bytes == 0
-    assert any(note.startswith("the working directory cannot be read (No such file") for note in report.notes)
+    assert any(
+        note.startswith("the working directory cannot be read (No such file")
+        for note in report.notes
+    )
 
 
 def test_a_missing_plotting_library_is_only_a_note(monkeypatch):
-    _import_failing(monkeypatch, "matplotlib", ModuleNotFoundError("No module named 'matplotlib'", name="matplotlib"))
+    _import_failing(
+        monkeypatch,
+        "matplotlib",
+        ModuleNotFoundError("No module named 'matplotlib'", name="matplotlib"),
+    )
     report = check_machine()
     assert report.ok
     assert any("--plot" in note for note in report.notes)
@@ -126,7 +139,9 @@ def test_without_a_compiler_the_numpy_backend_runs(monkeypatch, fresh_compiler):
 
 
 @needs_compiler
-def test_the_compiler_of_a_package_is_used_if_there_is_no_other(monkeypatch, tmp_path, fresh_compiler):
+def test_the_compiler_of_a_package_is_used_if_there_is_no_other(
+    monkeypatch, tmp_path, fresh_compiler
+):
     """Replace the compiler of ziglang by a module that runs the one of this machine."""
     (tmp_path / "ziglang").mkdir()
     call = f"subprocess.call([{find_compiler()!r}, *sys.argv[2:]], env={{'PATH': {os.environ['PATH']!r}}})"
@@ -148,10 +163,16 @@ def test_the_compiler_of_a_package_is_used_if_there_is_no_other(monkeypatch, tmp
 
 
 @pytest.mark.extended
-def test_the_compiler_of_ziglang_compiles_without_a_home_folder(monkeypatch, tmp_path, fresh_compiler):
+def test_the_compiler_of_ziglang_compiles_without_a_home_folder(
+    monkeypatch, tmp_path, fresh_compiler
+):
     pytest.importorskip("ziglang")
     monkeypatch.delenv("CC", raising=False)
-    for variable, value in (("PATH", ""), ("HOME", "/dev/null/none"), ("CNPGEN_CACHE", str(tmp_path / "cache"))):
+    for variable, value in (
+        ("PATH", ""),
+        ("HOME", "/dev/null/none"),
+        ("CNPGEN_CACHE", str(tmp_path / "cache")),
+    ):
         monkeypatch.setenv(variable, value)
     report = check_machine()
     assert "ziglang" in report.compiler
@@ -159,7 +180,9 @@ def test_the_compiler_of_ziglang_compiles_without_a_home_folder(monkeypatch, tmp
     assert list((tmp_path / "cache" / "ziglang").iterdir())
 
 
-def test_an_unwritable_cache_is_a_note_and_nothing_is_left_behind(monkeypatch, tmp_path):
+def test_an_unwritable_cache_is_a_note_and_nothing_is_left_behind(
+    monkeypatch, tmp_path
+):
     (tmp_path / "file").write_text("")
     (tmp_path / "tmp").mkdir()
     monkeypatch.setenv("CNPGEN_CACHE", str(tmp_path / "file" / "cache"))
@@ -179,21 +202,30 @@ def test_a_cache_or_a_kernel_that_others_may_write_to_is_a_note(monkeypatch, tmp
     monkeypatch.setenv("CNPGEN_CACHE", str(tmp_path / "cache"))
     report = check_machine()
     assert not report.cache_used
-    assert any(f"others may write to {tmp_path / 'cache'}" in note for note in report.notes)
+    assert any(
+        f"others may write to {tmp_path / 'cache'}" in note for note in report.notes
+    )
     assert f"{tmp_path / 'cache'} (not used)" in " ".join(machine_text(report).split())
     (tmp_path / "cache").chmod(0o700)
     (planted := tmp_path / "cache" / "lib" / "ik-123.so").write_bytes(b"")
     planted.chmod(0o666)
     report = check_machine()
     assert report.cache_used
-    assert any("are not used (1)" in note and str(planted) in note for note in report.notes)
+    assert any(
+        "are not used (1)" in note and str(planted) in note for note in report.notes
+    )
 
 
 def test_a_container_with_fewer_cores_is_a_note(monkeypatch):
-    monkeypatch.setattr(machine.os, "sched_getaffinity", lambda _pid: set(range(64)), raising=False)
+    monkeypatch.setattr(
+        machine.os, "sched_getaffinity", lambda _pid: set(range(64)), raising=False
+    )
     report = check_machine()
     assert report.cores < 64
-    assert any(note.startswith("this container may use") and re.search(r" workers?$", note) for note in report.notes)
+    assert any(
+        note.startswith("this container may use") and re.search(r" workers?$", note)
+        for note in report.notes
+    )
 
 
 def test_recipes_that_do_not_load_are_a_problem(monkeypatch, tmp_path):
@@ -210,11 +242,20 @@ def test_little_free_disk_is_a_note(monkeypatch):
 
 @pytest.mark.parametrize(
     ("flags", "name"),
-    [("sse2 avx avx2 avx512f", "avx512"), ("sse2 avx avx2", "avx2"), ("sse2", "sse2"), ("none", "unknown")],
+    [
+        ("sse2 avx avx2 avx512f", "avx512"),
+        ("sse2 avx avx2", "avx2"),
+        ("sse2", "sse2"),
+        ("none", "unknown"),
+    ],
 )
 def test_vector_instructions_are_read_from_cpuinfo(monkeypatch, flags, name):
     monkeypatch.setattr(machine.platform, "machine", lambda: "x86_64")
-    monkeypatch.setattr(machine.Path, "read_text", lambda *_, **__: f"processor : 0\nflags\t\t: fpu {flags}\n")
+    monkeypatch.setattr(
+        machine.Path,
+        "read_text",
+        lambda *_, **__: f"processor : 0\nflags\t\t: fpu {flags}\n",
+    )
     assert vector_instructions() == name
 
 
@@ -231,6 +272,8 @@ def test_variables_that_the_user_did_not_set_are_not_reported(monkeypatch):
     monkeypatch.setattr(threads, "_preferred", {})
     threads.prefer_one_thread()
     assert all(os.environ[name] == "1" for name in threads.VARIABLES)
-    assert set(threads.VARIABLES) & check_machine().environment.keys() == {"MKL_NUM_THREADS"}
+    assert set(threads.VARIABLES) & check_machine().environment.keys() == {
+        "MKL_NUM_THREADS"
+    }
     monkeypatch.setenv("OMP_NUM_THREADS", "4")
     assert check_machine().environment["OMP_NUM_THREADS"] == "4"

@@ -36,7 +36,12 @@ def changed(shard: Parts, name: str, where: Any, value: Any) -> list[str]:
     """Return the problems after a change that the statistics contain, too."""
     spec, task, columns, record = shard
     columns[name][where] = value
-    return check_numbers(spec, task, columns, replace(record, statistics=column_statistics(columns, spec.fields)))
+    return check_numbers(
+        spec,
+        task,
+        columns,
+        replace(record, statistics=column_statistics(columns, spec.fields)),
+    )
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -45,12 +50,17 @@ def test_made_datasets_have_no_findings(tiny, tmp_path, name, dtype):
     folder = tiny(name)
     if dtype == "float32":
         folder = tmp_path / name
-        make_dataset(tiny_recipe(name), folder, shard_size=TINY_SHARD, workers=1, dtype=dtype)
+        make_dataset(
+            tiny_recipe(name), folder, shard_size=TINY_SHARD, workers=1, dtype=dtype
+        )
     for index in range(4):
         assert check_numbers(*parts(folder, index)) == []
 
 
-@pytest.mark.parametrize(("name", "column"), [("start_q", 2), ("start_dq", 0), ("start_ddq", 5), ("goal_xyz", 1)])
+@pytest.mark.parametrize(
+    ("name", "column"),
+    [("start_q", 2), ("start_dq", 0), ("start_ddq", 5), ("goal_xyz", 1)],
+)
 @pytest.mark.parametrize("side", ["valid_min", "valid_max"])
 def test_a_value_outside_its_range_is_named(shard, name, column, side):
     bound = getattr(shard[0].field_named(name), side)[column]
@@ -62,7 +72,13 @@ def test_a_value_outside_its_range_is_named(shard, name, column, side):
 
 
 def test_float32_values_may_exceed_a_bound_by_one_rounding_error(tmp_path):
-    make_dataset(tiny_recipe("airhockey-replan"), tmp_path, shard_size=TINY_SHARD, workers=1, dtype="float32")
+    make_dataset(
+        tiny_recipe("airhockey-replan"),
+        tmp_path,
+        shard_size=TINY_SHARD,
+        workers=1,
+        dtype="float32",
+    )
     shard = parts(tmp_path)
     height = np.float32(0.16)
     assert changed(shard, "goal_xyz", (3, 2), height) == []
@@ -73,7 +89,10 @@ def test_float32_values_may_exceed_a_bound_by_one_rounding_error(tmp_path):
 def test_a_hit_above_its_maximum_speed_is_named(shard):
     fastest = float(shard[2]["hit_speed_max"][7])
     (problem,) = changed(shard, "hit_speed", 7, np.nextafter(fastest, 9.0))
-    assert problem == "hit_speed is above hit_speed_max: 1 of 250 rows, the first one is row 257"
+    assert (
+        problem
+        == "hit_speed is above hit_speed_max: 1 of 250 rows, the first one is row 257"
+    )
     assert changed(shard, "hit_speed", 7, fastest) == []
 
 
@@ -95,12 +114,17 @@ def test_statistics_must_be_those_of_the_values(shard):
 
 
 @pytest.mark.parametrize(
-    ("what", "by", "wrong"), [("mean", 1e-12, 0), ("mean", 1e-6, 1), ("m2", 1e-12, 0), ("m2", 1e-6, 1)]
+    ("what", "by", "wrong"),
+    [("mean", 1e-12, 0), ("mean", 1e-6, 1), ("m2", 1e-12, 0), ("m2", 1e-6, 1)],
 )
 def test_sums_may_differ_by_rounding_errors_only(shard, what, by, wrong):
     spec, task, columns, record = shard
     item = record.statistics["hit_speed"]
     record = replace(
-        record, statistics={**record.statistics, "hit_speed": replace(item, **{what: getattr(item, what) * (1 + by)})}
+        record,
+        statistics={
+            **record.statistics,
+            "hit_speed": replace(item, **{what: getattr(item, what) * (1 + by)}),
+        },
     )
     assert len(check_numbers(spec, task, columns, record)) == wrong

@@ -34,7 +34,9 @@ KINDS = some(FILES, 7)  # the others are shards, too
 
 def named(report: ValidationReport) -> dict[str, str]:
     """Return file -> problem, without notes."""
-    return {finding.file: finding.problem for finding in report.findings if not finding.note}
+    return {
+        finding.file: finding.problem for finding in report.findings if not finding.note
+    }
 
 
 def copied(tiny: Tiny, tmp_path: Path, name: str = "airhockey-hit") -> Path:
@@ -46,18 +48,24 @@ def copied(tiny: Tiny, tmp_path: Path, name: str = "airhockey-hit") -> Path:
 
 @pytest.mark.parametrize("dtype", some(["float64", "float32"], 1, "slow"))
 @pytest.mark.parametrize("name", some(SHIPPED, 1, "slow"))
-def test_made_datasets_are_valid_and_regenerated_blocks_are_identical(tiny: Tiny, tmp_path, name, dtype):
+def test_made_datasets_are_valid_and_regenerated_blocks_are_identical(
+    tiny: Tiny, tmp_path, name, dtype
+):
     folder = tiny(name)
     if dtype == "float32":
         folder = tmp_path / name
-        make_dataset(tiny_recipe(name), folder, shard_size=TINY_SHARD, workers=1, dtype=dtype)
+        make_dataset(
+            tiny_recipe(name), folder, shard_size=TINY_SHARD, workers=1, dtype=dtype
+        )
     report = validate_dataset(folder, deep=True, regenerate=4, workers=1)
     assert report.ok, report.summary()
     assert report.findings == ()
     assert (report.rows, report.regenerated, report.identical) == (660, 4, 4)
     assert report.deep is not None
     assert (report.deep.rows, len(report.deep.failed_rows)) == (660, 0)
-    assert {"tip position", "joint torque"} <= {check.name for check in report.deep.checks}
+    assert {"tip position", "joint torque"} <= {
+        check.name for check in report.deep.checks
+    }
     assert all(np.isfinite(check.worst) for check in report.deep.checks)
 
 
@@ -71,7 +79,10 @@ def test_thousands_of_float32_rows_are_valid(tmp_path):
 
 @pytest.mark.slow
 def test_one_worker_and_two_report_the_same(tiny: Tiny):
-    one, two = (validate_dataset(tiny("airhockey-hit"), deep=True, workers=workers) for workers in (1, 2))
+    one, two = (
+        validate_dataset(tiny("airhockey-hit"), deep=True, workers=workers)
+        for workers in (1, 2)
+    )
     assert one.to_dict() == two.to_dict()
 
 
@@ -89,7 +100,10 @@ def test_a_report_converts_to_text_and_json(tiny: Tiny):
 def test_at_most_all_blocks_are_regenerated_and_the_report_states_it(tiny: Tiny):
     report = validate_dataset(tiny("airhockey-hit"), regenerate=100_000)
     assert (report.regenerated, report.blocks) == (4, 4)
-    assert "made again: 4 of 4 blocks (100,000 were requested), 4 identical to the bit" in report.summary()
+    assert (
+        "made again: 4 of 4 blocks (100,000 were requested), 4 identical to the bit"
+        in report.summary()
+    )
     assert report.to_dict()["blocks"] == 4
 
 
@@ -97,14 +111,21 @@ def test_requested_blocks_that_do_not_exist_are_reported(damaged: Path):
     for shard in damaged.glob("*/*.h5"):
         shard.unlink()
     text = validate_dataset(damaged, regenerate=2).summary()
-    assert "made again: 0 of 0 blocks (2 were requested), 0 identical to the bit" in text
+    assert (
+        "made again: 0 of 0 blocks (2 were requested), 0 identical to the bit" in text
+    )
 
 
 def test_findings_have_consistent_hints(damaged: Path, another_seed: Path):
     shutil.copy(another_seed / "train/shard-00001.h5", damaged / "train/shard-00001.h5")
-    assert {finding.hint for finding in validate_dataset(damaged).findings} == {REMAKE_HINT}
+    assert {finding.hint for finding in validate_dataset(damaged).findings} == {
+        REMAKE_HINT
+    }
     (damaged / "specification.json").unlink()
-    assert "hint: without its specification the dataset cannot be repaired" in validate_dataset(damaged).summary()
+    assert (
+        "hint: without its specification the dataset cannot be repaired"
+        in validate_dataset(damaged).summary()
+    )
 
 
 def test_progress_is_called_for_every_shard(tiny: Tiny):
@@ -114,7 +135,13 @@ def test_progress_is_called_for_every_shard(tiny: Tiny):
 
 
 def test_the_finished_shards_of_an_unfinished_dataset_are_checked(tmp_path):
-    make_dataset(tiny_recipe("airhockey-hit"), tmp_path / "out", shard_size=TINY_SHARD, workers=1, part=(0, 2))
+    make_dataset(
+        tiny_recipe("airhockey-hit"),
+        tmp_path / "out",
+        shard_size=TINY_SHARD,
+        workers=1,
+        part=(0, 2),
+    )
     report = validate_dataset(tmp_path / "out", deep=True, regenerate=2, workers=1)
     assert report.rows == 500
     assert list(named(report)) == [MANIFEST]
@@ -127,14 +154,23 @@ def test_the_finished_shards_of_an_unfinished_dataset_are_checked(tmp_path):
 
 def test_the_files_of_a_dataset_are_all_tested(tiny: Tiny):
     folder = tiny("airhockey-hit")
-    assert sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()) == sorted(FILES)
+    assert sorted(
+        path.relative_to(folder).as_posix()
+        for path in folder.rglob("*")
+        if path.is_file()
+    ) == sorted(FILES)
 
 
 @pytest.mark.parametrize("file", some(KINDS, 3, "slow"))
 def test_a_flipped_byte_is_found_in_every_file(damaged: Path, file):
     whole = (damaged / file).read_bytes()
     random = np.random.default_rng(len(file))
-    for position in [0, len(whole) // 2, len(whole) - 1, *random.integers(len(whole), size=1).tolist()]:
+    for position in [
+        0,
+        len(whole) // 2,
+        len(whole) - 1,
+        *random.integers(len(whole), size=1).tolist(),
+    ]:
         flipped = bytearray(whole)
         flipped[position] ^= 0x04
         (damaged / file).write_bytes(bytes(flipped))
@@ -164,7 +200,9 @@ def test_a_cut_off_file_is_named(damaged: Path, file, keep):
 
 
 @pytest.mark.parametrize("file", some(KINDS, 1, "slow"))
-def test_damaged_files_are_findings_and_not_exceptions_in_all_checks(damaged: Path, file):
+def test_damaged_files_are_findings_and_not_exceptions_in_all_checks(
+    damaged: Path, file
+):
     """Also where the damage keeps the size, so that a shard seems to be there."""
     whole = bytearray((damaged / file).read_bytes())
     whole[: len(whole) // 2] = bytes(len(whole) // 2)
@@ -177,26 +215,43 @@ def test_damaged_files_are_findings_and_not_exceptions_in_all_checks(damaged: Pa
 @pytest.fixture(scope="module")
 def another_seed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("other") / "airhockey-hit"
-    make_dataset(tiny_recipe("airhockey-hit"), folder, shard_size=TINY_SHARD, workers=1, seed=4)
+    make_dataset(
+        tiny_recipe("airhockey-hit"), folder, shard_size=TINY_SHARD, workers=1, seed=4
+    )
     return folder
 
 
 def test_a_shard_of_another_seed_is_named(damaged: Path, another_seed: Path):
     shutil.copy(another_seed / "train/shard-00001.h5", damaged / "train/shard-00001.h5")
     assert list(named(validate_dataset(damaged))) == ["train/shard-00001.h5"]
-    shutil.copy(another_seed / "train/shard-00001.json", damaged / "train/shard-00001.json")
-    assert set(named(validate_dataset(damaged))) == {"train/shard-00001.h5", "train/shard-00001.json"}
+    shutil.copy(
+        another_seed / "train/shard-00001.json", damaged / "train/shard-00001.json"
+    )
+    assert set(named(validate_dataset(damaged))) == {
+        "train/shard-00001.h5",
+        "train/shard-00001.json",
+    }
 
 
 def test_a_shard_in_the_place_of_another_is_named(damaged: Path):
     for ending in ("h5", "json"):
-        shutil.copy(damaged / f"train/shard-00000.{ending}", damaged / f"train/shard-00001.{ending}")
-    assert {"train/shard-00001.h5", "train/shard-00001.json"} <= set(named(validate_dataset(damaged)))
+        shutil.copy(
+            damaged / f"train/shard-00000.{ending}",
+            damaged / f"train/shard-00001.{ending}",
+        )
+    assert {"train/shard-00001.h5", "train/shard-00001.json"} <= set(
+        named(validate_dataset(damaged))
+    )
 
 
-def test_two_shards_that_changed_places_are_named_even_if_the_manifest_is_rewritten(damaged: Path):
+def test_two_shards_that_changed_places_are_named_even_if_the_manifest_is_rewritten(
+    damaged: Path,
+):
     first, second = (read_shard(damaged / f"train/shard-0000{k}.h5") for k in (0, 1))
-    for file, values in (("train/shard-00000.h5", second), ("train/shard-00001.h5", first)):
+    for file, values in (
+        ("train/shard-00000.h5", second),
+        ("train/shard-00001.h5", first),
+    ):
 
         def exchange(shard: h5py.File, values=values) -> None:
             for name, column in values.items():
@@ -209,17 +264,23 @@ def test_two_shards_that_changed_places_are_named_even_if_the_manifest_is_rewrit
     assert {"train/shard-00000.h5", "train/shard-00001.h5"} == set(named(report))
 
 
-def test_files_that_do_not_belong_to_the_dataset_are_notes_and_no_problems(damaged: Path):
+def test_files_that_do_not_belong_to_the_dataset_are_notes_and_no_problems(
+    damaged: Path,
+):
     (damaged / "train" / "notes.txt").write_text("mine")
     report = validate_dataset(damaged)
     assert report.ok
-    assert [(finding.file, finding.note) for finding in report.findings] == [("train/notes.txt", True)]
+    assert [(finding.file, finding.note) for finding in report.findings] == [
+        ("train/notes.txt", True)
+    ]
 
 
 # --- rows that are wrong ----------------------------------------------------------------------------------------------
 
 
-def add(column: str, row: int, amount: float, component: int | None = None) -> Callable[[h5py.File], None]:
+def add(
+    column: str, row: int, amount: float, component: int | None = None
+) -> Callable[[h5py.File], None]:
     def change(shard: h5py.File) -> None:
         shard[column][(row,) if component is None else (row, component)] += amount
 
@@ -228,7 +289,11 @@ def add(column: str, row: int, amount: float, component: int | None = None) -> C
 
 # dataset, change of row 17, and the check that must fail
 WRONG = [
-    ("airhockey-replan", add("start_q", 17, 1e-6, 1), "vertical acceleration"),  # 5 mm up or down are no fault here
+    (
+        "airhockey-replan",
+        add("start_q", 17, 1e-6, 1),
+        "vertical acceleration",
+    ),  # 5 mm up or down are no fault here
     ("airhockey-replan", add("goal_q", 17, 1e-6, 3), "table height"),
     ("airhockey-replan", add("start_dq", 17, 1e-6, 1), "vertical velocity"),
     ("airhockey-replan", add("start_dq", 17, 9.0, 0), "joint velocity"),
@@ -256,7 +321,9 @@ WRONG = [
     some(WRONG, 3, "slow"),
     ids=[f"{index} {check}" for index, (_, _, check) in enumerate(WRONG)],
 )
-def test_deep_finds_a_wrong_number_whose_checksums_were_rewritten(tiny: Tiny, tmp_path, name, change, check):
+def test_deep_finds_a_wrong_number_whose_checksums_were_rewritten(
+    tiny: Tiny, tmp_path, name, change, check
+):
     folder = copied(tiny, tmp_path, name)
     edit(folder, "train/shard-00001.h5", change)
     assert validate_dataset(folder).ok
@@ -264,7 +331,10 @@ def test_deep_finds_a_wrong_number_whose_checksums_were_rewritten(tiny: Tiny, tm
     assert set(named(report)) == {"train/shard-00001.h5"}
     found = [finding.problem for finding in report.findings]
     row = TINY_SHARD + 17
-    assert any(problem.startswith(f"{check}: 1 row out") and f"in row {row}" in problem for problem in found), found
+    assert any(
+        problem.startswith(f"{check}: 1 row out") and f"in row {row}" in problem
+        for problem in found
+    ), found
     assert report.deep is not None
     assert report.deep.failed_rows.tolist() == [row]
 
@@ -277,15 +347,25 @@ def put_nan(column: str) -> Callable[[h5py.File], None]:
 
 
 @pytest.mark.parametrize("column", ["goal_q", "goal_dq"])
-@pytest.mark.parametrize("options", [{}, {"deep": True, "workers": 1}, {"regenerate": 40}], ids=str)
-def test_values_that_are_not_finite_are_named(damaged: Path, column: str, options: dict[str, Any]):
+@pytest.mark.parametrize(
+    "options", [{}, {"deep": True, "workers": 1}, {"regenerate": 40}], ids=str
+)
+def test_values_that_are_not_finite_are_named(
+    damaged: Path, column: str, options: dict[str, Any]
+):
     edit(damaged, "train/shard-00000.h5", put_nan(column))
     report = validate_dataset(damaged, **options)
-    assert named(report) == {"train/shard-00000.h5": f"field '{column}' is not finite in 1 rows, first in row 5"}
+    assert named(report) == {
+        "train/shard-00000.h5": f"field '{column}' is not finite in 1 rows, first in row 5"
+    }
 
 
 def test_sample_ids_of_other_rows_are_named(damaged: Path):
-    edit(damaged, "train/shard-00001.h5", lambda shard: shard["sample_id"].__setitem__(7, 3))
+    edit(
+        damaged,
+        "train/shard-00001.h5",
+        lambda shard: shard["sample_id"].__setitem__(7, 3),
+    )
     assert named(validate_dataset(damaged)) == {
         "train/shard-00001.h5": "sample_id is not the index of the row in the split"
     }
@@ -312,7 +392,9 @@ def exchange_two_rows(shard: h5py.File) -> None:
             item[...] = np.concatenate([values[1:2], values[:1], values[2:]])
 
 
-def test_regeneration_finds_changes_that_satisfy_checksums_and_constraints(damaged: Path):
+def test_regeneration_finds_changes_that_satisfy_checksums_and_constraints(
+    damaged: Path,
+):
     edit(damaged, "train/shard-00001.h5", exchange_two_rows)
     assert validate_dataset(damaged, deep=True, workers=1).ok
     report = validate_dataset(damaged, regenerate=40)
@@ -349,17 +431,23 @@ def test_all_rows_of_shards_that_begin_within_a_block_are_regenerated(tmp_path):
 
 @pytest.mark.slow
 def test_blocks_are_regenerated_with_the_backend_of_the_specification(tmp_path):
-    make_dataset(tiny_recipe("airhockey-hit"), tmp_path / "out", workers=1, backend="numpy")
+    make_dataset(
+        tiny_recipe("airhockey-hit"), tmp_path / "out", workers=1, backend="numpy"
+    )
     report = validate_dataset(tmp_path / "out", regenerate=2)
     assert (report.ok, report.identical) == (True, 2)
 
 
 @pytest.mark.slow
 @needs_compiler
-def test_blocks_of_compiled_kernels_need_a_compiler_and_nothing_else_does(tiny: Tiny, monkeypatch, fresh_compiler):
+def test_blocks_of_compiled_kernels_need_a_compiler_and_nothing_else_does(
+    tiny: Tiny, monkeypatch, fresh_compiler
+):
     folder = tiny("airhockey-hit")
     monkeypatch.setenv("CC", "no-such-compiler")
-    with pytest.raises(MachineError, match="was made by the compiled backend, which does not work here") as caught:
+    with pytest.raises(
+        MachineError, match="was made by the compiled backend, which does not work here"
+    ) as caught:
         validate_dataset(folder, deep=True, regenerate=1, workers=1)
     assert "CC is 'no-such-compiler'" in str(caught.value)
     assert "all checks but regenerate= work without it" in str(caught.value)
@@ -370,9 +458,13 @@ def test_blocks_of_compiled_kernels_need_a_compiler_and_nothing_else_does(tiny: 
 
 
 def test_missing_folders_and_negative_counts_are_refused(damaged: Path, tmp_path):
-    with pytest.raises(UsageError, match="is not there, expected the folder of a dataset"):
+    with pytest.raises(
+        UsageError, match="is not there, expected the folder of a dataset"
+    ):
         validate_dataset(tmp_path / "nowhere")
-    with pytest.raises(UsageError, match="regenerate must be an integer from 0 on, got -1"):
+    with pytest.raises(
+        UsageError, match="regenerate must be an integer from 0 on, got -1"
+    ):
         validate_dataset(damaged, regenerate=-1)
     with pytest.raises(UsageError, match="workers must be an integer from 1 on, got 0"):
         validate_dataset(damaged, deep=True, workers=0)
@@ -380,11 +472,15 @@ def test_missing_folders_and_negative_counts_are_refused(damaged: Path, tmp_path
 
 def test_a_folder_that_holds_something_else_is_refused(tmp_path):
     (tmp_path / "mine.txt").write_text("no dataset")
-    with pytest.raises(UsageError, match=r"is not a dataset of cnpgen: it has no specification.json"):
+    with pytest.raises(
+        UsageError, match=r"is not a dataset of cnpgen: it has no specification.json"
+    ):
         validate_dataset(tmp_path, deep=True, regenerate=3)
 
 
-def test_a_backend_that_does_not_work_here_is_a_machine_error(damaged: Path, monkeypatch, fresh_compiler):
+def test_a_backend_that_does_not_work_here_is_a_machine_error(
+    damaged: Path, monkeypatch, fresh_compiler
+):
     if load_dataset_spec(damaged).backend != "compiled":
         pytest.skip("no C compiler on this machine")
     monkeypatch.setenv("CC", "/bin/false")
@@ -393,7 +489,9 @@ def test_a_backend_that_does_not_work_here_is_a_machine_error(damaged: Path, mon
     assert validate_dataset(damaged, deep=True, workers=1).ok
 
 
-def test_the_robot_of_the_specification_is_used_instead_of_the_shipped_one(damaged: Path):
+def test_the_robot_of_the_specification_is_used_instead_of_the_shipped_one(
+    damaged: Path,
+):
     """The specification contains recipe and URDF, and these are used for the validation."""
     robot = load_robot(load_problem("airhockey"))
     with h5py.File(damaged / "train/shard-00000.h5") as shard:

@@ -10,7 +10,11 @@ from cnpgen.store.dataset_summary import STATS_FORMAT, STATS_VERSION
 from cnpgen.store.files.documents import load_document, save_document
 from cnpgen.store.layout import STATS
 from cnpgen.store.manifest import finalize
-from cnpgen.validate.validate_dataset import check_recipe, check_statistics, validate_dataset
+from cnpgen.validate.validate_dataset import (
+    check_recipe,
+    check_statistics,
+    validate_dataset,
+)
 
 
 def test_the_recipe_in_a_specification_must_have_the_recorded_digest(damaged):
@@ -21,7 +25,9 @@ def test_the_recipe_in_a_specification_must_have_the_recorded_digest(damaged):
     (finding,) = check_recipe(replace(spec, recipe=changed))
     assert finding.file == "specification.json"
     assert spec.recipe_sha256 in finding.problem
-    (finding,) = check_recipe(replace(spec, robot={**spec.robot, "urdf": spec.robot["urdf"] + " "}))
+    (finding,) = check_recipe(
+        replace(spec, robot={**spec.robot, "urdf": spec.robot["urdf"] + " "})
+    )
     assert "not the recorded" in finding.problem
     retitled = json.loads(json.dumps(spec.recipe))
     retitled["pipeline"]["title"] = "Another title"
@@ -37,11 +43,16 @@ def test_a_specification_without_a_recipe_is_a_finding(damaged, recipe):
 def test_statistics_must_equal_the_summary_of_the_records(damaged):
     spec = load_dataset_spec(damaged)
     assert check_statistics(damaged, spec) == []
-    document = load_document(damaged / STATS, STATS_FORMAT, version=STATS_VERSION, structure={})
+    document = load_document(
+        damaged / STATS, STATS_FORMAT, version=STATS_VERSION, structure={}
+    )
     document["splits"]["train"]["start_q"]["mean"][0] += 1e-9
     save_document(damaged / STATS, document)
     (finding,) = check_statistics(damaged, spec)
-    assert (finding.file, finding.problem) == (STATS, "is not the summary of the records of the shards: splits differ")
+    assert (finding.file, finding.problem) == (
+        STATS,
+        "is not the summary of the records of the shards: splits differ",
+    )
     report = validate_dataset(damaged, deep=True, workers=1)
     assert finding in report.findings
     finalize(damaged, spec)

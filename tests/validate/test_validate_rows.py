@@ -16,7 +16,9 @@ def test_keys_of_a_million_different_rows_are_different(dtype):
 def test_equal_rows_have_equal_keys_and_the_last_bit_counts():
     rows = np.random.default_rng(2).normal(size=(100, 30))
     changed = rows.copy()
-    changed[np.arange(100), np.arange(100) % 30] = np.nextafter(changed[np.arange(100), np.arange(100) % 30], np.inf)
+    changed[np.arange(100), np.arange(100) % 30] = np.nextafter(
+        changed[np.arange(100), np.arange(100) % 30], np.inf
+    )
     np.testing.assert_array_equal(row_keys(rows), row_keys(rows.copy()))
     assert (row_keys(rows) != row_keys(changed)).all()
 

@@ -21,23 +21,36 @@ def world_on_a_path(problem: Problem, q: np.ndarray | None = None) -> PathWorld:
     robot = load_robot(problem)
     world = PathWorld(robot, problem.obstacle, problem.object_size)
     if q is None:
-        ends = np.random.default_rng(3).uniform(robot.position_lower, robot.position_upper, (2, robot.n))
+        ends = np.random.default_rng(3).uniform(
+            robot.position_lower, robot.position_upper, (2, robot.n)
+        )
         q = (ends[0] + np.linspace(0, 1, STATES)[:, None] * (ends[1] - ends[0])).T
     world.set_path(q, 0 * q, 0 * q, place_obstacles(problem.obstacle))
     return world
 
 
 @pytest.mark.parametrize("kind", ["robot", "self", "object"])
-def test_distances_equal_those_of_single_states_and_of_the_points(kind: str, tmp_path: Path) -> None:
-    problem = load_problem("heavy-object") if kind == "object" else load_problem(write_problem(tmp_path))
+def test_distances_equal_those_of_single_states_and_of_the_points(
+    kind: str, tmp_path: Path
+) -> None:
+    problem = (
+        load_problem("heavy-object")
+        if kind == "object"
+        else load_problem(write_problem(tmp_path))
+    )
     world = world_on_a_path(problem)
     closest = world.pairs(kind).closest_points()
     single = world_on_a_path(problem)
     for k in range(0, STATES, 7):
         single.set_path(
-            *(values[:, k : k + 1] for values in (world.q, world.dq, world.ddq)), place_obstacles(problem.obstacle)
+            *(values[:, k : k + 1] for values in (world.q, world.dq, world.ddq)),
+            place_obstacles(problem.obstacle),
         )
-        measured = {"robot": single.shape_distances, "self": single.self_distances, "object": single.object_distances}
+        measured = {
+            "robot": single.shape_distances,
+            "self": single.self_distances,
+            "object": single.object_distances,
+        }
         assert closest.distance[k] == pytest.approx(min(measured[kind]())[0], abs=1e-8)
     gaps = np.linalg.norm(closest.points[:, 0] - closest.points[:, 1], axis=1)
     np.testing.assert_allclose(gaps, np.abs(closest.distance), atol=1e-6)
@@ -47,7 +60,9 @@ def test_distances_equal_those_of_single_states_and_of_the_points(kind: str, tmp
 def test_the_paper_s_capsules_are_measured_from_their_surface() -> None:
     problem = load_problem("heavy-object")
     world = world_on_a_path(problem)
-    axes, surface = (world.pairs("robot").closest_points(radius) for radius in (0.0, 0.05))
+    axes, surface = (
+        world.pairs("robot").closest_points(radius) for radius in (0.0, 0.05)
+    )
     np.testing.assert_allclose(axes.distance - surface.distance, 0.05, atol=1e-12)
     outside = surface.distance > 0
     assert outside.any()
@@ -69,7 +84,9 @@ def test_the_smallest_pair_of_every_state_is_found(seed: int) -> None:
     def unused(*_: object) -> np.ndarray:
         raise NotImplementedError
 
-    distances, pairs = PairDistances(bounds, measure, unused, unused).smallest_per_state()
+    distances, pairs = PairDistances(
+        bounds, measure, unused, unused
+    ).smallest_per_state()
     np.testing.assert_array_equal(distances, truth.min(axis=0))
     np.testing.assert_array_equal(pairs, truth.argmin(axis=0))
     assert len(calls) < truth.size

@@ -23,26 +23,39 @@ BRANCHING = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/><
 
 def models(folder: Path) -> dict[str, pin.Model]:
     """Return models with revolute and prismatic joints and with branches."""
-    problems = [load_problem("airhockey"), load_problem("heavy-object"), load_problem(write_problem(folder))]
+    problems = [
+        load_problem("airhockey"),
+        load_problem("heavy-object"),
+        load_problem(write_problem(folder)),
+    ]
     found = {problem.name: load_robot(problem).model for problem in problems}
     return {**found, "branching": pin.buildModelFromXML(BRANCHING)}
 
 
 def test_poses_agree_with_those_of_single_states(tmp_path: Path) -> None:
     for name, model in models(tmp_path).items():
-        data, q = model.createData(), np.random.default_rng(0).uniform(-2, 2, (model.nq, 40))
+        data, q = (
+            model.createData(),
+            np.random.default_rng(0).uniform(-2, 2, (model.nq, 40)),
+        )
         rotations, positions = ForwardKinematics(model).poses(q)
         for k, state in enumerate(q.T):
             pin.forwardKinematics(model, data, state.copy())
             for joint, pose in enumerate(data.oMi):
-                np.testing.assert_allclose(rotations[joint, ..., k], pose.rotation, atol=1e-14, err_msg=name)
-                np.testing.assert_allclose(positions[joint, :, k], pose.translation, atol=1e-14, err_msg=name)
+                np.testing.assert_allclose(
+                    rotations[joint, ..., k], pose.rotation, atol=1e-14, err_msg=name
+                )
+                np.testing.assert_allclose(
+                    positions[joint, :, k], pose.translation, atol=1e-14, err_msg=name
+                )
 
 
 def test_poses_that_differ_from_pinocchios_raise_an_error() -> None:
     model = load_robot(load_problem("airhockey")).model
     kinematics = ForwardKinematics(model)
-    model.jointPlacements[3].translation += 1e-6  # the model changes after its coefficients were read
+    model.jointPlacements[
+        3
+    ].translation += 1e-6  # the model changes after its coefficients were read
     with pytest.raises(MachineError, match=r"differ from Pinocchio's by 1\.4e-06"):
         kinematics.poses(np.ones((model.nq, 3)))
 
@@ -59,6 +72,8 @@ def test_no_point_moves_by_more_than_the_motion_bounds(tmp_path: Path) -> None:
             places = []
             for state in (q, q + 1e-6 * dq):
                 pin.forwardKinematics(model, data, state)
-                places.append([pose.act(point) for pose in list(data.oMi)[1:] for point in points])
+                places.append(
+                    [pose.act(point) for pose in list(data.oMi)[1:] for point in points]
+                )
             moved = np.linalg.norm(np.diff(places, axis=0)[0], axis=1).max()
             assert moved <= 1e-6 * (bounds @ np.abs(dq)) * (1 + 1e-5)

@@ -24,20 +24,28 @@ def searched(
 
     def measure(pair: int, k: int) -> tuple[float, np.ndarray]:
         calls.append((pair, k))
-        return float(truth[pair, k]), np.array([1.0, 0.0, float(k)]) if directions else NO_DIRECTION
+        return float(truth[pair, k]), np.array(
+            [1.0, 0.0, float(k)]
+        ) if directions else NO_DIRECTION
 
     def separation(pair: int, direction: np.ndarray, states: np.ndarray) -> np.ndarray:
         return truth[pair, states] - 1e-3 * np.abs(states - direction[2])
 
-    return np.array(PairDistances(bounds, measure, separation, UNUSED).smallest()), calls
+    return np.array(
+        PairDistances(bounds, measure, separation, UNUSED).smallest()
+    ), calls
 
 
 @pytest.mark.parametrize("directions", [True, False])
 @pytest.mark.parametrize("seed", range(15))
-def test_the_smallest_distance_is_found_at_its_place(seed: int, directions: bool) -> None:
+def test_the_smallest_distance_is_found_at_its_place(
+    seed: int, directions: bool
+) -> None:
     random = np.random.default_rng(seed)
     pairs, states = random.integers(1, 6), random.integers(1, 300)
-    truth = np.cumsum(random.normal(0, 0.01, (pairs, states)), axis=1) + random.uniform(-0.2, 0.2, (pairs, 1))
+    truth = np.cumsum(random.normal(0, 0.01, (pairs, states)), axis=1) + random.uniform(
+        -0.2, 0.2, (pairs, 1)
+    )
     bounds = truth - random.exponential(0.05, truth.shape)
     found, calls = searched(truth, bounds, directions)
     assert found.shape == truth.shape
@@ -58,7 +66,10 @@ def test_directions_avoid_most_measurements() -> None:
 
 
 def test_directions_are_applied_only_where_the_distance_could_be_smaller() -> None:
-    truth, applied = 0.3 + 0.2 * np.cos(np.linspace(0, 9, 400))[None], list[np.ndarray]()
+    truth, applied = (
+        0.3 + 0.2 * np.cos(np.linspace(0, 9, 400))[None],
+        list[np.ndarray](),
+    )
     bounds = truth - 0.1
 
     def separation(pair: int, direction: np.ndarray, states: np.ndarray) -> np.ndarray:
@@ -103,7 +114,9 @@ def crane(tmp_path_factory):
 @pytest.mark.parametrize("what", ["shape", "self"])
 def test_clear_states_agree_with_single_states(crane, what, monkeypatch):
     problem, robot = crane
-    q = np.random.default_rng(3).uniform(robot.position_lower, robot.position_upper, (400, robot.n))
+    q = np.random.default_rng(3).uniform(
+        robot.position_lower, robot.position_upper, (400, robot.n)
+    )
     world, zero = World(robot, problem.obstacle), np.zeros(robot.n)
     nearest = []
     for state in q:
@@ -113,7 +126,9 @@ def test_clear_states_agree_with_single_states(crane, what, monkeypatch):
     path.set_path(np.ascontiguousarray(q.T), still, still, OBSTACLE_POSES)
     bodies, calls = path._placed_bodies(), []
     real = type(bodies)._measure
-    monkeypatch.setattr(type(bodies), "_measure", lambda *x: (calls.append(1), real(*x))[1])
+    monkeypatch.setattr(
+        type(bodies), "_measure", lambda *x: (calls.append(1), real(*x))[1]
+    )
     clear = path.pairs("robot" if what == "shape" else "self").clear_states
     for least in (-0.01, 0.0, 0.02):
         expected = np.array(nearest) >= least
@@ -131,20 +146,31 @@ def test_one_direction_resolves_all_states_that_it_bounds():
         return distances[k], np.array([1.0, 0.0, 0.0])
 
     bounds = np.full((1, 101), -1.0)
-    found = PairDistances(bounds, measure, lambda pair, direction, states: distances[states], UNUSED).clear_states(0.5)
+    found = PairDistances(
+        bounds, measure, lambda pair, direction, states: distances[states], UNUSED
+    ).clear_states(0.5)
     np.testing.assert_array_equal(found, distances >= 0.5)
-    assert calls == list(
-        range(50)
+    assert (
+        calls == list(range(50))
     )  # states that are not clear are measured, and the first clear one resolves the others
 
 
 @pytest.mark.parametrize(
-    ("distance", "direction"), [(np.nan, [1.0, 0, 0]), (-np.inf, [np.nan] * 3)], ids=["no number", "no direction"]
+    ("distance", "direction"),
+    [(np.nan, [1.0, 0, 0]), (-np.inf, [np.nan] * 3)],
+    ids=["no number", "no direction"],
 )
-def test_a_state_that_cannot_be_measured_is_not_clear_and_resolves_no_others(distance, direction):
+def test_a_state_that_cannot_be_measured_is_not_clear_and_resolves_no_others(
+    distance, direction
+):
     def measure(pair: int, k: int) -> tuple[float, np.ndarray]:
         return (distance, np.array(direction)) if k == 1 else (0.3, np.full(3, np.nan))
 
-    pairs = PairDistances(np.full((1, 3), -1.0), measure, lambda *where: np.full(len(where[2]), 0.05), UNUSED)
+    pairs = PairDistances(
+        np.full((1, 3), -1.0),
+        measure,
+        lambda *where: np.full(len(where[2]), 0.05),
+        UNUSED,
+    )
     found = pairs.clear_states(0.1)
     np.testing.assert_array_equal(found, [True, False, True])

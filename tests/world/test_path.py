@@ -23,16 +23,26 @@ ROBOTS = {name: load_robot(problem) for name, problem in PROBLEMS.items()}
 PLANS = json.loads((Path(__file__).parents[1] / "data" / "plans.json").read_text())
 
 
-def wandering(robot: Robot, *, seed: int, count: int = 150) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def wandering(
+    robot: Robot, *, seed: int, count: int = 150
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Draw smooth random joint motions, shape (n, count) each, with derivatives as large as the limits."""
     random, s = np.random.default_rng(seed), np.linspace(0, 1, count)
     control = random.uniform(robot.position_lower, robot.position_upper, (9, robot.n))
-    curve = BSpline(np.concatenate([[0] * 4, np.linspace(0, 1, 6), [1] * 4]), control[:9], 4)
+    curve = BSpline(
+        np.concatenate([[0] * 4, np.linspace(0, 1, 6), [1] * 4]), control[:9], 4
+    )
     dq, ddq = (random.uniform(-1, 1, (robot.n, count)) for _ in range(2))
-    return curve(s).T, dq * robot.velocity_limit[:, None], ddq * robot.acceleration_limit[:, None]
+    return (
+        curve(s).T,
+        dq * robot.velocity_limit[:, None],
+        ddq * robot.acceleration_limit[:, None],
+    )
 
 
-def one_by_one(problem: Problem, robot: Robot, path: tuple[np.ndarray, ...], poses: np.ndarray) -> list[World]:
+def one_by_one(
+    problem: Problem, robot: Robot, path: tuple[np.ndarray, ...], poses: np.ndarray
+) -> list[World]:
     """Return a separate world for every state."""
     worlds = []
     for q, dq, ddq in zip(*(values.T for values in path), strict=True):
@@ -52,7 +62,17 @@ def both(request: pytest.FixtureRequest) -> tuple[PathWorld, list[World]]:
 
 
 @pytest.mark.parametrize(
-    "name", ["q", "dq", "ddq", "torque", "tip_position", "tip_rotation", "tip_velocity", "tip_acceleration"]
+    "name",
+    [
+        "q",
+        "dq",
+        "ddq",
+        "torque",
+        "tip_position",
+        "tip_rotation",
+        "tip_velocity",
+        "tip_acceleration",
+    ],
 )
 def test_every_quantity_agrees_with_the_one_state_world(both, name):
     world, worlds = both
@@ -65,7 +85,9 @@ def test_every_quantity_agrees_with_the_one_state_world(both, name):
 def test_the_tip_velocity_at_one_state_agrees_with_that_of_all(both):
     world, _ = both
     for k in (0, 7, -1):
-        np.testing.assert_array_equal(world.tip_velocity_at(k), world.tip_velocity[:, k])
+        np.testing.assert_array_equal(
+            world.tip_velocity_at(k), world.tip_velocity[:, k]
+        )
 
 
 def test_measured_constraints_agree_with_those_of_single_states(both):
@@ -78,7 +100,11 @@ def test_measured_constraints_agree_with_those_of_single_states(both):
             expected = np.array([conditions[index].g for conditions in one]).T
             found = np.array(condition.g)
             assert found.shape == expected.shape
-            if condition.name in ("robot clearance", "object contact", "object clearance"):
+            if condition.name in (
+                "robot clearance",
+                "object contact",
+                "object clearance",
+            ):
                 assert found.min() == pytest.approx(expected.min(), abs=1e-9)
                 assert np.all(found <= expected + 1e-9)
             else:
@@ -88,18 +114,28 @@ def test_measured_constraints_agree_with_those_of_single_states(both):
 def test_object_distances_without_an_object_raise_an_error():
     with pytest.raises(RecipeError, match="no \\[object\\]"):
         PathWorld(
-            ROBOTS["airhockey"], PROBLEMS["airhockey"].obstacle, PROBLEMS["airhockey"].object_size
+            ROBOTS["airhockey"],
+            PROBLEMS["airhockey"].obstacle,
+            PROBLEMS["airhockey"].object_size,
         ).object_distances()
 
 
 def test_without_obstacles_there_are_no_distances():
-    world = PathWorld(ROBOTS["airhockey"], PROBLEMS["airhockey"].obstacle, PROBLEMS["airhockey"].object_size)
+    world = PathWorld(
+        ROBOTS["airhockey"],
+        PROBLEMS["airhockey"].obstacle,
+        PROBLEMS["airhockey"].object_size,
+    )
     world.set_path(*wandering(world.robot, seed=2), np.zeros(0))
     assert world.segment_distances() == []
 
 
 def test_states_that_are_not_finite_have_no_distances():
-    world = PathWorld(ROBOTS["heavy-object"], PROBLEMS["heavy-object"].obstacle, PROBLEMS["heavy-object"].object_size)
+    world = PathWorld(
+        ROBOTS["heavy-object"],
+        PROBLEMS["heavy-object"].obstacle,
+        PROBLEMS["heavy-object"].object_size,
+    )
     q, dq, ddq = wandering(world.robot, seed=3, count=5)
     q[2, 3] = np.nan
     world.set_path(q, dq, ddq, np.full(2, 0.3))
@@ -109,7 +145,9 @@ def test_states_that_are_not_finite_have_no_distances():
 # --- distances --------------------------------------------------------------------------------------------------------
 
 
-def brute_force(world: PathWorld, problem: Problem, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def brute_force(
+    world: PathWorld, problem: Problem, poses: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     one = World(world.robot, problem.obstacle, problem.object_size)
     segments, objects = [], []
     for state in zip(world.q.T, world.dq.T, world.ddq.T, strict=True):
@@ -133,7 +171,11 @@ def test_the_search_agrees_with_brute_force_on_random_motions(seed):
     """About half of the random motions collide with the pedestals."""
     problem, world = (
         PROBLEMS["heavy-object"],
-        PathWorld(ROBOTS["heavy-object"], PROBLEMS["heavy-object"].obstacle, PROBLEMS["heavy-object"].object_size),
+        PathWorld(
+            ROBOTS["heavy-object"],
+            PROBLEMS["heavy-object"].obstacle,
+            PROBLEMS["heavy-object"].object_size,
+        ),
     )
     poses = np.random.default_rng(seed).uniform(-0.3, 0.6, 2)
     world.set_path(*wandering(world.robot, seed=10 + seed, count=400), poses)
@@ -145,7 +187,10 @@ def test_the_search_agrees_with_brute_force_on_random_motions(seed):
 def test_a_path_that_is_not_exact_measures_only_if_bounds_are_not_sufficient():
     """Its distances are bounds if these are sufficient, and those of an exact path otherwise."""
     problem = PROBLEMS["heavy-object"]
-    world, poses = PathWorld(ROBOTS["heavy-object"], problem.obstacle, problem.object_size), np.full(2, -0.3)
+    world, poses = (
+        PathWorld(ROBOTS["heavy-object"], problem.obstacle, problem.object_size),
+        np.full(2, -0.3),
+    )
     states = wandering(world.robot, seed=12, count=400)
     distances_of = {}
     for exact in (True, False):
@@ -153,9 +198,15 @@ def test_a_path_that_is_not_exact_measures_only_if_bounds_are_not_sufficient():
         for what in ("segment", "object"):
             distances = getattr(world, f"{what}_distances")
             least = np.min(world.pairs("robot" if what == "segment" else what).bounds)
-            distances_of[what, exact] = [np.array(distances(sufficient)) for sufficient in (least - 1e-3, least + 1e-3)]
+            distances_of[what, exact] = [
+                np.array(distances(sufficient))
+                for sufficient in (least - 1e-3, least + 1e-3)
+            ]
     for what in ("segment", "object"):
-        (known, _), (bounds, measured) = distances_of[what, True], distances_of[what, False]
+        (known, _), (bounds, measured) = (
+            distances_of[what, True],
+            distances_of[what, False],
+        )
         assert (bounds <= known + 1e-9).all()
         assert bounds.min() < known.min() - 1e-3
         np.testing.assert_array_equal(measured, known)
@@ -177,7 +228,9 @@ def test_the_search_agrees_with_brute_force_on_a_plan_that_slides_along_a_pedest
 
 def test_nearly_all_states_are_not_measured(monkeypatch: pytest.MonkeyPatch):
     problem, plan = PROBLEMS["heavy-object"], PLANS["transport"]
-    states = Motion(np.array([plan["path"]]), np.array([plan["rate"]])).at(np.linspace(0, 1, 1500))
+    states = Motion(np.array([plan["path"]]), np.array([plan["rate"]])).at(
+        np.linspace(0, 1, 1500)
+    )
     world = PathWorld(ROBOTS["heavy-object"], problem.obstacle, problem.object_size)
     poses = np.array([plan["start_xyz"][2], plan["goal_xyz"][2]]) - 0.15
     world.set_path(states.q[0].T, states.dq[0].T, states.ddq[0].T, poses)
@@ -185,7 +238,9 @@ def test_nearly_all_states_are_not_measured(monkeypatch: pytest.MonkeyPatch):
     for name in ("object_distance", "segment_distance"):
         measure = getattr(world._collisions, name)
         monkeypatch.setattr(
-            world._collisions, name, lambda *where, measure=measure: (calls.append(1), measure(*where))[1]
+            world._collisions,
+            name,
+            lambda *where, measure=measure: (calls.append(1), measure(*where))[1],
         )
     world.object_distances()
     world.segment_distances()
@@ -193,7 +248,11 @@ def test_nearly_all_states_are_not_measured(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_setting_a_path_discards_the_previous_one():
-    world = PathWorld(ROBOTS["airhockey"], PROBLEMS["airhockey"].obstacle, PROBLEMS["airhockey"].object_size)
+    world = PathWorld(
+        ROBOTS["airhockey"],
+        PROBLEMS["airhockey"].obstacle,
+        PROBLEMS["airhockey"].object_size,
+    )
     first, second = wandering(world.robot, seed=6), wandering(world.robot, seed=7)
     world.set_path(*first, np.zeros(0))
     before = world.torque, world.tip_velocity
@@ -211,7 +270,10 @@ def test_a_motion_equals_scipys_spline_of_its_control_points(label):
     from scipy.integrate import solve_ivp
 
     path, rate = np.array(PLANS[label]["path"]), np.array(PLANS[label]["rate"])
-    knots = [np.r_[np.zeros(8), np.arange(1, c - 7) / (c - 7), np.ones(8)] for c in (len(path), len(rate))]
+    knots = [
+        np.r_[np.zeros(8), np.arange(1, c - 7) / (c - 7), np.ones(8)]
+        for c in (len(path), len(rate))
+    ]
     p, r = BSpline(knots[0], path, 7), BSpline(knots[1], rate, 7)
     motion = Motion(path[None], rate[None])
     phase = solve_ivp(
@@ -226,18 +288,30 @@ def test_a_motion_equals_scipys_spline_of_its_control_points(label):
     q = [p(phase(t + shift)[0]) for shift in (-2 * h, -h, 0, h, 2 * h)]
     states = motion.at(phase(t)[0])
     np.testing.assert_allclose(states.q[0], q[2], atol=1e-13)
-    np.testing.assert_allclose(states.dq[0], (q[0] - 8 * q[1] + 8 * q[3] - q[4]) / (12 * h), atol=1e-7)
     np.testing.assert_allclose(
-        states.ddq[0], (-q[0] + 16 * q[1] - 30 * q[2] + 16 * q[3] - q[4]) / (12 * h**2), atol=1e-3
+        states.dq[0], (q[0] - 8 * q[1] + 8 * q[3] - q[4]) / (12 * h), atol=1e-7
+    )
+    np.testing.assert_allclose(
+        states.ddq[0],
+        (-q[0] + 16 * q[1] - 30 * q[2] + 16 * q[3] - q[4]) / (12 * h**2),
+        atol=1e-3,
     )
     np.testing.assert_allclose(motion.time_at(np.sort(phase(t)[0]))[0], t, atol=1e-10)
 
 
 @pytest.mark.parametrize("joints", [1, 2])
-def test_arms_of_few_joints_have_a_row_of_torques_for_each(joints: int, tmp_path: Path) -> None:
+def test_arms_of_few_joints_have_a_row_of_torques_for_each(
+    joints: int, tmp_path: Path
+) -> None:
     robot = load_robot(chain(tmp_path, joints, jerk=False))
-    states, data = np.random.default_rng(0).normal(size=(3, joints, 7)), robot.model.createData()
+    states, data = (
+        np.random.default_rng(0).normal(size=(3, joints, 7)),
+        robot.model.createData(),
+    )
     world = PathWorld(robot, (), None)
     world.set_path(*states, np.zeros(0))
-    expected = [pin.rnea(robot.model, data, *(values[:, k].copy() for values in states)) for k in range(7)]
+    expected = [
+        pin.rnea(robot.model, data, *(values[:, k].copy() for values in states))
+        for k in range(7)
+    ]
     np.testing.assert_allclose(world.torque, np.transpose(expected), atol=1e-12)

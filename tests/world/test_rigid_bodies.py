@@ -51,7 +51,11 @@ def test_many_states_agree_with_single_states(crane):
     random = np.random.default_rng(4)
     ends = random.uniform(robot.position_lower, robot.position_upper, (2, robot.n))
     path = np.linspace(*ends, 120).T
-    many, one, zero = PathWorld(robot, problem.obstacle), World(robot, problem.obstacle), np.zeros(robot.n)
+    many, one, zero = (
+        PathWorld(robot, problem.obstacle),
+        World(robot, problem.obstacle),
+        np.zeros(robot.n),
+    )
     many.set_path(path, 0 * path, 0 * path, OBSTACLE_POSES)
     for what in ("shape_distances", "self_distances"):
         found, single = np.array(getattr(many, what)()), []
@@ -72,7 +76,9 @@ def test_obstacles_move_with_their_poses(crane):
     for lower in (0.0, 0.1):
         world.set_state(zero, zero, zero, OBSTACLE_POSES - [3.0, lower - 0.5])
         found.append(min(world.shape_distances()))
-    assert found[0] - found[1] == pytest.approx(0.1, abs=1e-8)  # the roof over the horizontal arm
+    assert found[0] - found[1] == pytest.approx(
+        0.1, abs=1e-8
+    )  # the roof over the horizontal arm
 
 
 @pytest.mark.parametrize("answer", [-1.8e308, 0.3, np.nan])
@@ -101,7 +107,9 @@ def test_no_failure_of_coal_overestimates_a_distance(crane, monkeypatch, answer)
     monkeypatch.setattr(coal, "distance", failing)
     found = measured()
     assert (found <= expected + 1e-8).all()
-    assert np.isclose(found, expected, atol=1e-6).mean() > 0.9  # another tolerance is tried
+    assert (
+        np.isclose(found, expected, atol=1e-6).mean() > 0.9
+    )  # another tolerance is tried
 
 
 def test_states_that_are_not_finite_have_no_distances(crane):
@@ -141,19 +149,46 @@ def test_no_point_of_the_arm_moves_by_more_than_the_motion_bound(crane):
     problem, robot = crane
     random = np.random.default_rng(6)
     path = random.uniform(robot.position_lower, robot.position_upper, (60, robot.n)).T
-    world, model, data = PathWorld(robot, problem.obstacle), robot.model, robot.model.createData()
-    bounds = world.motion_bounds(np.abs(path).max(axis=1)) @ np.abs(np.diff(path, axis=1))
+    world, model, data = (
+        PathWorld(robot, problem.obstacle),
+        robot.model,
+        robot.model.createData(),
+    )
+    bounds = world.motion_bounds(np.abs(path).max(axis=1)) @ np.abs(
+        np.diff(path, axis=1)
+    )
     found = []
     for q in path.T:
         pin.forwardKinematics(model, data, q)
-        pieces = [(data.oMi[robot.shape.joints[piece.link]], piece) for piece in robot.shape.convex_parts]
-        found.append(np.concatenate([piece.vertices @ pose.rotation.T + pose.translation for pose, piece in pieces]))
-    assert (np.linalg.norm(np.diff(found, axis=0), axis=2).max(axis=1) <= bounds + 1e-12).all()
+        pieces = [
+            (data.oMi[robot.shape.joints[piece.link]], piece)
+            for piece in robot.shape.convex_parts
+        ]
+        found.append(
+            np.concatenate(
+                [
+                    piece.vertices @ pose.rotation.T + pose.translation
+                    for pose, piece in pieces
+                ]
+            )
+        )
+    assert (
+        np.linalg.norm(np.diff(found, axis=0), axis=2).max(axis=1) <= bounds + 1e-12
+    ).all()
 
 
-@pytest.mark.parametrize(("corners", "directions"), [(3, 5), (1000, 300), (70, 70_000), (1, 0)])
-def test_smallest_products_in_blocks_are_those_of_the_whole(corners: int, directions: int) -> None:
+@pytest.mark.parametrize(
+    ("corners", "directions"), [(3, 5), (1000, 300), (70, 70_000), (1, 0)]
+)
+def test_smallest_products_in_blocks_are_those_of_the_whole(
+    corners: int, directions: int
+) -> None:
     random = np.random.default_rng(3)
-    points, along = random.normal(size=(corners, 3)), random.normal(size=(3, directions))
+    points, along = (
+        random.normal(size=(corners, 3)),
+        random.normal(size=(3, directions)),
+    )
     expected = np.einsum("ni,ik->nk", points, along).min(axis=0)
-    np.testing.assert_allclose(lowest_products(points, along), expected, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(
+        lowest_products(points, along), expected, rtol=1e-12, atol=1e-14
+    )

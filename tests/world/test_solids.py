@@ -15,7 +15,13 @@ from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
 from tests.conftest import some
 from tests.examples.meshes import Meshes
-from tests.examples.obstacles import KINDS, ROUNDER, coal_distance, draw_obstacle, segment
+from tests.examples.obstacles import (
+    KINDS,
+    ROUNDER,
+    coal_distance,
+    draw_obstacle,
+    segment,
+)
 from tests.examples.shaped_robot import KINDS as AMONG_KINDS
 from tests.examples.shaped_robot import write_problem
 from tests.problems.test_constraints import gantry_problem
@@ -24,18 +30,32 @@ SIZE = (0.2, 0.14, 0.3)
 
 
 @pytest.mark.parametrize("kind", some(KINDS, 3, "slow"))
-def test_distances_of_segments_and_objects_agree_with_coal_s_own_shapes(kind: str) -> None:
+def test_distances_of_segments_and_objects_agree_with_coal_s_own_shapes(
+    kind: str,
+) -> None:
     random, inside = np.random.default_rng(3), 0
     for _ in range(10):
         obstacle = draw_obstacle(kind, random)
-        world, thinner = CollisionWorld(SIZE), ROUNDER * (obstacle.radius or 0.0) if kind == "cylinder" else 0.0
+        world, thinner = (
+            CollisionWorld(SIZE),
+            ROUNDER * (obstacle.radius or 0.0) if kind == "cylinder" else 0.0,
+        )
         world.place(solids_of([obstacle], place_obstacles([obstacle])))
         for _ in range(20):
             first, second = random.normal(0, 0.2, (2, 3))
-            position, turn = random.normal(0, 0.25, 3), Rotation.random(random_state=random).as_matrix()
+            position, turn = (
+                random.normal(0, 0.25, 3),
+                Rotation.random(random_state=random).as_matrix(),
+            )
             bodies = [
-                (world.segment_distance(first.tolist(), second.tolist(), 0), segment(first, second)),
-                (world.object_distance(position, turn, 0), (coal.Box(*SIZE), coal.Transform3s(turn, position))),
+                (
+                    world.segment_distance(first.tolist(), second.tolist(), 0),
+                    segment(first, second),
+                ),
+                (
+                    world.object_distance(position, turn, 0),
+                    (coal.Box(*SIZE), coal.Transform3s(turn, position)),
+                ),
             ]
             for (found, direction), body in bodies:
                 expected = coal_distance(*body, obstacle)
@@ -63,7 +83,11 @@ def test_shapes_of_links_among_obstacles_of_every_kind(tmp_path: Path) -> None:
     problem = load_problem(write_problem(tmp_path, obstacles=AMONG_KINDS))
     robot, random = load_robot(problem), np.random.default_rng(3)
     world, many = World(robot, problem.obstacle), PathWorld(robot, problem.obstacle)
-    reference, zero, poses = Meshes(problem, robot, tmp_path), np.zeros(robot.n), place_obstacles(problem.obstacle)
+    reference, zero, poses = (
+        Meshes(problem, robot, tmp_path),
+        np.zeros(robot.n),
+        place_obstacles(problem.obstacle),
+    )
     hits, smallest = 0, []
     states = random.uniform(robot.position_lower, robot.position_upper, (200, robot.n))
     for q in states:
@@ -80,11 +104,15 @@ def test_shapes_of_links_among_obstacles_of_every_kind(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "upright"])
-def test_many_states_of_a_robot_without_link_geometry_agree_with_single_states(tmp_path: Path, kind: str) -> None:
+def test_many_states_of_a_robot_without_link_geometry_agree_with_single_states(
+    tmp_path: Path, kind: str
+) -> None:
     problem = gantry_problem(tmp_path)
     robot, random = load_robot(problem), np.random.default_rng(7)
     obstacles = [draw_obstacle(kind, random, spread=0.3) for _ in range(2)]
-    path = np.linspace(*random.uniform(robot.position_lower, robot.position_upper, (2, robot.n)), 40).T.copy()
+    path = np.linspace(
+        *random.uniform(robot.position_lower, robot.position_upper, (2, robot.n)), 40
+    ).T.copy()
     many, one = (make(robot, obstacles, SIZE) for make in (PathWorld, World))
     zero, poses = np.zeros(robot.n), place_obstacles(obstacles)
     many.set_path(path, 0 * path, 0 * path, poses)
@@ -97,14 +125,20 @@ def test_many_states_of_a_robot_without_link_geometry_agree_with_single_states(t
         assert (found <= expected + 1e-8).all()
         assert found.min() == pytest.approx(expected.min(), abs=1e-8)
         if what == "object_distances":
-            np.testing.assert_allclose(found.min(axis=1), expected.min(axis=1), atol=1e-8)
+            np.testing.assert_allclose(
+                found.min(axis=1), expected.min(axis=1), atol=1e-8
+            )
 
 
 def test_an_obstacle_below_the_object_touches_it() -> None:
     random = np.random.default_rng(8)
     for kind in KINDS[1:]:
         obstacle = draw_obstacle(kind, random)
-        obstacle = type(obstacle)(**vars(obstacle) | {"below": "goal", "position": (0.4, 0.1, -0.02)})
-        numbers = place_obstacles([obstacle], {"start": np.array([0.9, 0.8]), "goal": np.array([0.3, 0.5])})
+        obstacle = type(obstacle)(
+            **vars(obstacle) | {"below": "goal", "position": (0.4, 0.1, -0.02)}
+        )
+        numbers = place_obstacles(
+            [obstacle], {"start": np.array([0.9, 0.8]), "goal": np.array([0.3, 0.5])}
+        )
         poses = [solids_of([obstacle], each)[0].high[2] for each in numbers]
         np.testing.assert_allclose(poses, [0.28, 0.48], atol=1e-12)

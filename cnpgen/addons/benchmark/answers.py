@@ -1,7 +1,8 @@
 """Verdicts on the answers of planners, as by ``cnpgen evaluate``, and their execution in the simulator.
 
-A sampled trajectory stands for the curve of a controller: linear through positions, cubic with velocities, quintic with
-accelerations. A condition that needs a derivative which this curve lacks at its samples counts as violated.
+A sampled trajectory stands for the curve of a controller: linear through positions,
+cubic with velocities, quintic with accelerations. A condition that needs a derivative
+which this curve lacks at its samples counts as violated.
 """
 
 from dataclasses import replace
@@ -55,27 +56,42 @@ def judge_answer(problem: Plans, answer: Plans | Trajectory) -> Verdict:
     verdict = judge(interpolated(answer, None, np.zeros(3)), answer, scene=scene)
     if not verdict.conditions:
         return Verdict(verdict.reason)
-    t = np.linspace(0, answer.duration, int(np.ceil(answer.duration / JUDGING_STEP_S)) + 1)
+    t = np.linspace(
+        0, answer.duration, int(np.ceil(answer.duration / JUDGING_STEP_S)) + 1
+    )
     samples = Samples(t / answer.duration, t)
     with np.errstate(all="ignore"):
         states = _states(answer, t)
         world.set_path(states.q, states.dq, states.ddq, scene, states.jerk)
-        jerk = states.jerk if loaded.uses_jerk and states.jerk is not None else np.full_like(states.q, np.nan)
+        jerk = (
+            states.jerk
+            if loaded.uses_jerk and states.jerk is not None
+            else np.full_like(states.q, np.nan)
+        )
         metrics = metrics_of(loaded, world, samples, jerk)
-        finished, broken = paper_rule(loaded, world, scene, problem.columns["goal_xyz"][0])
+        finished, broken = paper_rule(
+            loaded, world, scene, problem.columns["goal_xyz"][0]
+        )
     margins = boundary_margins(states, problem.boundary, samples, robot)
     margins += [_evaluated(entry) for entry in verdict.conditions.values()]
     paper = PaperRule(finished, finished and not broken, broken)
-    return Verdict(reason_of(margins), by_name(margins), metrics, paper, verdict.samples)
+    return Verdict(
+        reason_of(margins), by_name(margins), metrics, paper, verdict.samples
+    )
 
 
 def _states(answer: Trajectory, t: Array) -> EvaluatedTrajectory:
-    """Evaluate a trajectory at times, for metrics and the paper's rule; steps of linear spans are differences."""
+    """Evaluate a trajectory at times, for metrics and the paper's rule.
+
+    Steps of linear spans are differences.
+    """
     q, dq, ddq = answer.states(t)
     if answer.dq is None:
         ddq = np.gradient(dq, t, axis=0)
     jerk = np.gradient(ddq, t, axis=0) if answer.ddq is None else answer.jerks(t)
-    return EvaluatedTrajectory(*(np.ascontiguousarray(values.T) for values in (q, dq, ddq, jerk)))
+    return EvaluatedTrajectory(
+        *(np.ascontiguousarray(values.T) for values in (q, dq, ddq, jerk))
+    )
 
 
 def _evaluated(entry: ConditionDecision) -> Margin:
@@ -88,11 +104,16 @@ def _evaluated(entry: ConditionDecision) -> Margin:
 @lru_cache(maxsize=2)
 def _judge_and_world(record: ProblemRecord) -> tuple[FamilyJudge, PathWorld]:
     problem, robot = open_problem(record)
-    return FamilyJudge(problem, robot, step=JUDGING_STEP_S), PathWorld(robot, problem.obstacle, problem.object_size)
+    return FamilyJudge(problem, robot, step=JUDGING_STEP_S), PathWorld(
+        robot, problem.obstacle, problem.object_size
+    )
 
 
 def execute_answer(task: Task, *, plant: Plant) -> Executed:
-    """Execute an answer on a plant; if this is impossible, ``failure`` has the reason."""
+    """Execute an answer on a plant.
+
+    If this is impossible, ``failure`` has the reason.
+    """
     try:
         return execution_of(task, plant).executed
     except UsageError as error:
@@ -102,14 +123,18 @@ def execute_answer(task: Task, *, plant: Plant) -> Executed:
 def execution_of(task: Task, plant: Plant) -> Execution:
     """Execute an answer; in a replanning scenario, the first motion is executed up to the switch.
 
-    Raise UsageError if the answer is invalid or cannot be executed, and RecipeError if MuJoCo cannot simulate the
-    robot.
+    Raise UsageError if the answer is invalid or cannot be executed, and RecipeError if
+    MuJoCo cannot simulate the robot.
     """
     problem, content, prefix = task
     states, duration = _timed(answer_from_dict(problem, content))
     if prefix is None:
-        return execute_states(problem, states, duration, plant, problem.boundary.start_dq[0])
-    return execute_states(problem, joined(prefix, states), float(prefix.until[0]) + duration, plant)
+        return execute_states(
+            problem, states, duration, plant, problem.boundary.start_dq[0]
+        )
+    return execute_states(
+        problem, joined(prefix, states), float(prefix.until[0]) + duration, plant
+    )
 
 
 def joined(prefix: ExecutedPrefix, states: StatesAt) -> StatesAt:
@@ -118,7 +143,10 @@ def joined(prefix: ExecutedPrefix, states: StatesAt) -> StatesAt:
 
     def at(t: Array) -> tuple[Array, Array, Array]:
         before, after = first(np.minimum(t, until)), states(np.maximum(t - until, 0.0))
-        q, dq, ddq = (np.where((t < until)[:, None], a, b) for a, b in zip(before, after, strict=True))
+        q, dq, ddq = (
+            np.where((t < until)[:, None], a, b)
+            for a, b in zip(before, after, strict=True)
+        )
         return q, dq, ddq
 
     return at

@@ -1,11 +1,13 @@
 """Compare planners on the problems of a suite.
 
-Each planner solves one problem after the other, in its own process and on one thread. Pinocchio and Coal judge the
-answers, and with --simulate MuJoCo executes them. Every finished problem is written to DIR at once, one file per
-planner. After an interruption the same command resumes; more --planners or --plant extend the results. If a planner
-crashes, times out or returns an invalid result, only that problem is marked as failed. With --engine several workers
-plan at once, so compare CPU times only. 'cnpgen docs benchmark' describes suites and planners. The exit code is 0 if
-the benchmark is complete, also if planners failed.
+Each planner solves one problem after the other, in its own process and on one thread.
+Pinocchio and Coal judge the answers, and with --simulate MuJoCo executes them. Every
+finished problem is written to DIR at once, one file per planner. After an interruption
+the same command resumes; more --planners or --plant extend the results. If a planner
+crashes, times out or returns an invalid result, only that problem is marked as failed.
+With --engine several workers plan at once, so compare CPU times only. 'cnpgen docs
+benchmark' describes suites and planners. The exit code is 0 if the benchmark is
+complete, also if planners failed.
 """
 
 import argparse
@@ -29,28 +31,108 @@ def add_options(parser: Parser) -> None:
     option = parser.add_argument
     text = "a suite (see --list), or a dataset for random problems"
     option("suite", metavar="SUITE", nargs="?", type=recipe_names.suite, help=text)
-    option("--list", action="store_true", help="list suites, planners with their fields, and plants")
-    option("-o", "--out", metavar="DIR", type=Path, help="folder of the results (default: SUITE-results)")
-    option("--planners", metavar="NAME", nargs="+", help="planners to compare (default: cnpgen cnpgen+refine solve)")
-    option("--n", metavar="N", type=values.positive, help="number of problems; a random suite has any number")
+    option(
+        "--list",
+        action="store_true",
+        help="list suites, planners with their fields, and plants",
+    )
+    option(
+        "-o",
+        "--out",
+        metavar="DIR",
+        type=Path,
+        help="folder of the results (default: SUITE-results)",
+    )
+    option(
+        "--planners",
+        metavar="NAME",
+        nargs="+",
+        help="planners to compare (default: cnpgen cnpgen+refine solve)",
+    )
+    option(
+        "--n",
+        metavar="N",
+        type=values.positive,
+        help="number of problems; a random suite has any number",
+    )
     option("--simulate", action="store_true", help="also execute the plans")
-    option("--plant", metavar="NAME", nargs="+", help="simulated robots that execute them (default: nominal)")
+    option(
+        "--plant",
+        metavar="NAME",
+        nargs="+",
+        help="simulated robots that execute them (default: nominal)",
+    )
     text = "also execute them in this clone of the Air Hockey Challenge"
     option("--environment", metavar="PATH", type=Path, help=text)
-    option("--video", action="store_true", help="film the first plan of every planner for the report")
-    option("--time-limit", metavar="S", type=values.seconds, default=60.0, help="time limit per problem (default: 60s)")
-    add_engine(parser, "processes for execution, and with --engine for planning; default one per available core")
-    option("--seed", metavar="SEED", type=values.seed, default=0, help="seed of random planners (default: 0)")
-    option("--repeat", metavar="K", type=values.positive, default=1, help="repetitions of every problem (default: 1)")
+    option(
+        "--video",
+        action="store_true",
+        help="film the first plan of every planner for the report",
+    )
+    option(
+        "--time-limit",
+        metavar="S",
+        type=values.seconds,
+        default=60.0,
+        help="time limit per problem (default: 60s)",
+    )
+    add_engine(
+        parser,
+        "processes for execution, and with --engine for planning; default one per available core",
+    )
+    option(
+        "--seed",
+        metavar="SEED",
+        type=values.seed,
+        default=0,
+        help="seed of random planners (default: 0)",
+    )
+    option(
+        "--repeat",
+        metavar="K",
+        type=values.positive,
+        default=1,
+        help="repetitions of every problem (default: 1)",
+    )
     text = "largest distance of the mallet of a successful hit from the table plane (default: 20mm)"
-    option("--plane-tolerance", metavar="M", type=values.meters, default=0.02, help=text)
-    option("--reference", metavar="NAME", help="planner that p-values compare with (default: cnpgen+refine)")
+    option(
+        "--plane-tolerance", metavar="M", type=values.meters, default=0.02, help=text
+    )
+    option(
+        "--reference",
+        metavar="NAME",
+        help="planner that p-values compare with (default: cnpgen+refine)",
+    )
     text = "field of a planner, such as trajopt.iterations=50 or rrtconnect.simplify_time=0.5s"
-    option("--set", metavar="NAME.KEY=VALUE", nargs="+", default=[], type=parameter, help=text)
+    option(
+        "--set",
+        metavar="NAME.KEY=VALUE",
+        nargs="+",
+        default=[],
+        type=parameter,
+        help=text,
+    )
     text = "instead, try random values of fields of one planner, such as drake.control_points=8..25; ranks them"
-    option("--search", metavar="NAME.KEY=LOW..HIGH", nargs="+", default=[], type=parameter_range, help=text)
-    option("--trials", metavar="K", type=values.positive, default=20, help="random trials of --search (default: 20)")
-    option("--replan", action="store_true", help="discard earlier answers of these planners in DIR")
+    option(
+        "--search",
+        metavar="NAME.KEY=LOW..HIGH",
+        nargs="+",
+        default=[],
+        type=parameter_range,
+        help=text,
+    )
+    option(
+        "--trials",
+        metavar="K",
+        type=values.positive,
+        default=20,
+        help="random trials of --search (default: 20)",
+    )
+    option(
+        "--replan",
+        action="store_true",
+        help="discard earlier answers of these planners in DIR",
+    )
     text = "delete results of another suite, version, time limit, seed or planner parameters in DIR"
     option("--force", action="store_true", help=text)
     add_json(parser)
@@ -61,7 +143,9 @@ def parameter(text: str) -> tuple[str, str, Any]:
     left, equals, value = text.partition("=")
     name, dot, key = left.rpartition(".")
     if not (equals and dot and name and key):
-        raise argparse.ArgumentTypeError(f"expected NAME.KEY=VALUE, such as trajopt.iterations=50, got {text!r}")
+        raise argparse.ArgumentTypeError(
+            f"expected NAME.KEY=VALUE, such as trajopt.iterations=50, got {text!r}"
+        )
     return name, key, values.toml_value(value)
 
 
@@ -71,7 +155,9 @@ def parameter_range(text: str) -> tuple[str, str, tuple[float, float]]:
     name, _, key = left.rpartition(".")
     ends = right.split("..")
     try:
-        low, high = (int(end) if end.lstrip("-").isdigit() else float(end) for end in ends)
+        low, high = (
+            int(end) if end.lstrip("-").isdigit() else float(end) for end in ends
+        )
     except ValueError:
         name = ""
     if not (name and key):
@@ -81,14 +167,19 @@ def parameter_range(text: str) -> tuple[str, str, tuple[float, float]]:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from cnpgen.addons.benchmark.benchmark_report import save_benchmark_figures, save_benchmark_report
+    from cnpgen.addons.benchmark.benchmark_report import (
+        save_benchmark_figures,
+        save_benchmark_report,
+    )
     from cnpgen.addons.benchmark.result_tables import save_benchmark_tables
 
     if arguments.list:
         print(_listing(as_json=arguments.json))
         return
     if arguments.suite is None:
-        raise UsageError("the argument SUITE is missing; 'cnpgen benchmark --list' lists suites")
+        raise UsageError(
+            "the argument SUITE is missing; 'cnpgen benchmark --list' lists suites"
+        )
     for name in ("plant", "environment", "video"):
         if getattr(arguments, name) and not arguments.simulate:
             raise UsageError(f"--{name} needs --simulate")
@@ -100,17 +191,33 @@ def run(arguments: argparse.Namespace) -> None:
     save_benchmark_tables(found, folder)
     save_benchmark_figures(found, folder)
     report = save_benchmark_report(found, folder / "report.html", video=arguments.video)
-    print(json.dumps(_facts(found, folder), indent=2) if arguments.json else _text(found))
+    print(
+        json.dumps(_facts(found, folder), indent=2) if arguments.json else _text(found)
+    )
     print(f"report: {report}", file=sys.stderr)
 
 
 def _search(arguments: argparse.Namespace) -> None:
     """Search for parameters of one planner and print the trials, the best one first."""
-    from cnpgen.addons.benchmark.parameter_search import SEARCH_FILE, csv_of, search_parameters
+    from cnpgen.addons.benchmark.parameter_search import (
+        SEARCH_FILE,
+        csv_of,
+        search_parameters,
+    )
 
-    (planner, *others), ranges = {name for name, _, _ in arguments.search}, {k: ends for _, k, ends in arguments.search}
-    if others or arguments.planners not in (None, [planner]) or arguments.set or arguments.repeat != 1:
-        raise UsageError("--search has fields of one planner, without --planners, --set and --repeat")
+    (planner, *others), ranges = (
+        {name for name, _, _ in arguments.search},
+        {k: ends for _, k, ends in arguments.search},
+    )
+    if (
+        others
+        or arguments.planners not in (None, [planner])
+        or arguments.set
+        or arguments.repeat != 1
+    ):
+        raise UsageError(
+            "--search has fields of one planner, without --planners, --set and --repeat"
+        )
     folder = arguments.out or Path(f"{Path(arguments.suite).stem}-search")
     options = {"trials": arguments.trials, **_options(arguments)}
     with resumable(folder):
@@ -125,7 +232,10 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
 
     meter, doing = Meter(noun="problem"), [""]
     planners = {name for name, _, _ in arguments.set}
-    parameters = {each: {key: value for name, key, value in arguments.set if name == each} for each in planners}
+    parameters = {
+        each: {key: value for name, key, value in arguments.set if name == each}
+        for each in planners
+    }
 
     def progress(what: str, total: int, done: int) -> None:
         if what != doing[0]:
@@ -148,7 +258,16 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
 
 def _options(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the options of a run and of the runs of a search."""
-    names = ("n", "environment", "time_limit", "seed", "plane_tolerance", *ENGINE, "replan", "force")
+    names = (
+        "n",
+        "environment",
+        "time_limit",
+        "seed",
+        "plane_tolerance",
+        *ENGINE,
+        "replan",
+        "force",
+    )
     plants = (arguments.plant or ("nominal",)) if arguments.simulate else ()
     return {"plants": plants, **options_of(arguments, *names)}
 
@@ -168,16 +287,25 @@ def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:
         "runs": [asdict(run) for run in found.runs],
         "reference": reference_planner(found.results, found.reference),
         "plane_tolerance_m": found.plane_tolerance,
-        "planners": {plant or "planned": found.summary(plant) for plant in found.executions},
+        "planners": {
+            plant or "planned": found.summary(plant) for plant in found.executions
+        },
     }
 
 
 def _text(found: "Benchmark") -> str:
     """Format one table per plant with a column per planner."""
-    from cnpgen.addons.benchmark.result_tables import failure_summaries, notes, table_rows
+    from cnpgen.addons.benchmark.result_tables import (
+        failure_summaries,
+        notes,
+        table_rows,
+    )
 
     head = f"{found.suite.name} {found.suite.version}: {len(found.problems)} problems"
-    tables = [table([(*row, "") for row in table_rows(found, plant)], indent="  ") for plant in found.executions]
+    tables = [
+        table([(*row, "") for row in table_rows(found, plant)], indent="  ")
+        for plant in found.executions
+    ]
     sections = [[head], *tables, [*failure_summaries(found), *notes(found)]]
     return "\n\n".join("\n".join(lines) for lines in sections)
 
@@ -197,7 +325,10 @@ def _listing(*, as_json: bool) -> str:
     }
     if as_json:
         return json.dumps(found, indent=2)
-    return "\n\n".join("\n".join([what, *table(list(names.items()), indent="  ")]) for what, names in found.items())
+    return "\n\n".join(
+        "\n".join([what, *table(list(names.items()), indent="  ")])
+        for what, names in found.items()
+    )
 
 
 def _planners() -> tuple[dict[str, str], dict[str, str]]:

@@ -31,13 +31,11 @@ Plan = Callable[[Plans], Answer]
 class Setting:
     """Information for a planner before the first problem.
 
-    Attributes:
-        problem: Record of the problem.
-        model: Name of the shipped model for problems of this kind, or empty.
-        time_limit: Planning time per problem [s]; a planner that takes longer has no plan and is stopped.
-        seed: Seed of random planners.
-        repetition: Number of the repetition, from 0.
-        parameters: Values of the planner's fields, as in a recipe; the others have their defaults.
+    Attributes: problem: Record of the problem. model: Name of the shipped model for
+        problems of this kind, or empty. time_limit: Planning time per problem [s]; a
+        planner that takes longer has no plan and is stopped. seed: Seed of random
+        planners. repetition: Number of the repetition, from 0. parameters: Values of
+        the planner's fields, as in a recipe; the others have their defaults.
     """
 
     problem: ProblemRecord
@@ -54,13 +52,16 @@ class Setting:
         Args:
             problem: The boundary problem, which is known by its ``sample_id``.
         """
-        return np.random.default_rng([self.seed, self.repetition, int(problem.sample_id[0])])
+        return np.random.default_rng(
+            [self.seed, self.repetition, int(problem.sample_id[0])]
+        )
 
 
 class BenchmarkPlanner(ABC):
     """Planner of the benchmark: a frozen dataclass whose fields are declared with ``cnpgen.plugins.field``.
 
-    Packages register planners under the entry point ``cnpgen.planners``. Each planner runs in its own process.
+    Packages register planners under the entry point ``cnpgen.planners``. Each planner
+    runs in its own process.
     """
 
     def describe(self) -> str:
@@ -95,7 +96,9 @@ def load_planner(name: str, parameters: Mapping[str, Any]) -> BenchmarkPlanner:
         UsageError: A parameter is unknown or invalid.
     """
     errors: list[str] = []
-    planner = parse(load_kind(name), dict(parameters), where=RecipeLocation(name), errors=errors)
+    planner = parse(
+        load_kind(name), dict(parameters), where=RecipeLocation(name), errors=errors
+    )
     if planner is None:
         raise UsageError("; ".join(errors), concerns="parameters")
     assert isinstance(planner, BenchmarkPlanner)

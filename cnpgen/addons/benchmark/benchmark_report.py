@@ -36,16 +36,24 @@ _STYLE += "td:first-child,th:first-child{text-align:left}table{border-collapse:c
 _STYLE += "svg{max-width:100%;height:auto}figure{display:inline-block;width:46%;margin:1%}img,video{width:100%}"
 MIN_LOGARITHMIC_RATIO = 20.0  # of the largest to the smallest positive value, from which axes are logarithmic
 PANELS_PER_ROW = 4
-STYLES = ("-", "--", "-.", ":")  # with the ten colors of matplotlib, forty planners differ
+STYLES = (
+    "-",
+    "--",
+    "-.",
+    ":",
+)  # with the ten colors of matplotlib, forty planners differ
 COLORS = 10
 
 
 @checked_arguments
-def save_benchmark_figures(benchmark: Benchmark, folder: str | Path) -> tuple[Path, ...]:
+def save_benchmark_figures(
+    benchmark: Benchmark, folder: str | Path
+) -> tuple[Path, ...]:
     """Write ``success-PLANT.pdf`` and ``distributions-PLANT.pdf`` for every plant; existing files are replaced.
 
-    The first one has the ratio of problems that are solved within a planning time on one thread: successful
-    executions, or without a plant valid plans. Distributions are box plots with medians and quartiles.
+    The first one has the ratio of problems that are solved within a planning time on
+    one thread: successful executions, or without a plant valid plans. Distributions are
+    box plots with medians and quartiles.
 
     Args:
         benchmark: Result of ``run_benchmark``.
@@ -65,7 +73,10 @@ def save_benchmark_figures(benchmark: Benchmark, folder: str | Path) -> tuple[Pa
 def benchmark_figures(benchmark: Benchmark, plant: str) -> dict[str, "Figure"]:
     """Draw both figures of a plant; return name -> figure."""
     values = benchmark_values(benchmark, plant)
-    return {"success": success_figure(values, plant), "distributions": distribution_figure(values)}
+    return {
+        "success": success_figure(values, plant),
+        "distributions": distribution_figure(values),
+    }
 
 
 def benchmark_values(benchmark: Benchmark, plant: str) -> dict[str, list[Values]]:
@@ -80,7 +91,9 @@ def benchmark_values(benchmark: Benchmark, plant: str) -> dict[str, list[Values]
 
 def success_over_time(rows: list[Values], flag: str) -> tuple[Array, Array]:
     """Return the planning times of problems with a flag in increasing order [ms], and the ratios solved by then."""
-    times = np.sort([float(known["planning_cpu_ms"]) for known in rows if known.get(flag)])
+    times = np.sort(
+        [float(known["planning_cpu_ms"]) for known in rows if known.get(flag)]
+    )
     return times, np.arange(1, len(times) + 1) / max(len(rows), 1)
 
 
@@ -88,13 +101,20 @@ def success_figure(values: dict[str, list[Values]], plant: str) -> "Figure":
     """Draw the ratio of successful executions, or of valid plans without a plant, over the planning time."""
     figure = new_figure(4.5, 3.2)
     axes, flag = figure.add_subplot(), "success" if plant else "valid"
-    times_ms = [float(known.get("planning_cpu_ms", 0.0)) for rows in values.values() for known in rows]
+    times_ms = [
+        float(known.get("planning_cpu_ms", 0.0))
+        for rows in values.values()
+        for known in rows
+    ]
     max_time = max(times_ms, default=1.0)
     for index, (name, rows) in enumerate(values.items()):
         times, ratios = success_over_time(rows, flag)
         end = ratios[-1] if len(ratios) else 0.0
         line = np.append(times, max(max_time, 1e-3)), np.append(ratios, end)
-        style = {"linestyle": STYLES[index // COLORS % len(STYLES)], "color": f"C{index % COLORS}"}
+        style = {
+            "linestyle": STYLES[index // COLORS % len(STYLES)],
+            "color": f"C{index % COLORS}",
+        }
         axes.step(*line, where="post", label=f"{name} ({100 * end:.0f} %)", **style)  # type: ignore[arg-type]
     axes.set_xscale("log")
     axes.set_ylim(0, 1.02)
@@ -107,12 +127,19 @@ def success_figure(values: dict[str, list[Values]], plant: str) -> "Figure":
 
 def distribution_figure(values: dict[str, list[Values]]) -> "Figure":
     """Draw a box plot of each known figure."""
-    keys = [key for key in FIGURES if any(key in known for rows in values.values() for known in rows)]
+    keys = [
+        key
+        for key in FIGURES
+        if any(key in known for rows in values.values() for known in rows)
+    ]
     columns = max(min(len(keys), PANELS_PER_ROW), 1)
     count = max(-(-len(keys) // columns), 1)
     figure = new_figure(4 * columns, 3 * count, dpi=100)
     for place, key in enumerate(keys, start=1):
-        known = {name: [float(row[key]) for row in rows if key in row] for name, rows in values.items()}
+        known = {
+            name: [float(row[key]) for row in rows if key in row]
+            for name, rows in values.items()
+        }
         _draw_boxes(figure.add_subplot(count, columns, place), known, FIGURES[key])
     return figure
 
@@ -122,18 +149,23 @@ def _draw_boxes(axes: "Axes", known: dict[str, list[float]], title: str) -> None
     axes.set_xticks(range(1, len(known) + 1), list(known), rotation=30, fontsize=7)
     axes.set_title(title, fontsize=9)
     numbers: Any = np.concatenate([np.array(part, float) for part in known.values()])
-    if len(numbers) and numbers.min() > 0 and numbers.max() > MIN_LOGARITHMIC_RATIO * numbers.min():
+    if (
+        len(numbers)
+        and numbers.min() > 0
+        and numbers.max() > MIN_LOGARITHMIC_RATIO * numbers.min()
+    ):
         axes.set_yscale("log")
 
 
 @checked_arguments
-def save_benchmark_report(benchmark: Benchmark, path: str | Path, *, video: bool = False) -> Path:
+def save_benchmark_report(
+    benchmark: Benchmark, path: str | Path, *, video: bool = False
+) -> Path:
     """Write the report of a benchmark as one self-contained file; an existing file is replaced.
 
-    Args:
-        benchmark: Result of ``run_benchmark``.
-        path: Output file, ``.html``.
-        video: Whether to film the first plan of every planner, instead of an image; takes some seconds each.
+    Args: benchmark: Result of ``run_benchmark``. path: Output file, ``.html``. video:
+        Whether to film the first plan of every planner, instead of an image; takes some
+        seconds each.
 
     Raises:
         MachineError: matplotlib is missing, or the file cannot be written.
@@ -142,7 +174,10 @@ def save_benchmark_report(benchmark: Benchmark, path: str | Path, *, video: bool
     parts = [
         f"<h1>{escape(suite.name)} {suite.version}</h1><p>{escape(suite.title)}: {len(benchmark.problems)} problems</p>"
     ]
-    parts += [f"<p>{escape(text)}</p>" for text in [*failure_summaries(benchmark), *notes(benchmark)]]
+    parts += [
+        f"<p>{escape(text)}</p>"
+        for text in [*failure_summaries(benchmark), *notes(benchmark)]
+    ]
     for plant in benchmark.executions:
         title = f"executed by the {plant} plant" if plant else "planned"
         drawings = "".join(map(_as_svg, benchmark_figures(benchmark, plant).values()))
@@ -156,8 +191,13 @@ def save_benchmark_report(benchmark: Benchmark, path: str | Path, *, video: bool
 def _table(benchmark: Benchmark, plant: str) -> str:
     """Format the rows of ``table_rows``."""
     head, *rows = table_rows(benchmark, plant)
-    lines = ["<table><tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in head) + "</tr>"]
-    lines += ["<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
+    lines = [
+        "<table><tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in head) + "</tr>"
+    ]
+    lines += [
+        "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>"
+        for row in rows
+    ]
     return "\n".join([*lines, "</table>"])
 
 
@@ -173,7 +213,8 @@ def _motions(benchmark: Benchmark, *, video: bool) -> list[str]:
         return []
     parts, plant = [], benchmark.plants[0]
     executed = {
-        name: [row for row in rows if _was_executed(row, plant.name)] for name, rows in benchmark.results.items()
+        name: [row for row in rows if _was_executed(row, plant.name)]
+        for name, rows in benchmark.results.items()
     }
     problems = [{row["problem"] for row in rows} for rows in executed.values() if rows]
     common = min(set.intersection(*problems), default=None) if problems else None
@@ -182,7 +223,11 @@ def _motions(benchmark: Benchmark, *, video: bool) -> list[str]:
             continue
         row = next((row for row in rows if row["problem"] == common), rows[0])
         index = row["problem"]
-        task = benchmark.problems[index], row["answer"], benchmark.prefix and benchmark.prefix[index]
+        task = (
+            benchmark.problems[index],
+            row["answer"],
+            benchmark.prefix and benchmark.prefix[index],
+        )
         label = f"{escape(name)}, problem {index}"
         try:
             element, caption = _render(task, plant, video=video)
@@ -191,7 +236,9 @@ def _motions(benchmark: Benchmark, *, video: bool) -> list[str]:
         except CnpgenError as error:  # the line is damaged
             parts.append(f"<p>{label}: no image: {escape(str(error))}</p>")
             continue
-        parts.append(f"<figure>{element}<figcaption>{label}, {caption}</figcaption></figure>")
+        parts.append(
+            f"<figure>{element}<figcaption>{label}, {caption}</figcaption></figure>"
+        )
     return parts
 
 
@@ -216,7 +263,10 @@ def _render(task: Task, plant: Plant, *, video: bool) -> tuple[str, str]:
         if not film.exists():
             return f"<img src='{image}'>", caption
         source = _embedded(film, "video/mp4")
-    return f"<video controls loop muted poster='{image}' src='{source}'></video>", "scaled in time"
+    return (
+        f"<video controls loop muted poster='{image}' src='{source}'></video>",
+        "scaled in time",
+    )
 
 
 def _embedded(file: Path, kind: str) -> str:

@@ -1,7 +1,8 @@
 """Statistics of benchmark results: ratios with intervals, medians, tails, and significance of differences.
 
-A planner is compared with the reference planner over common problems. Repetitions of a problem are not independent, so
-tests compare one mean per problem, and intervals count problems.
+A planner is compared with the reference planner over common problems. Repetitions of a
+problem are not independent, so tests compare one mean per problem, and intervals count
+problems.
 """
 
 from collections import defaultdict
@@ -62,21 +63,32 @@ Values = dict[str, bool | float]
 """Flags and figures of one problem, by the names of ``FLAGS`` and ``FIGURES``."""
 
 
-def values_of(row: Mapping[str, Any], plant: str = "", plane_tolerance: float = PLANE_TOLERANCE_M) -> Values:
+def values_of(
+    row: Mapping[str, Any], plant: str = "", plane_tolerance: float = PLANE_TOLERANCE_M
+) -> Values:
     """Return the known flags and figures of a row; empty if the planner or the plant does not apply.
 
     The plant is empty for plans only; ``succeeded`` defines the tolerance.
     """
     has_answer = row["answer"] is not None
     executed = row.get("executed", {}).get(plant)
-    if row.get("ending") == NOT_APPLICABLE or (plant and has_answer and executed is None):
+    if row.get("ending") == NOT_APPLICABLE or (
+        plant and has_answer and executed is None
+    ):
         return {}
     values: Values = {"planned": has_answer}
     if row.get("ending") != CRASHED:  # the CPU time of a crashed process is unknown
-        values |= {"planning_ms": 1e3 * row["planning_s"], "planning_cpu_ms": 1e3 * row["planning_cpu_s"]}
+        values |= {
+            "planning_ms": 1e3 * row["planning_s"],
+            "planning_cpu_ms": 1e3 * row["planning_cpu_s"],
+        }
     if plant:
         executed = executed or {}
-        values |= {name: value for name, value in executed.items() if name in FLAGS or name in FIGURES}
+        values |= {
+            name: value
+            for name, value in executed.items()
+            if name in FLAGS or name in FIGURES
+        }
         if "penalty_points" in executed:
             values["violated"] = executed["penalty_points"] > 0
         values["success"] = bool(executed) and succeeded(executed, plane_tolerance)
@@ -84,8 +96,14 @@ def values_of(row: Mapping[str, Any], plant: str = "", plane_tolerance: float = 
     if verdict is None:
         return {**values, "valid": False, "paper_valid": False, "paper_finished": False}
     metrics, paper = verdict["metrics"], verdict["paper"]
-    values |= {"valid": verdict["valid"], "paper_valid": paper["valid"], "paper_finished": paper["finished"]}
-    values |= {name: metrics[key] for name, key in METRICS_OF_FIGURES.items() if key in metrics}
+    values |= {
+        "valid": verdict["valid"],
+        "paper_valid": paper["valid"],
+        "paper_finished": paper["finished"],
+    }
+    values |= {
+        name: metrics[key] for name, key in METRICS_OF_FIGURES.items() if key in metrics
+    }
     if "joint acceleration" in verdict["value_over_bound"]:
         values["acceleration_use"] = verdict["value_over_bound"]["joint acceleration"]
     return values
@@ -100,12 +118,13 @@ def summarize_results(
 ) -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
     """Summarize the rows of all planners on a plant, or of their plans only if it is empty.
 
-    Returns:
-        Planner -> ``{"ratios": ..., "figures": ...}``, both empty if the planner does not apply. A ratio has ``count``,
-        ``of``, ``share`` and its 95 % interval by Wilson, ``low`` and ``high``. A figure has ``median``, ``q1``,
-        ``q3``, the tails ``p99``, ``p999`` and ``max``, and ``of``, its number of values. A tail is the next larger
-        value, so p99 of fewer than 100 values is the maximum. Both have ``p``, the p-value of the difference from the
-        reference planner, and ``p_holm``, corrected by Holm for all comparisons of this table.
+    Returns: Planner -> ``{"ratios": ..., "figures": ...}``, both empty if the planner
+        does not apply. A ratio has ``count``, ``of``, ``share`` and its 95 % interval
+        by Wilson, ``low`` and ``high``. A figure has ``median``, ``q1``, ``q3``, the
+        tails ``p99``, ``p999`` and ``max``, and ``of``, its number of values. A tail is
+        the next larger value, so p99 of fewer than 100 values is the maximum. Both have
+        ``p``, the p-value of the difference from the reference planner, and ``p_holm``,
+        corrected by Holm for all comparisons of this table.
     """
     values = {
         name: {
@@ -119,9 +138,13 @@ def summarize_results(
     keys = {key for rows in values.values() for known in rows.values() for key in known}
     summary = {
         name: {
-            "ratios": {key: _ratio(key, rows, other) for key in FLAGS if key in keys and rows},
+            "ratios": {
+                key: _ratio(key, rows, other) for key in FLAGS if key in keys and rows
+            },
             "figures": {
-                key: _figure(key, rows, other) for key in FIGURES if any(key in known for known in rows.values())
+                key: _figure(key, rows, other)
+                for key in FIGURES
+                if any(key in known for known in rows.values())
             },
         }
         for name, rows in values.items()
@@ -145,13 +168,21 @@ Keyed = Mapping[tuple[int, int], Values]
 def _ratio(key: str, rows: Keyed, others: Keyed) -> dict[str, Any]:
     count, of = sum(bool(known.get(key, False)) for known in rows.values()), len(rows)
     mine, theirs = (
-        _means({at: {key: known.get(key, False)} for at, known in part.items()}, key) for part in (rows, others)
+        _means({at: {key: known.get(key, False)} for at, known in part.items()}, key)
+        for part in (rows, others)
     )
     low, high = wilson(count / max(of, 1), len(mine))
     pairs = _pairs(mine, theirs)
     is_binary = not np.any(pairs % 1)
     p = mcnemar(*(pairs.T > 0)) if is_binary else wilcoxon(pairs)
-    return {"count": count, "of": of, "share": count / max(of, 1), "low": low, "high": high, "p": p}
+    return {
+        "count": count,
+        "of": of,
+        "share": count / max(of, 1),
+        "low": low,
+        "high": high,
+        "p": p,
+    }
 
 
 def _figure(key: str, rows: Keyed, others: Keyed) -> dict[str, Any]:
@@ -160,7 +191,14 @@ def _figure(key: str, rows: Keyed, others: Keyed) -> dict[str, Any]:
     tails = np.quantile(values, list(TAILS.values()), method="higher").tolist()
     pairs = _pairs(_means(rows, key), _means(others, key))
     p = wilcoxon(pairs)
-    return {"median": median, "q1": q1, "q3": q3, **dict(zip(TAILS, tails, strict=True)), "of": len(values), "p": p}
+    return {
+        "median": median,
+        "q1": q1,
+        "q3": q3,
+        **dict(zip(TAILS, tails, strict=True)),
+        "of": len(values),
+        "p": p,
+    }
 
 
 def _means(rows: Keyed, key: str) -> dict[int, float]:
@@ -174,13 +212,22 @@ def _means(rows: Keyed, key: str) -> dict[int, float]:
 
 def _pairs(mine: Mapping[int, float], theirs: Mapping[int, float]) -> Array:
     """Return the values of common problems, shape (N, 2)."""
-    return np.array([(mine[at], theirs[at]) for at in mine if at in theirs], float).reshape(-1, 2)
+    return np.array(
+        [(mine[at], theirs[at]) for at in mine if at in theirs], float
+    ).reshape(-1, 2)
 
 
 def _correct(summary: dict[str, dict[str, dict[str, dict[str, Any]]]]) -> None:
     """Add the corrected p-values of a table."""
-    statistics = [item for groups in summary.values() for group in groups.values() for item in group.values()]
-    for item, p in zip(statistics, holm([item["p"] for item in statistics]), strict=True):
+    statistics = [
+        item
+        for groups in summary.values()
+        for group in groups.values()
+        for item in group.values()
+    ]
+    for item, p in zip(
+        statistics, holm([item["p"] for item in statistics]), strict=True
+    ):
         item["p_holm"] = p
 
 
@@ -190,8 +237,14 @@ def wilson(share: float, n: int) -> tuple[float, float]:
         return 0.0, 1.0
     z2 = NORMAL_QUANTILE_95**2
     center = (share + z2 / (2 * n)) / (1 + z2 / n)
-    half = NORMAL_QUANTILE_95 * np.sqrt(share * (1 - share) / n + z2 / (4 * n**2)) / (1 + z2 / n)
-    return float(center - half) if share > 0 else 0.0, float(center + half) if share < 1 else 1.0
+    half = (
+        NORMAL_QUANTILE_95
+        * np.sqrt(share * (1 - share) / n + z2 / (4 * n**2))
+        / (1 + z2 / n)
+    )
+    return float(center - half) if share > 0 else 0.0, float(
+        center + half
+    ) if share < 1 else 1.0
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
@@ -199,7 +252,9 @@ def holm(p_values: Sequence[float]) -> list[float]:
     order = np.argsort(p_values, kind="stable")
     factors = np.arange(len(order), 0, -1)
     corrected = np.empty(len(order))
-    corrected[order] = np.minimum(np.maximum.accumulate(factors * np.asarray(p_values, float)[order]), 1.0)
+    corrected[order] = np.minimum(
+        np.maximum.accumulate(factors * np.asarray(p_values, float)[order]), 1.0
+    )
     return [float(p) for p in corrected]
 
 
@@ -218,4 +273,8 @@ def wilcoxon(pairs: Any) -> float:
 
     if len(pairs) == 0 or not np.any(pairs[:, 0] != pairs[:, 1]):
         return 1.0
-    return float(signed_ranks(pairs[:, 0], pairs[:, 1], zero_method="wilcox", correction=False).pvalue)
+    return float(
+        signed_ranks(
+            pairs[:, 0], pairs[:, 1], zero_method="wilcox", correction=False
+        ).pvalue
+    )

@@ -27,8 +27,9 @@ MIN_LOGARITHMIC_RANGE = 10.0  # ratio of both ends, from which values are log-un
 class Trial:
     """Result of one set of parameters; number 0 has the default ones.
 
-    ``solved`` is the ratio of successful executions, the mean of all plants, or of valid plans without a plant. The
-    times are medians, nan if the planner does not apply or without a plan.
+    ``solved`` is the ratio of successful executions, the mean of all plants, or of
+    valid plans without a plant. The times are medians, nan if the planner does not
+    apply or without a plan.
     """
 
     number: int
@@ -50,16 +51,25 @@ def search_parameters(
 ) -> list[Trial]:
     """Try random parameters of a planner on a suite; an interrupted search resumes.
 
-    A range maps a field to (low, high), in SI units. Values are uniform, or log-uniform if both ends are positive and
-    differ by a factor of 10 or more. Fields of type int get whole numbers. The default parameters are tried, too. Tune
-    on other problems than those of the comparison: the name of a dataset gives fresh ones. Options are further
-    arguments of ``run_benchmark``. The folder gets one folder per trial, and ``search.csv``.
+    A range maps a field to (low, high), in SI units. Values are uniform, or log-uniform
+    if both ends are positive and differ by a factor of 10 or more. Fields of type int
+    get whole numbers. The default parameters are tried, too. Tune on other problems
+    than those of the comparison: the name of a dataset gives fresh ones. Options are
+    further arguments of ``run_benchmark``. The folder gets one folder per trial, and
+    ``search.csv``.
 
-    Return the trials, the best one first: by solved problems, then by motion time, then by planning time.
+    Return the trials, the best one first: by solved problems, then by motion time, then
+    by planning time.
     """
-    trials, seed = integer("trials", trials, least=1, most=MAX_TRIALS), integer("seed", seed, least=0)
+    trials, seed = (
+        integer("trials", trials, least=1, most=MAX_TRIALS),
+        integer("seed", seed, least=0),
+    )
     whole = {key.name for key in _keys_of(planner) if key.hint is int}
-    drawn = (random_parameters(ranges, [seed, number], whole=whole) for number in range(trials))
+    drawn = (
+        random_parameters(ranges, [seed, number], whole=whole)
+        for number in range(trials)
+    )
     sets: list[dict[str, Any]] = [{}, *drawn]
     done = []
     for number, parameters in enumerate(sets):
@@ -78,13 +88,19 @@ def search_parameters(
 
 
 def _keys_of(planner: str) -> tuple[Key, ...]:
-    """Return the fields of a planner; empty if it is unknown, which ``run_benchmark`` reports."""
+    """Return the fields of a planner.
+
+    Empty if it is unknown, which ``run_benchmark`` reports.
+    """
     known = registry.names(PLANNERS)
     return keys(load_kind(planner)) if planner in known else ()
 
 
 def random_parameters(
-    ranges: Mapping[str, Sequence[float]], seed: Sequence[int], *, whole: Collection[str] = ()
+    ranges: Mapping[str, Sequence[float]],
+    seed: Sequence[int],
+    *,
+    whole: Collection[str] = (),
 ) -> dict[str, Any]:
     """Draw a value for each field; see ``search_parameters``.
 
@@ -96,7 +112,10 @@ def random_parameters(
     random, values = np.random.default_rng(list(seed)), {}
     for key, ends in ranges.items():
         if len(ends) != 2 or not all(map(math.isfinite, ends)) or not ends[0] < ends[1]:
-            raise UsageError(f"must have two increasing numbers for {key!r}, got {ends!r:.100}", argument="ranges")
+            raise UsageError(
+                f"must have two increasing numbers for {key!r}, got {ends!r:.100}",
+                argument="ranges",
+            )
         low, high = ends
         if low > 0 and high / low >= MIN_LOGARITHMIC_RANGE:
             value = float(np.exp(random.uniform(math.log(low), math.log(high))))
@@ -113,21 +132,39 @@ def csv_of(trials: Sequence[Trial], keys: Sequence[str]) -> str:
     writer.writerow(["trial", "solved", "planning_cpu_ms", "duration_s", *keys])
     for trial in trials:
         values = [trial.parameters.get(key, "") for key in keys]
-        writer.writerow([trial.number, trial.solved, trial.planning_cpu_ms, trial.duration_s, *values])
+        writer.writerow(
+            [
+                trial.number,
+                trial.solved,
+                trial.planning_cpu_ms,
+                trial.duration_s,
+                *values,
+            ]
+        )
     return text.getvalue()
 
 
-def _trial(number: int, parameters: Mapping[str, Any], benchmark: Benchmark, planner: str) -> Trial:
-    summaries = {plant: benchmark.summary(plant)[planner] for plant in benchmark.executions}
+def _trial(
+    number: int, parameters: Mapping[str, Any], benchmark: Benchmark, planner: str
+) -> Trial:
+    summaries = {
+        plant: benchmark.summary(plant)[planner] for plant in benchmark.executions
+    }
     ratios = [
         summary["ratios"].get("success" if plant else "valid", {"share": 0.0})["share"]
         for plant, summary in summaries.items()
     ]
     figures = summaries[benchmark.executions[0]]["figures"]
-    medians = [figures.get(key, {}).get("median", math.nan) for key in ("planning_cpu_ms", "duration_s")]
+    medians = [
+        figures.get(key, {}).get("median", math.nan)
+        for key in ("planning_cpu_ms", "duration_s")
+    ]
     return Trial(number, parameters, float(np.mean(ratios)), *medians)
 
 
 def _rank(trial: Trial) -> tuple[float, float, float, int]:
-    times = [math.inf if math.isnan(time) else time for time in (trial.duration_s, trial.planning_cpu_ms)]
+    times = [
+        math.inf if math.isnan(time) else time
+        for time in (trial.duration_s, trial.planning_cpu_ms)
+    ]
     return -trial.solved, times[0], times[1], trial.number

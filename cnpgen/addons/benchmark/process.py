@@ -40,7 +40,8 @@ class Ending(StrEnum):
 class PlanningOutcome:
     """Result of planning for one problem: the answer in its stored form, wall and CPU time [s], and an error message.
 
-    The CPU time includes that of ended child processes; of a stopped planner, also that of its running child processes.
+    The CPU time includes that of ended child processes; of a stopped planner, also that
+    of its running child processes.
     """
 
     ending: Ending
@@ -74,16 +75,30 @@ class PlannerProcess:
                 return self._in_time(self._pipe.recv())
         except (EOFError, OSError):
             self.stop()
-            return PlanningOutcome(Ending.CRASHED, seconds=time.perf_counter() - start, error="its process ended")
-        seconds, used = time.perf_counter() - start, cpu_time_of(self._process.pid) - used
+            return PlanningOutcome(
+                Ending.CRASHED,
+                seconds=time.perf_counter() - start,
+                error="its process ended",
+            )
+        seconds, used = (
+            time.perf_counter() - start,
+            cpu_time_of(self._process.pid) - used,
+        )
         self.stop()
-        return PlanningOutcome(Ending.OUT_OF_TIME, None, seconds, used, "stopped: no answer")
+        return PlanningOutcome(
+            Ending.OUT_OF_TIME, None, seconds, used, "stopped: no answer"
+        )
 
     def _in_time(self, outcome: PlanningOutcome) -> PlanningOutcome:
         """Return an outcome, without an answer that is late."""
         if outcome.answer is None or outcome.seconds <= self._setting.time_limit:
             return outcome
-        return replace(outcome, ending=Ending.OUT_OF_TIME, answer=None, error="answered after the time limit")
+        return replace(
+            outcome,
+            ending=Ending.OUT_OF_TIME,
+            answer=None,
+            error="answered after the time limit",
+        )
 
     def stop(self) -> None:
         """End the process and its child processes."""
@@ -99,14 +114,21 @@ class PlannerProcess:
         start = time.perf_counter()
         self._pipe, child_end = multiprocessing.Pipe()
         with child_end:  # multiprocessing.Process would run the caller's script and is forbidden in dask workers
-            program = (
-                f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve({child_end.fileno()})"
-            )
+            program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; "
+            program += f"serve({child_end.fileno()})"
             command = [sys.executable, "-c", program]
             self._process = subprocess.Popen(  # output of planners is not data
-                command, pass_fds=[child_end.fileno()], stdin=subprocess.DEVNULL, stdout=STDERR, start_new_session=True
+                command,
+                pass_fds=[child_end.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=STDERR,
+                start_new_session=True,
             )
-        refuses, lacks, message = False, False, "its process ended or was not ready in time"
+        refuses, lacks, message = (
+            False,
+            False,
+            "its process ended or was not ready in time",
+        )
         with suppress(EOFError, OSError):
             self._pipe.send((self._name, self._setting))
             if self._pipe.poll(MAX_PREPARATION_TIME_S):
@@ -119,7 +141,9 @@ class PlannerProcess:
         if refuses:
             return PlanningOutcome(Ending.NOT_APPLICABLE, error=message)
         return PlanningOutcome(
-            Ending.CRASHED, seconds=time.perf_counter() - start, error=f"before the first problem: {message}"
+            Ending.CRASHED,
+            seconds=time.perf_counter() - start,
+            error=f"before the first problem: {message}",
         )
 
 
@@ -128,7 +152,9 @@ def end_processes(root: int) -> None:
     import psutil
 
     with suppress(psutil.NoSuchProcess):
-        descendants = psutil.Process(root).children(recursive=True)  # also those with a session of their own
+        descendants = psutil.Process(root).children(
+            recursive=True
+        )  # also those with a session of their own
         with suppress(ProcessLookupError):
             os.killpg(root, signal.SIGKILL)
         for process in descendants:
@@ -138,7 +164,10 @@ def end_processes(root: int) -> None:
 
 
 def cpu_time_of(root: int) -> float:
-    """Return the CPU time of a process and all of its child processes [s]; 0 if it has ended."""
+    """Return the CPU time of a process and all of its child processes [s].
+
+    0 if it has ended.
+    """
     import psutil
 
     seconds = 0.0
@@ -146,7 +175,9 @@ def cpu_time_of(root: int) -> float:
         process = psutil.Process(root)
         for part in (process, *process.children(recursive=True)):
             with suppress(psutil.NoSuchProcess):
-                seconds += sum(part.cpu_times()[:4])  # user, system, and those of ended child processes
+                seconds += sum(
+                    part.cpu_times()[:4]
+                )  # user, system, and those of ended child processes
     return seconds
 
 
@@ -158,13 +189,18 @@ def _cpu_time() -> float:
 
 def serve(descriptor: int) -> None:
     """Prepare the planner whose name arrives on a pipe, then plan until the pipe is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all processes; the parent decides
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # a terminal sends it to all processes; the parent decides
     with Connection(descriptor) as pipe, suppress(EOFError, OSError):
         name, setting = pipe.recv()
         try:
             plan = load_planner(name, setting.parameters).prepare(setting)
         except Exception as error:  # noqa: BLE001 - a plug-in may raise any exception
-            refuses, lacks = isinstance(error, CnpgenError), isinstance(error, MachineError)
+            refuses, lacks = (
+                isinstance(error, CnpgenError),
+                isinstance(error, MachineError),
+            )
             pipe.send((refuses, lacks, _message(error)))
             return
         pipe.send((False, False, ""))
@@ -185,14 +221,18 @@ def _plan_once(plan: Plan, problem: Plans) -> PlanningOutcome:
         content = _content(answer, problem)
     except Exception as error:  # noqa: BLE001 - a plug-in may raise any exception
         return PlanningOutcome(Ending.FAILED, None, seconds, cpu, _message(error))
-    return PlanningOutcome(Ending.NO_PLAN if content is None else Ending.PLANNED, content, seconds, cpu)
+    return PlanningOutcome(
+        Ending.NO_PLAN if content is None else Ending.PLANNED, content, seconds, cpu
+    )
 
 
 def _content(answer: Any, problem: Plans) -> dict[str, Any] | None:
     """Return the stored form of an answer after checking that it can be read."""
     if answer is None:
         return None
-    if not isinstance(answer, Plans | Trajectory) or (isinstance(answer, Plans) and len(answer) != 1):
+    if not isinstance(answer, Plans | Trajectory) or (
+        isinstance(answer, Plans) and len(answer) != 1
+    ):
         raise UsageError(f"expected one plan, a Trajectory or None, got {answer!r:.60}")
     content = answer_to_dict(answer)
     answer_from_dict(problem, content)
@@ -201,4 +241,8 @@ def _content(answer: Any, problem: Plans) -> dict[str, Any] | None:
 
 def _message(error: Exception) -> str:
     text = " ".join(str(error).split())
-    return text if text and isinstance(error, CnpgenError) else f"{type(error).__name__}: {text}"
+    return (
+        text
+        if text and isinstance(error, CnpgenError)
+        else f"{type(error).__name__}: {text}"
+    )

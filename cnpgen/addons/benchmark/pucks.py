@@ -1,6 +1,7 @@
 """Pucks on a grid, and the boundary problems of hitting each of them towards the goal, from rest or while replanning.
 
-In a replanning scenario, the arm moves towards one puck and then hits another one, from its moving state.
+In a replanning scenario, the arm moves towards one puck and then hits another one, from
+its moving state.
 """
 
 from __future__ import annotations
@@ -47,16 +48,27 @@ class Pucks:
     columns: int = field("number of columns of pucks, evenly spaced along x", low=1)
     rows: int = field("number of rows of pucks, evenly spaced along y", low=1)
     goal: tuple[float, float] = field("target of the pucks: x, y", unit="m")
-    behind: float = field("distance of the tip behind the puck's centre at the hit", unit="m", low=0.0, plausible=1.0)
+    behind: float = field(
+        "distance of the tip behind the puck's centre at the hit",
+        unit="m",
+        low=0.0,
+        plausible=1.0,
+    )
 
     def validate(self) -> Iterator[tuple[str, str]]:
         """Yield (key, error) pairs."""
         if (count := self.columns * self.rows) > MAX_TASKS:
-            yield "columns", f"a grid of {count:,} pucks is too large, expected at most {MAX_TASKS:,}"
+            yield (
+                "columns",
+                f"a grid of {count:,} pucks is too large, expected at most {MAX_TASKS:,}",
+            )
 
     def positions(self) -> Array:
         """Place the pucks [m], shape (2, columns x rows), y fastest."""
-        x, y = np.linspace(self.x.low, self.x.high, self.columns), np.linspace(self.y.low, self.y.high, self.rows)
+        x, y = (
+            np.linspace(self.x.low, self.x.high, self.columns),
+            np.linspace(self.y.low, self.y.high, self.rows),
+        )
         return np.stack(np.meshgrid(x, y, indexing="ij")).reshape(2, -1)
 
 
@@ -71,8 +83,9 @@ def hits_of(pucks: Pucks) -> Plans:
 def hits_from(pucks: Pucks, puck: Array, start: State) -> Plans:
     """Return the boundary problems of hitting N pucks at positions [m] of shape (2, N), each from its own state.
 
-    The goal configuration maximizes the speed of the tip along the hit, near the configuration of the start. The goal
-    velocity has the maximum speed ('cnpgen docs references', 2).
+    The goal configuration maximizes the speed of the tip along the hit, near the
+    configuration of the start. The goal velocity has the maximum speed ('cnpgen docs
+    references', 2).
 
     Raises:
         RecipeError: The problem has no table, or a puck cannot be hit.
@@ -80,7 +93,9 @@ def hits_from(pucks: Pucks, puck: Array, start: State) -> Plans:
     problem = pucks.problem
     table = problem.first(Table)
     if table is None:
-        raise RecipeError([f"pucks.problem: {problem.name} has no table to put pucks on"])
+        raise RecipeError(
+            [f"pucks.problem: {problem.name} has no table to put pucks on"]
+        )
     direction = np.array(pucks.goal)[:, None] - puck
     goal_xy = behind(puck, np.arctan2(direction[1:], direction[:1]), pucks.behind).T
     stages = (
@@ -95,7 +110,9 @@ def hits_from(pucks: Pucks, puck: Array, start: State) -> Plans:
     columns = dict(zip(("start_q", "start_dq", "start_ddq"), start, strict=True))
     completed = complete(pipeline, goal_xyz=goal_xy, **columns)
     if refused := sum(completed.rejections.values()):
-        raise RecipeError([f"pucks: {refused} of {len(completed.reasons)} cannot be hit"])
+        raise RecipeError(
+            [f"pucks: {refused} of {len(completed.reasons)} cannot be hit"]
+        )
     return replace(completed.plans, source="pucks on a grid")
 
 
@@ -103,15 +120,25 @@ def hits_from(pucks: Pucks, puck: Array, start: State) -> Plans:
 class ReplanningScenario:
     """Switches from every puck of a grid to the opposite one, at given times of the first motion."""
 
-    switch_times: tuple[float, ...] = field("times at which the arm leaves its first motion", unit="s", low=0.0)
+    switch_times: tuple[float, ...] = field(
+        "times at which the arm leaves its first motion", unit="s", low=0.0
+    )
     pucks: Pucks = field("grid of pucks of the first and of the second motion")
 
     def validate(self) -> Iterator[tuple[str, str]]:
         """Yield (key, error) pairs."""
         if self.pucks.columns * self.pucks.rows % 2:
-            yield "pucks", "the grid has a puck in its centre, which has no opposite: expected an even number of pucks"
-        if (count := self.pucks.columns * self.pucks.rows * len(self.switch_times)) > MAX_SCENARIOS:
-            yield "switch_times", f"{count:,} switches are too many, expected at most {MAX_SCENARIOS:,}"
+            yield (
+                "pucks",
+                "the grid has a puck in its centre, which has no opposite: expected an even number of pucks",
+            )
+        if (
+            count := self.pucks.columns * self.pucks.rows * len(self.switch_times)
+        ) > MAX_SCENARIOS:
+            yield (
+                "switch_times",
+                f"{count:,} switches are too many, expected at most {MAX_SCENARIOS:,}",
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,4 +177,6 @@ def scenario_problems(scenario: ReplanningScenario) -> tuple[Plans, ExecutedPref
         problems.append(hits_from(scenario.pucks, opposite, first.states_at(time)))
     joined, prefix = concatenate(problems), concatenate([first] * len(problems)).motion
     until = np.repeat(scenario.switch_times, len(first))
-    return replace(joined, sample_id=np.arange(len(joined))), ExecutedPrefix(prefix, until)
+    return replace(joined, sample_id=np.arange(len(joined))), ExecutedPrefix(
+        prefix, until
+    )

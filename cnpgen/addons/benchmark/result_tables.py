@@ -7,13 +7,22 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cnpgen.addons.benchmark.hypothesis_tests import FIGURES, FLAGS, NOT_APPLICABLE, TAILS, reference_planner, values_of
+from cnpgen.addons.benchmark.hypothesis_tests import (
+    FIGURES,
+    FLAGS,
+    NOT_APPLICABLE,
+    TAILS,
+    reference_planner,
+    values_of,
+)
 from cnpgen.addons.benchmark.run_suite import Benchmark
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.files.atomic import write_file
 
 PAPER_PLANNER = "cnp-b-paper"  # the planner that the paper calls CNP-B
-PRINTED: dict[str, dict[str, dict[str, str]]] = {  # suite -> planner -> figure -> value in the paper's text
+PRINTED: dict[
+    str, dict[str, dict[str, str]]
+] = {  # suite -> planner -> figure -> value in the paper's text
     "hits-81": {
         PAPER_PLANNER: {"scored": "100 %", "planning_ms": "33", "z_error_mm_s": "< 5"},
         "aqp": {"scored": "92.59 %", "planning_ms": "42 in C++"},
@@ -23,16 +32,40 @@ PRINTED: dict[str, dict[str, dict[str, str]]] = {  # suite -> planner -> figure 
         PAPER_PLANNER: {"paper_finished": "100 %", "paper_valid": "95 %"},
         "cbirrt": {"paper_finished": "88 %", "paper_valid": "74 %"},
     },
-    "hits-110": {PAPER_PLANNER: {"scored": "78.2 % (real robot)"}, "aqp": {"scored": "52.7 % (real robot)"}},
+    "hits-110": {
+        PAPER_PLANNER: {"scored": "78.2 % (real robot)"},
+        "aqp": {"scored": "52.7 % (real robot)"},
+    },
 }
-PYTHON_LOOPS = ("aqp", "cbirrt", "rrtconnect", "sscbirrt")  # planners whose authors' inner loops are in C++
+PYTHON_LOOPS = (
+    "aqp",
+    "cbirrt",
+    "rrtconnect",
+    "sscbirrt",
+)  # planners whose authors' inner loops are in C++
 TAIL_FIGURES = ("planning_ms", "planning_cpu_ms")  # printed with their tails
 MAX_PRINTED_P = 0.05
 TABLE_FILES = ("results.csv", "tables.md", "tables.tex")
 _LATEX = str.maketrans(
-    {"&": r"\&", "%": r"\%", "_": r"\_", "<": r"\textless{}", "#": r"\#", "²": r"\textsuperscript{2}"}
+    {
+        "&": r"\&",
+        "%": r"\%",
+        "_": r"\_",
+        "<": r"\textless{}",
+        "#": r"\#",
+        "²": r"\textsuperscript{2}",
+    }
 )
-_COLUMNS = ("suite", "suite_version", "planner", "repetition", "problem", "plant", "ending", "seed")
+_COLUMNS = (
+    "suite",
+    "suite_version",
+    "planner",
+    "repetition",
+    "problem",
+    "plant",
+    "ending",
+    "seed",
+)
 
 
 @checked_arguments
@@ -58,7 +91,11 @@ def table_rows(benchmark: Benchmark, plant: str) -> list[tuple[str, ...]]:
     summary = benchmark.summary(plant)
     printed = PRINTED.get(benchmark.suite.name, {})
     rows: list[tuple[str, ...]] = [(f"{plant} plant" if plant else "planned", *summary)]
-    missing = {name: _missing_text(benchmark.results[name]) for name in summary if not summary[name]["ratios"]}
+    missing = {
+        name: _missing_text(benchmark.results[name])
+        for name in summary
+        if not summary[name]["ratios"]
+    }
     if missing:
         rows.append(("applicability", *(missing.get(name, "") for name in summary)))
     for group, texts in (("ratios", FLAGS), ("figures", FIGURES)):
@@ -67,17 +104,24 @@ def table_rows(benchmark: Benchmark, plant: str) -> list[tuple[str, ...]]:
             if not any(statistics):
                 continue
             cells = (
-                cell_text(item, printed.get(name, {}).get(key)) for name, item in zip(summary, statistics, strict=True)
+                cell_text(item, printed.get(name, {}).get(key))
+                for name, item in zip(summary, statistics, strict=True)
             )
             rows.append((text, *cells))
             if key in TAIL_FIGURES:
-                rows.append((f"{text}: p99, p99.9, maximum", *map(tail_text, statistics)))
+                rows.append(
+                    (f"{text}: p99, p99.9, maximum", *map(tail_text, statistics))
+                )
     return rows
 
 
 def _missing_text(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return the reason why a planner has no values: it does not apply, or the plant has not executed its plans."""
-    return NOT_APPLICABLE if all(row["ending"] == NOT_APPLICABLE for row in rows) else "not executed"
+    return (
+        NOT_APPLICABLE
+        if all(row["ending"] == NOT_APPLICABLE for row in rows)
+        else "not executed"
+    )
 
 
 def cell_text(statistic: dict[str, Any] | None, printed: str | None = None) -> str:
@@ -88,14 +132,22 @@ def cell_text(statistic: dict[str, Any] | None, printed: str | None = None) -> s
         interval = f"{100 * statistic['low']:.3g} to {100 * statistic['high']:.3g} %"
         text = f"{statistic['count']} of {statistic['of']} ({interval})"
     else:
-        text = f"{statistic['median']:.3g} [{statistic['q1']:.3g}, {statistic['q3']:.3g}]"
-    text += f", p {statistic['p_holm']:.1g}" if statistic["p_holm"] < MAX_PRINTED_P else ""
+        text = (
+            f"{statistic['median']:.3g} [{statistic['q1']:.3g}, {statistic['q3']:.3g}]"
+        )
+    text += (
+        f", p {statistic['p_holm']:.1g}" if statistic["p_holm"] < MAX_PRINTED_P else ""
+    )
     return text + (f" (paper: {printed})" if printed else "")
 
 
 def tail_text(statistic: dict[str, Any] | None) -> str:
     """Format the tails of a figure."""
-    return "" if statistic is None else ", ".join(f"{statistic[name]:.3g}" for name in TAILS)
+    return (
+        ""
+        if statistic is None
+        else ", ".join(f"{statistic[name]:.3g}" for name in TAILS)
+    )
 
 
 def notes(benchmark: Benchmark) -> list[str]:
@@ -124,7 +176,9 @@ def _printed_note(benchmark: Benchmark) -> list[str]:
     printed = PRINTED.get(benchmark.suite.name, {}).get(PAPER_PLANNER)
     if printed is None or PAPER_PLANNER in benchmark.results:
         return []
-    values = ", ".join(f"{ ({**FLAGS, **FIGURES}[key]) }: {value}" for key, value in printed.items())
+    values = ", ".join(
+        f"{ ({**FLAGS, **FIGURES}[key]) }: {value}" for key, value in printed.items()
+    )
     return [f"The paper's planner, CNP-B, has in the paper: {values}."]
 
 
@@ -135,13 +189,25 @@ def failure_summaries(benchmark: Benchmark) -> list[str]:
         unplanned = [row for row in rows if row["answer"] is None]
         for ending in dict.fromkeys(row["ending"] for row in unplanned):
             failed = [row for row in unplanned if row["ending"] == ending]
-            detail = f", problem {failed[0]['problem']}: {failed[0]['error']}" if failed[0]["error"] else ""
+            detail = (
+                f", problem {failed[0]['problem']}: {failed[0]['error']}"
+                if failed[0]["error"]
+                else ""
+            )
             texts.append(f"{name}: {len(failed)} of {len(rows)} {ending}{detail}")
         verdicts = [row["verdict"] for row in rows if row["answer"] is not None]
-        reasons = Counter(str(verdict.get("reason", "no reason")) for verdict in verdicts if not verdict["valid"])
+        reasons = Counter(
+            str(verdict.get("reason", "no reason"))
+            for verdict in verdicts
+            if not verdict["valid"]
+        )
         if reasons:
-            counts = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
-            texts.append(f"{name}: {reasons.total()} of {len(verdicts)} plans not valid by the verdict: {counts}")
+            counts = ", ".join(
+                f"{reason} {count}" for reason, count in reasons.most_common()
+            )
+            texts.append(
+                f"{name}: {reasons.total()} of {len(verdicts)} plans not valid by the verdict: {counts}"
+            )
     return texts
 
 
@@ -152,16 +218,28 @@ def csv_text(benchmark: Benchmark) -> str:
     text = io.StringIO()
     text.writelines(f"# {line}\n" for line in notes(benchmark)[1:])
     columns = (*FLAGS, *FIGURES)
-    writer = csv.DictWriter(text, [*_COLUMNS, *columns, "error"], restval="", lineterminator="\n")
+    writer = csv.DictWriter(
+        text, [*_COLUMNS, *columns, "error"], restval="", lineterminator="\n"
+    )
     writer.writeheader()
     for planner, rows in benchmark.results.items():
         for row in rows:
             executed = [plant for plant in plants if plant in row.get("executed", {})]
             for plant in executed or [""]:
                 values = values_of(row, plant, benchmark.plane_tolerance)
-                known = (suite.name, suite.version, planner, row.get("repetition", 0), row["problem"], plant)
+                known = (
+                    suite.name,
+                    suite.version,
+                    planner,
+                    row.get("repetition", 0),
+                    row["problem"],
+                    plant,
+                )
                 head = zip(_COLUMNS, (*known, row["ending"], seed), strict=True)
-                numbers = {name: int(value) if isinstance(value, bool) else value for name, value in values.items()}
+                numbers = {
+                    name: int(value) if isinstance(value, bool) else value
+                    for name, value in values.items()
+                }
                 writer.writerow({**dict(head), **numbers, "error": row["error"]})
     return text.getvalue()
 
@@ -170,18 +248,33 @@ def markdown_text(benchmark: Benchmark) -> str:
     """Write the tables of all plants as Markdown."""
     lines = [f"# {benchmark.suite.name} {benchmark.suite.version}", ""]
     for plant in benchmark.executions:
-        head, *rows = ([cell.replace("|", r"\|") for cell in row] for row in table_rows(benchmark, plant))
+        head, *rows = (
+            [cell.replace("|", r"\|") for cell in row]
+            for row in table_rows(benchmark, plant)
+        )
         lines += [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
         lines += [f"| {' | '.join(row)} |" for row in rows]
         lines.append("")
-    return "\n".join([*lines, *(f"* {note}" for note in [*notes(benchmark), *failure_summaries(benchmark)]), ""])
+    return "\n".join(
+        [
+            *lines,
+            *(
+                f"* {note}"
+                for note in [*notes(benchmark), *failure_summaries(benchmark)]
+            ),
+            "",
+        ]
+    )
 
 
 def latex_text(benchmark: Benchmark) -> str:
     """Write the tables of all plants as LaTeX, for the package booktabs."""
     lines = [f"% {note}" for note in [*notes(benchmark), *failure_summaries(benchmark)]]
     for plant in benchmark.executions:
-        head, *rows = ([cell.translate(_LATEX) for cell in row] for row in table_rows(benchmark, plant))
+        head, *rows = (
+            [cell.translate(_LATEX) for cell in row]
+            for row in table_rows(benchmark, plant)
+        )
         lines += [
             rf"\begin{{tabular}}{{l{'r' * (len(head) - 1)}}}",
             r"\toprule",

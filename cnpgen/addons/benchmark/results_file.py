@@ -1,6 +1,7 @@
 """Results on disk: a file per planner and repetition, with a line of JSON for every finished problem.
 
-Further lines of a problem add the execution of its plan on one plant. An incomplete last line is ignored.
+Further lines of a problem add the execution of its plan on one plant. An incomplete
+last line is ignored.
 """
 
 import json
@@ -39,10 +40,19 @@ RESULTS_FORMAT = "cnpgen-benchmark"
 RESULTS_VERSION = 2
 _FORMAT = {"format": RESULTS_FORMAT, "format_version": RESULTS_VERSION}
 _POINTS = [Nullable(FINITE)]
-_PLAN = {"degree": WHOLE, "path_control_points": [_POINTS], "rate_control_points": _POINTS}
+_PLAN = {
+    "degree": WHOLE,
+    "path_control_points": [_POINTS],
+    "rate_control_points": _POINTS,
+}
 _REQUIRED = {"t": _POINTS, "q": [_POINTS]}
 _SAMPLES = {**_REQUIRED, "dq": [_POINTS], "ddq": [_POINTS]}
-_PLANNED = {"ending": TEXT, "planning_s": FINITE, "planning_cpu_s": FINITE, "error": TEXT}
+_PLANNED = {
+    "ending": TEXT,
+    "planning_s": FINITE,
+    "planning_cpu_s": FINITE,
+    "error": TEXT,
+}
 _VERDICT = {
     "valid": ANYTHING,
     "paper": {"valid": ANYTHING, "finished": ANYTHING},
@@ -66,7 +76,9 @@ class Results:
 
     def missing(self, count: int) -> Iterator[int]:
         """Yield those of the first ``count`` problems without planning result."""
-        return (index for index in range(count) if "ending" not in self.rows.get(index, {}))
+        return (
+            index for index in range(count) if "ending" not in self.rows.get(index, {})
+        )
 
     def unexecuted(self, plant: str, count: int) -> Iterator[int]:
         """Yield the problems whose plans a plant has not executed."""
@@ -83,10 +95,17 @@ class Results:
             known["executed"] = executed
 
 
-def open_results(path: Path, identity: dict[str, Any], *, overwrite: bool = False, discard: bool = False) -> Results:
+def open_results(
+    path: Path,
+    identity: dict[str, Any],
+    *,
+    overwrite: bool = False,
+    discard: bool = False,
+) -> Results:
     """Open the results of a planner with the rows of earlier runs.
 
-    Results of another run, by its identity, are refused or overwritten; those of this run may be discarded.
+    Results of another run, by its identity, are refused or overwritten; those of this
+    run may be discarded.
 
     Raises:
         UsageError: The file belongs to another run.
@@ -115,7 +134,9 @@ def _differences(line: str, head: str) -> str:
     one, other = json.loads(line), json.loads(head)
     if not isinstance(one, dict):
         return "it has no head"
-    keys = [key for key in other if one.get(key) != other[key] and key != "suite_sha256"]
+    keys = [
+        key for key in other if one.get(key) != other[key] and key != "suite_sha256"
+    ]
     return f"other {', '.join(keys) or 'problems'}".replace("_", " ")
 
 
@@ -126,18 +147,27 @@ def _read_rows(path: Path, lines: list[str]) -> Results:
         try:
             _check_row(row)
         except ValueError as error:
-            raise DatasetError(f"{path} is damaged: line {number}: {error}; delete that line") from error
+            raise DatasetError(
+                f"{path} is damaged: line {number}: {error}; delete that line"
+            ) from error
         results._merge(row)
     return results
 
 
 def _check_row(row: Any) -> None:
-    """Raise ``ValueError`` if a line is not a row of results; files are untrusted input."""
+    """Raise ``ValueError`` if a line is not a row of results.
+
+    Files are untrusted input.
+    """
     check_structure(row, {"problem": WHOLE})
     if "ending" in row:
         check_structure(row, {**_PLANNED, "answer": Nullable({ANY_KEY: ANYTHING})})
         if (answer := row["answer"]) is not None:
-            structure = _PLAN if "degree" in answer else {**_REQUIRED, **_present(_SAMPLES, answer)}
+            structure = (
+                _PLAN
+                if "degree" in answer
+                else {**_REQUIRED, **_present(_SAMPLES, answer)}
+            )
             check_structure(answer, structure)
             check_structure(row, {"verdict": _VERDICT})
             for name in structure.keys() - {"degree"}:
@@ -145,10 +175,14 @@ def _check_row(row: Any) -> None:
     if "executed" in row:
         check_structure(row, {"executed": {ANY_KEY: {ANY_KEY: ANYTHING}}})
         for executed in row["executed"].values():
-            check_structure(executed, _present(dict.fromkeys(FIGURES, Nullable(FINITE)), executed))
+            check_structure(
+                executed, _present(dict.fromkeys(FIGURES, Nullable(FINITE)), executed)
+            )
 
 
-def _present(structures: dict[str, Structure], table: dict[str, Any]) -> dict[str, Structure]:
+def _present(
+    structures: dict[str, Structure], table: dict[str, Any]
+) -> dict[str, Structure]:
     return {name: structure for name, structure in structures.items() if name in table}
 
 
@@ -174,16 +208,29 @@ def answer_to_dict(answer: Plans | Trajectory) -> dict[str, Any]:
             "path_control_points": _rows(answer.path_control_points[0]),
             "rate_control_points": _rows(answer.rate_control_points[0]),
         }
-    return {name: _rows(values) for name in _SAMPLES if (values := getattr(answer, name)) is not None}
+    return {
+        name: _rows(values)
+        for name in _SAMPLES
+        if (values := getattr(answer, name)) is not None
+    }
 
 
 def answer_from_dict(problem: Plans, content: dict[str, Any]) -> Plans | Trajectory:
-    """Read an answer for one boundary problem; raise UsageError if a shape or the number of joints is wrong."""
-    known = _PLAN.keys() - {"degree"} if "degree" in content else _SAMPLES.keys() & content.keys()
+    """Read an answer for one boundary problem.
+
+    Raise UsageError if a shape or the number of joints is wrong.
+    """
+    known = (
+        _PLAN.keys() - {"degree"}
+        if "degree" in content
+        else _SAMPLES.keys() & content.keys()
+    )
     numbers = {name: np.array(content[name], float) for name in known}
     if "degree" not in content:
         trajectory = Trajectory(**numbers)
-        if (joints := trajectory.q.shape[1]) != (wanted := problem.boundary.start_q.shape[1]):
+        if (joints := trajectory.q.shape[1]) != (
+            wanted := problem.boundary.start_q.shape[1]
+        ):
             raise UsageError(f"the problem has {wanted} joints, its answer {joints}")
         return trajectory
     return make_plans(
@@ -215,31 +262,45 @@ class ResultsFolder:
 
     def __init__(self, path: Path, suite: Suite, setting: Setting) -> None:
         if path.exists() and not path.is_dir():
-            raise UsageError(f"{path} is a file, expected a folder for the results", concerns="folder")
+            raise UsageError(
+                f"{path} is a file, expected a folder for the results",
+                concerns="folder",
+            )
         check_writable(path)
         path.mkdir(parents=True, exist_ok=True)
         self.path = path
         self._shared = {
             "suite": suite.name,
             "suite_version": suite.version,
-            "suite_sha256": canonical_sha256(plain(resolved(replace(suite, planners=None)))),
+            "suite_sha256": canonical_sha256(
+                plain(resolved(replace(suite, planners=None)))
+            ),
             "cnpgen": __version__,
             "time_limit_s": setting.time_limit,
             "seed": setting.seed,
         }
 
     def _results(self) -> Iterator[tuple[Path, dict[str, Any], Results | None]]:
-        """Yield path, head and results of every file; None for results of another suite, version or time limit."""
+        """Yield path, head and results of every file.
+
+        None for results of another suite, version or time limit.
+        """
         for path in sorted(self.path.glob("*.jsonl")):
             require_file(path, "the results of a planner")
             lines = _complete_lines(path)
             head = json.loads(lines[0]) if lines else None
             if isinstance(head, dict) and head.get("format") == RESULTS_FORMAT:
-                is_own = all(head.get(key) == value for key, value in {**_FORMAT, **self._shared}.items())
+                is_own = all(
+                    head.get(key) == value
+                    for key, value in {**_FORMAT, **self._shared}.items()
+                )
                 yield path, head, _read_rows(path, lines[1:]) if is_own else None
 
     def planners(self, *, delete_others: bool) -> set[str]:
-        """Return the planners with results; delete results of another run, or raise UsageError."""
+        """Return the planners with results.
+
+        Delete results of another run, or raise UsageError.
+        """
         names = set()
         for path, head, results in self._results():
             if results is not None:
@@ -255,19 +316,36 @@ class ResultsFolder:
         return names
 
     def open(
-        self, planner: str, repetition: int, parameters: dict[str, Any], *, overwrite: bool, discard: bool
+        self,
+        planner: str,
+        repetition: int,
+        parameters: dict[str, Any],
+        *,
+        overwrite: bool,
+        discard: bool,
     ) -> Results:
         """Open the results of a planner and a repetition; see ``open_results``."""
-        packages = [entry.dist for entry in addons.installed(PLANNERS) if entry.name == planner]
+        packages = [
+            entry.dist for entry in addons.installed(PLANNERS) if entry.name == planner
+        ]
         identity = {
             **self._shared,
             "planner": planner,
-            "planner_version": next((package.version for package in packages if package is not None), __version__),
+            "planner_version": next(
+                (package.version for package in packages if package is not None),
+                __version__,
+            ),
             "parameters": parameters,
             "repetition": repetition,
         }
-        name = f"{planner}.jsonl" if repetition == 0 else f"{planner}.repetition-{repetition}.jsonl"
-        return open_results(self.path / name, identity, overwrite=overwrite, discard=discard)
+        name = (
+            f"{planner}.jsonl"
+            if repetition == 0
+            else f"{planner}.repetition-{repetition}.jsonl"
+        )
+        return open_results(
+            self.path / name, identity, overwrite=overwrite, discard=discard
+        )
 
     def rows(self, first: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
         """Return planner -> rows of all results, the given planners first."""

@@ -18,7 +18,17 @@ from cnpgen.store.files.documents import parse_json
 RUNS_FILE = "runs.json"
 MAX_RUNS_BYTES = 10_000_000
 # Beside those of ``versions``.
-LIBRARIES = ("scipy", "daqp", "mujoco", "ompl", "toppra", "ruckig", "sscbirrt", "drake", "crocoddyl")
+LIBRARIES = (
+    "scipy",
+    "daqp",
+    "mujoco",
+    "ompl",
+    "toppra",
+    "ruckig",
+    "sscbirrt",
+    "drake",
+    "crocoddyl",
+)
 _STRUCTURE = {
     "date": TEXT,
     "processor": TEXT,
@@ -50,19 +60,33 @@ class RunRecord:
     versions: dict[str, str]
 
     def __str__(self) -> str:
-        libraries = ", ".join(f"{name} {number}" for name, number in self.versions.items())
+        libraries = ", ".join(
+            f"{name} {number}" for name, number in self.versions.items()
+        )
         return f"{self.date}: {self.processor}, {self.cores} cores; seed {self.seed}; {libraries}"
 
 
 def describe_run(seed: int, planners: Sequence[str]) -> RunRecord:
     """Describe a run of these planners that begins now."""
-    libraries = {name: number for name in LIBRARIES if (number := installed_version(name))}
+    libraries = {
+        name: number for name in LIBRARIES if (number := installed_version(name))
+    }
     date = datetime.now(UTC).isoformat(timespec="seconds")
-    return RunRecord(date, _processor(), os.cpu_count() or 1, seed, tuple(planners), {**versions(), **libraries})
+    return RunRecord(
+        date,
+        _processor(),
+        os.cpu_count() or 1,
+        seed,
+        tuple(planners),
+        {**versions(), **libraries},
+    )
 
 
 def load_runs(folder: Path) -> tuple[RunRecord, ...]:
-    """Load the records of earlier runs in a folder; raise DatasetError if the file is damaged."""
+    """Load the records of earlier runs in a folder.
+
+    Raise DatasetError if the file is damaged.
+    """
     path = folder / RUNS_FILE
     if not path.exists():
         return ()
@@ -72,7 +96,10 @@ def load_runs(folder: Path) -> tuple[RunRecord, ...]:
     except ValueError as error:
         raise DatasetError(f"{path} is damaged: {error}; delete it") from error
     known = ({name: document[name] for name in _STRUCTURE} for document in documents)
-    return tuple(RunRecord(**{**values, "planners": tuple(values["planners"])}) for values in known)
+    return tuple(
+        RunRecord(**{**values, "planners": tuple(values["planners"])})
+        for values in known
+    )
 
 
 def save_runs(folder: Path, runs: Sequence[RunRecord]) -> None:

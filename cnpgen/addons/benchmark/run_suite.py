@@ -1,4 +1,7 @@
-"""Benchmark runs: every planner on every problem, judged and optionally executed; finished problems are kept."""
+"""Benchmark runs: every planner on every problem, judged and optionally executed.
+
+Finished problems are kept.
+"""
 
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
@@ -15,8 +18,17 @@ from cnpgen.addons.benchmark.benchmark_planner import PLANNERS, Setting, load_pl
 from cnpgen.addons.benchmark.hypothesis_tests import summarize_results
 from cnpgen.addons.benchmark.process import PlannerProcess, PlanningOutcome
 from cnpgen.addons.benchmark.pucks import ExecutedPrefix
-from cnpgen.addons.benchmark.results_file import Results, ResultsFolder, answer_from_dict
-from cnpgen.addons.benchmark.run_record import RunRecord, describe_run, load_runs, save_runs
+from cnpgen.addons.benchmark.results_file import (
+    Results,
+    ResultsFolder,
+    answer_from_dict,
+)
+from cnpgen.addons.benchmark.run_record import (
+    RunRecord,
+    describe_run,
+    load_runs,
+    save_runs,
+)
 from cnpgen.addons.benchmark.simulator.challenge import challenge_plant, check_challenge
 from cnpgen.addons.benchmark.simulator.execute import load_mujoco
 from cnpgen.addons.benchmark.simulator.executed import PLANE_TOLERANCE_M
@@ -50,16 +62,16 @@ Rows = Generator[dict[str, Any], None, None]
 class Benchmark:
     """Results of planners on the problems of a suite.
 
-    Attributes:
-        suite: The suite.
-        problems: Its problems.
-        prefix: Of replanning scenarios, the prefixes of the first motions.
-        results: Planner -> its rows, ordered by repetition and problem ('cnpgen docs benchmark'). They cover all
+    Attributes: suite: The suite. problems: Its problems. prefix: Of replanning
+        scenarios, the prefixes of the first motions. results: Planner -> its rows,
+        ordered by repetition and problem ('cnpgen docs benchmark'). They cover all
             results in the folder, also those of earlier runs.
         plants: Plants that executed plans in this run.
-        runs: Date, machine, versions and seed of the runs that wrote into the folder; the last one is this run.
+        runs: Date, machine, versions and seed of the runs that wrote into the folder;
+            the last one is this run.
         reference: Planner with which the others are compared, or None for the default.
-        plane_tolerance: Maximum distance of the mallet of a successful hit from the table plane [m].
+        plane_tolerance: Maximum distance of the mallet of a successful hit from the
+            table plane [m].
     """
 
     suite: Suite
@@ -76,19 +88,34 @@ class Benchmark:
 
     @property
     def executions(self) -> tuple[str, ...]:
-        """Names of the plants that executed any plan; one empty name without execution."""
+        """Names of the plants that executed any plan.
+
+        One empty name without execution.
+        """
         known = dict.fromkeys(plant.name for plant in self.plants)
-        known |= {name: None for rows in self.results.values() for row in rows for name in row.get("executed", {})}
+        known |= {
+            name: None
+            for rows in self.results.values()
+            for row in rows
+            for name in row.get("executed", {})
+        }
         return tuple(known) or ("",)
 
     @checked_arguments
-    def summary(self, plant: str = "") -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
+    def summary(
+        self, plant: str = ""
+    ) -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
         """Return ratios, medians, quartiles and p-values of every planner; see ``summarize_results``.
 
         Args:
             plant: Name of the plant; empty for plans only.
         """
-        return summarize_results(self.results, plant, reference=self.reference, plane_tolerance=self.plane_tolerance)
+        return summarize_results(
+            self.results,
+            plant,
+            reference=self.reference,
+            plane_tolerance=self.plane_tolerance,
+        )
 
 
 @checked_arguments
@@ -115,37 +142,45 @@ def run_benchmark(
 ) -> Benchmark:
     """Compare planners; an interrupted run resumes.
 
-    Every planner runs in its own process on one thread, one problem after the other, so planning times are undisturbed.
-    Plans are executed in ``workers`` processes. With an engine, its workers also plan, each for other problems;
-    planning times are then those of a shared machine.
+    Every planner runs in its own process on one thread, one problem after the other, so
+    planning times are undisturbed. Plans are executed in ``workers`` processes. With an
+    engine, its workers also plan, each for other problems; planning times are then
+    those of a shared machine.
 
-    Args:
-        suite: A suite, or the name or file of a suite or dataset.
-        folder: Folder for results, one file per planner; created if missing.
-        planners: Names of planners.
-        n: Number of problems, the first ones; random suites may have more than the recipe.
-        plants: Plants that execute plans; none by default.
-        environment: A clone of the Air Hockey Challenge's environment, which also executes plans, as the plant
+    Args: suite: A suite, or the name or file of a suite or dataset. folder: Folder for
+        results, one file per planner; created if missing. planners: Names of planners.
+        n: Number of problems, the first ones; random suites may have more than the
+        recipe. plants: Plants that execute plans; none by default. environment: A clone
+        of the Air Hockey Challenge's environment, which also executes plans, as the
+        plant
             "challenge".
-        time_limit: Planning time per problem [s]; later answers are not counted, and the planner's processes are ended.
-        seed: Seed of random planners. Each problem and repetition has its own random generator.
+        time_limit: Planning time per problem [s]; later answers are not counted, and
+            the planner's processes are ended.
+        seed: Seed of random planners. Each problem and repetition has its own random
+            generator.
         repeat: Number of repetitions of every problem.
-        plane_tolerance: Maximum distance of the mallet of a successful hit from the table plane [m].
-        reference: Planner with which the others are compared; default ``cnpgen+refine``, or the first one without it.
-        parameters: Planner -> its field -> value, as in a recipe; the others have the values of the suite, or their
-            defaults.
-        workers: Processes that execute plans and, with an engine, plan; default one per available core.
-        engine: Engine of the workers, see ``make_dataset``; by default planners run on this machine.
+        plane_tolerance: Maximum distance of the mallet of a successful hit from the
+            table plane [m].
+        reference: Planner with which the others are compared; default
+            ``cnpgen+refine``, or the first one without it.
+        parameters: Planner -> its field -> value, as in a recipe; the others have the
+            values of the suite, or their defaults.
+        workers: Processes that execute plans and, with an engine, plan; default one per
+            available core.
+        engine: Engine of the workers, see ``make_dataset``; by default planners run on
+            this machine.
         address: Address of the engine, see ``make_dataset``.
         replan: Whether to discard the earlier answers of these planners.
-        force: Whether to delete results of another suite, version, time limit or planner parameters in the folder.
+        force: Whether to delete results of another suite, version, time limit or
+            planner parameters in the folder.
         progress: Called after every problem.
 
-    Raises:
-        UsageError: A planner, plant or environment is unknown or unsuitable, or the folder has results of another
+    Raises: UsageError: A planner, plant or environment is unknown or unsuitable, or the
+        folder has results of another
             run.
         RecipeError: The suite has errors.
-        MachineError: MuJoCo is missing, the results cannot be written, or a cluster cannot be reached.
+        MachineError: MuJoCo is missing, the results cannot be written, or a cluster
+            cannot be reached.
     """
     where = Engine(engine, address, workers)
     with concerning("suite"):
@@ -161,13 +196,18 @@ def run_benchmark(
     place = ResultsFolder(Path(folder), loaded, setting)
     names = {*place.planners(delete_others=force), *planners}
     if reference is not None and reference not in names:
-        raise UsageError(f"must be one of {', '.join(sorted(names))}, got {reference!r}", argument="reference")
+        raise UsageError(
+            f"must be one of {', '.join(sorted(names))}, got {reference!r}",
+            argument="reference",
+        )
     runs = (*load_runs(place.path), describe_run(seed, planners))
     save_runs(place.path, runs)
     report = progress or (lambda *_: None)
     with assembled(where, len(problems)) as pool:
         for name, repetition in product(planners, range(repeat)):
-            results = place.open(name, repetition, values[name], overwrite=force, discard=replan)
+            results = place.open(
+                name, repetition, values[name], overwrite=force, discard=replan
+            )
             planned = partial(
                 _plan_locally if engine is None else partial(_plan_in_pool, pool),
                 name,
@@ -177,25 +217,49 @@ def run_benchmark(
             _plan_all(results, problems, planned, partial(report, f"{label} plans"))
             for plant in robots:
                 activity = f"{label}, {plant.name} plant"
-                _execute_all(results, plant, problems, prefix, pool=pool, report=partial(report, activity))
+                _execute_all(
+                    results,
+                    plant,
+                    problems,
+                    prefix,
+                    pool=pool,
+                    report=partial(report, activity),
+                )
     rows = place.rows(planners)
-    count = max((row["problem"] + 1 for part in rows.values() for row in part), default=0)
+    count = max(
+        (row["problem"] + 1 for part in rows.values() for row in part), default=0
+    )
     if count > len(problems):
         problems, prefix = loaded.problems(count)
-    return Benchmark(loaded, problems, prefix, rows, robots, runs, reference, plane_tolerance)
+    return Benchmark(
+        loaded, problems, prefix, rows, robots, runs, reference, plane_tolerance
+    )
 
 
-def _checked_numbers(time_limit: float, plane_tolerance: float, seed: int, repeat: int) -> tuple[float, int, int]:
+def _checked_numbers(
+    time_limit: float, plane_tolerance: float, seed: int, repeat: int
+) -> tuple[float, int, int]:
     """Return the time limit, the seed and the number of repetitions after checking all numbers."""
     limit = number("time_limit", time_limit)
     if limit <= 0:
-        raise UsageError(f"must be above 0 s, got {time_limit:g} s", argument="time_limit")
+        raise UsageError(
+            f"must be above 0 s, got {time_limit:g} s", argument="time_limit"
+        )
     if number("plane_tolerance", plane_tolerance) < 0:
-        raise UsageError(f"must not be negative, got {plane_tolerance:g} m", argument="plane_tolerance")
-    return limit, integer("seed", seed, least=0), integer("repeat", repeat, least=1, most=MAX_REPETITIONS)
+        raise UsageError(
+            f"must not be negative, got {plane_tolerance:g} m",
+            argument="plane_tolerance",
+        )
+    return (
+        limit,
+        integer("seed", seed, least=0),
+        integer("repeat", repeat, least=1, most=MAX_REPETITIONS),
+    )
 
 
-def _checked_plants(plants: Sequence[str | Plant], environment: str | Path | None) -> tuple[Plant, ...]:
+def _checked_plants(
+    plants: Sequence[str | Plant], environment: str | Path | None
+) -> tuple[Plant, ...]:
     """Return the plants, with that of the environment."""
     robots = tuple(as_plant(plant, argument="plants") for plant in plants)
     if environment is not None:
@@ -206,36 +270,53 @@ def _checked_plants(plants: Sequence[str | Plant], environment: str | Path | Non
 
 
 def _checked_planners(
-    planners: Sequence[str], of_suite: PlannerFields, parameters: Mapping[str, Mapping[str, Any]]
+    planners: Sequence[str],
+    of_suite: PlannerFields,
+    parameters: Mapping[str, Mapping[str, Any]],
 ) -> PlannerFields:
     """Return planner -> given values of its fields, after checking names before any work."""
     known = registry.names(PLANNERS)
     if not planners:
-        raise UsageError(f"no planners, expected some of {', '.join(known)}", concerns="planners")
+        raise UsageError(
+            f"no planners, expected some of {', '.join(known)}", concerns="planners"
+        )
     for name in planners:
         if not isinstance(name, str):
-            raise UsageError(f"must be names of planners, got {name!r:.100}", argument="planners")
+            raise UsageError(
+                f"must be names of planners, got {name!r:.100}", argument="planners"
+            )
         if name not in known:
             raise UsageError(
                 f"unknown planner {name!r}{registry.name_hint(PLANNERS, name)}; known: {', '.join(known)}",
                 concerns="planners",
             )
     if unused := sorted(parameters.keys() - set(planners)):
-        raise UsageError(f"must be of planners of this run, got those of {', '.join(unused)}", argument="parameters")
-    return {name: {**of_suite.get(name, {}), **parameters.get(name, {})} for name in planners}
+        raise UsageError(
+            f"must be of planners of this run, got those of {', '.join(unused)}",
+            argument="parameters",
+        )
+    return {
+        name: {**of_suite.get(name, {}), **parameters.get(name, {})}
+        for name in planners
+    }
 
 
 def _checked_parameters(planner: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of all fields of a planner."""
     try:
-        loaded: Any = load_planner(planner, parameters)  # a dataclass, as its contract requires
+        loaded: Any = load_planner(
+            planner, parameters
+        )  # a dataclass, as its contract requires
     except RecipeError:  # it cannot be imported; its own process reports the error
         return {}
     return dict(plain(asdict(loaded)))
 
 
 def _plan_all(
-    results: Results, problems: Plans, planned: Callable[[list[Numbered]], Rows], report: Callable[[int, int], None]
+    results: Results,
+    problems: Plans,
+    planned: Callable[[list[Numbered]], Rows],
+    report: Callable[[int, int], None],
 ) -> None:
     """Plan for the problems without result."""
     waiting = [(index, problems[index]) for index in results.missing(len(problems))]
@@ -257,7 +338,9 @@ def _plan_locally(name: str, setting: Setting, waiting: list[Numbered]) -> Rows:
         process.stop()
 
 
-def _plan_in_pool(pool: WorkerPool, name: str, setting: Setting, waiting: list[Numbered]) -> Rows:
+def _plan_in_pool(
+    pool: WorkerPool, name: str, setting: Setting, waiting: list[Numbered]
+) -> Rows:
     """Yield the rows of problems that are distributed over a worker pool."""
     size = min(PROBLEMS_PER_TASK, -(-len(waiting) // pool.size))
     parts = (waiting[first : first + size] for first in range(0, len(waiting), size))
@@ -266,7 +349,9 @@ def _plan_in_pool(pool: WorkerPool, name: str, setting: Setting, waiting: list[N
             yield from ({**row, "planners_at_once": pool.size} for row in rows)
 
 
-def _plan_task(name: str, setting: Setting, part: list[Numbered]) -> list[dict[str, Any]]:
+def _plan_task(
+    name: str, setting: Setting, part: list[Numbered]
+) -> list[dict[str, Any]]:
     return list(_plan_locally(name, setting, part))
 
 
@@ -280,8 +365,12 @@ def _row(index: int, problem: Plans, outcome: PlanningOutcome) -> dict[str, Any]
         "error": outcome.error,
         "answer": outcome.answer,
     }
-    if outcome.answer is not None:  # with the boundary conditions of the problem, not those of the answer
-        row["verdict"] = verdict_to_dict(judge_answer(problem, answer_from_dict(problem, outcome.answer)))
+    if (
+        outcome.answer is not None
+    ):  # with the boundary conditions of the problem, not those of the answer
+        row["verdict"] = verdict_to_dict(
+            judge_answer(problem, answer_from_dict(problem, outcome.answer))
+        )
     return row
 
 
@@ -298,7 +387,9 @@ def verdict_to_dict(verdict: Verdict) -> dict[str, Any]:
             for name, margin in verdict.margins.items()
             if margin.bound and np.isfinite(margin.value / margin.bound)
         },
-        "severity": {name: value for name, value in severity.items() if np.isfinite(value)},
+        "severity": {
+            name: value for name, value in severity.items() if np.isfinite(value)
+        },
     }
 
 
@@ -315,8 +406,17 @@ def _execute_all(
     waiting = list(results.unexecuted(plant.name, len(problems)))
     if not waiting:
         return
-    tasks = ((problems[index], results.rows[index]["answer"], prefix and prefix[index]) for index in waiting)
-    with closing(pool.distribute(partial(execute_answer, plant=plant), tasks, ordered=True)) as executions:
-        for done, (index, executed) in enumerate(zip(waiting, executions, strict=True), start=1):
-            results.append({"problem": index, "executed": {plant.name: executed.to_dict()}})
+    tasks = (
+        (problems[index], results.rows[index]["answer"], prefix and prefix[index])
+        for index in waiting
+    )
+    with closing(
+        pool.distribute(partial(execute_answer, plant=plant), tasks, ordered=True)
+    ) as executions:
+        for done, (index, executed) in enumerate(
+            zip(waiting, executions, strict=True), start=1
+        ):
+            results.append(
+                {"problem": index, "executed": {plant.name: executed.to_dict()}}
+            )
             report(len(waiting), done)

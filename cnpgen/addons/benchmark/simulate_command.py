@@ -1,9 +1,10 @@
 """Execute the plans of a file in MuJoCo.
 
-Every plan is executed separately by computed torque at 1 kHz on a robot with friction that its controller does not
-model. On a table, a plan that ends with a velocity is a hit: the puck lies 7 cm ahead of its end.
-'cnpgen docs benchmark' describes the simulation and its results. The exit code is 0 if every plan succeeds (it scores
-without touching the puck early, or reaches its goal without collision), and 1 otherwise.
+Every plan is executed separately by computed torque at 1 kHz on a robot with friction
+that its controller does not model. On a table, a plan that ends with a velocity is a
+hit: the puck lies 7 cm ahead of its end. 'cnpgen docs benchmark' describes the
+simulation and its results. The exit code is 0 if every plan succeeds (it scores without
+touching the puck early, or reaches its goal without collision), and 1 otherwise.
 """
 
 import argparse
@@ -45,16 +46,47 @@ _FIGURES = {
 def add_options(parser: Parser) -> None:
     option = parser.add_argument
     option("file", metavar="FILE", type=Path, help="plan file, .h5")
-    option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help="the problem of the plans")
+    option(
+        "--problem",
+        metavar="NAME|FILE",
+        type=recipe_names.problem,
+        help="the problem of the plans",
+    )
     where = parser.add_mutually_exclusive_group().add_argument
-    where("--plant", choices=PLANTS, default="nominal", help=f"the robot: {', '.join(PLANTS)} (default: nominal)")
-    where("--environment", metavar="PATH", type=Path, help="clone of the Air Hockey Challenge that executes them")
-    option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
+    where(
+        "--plant",
+        choices=PLANTS,
+        default="nominal",
+        help=f"the robot: {', '.join(PLANTS)} (default: nominal)",
+    )
+    where(
+        "--environment",
+        metavar="PATH",
+        type=Path,
+        help="clone of the Air Hockey Challenge that executes them",
+    )
+    option(
+        "--workers",
+        metavar="W",
+        type=values.positive,
+        help="processes; default one per available core",
+    )
     option("--list", action="store_true", help="also list the plans, one per line")
-    option("--plan", metavar="I", type=values.natural, default=0, help="plan to draw (default: 0)")
+    option(
+        "--plan",
+        metavar="I",
+        type=values.natural,
+        default=0,
+        help="plan to draw (default: 0)",
+    )
     text = "draw the world at the end of one plan: .png"
     option("--image", metavar="PICTURE", type=values.file_in(".png"), help=text)
-    option("--video", metavar="FILM", type=values.file_in(".mp4", ".gif"), help="film one plan: .mp4 or .gif")
+    option(
+        "--video",
+        metavar="FILM",
+        type=values.file_in(".mp4", ".gif"),
+        help="film one plan: .mp4 or .gif",
+    )
     add_json(parser)
 
 
@@ -63,15 +95,29 @@ def run(arguments: argparse.Namespace) -> int:
 
     plans = recipe_names.read_plans(arguments.file, problem=arguments.problem)
     if arguments.plan >= len(plans):
-        raise UsageError(f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0")
+        raise UsageError(
+            f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0"
+        )
     with Meter(quiet=not sys.stderr.isatty(), noun="plan") as meter:
         meter.begin(f"executing {arguments.file}", len(plans))
         found = simulate_plans(
-            plans, plant=arguments.plant, environment=arguments.environment, workers=arguments.workers, progress=meter
+            plans,
+            plant=arguments.plant,
+            environment=arguments.environment,
+            workers=arguments.workers,
+            progress=meter,
         )
     if arguments.json:
-        rows = [{"plan": index, **each.to_dict()} for index, each in enumerate(found.executed)]
-        print(json.dumps({"file": str(arguments.file), **found.summary(), "executed": rows}, indent=2))
+        rows = [
+            {"plan": index, **each.to_dict()}
+            for index, each in enumerate(found.executed)
+        ]
+        print(
+            json.dumps(
+                {"file": str(arguments.file), **found.summary(), "executed": rows},
+                indent=2,
+            )
+        )
     else:
         print(_text(arguments.file, found))
         if arguments.list:
@@ -85,17 +131,46 @@ def _text(file: Path, found: "Simulation") -> str:
     summary, count = found.summary(), len(found.executed)
     head = f"{file}: {counted(count, 'plan')} of {found.plans.problem.name}, executed by the {found.plant.name} plant"
     counts = {text: summary[name] for name, text in _NAMES.items() if name in summary}
-    tallies = [(text, f"{number:,} of {count:,}", f"{number / count:.2%}") for text, number in counts.items()]
-    shown = {name: figure for name, figure in _figures(found).items() if name in summary["medians"]}
-    figures = [(text, form.format(summary["medians"][name])) for name, (text, form) in shown.items()]
-    lines = [head, "", *table(tallies, indent="  ", right=(1, 2)), "", "  medians", *table(figures, indent="    ")]
-    refused = [(index, each.failure) for index, each in enumerate(found.executed) if each.failure]
-    return "\n".join(lines + [f"  plan {index} was not executed: {why}" for index, why in refused])
+    tallies = [
+        (text, f"{number:,} of {count:,}", f"{number / count:.2%}")
+        for text, number in counts.items()
+    ]
+    shown = {
+        name: figure
+        for name, figure in _figures(found).items()
+        if name in summary["medians"]
+    }
+    figures = [
+        (text, form.format(summary["medians"][name]))
+        for name, (text, form) in shown.items()
+    ]
+    lines = [
+        head,
+        "",
+        *table(tallies, indent="  ", right=(1, 2)),
+        "",
+        "  medians",
+        *table(figures, indent="    "),
+    ]
+    refused = [
+        (index, each.failure)
+        for index, each in enumerate(found.executed)
+        if each.failure
+    ]
+    return "\n".join(
+        lines + [f"  plan {index} was not executed: {why}" for index, why in refused]
+    )
 
 
 def _figures(found: "Simulation") -> dict[str, tuple[str, str]]:
-    """Return the figures that are shown, with text and format; that of the tilt only if a constraint limits it."""
-    uses = {constraint.get("use") for constraint in found.plans.problem.content.get("constraint", [])}
+    """Return the figures that are shown, with text and format.
+
+    That of the tilt only if a constraint limits it.
+    """
+    uses = {
+        constraint.get("use")
+        for constraint in found.plans.problem.content.get("constraint", [])
+    }
     hidden = set() if uses & {"vertical", "axis", "pose"} else {"vertical_error_rad_s"}
     return {name: figure for name, figure in _FIGURES.items() if name not in hidden}
 
@@ -106,7 +181,11 @@ def _lines(found: "Simulation") -> list[str]:
     for index, each in enumerate(found.executed):
         row = each.to_dict()
         flags = [text for name, text in _NAMES.items() if row.get(name) is True]
-        figures = [f"{text} {form.format(row[name])}" for name, (text, form) in _figures(found).items() if name in row]
+        figures = [
+            f"{text} {form.format(row[name])}"
+            for name, (text, form) in _figures(found).items()
+            if name in row
+        ]
         lines.append(f"plan {index}: {'; '.join([*flags, *figures]) or each.failure}")
     return lines
 

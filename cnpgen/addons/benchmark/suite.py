@@ -8,7 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.addons.benchmark.benchmark_planner import PLANNERS, load_kind
-from cnpgen.addons.benchmark.pucks import ExecutedPrefix, Pucks, ReplanningScenario, hits_of, scenario_problems
+from cnpgen.addons.benchmark.pucks import (
+    ExecutedPrefix,
+    Pucks,
+    ReplanningScenario,
+    hits_of,
+    scenario_problems,
+)
 from cnpgen.addons.scene_files.scene_files import load_scenes
 from cnpgen.errors import CnpgenError, nearest
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
@@ -54,32 +60,55 @@ class SceneFileProblems:
 class Suite:
     """Boundary problems for the comparison of planners: pucks on a grid, or samples of a dataset."""
 
-    name: str = field("name of the suite: lower-case letters, digits and hyphens", pattern=NAME)
-    version: str = field("semantic version; other problems need another version", pattern=r"^\d+\.\d+\.\d+$")
+    name: str = field(
+        "name of the suite: lower-case letters, digits and hyphens", pattern=NAME
+    )
+    version: str = field(
+        "semantic version; other problems need another version",
+        pattern=r"^\d+\.\d+\.\d+$",
+    )
     title: str = field("title in one line", default="")
     model: str = field("shipped model for these problems", default="")
     pucks: Pucks | None = field("grid of pucks to hit from rest", default=None)
-    replanning: ReplanningScenario | None = field("replanning scenarios: pucks to hit from moving states", default=None)
-    samples: SampledProblems | None = field("random problems of a dataset", default=None)
-    scenes: SceneFileProblems | None = field("problems of a scene file", default=None, since_version=2)
+    replanning: ReplanningScenario | None = field(
+        "replanning scenarios: pucks to hit from moving states", default=None
+    )
+    samples: SampledProblems | None = field(
+        "random problems of a dataset", default=None
+    )
+    scenes: SceneFileProblems | None = field(
+        "problems of a scene file", default=None, since_version=2
+    )
     planners: PlannerFields | None = field(
-        "fields of planners, in a table per planner", default=None, form="a table of tables", since_version=2
+        "fields of planners, in a table per planner",
+        default=None,
+        form="a table of tables",
+        since_version=2,
     )
 
     def validate(self) -> Iterator[tuple[str, str]]:
         """Yield (key, error) pairs."""
-        if sum(part is not None for part in (self.pucks, self.replanning, self.samples, self.scenes)) != 1:
-            yield "pucks", "expected exactly one of [pucks], [replanning], [samples] and [scenes]"
+        if (
+            sum(
+                part is not None
+                for part in (self.pucks, self.replanning, self.samples, self.scenes)
+            )
+            != 1
+        ):
+            yield (
+                "pucks",
+                "expected exactly one of [pucks], [replanning], [samples] and [scenes]",
+            )
 
     @checked_arguments
     def problems(self, n: int | None = None) -> tuple[Plans, ExecutedPrefix | None]:
         """Return the boundary problems, as plans without motions.
 
-        Args:
-            n: Number of problems, the first ones; random suites may have more than the recipe.
+        Args: n: Number of problems, the first ones; random suites may have more than
+            the recipe.
 
-        Returns:
-            The problems and, of replanning scenarios, the prefixes of the first motions.
+        Returns: The problems and, of replanning scenarios, the prefixes of the first
+            motions.
 
         Raises:
             RecipeError: A recipe has errors.
@@ -87,9 +116,13 @@ class Suite:
         """
         n = None if n is None else integer("n", n, least=1)
         if self.samples is not None:
-            return draw_boundary_problems(self.samples.recipe, n or self.samples.n, seed=self.samples.seed), None
+            return draw_boundary_problems(
+                self.samples.recipe, n or self.samples.n, seed=self.samples.seed
+            ), None
         if self.scenes is not None:
-            return scene_plans(load_problem(self.scenes.robot), load_scenes(self.scenes.file))[:n], None
+            return scene_plans(
+                load_problem(self.scenes.robot), load_scenes(self.scenes.file)
+            )[:n], None
         if self.replanning is not None:
             problems, prefix = scenario_problems(self.replanning)
             return problems[:n], prefix
@@ -101,8 +134,8 @@ class Suite:
 def load_suite(name_or_path: str | Path) -> Suite:
     """Load a suite; a dataset or a pipeline becomes a suite of its samples.
 
-    Args:
-        name_or_path: Name of a shipped suite, dataset or pipeline, or path of such a file.
+    Args: name_or_path: Name of a shipped suite, dataset or pipeline, or path of such a
+        file.
 
     Raises:
         RecipeError: With every error in the file.
@@ -111,15 +144,22 @@ def load_suite(name_or_path: str | Path) -> Suite:
 
 
 def _beside(folder: Path, name: str) -> str:
-    """Return the path of a recipe beside the suite, from any working directory; the name if there is none."""
+    """Return the path of a recipe beside the suite, from any working directory.
+
+    The name if there is none.
+    """
     return str(folder / name) if (folder / name).is_file() else name
 
 
-def _read_planners(tables: Any, where: RecipeLocation, errors: list[str]) -> PlannerFields | None:
+def _read_planners(
+    tables: Any, where: RecipeLocation, errors: list[str]
+) -> PlannerFields | None:
     """Return the fields of planners after checking them."""
     before, known = len(errors), registry.names(PLANNERS)
     if not isinstance(tables, dict):
-        errors.append(where.message(f"expected a table per planner, got {show(tables)}"))
+        errors.append(
+            where.message(f"expected a table per planner, got {show(tables)}")
+        )
         return None
     for name, fields in tables.items():
         if name not in known:
@@ -152,10 +192,20 @@ def _read(path: Path, errors: list[str]) -> Suite | None:
         Problem: reference("problem", read_problem, path.parent),
         PlannerFields: _read_planners,
     }
-    suite = parse(Suite, table, where=RecipeLocation(str(path)), errors=errors, readers=readers)
+    suite = parse(
+        Suite, table, where=RecipeLocation(str(path)), errors=errors, readers=readers
+    )
     if suite is not None and suite.scenes is not None:
-        file, robot = str(path.parent / suite.scenes.file), _beside(path.parent, suite.scenes.robot)
+        file, robot = (
+            str(path.parent / suite.scenes.file),
+            _beside(path.parent, suite.scenes.robot),
+        )
         return replace(suite, scenes=SceneFileProblems(file=file, robot=robot))
     if suite is not None and suite.samples is not None:
-        return replace(suite, samples=replace(suite.samples, recipe=_beside(path.parent, suite.samples.recipe)))
+        return replace(
+            suite,
+            samples=replace(
+                suite.samples, recipe=_beside(path.parent, suite.samples.recipe)
+            ),
+        )
     return suite

@@ -15,7 +15,9 @@ class _NamedEngine(ClusterEngine):
     def check_address(self, address: str) -> None:
         check_address(self.name, address)
 
-    def joined(self, address: str | None, workers: int | None) -> AbstractContextManager[Cluster]:
+    def joined(
+        self, address: str | None, workers: int | None
+    ) -> AbstractContextManager[Cluster]:
         return joined(self.name, address, workers)
 
 

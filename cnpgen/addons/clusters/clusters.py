@@ -1,4 +1,7 @@
-"""Clusters of dask and ray through their own interfaces; joblib's interface cannot report missing workers."""
+"""Clusters of dask and ray through their own interfaces.
+
+Joblib's interface cannot report missing workers.
+"""
 
 import importlib
 import importlib.metadata
@@ -26,7 +29,10 @@ CLOSING_TIMEOUT_S = 3.0
 LOOPBACK = "127.0.0.1"
 MIN_RAY_VERSION = (2, 52)  # the first one with tokens
 _ADDRESSES = {  # name -> pattern of addresses, examples
-    "dask": (r"((tcp|tls|ws|wss|ucx|inproc)://)?[^\s/:]+:\d{1,5}|inproc://\S+", "tcp://host:8786 or tls://host:8786"),
+    "dask": (
+        r"((tcp|tls|ws|wss|ucx|inproc)://)?[^\s/:]+:\d{1,5}|inproc://\S+",
+        "tcp://host:8786 or tls://host:8786",
+    ),
     "ray": (r"auto|(ray://)?[^\s/:]+:\d{1,5}", "host:6379 or auto"),
 }
 FIRST_WARNING_S = 10.0  # time without workers before the first warning; doubled for each further warning
@@ -37,7 +43,10 @@ R = TypeVar("R")
 
 
 class Cluster(ABC):
-    """Workers of a cluster, which may join and leave; unfinished tasks of a lost worker run again on another."""
+    """Workers of a cluster, which may join and leave.
+
+    Unfinished tasks of a lost worker run again on another.
+    """
 
     is_remote = True
 
@@ -50,12 +59,17 @@ class Cluster(ABC):
         return self._workers or max(self.present(), 1)
 
     def distribute(
-        self, function: Callable[[T], R], tasks: Iterable[T], *, ordered: bool = False, hint: str = ""
+        self,
+        function: Callable[[T], R],
+        tasks: Iterable[T],
+        *,
+        ordered: bool = False,
+        hint: str = "",
     ) -> Generator[R, None, None]:
         """Run a function on every task and yield the results.
 
-        Raises:
-            MachineError: A task has crashed several workers, or the connection to the cluster is lost.
+        Raises: MachineError: A task has crashed several workers, or the connection to
+            the cluster is lost.
         """
         submit, left = self.prepared(function), enumerate(tasks)
         under_way: dict[Any, int] = {}
@@ -63,7 +77,9 @@ class Cluster(ABC):
         following = 0
         try:
             while True:
-                for number, task in islice(left, max(2 * self.size - len(under_way), 0)):
+                for number, task in islice(
+                    left, max(2 * self.size - len(under_way), 0)
+                ):
                     under_way[submit(task)] = number
                 if not under_way:
                     return
@@ -84,7 +100,11 @@ class Cluster(ABC):
             if self.present():
                 idle_since, warn_after = time.monotonic(), FIRST_WARNING_S
             elif time.monotonic() - idle_since >= warn_after:
-                _LOG.warning("%s has had no worker for %.0f s; waiting for one", self._name, warn_after)
+                _LOG.warning(
+                    "%s has had no worker for %.0f s; waiting for one",
+                    self._name,
+                    warn_after,
+                )
                 warn_after *= 2
         return finished
 
@@ -119,7 +139,9 @@ class _Dask(Cluster):
         try:
             return sum(self._client.nthreads().values())
         except lost as error:  # includes time-outs and closed connections
-            raise MachineError(f"the connection to {self._name} is lost: {error}") from error
+            raise MachineError(
+                f"the connection to {self._name} is lost: {error}"
+            ) from error
 
     def prepared(self, function: Callable[[T], R]) -> Callable[[T], Any]:
         return partial(self._client.submit, function, pure=False)
@@ -129,7 +151,9 @@ class _Dask(Cluster):
 
         try:
             with self._client.as_current():
-                return list(wait(tickets, timeout=seconds, return_when="FIRST_COMPLETED").done)
+                return list(
+                    wait(tickets, timeout=seconds, return_when="FIRST_COMPLETED").done
+                )
         except TimeoutError:
             return []
         except _lost_of_dask() as error:
@@ -214,7 +238,8 @@ def _call(function: Callable[[T], R], task: T) -> R:
 def joined(name: str, address: str | None, workers: int | None) -> Iterator[Cluster]:
     """Connect to a cluster of dask or ray, or start one on this machine, for the duration of the block.
 
-    The number of tasks that run at once is that of the workers of the cluster by default.
+    The number of tasks that run at once is that of the workers of the cluster by
+    default.
 
     Raises:
         MissingExtraError: The package is not installed.
@@ -222,7 +247,11 @@ def joined(name: str, address: str | None, workers: int | None) -> Iterator[Clus
     """
     module, join = {"dask": ("distributed", _dask), "ray": ("ray", _ray)}[name]
     with requires_extra(name, module):
-        if name == "ray" and address is None and importlib.util.find_spec(module) is not None:
+        if (
+            name == "ray"
+            and address is None
+            and importlib.util.find_spec(module) is not None
+        ):
             _prepare_ray()
         importlib.import_module(module)
     what = f"the {name} cluster " + (f"at {address}" if address else "on this machine")
@@ -240,13 +269,27 @@ def _dask(address: str | None, workers: int | None, what: str) -> Iterator[Clust
         cluster = None
         try:
             if address is not None:
-                client = Client(address, set_as_default=False, timeout=CONNECTION_TIMEOUT_S)
+                client = Client(
+                    address, set_as_default=False, timeout=CONNECTION_TIMEOUT_S
+                )
             else:
-                with signals_blocked():  # local workers do not receive the Ctrl-C of a terminal
+                with (
+                    signals_blocked()
+                ):  # local workers do not receive the Ctrl-C of a terminal
                     cluster = _local_dask(workers)
-                    client = Client(cluster, set_as_default=False, security=cluster.security)
-        except (OSError, ValueError, TypeError, RuntimeError, MemoryError) as error:  # memory: of a foreign answer
-            raise MachineError(f"cannot reach {what}: {str(error) or 'it is no scheduler'}") from error
+                    client = Client(
+                        cluster, set_as_default=False, security=cluster.security
+                    )
+        except (
+            OSError,
+            ValueError,
+            TypeError,
+            RuntimeError,
+            MemoryError,
+        ) as error:  # memory: of a foreign answer
+            raise MachineError(
+                f"cannot reach {what}: {str(error) or 'it is no scheduler'}"
+            ) from error
         try:
             yield _Dask(client, what, workers)
         finally:
@@ -264,7 +307,9 @@ def _local_dask(workers: int | None) -> Any:
     with requires_extra("dask", "cryptography"):
         security = Security.temporary()
     config = importlib.import_module("dask.config")
-    with config.set({"distributed.scheduler.http.routes": []}):  # its HTTP server has no authentication
+    with config.set(
+        {"distributed.scheduler.http.routes": []}
+    ):  # its HTTP server has no authentication
         return LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
@@ -281,7 +326,11 @@ def _local_dask(workers: int | None) -> Any:
 def _dask_silenced() -> Iterator[None]:
     """Silence the logs of lost connections, which ``_Dask`` reports."""
     known = list(logging.root.manager.loggerDict)
-    names = [name for name in known if name.partition(".")[0] in {"distributed", "tornado", "asyncio"}]
+    names = [
+        name
+        for name in known
+        if name.partition(".")[0] in {"distributed", "tornado", "asyncio"}
+    ]
     before = {name: logging.getLogger(name).level for name in names}
     for name in names:
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)
@@ -298,9 +347,16 @@ def _ray(address: str | None, workers: int | None, what: str) -> Iterator[Cluste
 
     ours = not ray.is_initialized()
     if ours:
-        here = {"num_cpus": workers, "include_dashboard": False, "_node_ip_address": LOOPBACK}
+        here = {
+            "num_cpus": workers,
+            "include_dashboard": False,
+            "_node_ip_address": LOOPBACK,
+        }
         try:
-            with nullcontext() if address else signals_blocked(), nullcontext() if address else _on_loopback():
+            with (
+                nullcontext() if address else signals_blocked(),
+                nullcontext() if address else _on_loopback(),
+            ):
                 ray.init(
                     address or "local",
                     log_to_driver=False,
@@ -308,7 +364,9 @@ def _ray(address: str | None, workers: int | None, what: str) -> Iterator[Cluste
                     **({} if address else here),
                 )
         except Exception as error:
-            raise MachineError(f"cannot reach {what}: {' '.join(str(error).split())}") from error
+            raise MachineError(
+                f"cannot reach {what}: {' '.join(str(error).split())}"
+            ) from error
     try:
         yield _Ray(what, workers)
     finally:
@@ -318,7 +376,10 @@ def _ray(address: str | None, workers: int | None, what: str) -> Iterator[Cluste
 
 @contextmanager
 def _on_loopback() -> Iterator[None]:
-    """Let ray use the loopback interface, as it does on macOS; it replaces ``_node_ip_address`` otherwise."""
+    """Let ray use the loopback interface, as it does on macOS.
+
+    It replaces ``_node_ip_address`` otherwise.
+    """
     from ray._private import ray_constants
 
     before = getattr(ray_constants, "ENABLE_RAY_CLUSTER", True)
@@ -330,18 +391,25 @@ def _on_loopback() -> Iterator[None]:
 
 
 def _prepare_ray() -> None:
-    """Let local ray clusters of this process accept only processes with its token; ray reads it on import."""
+    """Let local ray clusters of this process accept only processes with its token.
+
+    Ray reads it on import.
+    """
     version = importlib.metadata.version("ray")
     if tuple(int(part) for part in version.split(".")[:2]) < MIN_RAY_VERSION:
         least = ".".join(map(str, MIN_RAY_VERSION))
-        raise MachineError(f"ray {version} starts clusters without authentication: pip install 'ray>={least}'")
+        raise MachineError(
+            f"ray {version} starts clusters without authentication: pip install 'ray>={least}'"
+        )
     if os.environ.get("RAY_AUTH_MODE") == "token":
         return
     ray = sys.modules.get("ray")
     if ray is None:
         os.environ.update(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=secrets.token_hex(32))
     elif not ray.is_initialized():
-        raise MachineError("ray was imported without a token: set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN before")
+        raise MachineError(
+            "ray was imported without a token: set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN before"
+        )
 
 
 def check_address(name: str, address: str) -> None:
@@ -353,12 +421,16 @@ def check_address(name: str, address: str) -> None:
     pattern, examples = _ADDRESSES[name]
     if not re.fullmatch(pattern, address):
         raise UsageError(
-            f"must be the address of a {name} cluster, such as {examples}, got {address!r}", argument="address"
+            f"must be the address of a {name} cluster, such as {examples}, got {address!r}",
+            argument="address",
         )
 
 
 def _check_reachable(address: str, what: str) -> None:
-    """Connect once to the host and port of an address; the libraries wait longer, and report less."""
+    """Connect once to the host and port of an address.
+
+    The libraries wait longer, and report less.
+    """
     found = re.search(r"(?:^|//)([^/]+):(\d+)$", address)
     if found is None:
         return

@@ -14,43 +14,71 @@ WALL_M = 0.02
 
 
 def _open_box(
-    furniture: Furniture, prefix: str, center: tuple[float, float], bottom: float, size: tuple[float, float, float]
+    furniture: Furniture,
+    prefix: str,
+    center: tuple[float, float],
+    bottom: float,
+    size: tuple[float, float, float],
 ) -> None:
     """Add a bottom and four walls."""
     (x, y), (depth, width, height) = center, size
-    furniture.box(f"{prefix} bottom", (x, y, bottom + WALL_M / 2), (depth, width, WALL_M))
+    furniture.box(
+        f"{prefix} bottom", (x, y, bottom + WALL_M / 2), (depth, width, WALL_M)
+    )
     z = bottom + WALL_M + height / 2
     for name, sign in (("front", -0.5), ("back", 0.5)):
-        furniture.box(f"{prefix} {name}", (x + sign * (depth - WALL_M), y, z), (WALL_M, width, height))
+        furniture.box(
+            f"{prefix} {name}",
+            (x + sign * (depth - WALL_M), y, z),
+            (WALL_M, width, height),
+        )
     for name, sign in (("left", 0.5), ("right", -0.5)):
-        furniture.box(f"{prefix} {name}", (x, y + sign * (width - WALL_M), z), (depth - 2 * WALL_M, WALL_M, height))
+        furniture.box(
+            f"{prefix} {name}",
+            (x, y + sign * (width - WALL_M), z),
+            (depth - 2 * WALL_M, WALL_M, height),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
 class OpenBox(SceneFamily):
     """A box that is open at the top, with objects in it."""
 
-    distance: Range = length("distance of the box's front from the base", Range(0.3, 0.42))
+    distance: Range = length(
+        "distance of the box's front from the base", Range(0.3, 0.42)
+    )
     bottom: Range = length("height of the bottom", Range(-0.05, 0.2))
     width: Range = length("width of the box", Range(0.4, 0.6), low=0.2)
     depth: Range = length("depth of the box", Range(0.32, 0.42), low=0.2)
     height: Range = length("height of the walls", Range(0.2, 0.32), low=0.05)
-    objects: Range = field("number of cylinders in the box", default=Range(0, 2), low=0, high=10)
+    objects: Range = field(
+        "number of cylinders in the box", default=Range(0, 2), low=0, high=10
+    )
 
     def draw(self, random: np.random.Generator) -> Layout:
         """Draw the box, the cylinders and grasps inside of it."""
         box = place_furniture(random, self)
-        width, depth, height = (uniform(random, size) for size in (self.width, self.depth, self.height))
+        width, depth, height = (
+            uniform(random, size) for size in (self.width, self.depth, self.height)
+        )
         bottom = uniform(random, self.bottom)
         _open_box(box, "box", (depth / 2, 0.0), bottom, (depth, width, height))
         floor = bottom + WALL_M
         for index in range(whole(random, self.objects)):
-            x, y = depth * random.uniform(0.25, 0.75), width * (index - 0.5) * random.uniform(0.3, 0.6)
-            box.cylinder(f"object {index + 1}", (float(x), float(y), floor + 0.05), 0.03, 0.1)
+            x, y = (
+                depth * random.uniform(0.25, 0.75),
+                width * (index - 0.5) * random.uniform(0.3, 0.6),
+            )
+            box.cylinder(
+                f"object {index + 1}", (float(x), float(y), floor + 0.05), 0.03, 0.1
+            )
             box.grasp((float(x), float(y), floor + 0.12), (0, 0, -1))
         for _ in range(6):
             x, y = depth * random.uniform(0.3, 0.7), width * random.uniform(-0.25, 0.25)
-            box.grasp((float(x), float(y), floor + float(random.uniform(0.06, 0.16))), (0.15, 0, -1))
+            box.grasp(
+                (float(x), float(y), floor + float(random.uniform(0.06, 0.16))),
+                (0.15, 0, -1),
+            )
         return box.layout()
 
 
@@ -60,8 +88,12 @@ class Cage(SceneFamily):
 
     distance: Range = length("distance of the bars from the base", Range(0.36, 0.48))
     bottom: Range = length("height of the floor", Range(0.0, 0.2))
-    size: Range = length("width, depth and height of the cage", Range(0.6, 0.75), low=0.3)
-    opening: Range = length("height between the bars in front", Range(0.3, 0.42), low=0.15)
+    size: Range = length(
+        "width, depth and height of the cage", Range(0.6, 0.75), low=0.3
+    )
+    opening: Range = length(
+        "height between the bars in front", Range(0.3, 0.42), low=0.15
+    )
 
     def draw(self, random: np.random.Generator) -> Layout:
         """Draw walls, bars and an object in the cage."""
@@ -90,17 +122,23 @@ class Cage(SceneFamily):
 class Dresser(SceneFamily):
     """A dresser with one or two open drawers, into which the tip reaches."""
 
-    distance: Range = length("distance of the open drawers from the base", Range(0.3, 0.4))
+    distance: Range = length(
+        "distance of the open drawers from the base", Range(0.3, 0.4)
+    )
     drawers: Range = field("number of open drawers", default=Range(1, 2), low=1, high=2)
     width: Range = length("width of a drawer", Range(0.4, 0.5), low=0.2)
-    extension: Range = length("length of the open part of a drawer", Range(0.28, 0.36), low=0.1)
+    extension: Range = length(
+        "length of the open part of a drawer", Range(0.28, 0.36), low=0.1
+    )
     height: Range = length("height of a drawer", Range(0.12, 0.18), low=0.05)
     bottom: Range = length("height of the lower drawer's bottom", Range(0.05, 0.25))
 
     def draw(self, random: np.random.Generator) -> Layout:
         """Draw the body, the drawers side by side, and grasps in them."""
         dresser = place_furniture(random, self)
-        width, height, bottom = (uniform(random, size) for size in (self.width, self.height, self.bottom))
+        width, height, bottom = (
+            uniform(random, size) for size in (self.width, self.height, self.bottom)
+        )
         count = whole(random, self.drawers)
         lengths = [uniform(random, self.extension) for _ in range(count)]
         body, total = 0.3, float(random.uniform(0.6, 0.9))
@@ -110,9 +148,16 @@ class Dresser(SceneFamily):
             y = 0.0 if count == 1 else (index - 0.5) * (width + 0.03)
             z = bottom + (float(random.uniform(0.0, 0.25)) if index else 0.0)
             x = front - extended / 2
-            _open_box(dresser, f"drawer {index + 1}", (x, y), z, (extended, width, height))
+            _open_box(
+                dresser, f"drawer {index + 1}", (x, y), z, (extended, width, height)
+            )
             for _ in range(4):
-                place = x + extended * random.uniform(-0.15, 0.15), y + width * random.uniform(-0.2, 0.2)
+                place = (
+                    x + extended * random.uniform(-0.15, 0.15),
+                    y + width * random.uniform(-0.2, 0.2),
+                )
                 level = z + WALL_M + float(random.uniform(0.05, height))
-                dresser.grasp((float(place[0]), float(place[1]), level), (0.2, 0, -1), tilt=0.35)
+                dresser.grasp(
+                    (float(place[0]), float(place[1]), level), (0.2, 0, -1), tilt=0.35
+                )
         return dresser.layout()

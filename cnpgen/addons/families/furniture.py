@@ -22,7 +22,8 @@ GRASP_GAP_M = 0.015  # between an object and the tip
 class Furniture:
     """Obstacles and grasps that are placed in a frame: x away from the base of the robot, z up.
 
-    The frame has an origin [m] and a yaw about z [rad] in the frame of the robot's base.
+    The frame has an origin [m] and a yaw about z [rad] in the frame of the robot's
+    base.
     """
 
     origin: Point
@@ -34,19 +35,35 @@ class Furniture:
         """Return a point in the frame of the robot's base [m]."""
         x, y, z = local
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
-        return self.origin[0] + cos * x - sin * y, self.origin[1] + sin * x + cos * y, self.origin[2] + z
+        return (
+            self.origin[0] + cos * x - sin * y,
+            self.origin[1] + sin * x + cos * y,
+            self.origin[2] + z,
+        )
 
     def box(self, name: str, center: Point, size: Point, turn: float = 0.0) -> None:
         """Add a box, whose edges are rotated about z by ``turn`` [rad]."""
         yaw = self.yaw + turn
         self.obstacles.append(
-            Obstacle(name=name, kind="box", position=self.point(center), size=size, rotation=(0.0, 0.0, yaw))
+            Obstacle(
+                name=name,
+                kind="box",
+                position=self.point(center),
+                size=size,
+                rotation=(0.0, 0.0, yaw),
+            )
         )
 
     def cylinder(self, name: str, center: Point, radius: float, height: float) -> None:
         """Add an upright cylinder."""
         self.obstacles.append(
-            Obstacle(name=name, kind="cylinder", position=self.point(center), radius=radius, length=height)
+            Obstacle(
+                name=name,
+                kind="cylinder",
+                position=self.point(center),
+                radius=radius,
+                length=height,
+            )
         )
 
     def grasp(self, position: Point, approach: Point, tilt: float = 0.3) -> None:
@@ -61,18 +78,30 @@ class Furniture:
         """Return the obstacles and grasps of this and other furniture."""
         parts = (self, *others)
         obstacles = tuple(obstacle for part in parts for obstacle in part.obstacles)
-        return Layout(obstacles, tuple(grasp for part in parts for grasp in part.grasps))
+        return Layout(
+            obstacles, tuple(grasp for part in parts for grasp in part.grasps)
+        )
 
 
-def place_furniture(random: np.random.Generator, family: SceneFamily, z: float = 0.0) -> Furniture:
+def place_furniture(
+    random: np.random.Generator, family: SceneFamily, z: float = 0.0
+) -> Furniture:
     """Draw the frame of furniture: its origin is the center of the front at the height z [m]."""
-    distance, bearing = uniform(random, family.distance), uniform(random, family.bearing)
+    distance, bearing = (
+        uniform(random, family.distance),
+        uniform(random, family.bearing),
+    )
     yaw = bearing + uniform(random, family.turn)
-    return Furniture((distance * math.cos(bearing), distance * math.sin(bearing), z), yaw)
+    return Furniture(
+        (distance * math.cos(bearing), distance * math.sin(bearing), z), yaw
+    )
 
 
 Objects = tuple[Range, Range, Range]
-"""Number of objects; widths, of boxes or diameters of cylinders [m]; and heights [m]."""
+"""Number of objects; widths, of boxes or diameters of cylinders [m].
+
+And heights [m].
+"""
 
 
 def place_objects(
@@ -87,7 +116,8 @@ def place_objects(
 ) -> None:
     """Place boxes and cylinders on a rectangle without overlap, with grasps at each, from above or along x.
 
-    The area is the lowest and highest x and the lowest and highest y, at the height z, in the furniture's frame [m].
+    The area is the lowest and highest x and the lowest and highest y, at the height z,
+    in the furniture's frame [m].
     """
     circles: list[tuple[float, float, float]] = []
     count, widths, heights = objects
@@ -98,17 +128,27 @@ def place_objects(
         for _ in range(MAX_PLACEMENTS):
             x = area[0] + (area[1] - area[0]) * random.random()
             y = area[2] + (area[3] - area[2]) * random.random()
-            if all(math.hypot(x - u, y - v) > radius + r + OBJECT_GAP_M for u, v, r in circles):
+            if all(
+                math.hypot(x - u, y - v) > radius + r + OBJECT_GAP_M
+                for u, v, r in circles
+            ):
                 break
         else:
             continue
         circles.append((x, y, radius))
         name, center = f"{prefix} {index + 1}", (x, y, z + height / 2)
         if is_box:
-            furniture.box(name, center, (a, b, height), turn=float(random.uniform(-math.pi, math.pi)))
+            furniture.box(
+                name,
+                center,
+                (a, b, height),
+                turn=float(random.uniform(-math.pi, math.pi)),
+            )
         else:
             furniture.cylinder(name, center, a / 2, height)
         if from_above:
             furniture.grasp((x, y, z + height + GRASP_GAP_M), (0, 0, -1))
         else:
-            furniture.grasp((x - radius - GRASP_GAP_M, y, z + max(height / 2, 0.06)), (1, 0, 0))
+            furniture.grasp(
+                (x - radius - GRASP_GAP_M, y, z + max(height / 2, 0.06)), (1, 0, 0)
+            )

@@ -1,10 +1,12 @@
 """Make planning problems in random scenes.
 
-A family draws furniture and objects around the robot. Goals are grasp-like poses, for which inverse kinematics finds
-collision-free joint positions; starts are neutral, at other grasps or random. Nine of ten straight lines between them
-collide. 'cnpgen solve OUT --robot NAME' solves the problems. The format follows from OUT: HDF5 as of MPiNets (.h5,
-.hdf5), or a folder of planning scenes and requests of MoveIt in YAML. --list prints the families with their parameters.
-'cnpgen docs scene-files' describes the formats. The same arguments give the same problems.
+A family draws furniture and objects around the robot. Goals are grasp-like poses, for
+which inverse kinematics finds collision-free joint positions; starts are neutral, at
+other grasps or random. Nine of ten straight lines between them collide. 'cnpgen solve
+OUT --robot NAME' solves the problems. The format follows from OUT: HDF5 as of MPiNets
+(.h5, .hdf5), or a folder of planning scenes and requests of MoveIt in YAML. --list
+prints the families with their parameters. 'cnpgen docs scene-files' describes the
+formats. The same arguments give the same problems.
 """
 
 import argparse
@@ -36,10 +38,29 @@ def add_options(parser: Parser) -> None:
     option("--robot", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     option("--n", metavar="K", type=values.rows, help="number of problems")
     option("--seed", metavar="S", type=values.seed, default=0, help="seed (default: 0)")
-    option("--per-scene", metavar="K", type=values.positive, default=4, help="largest number in one scene (default: 4)")
+    option(
+        "--per-scene",
+        metavar="K",
+        type=values.positive,
+        default=4,
+        help="largest number in one scene (default: 4)",
+    )
     text = "parameter of the family, such as tables=2 or 'height=[0, 30] cm'"
-    option("--set", metavar="KEY=VALUE", nargs="+", default=[], type=family_parameter, help=text)
-    option("-o", "--out", metavar="OUT", type=Path, help="file (.h5, .hdf5) or folder (default: FAMILY-scenes.h5)")
+    option(
+        "--set",
+        metavar="KEY=VALUE",
+        nargs="+",
+        default=[],
+        type=family_parameter,
+        help=text,
+    )
+    option(
+        "-o",
+        "--out",
+        metavar="OUT",
+        type=Path,
+        help="file (.h5, .hdf5) or folder (default: FAMILY-scenes.h5)",
+    )
     option("--force", action="store_true", help="replace OUT")
     option("--quiet", action="store_true", help="no progress")
     add_json(parser)
@@ -49,7 +70,9 @@ def family_parameter(text: str) -> tuple[str, Any]:
     """Read a parameter of a family: the key and the value, as in a recipe or as plain text."""
     key, equals, value = text.partition("=")
     if not (equals and key):
-        raise argparse.ArgumentTypeError(f"expected KEY=VALUE, such as tables=2, got {text!r}")
+        raise argparse.ArgumentTypeError(
+            f"expected KEY=VALUE, such as tables=2, got {text!r}"
+        )
     return key, values.toml_value(value)
 
 
@@ -60,10 +83,16 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.list:
         print(_listing(as_json=arguments.json))
         return
-    needed = {"FAMILY": arguments.family, "--robot": arguments.robot, "--n": arguments.n}
+    needed = {
+        "FAMILY": arguments.family,
+        "--robot": arguments.robot,
+        "--n": arguments.n,
+    }
     missing = [name for name, value in needed.items() if value is None]
     if missing:
-        raise UsageError(f"{' and '.join(missing)} must be given; 'cnpgen make-scenes --list' lists families")
+        raise UsageError(
+            f"{' and '.join(missing)} must be given; 'cnpgen make-scenes --list' lists families"
+        )
     out = arguments.out or Path(f"{arguments.family}-scenes.h5")
     _check_place(out, force=arguments.force)
     with Meter(quiet=arguments.quiet, noun="problem") as meter:
@@ -92,11 +121,17 @@ def _check_place(out: Path, *, force: bool) -> None:
     from cnpgen.store.files.atomic import check_writable
 
     if out.suffix not in {"", ".h5", ".hdf5"}:
-        raise UsageError(f"{out} must end in .h5 or .hdf5, or be a folder for YAML files")
+        raise UsageError(
+            f"{out} must end in .h5 or .hdf5, or be a folder for YAML files"
+        )
     if not out.parent.is_dir():
         raise UsageError(f"{out} must be in a folder that exists")
     if out.exists() and (not force or out.is_dir()):
-        hint = "-o names another folder" if out.is_dir() else "--force replaces it, -o names another file"
+        hint = (
+            "-o names another folder"
+            if out.is_dir()
+            else "--force replaces it, -o names another file"
+        )
         raise UsageError(f"{out} exists: {hint}")
     check_writable(out)
 
@@ -109,7 +144,12 @@ def _listing(*, as_json: bool) -> str:
     table: dict[str, Any] = {}
     for name, family in shipped_families().items():
         parameters = {
-            key.name: {"description": key.doc, "unit": key.unit, "default": _plain(key.default)} for key in keys(family)
+            key.name: {
+                "description": key.doc,
+                "unit": key.unit,
+                "default": _plain(key.default),
+            }
+            for key in keys(family)
         }
         table[name] = {"description": family.describe(), "parameters": parameters}
     if as_json:

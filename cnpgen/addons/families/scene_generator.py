@@ -18,7 +18,12 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
-from cnpgen.problems.scenes.scene_problem import MAX_SCENES, SceneError, SceneProblem, checked_scene
+from cnpgen.problems.scenes.scene_problem import (
+    MAX_SCENES,
+    SceneError,
+    SceneProblem,
+    checked_scene,
+)
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.hull import frame_along
 from cnpgen.schema import addons, registry
@@ -37,13 +42,22 @@ MAX_PAIRS = 24  # of a start and a goal that are tried for one problem
 MAX_FAILED_SCENES = 20  # in a row, without any problem
 END_MARGIN_M = 0.005  # clearance of starts and goals
 STRAIGHT_SHARE = 0.1  # of the problems that may be solvable by a straight line
-NEUTRAL_SPREAD_RAD = 0.1  # standard deviation of neutral starts around the base configuration
+NEUTRAL_SPREAD_RAD = (
+    0.1  # standard deviation of neutral starts around the base configuration
+)
 _STARTS = {"neutral": 0.4, "grasp": 0.4, "random": 0.2}  # kind of start -> probability
 
 
 def shipped_families() -> dict[str, type[SceneFamily]]:
-    """Return the families of this add-on by their names; those of other packages may not be importable."""
-    own = (entry.name for entry in addons.installed(registry.FAMILIES) if addons.addon_of(entry.module))
+    """Return the families of this add-on by their names.
+
+    Those of other packages may not be importable.
+    """
+    own = (
+        entry.name
+        for entry in addons.installed(registry.FAMILIES)
+        if addons.addon_of(entry.module)
+    )
     return {name: registry.load(registry.FAMILIES, name) for name in own}
 
 
@@ -51,9 +65,9 @@ def shipped_families() -> dict[str, type[SceneFamily]]:
 def load_family(name: str, parameters: Mapping[str, Any] | None = None) -> SceneFamily:
     """Return a family by its name.
 
-    Args:
-        name: Its name among ``shipped_families``, or that of an installed package.
-        parameters: Values of its fields, as in recipes: ``{"tables": [1, 2], "height": "[0, 30] cm"}``.
+    Args: name: Its name among ``shipped_families``, or that of an installed package.
+        parameters: Values of its fields, as in recipes: ``{"tables": [1, 2], "height":
+        "[0, 30] cm"}``.
 
     Raises:
         UsageError: The family or a parameter is unknown, or a value is invalid.
@@ -67,7 +81,9 @@ def load_family(name: str, parameters: Mapping[str, Any] | None = None) -> Scene
         kind = registry.load(registry.FAMILIES, name)
     except RecipeError as error:
         raise UsageError(str(error), concerns="family") from error
-    family = parse(kind, dict(parameters or {}), where=RecipeLocation(name), errors=errors)
+    family = parse(
+        kind, dict(parameters or {}), where=RecipeLocation(name), errors=errors
+    )
     if family is None or errors:
         raise UsageError("; ".join(errors), concerns="parameters")
     assert isinstance(family, SceneFamily)
@@ -87,9 +103,10 @@ def make_scenes(
 ) -> list[SceneProblem]:
     """Generate planning problems in scenes of a family.
 
-    Goals are grasp-like poses, for which inverse kinematics finds collision-free states with feasible holding torques.
-    Starts are neutral states around the base configuration, other grasps, or random states. At least nine of ten
-    straight lines between start and goal collide. The same arguments give the same problems.
+    Goals are grasp-like poses, for which inverse kinematics finds collision-free states
+    with feasible holding torques. Starts are neutral states around the base
+    configuration, other grasps, or random states. At least nine of ten straight lines
+    between start and goal collide. The same arguments give the same problems.
 
     Args:
         family: Name of a family, or a family.
@@ -100,8 +117,8 @@ def make_scenes(
         parameters: Values of the fields of a named family.
         progress: Called with the number of problems since the last call.
 
-    Raises:
-        UsageError: An argument is invalid, the problem has an equality constraint, or no problems are found for this
+    Raises: UsageError: An argument is invalid, the problem has an equality constraint,
+        or no problems are found for this
             robot.
     """
     n, seed = integer("n", n, least=1, most=MAX_SCENES), integer("seed", seed, least=0)
@@ -119,7 +136,11 @@ def make_scenes(
     scenes, failed, index = list[SceneProblem](), 0, 0
     while len(scenes) < n:
         random = np.random.default_rng([seed, zlib.crc32(name.encode()), index])
-        found = list(generator.problems(random, f"{name} {index}", min(per_scene, n - len(scenes))))
+        found = list(
+            generator.problems(
+                random, f"{name} {index}", min(per_scene, n - len(scenes))
+            )
+        )
         scenes += found
         index, failed = index + 1, 0 if found else failed + 1
         if failed > MAX_FAILED_SCENES:
@@ -134,10 +155,21 @@ def make_scenes(
 
 def _check_no_manifold(problem: Problem, robot: Robot) -> None:
     """Raise UsageError for constraints that hardly any drawn end meets."""
-    world, rest, zero = World(robot, problem.obstacle, problem.object_size), np.zeros(robot.n), np.zeros((1, 3))
-    world.set_state(robot.home, rest, rest, scene_of(problem, zero, zero, zero).poses[0])
-    for constraint in problem.constraint if robot.shape is not None else ():  # the lack of a shape is reported later
-        if any(condition.g and condition.is_equality for condition in constraint.measured(world)):
+    world, rest, zero = (
+        World(robot, problem.obstacle, problem.object_size),
+        np.zeros(robot.n),
+        np.zeros((1, 3)),
+    )
+    world.set_state(
+        robot.home, rest, rest, scene_of(problem, zero, zero, zero).poses[0]
+    )
+    for constraint in (
+        problem.constraint if robot.shape is not None else ()
+    ):  # the lack of a shape is reported later
+        if any(
+            condition.g and condition.is_equality
+            for condition in constraint.measured(world)
+        ):
             name = registry.name_of(registry.CONSTRAINTS, type(constraint))
             raise UsageError(
                 f"the problem {problem.name!r} has the equality constraint {name!r}, which the ends that a family draws"
@@ -154,11 +186,19 @@ class _Generator:
     robot: Robot
     family: SceneFamily
 
-    def problems(self, random: np.random.Generator, name: str, count: int) -> Iterator[SceneProblem]:
+    def problems(
+        self, random: np.random.Generator, name: str, count: int
+    ) -> Iterator[SceneProblem]:
         """Yield up to ``count`` problems in one scene."""
         layout, names = self.family.draw(random), self.robot.joint_names
         start, goal = np.zeros(self.robot.n), np.zeros((0, self.robot.n))
-        scene = SceneProblem(name=name, obstacles=layout.obstacles, start_q=start, goal_q=goal, joint_names=names)
+        scene = SceneProblem(
+            name=name,
+            obstacles=layout.obstacles,
+            start_q=start,
+            goal_q=goal,
+            joint_names=names,
+        )
         try:
             scene = checked_scene(scene)
         except SceneError:  # an obstacle contains the base
@@ -171,17 +211,28 @@ class _Generator:
             pair = self._pair(states, grasps, random)
             if pair is not None:
                 start, goal = pair
-                yield replace(scene, name=f"{name} {number}", start_q=start, goal_q=goal[None])
+                yield replace(
+                    scene, name=f"{name} {number}", start_q=start, goal_q=goal[None]
+                )
 
-    def _grasp_states(self, states: RestingStates, layout: Layout, random: np.random.Generator) -> list[Array]:
+    def _grasp_states(
+        self, states: RestingStates, layout: Layout, random: np.random.Generator
+    ) -> list[Array]:
         """Return collision-free states at grasps, a few for each grasp, shape (G, n) each."""
         kinematics, found = PoseKinematics(self.robot), list[Array]()
         for index in random.permutation(len(layout.grasps))[:MAX_GRASPS]:
             grasp = layout.grasps[index]
             rotations = grasp_rotations(grasp, POSES_PER_GRASP, random)
             positions = np.tile(grasp.position, (POSES_PER_GRASP, 1))
-            q, met = solve_pose_ik(kinematics, positions, rotations, seeds_of(self.robot, POSES_PER_GRASP, random))
-            valid = q[:, met][:, states.are_ends(q[:, met], margin=END_MARGIN_M)].T.copy()
+            q, met = solve_pose_ik(
+                kinematics,
+                positions,
+                rotations,
+                seeds_of(self.robot, POSES_PER_GRASP, random),
+            )
+            valid = q[:, met][
+                :, states.are_ends(q[:, met], margin=END_MARGIN_M)
+            ].T.copy()
             if len(valid):
                 found.append(valid)
         return found
@@ -194,12 +245,18 @@ class _Generator:
         for _ in range(MAX_PAIRS):
             target = int(random.integers(len(grasps)))
             goal = grasps[target][random.integers(len(grasps[target]))]
-            start = self._start(states, [grasps[i] for i in range(len(grasps)) if i != target], random)
-            if start is not None and (may_be_straight or not states.is_line_clear(start, goal)):
+            start = self._start(
+                states, [grasps[i] for i in range(len(grasps)) if i != target], random
+            )
+            if start is not None and (
+                may_be_straight or not states.is_line_clear(start, goal)
+            ):
                 return start, goal
         return None
 
-    def _start(self, states: RestingStates, grasps: list[Array], random: np.random.Generator) -> Array | None:
+    def _start(
+        self, states: RestingStates, grasps: list[Array], random: np.random.Generator
+    ) -> Array | None:
         """Return a collision-free start of a random kind, or None."""
         kind = str(random.choice(list(_STARTS), p=list(_STARTS.values())))
         if kind == "grasp":
@@ -208,7 +265,9 @@ class _Generator:
             chosen = grasps[int(random.integers(len(grasps)))]
             return np.asarray(chosen[random.integers(len(chosen))])
         if kind == "neutral":
-            q = self.robot.home + NEUTRAL_SPREAD_RAD * random.standard_normal(self.robot.n)
+            q = self.robot.home + NEUTRAL_SPREAD_RAD * random.standard_normal(
+                self.robot.n
+            )
         else:
             q = seeds_of(self.robot, 1, random)[:, 0]
         return q if states.are_ends(q[:, None], margin=END_MARGIN_M)[0] else None

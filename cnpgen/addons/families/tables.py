@@ -19,11 +19,17 @@ class Tabletop(SceneFamily):
     """One to three tables around the robot with boxes and cylinders on them."""
 
     tables: Range = field("number of tables", default=Range(1, 3), low=1, high=3)
-    height: Range = length("height of the upper faces of the tables", Range(0.0, 0.3), low=0.0)
+    height: Range = length(
+        "height of the upper faces of the tables", Range(0.0, 0.3), low=0.0
+    )
     width: Range = length("width of the tables", Range(0.6, 1.0), low=0.2)
     depth: Range = length("depth of the tables", Range(0.4, 0.6), low=0.2)
-    distance: Range = length("distance of the first table's front from the base", Range(0.22, 0.35))
-    objects: Range = field("number of objects on each table", default=Range(2, 4), low=0, high=20)
+    distance: Range = length(
+        "distance of the first table's front from the base", Range(0.22, 0.35)
+    )
+    objects: Range = field(
+        "number of objects on each table", default=Range(2, 4), low=0, high=20
+    )
     object_width: Range = length("widths of objects", Range(0.05, 0.14), low=0.01)
     object_height: Range = length("heights of objects", Range(0.08, 0.35), low=0.01)
 
@@ -34,16 +40,34 @@ class Tabletop(SceneFamily):
         side = 1.0 if random.random() < 0.5 else -1.0
         for index in range(whole(random, self.tables)):
             bearing = first + (0.0, side, -side)[index] * math.pi / 2
-            distance, height = uniform(random, self.distance), uniform(random, self.height)
+            distance, height = (
+                uniform(random, self.distance),
+                uniform(random, self.height),
+            )
             width, depth = uniform(random, self.width), uniform(random, self.depth)
             origin = distance * math.cos(bearing), distance * math.sin(bearing), height
             table = Furniture(origin, bearing)
-            table.box(f"table {index + 1}", (depth / 2, 0, -BOARD_M / 2), (depth, width, BOARD_M))
+            table.box(
+                f"table {index + 1}",
+                (depth / 2, 0, -BOARD_M / 2),
+                (depth, width, BOARD_M),
+            )
             area = (0.08, depth - 0.08, -width / 2 + 0.08, width / 2 - 0.08)
             objects = self.objects, self.object_width, self.object_height
-            place_objects(random, table, area, 0.0, objects, from_above=True, prefix=f"object {index + 1}")
+            place_objects(
+                random,
+                table,
+                area,
+                0.0,
+                objects,
+                from_above=True,
+                prefix=f"object {index + 1}",
+            )
             for _ in range(2):  # free places
-                x, y = random.uniform(area[0], area[1]), random.uniform(area[2], area[3])
+                x, y = (
+                    random.uniform(area[0], area[1]),
+                    random.uniform(area[2], area[3]),
+                )
                 table.grasp((float(x), float(y), 0.05), (0, 0, -1))
             tables.append(table)
         return tables[0].layout(*tables[1:])
@@ -54,7 +78,9 @@ class TablePick(SceneFamily):
     """A table with dense objects, from which one is grasped."""
 
     height: Range = length("height of the table top", Range(0.0, 0.35), low=0.0)
-    distance: Range = length("distance of the table's front from the base", Range(0.22, 0.32))
+    distance: Range = length(
+        "distance of the table's front from the base", Range(0.22, 0.32)
+    )
     objects: Range = field("number of objects", default=Range(7, 11), low=1, high=40)
     object_width: Range = length("widths of objects", Range(0.05, 0.1), low=0.01)
     object_height: Range = length("heights of objects", Range(0.1, 0.4), low=0.01)
@@ -65,12 +91,18 @@ class TablePick(SceneFamily):
         depth, width = 0.55, 0.9
         table.box("table", (depth / 2, 0, -BOARD_M / 2), (depth, width, BOARD_M))
         objects = self.objects, self.object_width, self.object_height
-        place_objects(random, table, (0.08, 0.47, -0.37, 0.37), 0.0, objects, from_above=True)
+        place_objects(
+            random, table, (0.08, 0.47, -0.37, 0.37), 0.0, objects, from_above=True
+        )
         for obstacle in list(table.obstacles[1:]):  # low places beside the objects
             x, y, _ = obstacle.position or (0.0, 0.0, 0.0)
             dx, dy = x - table.origin[0], y - table.origin[1]
             cos, sin = math.cos(table.yaw), math.sin(table.yaw)
-            table.grasp((cos * dx + sin * dy - 0.1, -sin * dx + cos * dy, 0.06), (0.5, 0, -1), tilt=0.5)
+            table.grasp(
+                (cos * dx + sin * dy - 0.1, -sin * dx + cos * dy, 0.06),
+                (0.5, 0, -1),
+                tilt=0.5,
+            )
         return table.layout()
 
 
@@ -80,7 +112,9 @@ class TableUnderPick(SceneFamily):
 
     height: Range = length("height of the table top", Range(0.45, 0.65), low=0.2)
     floor: Range = length("height of the floor below the table", Range(-0.1, 0.05))
-    distance: Range = length("distance of the table's front from the base", Range(0.25, 0.4))
+    distance: Range = length(
+        "distance of the table's front from the base", Range(0.25, 0.4)
+    )
     objects: Range = field("number of objects", default=Range(2, 4), low=1, high=20)
     object_width: Range = length("widths of objects", Range(0.05, 0.09), low=0.01)
     object_height: Range = length("heights of objects", Range(0.1, 0.25), low=0.01)
@@ -91,12 +125,20 @@ class TableUnderPick(SceneFamily):
         table = place_furniture(random, self)
         depth, width, leg = 0.55, 0.9, 0.05
         table.box("top", (depth / 2, 0, top), (depth, width, BOARD_M))
-        table.box("floor", (depth / 2 + 0.05, 0, floor - BOARD_M / 2), (depth, width, BOARD_M))
+        table.box(
+            "floor", (depth / 2 + 0.05, 0, floor - BOARD_M / 2), (depth, width, BOARD_M)
+        )
         for index, (x, y) in enumerate([(0, -1), (0, 1), (1, -1), (1, 1)], 1):
-            center = (leg / 2 + x * (depth - leg), y * (width - leg) / 2, (floor + top) / 2)
+            center = (
+                leg / 2 + x * (depth - leg),
+                y * (width - leg) / 2,
+                (floor + top) / 2,
+            )
             table.box(f"leg {index}", center, (leg, leg, top - floor - BOARD_M))
         objects = self.objects, self.object_width, self.object_height
-        place_objects(random, table, (0.15, 0.4, -0.3, 0.3), floor, objects, from_above=False)
+        place_objects(
+            random, table, (0.15, 0.4, -0.3, 0.3), floor, objects, from_above=False
+        )
         center_z = (floor + top) / 2
         for _ in range(3):
             place = random.uniform([0.1, -0.3, -0.08], [0.3, 0.3, 0.08]).tolist()

@@ -13,7 +13,16 @@ from cnpgen.store.scene_table import SCENE_ARRAYS
 from cnpgen.store.statistics import FieldStatistics
 
 # Size categories of Hugging Face: below 10^3 rows, below 10^4 rows, and so on.
-_SIZES = ("n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M", "10M<n<100M", "100M<n<1B", "n>1B")
+_SIZES = (
+    "n<1K",
+    "1K<n<10K",
+    "10K<n<100K",
+    "100K<n<1M",
+    "1M<n<10M",
+    "10M<n<100M",
+    "100M<n<1B",
+    "n>1B",
+)
 
 PARQUET = "parquet"  # folder of the Parquet view in a repository
 
@@ -59,17 +68,24 @@ independently of the code that made the dataset.
 """
 
 
-def card_text(summary: DatasetSummary, *, folder: str, notes: str = "", shards: str = "") -> str:
+def card_text(
+    summary: DatasetSummary, *, folder: str, notes: str = "", shards: str = ""
+) -> str:
     """Return the card of a finished dataset; it depends on its rows and specification only, not on time or place.
 
-    The folder is that of the dataset or its repository on the Hugging Face Hub, the notes are Markdown. A repository
-    with a Parquet view in ``PARQUET`` has the shards in a folder, with a slash at its end.
+    The folder is that of the dataset or its repository on the Hugging Face Hub, the
+    notes are Markdown. A repository with a Parquet view in ``PARQUET`` has the shards
+    in a folder, with a slash at its end.
     """
     spec = summary.spec
     source = f'"{folder}"' if shards else f'"./{folder}"'
-    load = _LOAD.replace('"./FOLDER"', source).replace('f"{split}/', f'f"{shards}{{split}}/')
+    load = _LOAD.replace('"./FOLDER"', source).replace(
+        'f"{split}/', f'f"{shards}{{split}}/'
+    )
     split = next(iter(summary.statistics))
-    files = "" if spec.scene_obstacles else "{}/*.h5"  # Hugging Face reads equally many rows of all arrays only
+    files = (
+        "" if spec.scene_obstacles else "{}/*.h5"
+    )  # Hugging Face reads equally many rows of all arrays only
     sections = [
         _front_matter(summary, f"{PARQUET}/{{}}/*.parquet" if shards else files),
         f"# {spec.name} {spec.version}\n\n{spec.title or spec.name}\n\n{_contents(summary)}",
@@ -96,20 +112,36 @@ def card_notes(card: str) -> str:
 
 def _origin(recipe: Mapping[str, Any]) -> str:
     """Return the authors and the citation of a recipe."""
-    creator, citation = (str(recipe.get(key, "")).strip() for key in ("creator", "citation"))
+    creator, citation = (
+        str(recipe.get(key, "")).strip() for key in ("creator", "citation")
+    )
     authors = f"Made by {creator}." if creator else ""
     quote = f"```text\n{citation}\n```" if citation else ""
-    return "\n\n".join(part for part in ("## Citation", authors, quote) if part) if authors or quote else ""
+    return (
+        "\n\n".join(part for part in ("## Citation", authors, quote) if part)
+        if authors or quote
+        else ""
+    )
 
 
 def _front_matter(summary: DatasetSummary, files: str) -> str:
-    """Return the YAML header for Hugging Face, with JSON strings; without a pattern of files, there are no splits."""
+    """Return the YAML header for Hugging Face, with JSON strings.
+
+    Without a pattern of files, there are no splits.
+    """
     spec = summary.spec
     digits = len(str(sum(spec.splits.values())))
     size = _SIZES[min(max(digits - 3, 0), len(_SIZES) - 1)]
     lines = [f"license: {json.dumps(spec.license.lower())}"] if spec.license else []
     lines += [f"pretty_name: {json.dumps(spec.title or spec.name, ensure_ascii=False)}"]
-    lines += ["task_categories:", "- robotics", "tags:", "- robotics", "- motion-planning", "- trajectory-optimization"]
+    lines += [
+        "task_categories:",
+        "- robotics",
+        "tags:",
+        "- robotics",
+        "- motion-planning",
+        "- trajectory-optimization",
+    ]
     lines += ["- cnpgen", "size_categories:", f'- "{size}"']
     if files:
         lines += ["configs:", "- config_name: default", "  data_files:"]
@@ -121,7 +153,10 @@ def _front_matter(summary: DatasetSummary, files: str) -> str:
 
 def _contents(summary: DatasetSummary) -> str:
     spec = summary.spec
-    rows = [(f"`{split}`", f"{count:,}", len(summary.of_split(split))) for split, count in spec.splits.items()]
+    rows = [
+        (f"`{split}`", f"{count:,}", len(summary.of_split(split)))
+        for split, count in spec.splits.items()
+    ]
     checks = "Every row passed every stage of its pipeline. Constraints were evaluated on the stored values."
     return f"{checks}\n\n{_table(_BEFORE_NOTES, rows)}"
 
@@ -136,7 +171,9 @@ def _making(summary: DatasetSummary) -> str:
         "kernels": spec.backend,
         "stored as": spec.dtype,
         "specification": f"fingerprint `{spec.fingerprint}`",
-        "made with": ", ".join(f"{name} {version}" for name, version in spec.versions.items()),
+        "made with": ", ".join(
+            f"{name} {version}" for name, version in spec.versions.items()
+        ),
     }
     lines = [f"- {name}: {value}" for name, value in facts.items() if value]
     return (
@@ -148,14 +185,25 @@ def _making(summary: DatasetSummary) -> str:
 def _field_table(fields: Sequence[Field]) -> str:
     head = ("field", "unit", "width", "description", "role", "frame", "columns")
     rows = [
-        (f"`{f.name}`", f.unit, f.width or "-", f.long_name, f.role, f.frame or "-", ", ".join(f.names) or "-")
+        (
+            f"`{f.name}`",
+            f.unit,
+            f.width or "-",
+            f.long_name,
+            f.role,
+            f.frame or "-",
+            ", ".join(f.names) or "-",
+        )
         for f in fields
     ]
     return _table(head, rows)
 
 
 def _scene_table(spec: DatasetSpec, shards: str) -> str:
-    """Describe the scenes beside the rows of every shard; ``shards`` is that of ``card_text``."""
+    """Describe the scenes beside the rows of every shard.
+
+    ``shards`` is that of ``card_text``.
+    """
     only = f" The tables in `{PARQUET}/` have no scenes, only `scene_id`: the shards in `{shards}` have them."
     where = only if shards else ""
     head = ("HDF5 dataset", "unit", "shape", "description", "convention")
@@ -164,13 +212,18 @@ def _scene_table(spec: DatasetSpec, shards: str) -> str:
         (
             f"`{item.name}`",
             item.unit,
-            " x ".join(symbols.get(size, str(size)) for size in item.shape(1, spec.scene_obstacles)),
+            " x ".join(
+                symbols.get(size, str(size))
+                for size in item.shape(1, spec.scene_obstacles)
+            ),
             item.long_name,
             item.convention or "-",
         )
         for item in SCENE_ARRAYS
     ]
-    families = ", ".join(f"{index} {name}" for index, name in enumerate(spec.scene_families))
+    families = ", ".join(
+        f"{index} {name}" for index, name in enumerate(spec.scene_families)
+    )
     return (
         f"Every shard has each of its S scenes once, in arrays for up to O = {spec.scene_obstacles} obstacles."
         " The scene of row `i` is `numpy.searchsorted(scene_ids, scene_id[i])`."
@@ -180,11 +233,21 @@ def _scene_table(spec: DatasetSpec, shards: str) -> str:
 
 def _yield_table(summary: DatasetSummary) -> str:
     sampling = summary.sampling
-    counts = {"**tried**": sampling.tried, **sampling.rejections, "**accepted**": sampling.accepted}
-    rows = [(name, f"{count:,}", f"{100 * count / max(sampling.tried, 1):.3f} %") for name, count in counts.items()]
+    counts = {
+        "**tried**": sampling.tried,
+        **sampling.rejections,
+        "**accepted**": sampling.accepted,
+    }
+    rows = [
+        (name, f"{count:,}", f"{100 * count / max(sampling.tried, 1):.3f} %")
+        for name, count in counts.items()
+    ]
     text = _table(("outcome", "candidates", "share"), rows)
     if sampling.verification:
-        worst = [(f"`{name}`", f"{value:.3g}") for name, value in sampling.verification.items()]
+        worst = [
+            (f"`{name}`", f"{value:.3g}")
+            for name, value in sampling.verification.items()
+        ]
         text += (
             "\n\nWorst violation in 32 rows of every shard, recomputed with Pinocchio and Coal, in SI units:\n\n"
             + _table(("constraint", "worst"), worst)
@@ -192,25 +255,48 @@ def _yield_table(summary: DatasetSummary) -> str:
     return text
 
 
-def _range_table(fields: Sequence[Field], statistics: dict[str, FieldStatistics]) -> str:
+def _range_table(
+    fields: Sequence[Field], statistics: dict[str, FieldStatistics]
+) -> str:
     head = ("column", "unit", "min", "max", "mean", "std", "limits")
-    rows = [row for field in fields for row in _range_rows(field, statistics[field.name])]
+    rows = [
+        row for field in fields for row in _range_rows(field, statistics[field.name])
+    ]
     return _table(head, rows)
 
 
 def _range_rows(field: Field, statistics: FieldStatistics) -> list[tuple[str, ...]]:
     """Return one row per column of a field."""
-    numbers = np.stack([statistics.minimum, statistics.maximum, statistics.mean, statistics.std], axis=1)
+    numbers = np.stack(
+        [statistics.minimum, statistics.maximum, statistics.mean, statistics.std],
+        axis=1,
+    )
     rows = []
     for column, values in enumerate(numbers):
-        name = f"{field.name}.{field.names[column] if field.names else column}" if field.width else field.name
-        limits = [limit[column] for limit in (field.valid_min, field.valid_max) if limit]
+        name = (
+            f"{field.name}.{field.names[column] if field.names else column}"
+            if field.width
+            else field.name
+        )
+        limits = [
+            limit[column] for limit in (field.valid_min, field.valid_max) if limit
+        ]
         text = f"{limits[0]:.6g} ... {limits[1]:.6g}" if len(limits) == 2 else "-"
-        rows.append((f"`{name}`", field.units[column], *(f"{value:.6g}" for value in values), text))
+        rows.append(
+            (
+                f"`{name}`",
+                field.units[column],
+                *(f"{value:.6g}" for value in values),
+                text,
+            )
+        )
     return rows
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """Format a Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(str(cell).replace("|", "\\|") for cell in line) + " |" for line in lines)
+    return "\n".join(
+        "| " + " | ".join(str(cell).replace("|", "\\|") for cell in line) + " |"
+        for line in lines
+    )

@@ -16,7 +16,9 @@ class Card(DatasetDocument):
 
     file = CARD
 
-    def render(self, summary: DatasetSummary, *, created: str, folder: str, notes: str) -> str:  # noqa: ARG002
+    def render(
+        self, summary: DatasetSummary, *, created: str, folder: str, notes: str
+    ) -> str:
         """Return the card; it does not depend on the time."""
         return card_text(summary, folder=folder, notes=notes)
 
@@ -31,6 +33,8 @@ class Croissant(DatasetDocument):
 
     file = CROISSANT
 
-    def render(self, summary: DatasetSummary, *, created: str, folder: str, notes: str) -> str:  # noqa: ARG002
+    def render(
+        self, summary: DatasetSummary, *, created: str, folder: str, notes: str
+    ) -> str:
         """Return the description; it does not depend on the folder."""
         return render(plain(croissant_document(summary, created=created))) + "\n"

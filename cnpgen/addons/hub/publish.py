@@ -42,11 +42,17 @@ SOURCE_KEY = b"cnpgen.sha256"  # metadata of a table: the sha256 of its shard
 
 @checked_arguments
 def publish_dataset(
-    folder: str | Path, to: str, *, out: str | Path, private: bool = False, dry_run: bool = False
+    folder: str | Path,
+    to: str,
+    *,
+    out: str | Path,
+    private: bool = False,
+    dry_run: bool = False,
 ) -> str:
     """Write the repository of a dataset and upload it; a second call continues an interrupted one.
 
-    Tables and shards of an earlier state of the dataset are removed, from the folder and from the hub.
+    Tables and shards of an earlier state of the dataset are removed, from the folder
+    and from the hub.
 
     Args:
         folder: Folder of a finished dataset.
@@ -58,17 +64,22 @@ def publish_dataset(
     Returns:
         Address of the repository; empty if it was not uploaded.
 
-    Raises:
-        UsageError: The repository has no valid name or is inside the dataset, or the dataset has no license.
-        DatasetError: The dataset is unfinished or damaged.
-        MissingExtraError: pyarrow or huggingface_hub is not installed.
-        MachineError: The folder cannot be written, or the upload failed.
+    Raises: UsageError: The repository has no valid name or is inside the dataset, or
+        the dataset has no license. DatasetError: The dataset is unfinished or damaged.
+        MissingExtraError: pyarrow or huggingface_hub is not installed. MachineError:
+        The folder cannot be written, or the upload failed.
     """
     if not REPOSITORY.fullmatch(to):
-        raise UsageError(f"must be the name of a repository, USER/NAME, got {to!r:.200}", argument="to")
+        raise UsageError(
+            f"must be the name of a repository, USER/NAME, got {to!r:.200}",
+            argument="to",
+        )
     source, target = Path(folder), Path(out)
     if target.resolve().is_relative_to(source.resolve()):
-        raise UsageError(f"must be a folder outside the dataset {source}, got {target}", argument="out")
+        raise UsageError(
+            f"must be a folder outside the dataset {source}, got {target}",
+            argument="out",
+        )
     if target.exists() and not target.is_dir():
         raise UsageError(f"must be a folder, {target} is a file", argument="out")
     check_writable(target)
@@ -82,10 +93,17 @@ def publish_dataset(
     return "" if dry_run else upload_folder(target, to, private=private)
 
 
-def write_repository(source: Path, spec: DatasetSpec, target: Path, *, repository: str) -> None:
-    """Write card, Parquet view and dataset; finished files of an earlier call are kept, others removed."""
+def write_repository(
+    source: Path, spec: DatasetSpec, target: Path, *, repository: str
+) -> None:
+    """Write card, Parquet view and dataset.
+
+    Finished files of an earlier call are kept, others removed.
+    """
     tasks = shards(spec)
-    tables = [target / PARQUET / task.split / f"{task.index:05d}.parquet" for task in tasks]
+    tables = [
+        target / PARQUET / task.split / f"{task.index:05d}.parquet" for task in tasks
+    ]
     copies = [name for task in tasks for name in (task.file, task.sidecar)]
     _remove_others(target, {*tables, *(target / HDF5 / name for name in copies)})
     for task, path in zip(tasks, tables, strict=True):
@@ -96,19 +114,35 @@ def write_repository(source: Path, spec: DatasetSpec, target: Path, *, repositor
             _copy(source / name, target / HDF5 / name)
     notes = card_notes((source / CARD).read_text(encoding="utf-8"))
     summary = summarize_dataset(source, spec)
-    write_file(target / CARD, card_text(summary, folder=repository, notes=notes, shards=f"{HDF5}/"))
+    write_file(
+        target / CARD,
+        card_text(summary, folder=repository, notes=notes, shards=f"{HDF5}/"),
+    )
     files: dict[str, list[ParquetFile]] = {}
     for task, path in zip(tasks, tables, strict=True):
         name = path.relative_to(target).as_posix()
-        files.setdefault(task.split, []).append(ParquetFile(name, path.stat().st_size, file_sha256(path)))
+        files.setdefault(task.split, []).append(
+            ParquetFile(name, path.stat().st_size, file_sha256(path))
+        )
     created, url = load_manifest(source)["created"], f"{HUB}/datasets/{repository}"
-    write_file(target / CROISSANT, render(croissant_of_tables(summary, files, created=created, url=url)) + "\n")
+    write_file(
+        target / CROISSANT,
+        render(croissant_of_tables(summary, files, created=created, url=url)) + "\n",
+    )
 
 
 def _remove_others(target: Path, present: set[Path]) -> None:
-    """Remove tables and shards of an earlier state; files of other names are kept, and links are not followed."""
-    for path in [path for part in (PARQUET, HDF5) for path in target.glob(f"{part}/*/*")]:
-        is_own = WRITTEN.fullmatch(path.relative_to(target).as_posix()) and not path.parent.is_symlink()
+    """Remove tables and shards of an earlier state.
+
+    Files of other names are kept, and links are not followed.
+    """
+    for path in [
+        path for part in (PARQUET, HDF5) for path in target.glob(f"{part}/*/*")
+    ]:
+        is_own = (
+            WRITTEN.fullmatch(path.relative_to(target).as_posix())
+            and not path.parent.is_symlink()
+        )
         if is_own and path not in present and path.is_file():
             path.unlink()
             with suppress(OSError):  # other files are in it
@@ -122,17 +156,24 @@ def _write_table(source: Path, spec: DatasetSpec, task: ShardTask, path: Path) -
         import pyarrow.parquet
 
     sha256 = load_record(source, task).sha256.encode()
-    if path.exists() and (pyarrow.parquet.read_schema(path).metadata or {}).get(SOURCE_KEY) == sha256:
+    if (
+        path.exists()
+        and (pyarrow.parquet.read_schema(path).metadata or {}).get(SOURCE_KEY) == sha256
+    ):
         return
     columns = read_shard(source / task.file)
     arrays: dict[str, Any] = {}
     for field in spec.fields:
         values = columns[field.name]
-        arrays[field.name] = fixed_lists(values) if values.ndim == 2 else pyarrow.array(values)
+        arrays[field.name] = (
+            fixed_lists(values) if values.ndim == 2 else pyarrow.array(values)
+        )
     schema = pyarrow.schema(
         [
             pyarrow.field(
-                item.name, arrays[item.name].type, metadata={"unit": item.unit, "names": json.dumps(item.names)}
+                item.name,
+                arrays[item.name].type,
+                metadata={"unit": item.unit, "names": json.dumps(item.names)},
             )
             for item in spec.fields
         ],
@@ -165,14 +206,26 @@ def upload_folder(folder: Path, repository: str, *, private: bool) -> str:
 
     api = huggingface_hub.HfApi(library_name="cnpgen")
     try:
-        url = str(api.create_repo(repository, repo_type="dataset", private=private, exist_ok=True))
+        url = str(
+            api.create_repo(
+                repository, repo_type="dataset", private=private, exist_ok=True
+            )
+        )
         api.upload_folder(
             repo_id=repository,
             folder_path=folder,
             repo_type="dataset",
-            delete_patterns=[f"{part}/*" for part in (PARQUET, HDF5)],  # those that the folder does not contain
+            delete_patterns=[
+                f"{part}/*" for part in (PARQUET, HDF5)
+            ],  # those that the folder does not contain
         )
-    except (OSError, ValueError, RuntimeError) as error:  # the errors of huggingface_hub are OSError or ValueError
+    except (
+        OSError,
+        ValueError,
+        RuntimeError,
+    ) as error:  # the errors of huggingface_hub are OSError or ValueError
         hint = "'hf auth login' stores a token; the same command continues an interrupted upload"
-        raise MachineError(f"{repository} was not uploaded: {error!s:.300}; {hint}") from error
+        raise MachineError(
+            f"{repository} was not uploaded: {error!s:.300}; {hint}"
+        ) from error
     return url

@@ -1,8 +1,10 @@
 """Publish a dataset on the Hugging Face Hub (extra: hub).
 
-The repository has a card, a Parquet view and the dataset itself in hdf5/. License, creator and citation are those of
-the recipe's keys; a dataset without a license is refused. The same command continues an interrupted upload. 'hf auth
-login' stores the token of the upload. The path of the folder, or the address of the repository, is printed on stdout.
+The repository has a card, a Parquet view and the dataset itself in hdf5/. License,
+creator and citation are those of the recipe's keys; a dataset without a license is
+refused. The same command continues an interrupted upload. 'hf auth login' stores the
+token of the upload. The path of the folder, or the address of the repository, is
+printed on stdout.
 """
 
 import argparse
@@ -15,11 +17,29 @@ from cnpgen.cli.parser import Parser
 
 def add_options(parser: Parser) -> None:
     option = parser.add_argument
-    option("folder", metavar="DIR", type=recipe_names.dataset, help="folder of a finished dataset")
-    option("--to", metavar="USER/NAME", required=True, help="repository of the Hub; it is created if it does not exist")
-    option("-o", "--out", metavar="FOLDER", type=Path, help="folder of the repository here (default: DIR-hub)")
+    option(
+        "folder",
+        metavar="DIR",
+        type=recipe_names.dataset,
+        help="folder of a finished dataset",
+    )
+    option(
+        "--to",
+        metavar="USER/NAME",
+        required=True,
+        help="repository of the Hub; it is created if it does not exist",
+    )
+    option(
+        "-o",
+        "--out",
+        metavar="FOLDER",
+        type=Path,
+        help="folder of the repository here (default: DIR-hub)",
+    )
     option("--private", action="store_true", help="a new repository is private")
-    option("--dry-run", action="store_true", help="write the folder, but upload nothing")
+    option(
+        "--dry-run", action="store_true", help="write the folder, but upload nothing"
+    )
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -28,7 +48,13 @@ def run(arguments: argparse.Namespace) -> None:
     folder = arguments.folder
     own = folder.resolve()  # "." has no name
     out = arguments.out or own.with_name(f"{own.name}-hub")
-    url = publish_dataset(folder, arguments.to, out=out, private=arguments.private, dry_run=arguments.dry_run)
+    url = publish_dataset(
+        folder,
+        arguments.to,
+        out=out,
+        private=arguments.private,
+        dry_run=arguments.dry_run,
+    )
     if url:
         print(f"cnpgen: uploaded {out}", file=sys.stderr)
     print(url or out)

@@ -13,7 +13,10 @@ from cnpgen.robots.robot import recipe_errors_in
 from cnpgen.robots.urdf import read_urdf, urdf_tree
 from cnpgen.robots.urdf_parameters import LinkInertia, UrdfJoint, urdf_parameters
 
-DEFAULT_RANGE_RAD, DEFAULT_RANGE_M = math.pi, 0.5  # ranges to either side, where the URDF has none
+DEFAULT_RANGE_RAD, DEFAULT_RANGE_M = (
+    math.pi,
+    0.5,
+)  # ranges to either side, where the URDF has none
 MAX_INERTIA_ERROR = 0.01  # relative; published URDFs round their numbers
 MAX_LIMITED_RAD = 1000.0  # largest limit of a revolute joint that is one
 DEFAULT_SPEED = 1.0  # rad/s or m/s, where the URDF has none
@@ -29,7 +32,9 @@ class ArmJoint:
     upper: float
     velocity: float  # limit [rad/s or m/s]
     effort: float  # limit of the torque or force [N m or N]; 0 where the URDF has none
-    missing: tuple[str, ...]  # limits that the URDF does not have: "position", "velocity", "torque"
+    missing: tuple[
+        str, ...
+    ]  # limits that the URDF does not have: "position", "velocity", "torque"
 
 
 @dataclass(frozen=True)
@@ -38,12 +43,16 @@ class Arm:
 
     urdf: Path
     tip: str  # frame
-    planned: tuple[ArmJoint, ...]  # joints between the root and the tip, from the root outwards
+    planned: tuple[
+        ArmJoint, ...
+    ]  # joints between the root and the tip, from the root outwards
     locked: tuple[str, ...]  # names of all other joints that move: they stay at zero
     moved: tuple[str, ...]  # links that planned joints move
     frames: tuple[str, ...]  # names of all links and joints
     masses: Mapping[str, float]  # link -> mass [kg]; 0 where it has none
-    impossible: tuple[str, ...]  # links that planned joints move with inertias that no body has
+    impossible: tuple[
+        str, ...
+    ]  # links that planned joints move with inertias that no body has
     shaped: tuple[str, ...]  # links that have a ``<collision>`` element
     meshes: tuple[str, ...]  # mesh files that links name
 
@@ -56,9 +65,9 @@ class Arm:
 def read_arm(urdf: Path, tip: str | None) -> Arm:
     """Read an arm, whose tip frame is a link or a joint, by default the only link without a child.
 
-    Raises:
-        RecipeError: The file cannot be read, needs xacro, or has no joint that moves the tip.
-        UsageError: The frame does not exist, or several links have no child.
+    Raises: RecipeError: The file cannot be read, needs xacro, or has no joint that
+        moves the tip. UsageError: The frame does not exist, or several links have no
+        child.
     """
     try:
         tree = urdf_tree(read_urdf(urdf))
@@ -70,17 +79,27 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
         parameters = urdf_parameters(tree)
     links, joints = list(parameters.inertias), parameters.joints
     if not links:
-        raise RecipeError([f"{urdf}: has no <link>, expected a URDF (an SRDF is given by --srdf)"])
+        raise RecipeError(
+            [f"{urdf}: has no <link>, expected a URDF (an SRDF is given by --srdf)"]
+        )
     tip = tip if tip is not None else _only_leaf(urdf, links, joints)
     if text := missing_frame(tree, urdf, tip):
         raise UsageError(f"--tip: {text}")
     moving = [joint for joint in _path(tip, joints) if joint.kind != "fixed"]
     if not moving:
-        raise RecipeError([f"{urdf}: no joint moves the frame {tip!r}; its frames: {listed(frames_of(tree))}"])
+        raise RecipeError(
+            [
+                f"{urdf}: no joint moves the frame {tip!r}; its frames: {listed(frames_of(tree))}"
+            ]
+        )
     planned = tuple(map(_joint, moving))
     moved = tuple(link for link in links if moving[0] in _path(link, joints))
     names = {joint.name for joint in planned}
-    locked = [joint.name for joint in joints.values() if joint.kind != "fixed" and joint.name not in names]
+    locked = [
+        joint.name
+        for joint in joints.values()
+        if joint.kind != "fixed" and joint.name not in names
+    ]
     return Arm(
         urdf=urdf,
         tip=tip,
@@ -88,9 +107,18 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
         locked=tuple(locked),
         moved=moved,
         frames=tuple(frames_of(tree)),
-        masses={link: inertia.mass if inertia else 0.0 for link, inertia in parameters.inertias.items()},
-        impossible=tuple(link for link in moved if _is_impossible(parameters.inertias[link])),
-        shaped=tuple(link.get("name", "") for link in tree.findall("link") if link.find("collision") is not None),
+        masses={
+            link: inertia.mass if inertia else 0.0
+            for link, inertia in parameters.inertias.items()
+        },
+        impossible=tuple(
+            link for link in moved if _is_impossible(parameters.inertias[link])
+        ),
+        shaped=tuple(
+            link.get("name", "")
+            for link in tree.findall("link")
+            if link.find("collision") is not None
+        ),
         meshes=tuple(mesh.get("filename", "") for mesh in tree.iterfind("link//mesh")),
     )
 
@@ -105,10 +133,16 @@ def arm_notes(arm: Arm) -> Iterator[str]:
     }
     for limit, placeholder in placeholders.items():
         if joints := [joint.name for joint in arm.planned if limit in joint.missing]:
-            reason = ", or the joint is continuous" if limit == "position" else ", or it is zero"
+            reason = (
+                ", or the joint is continuous"
+                if limit == "position"
+                else ", or it is zero"
+            )
             text = f"the URDF has no {limit} limit of {', '.join(joints)}{reason}"
             yield f"{text}: [limits] has a placeholder, {placeholder}; enter the value of the data sheet"
-    if light := [link for link in arm.moved if link in arm.shaped and not arm.masses.get(link)]:
+    if light := [
+        link for link in arm.moved if link in arm.shaped and not arm.masses.get(link)
+    ]:
         yield f"no mass: {', '.join(light)}"
     if arm.impossible:
         text = "a principal inertia is negative or exceeds the sum of the others; torques may be wrong"
@@ -118,14 +152,23 @@ def arm_notes(arm: Arm) -> Iterator[str]:
 def with_torques(arm: Arm, torques: list[float]) -> Arm:
     """Return an arm with torques [N m] in place of missing ones."""
     pairs = zip(arm.planned, torques, strict=True)
-    return replace(arm, planned=tuple(replace(each, effort=each.effort or torque) for each, torque in pairs))
+    return replace(
+        arm,
+        planned=tuple(
+            replace(each, effort=each.effort or torque) for each, torque in pairs
+        ),
+    )
 
 
 def _only_leaf(urdf: Path, links: list[str], joints: Mapping[str, UrdfJoint]) -> str:
     parents = {joint.parent for joint in joints.values()}
     leaves = [link for link in links if link not in parents]
     if len(leaves) != 1:
-        leaf_text = f"{len(leaves)} links have no child: {', '.join(leaves)}" if leaves else "every link has a child"
+        leaf_text = (
+            f"{len(leaves)} links have no child: {', '.join(leaves)}"
+            if leaves
+            else "every link has a child"
+        )
         raise UsageError(f"--tip must name the tip frame of {urdf.name}: {leaf_text}")
     return leaves[0]
 
@@ -133,7 +176,10 @@ def _only_leaf(urdf: Path, links: list[str], joints: Mapping[str, UrdfJoint]) ->
 def _path(frame: str, joints: Mapping[str, UrdfJoint]) -> list[UrdfJoint]:
     """Return the joints between the root and a frame, from the root outwards."""
     child_of = {joint.name: child for child, joint in joints.items()}
-    found, link = list[UrdfJoint](), frame if frame in joints else child_of.get(frame, frame)
+    found, link = (
+        list[UrdfJoint](),
+        frame if frame in joints else child_of.get(frame, frame),
+    )
     while link in joints:
         found.append(joints[link])
         link = joints[link].parent
@@ -145,12 +191,17 @@ def _is_impossible(inertia: LinkInertia | None) -> bool:
     if inertia is None:
         return False
     low, medium, high = np.linalg.eigvalsh(inertia.inertia)
-    return bool(low < -MAX_INERTIA_ERROR * high or high > (1 + MAX_INERTIA_ERROR) * (low + medium))
+    return bool(
+        low < -MAX_INERTIA_ERROR * high
+        or high > (1 + MAX_INERTIA_ERROR) * (low + medium)
+    )
 
 
 def _joint(joint: UrdfJoint) -> ArmJoint:
     """Fill in missing limits of a joint; limits of many turns stand for none."""
-    lower, upper, velocity, effort = (joint.limits.get(key, 0.0) for key in ("lower", "upper", "velocity", "effort"))
+    lower, upper, velocity, effort = (
+        joint.limits.get(key, 0.0) for key in ("lower", "upper", "velocity", "effort")
+    )
     endless = joint.kind == "revolute" and max(abs(lower), abs(upper)) > MAX_LIMITED_RAD
     missing = {
         "position": joint.kind == "continuous" or lower == upper or endless,

@@ -24,9 +24,18 @@ Array = NDArray[np.float64]
 BASE_CANDIDATES = 4000  # random states; the base configuration is one of them
 LIMIT_SHARE = 0.1  # share of a joint's range at either end that is left out
 MAX_LOAD = 0.7  # share of the torque limits that the base configuration may use at rest
-MIN_LINK_CLEARANCE_M = 5e-3  # between links at the base configuration, if a state has it
+MIN_LINK_CLEARANCE_M = (
+    5e-3  # between links at the base configuration, if a state has it
+)
 MAX_CLEARANCE_CHECKS = 500  # free states whose clearance is measured
-BOX_SIZES = (0.3, 0.22, 0.16, 0.11, 0.08, 0.05)  # edge of the boxes / reach, the largest first
+BOX_SIZES = (
+    0.3,
+    0.22,
+    0.16,
+    0.11,
+    0.08,
+    0.05,
+)  # edge of the boxes / reach, the largest first
 MIN_BOX_DISTANCE = 0.15  # distance of the boxes / reach, so that no task is trivial
 GOOD_YIELD = 0.5  # share of accepted candidates at which the search for a box ends
 MIN_YIELD = 0.02  # share below which no box is usable
@@ -35,28 +44,43 @@ ROUNDING_M = 1e-3  # of the corners of boxes
 MIN_TIP_TRAVEL_M = 1e-6  # a tip that moves less along an axis does not move along it
 
 
-def comfortable_base(problem: Problem, robot: Robot) -> tuple[tuple[float, ...], tuple[str, ...]]:
+def comfortable_base(
+    problem: Problem, robot: Robot
+) -> tuple[tuple[float, ...], tuple[str, ...]]:
     """Find a configuration with the tip in front of the robot, far from its limits and with high manipulability.
 
-    Random states with the tip ahead along x and above the ground are preferred. The best one has the largest product of
-    the singular values of the tip's Jacobian and the distance from the nearest limit. If no state is free of collisions
-    and within the torque limits, the best of the others is returned.
+    Random states with the tip ahead along x and above the ground are preferred. The
+    best one has the largest product of the singular values of the tip's Jacobian and
+    the distance from the nearest limit. If no state is free of collisions and within
+    the torque limits, the best of the others is returned.
 
-    Returns:
-        Joint positions [rad], rounded, and notes about conditions that it does not meet.
+    Returns: Joint positions [rad], rounded, and notes about conditions that it does not
+        meet.
     """
     world, states = World(robot), _states(robot)
     tips, values, load = _measure_states(world, states)
     if not any(isinstance(each, JointTorque) for each in problem.constraint):
         load[:] = 0.0
-    centre, half = (robot.position_upper + robot.position_lower) / 2, (robot.position_upper - robot.position_lower) / 2
+    centre, half = (
+        (robot.position_upper + robot.position_lower) / 2,
+        (robot.position_upper - robot.position_lower) / 2,
+    )
     margin = 1 - np.abs((states - centre) / half).max(axis=1)
     moves = values.max(axis=0) > MIN_TIP_TRAVEL_M
     score = values[:, moves].prod(axis=1) * margin
     ahead = tips - robot.chain.joints[0].translation
-    front = (ahead[:, 0] > 0) & (np.abs(ahead[:, 1]) <= 0.2 * ahead[:, 0]) & (tips[:, 2] >= 0)
+    front = (
+        (ahead[:, 0] > 0)
+        & (np.abs(ahead[:, 1]) <= 0.2 * ahead[:, 0])
+        & (tips[:, 2] >= 0)
+    )
     free, order = _free_states(robot, states), np.argsort(-score, kind="stable")
-    groups = [front & (load <= MAX_LOAD), load <= MAX_LOAD, load <= 1, np.ones(len(states), bool)]
+    groups = [
+        front & (load <= MAX_LOAD),
+        load <= MAX_LOAD,
+        load <= 1,
+        np.ones(len(states), bool),
+    ]
     for group in groups[:3]:
         for k in order[(group & free)[order]][:MAX_CLEARANCE_CHECKS]:
             if _clearance(world, states[k]) > MIN_LINK_CLEARANCE_M:
@@ -65,14 +89,25 @@ def comfortable_base(problem: Problem, robot: Robot) -> tuple[tuple[float, ...],
     if not (groups[2] & free).any():
         text = f"in all of {BASE_CANDIDATES:,} random states links collide or gravity needs too much torque"
         notes = (f"{text}: choose the base configuration by hand",)
-    best = next(group for group in [*(group & free for group in groups[:3]), *groups] if group.any())
+    best = next(
+        group
+        for group in [*(group & free for group in groups[:3]), *groups]
+        if group.any()
+    )
     return tuple(states[order[best[order]][0]].tolist()), notes
 
 
 def _states(robot: Robot) -> Array:
     """Return random states away from the limits [rad], shape (N, n), rounded."""
-    shares = np.random.default_rng(0).uniform(LIMIT_SHARE, 1 - LIMIT_SHARE, (BASE_CANDIDATES, robot.n))
-    return np.asarray((robot.position_lower + shares * (robot.position_upper - robot.position_lower)).round(3))
+    shares = np.random.default_rng(0).uniform(
+        LIMIT_SHARE, 1 - LIMIT_SHARE, (BASE_CANDIDATES, robot.n)
+    )
+    return np.asarray(
+        (
+            robot.position_lower
+            + shares * (robot.position_upper - robot.position_lower)
+        ).round(3)
+    )
 
 
 def _measure_states(world: World, states: Array) -> tuple[Array, Array, Array]:
@@ -91,7 +126,9 @@ def _free_states(robot: Robot, states: Array) -> NDArray[np.bool_]:
     free, shape = np.ones(len(states), bool), robot.shape
     if shape is not None:
         poses = joint_poses(robot.model, states)
-        contact = LinkContact(poses, map(body_of_part, shape.convex_parts), shape.joints)
+        contact = LinkContact(
+            poses, map(body_of_part, shape.convex_parts), shape.joints
+        )
         for pair in shape.pairs:
             if not pair.left_out:
                 free &= ~contact.of(pair.first, pair.second, among=free)
@@ -110,9 +147,10 @@ def _clearance(world: World, q: Array) -> float:
 def find_boxes(pipeline: Pipeline) -> tuple[Pipeline, float]:
     """Return a pipeline with boxes of positions in its first stage, and the share of accepted candidates.
 
-    The boxes of start and goal are side by side about the tip of the base configuration. They are tried from the
-    largest to the smallest. The first with more than half of the candidates accepted is returned, or else the one with
-    the largest share.
+    The boxes of start and goal are side by side about the tip of the base
+    configuration. They are tried from the largest to the smallest. The first with more
+    than half of the candidates accepted is returned, or else the one with the largest
+    share.
 
     Raises:
         RecipeError: No box has enough accepted candidates.
@@ -121,7 +159,10 @@ def find_boxes(pipeline: Pipeline) -> tuple[Pipeline, float]:
     world = World(robot)
     tips = _measure_states(world, _states(robot)[:500])[0]
     world = World(robot)  # at the base configuration
-    centre, reach = world.tip_position, float(np.linalg.norm(tips - robot.chain.joints[0].translation, axis=1).max())
+    centre, reach = (
+        world.tip_position,
+        float(np.linalg.norm(tips - robot.chain.joints[0].translation, axis=1).max()),
+    )
     moves = np.ptp(tips, axis=0) > MIN_TIP_TRAVEL_M
     found: list[tuple[float, Pipeline]] = []
     for size in BOX_SIZES:
@@ -134,24 +175,39 @@ def find_boxes(pipeline: Pipeline) -> tuple[Pipeline, float]:
     if share < MIN_YIELD:
         where = ", ".join(f"{each:.2f}" for each in centre)
         text = f"the tip reaches less than {100 * MIN_YIELD:g} % of every box of positions near ({where}) m"
-        raise RecipeError([f"{robot.urdf}: {text}; choose another --tip, or copy a recipe and write its boxes by hand"])
+        raise RecipeError(
+            [
+                f"{robot.urdf}: {text}; choose another --tip, or copy a recipe and write its boxes by hand"
+            ]
+        )
     return best, share
 
 
-def _boxes(centre: Array, edge: float, moves: NDArray[np.bool_], distance: float) -> DrawPositions:
-    """Return two boxes side by side, along y if the tip moves along it; flat along axes along which it does not."""
+def _boxes(
+    centre: Array, edge: float, moves: NDArray[np.bool_], distance: float
+) -> DrawPositions:
+    """Return two boxes side by side, along y if the tip moves along it.
+
+    Flat along axes along which it does not.
+    """
     aside = next((axis for axis in (1, 2, 0) if moves[axis]), 1)
     shift = np.where(np.arange(3) == aside, (edge + distance) / 2 + ROUNDING_M, 0.0)
 
     def box(position: Array) -> tuple[Range, Range, Range]:
         x, y, z = (
-            Range(round(at - edge / 2, 3), round(at + edge / 2, 3)) if free else Range(at, at)
+            Range(round(at - edge / 2, 3), round(at + edge / 2, 3))
+            if free
+            else Range(at, at)
             for at, free in zip(position.tolist(), moves.tolist(), strict=True)
         )
         return x, y, z
 
-    min_distance = math.floor(1e3 * distance) / 1e3 if aside < 2 else 0.0  # in the horizontal plane
-    return DrawPositions(start=box(centre - shift), goal=box(centre + shift), min_distance=min_distance)
+    min_distance = (
+        math.floor(1e3 * distance) / 1e3 if aside < 2 else 0.0
+    )  # in the horizontal plane
+    return DrawPositions(
+        start=box(centre - shift), goal=box(centre + shift), min_distance=min_distance
+    )
 
 
 def _accepted(pipeline: Pipeline) -> float:

@@ -1,11 +1,14 @@
 """Write recipes for your own arm, or a planner.
 
-The command writes NAME/problem.toml, NAME/pipeline.toml and NAME/dataset.toml: motions from rest to rest between two
-boxes of positions in front of the robot, within its limits and without self-collision. Comments explain every key. The
-head of problem.toml lists findings about the robot: joints, masses, frames, link pairs, the free space that convex
-parts of links reject, and placeholders for limits that the URDF lacks. Links whose convex hulls reject much free space
-are decomposed. 'cnpgen docs your-arm' continues from there. With --planner the command writes NAME/pyproject.toml and a
-module with a planner for 'cnpgen benchmark', which uses limits, kinematics and the table through the public interface.
+The command writes NAME/problem.toml, NAME/pipeline.toml and NAME/dataset.toml: motions
+from rest to rest between two boxes of positions in front of the robot, within its
+limits and without self-collision. Comments explain every key. The head of problem.toml
+lists findings about the robot: joints, masses, frames, link pairs, the free space that
+convex parts of links reject, and placeholders for limits that the URDF lacks. Links
+whose convex hulls reject much free space are decomposed. 'cnpgen docs your-arm'
+continues from there. With --planner the command writes NAME/pyproject.toml and a module
+with a planner for 'cnpgen benchmark', which uses limits, kinematics and the table
+through the public interface.
 """
 
 import argparse
@@ -21,14 +24,34 @@ from cnpgen.errors import UsageError
 
 def add_options(parser: Parser) -> None:
     option = parser.add_argument
-    option("name", metavar="NAME", type=_folder, help="name of the recipes and of their folder")
+    option(
+        "name",
+        metavar="NAME",
+        type=_folder,
+        help="name of the recipes and of their folder",
+    )
     kind = parser.add_mutually_exclusive_group(required=True)
-    kind.add_argument("--urdf", metavar="FILE", type=Path, help="URDF file; the recipes refer to its path")
-    kind.add_argument("--planner", action="store_true", help="write a package with a planner for 'cnpgen benchmark'")
-    option("--tip", metavar="FRAME", help="tip frame, a link or joint; default the only link without a child")
+    kind.add_argument(
+        "--urdf",
+        metavar="FILE",
+        type=Path,
+        help="URDF file; the recipes refer to its path",
+    )
+    kind.add_argument(
+        "--planner",
+        action="store_true",
+        help="write a package with a planner for 'cnpgen benchmark'",
+    )
+    option(
+        "--tip",
+        metavar="FRAME",
+        help="tip frame, a link or joint; default the only link without a child",
+    )
     text = "a folder that is searched for package:// of the URDF; may be repeated. By default those of ROS_PACKAGE_PATH"
     text += " and AMENT_PREFIX_PATH, and those above the URDF; what is used of the former is written down"
-    option("--packages", metavar="DIR", type=Path, action="append", default=[], help=text)
+    option(
+        "--packages", metavar="DIR", type=Path, action="append", default=[], help=text
+    )
     text = "an SRDF file, whose disabled pairs of links are not checked for collisions"
     option("--srdf", metavar="FILE", type=Path, help=text)
     option("--force", action="store_true", help="overwrite existing files")
@@ -46,9 +69,14 @@ def run(arguments: argparse.Namespace) -> None:
         return
     check_absent(folder, FILES, force=arguments.force)
     arm = read_arm(arguments.urdf, arguments.tip)
-    packages = (*arguments.packages, *packages_of_environment(arm.meshes, arm.urdf, arguments.packages))
+    packages = (
+        *arguments.packages,
+        *packages_of_environment(arm.meshes, arm.urdf, arguments.packages),
+    )
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # about the robot, which are in the notes
+        warnings.simplefilter(
+            "ignore", RuntimeWarning
+        )  # about the robot, which are in the notes
         initial = problem_of(arm, folder.name, folder, packages, arguments.srdf)
         _write(folder, {FILES[0]: problem_text(initial, folder)})
         sys.stderr.writelines(f"note: {note}\n" for note in initial.notes)
@@ -72,7 +100,14 @@ def _write_planner(folder: Path, *, force: bool) -> None:
     check_absent(folder, texts, force=force)
     _write(folder, texts)
     test = f"cnpgen benchmark hits-81 --planners {folder.name} cnpgen --n 2"
-    print("next:", f"pip install -e {folder}", test, "cnpgen docs benchmark", sep="\n  ", file=sys.stderr)
+    print(
+        "next:",
+        f"pip install -e {folder}",
+        test,
+        "cnpgen docs benchmark",
+        sep="\n  ",
+        file=sys.stderr,
+    )
 
 
 def _write(folder: Path, texts: Mapping[str, str]) -> None:
@@ -92,6 +127,8 @@ def _folder(name: str) -> Path:
 
     folder = Path(name)
     if not re.match(NAME, folder.name):
-        raise UsageError(f"NAME must be lower-case letters, digits and hyphens, such as my-arm; got {name!r}")
+        raise UsageError(
+            f"NAME must be lower-case letters, digits and hyphens, such as my-arm; got {name!r}"
+        )
     check_writable(folder)
     return folder

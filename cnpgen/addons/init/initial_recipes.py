@@ -21,7 +21,13 @@ from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.pipelines.stages.torque import GravityTorque
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import Constraint
-from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, JointPosition, JointTorque, JointVelocity
+from cnpgen.problems.constraints.joint import (
+    JointAcceleration,
+    JointJerk,
+    JointPosition,
+    JointTorque,
+    JointVelocity,
+)
 from cnpgen.problems.constraints.link_clearance import SelfClearance
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
@@ -31,11 +37,16 @@ from cnpgen.schema.keys import PerJoint, Range
 
 Array = NDArray[np.float64]
 
-GUESS_RANGE_RAD, GUESS_RANGE_M = 0.5, 0.1  # range of inverse kinematics guesses around the base configuration
+GUESS_RANGE_RAD, GUESS_RANGE_M = (
+    0.5,
+    0.1,
+)  # range of inverse kinematics guesses around the base configuration
 INITIAL_JERK_RATE = 100.0  # jerk limits per acceleration limit [1/s]; Franka Research 3: 500 ('cnpgen docs references')
 TORQUE_SCALE = 0.8  # planning limit / URDF limit of joint torques
 MIN_HOLDING_FRACTION = 0.25  # of the random states in which a joint's torque limit must suffice to hold the arm
-TORQUE_STATES = 1000  # random states that determine placeholders of missing torque limits
+TORQUE_STATES = (
+    1000  # random states that determine placeholders of missing torque limits
+)
 
 
 @dataclass(frozen=True)
@@ -48,43 +59,71 @@ class InitialProblem:
     notes: tuple[str, ...]
 
 
-def problem_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], srdf: Path | None) -> InitialProblem:
+def problem_of(
+    arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], srdf: Path | None
+) -> InitialProblem:
     """Make the problem of an arm, or raise RecipeError if it cannot be planned for.
 
-    ``packages`` are folders that are searched for packages of the URDF, the SRDF disables pairs of links.
+    ``packages`` are folders that are searched for packages of the URDF, the SRDF
+    disables pairs of links.
     """
-    problem = _problem(with_torques(arm, [1.0] * len(arm.planned)), name, folder, packages, srdf)
-    with warnings.catch_warnings(record=True) as caught:  # such as those about simplified meshes
+    problem = _problem(
+        with_torques(arm, [1.0] * len(arm.planned)), name, folder, packages, srdf
+    )
+    with warnings.catch_warnings(
+        record=True
+    ) as caught:  # such as those about simplified meshes
         warnings.simplefilter("always")
         overlaps = resolve_overlaps(problem) if arm.has_shape else None
         problem = overlaps.problem if overlaps else problem
         robot = load_robot(problem)
-    notes = [*dict.fromkeys(str(each.message) for each in caught), *(overlaps.notes if overlaps else ())]
+    notes = [
+        *dict.fromkeys(str(each.message) for each in caught),
+        *(overlaps.notes if overlaps else ()),
+    ]
     arm, overloaded = _with_torque_limits(arm, robot)
     limits = replace(problem.limits, **_replaced_limits(arm))
     problem = _with_jerk_limits(replace(problem, limits=limits), robot)
-    if robot.chain.joints[-1].mass > 0:  # torques of links without masses are meaningless
+    if (
+        robot.chain.joints[-1].mass > 0
+    ):  # torques of links without masses are meaningless
         limit = JointTorque(tolerance=5e-3, budget=6e-2)
-        problem = replace(problem, constraint=(*problem.constraint[:4], limit, *problem.constraint[4:]))
+        problem = replace(
+            problem,
+            constraint=(*problem.constraint[:4], limit, *problem.constraint[4:]),
+        )
     else:
-        notes.append("no mass that the last joint moves: its torques would be wrong, so 'joint-torque' is omitted")
+        notes.append(
+            "no mass that the last joint moves: its torques would be wrong, so 'joint-torque' is omitted"
+        )
     base, base_notes = comfortable_base(problem, load_robot(problem))
     problem = replace(problem, robot=replace(problem.robot, base=base))
-    return InitialProblem(problem, arm, overlaps, (*arm_notes(arm), *notes, *overloaded, *base_notes))
+    return InitialProblem(
+        problem, arm, overlaps, (*arm_notes(arm), *notes, *overloaded, *base_notes)
+    )
 
 
 def dataset_of(initial: InitialProblem, folder: Path) -> tuple[DatasetRecipe, float]:
-    """Return the dataset of a problem and the share of accepted candidates; raise RecipeError if none are found."""
+    """Return the dataset of a problem and the share of accepted candidates.
+
+    Raise RecipeError if none are found.
+    """
     problem, name = initial.problem, initial.problem.name
     title, path = f"From rest to rest: {name}", folder / "pipeline.toml"
     stages = _stages(initial.arm, problem)
-    pipeline, share = find_boxes(Pipeline(name=name, title=title, problem=problem, stage=stages, path=path))
+    pipeline, share = find_boxes(
+        Pipeline(name=name, title=title, problem=problem, stage=stages, path=path)
+    )
     title, path = f"Motions from rest to rest: {name}", folder / "dataset.toml"
     splits = {"train": 18_000, "validation": 2_000}
-    return DatasetRecipe(name=name, title=title, pipeline=pipeline, splits=splits, path=path), share
+    return DatasetRecipe(
+        name=name, title=title, pipeline=pipeline, splits=splits, path=path
+    ), share
 
 
-def _problem(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], srdf: Path | None) -> Problem:
+def _problem(
+    arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], srdf: Path | None
+) -> Problem:
     """Return the problem without torques, with the base configuration at the centre of all limits."""
     centre = tuple((joint.lower + joint.upper) / 2 for joint in arm.planned)
     robot = RobotSpec(
@@ -96,38 +135,65 @@ def _problem(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], srdf
         packages=tuple(str(each.absolute()) for each in packages),
         srdf="" if srdf is None else str(srdf.absolute()),
     )
-    limits = LimitSpec(velocity_scale=0.8, torque_scale=TORQUE_SCALE, **_replaced_limits(arm))
+    limits = LimitSpec(
+        velocity_scale=0.8, torque_scale=TORQUE_SCALE, **_replaced_limits(arm)
+    )
     constraints: tuple[Constraint, ...] = (
         JointPosition(tolerance=1e-3),
         JointVelocity(tolerance=2e-3, budget=6e-3),
         JointAcceleration(tolerance=5e-3, budget=6e-2),
     )
     if arm.has_shape:
-        clearances = RobotClearance(tolerance=1e-3, budget=1e-6), SelfClearance(tolerance=1e-3, budget=1e-6)
+        clearances = (
+            RobotClearance(tolerance=1e-3, budget=1e-6),
+            SelfClearance(tolerance=1e-3, budget=1e-6),
+        )
         constraints = (*constraints, *clearances)  # obstacles may follow
     path, title = folder / "problem.toml", f"Move {arm.urdf.stem} within its limits"
-    return Problem(name=name, title=title, robot=robot, limits=limits, constraint=constraints, path=path.absolute())
+    return Problem(
+        name=name,
+        title=title,
+        robot=robot,
+        limits=limits,
+        constraint=constraints,
+        path=path.absolute(),
+    )
 
 
 def _replaced_limits(arm: Arm) -> dict[str, Any]:
     """Return the limits that the problem states in place of the URDF's."""
     missing = {name for joint in arm.planned for name in joint.missing}
     return {
-        "position": tuple(Range(each.lower, each.upper) for each in arm.planned) if "position" in missing else None,
-        "velocity": PerJoint(tuple(each.velocity for each in arm.planned)) if "velocity" in missing else None,
-        "torque": PerJoint(tuple(each.effort for each in arm.planned)) if "torque" in missing else None,
+        "position": tuple(Range(each.lower, each.upper) for each in arm.planned)
+        if "position" in missing
+        else None,
+        "velocity": PerJoint(tuple(each.velocity for each in arm.planned))
+        if "velocity" in missing
+        else None,
+        "torque": PerJoint(tuple(each.effort for each in arm.planned))
+        if "torque" in missing
+        else None,
     }
 
 
 def _with_torque_limits(arm: Arm, robot: Robot) -> tuple[Arm, list[str]]:
-    """Replace torque limits that are missing or below the torques that gravity needs; return notes about the latter."""
+    """Replace torque limits that are missing or below the torques that gravity needs.
+
+    Return notes about the latter.
+    """
     moving, at_rest = _torques(robot)
     notes, planned = [], []
-    for joint, load in zip(arm.planned, np.quantile(at_rest, MIN_HOLDING_FRACTION, axis=0).tolist(), strict=True):
+    for joint, load in zip(
+        arm.planned,
+        np.quantile(at_rest, MIN_HOLDING_FRACTION, axis=0).tolist(),
+        strict=True,
+    ):
         if 0 < MAX_LOAD * TORQUE_SCALE * joint.effort < load:
             unit = "N" if joint.kind == "prismatic" else "N m"
             text = f"{joint.name}: gravity needs {load:.4g} {unit}, where the URDF allows {joint.effort:g} {unit}"
-            notes.append(f"{text}; the placeholder of a missing limit replaces it in [limits]")
+            notes.append(
+                f"{text}; the placeholder of a missing limit replaces it in [limits]"
+            )
             missing = tuple(dict.fromkeys((*joint.missing, "torque")))
             planned.append(replace(joint, effort=0.0, missing=missing))
         else:
@@ -137,11 +203,21 @@ def _with_torque_limits(arm: Arm, robot: Robot) -> tuple[Arm, list[str]]:
 
 
 def _with_jerk_limits(problem: Problem, robot: Robot) -> Problem:
-    """Return the problem with jerk limits in proportion to the acceleration limits; URDFs have none."""
-    jerks = tuple(float(f"{INITIAL_JERK_RATE * limit:.3g}") for limit in robot.acceleration_limit)
+    """Return the problem with jerk limits in proportion to the acceleration limits.
+
+    URDFs have none.
+    """
+    jerks = tuple(
+        float(f"{INITIAL_JERK_RATE * limit:.3g}") for limit in robot.acceleration_limit
+    )
     limits = replace(problem.limits, jerk=PerJoint(jerks))
     *others, acceleration = problem.constraint[:3]
-    constraints = (*others, acceleration, JointJerk(tolerance=5e-3, budget=6e-2), *problem.constraint[3:])
+    constraints = (
+        *others,
+        acceleration,
+        JointJerk(tolerance=5e-3, budget=6e-2),
+        *problem.constraint[3:],
+    )
     return replace(problem, limits=limits, constraint=constraints)
 
 
@@ -151,23 +227,34 @@ def _torques(robot: Robot) -> tuple[Array, Array]:
 
     model, random = robot.model, np.random.default_rng(0)
     data, still = model.createData(), np.zeros(robot.n)
-    q = random.uniform(robot.position_lower, robot.position_upper, (TORQUE_STATES, robot.n))
+    q = random.uniform(
+        robot.position_lower, robot.position_upper, (TORQUE_STATES, robot.n)
+    )
     dq, ddq = (
         random.uniform(-limit, limit, (TORQUE_STATES, robot.n))
         for limit in (robot.velocity_limit, robot.acceleration_limit)
     )
     moving = [pin.rnea(model, data, *state) for state in zip(q, dq, ddq, strict=True)]
-    return np.abs(moving), np.abs([pin.rnea(model, data, each, still, still) for each in q])
+    return np.abs(moving), np.abs(
+        [pin.rnea(model, data, each, still, still) for each in q]
+    )
 
 
 def _stages(arm: Arm, problem: Problem) -> tuple[Stage, ...]:
     """Return the stages; the boxes are still to be found."""
     anywhere = (Range(0.0, 0.0),) * 3
     torques = any(isinstance(each, JointTorque) for each in problem.constraint)
-    holding = {end: (GravityTorque(end=end),) if torques else () for end in ("start", "goal")}
+    holding = {
+        end: (GravityTorque(end=end),) if torques else () for end in ("start", "goal")
+    }
     return (
         DrawPositions(start=anywhere, goal=anywhere),
-        StartIK(guess=tuple(_near(joint, at) for joint, at in zip(arm.planned, problem.robot.base, strict=True))),
+        StartIK(
+            guess=tuple(
+                _near(joint, at)
+                for joint, at in zip(arm.planned, problem.robot.base, strict=True)
+            )
+        ),
         *holding["start"],
         GoalIK(),
         *holding["goal"],
@@ -178,4 +265,6 @@ def _stages(arm: Arm, problem: Problem) -> tuple[Stage, ...]:
 
 def _near(joint: ArmJoint, at: float) -> Range:
     half = GUESS_RANGE_M if joint.kind == "prismatic" else GUESS_RANGE_RAD
-    return Range(round(max(at - half, joint.lower), 4), round(min(at + half, joint.upper), 4))
+    return Range(
+        round(max(at - half, joint.lower), 4), round(min(at + half, joint.upper), 4)
+    )

@@ -16,10 +16,18 @@ from cnpgen.robots.urdf import read_urdf
 MAX_GAP = 0.01  # fraction of the free states that convex parts may reject without further decomposition
 MAX_PAIR_GAP = 1e-3  # of a pair whose links are not decomposed further
 LARGE_PAIR_GAP = 0.02  # of a pair that a note names
-PART_COUNTS = (4, 8, 16)  # maximum numbers of convex parts of a mesh, in the order in which they are tried
-MIN_FREE_FRACTION = 0.01  # of the sampled states, below which pairs in contact are ignored
+PART_COUNTS = (
+    4,
+    8,
+    16,
+)  # maximum numbers of convex parts of a mesh, in the order in which they are tried
+MIN_FREE_FRACTION = (
+    0.01  # of the sampled states, below which pairs in contact are ignored
+)
 MAX_IGNORED_PAIRS = 20
-LARGE_COLLIDING_FRACTION = 0.1  # of the random states, from which on a note names a pair
+LARGE_COLLIDING_FRACTION = (
+    0.1  # of the random states, from which on a note names a pair
+)
 MAX_LISTED_PAIRS = 6  # of a note
 
 
@@ -38,16 +46,24 @@ def resolve_overlaps(problem: Problem) -> LinkOverlaps:
     hulls = _gap(problem)
     problem, parts = _decompose(problem, hulls)
     problem, parts, contacts = _ignore_contacts(problem, parts)
-    contacts += _pair_notes(load_robot(problem).shape.pairs, {*map(frozenset, problem.robot.ignored_pairs)})  # type: ignore[union-attr]
-    problem = replace(problem, robot=replace(problem.robot, hull_gap=round(parts.fraction, 4)))
-    return LinkOverlaps(problem, hulls, parts, (*_gap_notes(problem, hulls, parts), *contacts))
+    shape, ignored = load_robot(problem).shape, problem.robot.ignored_pairs
+    assert shape is not None  # problems of ``init`` have the geometry of the URDF
+    contacts += _pair_notes(shape.pairs, {*map(frozenset, ignored)})
+    problem = replace(
+        problem, robot=replace(problem.robot, hull_gap=round(parts.fraction, 4))
+    )
+    return LinkOverlaps(
+        problem, hulls, parts, (*_gap_notes(problem, hulls, parts), *contacts)
+    )
 
 
 def _gap(problem: Problem) -> HullGap:
     """Measure the gap of a problem's convex parts."""
     robot, path = load_robot(problem), problem.urdf_path
     assert robot.shape is not None
-    return measure_hull_gap(read_urdf(path), path, problem.packages, model=robot.model, shape=robot.shape)
+    return measure_hull_gap(
+        read_urdf(path), path, problem.packages, model=robot.model, shape=robot.shape
+    )
 
 
 def _decompose(problem: Problem, gap: HullGap) -> tuple[Problem, HullGap]:
@@ -57,48 +73,82 @@ def _decompose(problem: Problem, gap: HullGap) -> tuple[Problem, HullGap]:
     for count in PART_COUNTS:
         if gap.fraction <= MAX_GAP and not gap.hidden:
             break
-        large = [*gap.hidden, *takewhile(lambda pair: pair.rejected > MAX_PAIR_GAP, gap.pairs)]
-        links = dict.fromkeys(link for pair in large for link in (pair.first, pair.second) if link in meshes)
+        large = [
+            *gap.hidden,
+            *takewhile(lambda pair: pair.rejected > MAX_PAIR_GAP, gap.pairs),
+        ]
+        links = dict.fromkeys(
+            link
+            for pair in large
+            for link in (pair.first, pair.second)
+            if link in meshes
+        )
         chosen = list(dict.fromkeys([*chosen, *links]))
         if not links:
             break
-        print(f"cnpgen: decomposing {', '.join(chosen)} into at most {count} convex parts each", file=sys.stderr)
+        print(
+            f"cnpgen: decomposing {', '.join(chosen)} into at most {count} convex parts each",
+            file=sys.stderr,
+        )
         robot = replace(problem.robot, convex_parts=count, decomposed=tuple(chosen))
         problem = replace(problem, robot=robot)
         gap = _gap(problem)
     return problem, gap
 
 
-def _ignore_contacts(problem: Problem, gap: HullGap) -> tuple[Problem, HullGap, list[str]]:
+def _ignore_contacts(
+    problem: Problem, gap: HullGap
+) -> tuple[Problem, HullGap, list[str]]:
     """Ignore the pairs that overlap most often until some sampled states are free."""
     ignored: list[PairGap] = []
-    while gap.accepted < MIN_FREE_FRACTION * GAP_STATES and len(ignored) < MAX_IGNORED_PAIRS:
+    while (
+        gap.accepted < MIN_FREE_FRACTION * GAP_STATES
+        and len(ignored) < MAX_IGNORED_PAIRS
+    ):
         ignored.append(max(gap.pairs, key=lambda pair: pair.parts))
         pairs = tuple((pair.first, pair.second) for pair in ignored)
         problem = replace(problem, robot=replace(problem.robot, ignored_pairs=pairs))
         gap = _gap(problem)
-    notes = [f"ignored, since otherwise no state is free of collisions: {_overlap(pair)}" for pair in ignored]
+    notes = [
+        f"ignored, since otherwise no state is free of collisions: {_overlap(pair)}"
+        for pair in ignored
+    ]
     return problem, gap, notes
 
 
-def _pair_notes(pairs: Sequence[LinkPair], ignored: set[frozenset[str]]) -> Iterator[str]:
+def _pair_notes(
+    pairs: Sequence[LinkPair], ignored: set[frozenset[str]]
+) -> Iterator[str]:
     """Yield sentences about pairs in permanent contact, pairs that collide often, and pairs that an SRDF disables."""
     if always := [pair for pair in pairs if pair.left_out == "always"]:
         names = "; ".join(f"{pair.first}, {pair.second}" for pair in always)
         yield f"not checked, since they are always in contact: {names}"
-    often = [pair for pair in pairs if not pair.left_out and pair.colliding > LARGE_COLLIDING_FRACTION]
+    often = [
+        pair
+        for pair in pairs
+        if not pair.left_out and pair.colliding > LARGE_COLLIDING_FRACTION
+    ]
     if often:
-        remedy = "if that is impossible, pass --srdf or name the pair in 'ignored_pairs'"
+        remedy = (
+            "if that is impossible, pass --srdf or name the pair in 'ignored_pairs'"
+        )
         yield f"these links collide in many states: {_shares(often)}; {remedy}"
-    disabled = [pair for pair in pairs if pair.left_out == "disabled" and pair.colliding > 0]
-    if missed := [pair for pair in disabled if frozenset((pair.first, pair.second)) not in ignored]:
+    disabled = [
+        pair for pair in pairs if pair.left_out == "disabled" and pair.colliding > 0
+    ]
+    if missed := [
+        pair for pair in disabled if frozenset((pair.first, pair.second)) not in ignored
+    ]:
         yield f"the SRDF disables links that collide, and these collisions are not noticed: {_shares(missed)}"
 
 
 def _shares(pairs: list[LinkPair]) -> str:
     """List pairs with their fractions of the random states, the largest first."""
     pairs = sorted(pairs, key=lambda pair: -pair.colliding)
-    return listed([f"{pair.first} and {pair.second} ({pair.colliding:.1%})" for pair in pairs], most=MAX_LISTED_PAIRS)
+    return listed(
+        [f"{pair.first} and {pair.second} ({pair.colliding:.1%})" for pair in pairs],
+        most=MAX_LISTED_PAIRS,
+    )
 
 
 def _overlap(pair: PairGap) -> str:
@@ -115,9 +165,15 @@ def _gap_notes(problem: Problem, hulls: HullGap, parts: HullGap) -> list[str]:
         text += f", the convex parts {parts.fraction:.2%}; decomposed: {', '.join(problem.robot.decomposed)}"
     notes = [text]
     for pair in takewhile(lambda pair: pair.rejected > LARGE_PAIR_GAP, parts.pairs):
-        rejected = f"the pair {pair.first}, {pair.second} rejects {pair.rejected:.2%} of them"
-        notes.append(f"{rejected}: finer convex parts of its links or 'ignored_pairs' would accept them")
+        rejected = (
+            f"the pair {pair.first}, {pair.second} rejects {pair.rejected:.2%} of them"
+        )
+        notes.append(
+            f"{rejected}: finer convex parts of its links or 'ignored_pairs' would accept them"
+        )
     if parts.hidden:
         hidden = "; ".join(map(_overlap, parts.hidden))
-        notes.append(f"not checked, although their meshes are not always in contact: {hidden}")
+        notes.append(
+            f"not checked, although their meshes are not always in contact: {hidden}"
+        )
     return notes

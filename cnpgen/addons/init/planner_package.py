@@ -83,7 +83,10 @@ def min_duration(robot, q, s):
 
 
 def planner_texts(name: str) -> dict[str, str]:
-    """Return file -> text of a package with one planner; the name has lower-case letters, digits and hyphens."""
+    """Return file -> text of a package with one planner.
+
+    The name has lower-case letters, digits and hyphens.
+    """
     module = name.replace("-", "_")
     kind = "".join(part.capitalize() for part in name.split("-"))
     values = {"{name}": name, "{module}": module, "{kind}": kind}

@@ -8,8 +8,17 @@ from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
-from cnpgen.addons.init.arm import DEFAULT_RANGE_M, DEFAULT_RANGE_RAD, DEFAULT_SPEED, Arm
-from cnpgen.addons.init.initial_recipes import INITIAL_JERK_RATE, TORQUE_STATES, InitialProblem
+from cnpgen.addons.init.arm import (
+    DEFAULT_RANGE_M,
+    DEFAULT_RANGE_RAD,
+    DEFAULT_SPEED,
+    Arm,
+)
+from cnpgen.addons.init.initial_recipes import (
+    INITIAL_JERK_RATE,
+    TORQUE_STATES,
+    InitialProblem,
+)
 from cnpgen.addons.init.link_overlaps import MAX_PAIR_GAP, LinkOverlaps
 from cnpgen.cli.describe import link_rows, pair_rows, with_units
 from cnpgen.cli.describe_keys import GROUPS, is_array, kind_summary, part_of
@@ -35,10 +44,16 @@ def problem_text(initial: InitialProblem, folder: Path) -> str:
     """Write the problem of an arm in a folder, with findings about the arm."""
     problem, arm = initial.problem, initial.arm
     places: dict[str, Any] = {"robot.urdf": _from(folder, problem.robot.urdf)}
-    places["robot.packages"] = tuple(_from(folder, each) for each in problem.robot.packages)
+    places["robot.packages"] = tuple(
+        _from(folder, each) for each in problem.robot.packages
+    )
     if problem.robot.srdf:
         places["robot.srdf"] = _from(folder, problem.robot.srdf)
-    head = [*_head(f"What a valid motion of {arm.urdf.name} is."), "#", *_about(initial, load_robot(problem))]
+    head = [
+        *_head(f"What a valid motion of {arm.urdf.name} is."),
+        "#",
+        *_about(initial, load_robot(problem)),
+    ]
     return "\n".join([*head, "", recipe_text(problem, places, _notes(arm))])
 
 
@@ -48,7 +63,9 @@ def sampling_texts(recipe: DatasetRecipe, share: float) -> dict[str, str]:
         "stage.0.start": f"Found by sampling: of the draws {100 * share:.0f} % become samples.",
         "stage.1.guess": "About the base configuration of the problem.",
     }
-    pipeline = _head("How starts and goals are drawn: positions, and joint angles that reach them.")
+    pipeline = _head(
+        "How starts and goals are drawn: positions, and joint angles that reach them."
+    )
     pipeline += ["", recipe_text(recipe.pipeline, {"problem": FILES[0]}, comments)]
     dataset = _head("How many samples there are, from which seed, split how.")
     dataset += ["", recipe_text(recipe, {"pipeline": FILES[1]}, {})]
@@ -68,14 +85,20 @@ def _notes(arm: Arm) -> Mapping[str, str]:
     """Say which values were put in the place of missing ones, and how others were found."""
     ranges = f"{DEFAULT_RANGE_RAD:.3g} rad, or {DEFAULT_RANGE_M:g} m, to either side"
     torques = f"the largest of {TORQUE_STATES:,} random states, at speeds and accelerations within the limits"
-    put = {"position": ranges, "velocity": f"{DEFAULT_SPEED:g} rad/s or m/s", "torque": torques}
+    put = {
+        "position": ranges,
+        "velocity": f"{DEFAULT_SPEED:g} rad/s or m/s",
+        "torque": torques,
+    }
     base = "Found by sampling: in front of the robot, far from its limits, with high manipulability."
     jerk = f"{INITIAL_JERK_RATE:.0f}/s times the acceleration limits; a Franka Research 3 has 500/s. Look them up."
     notes = {"robot.home": base, "limits.jerk": jerk}
     for what, instead in put.items():
         without = [joint.name for joint in arm.planned if what in joint.missing]
         if without:
-            notes[f"limits.{what}"] = f"The URDF has none for {', '.join(without)}: put in: {instead}. Look them up."
+            notes[f"limits.{what}"] = (
+                f"The URDF has none for {', '.join(without)}: put in: {instead}. Look them up."
+            )
     return notes
 
 
@@ -89,23 +112,59 @@ def _about(initial: InitialProblem, robot: Robot) -> Iterator[str]:
     heavy = [link for link in arm.moved if arm.masses.get(link)]
     light = [link for link in arm.moved if not arm.masses.get(link)]
     mass = sum(arm.masses[link] for link in heavy)
-    facts = [("locked", f"joints that are not planned and stay at zero: {', '.join(arm.locked) or 'none'}")]
-    facts += [("mass", f"{mass:.4g} kg in {len(heavy)} links that move; without any: {', '.join(light) or 'none'}")]
+    facts = [
+        (
+            "locked",
+            f"joints that are not planned and stay at zero: {', '.join(arm.locked) or 'none'}",
+        )
+    ]
+    facts += [
+        (
+            "mass",
+            f"{mass:.4g} kg in {len(heavy)} links that move; without any: {', '.join(light) or 'none'}",
+        )
+    ]
     if not robot.chain.joints[-1].mass:
-        facts += [("torque", "the last joint moves nothing that has a mass, so that 'joint-torque' is left out")]
+        facts += [
+            (
+                "torque",
+                "the last joint moves nothing that has a mass, so that 'joint-torque' is left out",
+            )
+        ]
     facts += [("frames", ", ".join(arm.frames))]
     if robot.shape is None:
-        facts += [("shape", "no link that moves has a <collision> element, so that 'self-clearance' is left out")]
+        facts += [
+            (
+                "shape",
+                "no link that moves has a <collision> element, so that 'self-clearance' is left out",
+            )
+        ]
     yield from table(facts, indent="#   ")
     for note in initial.notes:
-        yield from ("#", *wrap(note, RECIPE_LINE_WIDTH, initial_indent="#   - ", subsequent_indent="#     "))
+        yield from (
+            "#",
+            *wrap(
+                note,
+                RECIPE_LINE_WIDTH,
+                initial_indent="#   - ",
+                subsequent_indent="#     ",
+            ),
+        )
     if robot.shape is not None:
-        yield from ("#", "#   Links: solvers use capsules around them, judges their convex parts", "#")
+        yield from (
+            "#",
+            "#   Links: solvers use capsules around them, judges their convex parts",
+            "#",
+        )
         yield from table(link_rows(robot.shape), indent="#   ", right=range(1, 6))
         yield from ("#", "#   Pairs of links, by random states", "#")
         yield from table(pair_rows(robot.shape), indent="#   ", right=(2, 3))
     if initial.overlaps and (rows := _gap_rows(initial.overlaps)):
-        yield from ("#", "#   Links that overlap by their convex hulls or parts, but not by their meshes", "#")
+        yield from (
+            "#",
+            "#   Links that overlap by their convex hulls or parts, but not by their meshes",
+            "#",
+        )
         yield from table(rows, indent="#   ", right=(2, 3, 4, 5))
 
 
@@ -113,22 +172,41 @@ def _gap_rows(overlaps: LinkOverlaps) -> list[tuple[str, ...]]:
     """List the pairs with a gap: shares of random states, and of those that all meshes accept."""
     hulls = {(pair.first, pair.second): pair for pair in overlaps.hulls.pairs}
     rows = [
-        (*pair, f"{hulls[pair].parts:.2%}", f"{after.parts:.2%}", f"{after.meshes:.2%}", f"{after.rejected:.2%}")
+        (
+            *pair,
+            f"{hulls[pair].parts:.2%}",
+            f"{after.parts:.2%}",
+            f"{after.meshes:.2%}",
+            f"{after.rejected:.2%}",
+        )
         for after in overlaps.parts.pairs
-        if (pair := (after.first, after.second)) in hulls and hulls[pair].rejected > MAX_PAIR_GAP
+        if (pair := (after.first, after.second)) in hulls
+        and hulls[pair].rejected > MAX_PAIR_GAP
     ]
-    head = ("links", "", "hulls overlap", "parts overlap", "meshes overlap", "free states rejected")
+    head = (
+        "links",
+        "",
+        "hulls overlap",
+        "parts overlap",
+        "meshes overlap",
+        "free states rejected",
+    )
     return [head, *rows] if rows else []
 
 
 def _joint_rows(arm: Arm) -> Iterator[tuple[str, ...]]:
     prismatic = tuple(joint.kind == "prismatic" for joint in arm.planned)
     limits = {
-        ("position", "rad"): [f"{joint.lower:.4g} to {joint.upper:.4g}" for joint in arm.planned],
+        ("position", "rad"): [
+            f"{joint.lower:.4g} to {joint.upper:.4g}" for joint in arm.planned
+        ],
         ("velocity", "rad/s"): [f"{joint.velocity:.4g}" for joint in arm.planned],
         ("torque", "N m"): [f"{joint.effort:.4g}" for joint in arm.planned],
     }
-    columns = [(name, *with_units(units_of_joints(unit, prismatic), cells)) for (name, unit), cells in limits.items()]
+    columns = [
+        (name, *with_units(units_of_joints(unit, prismatic), cells))
+        for (name, unit), cells in limits.items()
+    ]
     yield from zip(
         ("joint", "", *(joint.name for joint in arm.planned)),
         ("type", "", *(joint.kind for joint in arm.planned)),
@@ -138,20 +216,28 @@ def _joint_rows(arm: Arm) -> Iterator[tuple[str, ...]]:
     )
 
 
-def recipe_text(recipe: Any, values: Mapping[str, Any], notes: Mapping[str, str]) -> str:
+def recipe_text(
+    recipe: Any, values: Mapping[str, Any], notes: Mapping[str, str]
+) -> str:
     """Write a problem, pipeline or dataset, with other values of keys, such as "robot.urdf", and notes on keys."""
     return "\n".join(_Writer(values, notes).table(type(recipe), recipe, "")) + "\n"
 
 
 @dataclass(frozen=True)
 class _Writer:
-    """Writes tables, with values and notes as ``recipe_text`` has them; what is left out has ``# `` before it."""
+    """Writes tables, with values and notes as ``recipe_text`` has them.
+
+    What is left out has ``# `` before it.
+    """
 
     values: Mapping[str, Any]
     notes: Mapping[str, str]
 
     def table(self, cls: type, table: Any, path: str) -> Iterator[str]:
-        """Write the keys of a table, those that hold tables last; without a table, all as left out."""
+        """Write the keys of a table, those that hold tables last.
+
+        Without a table, all as left out.
+        """
         below = list[str]()
         for key in keys(cls):
             name = f"{path}.{key.name}" if path else key.name
@@ -162,26 +248,44 @@ class _Writer:
                 for at, item in enumerate(value or (None,)):
                     below += ["", *self.entry(part, item, f"{name}.{at}")]
             else:
-                below += ["", *_comment(kind_summary(part)), _unless(value, f"[{name}]")]
+                below += [
+                    "",
+                    *_comment(kind_summary(part)),
+                    _unless(value, f"[{name}]"),
+                ]
                 below += self.table(part, value, name)
         yield from below
 
     def entry(self, cls: type, item: Any, path: str) -> Iterator[str]:
-        """Write one of several tables of the same name; without one, how it would be written."""
+        """Write one of several tables of the same name.
+
+        Without one, how it would be written.
+        """
         kind = cls if item is None else type(item)
         yield from _comment(kind_summary(kind))
         yield _unless(item, f"[[{path.rpartition('.')[0]}]]")
         if cls in GROUPS:
             names = registry.names(GROUPS[cls])
-            yield f'# use = "{names[0]}"' if item is None else f'use = "{registry.name_of(GROUPS[cls], kind)}"'
+            yield (
+                f'# use = "{names[0]}"'
+                if item is None
+                else f'use = "{registry.name_of(GROUPS[cls], kind)}"'
+            )
         yield from self.table(kind, item, path)
 
     def key(self, key: Key, table: Any, name: str) -> Iterator[str]:
-        """Write a key below what it means; as left out where it is at its default, or of a table that is left out."""
-        value = self.values.get(name, getattr(table, key.name, None if key.required else key.default))
+        """Write a key below what it means.
+
+        As left out where it is at its default, or of a table that is left out.
+        """
+        value = self.values.get(
+            name, getattr(table, key.name, None if key.required else key.default)
+        )
         given = table is not None and (key.required or value != key.default)
         note = f". {self.notes[name]}" if name in self.notes else ""
-        yield from _comment(f"{key.doc}{note}" if given else f"{key.doc} ({key.expected}){note}")
+        yield from _comment(
+            f"{key.doc}{note}" if given else f"{key.doc} ({key.expected}){note}"
+        )
         yield _unless(given, f"{key.name} = {toml(value) or NOTHING}")
 
 
@@ -191,7 +295,13 @@ def _unless(given: Any, line: str) -> str:
 
 
 def _comment(text: str) -> list[str]:
-    return wrap(text, RECIPE_LINE_WIDTH, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False)
+    return wrap(
+        text,
+        RECIPE_LINE_WIDTH,
+        initial_indent="# ",
+        subsequent_indent="# ",
+        break_on_hyphens=False,
+    )
 
 
 def toml(value: Any) -> str:
@@ -203,7 +313,9 @@ def toml(value: Any) -> str:
     if isinstance(value, tuple):
         return f"[{', '.join(map(toml, value))}]" if value else ""
     if isinstance(value, dict):
-        return f"{{ {', '.join(f'{name} = {entry}' for name, entry in value.items())} }}"
+        return (
+            f"{{ {', '.join(f'{name} = {entry}' for name, entry in value.items())} }}"
+        )
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False) if value else ""
     return repr(value) if isinstance(value, int | float) else ""

@@ -23,11 +23,20 @@ from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
 
-HIT_COLUMNS = ("start_q", "start_dq", "start_ddq", "goal_xyz", "hit_angle", SPEED_SHARE_COLUMN)
-
-_ARGUMENT_OF = {"goal_xyz": "puck", "hit_angle": "target", SPEED_SHARE_COLUMN: "speed_share"} | dict.fromkeys(
-    HIT_COLUMNS[:3], "state"
+HIT_COLUMNS = (
+    "start_q",
+    "start_dq",
+    "start_ddq",
+    "goal_xyz",
+    "hit_angle",
+    SPEED_SHARE_COLUMN,
 )
+
+_ARGUMENT_OF = {
+    "goal_xyz": "puck",
+    "hit_angle": "target",
+    SPEED_SHARE_COLUMN: "speed_share",
+} | dict.fromkeys(HIT_COLUMNS[:3], "state")
 
 State = tuple[ArrayLike, ArrayLike, ArrayLike]
 """Positions [rad], velocities [rad/s], accelerations [rad/s^2], shape (n,) or (N, n), as from ``Plans.states_at``."""
@@ -36,25 +45,34 @@ State = tuple[ArrayLike, ArrayLike, ArrayLike]
 def load_completion(model: Model, backend: str | None) -> Completion:
     """Load the pipeline stages that completed the model's training rows, with the columns of hits as input.
 
-    Raises:
-        UsageError: The model does not record its stages, or they do not complete hits.
-        CnpgenError: The stages do not fit this version of cnpgen, or a backend is missing.
+    Raises: UsageError: The model does not record its stages, or they do not complete
+        hits. CnpgenError: The stages do not fit this version of cnpgen, or a backend is
+        missing.
     """
     stages = model.training.get("stages")
     if stages is None:
-        raise UsageError("the model does not record the pipeline stages of its training rows, so it cannot plan hits")
+        raise UsageError(
+            "the model does not record the pipeline stages of its training rows, so it cannot plan hits"
+        )
     name = str(model.training.get("dataset", {}).get("name", model.problem.name))
     with loaded_problem(model.problem, backend) as loaded:
         context = Context(loaded.problem, loaded.robot, loaded.kernels)
-        given = (*HIT_COLUMNS, "parameters") if loaded.problem.parameters else HIT_COLUMNS
-        return Completion(restore_pipeline(name, drawing_stages(stages), loaded.problem), context, given)
+        given = (
+            (*HIT_COLUMNS, "parameters") if loaded.problem.parameters else HIT_COLUMNS
+        )
+        return Completion(
+            restore_pipeline(name, drawing_stages(stages), loaded.problem),
+            context,
+            given,
+        )
 
 
 def state_lanes(state: State, n: int) -> list[Array]:
     """Return positions, velocities and accelerations of n joints, shape (n, N) or (n, 1) each."""
     if len(state) != 3 or np.ndim(state[0]) == 0:
         raise UsageError(
-            f"must be positions, velocities and accelerations, got {len(state)} values or arrays", argument="state"
+            f"must be positions, velocities and accelerations, got {len(state)} values or arrays",
+            argument="state",
         )
     return [lanes("state", values, {n}) for values in state]
 
@@ -70,20 +88,36 @@ def hit_tasks(
     angle: Array | None = None,
     parameters: ArrayLike | None = None,
 ) -> TaskBatch:
-    """Complete the tasks of N hits; see ``plan_hits``. Their angles [rad], shape (N,), are by default to the target."""
+    """Complete the tasks of N hits; see ``plan_hits``.
+
+    Their angles [rad], shape (N,), are by default to the target.
+    """
     n = completion.context.robot.n
     parts = state_lanes(state, n)
     with concerning("state"):
-        states = {name: values.T for name, values in zip(HIT_COLUMNS[:3], parts, strict=True)}
+        states = {
+            name: values.T for name, values in zip(HIT_COLUMNS[:3], parts, strict=True)
+        }
         check_units_of_states(completion.context.robot, states, noun="hit")
     centre, goal = lanes("puck", puck, {2, 3}), lanes("target", target, {2})
     direction = goal - centre[:2]
     if not np.count_nonzero(direction, axis=0).all():
-        raise UsageError(f"must differ from the puck's position, got {goal.T.tolist()} for both", argument="target")
+        raise UsageError(
+            f"must differ from the puck's position, got {goal.T.tolist()} for both",
+            argument="target",
+        )
     angles = np.arctan2(direction[1:], direction[:1]) if angle is None else angle[None]
-    shares = lanes("speed_share", np.reshape(numbers("speed_share", share), (-1, 1)), {1})
+    shares = lanes(
+        "speed_share", np.reshape(numbers("speed_share", share), (-1, 1)), {1}
+    )
     _check_distance(completion, contact_distance, {"puck": centre, "target": goal})
-    columns = dict(zip(HIT_COLUMNS, [*parts, behind(centre, angles, contact_distance), angles, shares], strict=True))
+    columns = dict(
+        zip(
+            HIT_COLUMNS,
+            [*parts, behind(centre, angles, contact_distance), angles, shares],
+            strict=True,
+        )
+    )
     columns |= _parameter_columns(completion.context, parameters)
     counts = {name: values.shape[1] for name, values in columns.items()}
     largest = max(counts.values())
@@ -92,35 +126,59 @@ def hit_tasks(
         if count == 0:
             raise UsageError("is empty, expected at least 1 hit", argument=name)
         if count not in {1, largest}:
-            raise UsageError(f"has {count:,} hits, another argument has {largest:,}", argument=name)
-    check_memory_of_rows({_ARGUMENT_OF.get(name, name): count for name, count in counts.items()}, completion.width)
+            raise UsageError(
+                f"has {count:,} hits, another argument has {largest:,}", argument=name
+            )
+    check_memory_of_rows(
+        {_ARGUMENT_OF.get(name, name): count for name, count in counts.items()},
+        completion.width,
+    )
     return completion(columns)
 
 
-def _parameter_columns(context: Context, parameters: ArrayLike | None) -> dict[str, Array]:
+def _parameter_columns(
+    context: Context, parameters: ArrayLike | None
+) -> dict[str, Array]:
     """Return the column of the parameters, shape (width, N), if the problem has any."""
     ranges = context.problem.parameters
     if not ranges:
         if parameters is not None:
-            raise UsageError(f"must be None: {context.problem.name!r} has no parameters", argument="parameters")
+            raise UsageError(
+                f"must be None: {context.problem.name!r} has no parameters",
+                argument="parameters",
+            )
         return {}
-    values = context.robot.nominal_parameters if parameters is None else numbers("parameters", parameters)
+    values = (
+        context.robot.nominal_parameters
+        if parameters is None
+        else numbers("parameters", parameters)
+    )
     return {"parameters": ranges.checked(values).T}
 
 
-def _check_distance(completion: Completion, contact_distance: float, positions: Mapping[str, Array]) -> None:
+def _check_distance(
+    completion: Completion, contact_distance: float, positions: Mapping[str, Array]
+) -> None:
     """Check that lengths are not in millimetres."""
-    values = np.concatenate([[contact_distance], *(values.ravel() for values in positions.values())])
+    values = np.concatenate(
+        [[contact_distance], *(values.ravel() for values in positions.values())]
+    )
     if np.abs(values).max() <= MAX_LIMIT_RATIO * completion.context.robot.reach:
         return  # the usual case: the check takes 50 microseconds
     lengths = {"contact_distance": np.array([[contact_distance]])}
     lengths |= {name: values.T for name, values in positions.items()}
-    check_plausible(completion.context.robot, lengths, dict.fromkeys(lengths, "m"), noun="hit")
+    check_plausible(
+        completion.context.robot, lengths, dict.fromkeys(lengths, "m"), noun="hit"
+    )
 
 
 def boundary_of_tasks(tasks: TaskBatch, fixed_at_goal: int) -> Boundary:
     """Return the boundary conditions of the tasks that have an answer, with goal accelerations if they are fixed."""
-    names = [name for name in CONDITIONS if name in tasks.columns and (name != "goal_ddq" or fixed_at_goal == 3)]
+    names = [
+        name
+        for name in CONDITIONS
+        if name in tasks.columns and (name != "goal_ddq" or fixed_at_goal == 3)
+    ]
     return Boundary(**{name: np.ascontiguousarray(tasks[name].T) for name in names})
 
 
@@ -130,8 +188,14 @@ def lanes(name: str, values: ArrayLike, widths: set[int]) -> Array:
     if array.ndim == 1:
         array = array[None]
     if array.ndim != 2 or array.shape[1] not in widths:
-        expected = " or ".join(f"({width},) or (N, {width})" for width in sorted(widths))
-        raise UsageError(f"must have shape {expected}, got {np.shape(values)}", argument=name)
-    if not math.isfinite(np.vdot(array, array)) and not np.isfinite(array).all():  # vdot takes a third of the time
+        expected = " or ".join(
+            f"({width},) or (N, {width})" for width in sorted(widths)
+        )
+        raise UsageError(
+            f"must have shape {expected}, got {np.shape(values)}", argument=name
+        )
+    if (
+        not math.isfinite(np.vdot(array, array)) and not np.isfinite(array).all()
+    ):  # vdot takes a third of the time
         raise UsageError(f"must be finite, got {array}", argument=name)
     return array.T

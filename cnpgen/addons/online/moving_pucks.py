@@ -1,9 +1,10 @@
 """Moving pucks: their motion, the contact with the mallet, and hits that meet them.
 
-Mallet and puck are two discs with restitution and Coulomb friction, and the mallet is much heavier. At the contact, the
-velocity of the mallet relative to the puck has a normal part, which the contact reverses by the restitution, and a
-tangential part, which friction reduces at most to rolling (Stronge, Impact Mechanics, 2000, chapter 3). The puck is a
-homogeneous disc: rolling transfers a third of it.
+Mallet and puck are two discs with restitution and Coulomb friction, and the mallet is
+much heavier. At the contact, the velocity of the mallet relative to the puck has a
+normal part, which the contact reverses by the restitution, and a tangential part, which
+friction reduces at most to rolling (Stronge, Impact Mechanics, 2000, chapter 3). The
+puck is a homogeneous disc: rolling transfers a third of it.
 """
 
 from __future__ import annotations
@@ -14,31 +15,48 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.addons.online.hit_tasks import State, boundary_of_tasks, hit_tasks, lanes, state_lanes
+from cnpgen.addons.online.hit_tasks import (
+    State,
+    boundary_of_tasks,
+    hit_tasks,
+    lanes,
+    state_lanes,
+)
 from cnpgen.errors import UsageError
 from cnpgen.pipelines.completion import Completion
 from cnpgen.planner.planner import Planner, plan_tasks
 from cnpgen.plans.boundary_problems import CONTEXT
 from cnpgen.plans.plans import Plans
-from cnpgen.problems.constraints.puck_contact import PuckContact, distances_from_segments
+from cnpgen.problems.constraints.puck_contact import (
+    PuckContact,
+    distances_from_segments,
+)
 from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.arguments import check_range, numbers
 from cnpgen.trajectory.spline import basis
 
 Array = NDArray[np.float64]
-HitArguments = tuple[State, ArrayLike, ArrayLike, ArrayLike, ArrayLike, ArrayLike | None]
+HitArguments = tuple[
+    State, ArrayLike, ArrayLike, ArrayLike, ArrayLike, ArrayLike | None
+]
 
 MAX_MEETING_TIME_S = 60.0
 MAX_PUCK_SPEED_M_S = 20.0
-EARLY_CONTACT_PHASES = 65  # at which early contacts are checked; motion between them is straight
-EARLY_CONTACT_MARGIN_M = 2e-3  # of the mallet's path before the contact, on which it is no early one
+EARLY_CONTACT_PHASES = (
+    65  # at which early contacts are checked; motion between them is straight
+)
+EARLY_CONTACT_MARGIN_M = (
+    2e-3  # of the mallet's path before the contact, on which it is no early one
+)
 MAX_EARLY_DEPTH_M = 5e-4
 MAX_MEETING_ITERATIONS = 12
 MAX_MEETING_ERROR_S = 1e-4  # of the time at which mallet and puck meet
 EXPECTED_HIT_SPEED_M_S = 1.5  # of the first iteration
 TOO_LATE = "the mallet cannot meet the puck in time"
 NO_MEETING = "no meeting time: the iteration does not converge"
-ROLLING_SHARE = 1 / 3  # of the tangential velocity that a homogeneous disc takes over when it rolls
+ROLLING_SHARE = (
+    1 / 3
+)  # of the tangential velocity that a homogeneous disc takes over when it rolls
 MAX_BOUNCES = 4  # on the bands, of one prediction
 ANGLE_ITERATIONS = 8
 
@@ -47,14 +65,13 @@ ANGLE_ITERATIONS = 8
 class PuckModel:
     """Motion and contacts of a puck; the defaults are those of the simulator's plants.
 
-    Attributes:
-        drag: Deceleration over velocity on the table [1/s].
-        restitution: Speed of separation over speed of approach, for mallet and puck.
-        friction: Coefficient of friction of mallet and puck.
-        band_restitution: The restitution of bands and puck.
-        band_loss: Fraction of the velocity along a band that a bounce takes.
-        half_width: Distance of the puck's centre from the table's centre line at a side band [m].
-        home_edge: Coordinate x of the puck's centre at the band of the arm's side [m].
+    Attributes: drag: Deceleration over velocity on the table [1/s]. restitution: Speed
+        of separation over speed of approach, for mallet and puck. friction: Coefficient
+        of friction of mallet and puck. band_restitution: The restitution of bands and
+        puck. band_loss: Fraction of the velocity along a band that a bounce takes.
+        half_width: Distance of the puck's centre from the table's centre line at a side
+        band [m]. home_edge: Coordinate x of the puck's centre at the band of the arm's
+        side [m].
 
     Raises:
         UsageError: A parameter is negative or not finite.
@@ -72,9 +89,13 @@ class PuckModel:
         check_fields(self)
         for name, value in vars(self).items():
             if not (np.isfinite(value) and value >= 0):
-                raise UsageError(f"must be finite and not negative, got {value:g}", argument=name)
+                raise UsageError(
+                    f"must be finite and not negative, got {value:g}", argument=name
+                )
 
-    def predict(self, position: Array, velocity: Array, time: Array) -> tuple[Array, Array]:
+    def predict(
+        self, position: Array, velocity: Array, time: Array
+    ) -> tuple[Array, Array]:
         """Predict N pucks, with bounces on the two side bands and the band of the arm's side.
 
         Args:
@@ -86,13 +107,24 @@ class PuckModel:
             Positions and velocities at these times, shape (N, 2) each.
         """
         # The path over the velocity that a puck still covers [s].
-        left = np.array(time, np.float64) if self.drag == 0 else -np.expm1(-self.drag * time) / self.drag
+        left = (
+            np.array(time, np.float64)
+            if self.drag == 0
+            else -np.expm1(-self.drag * time) / self.drag
+        )
         position, velocity = position.copy(), velocity.copy()
-        low, high = np.array([self.home_edge, -self.half_width]), np.array([np.inf, self.half_width])
+        low, high = (
+            np.array([self.home_edge, -self.half_width]),
+            np.array([np.inf, self.half_width]),
+        )
         for _ in range(MAX_BOUNCES):
             with np.errstate(divide="ignore", invalid="ignore"):
                 bound = np.where(velocity > 0, high, low)
-                share = np.where(velocity == 0, np.inf, np.maximum((bound - position) / velocity, 0.0))
+                share = np.where(
+                    velocity == 0,
+                    np.inf,
+                    np.maximum((bound - position) / velocity, 0.0),
+                )
             axis = np.argmin(share, axis=1)
             rows = np.arange(len(share))
             bounces = share[rows, axis] < left
@@ -108,7 +140,9 @@ class PuckModel:
             velocity = np.where(bounces[:, None], velocity * factors, velocity)
         return position, velocity
 
-    def velocity_after(self, velocity: Array, mallet_velocity: Array, normal: Array) -> Array:
+    def velocity_after(
+        self, velocity: Array, mallet_velocity: Array, normal: Array
+    ) -> Array:
         """Compute the velocities of N pucks after the contact [m/s], shape (N, 2).
 
         Args:
@@ -121,7 +155,9 @@ class PuckModel:
         tangent = np.stack([-normal[:, 1], normal[:, 0]], axis=1)
         sliding = np.sum(relative * tangent, axis=1)
         impulse = (1 + self.restitution) * approach
-        dragged = np.clip(ROLLING_SHARE * sliding, -self.friction * impulse, self.friction * impulse)
+        dragged = np.clip(
+            ROLLING_SHARE * sliding, -self.friction * impulse, self.friction * impulse
+        )
         after: Array = velocity + impulse[:, None] * normal + dragged[:, None] * tangent
         return after
 
@@ -130,10 +166,9 @@ class PuckModel:
 
         The mallet moves along the line to the puck's centre.
 
-        Args:
-            velocity: Velocities of the pucks before the contact [m/s], shape (N, 2).
-            speed: Speeds of the mallet [m/s], shape (N,).
-            direction: Directions of the pucks after the contact, shape (N, 2), of any length.
+        Args: velocity: Velocities of the pucks before the contact [m/s], shape (N, 2).
+            speed: Speeds of the mallet [m/s], shape (N,). direction: Directions of the
+            pucks after the contact, shape (N, 2), of any length.
         """
         wanted = np.arctan2(direction[:, 1], direction[:, 0])
         angle = wanted.copy()
@@ -148,39 +183,80 @@ class PuckModel:
 class MovingHits:
     """Arguments of ``plan_hits`` for N moving pucks, checked and brought to one length.
 
-    They are state, puck, velocity, target, speed share and meeting time, None for the earliest. ``distance`` is that of
-    the centres at the goal, and ``overlap`` the path of the mallet from the contact to the goal [m].
+    They are state, puck, velocity, target, speed share and meeting time, None for the
+    earliest. ``distance`` is that of the centres at the goal, and ``overlap`` the path
+    of the mallet from the contact to the goal [m].
     """
 
-    def __init__(self, n: int, arguments: HitArguments, *, model: PuckModel, distance: float, overlap: float) -> None:
+    def __init__(
+        self,
+        n: int,
+        arguments: HitArguments,
+        *,
+        model: PuckModel,
+        distance: float,
+        overlap: float,
+    ) -> None:
         state, puck, velocity, target, share, meeting_time = arguments
-        self.model, self.distance, self.overlap, self.waits = model, distance, overlap, meeting_time is not None
+        self.model, self.distance, self.overlap, self.waits = (
+            model,
+            distance,
+            overlap,
+            meeting_time is not None,
+        )
         given = {"puck": puck, "puck_velocity": velocity, "target": target}
         parts = {name: lanes(name, values, {2}).T for name, values in given.items()}
-        scalars = {"speed_share": share, "meeting_time": 0.0 if meeting_time is None else meeting_time}
-        parts |= {
-            name: lanes(name, np.reshape(numbers(name, values), (-1, 1)), {1}).T for name, values in scalars.items()
+        scalars = {
+            "speed_share": share,
+            "meeting_time": 0.0 if meeting_time is None else meeting_time,
         }
-        parts |= {f"state {index}": values.T for index, values in enumerate(state_lanes(state, n))}
+        parts |= {
+            name: lanes(name, np.reshape(numbers(name, values), (-1, 1)), {1}).T
+            for name, values in scalars.items()
+        }
+        parts |= {
+            f"state {index}": values.T
+            for index, values in enumerate(state_lanes(state, n))
+        }
         check_range("meeting_time", parts["meeting_time"], 0.0, MAX_MEETING_TIME_S, "s")
-        check_range("puck_velocity", parts["puck_velocity"], -MAX_PUCK_SPEED_M_S, MAX_PUCK_SPEED_M_S, "m/s")
+        check_range(
+            "puck_velocity",
+            parts["puck_velocity"],
+            -MAX_PUCK_SPEED_M_S,
+            MAX_PUCK_SPEED_M_S,
+            "m/s",
+        )
         size = max(len(values) for values in parts.values())
         for name, values in parts.items():
             if len(values) not in {1, size}:
                 argument = name.partition(" ")[0]
-                raise UsageError(f"has {len(values)} hits, another argument has {size}", argument=argument)
+                raise UsageError(
+                    f"has {len(values)} hits, another argument has {size}",
+                    argument=argument,
+                )
             parts[name] = np.repeat(values, size // len(values), axis=0)
         self.puck, self.velocity, self.target = (parts[name] for name in given)
-        self.share, self.meeting_time = parts["speed_share"][:, 0], parts["meeting_time"][:, 0]
+        self.share, self.meeting_time = (
+            parts["speed_share"][:, 0],
+            parts["meeting_time"][:, 0],
+        )
         self.state = tuple(parts[f"state {index}"] for index in range(3))
         if self.waits and (self.state[1].any() or self.state[2].any()):
-            raise UsageError("is not at rest: an arm that waits for the puck must be", argument="state")
+            raise UsageError(
+                "is not at rest: an arm that waits for the puck must be",
+                argument="state",
+            )
 
     def with_pucks(self, plans: Plans, delay: Array) -> Plans:
         """Add the pucks at the starts of the plans: columns ``puck_xy`` [m] and ``puck_velocity`` [m/s]."""
         rows = plans.sample_id
-        position, velocity = self.model.predict(self.puck[rows], self.velocity[rows], delay)
-        return replace(plans, columns={**plans.columns, "puck_xy": position, "puck_velocity": velocity})
+        position, velocity = self.model.predict(
+            self.puck[rows], self.velocity[rows], delay
+        )
+        return replace(
+            plans,
+            columns={**plans.columns, "puck_xy": position, "puck_velocity": velocity},
+        )
 
 
 def plan_moving_hits(
@@ -188,14 +264,22 @@ def plan_moving_hits(
 ) -> tuple[Plans, tuple[str, ...], Array]:
     """Plan hits of moving pucks; return plans, reasons of the others, and waiting times before the plans [s].
 
-    The earliest meeting time is a fixed point: the time of the contact in the plan to the puck at this time. The
-    iteration converges if the puck is slower than the mallet.
+    The earliest meeting time is a fixed point: the time of the contact in the plan to
+    the puck at this time. The iteration converges if the puck is slower than the
+    mallet.
     """
-    time, speed = hits.meeting_time.copy(), np.full(len(hits.puck), EXPECTED_HIT_SPEED_M_S)
+    time, speed = (
+        hits.meeting_time.copy(),
+        np.full(len(hits.puck), EXPECTED_HIT_SPEED_M_S),
+    )
     reasons, active = np.full(len(hits.puck), "", object), np.arange(len(hits.puck))
     for iteration in range(MAX_MEETING_ITERATIONS):
-        position, puck_velocity = hits.model.predict(hits.puck[active], hits.velocity[active], time[active])
-        angle = hits.model.hit_angle(puck_velocity, speed[active], hits.target[active] - position)
+        position, puck_velocity = hits.model.predict(
+            hits.puck[active], hits.velocity[active], time[active]
+        )
+        angle = hits.model.hit_angle(
+            puck_velocity, speed[active], hits.target[active] - position
+        )
         tasks = hit_tasks(
             completion,
             tuple(part[active] for part in hits.state),  # type: ignore[arg-type]
@@ -211,14 +295,23 @@ def plan_moving_hits(
         if hits.waits and iteration == 0 and len(active):
             continue  # the direction depends on the speed
         columns = {name: tasks[name][0] for name in CONTEXT}
-        plans = plan_tasks(planner, boundary_of_tasks(tasks, planner.model.fixed_at_goal), active, columns)
+        plans = plan_tasks(
+            planner,
+            boundary_of_tasks(tasks, planner.model.fixed_at_goal),
+            active,
+            columns,
+        )
         contact = plans.duration - hits.overlap / speed[active]
         change, last = np.abs(contact - time[active]), time[active]
         if hits.waits or not len(active) or (change <= MAX_MEETING_ERROR_S).all():
             break
         time[active] = np.where(change <= MAX_MEETING_ERROR_S, last, contact)
     if not hits.waits:
-        delay, accepted, reason = np.zeros(len(active)), change <= MAX_MEETING_ERROR_S, NO_MEETING
+        delay, accepted, reason = (
+            np.zeros(len(active)),
+            change <= MAX_MEETING_ERROR_S,
+            NO_MEETING,
+        )
     else:
         delay, reason = hits.meeting_time[active] - contact, TOO_LATE
         accepted = delay >= 0
@@ -229,27 +322,59 @@ def plan_moving_hits(
     touching = np.linalg.norm(hits.puck - start, axis=1) < hits.distance + hits.overlap
     reasons[touching] = PuckContact.boundary_reason
     accepted &= ~touched & ~touching[active]
-    return hits.with_pucks(plans[accepted], delay[accepted]), tuple(reasons.tolist()), delay[accepted]
+    return (
+        hits.with_pucks(plans[accepted], delay[accepted]),
+        tuple(reasons.tolist()),
+        delay[accepted],
+    )
 
 
-def _touched_early(completion: Completion, hits: MovingHits, plans: Plans, delay: Array) -> NDArray[np.bool_]:
+def _touched_early(
+    completion: Completion, hits: MovingHits, plans: Plans, delay: Array
+) -> NDArray[np.bool_]:
     """Return whether moving pucks touch the mallet before the meeting, while it waits (if not negative) or moves."""
     if not len(plans):
         return np.zeros(0, bool)
-    phases, rows, speed = np.linspace(0, 1, EARLY_CONTACT_PHASES), plans.sample_id, plans.columns["hit_speed"]
-    q = _path_basis(plans.path_control_points.shape[1], plans.motion.degree) @ plans.path_control_points
-    moving = completion.tip_positions(q.reshape(-1, q.shape[2]).T)[:2].T.reshape(*q.shape[:2], 2)
+    phases, rows, speed = (
+        np.linspace(0, 1, EARLY_CONTACT_PHASES),
+        plans.sample_id,
+        plans.columns["hit_speed"],
+    )
+    q = (
+        _path_basis(plans.path_control_points.shape[1], plans.motion.degree)
+        @ plans.path_control_points
+    )
+    moving = completion.tip_positions(q.reshape(-1, q.shape[2]).T)[:2].T.reshape(
+        *q.shape[:2], 2
+    )
     start = np.maximum(delay, 0.0)[:, None]
     times = start + plans.motion.time_at(phases)
-    before = times <= times[:, -1:] - (hits.overlap + EARLY_CONTACT_MARGIN_M) / speed[:, None]
+    before = (
+        times
+        <= times[:, -1:] - (hits.overlap + EARLY_CONTACT_MARGIN_M) / speed[:, None]
+    )
     parts = [(moving, times, before)]
     if start.any():
-        parts.append((np.repeat(moving[:, :1], len(phases), axis=1), start * phases, np.ones_like(before)))
+        parts.append(
+            (
+                np.repeat(moving[:, :1], len(phases), axis=1),
+                start * phases,
+                np.ones_like(before),
+            )
+        )
     touched = np.zeros(len(plans), bool)
     for mallet, time, is_early in parts:
-        puck, velocity = (np.repeat(values[rows], len(phases), axis=0) for values in (hits.puck, hits.velocity))
-        relative = hits.model.predict(puck, velocity, time.ravel())[0].reshape(mallet.shape) - mallet
-        distance = distances_from_segments(np.zeros(2), relative[:, :-1], relative[:, 1:])
+        puck, velocity = (
+            np.repeat(values[rows], len(phases), axis=0)
+            for values in (hits.puck, hits.velocity)
+        )
+        relative = (
+            hits.model.predict(puck, velocity, time.ravel())[0].reshape(mallet.shape)
+            - mallet
+        )
+        distance = distances_from_segments(
+            np.zeros(2), relative[:, :-1], relative[:, 1:]
+        )
         touching = distance < hits.distance + hits.overlap - MAX_EARLY_DEPTH_M
         touched |= (touching & is_early[:, 1:]).any(axis=1)
     return touched

@@ -8,7 +8,12 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.addons.online.hit_tasks import State, boundary_of_tasks, hit_tasks, load_completion
+from cnpgen.addons.online.hit_tasks import (
+    State,
+    boundary_of_tasks,
+    hit_tasks,
+    load_completion,
+)
 from cnpgen.addons.online.moving_pucks import MovingHits, PuckModel, plan_moving_hits
 from cnpgen.errors import UsageError, counted
 from cnpgen.machine.threads import one_thread
@@ -24,7 +29,9 @@ from cnpgen.schema.arguments import concerning, number, numbers
 
 Array = NDArray[np.float64]
 
-CONTACT_DISTANCE_M = 0.07  # from the centre of the paper's puck to that of its mallet at contact
+CONTACT_DISTANCE_M = (
+    0.07  # from the centre of the paper's puck to that of its mallet at contact
+)
 
 _COMPLETIONS: WeakKeyDictionary[Planner, Completion] = WeakKeyDictionary()
 
@@ -33,12 +40,13 @@ _COMPLETIONS: WeakKeyDictionary[Planner, Completion] = WeakKeyDictionary()
 class PlannedHits:
     """Plans of N hits.
 
-    Attributes:
-        plans: Plans of the hits that have an answer, not checked yet; ``plans.sample_id`` is the index of each hit.
-        reasons: Reason why a hit has no answer; empty if it has one. One entry per hit.
-        delay: Time to wait before each plan starts [s], shape (M,) for M plans; zero without a meeting time.
-        overlap: Path of the mallet from the contact to the goal [m].
-        return_plans: The ways back, M plans from the ends of the hits to the home configuration; None without one.
+    Attributes: plans: Plans of the hits that have an answer, not checked yet;
+        ``plans.sample_id`` is the index of each hit. reasons: Reason why a hit has no
+        answer; empty if it has one. One entry per hit. delay: Time to wait before each
+        plan starts [s], shape (M,) for M plans; zero without a meeting time. overlap:
+        Path of the mallet from the contact to the goal [m]. return_plans: The ways
+        back, M plans from the ends of the hits to the home configuration; None without
+        one.
     """
 
     plans: Plans
@@ -50,7 +58,9 @@ class PlannedHits:
     @property
     def contact_time(self) -> Array:
         """Time from the start of each plan to the contact of mallet and puck [s], shape (M,)."""
-        time: Array = self.plans.duration - self.overlap / self.plans.columns["hit_speed"]
+        time: Array = (
+            self.plans.duration - self.overlap / self.plans.columns["hit_speed"]
+        )
         return time
 
     @property
@@ -61,7 +71,9 @@ class PlannedHits:
             UsageError: The hits were planned without a home configuration.
         """
         if self.return_plans is None:
-            raise UsageError("the hits have no ways back: pass home= to plan_hits", concerns="home")
+            raise UsageError(
+                "the hits have no ways back: pass home= to plan_hits", concerns="home"
+            )
         return join_plans(self.plans, self.return_plans)
 
     def __repr__(self) -> str:
@@ -86,44 +98,66 @@ def plan_hits(
 ) -> PlannedHits:
     """Plan hits from a state of the arm that send a puck towards a target.
 
-    The pipeline stages of the model's training rows compute the goal configuration and velocity (``cnpgen.complete``
-    does the same for files). They are loaded at the first call for a planner.
+    The pipeline stages of the model's training rows compute the goal configuration and
+    velocity (``cnpgen.complete`` does the same for files). They are loaded at the first
+    call for a planner.
 
-    For a moving puck, the planner solves for the time at which the mallet meets the puck, and the direction of the hit
-    accounts for the puck's velocity. With a meeting time, an arm at rest waits before the plan starts.
+    For a moving puck, the planner solves for the time at which the mallet meets the
+    puck, and the direction of the hit accounts for the puck's velocity. With a meeting
+    time, an arm at rest waits before the plan starts.
 
-    Args:
-        planner: A planner whose model was trained on hits.
-        state: Positions [rad], velocities [rad/s] and accelerations [rad/s^2] of the arm, shape (n,) or (N, n) each,
-            as returned by ``Plans.states_at``; the distance to the table must be within the tolerance of plans.
-        puck: Position of the puck's centre, x and y [m], shape (2,) or (N, 2); x, y and z for problems without table.
+    Args: planner: A planner whose model was trained on hits. state: Positions [rad],
+        velocities [rad/s] and accelerations [rad/s^2] of the arm, shape (n,) or (N, n)
+        each,
+            as returned by ``Plans.states_at``; the distance to the table must be within
+            the tolerance of plans.
+        puck: Position of the puck's centre, x and y [m], shape (2,) or (N, 2); x, y and
+            z for problems without table.
         target: Position to hit the puck towards, x and y [m], shape (2,) or (N, 2).
-        contact_distance: Distance from the puck's centre to the mallet's at the goal [m]; by default that of the
-            problem's constraint ``puck-contact``, or 0.07 without one.
-        speed_share: Speed of the hit as a fraction of the highest possible one, a number or shape (N,).
-        puck_velocity: Velocity of the puck in the state of the arm, x and y [m/s], shape (2,) or (N, 2).
-        meeting_time: Time from the state of the arm to the contact [s], a number or shape (N,); by default as soon as
-            possible. A hit that cannot be in time has a reason.
-        puck_model: Drag, restitution and friction of a moving puck; by default those of the simulator.
-        home: Joint positions at which the arm rests after the hit [rad], shape (n,) or (N, n).
-        parameters: Parameters of the problem, shape (width,) or (N, width); nominal by default. Positions are those on
-            a table that they move.
+        contact_distance: Distance from the puck's centre to the mallet's at the goal
+            [m]; by default that of the problem's constraint ``puck-contact``, or 0.07
+            without one.
+        speed_share: Speed of the hit as a fraction of the highest possible one, a
+            number or shape (N,).
+        puck_velocity: Velocity of the puck in the state of the arm, x and y [m/s],
+            shape (2,) or (N, 2).
+        meeting_time: Time from the state of the arm to the contact [s], a number or
+            shape (N,); by default as soon as possible. A hit that cannot be in time has
+            a reason.
+        puck_model: Drag, restitution and friction of a moving puck; by default those of
+            the simulator.
+        home: Joint positions at which the arm rests after the hit [rad], shape (n,) or
+            (N, n).
+        parameters: Parameters of the problem, shape (width,) or (N, width); nominal by
+            default. Positions are those on a table that they move.
 
-    Returns:
-        Plans of the hits that have an answer, not checked yet, and the reasons why the others have none.
+    Returns: Plans of the hits that have an answer, not checked yet, and the reasons why
+        the others have none.
 
-    Raises:
-        UsageError: A shape is wrong, a value is not finite, the contact distance differs from that of the problem, the
-            model was not trained on hits, or ``home`` is given for a model without moving starts.
+    Raises: UsageError: A shape is wrong, a value is not finite, the contact distance
+        differs from that of the problem, the
+            model was not trained on hits, or ``home`` is given for a model without
+            moving starts.
     """
     completion = _COMPLETIONS.get(planner)
     if completion is None:
-        completion = _COMPLETIONS[planner] = load_completion(planner.model, planner.backend)
+        completion = _COMPLETIONS[planner] = load_completion(
+            planner.model, planner.backend
+        )
     contact = as_problem(planner.model.problem).first(PuckContact)
-    distance, overlap = _contact_distance(contact, contact_distance), 0.0 if contact is None else contact.overlap
+    distance, overlap = (
+        _contact_distance(contact, contact_distance),
+        0.0 if contact is None else contact.overlap,
+    )
     if puck_velocity is None and meeting_time is None:
         tasks = hit_tasks(
-            completion, state, puck, target, contact_distance=distance, share=speed_share, parameters=parameters
+            completion,
+            state,
+            puck,
+            target,
+            contact_distance=distance,
+            share=speed_share,
+            parameters=parameters,
         )
         columns = {name: tasks[name][0] for name in CONTEXT}
         boundary = boundary_of_tasks(tasks, planner.model.fixed_at_goal)
@@ -135,9 +169,17 @@ def plan_hits(
         velocity = np.zeros(2) if puck_velocity is None else puck_velocity
         arguments = state, puck, velocity, target, speed_share, meeting_time
         model = puck_model or PuckModel()
-        moving = MovingHits(planner.robot.n, arguments, model=model, distance=distance, overlap=overlap)
+        moving = MovingHits(
+            planner.robot.n, arguments, model=model, distance=distance, overlap=overlap
+        )
         hits = PlannedHits(*plan_moving_hits(planner, completion, moving), overlap)
-    return hits if home is None else replace(hits, return_plans=_plan_returns(planner, hits, numbers("home", home)))
+    return (
+        hits
+        if home is None
+        else replace(
+            hits, return_plans=_plan_returns(planner, hits, numbers("home", home))
+        )
+    )
 
 
 def _plan_returns(planner: Planner, hits: PlannedHits, home: Array) -> Plans:
@@ -145,21 +187,30 @@ def _plan_returns(planner: Planner, hits: PlannedHits, home: Array) -> Plans:
     plans, n = hits.plans, planner.robot.n
     if home.shape not in ((n,), (len(hits.reasons), n)):
         expected = f"({n},) or ({len(hits.reasons)}, {n})"
-        raise UsageError(f"must have shape {expected}, got {home.shape}", argument="home")
+        raise UsageError(
+            f"must have shape {expected}, got {home.shape}", argument="home"
+        )
     home = home[plans.sample_id] if home.ndim == 2 else home
     q, dq, ddq = plans.states_at(plans.duration)
     goal = np.broadcast_to(home, q.shape) if len(q) else q
     with concerning("home"):
-        back = planner.plan(q, goal, start_dq=dq, start_ddq=ddq, parameters=plans.boundary.parameters)
+        back = planner.plan(
+            q, goal, start_dq=dq, start_ddq=ddq, parameters=plans.boundary.parameters
+        )
         return replace(back, sample_id=plans.sample_id)
 
 
 def _contact_distance(contact: PuckContact | None, given: float | None) -> float:
-    """Return the distance of the centres at the goal [m]; it must equal that of the constraint, if there is one."""
+    """Return the distance of the centres at the goal [m].
+
+    It must equal that of the constraint, if there is one.
+    """
     if given is None:
         return CONTACT_DISTANCE_M if contact is None else contact.contact_distance
     distance = number("contact_distance", given)
     if contact is not None and distance != contact.contact_distance:
         expected = f"{contact.contact_distance:g} m, as in the problem's constraint puck-contact"
-        raise UsageError(f"must be {expected}, got {distance:g} m", argument="contact_distance")
+        raise UsageError(
+            f"must be {expected}, got {distance:g} m", argument="contact_distance"
+        )
     return distance

@@ -1,6 +1,7 @@
 """The paper's own rules of what counts as a valid plan, which are looser than ours,.
 
-They follow the authors' baselines. The constraints of a problem determine which rules apply:
+They follow the authors' baselines. The constraints of a problem determine which rules
+apply:
 
 * joint velocity and torque within the nominal limits, those before the problem's scales; on a table also accelerations,
   with the scale of the velocity (the rules for the heavy object have none);
@@ -10,7 +11,8 @@ They follow the authors' baselines. The constraints of a problem determine which
   2 cm;
 * the tip ends within 1 cm of the goal.
 
-Joint positions, the robot's clearance and constraints of plug-ins are not checked by these rules.
+Joint positions, the robot's clearance and constraints of plug-ins are not checked by
+these rules.
 """
 
 from collections.abc import Iterator
@@ -21,7 +23,11 @@ from numpy.typing import NDArray
 from cnpgen.problems.constraints.axis import Vertical
 from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.constraint import Constraint
-from cnpgen.problems.constraints.joint import JointAcceleration, JointTorque, JointVelocity
+from cnpgen.problems.constraints.joint import (
+    JointAcceleration,
+    JointTorque,
+    JointVelocity,
+)
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import solids_of
@@ -40,15 +46,25 @@ def paper_rule(
 ) -> tuple[bool, tuple[str, ...]]:
     """Judge one motion by the paper's rules, as of ``PublishedRules.judge``; the world is at its samples.
 
-    ``obstacle_poses`` has shape (width,); ``goal_xyz`` is the position of the tip at the goal [m], shape (3,).
+    ``obstacle_poses`` has shape (width,); ``goal_xyz`` is the position of the tip at
+    the goal [m], shape (3,).
     """
-    finished = bool(np.linalg.norm(world.tip_position[:, -1] - goal_xyz) < MAX_GOAL_DISTANCE_M)
-    broken = tuple(reason for reason, ok in _checks(problem, world, obstacle_poses) if not ok)
+    finished = bool(
+        np.linalg.norm(world.tip_position[:, -1] - goal_xyz) < MAX_GOAL_DISTANCE_M
+    )
+    broken = tuple(
+        reason for reason, ok in _checks(problem, world, obstacle_poses) if not ok
+    )
     return finished, broken
 
 
-def _checks(problem: Problem, world: PathWorld, obstacle_poses: Array) -> Iterator[tuple[str, bool]]:
-    """Yield pairs of a reason and whether its rule is met; nan values violate a rule."""
+def _checks(
+    problem: Problem, world: PathWorld, obstacle_poses: Array
+) -> Iterator[tuple[str, bool]]:
+    """Yield pairs of a reason and whether its rule is met.
+
+    Nan values violate a rule.
+    """
     on_table = any(isinstance(constraint, Table) for constraint in problem.constraint)
     for constraint in problem.constraint:
         if isinstance(constraint, JointVelocity | JointTorque) or (
@@ -60,7 +76,12 @@ def _checks(problem: Problem, world: PathWorld, obstacle_poses: Array) -> Iterat
         elif isinstance(constraint, Vertical):
             yield (
                 constraint.reason,
-                bool(np.all(1 - world.parameters.along_upright(world.tip_rotation)[2, 2] < MAX_TILT)),
+                bool(
+                    np.all(
+                        1 - world.parameters.along_upright(world.tip_rotation)[2, 2]
+                        < MAX_TILT
+                    )
+                ),
             )
         elif isinstance(constraint, ObjectContact):
             yield constraint.reason, _is_clear(problem, world, obstacle_poses)
@@ -75,12 +96,18 @@ def _is_nominal(constraint: Constraint, problem: Problem, world: PathWorld) -> b
         values, limit = world.dq, factor * robot.velocity_limit / limits.velocity_scale
     else:
         factor = world.parameters.values.get("acceleration_factor", 1.0)
-        values, limit = world.ddq, factor * robot.acceleration_limit / limits.velocity_scale
+        values, limit = (
+            world.ddq,
+            factor * robot.acceleration_limit / limits.velocity_scale,
+        )
     return bool(np.all(np.abs(values) <= limit[:, None]))
 
 
 def _is_on_table(table: Table, world: PathWorld) -> bool:
-    tip, corners = world.parameters.on_table(world.tip_position), table.bounds_of(world.parameters.values)
+    tip, corners = (
+        world.parameters.on_table(world.tip_position),
+        table.bounds_of(world.parameters.values),
+    )
     low, high = (np.array([*corner, table.z], float) for corner in corners)
     low, high = low - TABLE_TOLERANCE_M, high + TABLE_TOLERANCE_M
     return bool(np.all((low[:, None] < tip) & (tip < high[:, None])))
@@ -89,7 +116,11 @@ def _is_on_table(table: Table, world: PathWorld) -> bool:
 def _is_clear(problem: Problem, world: PathWorld, obstacle_poses: Array) -> bool:
     size = np.array(problem.object_size or (0.0, 0.0, 0.0))
     center, reach = world.tip_position, np.linalg.norm(size) / 2
-    measured = world.object_distances() if any(not obstacle.upright for obstacle in problem.obstacle) else []
+    measured = (
+        world.object_distances()
+        if any(not obstacle.upright for obstacle in problem.obstacle)
+        else []
+    )
     for index, (obstacle, solid) in enumerate(
         zip(problem.obstacle, solids_of(problem.obstacle, obstacle_poses), strict=True)
     ):
@@ -102,8 +133,13 @@ def _is_clear(problem: Problem, world: PathWorld, obstacle_poses: Array) -> bool
             low[2] = -np.inf
         offset = center - np.clip(center, low, high)
         distance = np.sqrt(np.einsum("ik,ik->k", offset, offset))
-        corners = world.object_corners(distance < reach)  # at other states no corner is inside
+        corners = world.object_corners(
+            distance < reach
+        )  # at other states no corner is inside
         depth = np.minimum(corners - low, high - corners).min(axis=1)
-        if not (np.all(distance > size[2] / 2 - MAX_OBJECT_DEPTH_M) and np.all(depth < MAX_OBJECT_DEPTH_M)):
+        if not (
+            np.all(distance > size[2] / 2 - MAX_OBJECT_DEPTH_M)
+            and np.all(depth < MAX_OBJECT_DEPTH_M)
+        ):
             return False
     return True

@@ -22,14 +22,20 @@ class PaperRules(PublishedRules):
     """Rules: those of the paper, which are looser than the constraints of the problems."""
 
     def judge(
-        self, problem: Problem, world: PathWorld, obstacle_poses: NDArray[np.float64], goal_xyz: NDArray[np.float64]
+        self,
+        problem: Problem,
+        world: PathWorld,
+        obstacle_poses: NDArray[np.float64],
+        goal_xyz: NDArray[np.float64],
     ) -> tuple[bool, tuple[str, ...]]:
         """Judge one motion by ``paper_rule``."""
         from cnpgen.addons.paper.paper_rule import paper_rule
 
         return paper_rule(problem, world, obstacle_poses, goal_xyz)
 
-    def conditions(self, constraint: Constraint, state: SymbolicState) -> tuple[Condition, ...]:
+    def conditions(
+        self, constraint: Constraint, state: SymbolicState
+    ) -> tuple[Condition, ...]:
         """Return the ``published_conditions`` of a constraint."""
         from cnpgen.addons.paper.published_conditions import published_conditions
 

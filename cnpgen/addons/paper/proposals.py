@@ -1,9 +1,10 @@
 """Network that proposes the next configuration towards a goal, trained on certified plans (Li et al., 2021).
 
-From a state, the goal and the obstacles, it predicts the change of every joint within a time as a normal distribution.
-The configuration head predicts the mean, within the velocity limits, and the linear head the deviation. Proposals are
-samples of it; the authors sample by dropout. Training maximizes the likelihood of the next configuration on plans;
-datasets/proposals/README.md has the commands.
+From a state, the goal and the obstacles, it predicts the change of every joint within a
+time as a normal distribution. The configuration head predicts the mean, within the
+velocity limits, and the linear head the deviation. Proposals are samples of it; the
+authors sample by dropout. Training maximizes the likelihood of the next configuration
+on plans; datasets/proposals/README.md has the commands.
 """
 
 from collections.abc import Mapping
@@ -17,12 +18,22 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.machine.versions import __version__
-from cnpgen.planner.network.architecture import Architecture, Weights, backward, forward, initial_parameters
+from cnpgen.planner.network.architecture import (
+    Architecture,
+    Weights,
+    backward,
+    forward,
+    initial_parameters,
+)
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.solid import pose_width
 from cnpgen.schema.catalogue import recipes_root
-from cnpgen.store.files.checksum_file import Content, read_with_checksum, write_with_checksum
+from cnpgen.store.files.checksum_file import (
+    Content,
+    read_with_checksum,
+    write_with_checksum,
+)
 from cnpgen.training.adam import learning_rate, start_adam
 
 Array = NDArray[Any]
@@ -30,16 +41,23 @@ Array = NDArray[Any]
 PROPOSALS_KIND, PROPOSALS_VERSION = "cnpgen-proposals", 1
 MIN_PROPOSAL_DEVIATION = 0.02  # fraction of the reach
 STATES_PER_PLAN = 40
-HIDDEN_WIDTH, HIDDEN_LAYERS, BATCH_ROWS, TRAINING_STEPS, PEAK_LEARNING_RATE = 128, 3, 256, 12_000, 2e-3
+HIDDEN_WIDTH, HIDDEN_LAYERS, BATCH_ROWS, TRAINING_STEPS, PEAK_LEARNING_RATE = (
+    128,
+    3,
+    256,
+    12_000,
+    2e-3,
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Proposals:
     """A trained network, whose heads have n outputs each; its parameters are float32.
 
-    ``mean`` and ``scale`` have the mean of every input over the training rows and the reciprocal of its standard
-    deviation, 0 for constant inputs, shape (F,). ``reach`` is the maximum change of a joint [rad], shape (n,), within
-    the time ``ahead`` [s]. ``training`` has data of the training, as text.
+    ``mean`` and ``scale`` have the mean of every input over the training rows and the
+    reciprocal of its standard deviation, 0 for constant inputs, shape (F,). ``reach``
+    is the maximum change of a joint [rad], shape (n,), within the time ``ahead`` [s].
+    ``training`` has data of the training, as text.
     """
 
     architecture: Architecture
@@ -50,12 +68,24 @@ class Proposals:
     ahead: float
     training: Mapping[str, str] = field(default_factory=dict)
 
-    def propose(self, state: Array, goal_q: Array, obstacle_poses: Array, random: np.random.Generator) -> Array:
+    def propose(
+        self,
+        state: Array,
+        goal_q: Array,
+        obstacle_poses: Array,
+        random: np.random.Generator,
+    ) -> Array:
         """Sample a next configuration [rad], shape (n,), from a state of shape (2 n,) towards a goal of shape (n,)."""
-        poses = obstacle_poses[None, : len(self.mean) - 2 * len(state)]  # without the puck of a hit
-        inputs = standardize(inputs_of(state[None], goal_q[None], poses), self.mean, self.scale)
+        poses = obstacle_poses[
+            None, : len(self.mean) - 2 * len(state)
+        ]  # without the puck of a hit
+        inputs = standardize(
+            inputs_of(state[None], goal_q[None], poses), self.mean, self.scale
+        )
         prediction = forward(self._weights, inputs)
-        change = random.normal(prediction.path[0], MIN_PROPOSAL_DEVIATION + np.exp(prediction.log_rate[0]))
+        change = random.normal(
+            prediction.path[0], MIN_PROPOSAL_DEVIATION + np.exp(prediction.log_rate[0])
+        )
         return np.asarray(state[: len(goal_q)] + self.reach * change)
 
     @cached_property
@@ -65,7 +95,9 @@ class Proposals:
 
 def inputs_of(states: Array, goal_q: Array, obstacle_poses: Array) -> Array:
     """Concatenate inputs: states (N, 2 n), goals (N, n), their differences, and obstacles (N, m)."""
-    return np.concatenate([states, goal_q, goal_q - states[:, : goal_q.shape[1]], obstacle_poses], axis=1)
+    return np.concatenate(
+        [states, goal_q, goal_q - states[:, : goal_q.shape[1]], obstacle_poses], axis=1
+    )
 
 
 def standardize(inputs: Array, mean: Array, scale: Array) -> Array:
@@ -79,37 +111,53 @@ def save_proposals(path: str | Path, proposals: Proposals) -> None:
     Raises:
         MachineError: The file cannot be written.
     """
-    arrays = {name: getattr(proposals, name) for name in ("parameters", "mean", "scale", "reach")}
+    arrays = {
+        name: getattr(proposals, name)
+        for name in ("parameters", "mean", "scale", "reach")
+    }
     arrays["ahead"] = np.array([proposals.ahead])
     arrays["architecture"] = np.array(list(asdict(proposals.architecture).values()))
     content = Content(arrays, dict(proposals.training))
-    write_with_checksum(Path(path), content, kind=PROPOSALS_KIND, version=PROPOSALS_VERSION)
+    write_with_checksum(
+        Path(path), content, kind=PROPOSALS_KIND, version=PROPOSALS_VERSION
+    )
 
 
 def load_proposals(path: str | Path) -> Proposals:
     """Read a network; raise DatasetError if the file is damaged or of another kind."""
-    content = read_with_checksum(Path(path), kind=PROPOSALS_KIND, version=PROPOSALS_VERSION)
+    content = read_with_checksum(
+        Path(path), kind=PROPOSALS_KIND, version=PROPOSALS_VERSION
+    )
     arrays = dict(content.arrays)
     try:
         names = ("inputs", "hidden", "layers", "path_outputs", "rate_outputs")
         sizes = dict(zip(names, arrays.pop("architecture").tolist(), strict=True))
         ahead = float(arrays.pop("ahead")[0])
-        return Proposals(Architecture(**sizes), ahead=ahead, training=content.texts, **arrays)
+        return Proposals(
+            Architecture(**sizes), ahead=ahead, training=content.texts, **arrays
+        )
     except (KeyError, TypeError, ValueError) as error:
         raise DatasetError(f"{path} is damaged: {error}") from error
 
 
 def shipped_proposals(problem: str) -> Path:
-    """Find the network that cnpgen ships for a problem; raise UsageError if there is none."""
+    """Find the network that cnpgen ships for a problem.
+
+    Raise UsageError if there is none.
+    """
     folder = recipes_root() / "datasets" / "proposals"
     path = folder / f"{problem}.h5"
     if not path.is_file():
         known = ", ".join(sorted(file.stem for file in folder.glob("*.h5")))
-        raise UsageError(f"no network proposes configurations for {problem!r}, only for {known} (datasets/proposals)")
+        raise UsageError(
+            f"no network proposes configurations for {problem!r}, only for {known} (datasets/proposals)"
+        )
     return path
 
 
-def train_proposals(plans: Plans, *, ahead: float, steps: int = TRAINING_STEPS, seed: int = 0) -> Proposals:
+def train_proposals(
+    plans: Plans, *, ahead: float, steps: int = TRAINING_STEPS, seed: int = 0
+) -> Proposals:
     """Train a network to predict the next configuration on plans.
 
     Args:
@@ -129,47 +177,91 @@ def train_proposals(plans: Plans, *, ahead: float, steps: int = TRAINING_STEPS, 
     reach, deviation = robot.velocity_limit * ahead, inputs.std(axis=0)
     scale = np.where(deviation > 1e-9, 1 / np.maximum(deviation, 1e-9), 0.0)
     architecture = Architecture(
-        inputs=inputs.shape[1], hidden=HIDDEN_WIDTH, layers=HIDDEN_LAYERS, path_outputs=robot.n, rate_outputs=robot.n
+        inputs=inputs.shape[1],
+        hidden=HIDDEN_WIDTH,
+        layers=HIDDEN_LAYERS,
+        path_outputs=robot.n,
+        rate_outputs=robot.n,
     )
-    parameters = initial_parameters(architecture, seed=seed, head_scale=0.1, rate_bias=-1.0)
-    made = {"made": f"{len(plans)} plans of {plans.problem.name}, {steps} steps, seed {seed}, cnpgen {__version__}"}
-    network = Proposals(architecture, parameters, inputs.mean(axis=0), scale, reach, ahead, made)
-    features, targets = standardize(inputs, network.mean, scale), (changes / reach).astype(np.float32)
+    parameters = initial_parameters(
+        architecture, seed=seed, head_scale=0.1, rate_bias=-1.0
+    )
+    made = {
+        "made": f"{len(plans)} plans of {plans.problem.name}, {steps} steps, seed {seed}, cnpgen {__version__}"
+    }
+    network = Proposals(
+        architecture, parameters, inputs.mean(axis=0), scale, reach, ahead, made
+    )
+    features, targets = (
+        standardize(inputs, network.mean, scale),
+        (changes / reach).astype(np.float32),
+    )
     return replace(network, parameters=_fit(network, features, targets, steps, random))
 
 
-def _training_rows(plans: Plans, ahead: float, random: np.random.Generator) -> tuple[Array, Array]:
+def _training_rows(
+    plans: Plans, ahead: float, random: np.random.Generator
+) -> tuple[Array, Array]:
     """Return inputs and the following changes of the joints [rad], at random times of all plans."""
-    first = random.uniform(0, 1, (len(plans), STATES_PER_PLAN)) * plans.duration[:, None]
+    first = (
+        random.uniform(0, 1, (len(plans), STATES_PER_PLAN)) * plans.duration[:, None]
+    )
     now = plans.motion.at_times(first)
     later = plans.motion.at_times(np.minimum(first + ahead, plans.duration[:, None]))
-    ends = plans.boundary.goal_q, plans.scene.poses[:, : pose_width(plans.scene.obstacles)]
-    goal_q, obstacle_poses = (np.repeat(values, STATES_PER_PLAN, axis=0) for values in ends)
+    ends = (
+        plans.boundary.goal_q,
+        plans.scene.poses[:, : pose_width(plans.scene.obstacles)],
+    )
+    goal_q, obstacle_poses = (
+        np.repeat(values, STATES_PER_PLAN, axis=0) for values in ends
+    )
     states = np.concatenate([now.q, now.dq], axis=2).reshape(len(goal_q), -1)
-    return inputs_of(states, goal_q, obstacle_poses), (later.q - now.q).reshape(len(goal_q), -1)
+    return inputs_of(states, goal_q, obstacle_poses), (later.q - now.q).reshape(
+        len(goal_q), -1
+    )
 
 
-def _fit(network: Proposals, features: Array, targets: Array, steps: int, random: np.random.Generator) -> Array:
+def _fit(
+    network: Proposals,
+    features: Array,
+    targets: Array,
+    steps: int,
+    random: np.random.Generator,
+) -> Array:
     """Run all training steps; return the average of the last parameters."""
-    adam, gradient = start_adam(network.parameters.copy()), np.empty_like(network.parameters)
+    adam, gradient = (
+        start_adam(network.parameters.copy()),
+        np.empty_like(network.parameters),
+    )
     split = network.architecture.split
     for step in range(steps):
         batch = random.integers(0, len(features), BATCH_ROWS)
-        likelihood_gradient(split(adam.parameters), features[batch], targets[batch], out=split(gradient))
-        adam.update(gradient, rate=learning_rate(step, steps, peak=PEAK_LEARNING_RATE, final=0.01, warm_up=100))
+        likelihood_gradient(
+            split(adam.parameters), features[batch], targets[batch], out=split(gradient)
+        )
+        adam.update(
+            gradient,
+            rate=learning_rate(
+                step, steps, peak=PEAK_LEARNING_RATE, final=0.01, warm_up=100
+            ),
+        )
     return adam.average
 
 
-def likelihood_gradient(weights: Weights, features: Array, targets: Array, *, out: Weights) -> float:
+def likelihood_gradient(
+    weights: Weights, features: Array, targets: Array, *, out: Weights
+) -> float:
     """Write the gradient of the mean negative logarithm of the likelihood; return this mean, up to the constant.
 
-    Features are the standardized inputs, shape (N, F). Targets are the changes of the joints as fractions of their
-    reach, shape (N, n).
+    Features are the standardized inputs, shape (N, F). Targets are the changes of the
+    joints as fractions of their reach, shape (N, n).
     """
     prediction = forward(weights, features)
     deviation = np.exp(prediction.log_rate) + MIN_PROPOSAL_DEVIATION
     residual = (prediction.path - targets) / deviation
-    log_rate_gradient = (1 - residual * residual) / deviation * (deviation - MIN_PROPOSAL_DEVIATION)
+    log_rate_gradient = (
+        (1 - residual * residual) / deviation * (deviation - MIN_PROPOSAL_DEVIATION)
+    )
     backward(
         weights,
         prediction,

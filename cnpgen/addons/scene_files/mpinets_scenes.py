@@ -1,10 +1,12 @@
 """Scenes in HDF5 as Motion Policy Networks and Avoid Everything store them.
 
-Datasets at the root, one row per problem: ``cuboid_dims``, ``cuboid_centers``, ``cuboid_quaternions``,
-``cylinder_radii``, ``cylinder_heights``, ``cylinder_centers``, ``cylinder_quaternions``; here also ``sphere_radii`` and
-``sphere_centers``. Lengths are in m, quaternions are (w, x, y, z), and poses are relative to the robot's base. Rows are
-padded with zeros, quaternions included: an entry with a size of zero is no obstacle. The ends are ``start_q`` and
-``goal_q``, ``start_configs`` and ``target_configs``, or the first and last state of trajectories.
+Datasets at the root, one row per problem: ``cuboid_dims``, ``cuboid_centers``,
+``cuboid_quaternions``, ``cylinder_radii``, ``cylinder_heights``, ``cylinder_centers``,
+``cylinder_quaternions``; here also ``sphere_radii`` and ``sphere_centers``. Lengths are
+in m, quaternions are (w, x, y, z), and poses are relative to the robot's base. Rows are
+padded with zeros, quaternions included: an entry with a size of zero is no obstacle.
+The ends are ``start_q`` and ``goal_q``, ``start_configs`` and ``target_configs``, or
+the first and last state of trajectories.
 """
 
 from __future__ import annotations
@@ -17,7 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.problems.scenes.quaternions import quaternion_of
-from cnpgen.problems.scenes.scene_problem import MAX_SCENES, SceneError, SceneProblem, check_count, make_obstacle
+from cnpgen.problems.scenes.scene_problem import (
+    MAX_SCENES,
+    SceneError,
+    SceneProblem,
+    check_count,
+    make_obstacle,
+)
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.shape.hull import Array
@@ -40,7 +48,10 @@ def is_mpinets(path: Path) -> bool:
 
 
 def read_mpinets(path: Path, rows: slice) -> Iterator[SceneProblem]:
-    """Yield the problems of a file; DatasetError if it is damaged, SceneError if a dataset or obstacle is invalid."""
+    """Yield the problems of a file.
+
+    DatasetError if it is damaged, SceneError if a dataset or obstacle is invalid.
+    """
     with open_hdf5(path) as file:
         start, goal = _ends(file, rows)
         count = len(start)
@@ -49,7 +60,12 @@ def read_mpinets(path: Path, rows: slice) -> Iterator[SceneProblem]:
     for row, name in enumerate(names):
         place = f"{path}: scene {name!r}"
         numbers = {kind: values[row] for kind, values in shapes.items()}
-        check_count(sum(int(_is_present(kind, values).sum()) for kind, values in numbers.items()), place)
+        check_count(
+            sum(
+                int(_is_present(kind, values).sum()) for kind, values in numbers.items()
+            ),
+            place,
+        )
         yield SceneProblem(
             name=name,
             obstacles=tuple(_obstacles(numbers, place)),
@@ -75,10 +91,14 @@ def _ends(file: Hdf5, rows: slice) -> tuple[Array, Array]:
             _check_rows(file, name, rows)
             states = np.asarray(file[name].read(rows), float)
             if states.ndim != 3 or not states.shape[1]:
-                raise SceneError(f"{file.path}: {name} must have shape (N, T, n), got {states.shape}")
+                raise SceneError(
+                    f"{file.path}: {name} must have shape (N, T, n), got {states.shape}"
+                )
             return states[:, 0], states[:, -1]
     known = [" and ".join(names) for names in _ENDS] + list(_TRAJECTORIES)
-    raise SceneError(f"{file.path} has no starts and goals, expected {', or '.join(known)}")
+    raise SceneError(
+        f"{file.path} has no starts and goals, expected {', or '.join(known)}"
+    )
 
 
 def _check_rows(file: Hdf5, name: str, rows: slice) -> None:
@@ -95,16 +115,23 @@ def _entries(file: Hdf5, kind: str, rows: slice, count: int) -> Array:
     names, widths, word = _SHAPES[kind]
     if not any(name in file for name in names):
         return np.zeros((count, 0, sum(widths) + 7))
-    columns = [_column(file, name, width, rows, count) for name, width in zip(names, widths, strict=True)]
+    columns = [
+        _column(file, name, width, rows, count)
+        for name, width in zip(names, widths, strict=True)
+    ]
     columns.append(_column(file, f"{word}_centers", 3, rows, count))
     if kind == "sphere":
-        columns.append(np.broadcast_to([1.0, 0.0, 0.0, 0.0], (*columns[0].shape[:2], 4)))
+        columns.append(
+            np.broadcast_to([1.0, 0.0, 0.0, 0.0], (*columns[0].shape[:2], 4))
+        )
     else:
         name = f"{word}_quats" if f"{word}_quats" in file else f"{word}_quaternions"
         columns.append(_column(file, name, 4, rows, count))
     if len({column.shape[1] for column in columns}) > 1:
         counts = [column.shape[1] for column in columns]
-        raise SceneError(f"{file.path}: the datasets of {word}s have different numbers of entries: {counts}")
+        raise SceneError(
+            f"{file.path}: the datasets of {word}s have different numbers of entries: {counts}"
+        )
     return np.concatenate(columns, axis=2)
 
 
@@ -116,7 +143,9 @@ def _column(file: Hdf5, name: str, width: int, rows: slice, count: int) -> Array
     if values.ndim == 2:
         values = values[:, :, None] if width == 1 else values[:, None]
     if values.ndim != 3 or len(values) != count or values.shape[2] != width:
-        raise SceneError(f"{file.path}: {name} must have shape ({count}, M, {width}), got {file[name].shape}")
+        raise SceneError(
+            f"{file.path}: {name} must have shape ({count}, M, {width}), got {file[name].shape}"
+        )
     return values
 
 
@@ -126,15 +155,21 @@ def _names(file: Hdf5, rows: slice, count: int) -> list[str]:
         first = rows.start or 0
         return [str(first + row) for row in range(count)]
     text = file.attributes[SCENE_NAMES]
-    names = (text.decode(errors="replace") if isinstance(text, bytes) else str(text)).split("\n")[rows]
+    names = (
+        text.decode(errors="replace") if isinstance(text, bytes) else str(text)
+    ).split("\n")[rows]
     if len(names) != count:
-        raise SceneError(f"{file.path}: {SCENE_NAMES} must have {count} lines, got {len(names)}")
+        raise SceneError(
+            f"{file.path}: {SCENE_NAMES} must have {count} lines, got {len(names)}"
+        )
     return names
 
 
 def _is_present(kind: str, values: Array) -> NDArray[np.bool_]:
     """Return which entries are obstacles: those without a size of zero."""
-    return np.asarray((values[:, : sum(_SHAPES[kind][1])] != 0).all(axis=1))  # nan counts as a size
+    return np.asarray(
+        (values[:, : sum(_SHAPES[kind][1])] != 0).all(axis=1)
+    )  # nan counts as a size
 
 
 def _obstacles(numbers: dict[str, Array], place: str) -> Iterator[Obstacle]:
@@ -142,11 +177,21 @@ def _obstacles(numbers: dict[str, Array], place: str) -> Iterator[Obstacle]:
         width = sum(_SHAPES[kind][1])
         for index in np.flatnonzero(_is_present(kind, values)).tolist():
             sizes, center, quaternion = np.split(values[index], [width, width + 3])
-            yield make_obstacle(f"{_SHAPES[kind][2]} {index}", kind, sizes, center, quaternion, place=place)
+            yield make_obstacle(
+                f"{_SHAPES[kind][2]} {index}",
+                kind,
+                sizes,
+                center,
+                quaternion,
+                place=place,
+            )
 
 
 def mpinets_bytes(scenes: Sequence[SceneProblem]) -> bytes:
-    """Return scenes, with one goal state and equal numbers of joints, as HDF5; equal scenes give equal bytes."""
+    """Return scenes, with one goal state and equal numbers of joints, as HDF5.
+
+    Equal scenes give equal bytes.
+    """
     import h5py
 
     for scene in scenes:
@@ -162,7 +207,13 @@ def mpinets_bytes(scenes: Sequence[SceneProblem]) -> bytes:
     columns = {"start_q": np.array([scene.start_q for scene in scenes])}
     columns["goal_q"] = np.array([scene.goal_q[0] for scene in scenes])
     for kind in _SHAPES:
-        columns |= _padded(kind, [[item for item in scene.obstacles if item.kind == kind] for scene in scenes])
+        columns |= _padded(
+            kind,
+            [
+                [item for item in scene.obstacles if item.kind == kind]
+                for scene in scenes
+            ],
+        )
     buffer = io.BytesIO()
     with h5py.File(create_hdf5(buffer)) as file:
         for name, values in columns.items():
@@ -182,9 +233,17 @@ def _padded(kind: str, obstacles: list[list[Obstacle]]) -> dict[str, Array]:
     values = np.zeros((count, most, width + 7))
     for row, items in enumerate(obstacles):
         for index, item in enumerate(items):
-            sizes = item.size if kind == "box" else (item.radius, item.length)[: len(names)]
-            values[row, index] = [*(sizes or ()), *(item.position or ()), *quaternion_of(turned(*item.rotation))]
+            sizes = (
+                item.size if kind == "box" else (item.radius, item.length)[: len(names)]
+            )
+            values[row, index] = [
+                *(sizes or ()),
+                *(item.position or ()),
+                *quaternion_of(turned(*item.rotation)),
+            ]
     ends = np.cumsum([*widths, 3])
     parts = np.split(values, ends, axis=2)
-    found = dict(zip((*names, f"{word}_centers", f"{word}_quaternions"), parts, strict=True))
+    found = dict(
+        zip((*names, f"{word}_centers", f"{word}_quaternions"), parts, strict=True)
+    )
     return {name: part for name, part in found.items() if name != "sphere_quaternions"}

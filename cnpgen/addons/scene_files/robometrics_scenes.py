@@ -1,8 +1,9 @@
 """Scenes in YAML as robometrics stores the problems of MotionBenchMaker and MPiNets.
 
-A mapping from families to lists of problems with ``start``, ``goal_ik`` (several goal states), ``goal_pose``
-(``position_xyz``, ``quaternion_wxyz``, ``frame``) and ``obstacles``: cuboids with ``dims``, cylinders with ``radius``
-and ``height``, each with a ``pose`` (x, y, z, qw, qx, qy, qz) relative to the robot's base.
+A mapping from families to lists of problems with ``start``, ``goal_ik`` (several goal
+states), ``goal_pose`` (``position_xyz``, ``quaternion_wxyz``, ``frame``) and
+``obstacles``: cuboids with ``dims``, cylinders with ``radius`` and ``height``, each
+with a ``pose`` (x, y, z, qw, qx, qy, qz) relative to the robot's base.
 """
 
 from __future__ import annotations
@@ -14,7 +15,13 @@ from typing import Any
 import numpy as np
 
 from cnpgen.problems.scenes.quaternions import quaternion_error, rotation_matrix
-from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError, SceneProblem, check_count, make_obstacle
+from cnpgen.problems.scenes.scene_problem import (
+    GoalPose,
+    SceneError,
+    SceneProblem,
+    check_count,
+    make_obstacle,
+)
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.store.files.yaml_document import part, scalar, vector
 
@@ -26,7 +33,12 @@ def is_robometrics(document: Any) -> bool:
     if not isinstance(document, dict) or not document:
         return False
     first = next(iter(document.values()))
-    return isinstance(first, list) and bool(first) and isinstance(first[0], dict) and "obstacles" in first[0]
+    return (
+        isinstance(first, list)
+        and bool(first)
+        and isinstance(first[0], dict)
+        and "obstacles" in first[0]
+    )
 
 
 def read_robometrics(path: Path, document: Any) -> Iterator[SceneProblem]:
@@ -39,9 +51,14 @@ def read_robometrics(path: Path, document: Any) -> Iterator[SceneProblem]:
 
 def _problem(path: Path, name: str, entry: Any, place: str) -> SceneProblem:
     start = vector(part(entry, "start", list, place), "", f"{place}: start")
-    goals = [vector(goal, "", f"{place}: goal_ik") for goal in part(entry, "goal_ik", list, place)]
+    goals = [
+        vector(goal, "", f"{place}: goal_ik")
+        for goal in part(entry, "goal_ik", list, place)
+    ]
     if any(goal.shape != start.shape for goal in goals):
-        raise SceneError(f"{place}: every goal_ik must have {len(start)} joint positions like start")
+        raise SceneError(
+            f"{place}: every goal_ik must have {len(start)} joint positions like start"
+        )
     pose = _goal_pose(part(entry, "goal_pose", dict, place), place)
     if not goals and pose is None:
         raise SceneError(f"{place} has neither goal_ik nor goal_pose")
@@ -62,14 +79,20 @@ def _goal_pose(entry: Any, place: str) -> GoalPose | None:
     if text := quaternion_error(quaternion):
         raise SceneError(f"{place}: goal_pose: {text}")
     position = vector(entry.get("position_xyz"), "xyz", f"{place}: goal_pose")
-    return GoalPose(part(entry, "frame", str, place), position, rotation_matrix(quaternion))
+    return GoalPose(
+        part(entry, "frame", str, place), position, rotation_matrix(quaternion)
+    )
 
 
 def _obstacles(obstacles: Any, place: str) -> Iterator[Obstacle]:
     for kind in obstacles:
         if kind not in _KINDS:
-            raise SceneError(f"{place} has obstacles of the kind {kind!r}, expected {', '.join(_KINDS)}")
-    check_count(sum(len(part(obstacles, kind, dict, place)) for kind in obstacles), place)
+            raise SceneError(
+                f"{place} has obstacles of the kind {kind!r}, expected {', '.join(_KINDS)}"
+            )
+    check_count(
+        sum(len(part(obstacles, kind, dict, place)) for kind in obstacles), place
+    )
     for kind in _KINDS:
         for name, entry in part(obstacles, kind, dict, place).items():
             where = f"{place}: obstacle {name!r}"
@@ -78,7 +101,9 @@ def _obstacles(obstacles: Any, place: str) -> Iterator[Obstacle]:
                 sizes = vector(part(entry, "dims", list, where), "", f"{where}: dims")
             else:
                 keys = ("radius", "height")[: 2 if kind == "cylinder" else 1]
-                sizes = np.array([scalar(entry.get(key), f"{where}: {key}") for key in keys])
+                sizes = np.array(
+                    [scalar(entry.get(key), f"{where}: {key}") for key in keys]
+                )
             if kind == "sphere" and len(pose) == 3:
                 pose = np.array([*pose, 1.0, 0.0, 0.0, 0.0])
             shape = "box" if kind == "cuboid" else kind

@@ -8,10 +8,23 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.addons.scene_files.moveit_scenes import is_moveit, moveit_texts, read_moveit
-from cnpgen.addons.scene_files.mpinets_scenes import is_mpinets, mpinets_bytes, read_mpinets
-from cnpgen.addons.scene_files.robometrics_scenes import is_robometrics, read_robometrics
+from cnpgen.addons.scene_files.mpinets_scenes import (
+    is_mpinets,
+    mpinets_bytes,
+    read_mpinets,
+)
+from cnpgen.addons.scene_files.robometrics_scenes import (
+    is_robometrics,
+    read_robometrics,
+)
 from cnpgen.errors import UsageError
-from cnpgen.problems.scenes.scene_problem import MAX_SCENES, SceneError, SceneProblem, check_scenes, checked_scene
+from cnpgen.problems.scenes.scene_problem import (
+    MAX_SCENES,
+    SceneError,
+    SceneProblem,
+    check_scenes,
+    checked_scene,
+)
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.store.files.atomic import write_file
@@ -24,22 +37,23 @@ MAX_SCENE_FILES = 20_000  # of a folder
 
 
 @checked_arguments
-def load_scenes(path: str | Path, *, start: int = 0, n: int | None = None) -> list[SceneProblem]:
+def load_scenes(
+    path: str | Path, *, start: int = 0, n: int | None = None
+) -> list[SceneProblem]:
     """Read the planning problems of scene files.
 
-    The format follows from the content: MoveIt planning scenes and requests, or robometrics, in YAML; MPiNets or Avoid
-    Everything in HDF5. Files of a folder are read in the order of their names, without subfolders.
+    The format follows from the content: MoveIt planning scenes and requests, or
+    robometrics, in YAML; MPiNets or Avoid Everything in HDF5. Files of a folder are
+    read in the order of their names, without subfolders.
 
     Args:
         path: A file, or a folder of files.
         start: First scene.
         n: Number of scenes; by default all that follow.
 
-    Raises:
-        UsageError: There are no scenes.
-        SceneError: A scene is invalid; the message names file, scene and obstacle. A subclass of UsageError.
-        DatasetError: An HDF5 file is damaged.
-        MissingExtraError: PyYAML is missing.
+    Raises: UsageError: There are no scenes. SceneError: A scene is invalid; the message
+        names file, scene and obstacle. A subclass of UsageError. DatasetError: An HDF5
+        file is damaged. MissingExtraError: PyYAML is missing.
     """
     path, start = Path(path), integer("start", start, least=0)
     stop = None if n is None else start + integer("n", n, least=1)
@@ -47,9 +61,17 @@ def load_scenes(path: str | Path, *, start: int = 0, n: int | None = None) -> li
     if len(files) == 1 and _is_hdf5(files[0]):
         scenes = list(read_mpinets(files[0], slice(start, stop)))
     else:
-        scenes = list(itertools.islice(_scenes(files), start, stop if stop is not None else start + MAX_SCENES + 1))
+        scenes = list(
+            itertools.islice(
+                _scenes(files),
+                start,
+                stop if stop is not None else start + MAX_SCENES + 1,
+            )
+        )
     if len(scenes) > MAX_SCENES:
-        raise SceneError(f"{path} has more than {MAX_SCENES:,} scenes: choose some by start and n")
+        raise SceneError(
+            f"{path} has more than {MAX_SCENES:,} scenes: choose some by start and n"
+        )
     if not scenes:
         raise UsageError(f"{path} has no scene from number {start} on", concerns="path")
     return [checked_scene(scene) for scene in scenes]
@@ -58,8 +80,13 @@ def load_scenes(path: str | Path, *, start: int = 0, n: int | None = None) -> li
 def holds_scenes(path: Path) -> bool:
     """Return whether a file or a folder contains scenes, judged by suffixes and the names of HDF5 datasets."""
     if path.is_dir():
-        return any(entry.suffix.lower() in YAML_SUFFIXES or _is_scene_hdf5(entry) for entry in path.iterdir())
-    return path.is_file() and (path.suffix.lower() in YAML_SUFFIXES or _is_scene_hdf5(path))
+        return any(
+            entry.suffix.lower() in YAML_SUFFIXES or _is_scene_hdf5(entry)
+            for entry in path.iterdir()
+        )
+    return path.is_file() and (
+        path.suffix.lower() in YAML_SUFFIXES or _is_scene_hdf5(path)
+    )
 
 
 def _is_hdf5(path: Path) -> bool:
@@ -75,31 +102,45 @@ def _files(path: Path) -> list[Path]:
         raise UsageError(f"no such file or folder: {path}", concerns="path")
     if not path.is_dir():
         if path.suffix.lower() not in SCENE_SUFFIXES:
-            raise UsageError(f"{path} must end in one of {', '.join(SCENE_SUFFIXES)}", concerns="path")
+            raise UsageError(
+                f"{path} must end in one of {', '.join(SCENE_SUFFIXES)}",
+                concerns="path",
+            )
         return [path]
     files = list(itertools.islice(path.iterdir(), MAX_SCENE_FILES + 1))
     if len(files) > MAX_SCENE_FILES:
-        raise UsageError(f"{path} has more than {MAX_SCENE_FILES:,} files", concerns="path")
+        raise UsageError(
+            f"{path} has more than {MAX_SCENE_FILES:,} files", concerns="path"
+        )
     known = [file for file in sorted(files) if file.suffix.lower() in SCENE_SUFFIXES]
     if not known:
-        raise UsageError(f"{path} contains no scenes in YAML or HDF5 files", concerns="path")
+        raise UsageError(
+            f"{path} contains no scenes in YAML or HDF5 files", concerns="path"
+        )
     return known
 
 
 def _scenes(files: Sequence[Path]) -> Iterator[SceneProblem]:
-    """Yield the scenes of several files; requests of MoveIt belong to scenes in other files."""
+    """Yield the scenes of several files.
+
+    Requests of MoveIt belong to scenes in other files.
+    """
     moveit: dict[Path, Any] = {}
     for file in files:
         if _is_hdf5(file):
             yield from read_mpinets(file, slice(0, None))
             continue
-        for document in read_yaml(file) if len(files) > 1 else _with_partner(file, moveit):
+        for document in (
+            read_yaml(file) if len(files) > 1 else _with_partner(file, moveit)
+        ):
             if is_moveit(document):
                 moveit[file] = {**moveit.get(file, {}), **document}
             elif is_robometrics(document):
                 yield from read_robometrics(file, document)
             elif len(files) == 1:
-                raise SceneError(f"{file} is neither a planning scene or request of MoveIt nor a robometrics file")
+                raise SceneError(
+                    f"{file} is neither a planning scene or request of MoveIt nor a robometrics file"
+                )
     yield from read_moveit(moveit)
 
 
@@ -109,13 +150,17 @@ def _with_partner(file: Path, moveit: dict[Path, Any]) -> list[Any]:
         head, word, tail = file.name.rpartition(old)
         partner = file.with_name(head + new + tail)
         if word and partner.is_file():
-            documents = [document for document in read_yaml(partner) if is_moveit(document)]
+            documents = [
+                document for document in read_yaml(partner) if is_moveit(document)
+            ]
             moveit |= {partner: documents[0]} if documents else {}
     return read_yaml(file)
 
 
 @checked_arguments
-def save_scenes(path: str | Path, scenes: Sequence[SceneProblem], *, joints: Sequence[str] = ()) -> None:
+def save_scenes(
+    path: str | Path, scenes: Sequence[SceneProblem], *, joints: Sequence[str] = ()
+) -> None:
     """Write scenes: one HDF5 file in the format of MPiNets, or a folder of planning scenes and requests of MoveIt.
 
     Args:
@@ -134,13 +179,17 @@ def save_scenes(path: str | Path, scenes: Sequence[SceneProblem], *, joints: Seq
         write_file(path, mpinets_bytes(scenes))
         return
     if path.suffix:
-        raise UsageError(f"{path} must end in .h5 or .hdf5, or be a folder for YAML files", concerns="path")
+        raise UsageError(
+            f"{path} must end in .h5 or .hdf5, or be a folder for YAML files",
+            concerns="path",
+        )
     texts = []
     for scene in scenes:
         names = scene.joint_names or tuple(joints)
         if len(names) != len(scene.start_q):
             raise UsageError(
-                f"must name {len(scene.start_q)} joints for {scene.place}, got {len(names)}", argument="joints"
+                f"must name {len(scene.start_q)} joints for {scene.place}, got {len(names)}",
+                argument="joints",
             )
         texts.append(moveit_texts(scene, names))
     for index, (scene_text, request_text) in enumerate(texts, 1):

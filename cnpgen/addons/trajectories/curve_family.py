@@ -1,7 +1,8 @@
 """A family of curves around a piecewise polynomial: everything that samples and assumptions say about a motion.
 
-The nominal curve is a polynomial on every span between two knots. Every curve of the family differs from it by at most
-a bound that is constant on each span. A family with zero bounds is one known curve.
+The nominal curve is a polynomial on every span between two knots. Every curve of the
+family differs from it by at most a bound that is constant on each span. A family with
+zero bounds is one known curve.
 """
 
 from dataclasses import dataclass
@@ -22,11 +23,16 @@ UNDEFINED = 1e6  # bound of a derivative that the curve does not have, in SI uni
 
 @dataclass(frozen=True, eq=False)
 class CurveFamily:
-    """Curves of n joints on S spans; the bound of a derivative that does not exist at the knots is ``UNDEFINED``."""
+    """Curves of n joints on S spans.
+
+    The bound of a derivative that does not exist at the knots is ``UNDEFINED``.
+    """
 
     t: Array  # times of the knots [s], from 0 to the duration, shape (S + 1,)
     coefficients: Array  # Bernstein coefficients of the nominal positions [rad], shape (d + 1, S, n)
-    bounds: tuple[Array, Array, Array, Array]  # largest differences of q, dq, ddq and jerk, shape (S, n) each
+    bounds: tuple[
+        Array, Array, Array, Array
+    ]  # largest differences of q, dq, ddq and jerk, shape (S, n) each
     has_jerk: bool = True  # whether the nominal jerks are those of the polynomials; otherwise they are 0
 
     @property
@@ -50,10 +56,15 @@ class CurveFamily:
         return PiecewisePolynomials(self.edges, *found)
 
     def evaluate(self, s: Array, *, jerk: bool) -> EvaluatedTrajectory:
-        """Evaluate the nominal curve at phases s in [0, 1], shape (K,); at a knot, the span after it."""
+        """Evaluate the nominal curve at phases s in [0, 1], shape (K,).
+
+        At a knot, the span after it.
+        """
         span, u = self._spans(s)
         orders = ORDERS if jerk else ORDERS[:3]
-        return EvaluatedTrajectory(*(_values(getattr(self.polynomials, name), span, u) for name in orders))
+        return EvaluatedTrajectory(
+            *(_values(getattr(self.polynomials, name), span, u) for name in orders)
+        )
 
     def bounds_at(self, s: Array) -> list[Array]:
         """Return the bounds of all orders at phases s, shape (n, K) each."""
@@ -61,13 +72,21 @@ class CurveFamily:
         return [np.ascontiguousarray(bound[span].T) for bound in self.bounds]
 
     def derivative_bounds(self) -> tuple[Array, Array, Array]:
-        """Bound the derivatives of the nominal positions by the phase; see ``Curve``."""
-        first, second = (np.abs(values).max(axis=0) for values in (self.polynomials.dq, self.polynomials.ddq))
+        """Bound the derivatives of the nominal positions by the phase.
+
+        See ``Curve``.
+        """
+        first, second = (
+            np.abs(values).max(axis=0)
+            for values in (self.polynomials.dq, self.polynomials.ddq)
+        )
         return self.edges, first * self.duration, second * self.duration**2
 
     def max_positions(self) -> Array:
         """Bound the absolute positions of all curves [rad], shape (n,)."""
-        return np.asarray((np.abs(self.coefficients).max(axis=0) + self.bounds[0]).max(axis=0))
+        return np.asarray(
+            (np.abs(self.coefficients).max(axis=0) + self.bounds[0]).max(axis=0)
+        )
 
     def _spans(self, s: Array) -> tuple[NDArray[np.intp], Array]:
         """Return the span of every phase and the position in it, from 0 to 1."""
@@ -80,13 +99,17 @@ def _derivative(coefficients: Array, lengths: Array) -> Array:
     """Differentiate polynomials by time, shape (d + 1, S, n) -> (max(d, 1), S, n)."""
     if len(coefficients) == 1:
         return np.zeros_like(coefficients)
-    return np.asarray((len(coefficients) - 1) * np.diff(coefficients, axis=0) / lengths[:, None])
+    return np.asarray(
+        (len(coefficients) - 1) * np.diff(coefficients, axis=0) / lengths[:, None]
+    )
 
 
 def _values(coefficients: Array, span: NDArray[np.intp], u: Array) -> Array:
     """Evaluate polynomials in their spans, shape (n, K)."""
     degree = len(coefficients) - 1
-    basis = [comb(degree, k) * u**k * (1 - u) ** (degree - k) for k in range(degree + 1)]
+    basis = [
+        comb(degree, k) * u**k * (1 - u) ** (degree - k) for k in range(degree + 1)
+    ]
     total = np.zeros((len(span), coefficients.shape[2]))
     for weight, row in zip(basis, coefficients, strict=True):
         total += weight[:, None] * row[span]

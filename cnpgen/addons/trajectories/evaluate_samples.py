@@ -1,8 +1,10 @@
 """Sampled trajectories.
 
-With --problem, FILE may also hold sampled trajectories: CSV, JSON, YAML, NPZ, HDF5 or Parquet, messages of ROS and
-MoveIt, or a folder of such files ('cnpgen docs trajectories'). Each trajectory and condition is valid, invalid or
-undecided. The exit code is then 0 if all are valid, otherwise 1; 2 for damaged files and files of other kinds.
+With --problem, FILE may also hold sampled trajectories: CSV, JSON, YAML, NPZ, HDF5 or
+Parquet, messages of ROS and MoveIt, or a folder of such files ('cnpgen docs
+trajectories'). Each trajectory and condition is valid, invalid or undecided. The exit
+code is then 0 if all are valid, otherwise 1; 2 for damaged files and files of other
+kinds.
 """
 
 import argparse
@@ -40,12 +42,17 @@ def add_options(options: Options) -> None:
 
 
 def accepts(arguments: argparse.Namespace) -> bool:
-    """Return whether the file holds sampled trajectories; refuse their options for other files."""
+    """Return whether the file holds sampled trajectories.
+
+    Refuse their options for other files.
+    """
     from cnpgen.addons.trajectories.trajectory_tables import holds_trajectories
 
     if holds_trajectories(arguments.file):
         return True
-    refuse_trajectory_options(arguments, arguments.file, "interpolation", "max_jerk", "noise")
+    refuse_trajectory_options(
+        arguments, arguments.file, "interpolation", "max_jerk", "noise"
+    )
     return False
 
 
@@ -54,12 +61,16 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.addons.trajectories.evaluate_trajectories import evaluate_trajectories
 
     if arguments.tracking_error is not None:
-        raise UsageError("--tracking-error is for plans: --noise gives the error of sampled trajectories")
+        raise UsageError(
+            "--tracking-error is for plans: --noise gives the error of sampled trajectories"
+        )
     problem = problem_of(arguments)
     loaded = load_file(arguments, problem)
     count = len(loaded.trajectories)
     if arguments.plan is not None and arguments.plan >= count:
-        raise UsageError(f"{arguments.file} has no trajectory {arguments.plan}: {count} are numbered from 0")
+        raise UsageError(
+            f"{arguments.file} has no trajectory {arguments.plan}: {count} are numbered from 0"
+        )
     with Meter(quiet=not sys.stderr.isatty(), noun="trajectory") as meter:
         meter.begin(f"judging {arguments.file}", count)
         found = evaluate_trajectories(
@@ -83,15 +94,24 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if found.valid.all() else 1
 
 
-def _draw_trajectory(found: "TrajectoryEvaluation", picture: str, index: int | None, labels: tuple[str, ...]) -> None:
+def _draw_trajectory(
+    found: "TrajectoryEvaluation",
+    picture: str,
+    index: int | None,
+    labels: tuple[str, ...],
+) -> None:
     """Draw a trajectory, by default the first that is not valid, and mark what is not valid."""
     from cnpgen.addons.trajectories.trajectory_plot import plot_trajectory
     from cnpgen.plans import open_problem
 
-    first = next((at for at, verdict in enumerate(found.verdicts) if not verdict.valid), 0)
+    first = next(
+        (at for at, verdict in enumerate(found.verdicts) if not verdict.valid), 0
+    )
     chosen = first if index is None else index
     trajectory, verdict = found.trajectories[chosen], found.verdicts[chosen]
-    margins = [entry.margin for entry in verdict.conditions.values() if not entry.margin.ok]
+    margins = [
+        entry.margin for entry in verdict.conditions.values() if not entry.margin.ok
+    ]
     problem, robot = open_problem(found.problem)
     title = f"{problem.name}, {labels[chosen]}: {trajectory.duration:.3f} s\n{verdict}"
     plot_trajectory(problem, robot, trajectory, picture, title=title, margins=margins)

@@ -51,7 +51,9 @@ class TrajectoryEvaluation:
     step: float
 
     def __repr__(self) -> str:
-        texts = ", ".join(f"{count:,} {decision}" for decision, count in self.counts.items() if count)
+        texts = ", ".join(
+            f"{count:,} {decision}" for decision, count in self.counts.items() if count
+        )
         return f"<{counted(len(self.verdicts), 'trajectory')}: {texts}>"
 
     @property
@@ -70,7 +72,9 @@ class TrajectoryEvaluation:
         conditions: dict[str, dict[str, Any]] = {}
         for verdict in self.verdicts:
             for name, entry in verdict.conditions.items():
-                counts = conditions.setdefault(name, {str(decision): 0 for decision in Decision})
+                counts = conditions.setdefault(
+                    name, {str(decision): 0 for decision in Decision}
+                )
                 counts[str(entry.decision)] += 1
         return {
             "format": FORMAT,
@@ -80,7 +84,9 @@ class TrajectoryEvaluation:
             "step_s": self.step,
             "trajectories": len(self.verdicts),
             **self.counts,
-            "reasons": dict(Counter(str(v.reason) for v in self.verdicts if v.reason).most_common()),
+            "reasons": dict(
+                Counter(str(v.reason) for v in self.verdicts if v.reason).most_common()
+            ),
             "conditions": conditions,
         }
 
@@ -99,50 +105,68 @@ def evaluate_trajectories(
 ) -> TrajectoryEvaluation:
     """Judge sampled trajectories: valid, invalid or undecided.
 
-    By default, the motion that the samples resolve is judged. It is valid if the smooth curve through exact samples
-    with velocities is valid; otherwise all curves within the errors of the resolution decide. With
-    ``interpolation``, the curve of a controller is judged. With ``max_jerk``, all curves through the samples whose
-    jerks are within it are judged. With noise, so are all curves of samples within the noise. A trajectory is valid
-    if every curve is valid, invalid if every curve violates a condition, and otherwise undecided. Obstacles that
-    depend on the ends of a motion are placed at its first and last sample.
+    By default, the motion that the samples resolve is judged. It is valid if the smooth
+    curve through exact samples with velocities is valid; otherwise all curves within
+    the errors of the resolution decide. With ``interpolation``, the curve of a
+    controller is judged. With ``max_jerk``, all curves through the samples whose jerks
+    are within it are judged. With noise, so are all curves of samples within the noise.
+    A trajectory is valid if every curve is valid, invalid if every curve violates a
+    condition, and otherwise undecided. Obstacles that depend on the ends of a motion
+    are placed at its first and last sample.
 
-    Args:
-        problem: Problem, record, or name or path of a problem, pipeline or dataset.
+    Args: problem: Problem, record, or name or path of a problem, pipeline or dataset.
         trajectories: The trajectories, with the problem's joints in their order.
         interpolation: "hold", "linear", "cubic" or "quintic"; not with ``max_jerk``.
-        noise: Largest error of the samples in SI units: one number for positions, velocities and accelerations, or
+        noise: Largest error of the samples in SI units: one number for positions,
+        velocities and accelerations, or
             three.
         max_jerk: Bound of the jerks [rad/s^3], one number or shape (n,).
         step: Maximum distance of checked times [s].
         workers: Number of processes.
-        progress: Called with the number of trajectories that were judged since the last call.
+        progress: Called with the number of trajectories that were judged since the last
+            call.
 
-    Raises:
-        UsageError: An argument is invalid, or a trajectory has another number of joints or of parameters.
-        RecipeError: A required plug-in is not installed.
+    Raises: UsageError: An argument is invalid, or a trajectory has another number of
+        joints or of parameters. RecipeError: A required plug-in is not installed.
     """
     check_step(step := number("step", step))
     record = as_record(problem)
     n = len(record.joint_names)
     check_trajectories(trajectories, record)
     if interpolation is not None and max_jerk is not None:
-        raise UsageError("interpolation and max_jerk exclude each other", concerns="interpolation")
+        raise UsageError(
+            "interpolation and max_jerk exclude each other", concerns="interpolation"
+        )
     errors = non_negative("noise", noise, 3)
     jerk = None if max_jerk is None else non_negative("max_jerk", max_jerk, n)
-    task = partial(_judge, record=record, interpolation=interpolation, noise=errors, max_jerk=jerk, step=step)
+    task = partial(
+        _judge,
+        record=record,
+        interpolation=interpolation,
+        noise=errors,
+        max_jerk=jerk,
+        step=step,
+    )
     chosen = tuple(trajectories)
-    verdicts = judged_in_parts(task, chosen, size=TRAJECTORIES_PER_TASK, workers=workers, progress=progress)
+    verdicts = judged_in_parts(
+        task, chosen, size=TRAJECTORIES_PER_TASK, workers=workers, progress=progress
+    )
     return TrajectoryEvaluation(record, chosen, tuple(verdicts), step)
 
 
-def check_trajectories(trajectories: Sequence[Trajectory], record: ProblemRecord) -> None:
+def check_trajectories(
+    trajectories: Sequence[Trajectory], record: ProblemRecord
+) -> None:
     """Check that there are trajectories with the joints and the parameters of a problem."""
     n, names = len(record.joint_names), ", ".join(record.parameters.names)
     if not len(trajectories):
         raise UsageError("there are no trajectories", concerns="trajectories")
     for index, trajectory in enumerate(trajectories):
         if not isinstance(trajectory, Trajectory):
-            raise UsageError(f"must hold objects of Trajectory, got {trajectory!r:.60}", argument="trajectories")
+            raise UsageError(
+                f"must hold objects of Trajectory, got {trajectory!r:.60}",
+                argument="trajectories",
+            )
         if trajectory.q.shape[1] != n:
             raise UsageError(
                 f"trajectory {index} has {trajectory.q.shape[1]} joints, the problem plans {n}",
@@ -151,17 +175,23 @@ def check_trajectories(trajectories: Sequence[Trajectory], record: ProblemRecord
         if trajectory.parameters is not None:
             record.parameters.checked(trajectory.parameters)
         elif names:
-            text = (
-                f"trajectory {index} has no values of {names}: its file needs columns of these names, or {{parameters}}"
+            text = f"trajectory {index} has no values of {names}: its file needs columns of these names, or {{parameters}}"
+            raise UsageError(
+                text, concerns="trajectories", remedies={"parameters": None}
             )
-            raise UsageError(text, concerns="trajectories", remedies={"parameters": None})
 
 
 def non_negative(name: str, value: ArrayLike, size: int) -> Array:
     """Return one number or several as an array of shape (size,)."""
     found = numbers(name, value)
-    if found.shape not in {(), (size,)} or not (np.isfinite(found) & (found >= 0)).all():
-        raise UsageError(f"must be one number or {size}, finite and at least 0, got {found!s:.60}", argument=name)
+    if (
+        found.shape not in {(), (size,)}
+        or not (np.isfinite(found) & (found >= 0)).all()
+    ):
+        raise UsageError(
+            f"must be one number or {size}, finite and at least 0, got {found!s:.60}",
+            argument=name,
+        )
     return np.broadcast_to(found, (size,)).astype(float)
 
 
@@ -185,7 +215,11 @@ def _judge(  # noqa: PLR0917 - the arguments of evaluate_trajectories
         else:
             bounded = bounded_jerk(trajectory, max_jerk, noise)
             if bounded is None:
-                verdicts.append(TrajectoryVerdict(Decision.UNDECIDED, CONTRADICTION, duration=trajectory.duration))
+                verdicts.append(
+                    TrajectoryVerdict(
+                        Decision.UNDECIDED, CONTRADICTION, duration=trajectory.duration
+                    )
+                )
                 continue
             family = bounded
         verdicts.append(judge(family, trajectory))

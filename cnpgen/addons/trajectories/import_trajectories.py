@@ -13,7 +13,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.addons.trajectories.evaluate_trajectories import check_trajectories, non_negative
+from cnpgen.addons.trajectories.evaluate_trajectories import (
+    check_trajectories,
+    non_negative,
+)
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.judges.plans.continuous_collision import is_contact
 from cnpgen.machine.threads import one_thread
@@ -38,7 +41,9 @@ State = tuple[Array, Array, Array]
 MAX_FIT_ERROR_RAD = 2e-3  # of the positions at the samples, plus the noise, with more control points otherwise
 GROWTH = (1.0, 1.6, 2.6)  # of the number of control points of the path
 FIT_SAMPLES_PER_POINT = 4  # of the path, at most
-MIN_SAMPLES_PER_POINT = 2  # of the path, from which velocities of the samples are not needed
+MIN_SAMPLES_PER_POINT = (
+    2  # of the path, from which velocities of the samples are not needed
+)
 REST_WINDOW_S = 0.05  # in which noise of the positions looks like a velocity
 MIN_SNAP_RAD = 1e-3  # distance by which positions may always be moved
 SNAP_FACTOR = 3.0  # largest change of positions by snapping, relative to the noise
@@ -46,17 +51,21 @@ MAX_ITERATIONS = 12  # of snapping
 DIFFERENCE = 1e-6  # of central differences, in units of the scaled state
 BOUND_INSET = 1e-6  # distance from a violated bound, relative to its range, at which a state is placed
 MAX_RESIDUAL = 1e-10  # at which the iteration ends
-SCALES = (1.0, 100.0, 1e5)  # a change of 1 mrad counts as much as one of 0.1 rad/s, or of 100 rad/s^2
+SCALES = (
+    1.0,
+    100.0,
+    1e5,
+)  # a change of 1 mrad counts as much as one of 0.1 rad/s, or of 100 rad/s^2
 
 
 @dataclass(frozen=True, eq=False)
 class ImportedTrajectories:
     """Plans of N sampled trajectories.
 
-    Attributes:
-        plans: The plans, with one number of control points for all.
-        deviation: Largest distance of a plan from its samples over all joints [rad], shape (N,).
-        snapped: Largest change of a boundary position [rad], shape (N,); nan where the constraints cannot be met by a
+    Attributes: plans: The plans, with one number of control points for all. deviation:
+        Largest distance of a plan from its samples over all joints [rad], shape (N,).
+        snapped: Largest change of a boundary position [rad], shape (N,); nan where the
+        constraints cannot be met by a
             small change, so that the boundary conditions are those of the samples.
     """
 
@@ -77,28 +86,41 @@ def import_trajectories(
 ) -> ImportedTrajectories:
     """Fit plans to sampled trajectories.
 
-    Boundary conditions are those of the first and the last sample; derivatives that are not given are estimated, and
-    zero within the noise. The states are then moved onto the constraints of the problem, by a change of positions of at
-    most three times the noise or 1 mrad. The path has as many control points as the samples require.
+    Boundary conditions are those of the first and the last sample; derivatives that are
+    not given are estimated, and zero within the noise. The states are then moved onto
+    the constraints of the problem, by a change of positions of at most three times the
+    noise or 1 mrad. The path has as many control points as the samples require.
 
-    Args:
-        problem: Problem, record, or name or path of a problem, pipeline or dataset.
-        trajectories: The trajectories, with the problem's joints in their order.
-        noise: Largest error of the samples in SI units: one number for positions, velocities and accelerations, or
+    Args: problem: Problem, record, or name or path of a problem, pipeline or dataset.
+        trajectories: The trajectories, with the problem's joints in their order. noise:
+        Largest error of the samples in SI units: one number for positions, velocities
+        and accelerations, or
             three.
-        at_rest: Ends at which all motions are at rest: "start", "goal", or True for both.
+        at_rest: Ends at which all motions are at rest: "start", "goal", or True for
+            both.
         source: Source of the plans, a line of text.
 
-    Raises:
-        UsageError: An argument is invalid, or a trajectory has another number of joints.
+    Raises: UsageError: An argument is invalid, or a trajectory has another number of
+        joints.
     """
     record = as_record(problem)
     check_trajectories(trajectories, record)
     errors = non_negative("noise", noise, 3)
     snapper = StateSnapper(*open_problem(record))
-    ends = [_boundary(trajectory, errors, snapper, at_rest=at_rest) for trajectory in trajectories]
-    boundaries, snapped = [boundary for boundary, _ in ends], np.array([change for _, change in ends])
-    motions, deviation = _fitted(trajectories, boundaries, record.trajectory, MAX_FIT_ERROR_RAD + float(errors[0]))
+    ends = [
+        _boundary(trajectory, errors, snapper, at_rest=at_rest)
+        for trajectory in trajectories
+    ]
+    boundaries, snapped = (
+        [boundary for boundary, _ in ends],
+        np.array([change for _, change in ends]),
+    )
+    motions, deviation = _fitted(
+        trajectories,
+        boundaries,
+        record.trajectory,
+        MAX_FIT_ERROR_RAD + float(errors[0]),
+    )
     plans = make_plans(
         record,
         join_boundaries(boundaries),
@@ -114,8 +136,12 @@ def _boundary(
 ) -> tuple[Boundary, float]:
     """Return the boundary conditions of one trajectory and the change of their positions by snapping [rad]."""
     estimate = sampled_boundary(trajectory.t, trajectory.q, trajectory.dq)
-    speed_error = noise[1] if trajectory.dq is not None else 2 * noise[0] / REST_WINDOW_S
-    acceleration_error = noise[2] if trajectory.ddq is not None else 4 * speed_error / REST_WINDOW_S
+    speed_error = (
+        noise[1] if trajectory.dq is not None else 2 * noise[0] / REST_WINDOW_S
+    )
+    acceleration_error = (
+        noise[2] if trajectory.ddq is not None else 4 * speed_error / REST_WINDOW_S
+    )
     allowed = max(MIN_SNAP_RAD, SNAP_FACTOR * float(noise[0]))
     given = [trajectory.dq is not None, trajectory.ddq is not None]
     snapper.set_parameters(trajectory.parameters)
@@ -129,13 +155,19 @@ def _boundary(
     for end, q, velocity, acceleration in ends:
         rests = at_rest in {True, end}
         dq = np.where(rests | (np.abs(velocity) <= speed_error), 0.0, velocity)
-        ddq = np.where(rests | (np.abs(acceleration) <= acceleration_error), 0.0, acceleration)
+        ddq = np.where(
+            rests | (np.abs(acceleration) <= acceleration_error), 0.0, acceleration
+        )
         snapped.append(_snapped(snapper, (q, dq, ddq), end, given, allowed))
     (first, moved_first), (last, moved_last) = snapped
     change = float(np.maximum(moved_first, moved_last))  # nan if one of them is
     parameters = None if trajectory.parameters is None else trajectory.parameters[None]
-    start_q, start_dq, start_ddq, goal_q, goal_dq = (part[None] for part in (*first, *last[:2]))
-    return Boundary(start_q, start_dq, start_ddq, goal_q, goal_dq, parameters=parameters), change
+    start_q, start_dq, start_ddq, goal_q, goal_dq = (
+        part[None] for part in (*first, *last[:2])
+    )
+    return Boundary(
+        start_q, start_dq, start_ddq, goal_q, goal_dq, parameters=parameters
+    ), change
 
 
 def _snapped(
@@ -143,7 +175,8 @@ def _snapped(
 ) -> tuple[State, float]:
     """Snap a state; estimated derivatives that prevent this are omitted, given ones are kept.
 
-    Return it with its change [rad]; or as it is, with nan, if a change above the allowed one is necessary.
+    Return it with its change [rad]; or as it is, with nan, if a change above the
+    allowed one is necessary.
     """
     q, dq, ddq = state
     still = np.zeros_like(q)
@@ -160,10 +193,16 @@ def _snapped(
     return state, float("nan")
 
 
-def _fit_samples(trajectory: Trajectory, points: int) -> tuple[Array, Array, Array | None]:
+def _fit_samples(
+    trajectory: Trajectory, points: int
+) -> tuple[Array, Array, Array | None]:
     """Return times, positions and, only if samples are few, velocities: enough of them for C control points."""
     count = len(trajectory.t)
-    chosen = np.unique(np.linspace(0, count - 1, min(count, FIT_SAMPLES_PER_POINT * points)).round().astype(np.intp))
+    chosen = np.unique(
+        np.linspace(0, count - 1, min(count, FIT_SAMPLES_PER_POINT * points))
+        .round()
+        .astype(np.intp)
+    )
     few = trajectory.dq is not None and count < MIN_SAMPLES_PER_POINT * points
     return (
         trajectory.t[chosen],
@@ -173,7 +212,10 @@ def _fit_samples(trajectory: Trajectory, points: int) -> tuple[Array, Array, Arr
 
 
 def _fitted(
-    trajectories: Sequence[Trajectory], boundaries: Sequence[Boundary], spec: TrajectorySpec, max_error: float
+    trajectories: Sequence[Trajectory],
+    boundaries: Sequence[Boundary],
+    spec: TrajectorySpec,
+    max_error: float,
 ) -> tuple[list[Motion], Array]:
     """Fit all trajectories with the smallest number of control points that meets the error; also return the errors."""
     for factor in GROWTH:
@@ -184,7 +226,9 @@ def _fitted(
             for each, boundary in zip(trajectories, boundaries, strict=True)
         ]
         pairs = zip(motions, trajectories, strict=True)
-        errors = np.array([largest_error(motion, each.t, each.q) for motion, each in pairs])
+        errors = np.array(
+            [largest_error(motion, each.t, each.q) for motion, each in pairs]
+        )
         if (errors <= max_error).all():
             break
     return motions, errors
@@ -197,7 +241,11 @@ class StateSnapper:
     """
 
     def __init__(self, problem: Problem, robot: Robot) -> None:
-        self._constraints = [constraint for constraint in problem.constraint if not is_contact(constraint)]
+        self._constraints = [
+            constraint
+            for constraint in problem.constraint
+            if not is_contact(constraint)
+        ]
         self._world = World(robot, problem.obstacle, problem.object_size)
         self._problem = problem
         self.set_parameters(None)
@@ -214,13 +262,23 @@ class StateSnapper:
         x = np.concatenate(state) / self._scale
         for _ in range(MAX_ITERATIONS):
             g, lower, upper = self._values(x, end)
-            inset = BOUND_INSET * np.where(np.isfinite(upper - lower), upper - lower, 1.0)
-            residual = np.where(g < lower, g - lower - inset, np.where(g > upper, g - upper + inset, 0.0))
+            inset = BOUND_INSET * np.where(
+                np.isfinite(upper - lower), upper - lower, 1.0
+            )
+            residual = np.where(
+                g < lower,
+                g - lower - inset,
+                np.where(g > upper, g - upper + inset, 0.0),
+            )
             rows = np.flatnonzero(np.abs(residual) > MAX_RESIDUAL)
             if not len(rows) or not np.isfinite(g).all():
                 break
             steps = DIFFERENCE * np.eye(len(x))
-            changes = [self._values(x + step, end)[0][rows] - self._values(x - step, end)[0][rows] for step in steps]
+            changes = [
+                self._values(x + step, end)[0][rows]
+                - self._values(x - step, end)[0][rows]
+                for step in steps
+            ]
             jacobian = np.stack(changes, axis=1) / (2 * DIFFERENCE)
             x = x - np.linalg.lstsq(jacobian, residual[rows], rcond=1e-8)[0]
         q, dq, ddq = np.split(x * self._scale, 3)
@@ -230,7 +288,14 @@ class StateSnapper:
         """Return the values and both bounds of all conditions, shape (m,) each."""
         q, dq, ddq = np.split(x * self._scale, 3)
         self._world.set_state(q, dq, ddq, self._poses)
-        conditions = [condition for part in self._constraints for condition in part.measured_at(self._world, end)]
-        parts = ([getattr(condition, name) for condition in conditions] for name in ("g", "lower", "upper"))
+        conditions = [
+            condition
+            for part in self._constraints
+            for condition in part.measured_at(self._world, end)
+        ]
+        parts = (
+            [getattr(condition, name) for condition in conditions]
+            for name in ("g", "lower", "upper")
+        )
         g, lower, upper = (np.concatenate([np.empty(0), *part]) for part in parts)
         return g, lower, upper

@@ -1,8 +1,9 @@
 """Families of curves through samples: a stated interpolation, or every curve whose jerk is bounded.
 
-Both begin with weights that map the data of a span to the Bernstein coefficients of its nominal polynomial. Noise of
-the data changes a derivative by at most the sum of the absolute weights. The difference between a polynomial and
-another curve through the same data is an integral of the curve's jerk against a kernel (Peano 1913), so a bound of the
+Both begin with weights that map the data of a span to the Bernstein coefficients of its
+nominal polynomial. Noise of the data changes a derivative by at most the sum of the
+absolute weights. The difference between a polynomial and another curve through the same
+data is an integral of the curve's jerk against a kernel (Peano 1913), so a bound of the
 jerk bounds it.
 """
 
@@ -21,7 +22,12 @@ Array = NDArray[np.float64]
 Interpolation = Literal["hold", "linear", "cubic", "quintic"]
 
 INTERPOLATIONS = ("hold", "linear", "cubic", "quintic")
-_DERIVATIVES = {"hold": 0, "linear": 0, "cubic": 1, "quintic": 2}  # that the data must have
+_DERIVATIVES = {
+    "hold": 0,
+    "linear": 0,
+    "cubic": 1,
+    "quintic": 2,
+}  # that the data must have
 KERNEL_NODES = 240  # of the integral over a kernel
 KERNEL_PHASES = 9  # in a span, at which the integral is evaluated
 KERNEL_MARGIN = 1.05  # factor on the integral, for phases and nodes between
@@ -29,41 +35,61 @@ STENCIL = 4  # samples around a span, for positions alone
 CONSISTENCY_TOLERANCE = 1e-6  # relative, of samples with a bound of the jerk: rounding
 
 
-def interpolated(trajectory: Trajectory, interpolation: Interpolation | None, noise: Array) -> CurveFamily:
+def interpolated(
+    trajectory: Trajectory, interpolation: Interpolation | None, noise: Array
+) -> CurveFamily:
     """Return the curves of an interpolation, by default the one that the derivatives determine, through samples.
 
-    Positions, velocities and accelerations have errors of at most the noise, shape (3,). If the samples lack the
-    derivatives of the interpolation, UsageError is raised.
+    Positions, velocities and accelerations have errors of at most the noise, shape
+    (3,). If the samples lack the derivatives of the interpolation, UsageError is
+    raised.
     """
     data = data_of(trajectory)
     kind = interpolation or INTERPOLATIONS[len(data)]
     if _DERIVATIVES[kind] >= len(data):
         missing = "velocities" if len(data) == 1 else "accelerations"
-        raise UsageError(f"{kind} interpolation needs samples with {missing}", concerns="interpolation")
+        raise UsageError(
+            f"{kind} interpolation needs samples with {missing}",
+            concerns="interpolation",
+        )
     data = data[: _DERIVATIVES[kind] + 1]
     h = np.diff(trajectory.t)
     weights = hermite_weights(len(data))
     coefficients = np.einsum("cw,swn->csn", weights, span_data(data, h))
     orders = np.tile(np.arange(len(data)), 2)
     scaled_noise = noise[orders] * h[:, None] ** orders
-    effects = [scaled_noise @ np.abs(differentiated(weights, order)).T for order in range(4)]
+    effects = [
+        scaled_noise @ np.abs(differentiated(weights, order)).T for order in range(4)
+    ]
     errors = [effect.max(axis=1) / h**order for order, effect in enumerate(effects)]
-    bounds = [np.repeat(error[:, None], trajectory.q.shape[1], axis=1) for error in errors]
+    bounds = [
+        np.repeat(error[:, None], trajectory.q.shape[1], axis=1) for error in errors
+    ]
     for order in range(len(data) + 1, 4):  # derivatives that jump at the knots
         bounds[order] = np.full_like(bounds[order], UNDEFINED)
     if kind == "hold":
         bounds[0] = bounds[0] + np.abs(np.diff(trajectory.q, axis=0))
         bounds[1] = bounds[2] = bounds[3] = np.full_like(bounds[0], UNDEFINED)
-    return CurveFamily(trajectory.t, coefficients, (bounds[0], bounds[1], bounds[2], bounds[3]))
+    return CurveFamily(
+        trajectory.t, coefficients, (bounds[0], bounds[1], bounds[2], bounds[3])
+    )
 
 
 def family_of_data(t: Array, data: list[Array]) -> CurveFamily:
     """Return the known curve through positions and derivatives at times from 0 [s], shape (S + 1, n) each."""
-    return _known(t, np.einsum("cw,swn->csn", hermite_weights(len(data)), span_data(data, np.diff(t))))
+    return _known(
+        t,
+        np.einsum(
+            "cw,swn->csn", hermite_weights(len(data)), span_data(data, np.diff(t))
+        ),
+    )
 
 
 def through_positions(trajectory: Trajectory, neighbors: int) -> CurveFamily:
-    """Return the curve of polynomials through the positions around every span; its velocities jump at the samples."""
+    """Return the curve of polynomials through the positions around every span.
+
+    Its velocities jump at the samples.
+    """
     _, weights, data = polynomials_of_positions(trajectory.t, trajectory.q, neighbors)
     return _known(trajectory.t, np.einsum("scw,swn->csn", weights, data))
 
@@ -73,16 +99,22 @@ def _known(t: Array, coefficients: Array) -> CurveFamily:
     return CurveFamily(t, coefficients, (exact, exact, exact, exact))
 
 
-def bounded_jerk(trajectory: Trajectory, max_jerk: Array, noise: Array) -> CurveFamily | None:
+def bounded_jerk(
+    trajectory: Trajectory, max_jerk: Array, noise: Array
+) -> CurveFamily | None:
     """Return all curves through samples with noise whose jerks are bounded; None if the samples contradict the bound.
 
-    Bounds of the jerks [rad/s^3] have shape (n,), the largest errors of positions, velocities and accelerations (3,).
-    Fewer than three samples with positions alone raise UsageError.
+    Bounds of the jerks [rad/s^3] have shape (n,), the largest errors of positions,
+    velocities and accelerations (3,). Fewer than three samples with positions alone
+    raise UsageError.
     """
     data = data_of(trajectory)
     if len(data) == 1:
         if len(trajectory.t) < STENCIL - 1:
-            raise UsageError("a bound of the jerk needs at least 3 samples of positions", concerns="max_jerk")
+            raise UsageError(
+                "a bound of the jerk needs at least 3 samples of positions",
+                concerns="max_jerk",
+            )
         chosen = _thinned(trajectory.t, float(max_jerk.min()), float(noise[0]))
         t, data = trajectory.t[chosen], [trajectory.q[chosen]]
         h = np.diff(t)
@@ -92,18 +124,28 @@ def bounded_jerk(trajectory: Trajectory, max_jerk: Array, noise: Array) -> Curve
         t = trajectory.t
         h = np.diff(t)
         orders = np.tile(np.arange(len(data)), 2)
-        nodes = np.broadcast_to(np.repeat([0.0, 1.0], len(data)), (len(h), 2 * len(data)))
-        weights = np.broadcast_to(hermite_weights(len(data)), (len(h), 2 * len(data), 2 * len(data)))
+        nodes = np.broadcast_to(
+            np.repeat([0.0, 1.0], len(data)), (len(h), 2 * len(data))
+        )
+        weights = np.broadcast_to(
+            hermite_weights(len(data)), (len(h), 2 * len(data), 2 * len(data))
+        )
         of_data = span_data(data, h)
     coefficients = np.einsum("scw,swn->csn", weights, of_data)
     scaled_noise = np.asarray(noise)[orders] * h[:, None] ** orders
     bounds = []
     for order in range(3):
         kernel = _kernel_norms(nodes, orders, weights, order)
-        from_noise = np.abs(differentiated(weights, order) * scaled_noise[:, None]).sum(axis=2).max(axis=1)
+        from_noise = (
+            np.abs(differentiated(weights, order) * scaled_noise[:, None])
+            .sum(axis=2)
+            .max(axis=1)
+        )
         error = (kernel * h**3)[:, None] * max_jerk + from_noise[:, None]
         bounds.append(error / h[:, None] ** order)
-    family = CurveFamily(t, coefficients, (bounds[0], bounds[1], bounds[2], np.zeros_like(bounds[0])))
+    family = CurveFamily(
+        t, coefficients, (bounds[0], bounds[1], bounds[2], np.zeros_like(bounds[0]))
+    )
     if not _is_consistent(family, weights, scaled_noise, data, max_jerk, noise):
         return None
     wide = np.repeat(max_jerk[None], len(h), axis=0)
@@ -112,7 +154,11 @@ def bounded_jerk(trajectory: Trajectory, max_jerk: Array, noise: Array) -> Curve
 
 def data_of(trajectory: Trajectory) -> list[Array]:
     """Return the positions and the derivatives that there are, shape (K, n) each."""
-    return [values for values in (trajectory.q, trajectory.dq, trajectory.ddq) if values is not None]
+    return [
+        values
+        for values in (trajectory.q, trajectory.dq, trajectory.ddq)
+        if values is not None
+    ]
 
 
 def _thinned(t: Array, max_jerk: float, noise: float) -> NDArray[np.intp]:
@@ -124,15 +170,24 @@ def _thinned(t: Array, max_jerk: float, noise: float) -> NDArray[np.intp]:
 
 def span_data(data: list[Array], h: Array) -> Array:
     """Return the scaled data of both ends of every span, shape (S, 2 m, n)."""
-    scaled = [[values[end:][: len(h)] * h[:, None] ** order for order, values in enumerate(data)] for end in (0, 1)]
+    scaled = [
+        [
+            values[end:][: len(h)] * h[:, None] ** order
+            for order, values in enumerate(data)
+        ]
+        for end in (0, 1)
+    ]
     return np.stack([*scaled[0], *scaled[1]], axis=1)
 
 
-def polynomials_of_positions(t: Array, q: Array, neighbors: int) -> tuple[Array, Array, Array]:
+def polynomials_of_positions(
+    t: Array, q: Array, neighbors: int
+) -> tuple[Array, Array, Array]:
     """Return polynomials through K positions [rad], shape (K, n), around every span between times [s], shape (K,).
 
-    At most W neighbors determine each. The results are nodes, where the span is [0, 1], shape (S, W), weights of the
-    positions for the Bernstein coefficients, shape (S, W, W), and the positions, shape (S, W, n).
+    At most W neighbors determine each. The results are nodes, where the span is [0, 1],
+    shape (S, W), weights of the positions for the Bernstein coefficients, shape (S, W,
+    W), and the positions, shape (S, W, n).
     """
     size, count = min(neighbors, len(t)), len(t) - 1
     first = np.clip(np.arange(count) - (size // 2 - 1), 0, len(t) - size)
@@ -156,7 +211,9 @@ def hermite_weights(m: int) -> Array:
 def _lagrange_weights(nodes: Array) -> Array:
     """Return weights from values at nodes, shape (S, k), to Bernstein coefficients on [0, 1], shape (S, k, k)."""
     size = nodes.shape[1]
-    powers = np.zeros((len(nodes), size, size))  # of the phase, for the polynomial that is 1 at one node
+    powers = np.zeros(
+        (len(nodes), size, size)
+    )  # of the phase, for the polynomial that is 1 at one node
     for node in range(size):
         polynomial = np.zeros((len(nodes), size))
         polynomial[:, 0] = 1.0
@@ -166,7 +223,9 @@ def _lagrange_weights(nodes: Array) -> Array:
                 product = shifted - nodes[:, other, None] * polynomial
                 polynomial = product / (nodes[:, node] - nodes[:, other])[:, None]
         powers[:, :, node] = polynomial
-    to_bernstein = np.array([[comb(i, k) / comb(size - 1, k) for k in range(size)] for i in range(size)])
+    to_bernstein = np.array(
+        [[comb(i, k) / comb(size - 1, k) for k in range(size)] for i in range(size)]
+    )
     return np.asarray(to_bernstein @ powers)
 
 
@@ -174,29 +233,43 @@ def differentiated(weights: Array, order: int) -> Array:
     """Differentiate Bernstein coefficients (..., d + 1, W) by the phase of the span."""
     for _ in range(order):
         degree = weights.shape[-2] - 1
-        weights = degree * np.diff(weights, axis=-2) if degree else np.zeros_like(weights)
+        weights = (
+            degree * np.diff(weights, axis=-2) if degree else np.zeros_like(weights)
+        )
     return weights
 
 
-def _kernel_norms(nodes: Array, orders: NDArray[np.intp], weights: Array, order: int) -> Array:
+def _kernel_norms(
+    nodes: Array, orders: NDArray[np.intp], weights: Array, order: int
+) -> Array:
     """Integrate the absolute Peano kernel of a derivative over the nodes of every span, at most over it, shape (S,)."""
-    _, chosen, inverse = np.unique(np.round(nodes, 6), axis=0, return_index=True, return_inverse=True)
+    _, chosen, inverse = np.unique(
+        np.round(nodes, 6), axis=0, return_index=True, return_inverse=True
+    )
     norms = np.empty(len(chosen))
     for row, index in enumerate(chosen):
         norms[row] = _kernel_norm(nodes[index], orders, weights[index], order)
     return np.asarray(norms[inverse.ravel()])
 
 
-def _kernel_norm(nodes: Array, orders: NDArray[np.intp], weights: Array, order: int) -> float:
+def _kernel_norm(
+    nodes: Array, orders: NDArray[np.intp], weights: Array, order: int
+) -> float:
     """Return the integral of one span; see ``_kernel_norms``."""
     low, high = min(nodes.min(), 0.0), max(nodes.max(), 1.0)
     tau = low + (high - low) * (np.arange(KERNEL_NODES) + 0.5) / KERNEL_NODES
     u = np.linspace(0, 1, KERNEL_PHASES)
     coefficients = differentiated(weights, order)
     degree = len(coefficients) - 1
-    basis = np.stack([comb(degree, k) * u**k * (1 - u) ** (degree - k) for k in range(degree + 1)])
-    from_data = np.stack([_truncated(node - tau, 2 - k) for node, k in zip(nodes, orders, strict=True)])
-    kernel = _truncated(u[:, None] - tau, 2 - order) - (basis.T @ coefficients) @ from_data
+    basis = np.stack(
+        [comb(degree, k) * u**k * (1 - u) ** (degree - k) for k in range(degree + 1)]
+    )
+    from_data = np.stack(
+        [_truncated(node - tau, 2 - k) for node, k in zip(nodes, orders, strict=True)]
+    )
+    kernel = (
+        _truncated(u[:, None] - tau, 2 - order) - (basis.T @ coefficients) @ from_data
+    )
     return float(np.abs(kernel).mean(axis=1).max() * (high - low) * KERNEL_MARGIN)
 
 
@@ -206,12 +279,18 @@ def _truncated(x: Array, power: int) -> Array:
 
 
 def _is_consistent(  # noqa: PLR0917 - the family with everything that it was made of
-    family: CurveFamily, weights: Array, scaled_noise: Array, data: list[Array], max_jerk: Array, noise: Array
+    family: CurveFamily,
+    weights: Array,
+    scaled_noise: Array,
+    data: list[Array],
+    max_jerk: Array,
+    noise: Array,
 ) -> bool:
     """Return whether a curve with bounded jerks can pass through the samples: a necessary condition.
 
-    The third derivative of a cubic through data is a mean of the jerks of every curve through the data. Accelerations
-    of samples change by at most the bound times the time between them.
+    The third derivative of a cubic through data is a mean of the jerks of every curve
+    through the data. Accelerations of samples change by at most the bound times the
+    time between them.
     """
     h = np.diff(family.t)[:, None]
     limit = max_jerk * (1 + CONSISTENCY_TOLERANCE)
@@ -224,5 +303,9 @@ def _is_consistent(  # noqa: PLR0917 - the family with everything that it was ma
     third = family.polynomials.jerk
     assert third is not None
     jerk = np.abs(third[0])
-    from_noise = (np.abs(differentiated(weights, 3)) * scaled_noise[:, None]).sum(axis=2).max(axis=1)
+    from_noise = (
+        (np.abs(differentiated(weights, 3)) * scaled_noise[:, None])
+        .sum(axis=2)
+        .max(axis=1)
+    )
     return bool((jerk <= limit + (from_noise[:, None] + 8 * rounding) / h**3).all())

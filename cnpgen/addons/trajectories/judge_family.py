@@ -1,8 +1,9 @@
 """Verdict on a family of curves: valid if all of them are valid, invalid if none is, otherwise undecided.
 
-It is the verdict on plans (``cnpgen.judges.plans``) with a bound of the error of every value. Joint limits are proven
-from Bernstein coefficients, distances by interval subdivision, and smooth conditions at samples and local maxima. A
-sampled trajectory without phases has the share of its duration as phase.
+It is the verdict on plans (``cnpgen.judges.plans``) with a bound of the error of every
+value. Joint limits are proven from Bernstein coefficients, distances by interval
+subdivision, and smooth conditions at samples and local maxima. A sampled trajectory
+without phases has the share of its duration as phase.
 """
 
 from collections.abc import Sequence
@@ -14,16 +15,38 @@ from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.curve_family import ORDERS, UNDEFINED, CurveFamily
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.addons.trajectories.trajectory_verdict import ConditionDecision, Decision, TrajectoryVerdict
+from cnpgen.addons.trajectories.trajectory_verdict import (
+    ConditionDecision,
+    Decision,
+    TrajectoryVerdict,
+)
 from cnpgen.addons.trajectories.uncertainty import uncertainty_of
 from cnpgen.judges.plans.bernstein import find_maximum
-from cnpgen.judges.plans.continuous_collision import check_continuous_collision, is_contact, pairs_of
+from cnpgen.judges.plans.continuous_collision import (
+    check_continuous_collision,
+    is_contact,
+    pairs_of,
+)
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
-from cnpgen.judges.plans.joint_limits import ProvenJointLimits, joint_limits, quantity_of
+from cnpgen.judges.plans.joint_limits import (
+    ProvenJointLimits,
+    joint_limits,
+    quantity_of,
+)
 from cnpgen.judges.plans.judge import check_step
 from cnpgen.judges.plans.local_maxima import check_local_maxima
-from cnpgen.judges.plans.measure import EvaluationContext, MeasuredCondition, by_name, evaluation_context
-from cnpgen.judges.plans.sampling import MAX_DURATION_S, MAX_TIME_SAMPLES, Samples, times
+from cnpgen.judges.plans.measure import (
+    EvaluationContext,
+    MeasuredCondition,
+    by_name,
+    evaluation_context,
+)
+from cnpgen.judges.plans.sampling import (
+    MAX_DURATION_S,
+    MAX_TIME_SAMPLES,
+    Samples,
+    times,
+)
 from cnpgen.judges.plans.verdict import ZERO_TOLERANCE, Margin, Reason
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
@@ -34,7 +57,9 @@ from cnpgen.world.path import PathWorld
 Array = NDArray[np.float64]
 
 MIN_SPAN_PARTS = 2  # between two knots
-DECIDING_ERROR = 1e3  # an error this large, in SI units, is that of a missing derivative
+DECIDING_ERROR = (
+    1e3  # an error this large, in SI units, is that of a missing derivative
+)
 
 
 class FamilyJudge:
@@ -46,13 +71,19 @@ class FamilyJudge:
     def __init__(self, problem: Problem, robot: Robot, *, step: float = 1e-3) -> None:
         check_step(step)
         self._problem, self._robot, self._step = problem, robot, step
-        self._world, self._moved = (PathWorld(robot, problem.obstacle, problem.object_size) for _ in range(2))
+        self._world, self._moved = (
+            PathWorld(robot, problem.obstacle, problem.object_size) for _ in range(2)
+        )
         self._limits = joint_limits(problem, self._world)
 
     def limits(self, parameters: Array | None = None) -> ProvenJointLimits:
         """Return the joint limits of the problem with parameters of shape (p,), nominal by default."""
         names = self._problem.parameters.names
-        return self._limits if parameters is None else self._limits.scaled(dict(zip(names, parameters, strict=True)))
+        return (
+            self._limits
+            if parameters is None
+            else self._limits.scaled(dict(zip(names, parameters, strict=True)))
+        )
 
     def __call__(
         self,
@@ -64,26 +95,39 @@ class FamilyJudge:
     ) -> TrajectoryVerdict:
         """Judge one family; values that cannot be evaluated give an undecided verdict.
 
-        The trajectory has the samples, with phases and parameters; without them, phases are shares of the duration, and
-        parameters nominal. The scene has poses and sizes of the obstacles, then values for a constraint and parameters,
-        shape (width,); by default, they follow from the ends of the curves and the parameters. Joint limits that
-        ``smooth``, another curve at the same times, violates are not valid.
+        The trajectory has the samples, with phases and parameters; without them, phases
+        are shares of the duration, and parameters nominal. The scene has poses and
+        sizes of the obstacles, then values for a constraint and parameters, shape
+        (width,); by default, they follow from the ends of the curves and the
+        parameters. Joint limits that ``smooth``, another curve at the same times,
+        violates are not valid.
         """
         if not family.duration < MAX_DURATION_S or len(family.t) > MAX_TIME_SAMPLES:
             reason = f"{Reason.TOO_LONG}: at most {MAX_DURATION_S:g} s and {MAX_TIME_SAMPLES:,} samples are judged"
-            return TrajectoryVerdict(Decision.UNDECIDED, reason, duration=family.duration)
+            return TrajectoryVerdict(
+                Decision.UNDECIDED, reason, duration=family.duration
+            )
         with np.errstate(all="ignore"):  # overflows give inf or nan, which are detected
             return self._judge(family, trajectory, scene, smooth)
 
     def _judge(
-        self, family: CurveFamily, trajectory: Trajectory, scene: Array | None, smooth: CurveFamily | None
+        self,
+        family: CurveFamily,
+        trajectory: Trajectory,
+        scene: Array | None,
+        smooth: CurveFamily | None,
     ) -> TrajectoryVerdict:
         s = checked_phases(family, self._step)
         table = np.array([[0.0, 1.0], [0.0, family.duration]])
         samples = Samples(s, times(s, table))
         states = family.evaluate(s, jerk=self._problem.uses_jerk)
         if not states.is_finite():
-            return TrajectoryVerdict(Decision.UNDECIDED, Reason.NOT_FINITE, duration=family.duration, samples=len(s))
+            return TrajectoryVerdict(
+                Decision.UNDECIDED,
+                Reason.NOT_FINITE,
+                duration=family.duration,
+                samples=len(s),
+            )
         if scene is None:
             poses = self._obstacle_poses(states.q, states.dq, trajectory.parameters)
             scenes = self._possible_scenes(family, states, poses, trajectory.parameters)
@@ -91,39 +135,64 @@ class FamilyJudge:
             poses, scenes = scene, []
         self._world.set_path(states.q, states.dq, states.ddq, poses, states.jerk)
         phase_of = trajectory.phase_of()
-        context = evaluation_context(self._problem, family, poses, self._world, samples, table, phase_of)
-        errors = uncertainty_of(self._problem, family, self._moved, [poses, *scenes], context.measured, s)
+        context = evaluation_context(
+            self._problem, family, poses, self._world, samples, table, phase_of
+        )
+        errors = uncertainty_of(
+            self._problem, family, self._moved, [poses, *scenes], context.measured, s
+        )
         measured = [errors.add(condition, s) for condition in context.measured]
         context = replace(context, measured=measured, with_uncertainty=errors.add)
         limits = self._limits.scaled(self._world.parameters.values)
-        entries = [*_limit_entries(limits, family, smooth, samples), *_measured_entries(context)]
+        entries = [
+            *_limit_entries(limits, family, smooth, samples),
+            *_measured_entries(context),
+        ]
         names = list(by_name([entry.margin for entry in entries]))
         return _verdict(dict(zip(names, entries, strict=True)), family.duration, len(s))
 
     def _obstacle_poses(self, q: Array, dq: Array, parameters: Array | None) -> Array:
         """Place the obstacles, and the puck of a hit, by the tip at both ends."""
-        (ends, speeds), still = (np.ascontiguousarray(x[:, [0, -1]]) for x in (q, dq)), np.zeros((len(q), 2))
+        (ends, speeds), still = (
+            (np.ascontiguousarray(x[:, [0, -1]]) for x in (q, dq)),
+            np.zeros((len(q), 2)),
+        )
         poses = scene_of(self._problem, *np.zeros((3, 1, 3))).poses[0]
         self._world.set_path(ends, speeds, still, poses, still)
         start, goal = self._world.tip_position.T[:, None].copy()
         rows = None if parameters is None else parameters[None]
-        return np.asarray(scene_of(self._problem, start, goal, self._world.tip_velocity[:, 1:].T, rows).poses[0])
+        return np.asarray(
+            scene_of(
+                self._problem, start, goal, self._world.tip_velocity[:, 1:].T, rows
+            ).poses[0]
+        )
 
     def _possible_scenes(
-        self, family: CurveFamily, states: EvaluatedTrajectory, poses: Array, parameters: Array | None
+        self,
+        family: CurveFamily,
+        states: EvaluatedTrajectory,
+        poses: Array,
+        parameters: Array | None,
     ) -> list[Array]:
         """Return scenes whose values of the motion, such as a puck, are those of other curves of the family."""
         if self._problem.scene_constraint is None:
             return []
         position, velocity, acceleration = (bound[-1] for bound in family.bounds[:3])
         if (acceleration >= UNDEFINED).all():  # velocities jump between spans
-            velocity = velocity + np.abs(states.dq[:, -1] - family.polynomials.dq[-1, max(len(family.t) - 3, 0)])
+            velocity = velocity + np.abs(
+                states.dq[:, -1] - family.polynomials.dq[-1, max(len(family.t) - 3, 0)]
+            )
         scenes, known = [], pose_width(self._problem.obstacle)
-        for (order, bound), sign in product({"q": position, "dq": velocity}.items(), (-1.0, 1.0)):
+        for (order, bound), sign in product(
+            {"q": position, "dq": velocity}.items(), (-1.0, 1.0)
+        ):
             if not bound.any():
                 continue
             for joint in (None, *np.flatnonzero(bound).tolist()):
-                ends = {name: getattr(states, name)[:, [0, -1]].copy() for name in ("q", "dq")}
+                ends = {
+                    name: getattr(states, name)[:, [0, -1]].copy()
+                    for name in ("q", "dq")
+                }
                 moved = slice(None) if joint is None else joint
                 ends[order][moved, -1] += sign * bound[moved]
                 scene = self._obstacle_poses(ends["q"], ends["dq"], parameters)
@@ -134,15 +203,23 @@ class FamilyJudge:
 def checked_phases(family: CurveFamily, step: float) -> Array:
     """Return phases at and between the knots, with both sides of every knot, at steps of at most ``step`` [s]."""
     count = max(1, int(np.ceil(MAX_TIME_SAMPLES / len(family.t))))
-    parts = np.clip(np.ceil(np.diff(family.t) / step).astype(np.intp), MIN_SPAN_PARTS, count + MIN_SPAN_PARTS)
+    parts = np.clip(
+        np.ceil(np.diff(family.t) / step).astype(np.intp),
+        MIN_SPAN_PARTS,
+        count + MIN_SPAN_PARTS,
+    )
     first = np.repeat(np.cumsum(parts) - parts, parts)
     share = (np.arange(parts.sum()) - first) / np.repeat(parts, parts)
     low, high = (np.repeat(family.edges[k:][: len(parts)], parts) for k in (0, 1))
     inner = low + share * (high - low)
-    return np.unique(np.concatenate([inner, np.nextafter(family.edges[1:-1], 0.0), family.edges]))
+    return np.unique(
+        np.concatenate([inner, np.nextafter(family.edges[1:-1], 0.0), family.edges])
+    )
 
 
-def _decided(margin: Margin, error: float, certain: float, *shares: float) -> ConditionDecision:
+def _decided(
+    margin: Margin, error: float, certain: float, *shares: float
+) -> ConditionDecision:
     """Decide a condition by the worst margin of any curve and the largest relative violation that every curve has."""
     if margin.ok:
         decision, reason = Decision.VALID, ""
@@ -168,9 +245,15 @@ def _share(mask: NDArray[np.bool_], t: Array) -> float:
 
 
 def _limit_entries(
-    limits: ProvenJointLimits, family: CurveFamily, smooth: CurveFamily | None, samples: Samples
+    limits: ProvenJointLimits,
+    family: CurveFamily,
+    smooth: CurveFamily | None,
+    samples: Samples,
 ) -> list[ConditionDecision]:
-    """Decide the joint limits; a violation by the smooth curve leaves a limit undecided."""
+    """Decide the joint limits.
+
+    A violation by the smooth curve leaves a limit undecided.
+    """
     entries, curves = [], [family] if smooth is None else [family, smooth]
     states = [curve.evaluate(samples.s, jerk=True) for curve in curves]
     bounds_at = dict(zip(ORDERS, family.bounds_at(samples.s), strict=True))
@@ -178,8 +261,15 @@ def _limit_entries(
     n = len(limits.joints)
     rows = np.arange(2 * n) % n
     for limit, constraint in enumerate(limits.constraints):
-        name, bound, scale = quantity_of(constraint), limits.bounds[limit], limits.scale[limit]
-        nominal, *others = ((getattr(curve.polynomials, name)[..., rows] - bound) / scale for curve in curves)
+        name, bound, scale = (
+            quantity_of(constraint),
+            limits.bounds[limit],
+            limits.scale[limit],
+        )
+        nominal, *others = (
+            (getattr(curve.polynomials, name)[..., rows] - bound) / scale
+            for curve in curves
+        )
         error = bounds[name][:, rows] / np.abs(scale)
         possible = find_maximum(nominal + error, family.edges)
         for other in others:
@@ -187,13 +277,24 @@ def _limit_entries(
         certain = find_maximum(nominal - error, family.edges)[0]
         t = float(possible[2] * family.duration)
         margin = limits.margin_at(limit, possible, t)
-        span = min(int(np.searchsorted(family.edges, possible[2], "right")) - 1, len(family.t) - 2)
+        span = min(
+            int(np.searchsorted(family.edges, possible[2], "right")) - 1,
+            len(family.t) - 2,
+        )
         joint = possible[1] % n
-        there = [getattr(curve.evaluate(np.array(possible[2:]), jerk=True), name)[joint, 0] for curve in curves]
+        there = [
+            getattr(curve.evaluate(np.array(possible[2:]), jerk=True), name)[joint, 0]
+            for curve in curves
+        ]
         uncertainty = max(float(bounds[name][span, joint]), float(np.ptp(there)))
-        at, *others = ((getattr(state, name)[rows].T - bound) / scale for state in states)
+        at, *others = (
+            (getattr(state, name)[rows].T - bound) / scale for state in states
+        )
         error_at = bounds_at[name][rows].T / np.abs(scale)
-        highest, lowest = np.max([at + error_at, *others], axis=(0, 2)), (at - error_at).max(axis=1)
+        highest, lowest = (
+            np.max([at + error_at, *others], axis=(0, 2)),
+            (at - error_at).max(axis=1),
+        )
         violated = _share(lowest > 1, samples.t)
         share = _share((highest > 1) & (lowest <= 1), samples.t)
         entries.append(_decided(margin, uncertainty, certain, violated, share))
@@ -203,19 +304,30 @@ def _limit_entries(
 def _measured_entries(context: EvaluationContext) -> list[ConditionDecision]:
     """Decide the measured conditions; the world of the context is moved."""
     t, samples = context.samples.t, context.samples
-    worst = {id(condition): condition.margin(context.problem, samples) for condition in context.measured}
+    worst = {
+        id(condition): condition.margin(context.problem, samples)
+        for condition in context.measured
+    }
     certain, masks = {}, {}
     for condition in context.measured:
         violated, possible = _violation_masks(context, condition)
         masks[id(condition)] = _share(violated, t), _share(possible & ~violated, t)
         certain[id(condition)] = float(_certain(context, condition).max())
-    between = chain(check_continuous_collision(context, early_exit=False), check_local_maxima(context))
+    between = chain(
+        check_continuous_collision(context, early_exit=False),
+        check_local_maxima(context),
+    )
     for condition, margin in between:
         key = id(condition)
-        error = float(np.max(condition.uncertainty))  # that of the margin is at most as large
+        error = float(
+            np.max(condition.uncertainty)
+        )  # that of the margin is at most as large
         worst[key] = max(worst[key], margin, key=lambda candidate: candidate.severity)
         if context.phase_of is not None or not condition.relaxation.any():
-            certain[key] = max(certain[key], (margin.violation - 2 * error) / max(margin.tolerance, ZERO_TOLERANCE))
+            certain[key] = max(
+                certain[key],
+                (margin.violation - 2 * error) / max(margin.tolerance, ZERO_TOLERANCE),
+            )
     entries = []
     for condition in context.measured:
         key = id(condition)
@@ -228,9 +340,13 @@ def _certain(context: EvaluationContext, condition: MeasuredCondition) -> Array:
     """Return the relative violations that every curve has, whatever its phases are if unknown, shape (m, K)."""
     excess: Array | float = 0.0
     if context.phase_of is None:
-        excess = condition.relaxation.max() - condition.relaxation  # bounds are widest at some phase
+        excess = (
+            condition.relaxation.max() - condition.relaxation
+        )  # bounds are widest at some phase
     certain = condition.violation - 2 * condition.uncertainty - excess
-    return np.asarray(certain / np.maximum(condition.tolerance, ZERO_TOLERANCE)[:, None])
+    return np.asarray(
+        certain / np.maximum(condition.tolerance, ZERO_TOLERANCE)[:, None]
+    )
 
 
 def _violation_masks(
@@ -238,15 +354,22 @@ def _violation_masks(
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return masks of the samples that every curve violates, and that some curve violates, shape (K,)."""
     if is_contact(condition.constraint):
-        pairs, required = pairs_of(context.world, condition.constraint), condition.condition.lower - condition.tolerance
+        pairs, required = (
+            pairs_of(context.world, condition.constraint),
+            condition.condition.lower - condition.tolerance,
+        )
         low = float(np.max(required - condition.uncertainty, initial=-np.inf))
         high = float(np.max(required + condition.uncertainty, initial=-np.inf))
         return ~pairs.clear_states(low), ~pairs.clear_states(high)
     possible = condition.relative_violation > 1
-    return np.asarray((_certain(context, condition) > 1).any(axis=0)), np.asarray(possible.any(axis=0))
+    return np.asarray((_certain(context, condition) > 1).any(axis=0)), np.asarray(
+        possible.any(axis=0)
+    )
 
 
-def _error_at(context: EvaluationContext, condition: MeasuredCondition, margin: Margin) -> float:
+def _error_at(
+    context: EvaluationContext, condition: MeasuredCondition, margin: Margin
+) -> float:
     """Return the error of a condition where a margin was measured."""
     uncertainty = condition.uncertainty
     if isinstance(uncertainty, float):
@@ -255,11 +378,17 @@ def _error_at(context: EvaluationContext, condition: MeasuredCondition, margin: 
     return float(np.asarray(uncertainty)[:, k].max())
 
 
-def _verdict(conditions: dict[str, ConditionDecision], duration: float, samples: int) -> TrajectoryVerdict:
+def _verdict(
+    conditions: dict[str, ConditionDecision], duration: float, samples: int
+) -> TrajectoryVerdict:
     """Combine the decisions on all conditions."""
     for decision in (Decision.INVALID, Decision.UNDECIDED):
-        deciding: Sequence[ConditionDecision] = [c for c in conditions.values() if c.decision == decision]
+        deciding: Sequence[ConditionDecision] = [
+            c for c in conditions.values() if c.decision == decision
+        ]
         if deciding:
             worst = max(deciding, key=lambda entry: entry.margin.severity)
-            return TrajectoryVerdict(decision, worst.reason, conditions, duration, samples)
+            return TrajectoryVerdict(
+                decision, worst.reason, conditions, duration, samples
+            )
     return TrajectoryVerdict(Decision.VALID, "", conditions, duration, samples)

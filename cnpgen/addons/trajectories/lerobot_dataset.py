@@ -1,7 +1,8 @@
 """Export format of LeRobot: plans as episodes of a LeRobotDataset v3.0, for imitation learning.
 
-A frame has the positions and velocities as ``observation.state``, goal, task columns and scene as
-``observation.environment_state``, and the positions at the next frame as ``action``.
+A frame has the positions and velocities as ``observation.state``, goal, task columns
+and scene as ``observation.environment_state``, and the positions at the next frame as
+``action``.
 """
 
 import json
@@ -13,7 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.addons.trajectories.trajectory_tables import LEROBOT_ENVIRONMENT, LEROBOT_INFO
+from cnpgen.addons.trajectories.trajectory_tables import (
+    LEROBOT_ENVIRONMENT,
+    LEROBOT_INFO,
+)
 from cnpgen.errors import UsageError, requires_extra
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan
 from cnpgen.plans.formats import fixed_lists, write_parquet
@@ -30,14 +34,20 @@ DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
 STATE, ENVIRONMENT, ACTION = "observation.state", LEROBOT_ENVIRONMENT, "action"
 QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
-_INDICES = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64"}
+_INDICES = {
+    "timestamp": "float32",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+}
 
 
 @dataclass(frozen=True)
 class LeRobotDataset(Exporter):
     """A folder with a LeRobotDataset v3.0: one episode per plan, frames at the rate of the export.
 
-    Plans that last less than one frame have one. ``observation.environment_state`` is absent if there are no values.
+    Plans that last less than one frame have one. ``observation.environment_state`` is
+    absent if there are no values.
     """
 
     suffix = "-lerobot"
@@ -45,13 +55,16 @@ class LeRobotDataset(Exporter):
     is_folder = True
     uses_environment = True
 
-    def write(self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet) -> None:
+    def write(
+        self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet
+    ) -> None:
         """Write the dataset, its description last; see ``Exporter.write``."""
         with requires_extra("parquet", "pyarrow"):
             import pyarrow  # noqa: F401
         if exported.rate != round(exported.rate):
             raise UsageError(
-                f"LeRobot needs a whole number of frames per second, got {exported.rate:g}", concerns="rate"
+                f"LeRobot needs a whole number of frames per second, got {exported.rate:g}",
+                concerns="rate",
             )
         if (path / LEROBOT_INFO).exists():
             (path / LEROBOT_INFO).unlink()  # an incomplete dataset has none
@@ -60,7 +73,10 @@ class LeRobotDataset(Exporter):
         task = f"{exported.problem}: move to the goal"
         _write_episodes(path, episodes, files, task)
         _write_tasks(path, task)
-        write_file(path / "meta" / "stats.json", json.dumps(_statistics(_joined(episodes)), indent=2))
+        write_file(
+            path / "meta" / "stats.json",
+            json.dumps(_statistics(_joined(episodes)), indent=2),
+        )
         info = _info(exported, names, [len(episode["index"]) for episode in episodes])
         write_file(path / LEROBOT_INFO, json.dumps(info, indent=2))
 
@@ -74,14 +90,26 @@ def _names(exported: ExportedSet) -> dict[str, list[str]]:
         for k in range(values.shape[1])
     ]
     state = [*joints, *(f"{joint}_velocity" for joint in joints)]
-    return {STATE: state, **({ENVIRONMENT: environment} if environment else {}), ACTION: list(joints)}
+    return {
+        STATE: state,
+        **({ENVIRONMENT: environment} if environment else {}),
+        ACTION: list(joints),
+    }
 
 
 def _write_frames(
-    path: Path, plans: Iterable[SampledPlan], exported: ExportedSet, names: Mapping[str, list[str]]
+    path: Path,
+    plans: Iterable[SampledPlan],
+    exported: ExportedSet,
+    names: Mapping[str, list[str]],
 ) -> tuple[list[Episode], list[int]]:
-    """Write the files of frames; return the episodes and the index of the file of each."""
-    environment = np.concatenate([np.empty((len(exported.index), 0)), *exported.environment.values()], axis=1)
+    """Write the files of frames.
+
+    Return the episodes and the index of the file of each.
+    """
+    environment = np.concatenate(
+        [np.empty((len(exported.index), 0)), *exported.environment.values()], axis=1
+    )
     episodes: list[Episode] = []
     files: list[int] = []
     file = size = first = begin = 0
@@ -101,11 +129,19 @@ def _write_frames(
 
 def _joined(episodes: list[Episode]) -> Episode:
     """Return the columns of several episodes, one after the other."""
-    return {name: np.concatenate([episode[name] for episode in episodes]) for name in episodes[0]}
+    return {
+        name: np.concatenate([episode[name] for episode in episodes])
+        for name in episodes[0]
+    }
 
 
-def _frames(plan: SampledPlan, rate: float, environment: Values, number: int, first: int) -> dict[str, Values]:
-    """Return the columns of one episode; the last sample of the plan is the last action."""
+def _frames(
+    plan: SampledPlan, rate: float, environment: Values, number: int, first: int
+) -> dict[str, Values]:
+    """Return the columns of one episode.
+
+    The last sample of the plan is the last action.
+    """
     count = len(plan.t) - 1
     frame = np.arange(count)
     return {
@@ -125,11 +161,19 @@ def _write_file(path: Path, episodes: list[Episode], file: int) -> None:
     import pyarrow
 
     chunk, index = divmod(file, MAX_CHUNK_FILES)
-    columns = {name: fixed_lists(values) if values.ndim == 2 else values for name, values in _joined(episodes).items()}
-    write_parquet(path / DATA_PATH.format(chunk_index=chunk, file_index=index), pyarrow.table(columns))
+    columns = {
+        name: fixed_lists(values) if values.ndim == 2 else values
+        for name, values in _joined(episodes).items()
+    }
+    write_parquet(
+        path / DATA_PATH.format(chunk_index=chunk, file_index=index),
+        pyarrow.table(columns),
+    )
 
 
-def _write_episodes(path: Path, episodes: list[Episode], files: list[int], task: str) -> None:
+def _write_episodes(
+    path: Path, episodes: list[Episode], files: list[int], task: str
+) -> None:
     """Write the table of episodes with their statistics."""
     import pyarrow
 
@@ -159,13 +203,31 @@ def _write_tasks(path: Path, task: str) -> None:
 
     index = "__index_level_0__"
     columns: list[dict[str, Any]] = [
-        {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64"},
-        {"name": None, "field_name": index, "pandas_type": "unicode", "numpy_type": "object"},
+        {
+            "name": "task_index",
+            "field_name": "task_index",
+            "pandas_type": "int64",
+            "numpy_type": "int64",
+        },
+        {
+            "name": None,
+            "field_name": index,
+            "pandas_type": "unicode",
+            "numpy_type": "object",
+        },
     ]
     described = [{**column, "metadata": None} for column in columns]
-    metadata = {"index_columns": [index], "column_indexes": [], "columns": described, "pandas_version": "2.0.0"}
+    metadata = {
+        "index_columns": [index],
+        "column_indexes": [],
+        "columns": described,
+        "pandas_version": "2.0.0",
+    }
     table = pyarrow.table({"task_index": np.zeros(1, np.int64), index: [task]})
-    write_parquet(path / "meta" / "tasks.parquet", table.replace_schema_metadata({"pandas": json.dumps(metadata)}))
+    write_parquet(
+        path / "meta" / "tasks.parquet",
+        table.replace_schema_metadata({"pandas": json.dumps(metadata)}),
+    )
 
 
 def _statistics(columns: Mapping[str, Values]) -> dict[str, dict[str, list[float]]]:
@@ -173,19 +235,34 @@ def _statistics(columns: Mapping[str, Values]) -> dict[str, dict[str, list[float
     statistics = {}
     for name, values in columns.items():
         rows = values.reshape(len(values), -1).astype(float)
-        entry = {"min": rows.min(axis=0), "max": rows.max(axis=0), "mean": rows.mean(axis=0), "std": rows.std(axis=0)}
-        entry |= {f"q{round(100 * q):02d}": np.quantile(rows, q, axis=0) for q in QUANTILES}
-        statistics[name] = {key: found.tolist() for key, found in entry.items()} | {"count": [len(rows)]}
+        entry = {
+            "min": rows.min(axis=0),
+            "max": rows.max(axis=0),
+            "mean": rows.mean(axis=0),
+            "std": rows.std(axis=0),
+        }
+        entry |= {
+            f"q{round(100 * q):02d}": np.quantile(rows, q, axis=0) for q in QUANTILES
+        }
+        statistics[name] = {key: found.tolist() for key, found in entry.items()} | {
+            "count": [len(rows)]
+        }
     return statistics
 
 
-def _info(exported: ExportedSet, names: Mapping[str, list[str]], lengths: list[int]) -> dict[str, Any]:
+def _info(
+    exported: ExportedSet, names: Mapping[str, list[str]], lengths: list[int]
+) -> dict[str, Any]:
     """Return the description of the dataset."""
     features: dict[str, Any] = {
-        key: {"dtype": "float32", "shape": [len(values)], "names": values} for key, values in names.items()
+        key: {"dtype": "float32", "shape": [len(values)], "names": values}
+        for key, values in names.items()
     }
     indices = {**_INDICES, "task_index": "int64"}
-    features |= {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in indices.items()}
+    features |= {
+        name: {"dtype": dtype, "shape": [1], "names": None}
+        for name, dtype in indices.items()
+    }
     return {
         "codebase_version": LEROBOT_VERSION,
         "robot_type": exported.problem,

@@ -12,7 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.addons.trajectories.trajectory_tables import TrajectoryTable, read_trajectory_tables
+from cnpgen.addons.trajectories.trajectory_tables import (
+    TrajectoryTable,
+    read_trajectory_tables,
+)
 from cnpgen.errors import UsageError, either, nearest
 from cnpgen.plans.format import PHASE_COLUMN
 from cnpgen.problems.problem import Problem
@@ -71,35 +74,55 @@ def load_trajectories(
 ) -> LoadedTrajectories:
     """Load sampled trajectories from a file or a folder; 'cnpgen docs trajectories' lists formats and columns.
 
-    Args:
-        path: CSV, JSON, YAML, NPZ, HDF5 or Parquet file, or a folder of them.
+    Args: path: CSV, JSON, YAML, NPZ, HDF5 or Parquet file, or a folder of them.
         problem: Problem, record, or name or path of a problem, pipeline or dataset.
-        joints: Names of the problem's joints in the file, in the problem's order; by default the same names. For arrays
+        joints: Names of the problem's joints in the file, in the problem's order; by
+        default the same names. For arrays
             without names: indices.
         unit: Unit of revolute joints in columns without a unit in their name.
         rate: Samples per second [Hz] of a file without times.
         separate_by: Column whose value differs from trajectory to trajectory.
-        unwrap: Whether revolute joints that jump by more than half a turn have passed the end of the range of angles.
-        parameters: Values of the problem's parameters that the file does not have, by name, in SI units.
+        unwrap: Whether revolute joints that jump by more than half a turn have passed
+            the end of the range of angles.
+        parameters: Values of the problem's parameters that the file does not have, by
+            name, in SI units.
 
-    Raises:
-        UsageError: A column is missing, a value is not finite, times do not increase, or the file is damaged.
-        UnitError: Positions without a unit are probably in degrees or millimetres, or times in milliseconds.
-        MissingExtraError: The format needs a package that is not installed.
+    Raises: UsageError: A column is missing, a value is not finite, times do not
+        increase, or the file is damaged. UnitError: Positions without a unit are
+        probably in degrees or millimetres, or times in milliseconds. MissingExtraError:
+        The format needs a package that is not installed.
     """
     record = as_record(problem)
     names = record.joint_names if joints is None else tuple(joints)
-    if len(names) != len(record.joint_names) or not all(isinstance(name, str) for name in names):
+    if len(names) != len(record.joint_names) or not all(
+        isinstance(name, str) for name in names
+    ):
         expected = f"one for each of {', '.join(record.joint_names)}"
-        raise UsageError(f"must have {len(record.joint_names)} names, {expected}, got {list(names)}", argument="joints")
+        raise UsageError(
+            f"must have {len(record.joint_names)} names, {expected}, got {list(names)}",
+            argument="joints",
+        )
     if rate is not None and not number("rate", rate) > 0:
         raise UsageError(f"must be above 0, got {rate}", argument="rate")
     _check_parameters(record, parameters or {})
     robot = open_problem(record)[1]
     try:
-        tables = [part for table in read_trajectory_tables(Path(path)) for part in _separated(table, separate_by)]
+        tables = [
+            part
+            for table in read_trajectory_tables(Path(path))
+            for part in _separated(table, separate_by)
+        ]
         readers = [
-            _Reader(table, record, names, unit == "deg", rate, unwrap, parameters or {}, robot.velocity_limit)
+            _Reader(
+                table,
+                record,
+                names,
+                unit == "deg",
+                rate,
+                unwrap,
+                parameters or {},
+                robot.velocity_limit,
+            )
             for table in tables
         ]
         trajectories = tuple(reader.trajectory() for reader in readers)
@@ -111,7 +134,9 @@ def load_trajectories(
     if unit == "rad":
         _check_unit(path, robot, [trajectory.q for trajectory in trajectories])
     ignored = dict.fromkeys(name for reader in readers for name in reader.unused())
-    return LoadedTrajectories(trajectories, tuple(table.place for table in tables), tuple(ignored))
+    return LoadedTrajectories(
+        trajectories, tuple(table.place for table in tables), tuple(ignored)
+    )
 
 
 def _check_unit(path: str | Path, robot: Robot, positions: Sequence[Array]) -> None:
@@ -124,15 +149,23 @@ def _check_unit(path: str | Path, robot: Robot, positions: Sequence[Array]) -> N
         raise UnitError(text, concerns="path", remedies={"unit": "deg"} if hint else {})
 
 
-def _separated(table: TrajectoryTable, separate_by: str | None) -> Iterator[TrajectoryTable]:
+def _separated(
+    table: TrajectoryTable, separate_by: str | None
+) -> Iterator[TrajectoryTable]:
     """Yield the trajectories of a table: groups of rows, or the first axis of three."""
     lengths = {len(values) for values in table.columns.values() if values.ndim}
-    stacked = {name: values for name, values in table.columns.items() if values.ndim == 3}
+    stacked = {
+        name: values for name, values in table.columns.items() if values.ndim == 3
+    }
     if separate_by is not None:
         if separate_by not in table.columns or table.columns[separate_by].ndim != 1:
-            raise UsageError(f"{table.place}: there is no column {separate_by!r}, only {', '.join(table.columns)}")
+            raise UsageError(
+                f"{table.place}: there is no column {separate_by!r}, only {', '.join(table.columns)}"
+            )
         if len(lengths) != 1:
-            raise UsageError(f"{table.place}: columns must have one value per row each, got {sorted(lengths)} values")
+            raise UsageError(
+                f"{table.place}: columns must have one value per row each, got {sorted(lengths)} values"
+            )
         key = table.columns[separate_by]
         for value in dict.fromkeys(key.tolist()):
             rows = {
@@ -140,19 +173,36 @@ def _separated(table: TrajectoryTable, separate_by: str | None) -> Iterator[Traj
                 for name, values in table.columns.items()
                 if name != separate_by
             }
-            lines = tuple(np.array(table.lines)[key == value].tolist()) if table.lines else ()
-            yield TrajectoryTable(f"{table.place}: {separate_by} {value}", rows, table.joint_names, lines)
+            lines = (
+                tuple(np.array(table.lines)[key == value].tolist())
+                if table.lines
+                else ()
+            )
+            yield TrajectoryTable(
+                f"{table.place}: {separate_by} {value}", rows, table.joint_names, lines
+            )
     elif stacked:
         count = len(next(iter(stacked.values())))
         for index in range(count):
             parts = {
-                name: values[index] if values.ndim == 3 or (values.ndim == 2 and len(values) == count) else values
+                name: values[index]
+                if values.ndim == 3 or (values.ndim == 2 and len(values) == count)
+                else values
                 for name, values in table.columns.items()
                 if values.ndim == 3 or _plain(name) in TIME_NAMES
             }
-            of_all = {name: values for name, values in table.columns.items() if _plain(name) in PARAMETER_UNITS}
-            parts |= {name: values[index] if values.shape == (count,) else values for name, values in of_all.items()}
-            yield TrajectoryTable(f"{table.place}: trajectory {index}", parts, table.joint_names)
+            of_all = {
+                name: values
+                for name, values in table.columns.items()
+                if _plain(name) in PARAMETER_UNITS
+            }
+            parts |= {
+                name: values[index] if values.shape == (count,) else values
+                for name, values in of_all.items()
+            }
+            yield TrajectoryTable(
+                f"{table.place}: trajectory {index}", parts, table.joint_names
+            )
     else:
         yield table
 
@@ -162,13 +212,23 @@ def _check_parameters(record: ProblemRecord, parameters: Mapping[str, float]) ->
     known = record.parameters.names
     for name in parameters:
         if name not in known:
-            expected = f"expected {either(known)}{nearest(name, known)}" if known else "the problem has no parameters"
-            raise UsageError(f"{name!r} is not a parameter of {record.name!r}: {expected}", argument="parameters")
+            expected = (
+                f"expected {either(known)}{nearest(name, known)}"
+                if known
+                else "the problem has no parameters"
+            )
+            raise UsageError(
+                f"{name!r} is not a parameter of {record.name!r}: {expected}",
+                argument="parameters",
+            )
 
 
 @dataclass
 class _Reader:
-    """Reader of one trajectory of a table; ``used`` has the names of the columns that were read."""
+    """Reader of one trajectory of a table.
+
+    ``used`` has the names of the columns that were read.
+    """
 
     table: TrajectoryTable
     record: ProblemRecord
@@ -196,11 +256,17 @@ class _Reader:
             turning = [not sliding for sliding in self.record.prismatic_joints]
             q[:, turning] = np.unwrap(q[:, turning], axis=0)
         parameters = self._parameters()
-        phase = self._numbers(PHASE_COLUMN, ndim=1) if PHASE_COLUMN in self.table.columns else None
+        phase = (
+            self._numbers(PHASE_COLUMN, ndim=1)
+            if PHASE_COLUMN in self.table.columns
+            else None
+        )
         try:
             if parameters is not None:
                 self.record.parameters.checked(parameters)
-            trajectory = Trajectory(t - t[0], q, columns["dq"], columns["ddq"], parameters, phase)
+            trajectory = Trajectory(
+                t - t[0], q, columns["dq"], columns["ddq"], parameters, phase
+            )
         except UsageError as error:
             raise self._error(str(error)) from error
         self._check_times(trajectory)
@@ -209,21 +275,30 @@ class _Reader:
     def unused(self) -> list[str]:
         """Return the names of the columns that were not read, except those of known other kinds."""
         names = [name for name in self.table.columns if name not in self.used]
-        return [name for name in names if not _plain(name).lower().startswith(UNUSED_KINDS)]
+        return [
+            name for name in names if not _plain(name).lower().startswith(UNUSED_KINDS)
+        ]
 
     def _error(self, text: str, **details: Any) -> UsageError:
         return UsageError(f"{self.table.place}: {text}", **details)
 
     def _parameters(self) -> Array | None:
         """Return the values of the problem's parameters, shape (p,)."""
-        ranges, plain = self.record.parameters, {_plain(name): name for name in self.table.columns}
+        ranges, plain = (
+            self.record.parameters,
+            {_plain(name): name for name in self.table.columns},
+        )
         found = dict(self.parameters)
         for parameter, unit in zip(ranges.names, ranges.value_units, strict=True):
             if (name := plain.get(parameter)) is None:
                 continue
-            values = np.unique(self._numbers(name, ndim=self.table.columns[name].ndim and 1))
+            values = np.unique(
+                self._numbers(name, ndim=self.table.columns[name].ndim and 1)
+            )
             if len(values) != 1:
-                raise self._error(f"{name} must have one value, got {values[0]:g} and {values[-1]:g}")
+                raise self._error(
+                    f"{name} must have one value, got {values[0]:g} and {values[-1]:g}"
+                )
             found[parameter] = float(values[0]) * self._factor(name, unit, 1.0)
         if not ranges or found.keys() != set(ranges.names):
             return None
@@ -232,7 +307,9 @@ class _Reader:
     def _times(self, count: int) -> Array:
         """Return the times of the samples [s]."""
         name, rate = self._time_column(), self.rate
-        if rate is not None and (name is None or not self._has_times_of_rate(name, rate)):
+        if rate is not None and (
+            name is None or not self._has_times_of_rate(name, rate)
+        ):
             return np.asarray(np.arange(count) / rate)
         if name is None:
             text = f"no column of times ({', '.join(TIME_NAMES)}): state {{rate}}"
@@ -243,7 +320,10 @@ class _Reader:
         return self._numbers(name, ndim=1) * self._factor(name, "s", 1.0)
 
     def _has_times_of_rate(self, name: str, rate: float) -> bool:
-        """Return whether the file has increasing times; raise UsageError if they do not agree with a stated rate."""
+        """Return whether the file has increasing times.
+
+        Raise UsageError if they do not agree with a stated rate.
+        """
         try:
             steps = np.diff(self._seconds(name))
         except UsageError:
@@ -256,25 +336,38 @@ class _Reader:
         return step > 0
 
     def _time_column(self) -> str | None:
-        return next((name for name in self.table.columns if _plain(name).lower() in TIME_NAMES), None)
+        return next(
+            (name for name in self.table.columns if _plain(name).lower() in TIME_NAMES),
+            None,
+        )
 
     def _check_times(self, trajectory: Trajectory) -> None:
         """Check that times without a unit are in seconds: milliseconds make long steps and slow joints."""
         name, step = self._time_column(), float(np.median(np.diff(trajectory.t)))
-        if name is None or self.rate is not None or _UNIT.search(name) or step < MIN_DOUBTFUL_STEP_S:
+        if (
+            name is None
+            or self.rate is not None
+            or _UNIT.search(name)
+            or step < MIN_DOUBTFUL_STEP_S
+        ):
             return
         speeds = np.abs(np.diff(trajectory.q, axis=0)) / np.diff(trajectory.t)[:, None]
         share = float((speeds / self.velocity_limit).max())
         if 0 < share < MAX_DOUBTFUL_SPEED:
             slow = f"all joints are slower than {share:.2g} of their velocity limits"
             text = f"{self.table.place}: {name} has steps of {step:.3g} s, and {slow}"
-            raise UnitError(f"{text}; name the column '{name} [ms]' or '{name} [s]'", concerns="path")
+            raise UnitError(
+                f"{text}; name the column '{name} [ms]' or '{name} [s]'",
+                concerns="path",
+            )
 
     def _kind(self, kind: str) -> Array | None:
         """Return positions, velocities or accelerations of the problem's joints, shape (K, n), or None."""
         for name, values in self.table.columns.items():
             if _plain(name).lower() in KIND_NAMES[kind] and values.ndim == 2:
-                return self._selected(name) * self._factors([name] * len(self.joints), kind)
+                return self._selected(name) * self._factors(
+                    [name] * len(self.joints), kind
+                )
         names = self._scalar_columns(kind)
         if names is None:
             return None
@@ -286,21 +379,34 @@ class _Reader:
         values, joints = self._numbers(name, ndim=2), self.joints
         width, named = values.shape[1], self.table.joint_names
         if named and len(named) != width:
-            raise self._error(f"{name} has {width} columns, joint_names has {len(named)}")
+            raise self._error(
+                f"{name} has {width} columns, joint_names has {len(named)}"
+            )
         if named:
             missing = [joint for joint in joints if joint not in named]
             if missing:
-                raise self._error(f"there is no joint {missing[0]!r}, only {', '.join(named)}")
+                raise self._error(
+                    f"there is no joint {missing[0]!r}, only {', '.join(named)}"
+                )
             return values[:, [named.index(joint) for joint in joints]]
         if all(joint.isdecimal() and int(joint) < width for joint in joints):
             return values[:, [int(joint) for joint in joints]]
         if width != len(joints):
-            raise self._error(f"{name} has {width} columns, the problem plans {len(joints)} joints")
+            raise self._error(
+                f"{name} has {width} columns, the problem plans {len(joints)} joints"
+            )
         return values
 
     def _scalar_columns(self, kind: str) -> list[str] | None:
-        """Return the column of every joint, or None without any; positions may have the joint's name alone."""
-        plain = {_plain(name).lower(): name for name, values in self.table.columns.items() if values.ndim == 1}
+        """Return the column of every joint, or None without any.
+
+        Positions may have the joint's name alone.
+        """
+        plain = {
+            _plain(name).lower(): name
+            for name, values in self.table.columns.items()
+            if values.ndim == 1
+        }
         joints = self.joints
         naming = [list(joints)]
         if not any(joint.isdecimal() for joint in joints):
@@ -312,10 +418,14 @@ class _Reader:
                 return [name for name in found if name]
             if any(found) and names is naming[0]:
                 missing = names[found.index(None)]
-                raise self._error(f"no column with the {KIND_NAMES[kind][1]} of {missing!r}")
+                raise self._error(
+                    f"no column with the {KIND_NAMES[kind][1]} of {missing!r}"
+                )
             most = max(most, len(joints) - found.count(None))
         if kind == "q" and most > 1:
-            raise self._error(f"{most} columns with joint positions, the problem plans {len(joints)} joints")
+            raise self._error(
+                f"{most} columns with joint positions, the problem plans {len(joints)} joints"
+            )
         return None
 
     def _numbers(self, name: str, *, ndim: int) -> Array:
@@ -324,20 +434,36 @@ class _Reader:
         values = self.table.columns[name]
         if values.ndim != ndim or values.dtype.kind not in "biuf":
             if values.ndim != 1 or ndim != 1:
-                raise self._error(f"{name} must have {ndim} dimensions of numbers, got shape {values.shape}")
+                raise self._error(
+                    f"{name} must have {ndim} dimensions of numbers, got shape {values.shape}"
+                )
             # The column has texts; the first one that is not a number is named.
-            row = next((k for k, value in enumerate(values.tolist()) if not _is_number(value)), 0)
-            place = f"line {self.table.lines[row]}" if self.table.lines else f"row {row}"
-            raise self._error(f"{place}: {name} must be a number, got {values[row].item()!r:.60}")
+            row = next(
+                (k for k, value in enumerate(values.tolist()) if not _is_number(value)),
+                0,
+            )
+            place = (
+                f"line {self.table.lines[row]}" if self.table.lines else f"row {row}"
+            )
+            raise self._error(
+                f"{place}: {name} must be a number, got {values[row].item()!r:.60}"
+            )
         return values.astype(float)
 
     def _factors(self, names: Sequence[str], kind: str) -> Array:
         """Return the factors to SI units of the columns of a kind, one per joint, shape (n,)."""
         exponent = {"q": "", "dq": "/s", "ddq": "/s^2"}[kind]
         turning = ("rad", _DEGREE if self.degrees else 1.0)
-        units = [("m", 1.0) if slides else turning for slides in self.record.prismatic_joints]
+        units = [
+            ("m", 1.0) if slides else turning for slides in self.record.prismatic_joints
+        ]
         parts = zip(names, units, strict=True)
-        return np.array([self._factor(name, unit + exponent, usual) for name, (unit, usual) in parts])
+        return np.array(
+            [
+                self._factor(name, unit + exponent, usual)
+                for name, (unit, usual) in parts
+            ]
+        )
 
     def _factor(self, name: str, unit: str, default: float) -> float:
         """Return the factor to SI of a column by the unit in its name, such as ``[deg/s]``; a default without one."""

@@ -21,18 +21,18 @@ Array = NDArray[np.float64]
 class Trajectory:
     """Motion given by samples and interpolated as ROS's joint trajectory controllers do.
 
-    The interpolation is linear for positions alone, cubic with velocities, and quintic with accelerations.
+    The interpolation is linear for positions alone, cubic with velocities, and quintic
+    with accelerations.
 
-    Attributes:
-        t: Times [s], shape (K,), increasing from 0.
-        q: Joint positions [rad], shape (K, n).
-        dq: Joint velocities [rad/s], shape (K, n), or None.
-        ddq: Joint accelerations [rad/s^2], shape (K, n), or None.
-        parameters: Values of the problem's parameters in SI units, shape (p,); None without parameters.
-        phase: Phases at the samples, increasing from 0 to 1, for bounds that depend on the phase, shape (K,), or None.
+    Attributes: t: Times [s], shape (K,), increasing from 0. q: Joint positions [rad],
+        shape (K, n). dq: Joint velocities [rad/s], shape (K, n), or None. ddq: Joint
+        accelerations [rad/s^2], shape (K, n), or None. parameters: Values of the
+        problem's parameters in SI units, shape (p,); None without parameters. phase:
+        Phases at the samples, increasing from 0 to 1, for bounds that depend on the
+        phase, shape (K,), or None.
 
-    Raises:
-        UsageError: A shape is wrong, the times do not increase from 0, or a value is not finite.
+    Raises: UsageError: A shape is wrong, the times do not increase from 0, or a value
+        is not finite.
     """
 
     t: Array
@@ -47,19 +47,35 @@ class Trajectory:
         ddq = None
         if self.ddq is not None:
             if dq is None:
-                raise UsageError("a trajectory with accelerations needs velocities, too", concerns="ddq")
+                raise UsageError(
+                    "a trajectory with accelerations needs velocities, too",
+                    concerns="ddq",
+                )
             ddq = checked_samples(t, q, self.ddq)[2]
-        parameters = None if self.parameters is None else numbers("parameters", self.parameters)
+        parameters = (
+            None if self.parameters is None else numbers("parameters", self.parameters)
+        )
         if parameters is not None and parameters.ndim != 1:
-            raise UsageError(f"must have shape (p,), got {parameters.shape}", argument="parameters")
+            raise UsageError(
+                f"must have shape (p,), got {parameters.shape}", argument="parameters"
+            )
         phase = None if self.phase is None else numbers("phase", self.phase)
         if phase is not None:
             _check_phase(phase, len(t))
-        arrays = {"t": t, "q": q, "dq": dq, "ddq": ddq, "parameters": parameters, "phase": phase}
+        arrays = {
+            "t": t,
+            "q": q,
+            "dq": dq,
+            "ddq": ddq,
+            "parameters": parameters,
+            "phase": phase,
+        }
         for name, values in arrays.items():
             object.__setattr__(self, name, values)  # lists become arrays
         if self.t[0] != 0:
-            raise UsageError(f"a trajectory begins at t = 0, got {self.t[0]} s", concerns="t")
+            raise UsageError(
+                f"a trajectory begins at t = 0, got {self.t[0]} s", concerns="t"
+            )
 
     @property
     def duration(self) -> float:
@@ -67,7 +83,10 @@ class Trajectory:
         return float(self.t[-1])
 
     def phase_of(self) -> Callable[[Array], Array] | None:
-        """Return the function from shares of the duration, shape (M,), to phases; None without phases."""
+        """Return the function from shares of the duration, shape (M,), to phases.
+
+        None without phases.
+        """
         if self.phase is None:
             return None
         from scipy.interpolate import PchipInterpolator
@@ -81,9 +100,9 @@ class Trajectory:
         Args:
             t: Times [s], shape (K,).
 
-        Returns:
-            Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (K, n) each.
-            Accelerations of linear spans are 0; they do not include jumps of the velocity.
+        Returns: Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape
+            (K, n) each. Accelerations of linear spans are 0; they do not include jumps
+            of the velocity.
         """
         t = self._clipped(t)
         q, dq, ddq = (np.asarray(self._piecewise(t, order)) for order in range(3))
@@ -101,7 +120,9 @@ class Trajectory:
         times = numbers("t", t)
         increasing = times.ndim == 1 and len(times) > 0 and not np.isnan(times).any()
         if not increasing:
-            raise UsageError(f"must be times, shape (K,), got {times!s:.100}", argument="t")
+            raise UsageError(
+                f"must be times, shape (K,), got {times!s:.100}", argument="t"
+            )
         return np.clip(times, 0, self.duration)
 
     @cached_property
@@ -116,6 +137,12 @@ class Trajectory:
 def _check_phase(phase: Array, count: int) -> None:
     """Check that phases increase from 0 to 1."""
     if phase.shape != (count,):
-        raise UsageError(f"must have shape ({count},), one for each sample, got {phase.shape}", argument="phase")
+        raise UsageError(
+            f"must have shape ({count},), one for each sample, got {phase.shape}",
+            argument="phase",
+        )
     if not (np.diff(phase) >= 0).all() or phase[0] != 0 or phase[-1] != 1:
-        raise UsageError(f"must increase from 0 to 1, got {phase[0]:g} to {phase[-1]:g}", argument="phase")
+        raise UsageError(
+            f"must increase from 0 to 1, got {phase[0]:g} to {phase[-1]:g}",
+            argument="phase",
+        )

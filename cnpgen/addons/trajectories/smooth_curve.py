@@ -1,9 +1,11 @@
 """The smooth curve through samples of positions and velocities, with accelerations within limits at both ends.
 
-Between samples that resolve the motion, the accelerations are those of a polynomial of degree 9 through the positions
-and velocities of five samples. At its ends, a motion may change its acceleration faster than the samples resolve. The
-accelerations of the first and the last spans are therefore piecewise linear: the smoothest ones that lead through the
-samples within the limits. Their positions and velocities are exactly those of the samples.
+Between samples that resolve the motion, the accelerations are those of a polynomial of
+degree 9 through the positions and velocities of five samples. At its ends, a motion may
+change its acceleration faster than the samples resolve. The accelerations of the first
+and the last spans are therefore piecewise linear: the smoothest ones that lead through
+the samples within the limits. Their positions and velocities are exactly those of the
+samples.
 """
 
 import ctypes
@@ -29,12 +31,16 @@ _PARTS = (  # of the first spans, as shares of their lengths: fine ones where th
     (0, 0.1, 0.25, 0.4, 0.55, 0.7, 0.85),
     (0, 0.25, 0.5, 0.75),
 )
-MIN_SMOOTHNESS = 0.1  # weight of a change of jerk at an end, relative to one after the first span
+MIN_SMOOTHNESS = (
+    0.1  # weight of a change of jerk at an end, relative to one after the first span
+)
 REGULARIZATION = 1e-10  # of the curvature of a quadratic program
 END_PROGRAM_TOLERANCE = 1e-10
 DAQP_EQUALITY = 5
 MIN_STEP_S = 1e-12  # between samples
-MIN_KNOT_STEP_S = 3e-5  # between knots in a span: rounding of positions changes jerks by eps / step^3
+MIN_KNOT_STEP_S = (
+    3e-5  # between knots in a span: rounding of positions changes jerks by eps / step^3
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +51,9 @@ class AccelerationLimits:
     jerk: Array
 
 
-def smooth_curve(trajectory: Trajectory, limits: AccelerationLimits) -> CurveFamily | None:
+def smooth_curve(
+    trajectory: Trajectory, limits: AccelerationLimits
+) -> CurveFamily | None:
     """Return the smooth curve through samples; None if no such curve meets the limits at the ends.
 
     Given accelerations are those of the curve at the samples.
@@ -54,14 +62,26 @@ def smooth_curve(trajectory: Trajectory, limits: AccelerationLimits) -> CurveFam
     if dq is None or len(t) < 2 * END_SPANS + 2:
         return None
     ddq = trajectory.ddq
-    inner, jerks = (estimated_derivative(trajectory, order, NEIGHBORS) for order in (2, 3))
+    inner, jerks = (
+        estimated_derivative(trajectory, order, NEIGHBORS) for order in (2, 3)
+    )
     inner = inner if ddq is None else ddq
     ends = []
     for sign in (1.0, -1.0):  # the end is the start of the reversed motion
         flip = slice(None, None, int(sign))
         reversed_t = t if sign > 0 else t[-1] - t[::-1]
-        samples = [reversed_t, q[flip], sign * dq[flip], inner[flip], sign * jerks[flip]]
-        end = _end(*(values[: END_SPANS + 1] for values in samples), limits=limits, given=ddq is not None)
+        samples = [
+            reversed_t,
+            q[flip],
+            sign * dq[flip],
+            inner[flip],
+            sign * jerks[flip],
+        ]
+        end = _end(
+            *(values[: END_SPANS + 1] for values in samples),
+            limits=limits,
+            given=ddq is not None,
+        )
         if end is None:
             return None
         ends.append(end)
@@ -89,29 +109,46 @@ def estimated_derivative(trajectory: Trajectory, order: int, neighbors: int) -> 
     powers = np.arange(2 * size)
     values = x[:, :, None] ** powers
     derivatives = powers * x[:, :, None] ** np.maximum(powers - 1, 0)
-    data = np.concatenate([q[window] - q[:, None], dq[window] * scale[:, None, None]], axis=1)
+    data = np.concatenate(
+        [q[window] - q[:, None], dq[window] * scale[:, None, None]], axis=1
+    )
     wanted = np.zeros((count, 2 * size, 1))
     wanted[:, order] = factorial(order)
-    weights = np.linalg.solve(np.concatenate([values, derivatives], axis=1).swapaxes(1, 2), wanted)[..., 0]
+    weights = np.linalg.solve(
+        np.concatenate([values, derivatives], axis=1).swapaxes(1, 2), wanted
+    )[..., 0]
     return np.asarray(np.einsum("kw,kwn->kn", weights, data) / scale[:, None] ** order)
 
 
 def _end(
-    t: Array, q: Array, dq: Array, ddq: Array, jerk: Array, *, limits: AccelerationLimits, given: bool
+    t: Array,
+    q: Array,
+    dq: Array,
+    ddq: Array,
+    jerk: Array,
+    *,
+    limits: AccelerationLimits,
+    given: bool,
 ) -> tuple[Array, Array, Array, Array] | None:
     """Return times, positions, velocities and accelerations at the knots of the first spans, or None."""
-    knots = np.concatenate([*(_knots(t[k], t[k + 1], _PARTS[k]) for k in range(END_SPANS)), t[-1:]])
+    knots = np.concatenate(
+        [*(_knots(t[k], t[k + 1], _PARTS[k]) for k in range(END_SPANS)), t[-1:]]
+    )
     program = _EndProgram.at(t, knots, given=given)
     columns = []
     for joint in range(q.shape[1]):
         bounds = float(limits.acceleration[joint]), float(limits.jerk[joint])
-        column = program.solve(q[:, joint], dq[:, joint], ddq[:, joint], float(jerk[-1, joint]), bounds)
+        column = program.solve(
+            q[:, joint], dq[:, joint], ddq[:, joint], float(jerk[-1, joint]), bounds
+        )
         if column is None:
             return None
         columns.append(column)
     accelerations, step = np.stack(columns, axis=1), np.diff(knots)[:, None]
     velocities = dq[0] + _sums(step * (accelerations[1:] + accelerations[:-1]) / 2)
-    moves = velocities[:-1] * step + step**2 * (accelerations[:-1] / 3 + accelerations[1:] / 6)
+    moves = velocities[:-1] * step + step**2 * (
+        accelerations[:-1] / 3 + accelerations[1:] / 6
+    )
     return knots, q[0] + _sums(moves), velocities, accelerations
 
 
@@ -135,7 +172,9 @@ class _EndProgram:
     """Quadratic program of the accelerations at N knots of one joint."""
 
     curvature: Array  # Hessian of the cost, shape (N, N)
-    gradient: Array  # gradient of the cost per unit of the jerk at the last knot, shape (N,)
+    gradient: (
+        Array  # gradient of the cost per unit of the jerk at the last knot, shape (N,)
+    )
     equalities: Array  # rows for the changes of velocity and position in every span, and for known accelerations
     jerks: Array  # rows for the jerks between knots, shape (N - 1, N)
     h: Array  # lengths of the spans [s]
@@ -151,10 +190,14 @@ class _EndProgram:
             for k in range(at_samples[span], at_samples[span + 1]):
                 rest = t[span + 1] - knots[k]
                 velocity[span, k : k + 2] += steps[k] / 2
-                position[span, k : k + 2] += steps[k] * np.array([rest / 2 - steps[k] / 6, rest / 2 - steps[k] / 3])
+                position[span, k : k + 2] += steps[k] * np.array(
+                    [rest / 2 - steps[k] / 6, rest / 2 - steps[k] / 3]
+                )
         known = np.eye(size)[at_samples if given else at_samples[-1:]]
         jerks = np.diff(np.eye(size), axis=0) / steps[:, None]
-        changes = np.concatenate([np.diff(jerks, axis=0), jerks[-1:]])  # and the difference from the given jerk
+        changes = np.concatenate(
+            [np.diff(jerks, axis=0), jerks[-1:]]
+        )  # and the difference from the given jerk
         width = np.append((steps[1:] + steps[:-1]) / 2, steps[-1])
         weight = (MIN_SMOOTHNESS + knots[1:] / h[0]) ** 2 * np.sqrt(h[0] ** 3 / width)
         weighted = changes * weight[:, None]
@@ -169,14 +212,22 @@ class _EndProgram:
             given,
         )
 
-    def solve(self, q: Array, dq: Array, ddq: Array, jerk: float, bounds: tuple[float, float]) -> Array | None:
-        """Return the accelerations of one joint at the knots, shape (N,); None if there are none within both bounds."""
+    def solve(
+        self, q: Array, dq: Array, ddq: Array, jerk: float, bounds: tuple[float, float]
+    ) -> Array | None:
+        """Return the accelerations of one joint at the knots, shape (N,).
+
+        None if there are none within both bounds.
+        """
         import daqp
 
         moved = (q[1:] - q[:-1] - dq[:-1] * self.h) / self.h**2
         known = ddq if self.given else ddq[-1:]
         target = np.concatenate([np.diff(dq) / self.h, moved, known])
-        size, (largest, steepest) = len(self.curvature), (min(bound, 1e30) for bound in bounds)
+        size, (largest, steepest) = (
+            len(self.curvature),
+            (min(bound, 1e30) for bound in bounds),
+        )
         rows = self.equalities
         high = [np.full(size, largest), target]
         low = [np.full(size, -largest), target]

@@ -18,18 +18,48 @@ if TYPE_CHECKING:
     from cnpgen.addons.trajectories.load_trajectories import LoadedTrajectories
     from cnpgen.problems.problem import Problem
 
-TRAJECTORY_OPTIONS = ("joints", "unit", "rate", "separate_by", "unwrap", "parameters")  # of load_trajectories
+TRAJECTORY_OPTIONS = (
+    "joints",
+    "unit",
+    "rate",
+    "separate_by",
+    "unwrap",
+    "parameters",
+)  # of load_trajectories
 MAX_IGNORED = 8  # unused columns that are listed
 
 
 def add_trajectory_options(option: Options) -> None:
     """Add the options that determine how a file is read."""
     add = option.add_argument
-    add("--joints", metavar="A,B,...", type=values.names, help="names of the problem's joints in the file, in order")
-    add("--unit", choices=("rad", "deg"), help="unit of columns without a unit in their name (default: rad)")
-    add("--rate", metavar="HZ", type=values.hertz, help="samples per second of a file without times")
-    add("--separate-by", metavar="COLUMN", help="column whose value differs from trajectory to trajectory")
-    add("--unwrap", action="store_true", default=None, help="continue angles that jump by more than half a turn")
+    add(
+        "--joints",
+        metavar="A,B,...",
+        type=values.names,
+        help="names of the problem's joints in the file, in order",
+    )
+    add(
+        "--unit",
+        choices=("rad", "deg"),
+        help="unit of columns without a unit in their name (default: rad)",
+    )
+    add(
+        "--rate",
+        metavar="HZ",
+        type=values.hertz,
+        help="samples per second of a file without times",
+    )
+    add(
+        "--separate-by",
+        metavar="COLUMN",
+        help="column whose value differs from trajectory to trajectory",
+    )
+    add(
+        "--unwrap",
+        action="store_true",
+        default=None,
+        help="continue angles that jump by more than half a turn",
+    )
 
     text = "values of the problem's parameters that the file does not have, such as payload_mass=6kg"
     add("--parameters", metavar="NAME=V,...", type=values.parameters, help=text)
@@ -37,11 +67,17 @@ def add_trajectory_options(option: Options) -> None:
     add("--payload", metavar="M[,X,Y,Z]", type=values.payload, help=text)
 
 
-def refuse_trajectory_options(arguments: argparse.Namespace, file: Path, *others: str) -> None:
+def refuse_trajectory_options(
+    arguments: argparse.Namespace, file: Path, *others: str
+) -> None:
     """Refuse options of sampled trajectories for a plan file or a dataset."""
-    for name, value in options_of(arguments, *TRAJECTORY_OPTIONS, "payload", *others).items():
+    for name, value in options_of(
+        arguments, *TRAJECTORY_OPTIONS, "payload", *others
+    ).items():
         if value is not None:
-            raise UsageError(f"--{name.replace('_', '-')} is for sampled trajectories, {file} holds plans")
+            raise UsageError(
+                f"--{name.replace('_', '-')} is for sampled trajectories, {file} holds plans"
+            )
 
 
 def problem_of(arguments: argparse.Namespace) -> "str | Problem":
@@ -51,15 +87,23 @@ def problem_of(arguments: argparse.Namespace) -> "str | Problem":
 
     name: str | None = arguments.problem
     if name is None:
-        raise UsageError("sampled trajectories need {problem}", remedies={"problem": None})
+        raise UsageError(
+            "sampled trajectories need {problem}", remedies={"problem": None}
+        )
     if arguments.payload is None:
         return name
     mass, *centre = arguments.payload
-    body = Payload(mass=mass) if not centre else Payload(mass=mass, centre=(centre[0], centre[1], centre[2]))
+    body = (
+        Payload(mass=mass)
+        if not centre
+        else Payload(mass=mass, centre=(centre[0], centre[1], centre[2]))
+    )
     return replace(as_problem(name), payload=body)
 
 
-def load_file(arguments: argparse.Namespace, problem: "str | Problem") -> "LoadedTrajectories":
+def load_file(
+    arguments: argparse.Namespace, problem: "str | Problem"
+) -> "LoadedTrajectories":
     """Load the trajectories of a command, and list the columns that are not used on stderr."""
     from cnpgen.addons.trajectories.load_trajectories import load_trajectories
 
@@ -67,43 +111,83 @@ def load_file(arguments: argparse.Namespace, problem: "str | Problem") -> "Loade
     given = {name: value for name, value in given.items() if value is not None}
     loaded = load_trajectories(arguments.file, problem, **given)
     if loaded.ignored:
-        print(f"columns that are not used: {listed(loaded.ignored, MAX_IGNORED)}", file=sys.stderr)
+        print(
+            f"columns that are not used: {listed(loaded.ignored, MAX_IGNORED)}",
+            file=sys.stderr,
+        )
     return loaded
 
 
-def write_json(file: Path, found: "TrajectoryEvaluation", labels: tuple[str, ...]) -> None:
+def write_json(
+    file: Path, found: "TrajectoryEvaluation", labels: tuple[str, ...]
+) -> None:
     """Write all verdicts as JSON."""
     rows = [
         {"trajectory": index, "place": label, **verdict.to_dict()}
-        for index, (label, verdict) in enumerate(zip(labels, found.verdicts, strict=True))
+        for index, (label, verdict) in enumerate(
+            zip(labels, found.verdicts, strict=True)
+        )
     ]
-    print(json.dumps({"file": str(file), **found.summary(), "verdicts": rows}, indent=2, ensure_ascii=False))
+    print(
+        json.dumps(
+            {"file": str(file), **found.summary(), "verdicts": rows},
+            indent=2,
+            ensure_ascii=False,
+        )
+    )
 
 
 def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
     """Return the counts, and for every condition the decisions with the worst margin."""
-    counts = ", ".join(f"{count:,} {decision}" for decision, count in found.counts.items())
+    counts = ", ".join(
+        f"{count:,} {decision}" for decision, count in found.counts.items()
+    )
     lines = [f"{file}: trajectories of {found.problem.name}: {counts}", ""]
     decided: list[tuple[str, ...]] = [
-        ("condition", "valid", "invalid", "undecided", "time violated", "time undecided", "")
+        (
+            "condition",
+            "valid",
+            "invalid",
+            "undecided",
+            "time violated",
+            "time undecided",
+            "",
+        )
     ]
     margins = [margin_head("condition", item="trajectory")]
     summary = found.summary()
     for name, decisions in summary["conditions"].items():
-        entries = [(index, v.conditions[name]) for index, v in enumerate(found.verdicts) if name in v.conditions]
+        entries = [
+            (index, v.conditions[name])
+            for index, v in enumerate(found.verdicts)
+            if name in v.conditions
+        ]
         worst, entry = max(entries, key=lambda item: item[1].margin.severity)
-        shares = [max(getattr(e, share) for _, e in entries) for share in ("violated_share", "undecided_share")]
-        counted = [f"{decisions[decision]:,}" for decision in ("valid", "invalid", "undecided")]
+        shares = [
+            max(getattr(e, share) for _, e in entries)
+            for share in ("violated_share", "undecided_share")
+        ]
+        counted = [
+            f"{decisions[decision]:,}" for decision in ("valid", "invalid", "undecided")
+        ]
         decided.append((name, *counted, *(f"{share:.1%}" for share in shares), ""))
         margins.append((name, *margin_cells(entry.margin.to_dict(), worst)))
     if summary["conditions"]:
         lines += [*table(decided, indent="  ", right=(1, 2, 3, 4, 5)), ""]
         lines += table(margins, indent="  ", right=(1, 2, 4, 5))
-    lines += ["", *(f"  {count:,} because of: {reason}" for reason, count in summary["reasons"].items())]
+    lines += [
+        "",
+        *(
+            f"  {count:,} because of: {reason}"
+            for reason, count in summary["reasons"].items()
+        ),
+    ]
     return "\n".join(lines).rstrip()
 
 
 def listing_text(found: "TrajectoryEvaluation", labels: tuple[str, ...]) -> str:
     """Return one line for each trajectory, with those that are not valid first."""
     order = sorted(range(len(labels)), key=lambda index: found.verdicts[index].valid)
-    return "\n".join(f"{index}  {labels[index]}  {found.verdicts[index]}" for index in order)
+    return "\n".join(
+        f"{index}  {labels[index]}  {found.verdicts[index]}" for index in order
+    )

@@ -34,8 +34,12 @@ def plot_trajectory(
     """
     times = [margin.time for margin in margins]
     with np.errstate(all="ignore"):
-        world, s, t, scene = along_trajectory(problem, robot, trajectory, extra_times=times)
-    draw_path(problem, world, s, t, Path(path), scene=scene, title=title, margins=margins)
+        world, s, t, scene = along_trajectory(
+            problem, robot, trajectory, extra_times=times
+        )
+    draw_path(
+        problem, world, s, t, Path(path), scene=scene, title=title, margins=margins
+    )
 
 
 def along_trajectory(

@@ -32,21 +32,27 @@ HELD_JOINTS_FILE = "held_joints.yaml"  # beside exported plans; it holds no traj
 LEROBOT_INFO = "meta/info.json"  # in a folder of LeRobot
 LEROBOT_ENVIRONMENT = "observation.environment_state"
 # of an array of one plan in an archive of cnpgen
-_PART_OF_ARCHIVE = re.compile(rf"(.+?)_(t|{PHASE_COLUMN}|q|dq|ddq|jerk|{'|'.join(PARAMETER_UNITS)})")
+_PART_OF_ARCHIVE = re.compile(
+    rf"(.+?)_(t|{PHASE_COLUMN}|q|dq|ddq|jerk|{'|'.join(PARAMETER_UNITS)})"
+)
 MESSAGE_TIME = "t [s]"  # of formats that define the unit
 _POINT_FIELDS = {"positions": "q", "velocities": "dq", "accelerations": "ddq"}
-_NESTING = ("joint_trajectory", "trajectory", "trajectories", "solution")  # keys of messages that hold messages
+_NESTING = (
+    "joint_trajectory",
+    "trajectory",
+    "trajectories",
+    "solution",
+)  # keys of messages that hold messages
 
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryTable:
     """One trajectory, or several of equal columns, as a file has them.
 
-    Attributes:
-        place: The file and the part of it, for messages.
-        columns: Name -> values, shape (K,), (K, w) or (N, K, w); texts are kept as texts.
-        joint_names: Names of the joints of columns with one value per joint; empty if the file does not name them.
-        lines: Numbers of the lines of a text file, for messages.
+    Attributes: place: The file and the part of it, for messages. columns: Name ->
+        values, shape (K,), (K, w) or (N, K, w); texts are kept as texts. joint_names:
+        Names of the joints of columns with one value per joint; empty if the file does
+        not name them. lines: Numbers of the lines of a text file, for messages.
     """
 
     place: str
@@ -58,23 +64,28 @@ class TrajectoryTable:
 def read_trajectory_tables(path: Path) -> list[TrajectoryTable]:
     """Read all trajectories of a file, or of all files of a folder in the order of their names.
 
-    Raises:
-        UsageError: The file does not exist, is damaged or of an unknown format; the message names the place.
-        MissingExtraError: The format needs a package that is not installed.
-        MachineError: The file cannot be read.
+    Raises: UsageError: The file does not exist, is damaged or of an unknown format; the
+        message names the place. MissingExtraError: The format needs a package that is
+        not installed. MachineError: The file cannot be read.
     """
     if (path / LEROBOT_INFO).is_file():
         return list(_read_lerobot(path))
     if path.is_dir():
         files = [file for file in sorted(path.iterdir()) if is_trajectory_file(file)]
         if not files:
-            raise UsageError(f"{path} has no files of trajectories, expected {either(sorted(_READERS))}")
+            raise UsageError(
+                f"{path} has no files of trajectories, expected {either(sorted(_READERS))}"
+            )
         return [table for file in files for table in read_trajectory_tables(file)]
     if not path.exists():
-        raise UsageError(f"{path} is not there, expected a file of trajectories or a folder of them")
+        raise UsageError(
+            f"{path} is not there, expected a file of trajectories or a folder of them"
+        )
     read = _READERS.get(path.suffix.lower())
     if read is None:
-        raise UsageError(f"{path} has an unknown format, expected {either(sorted(_READERS))}")
+        raise UsageError(
+            f"{path} has an unknown format, expected {either(sorted(_READERS))}"
+        )
     try:
         return list(read(path))
     except OSError as error:
@@ -99,7 +110,9 @@ def holds_trajectories(path: Path) -> bool:
     if (path / LEROBOT_INFO).is_file():
         return True
     if path.is_dir():
-        return not (path / SPECIFICATION).exists() and any(is_trajectory_file(file) for file in path.iterdir())
+        return not (path / SPECIFICATION).exists() and any(
+            is_trajectory_file(file) for file in path.iterdir()
+        )
     suffix, tables = path.suffix.lower(), sorted(_READERS.keys() - {*HDF5_SUFFIXES})
     if suffix in tables:
         return True
@@ -111,7 +124,9 @@ def holds_trajectories(path: Path) -> bool:
         return False
     try:
         with open_hdf5(path) as file:
-            return "path_control_points" not in file and bool({"q", "positions"} & set(file))
+            return "path_control_points" not in file and bool(
+                {"q", "positions"} & set(file)
+            )
     except CnpgenError:
         return False
 
@@ -124,7 +139,9 @@ def _read_csv(path: Path) -> Iterator[TrajectoryTable]:
             columns[name] = table.numbers(name)
         except DatasetError:  # a column of texts; an error only if it is used
             columns[name] = np.array(table.texts(name), np.str_)
-    yield TrajectoryTable(str(path), columns, lines=tuple(line for line, _ in table.lines))
+    yield TrajectoryTable(
+        str(path), columns, lines=tuple(line for line, _ in table.lines)
+    )
 
 
 def _read_npz(path: Path) -> Iterator[TrajectoryTable]:
@@ -132,11 +149,21 @@ def _read_npz(path: Path) -> Iterator[TrajectoryTable]:
         with zipfile.ZipFile(path) as archive:
             size = sum(member.file_size for member in archive.infolist())
         if size > MAX_ARCHIVE_BYTES:
-            raise UsageError(f"{path} holds {size:,} bytes, expected at most {MAX_ARCHIVE_BYTES:,}")
+            raise UsageError(
+                f"{path} holds {size:,} bytes, expected at most {MAX_ARCHIVE_BYTES:,}"
+            )
         with np.load(path, allow_pickle=False) as loaded:
             arrays = {name: loaded[name] for name in loaded.files}
-    except (zipfile.BadZipFile, ValueError, KeyError, EOFError, NotImplementedError) as error:
-        raise UsageError(f"{path} is not an archive of NumPy arrays, or is damaged: {error}") from error
+    except (
+        zipfile.BadZipFile,
+        ValueError,
+        KeyError,
+        EOFError,
+        NotImplementedError,
+    ) as error:
+        raise UsageError(
+            f"{path} is not an archive of NumPy arrays, or is damaged: {error}"
+        ) from error
     names = tuple(map(str, arrays.pop("joint_names", np.array([], np.str_)).ravel()))
     yield from _split(path, arrays, names)
 
@@ -147,7 +174,9 @@ def _read_hdf5(path: Path) -> Iterator[TrajectoryTable]:
     yield from _split(path, arrays, ())
 
 
-def _split(path: Path, arrays: dict[str, Values], names: tuple[str, ...]) -> Iterator[TrajectoryTable]:
+def _split(
+    path: Path, arrays: dict[str, Values], names: tuple[str, ...]
+) -> Iterator[TrajectoryTable]:
     """Yield the trajectories of an archive: ``plan_00000_t`` and so on, or ``t`` and ``q`` of all."""
     parts: dict[str, dict[str, Values]] = {}
     for name, values in arrays.items():
@@ -163,9 +192,16 @@ def _split(path: Path, arrays: dict[str, Values], names: tuple[str, ...]) -> Ite
 def _read_parquet(path: Path) -> Iterator[TrajectoryTable]:
     table = read_parquet(path)
     try:
-        names = tuple(map(str, json.loads((table.schema.metadata or {}).get(JOINT_NAMES_KEY, b"[]"))))
+        names = tuple(
+            map(
+                str,
+                json.loads((table.schema.metadata or {}).get(JOINT_NAMES_KEY, b"[]")),
+            )
+        )
     except (ValueError, TypeError, RecursionError) as error:
-        raise UsageError(f"{path}: its names of joints are no list of texts, or are damaged: {error}") from error
+        raise UsageError(
+            f"{path}: its names of joints are no list of texts, or are damaged: {error}"
+        ) from error
     columns = {name: _parquet_column(table, name, path) for name in table.column_names}
     if names and PLAN_COLUMN in columns:  # a table of cnpgen
         index = columns.pop(PLAN_COLUMN)
@@ -178,19 +214,33 @@ def _read_parquet(path: Path) -> Iterator[TrajectoryTable]:
 
 
 def read_parquet(path: Path) -> Any:
-    """Read a Parquet file as a table of pyarrow; raise UsageError if it is damaged or too large."""
+    """Read a Parquet file as a table of pyarrow.
+
+    Raise UsageError if it is damaged or too large.
+    """
     with requires_extra("parquet", "pyarrow"):
         import pyarrow
         import pyarrow.parquet
     content = read_file(path, max_bytes=MAX_TABLE_BYTES)
     try:
         file = pyarrow.parquet.ParquetFile(pyarrow.BufferReader(content))
-        size = sum(file.metadata.row_group(index).total_byte_size for index in range(file.num_row_groups))
+        size = sum(
+            file.metadata.row_group(index).total_byte_size
+            for index in range(file.num_row_groups)
+        )
         if size <= MAX_ARCHIVE_BYTES:
             return file.read()
-    except (pyarrow.ArrowException, OSError, ValueError) as error:  # damaged headers; texts that are not UTF-8
-        raise UsageError(f"{path} is not a Parquet file, or is damaged: {error}") from error
-    raise UsageError(f"{path} holds {size:,} bytes, expected at most {MAX_ARCHIVE_BYTES:,}")
+    except (
+        pyarrow.ArrowException,
+        OSError,
+        ValueError,
+    ) as error:  # damaged headers; texts that are not UTF-8
+        raise UsageError(
+            f"{path} is not a Parquet file, or is damaged: {error}"
+        ) from error
+    raise UsageError(
+        f"{path} holds {size:,} bytes, expected at most {MAX_ARCHIVE_BYTES:,}"
+    )
 
 
 def _parquet_column(table: Any, name: str, path: Path) -> Values:
@@ -198,7 +248,9 @@ def _parquet_column(table: Any, name: str, path: Path) -> Values:
     try:
         return np.array(table.column(name).to_pylist())
     except ValueError as error:
-        raise UsageError(f"{path}: column {name!r}: its rows have different lengths") from error
+        raise UsageError(
+            f"{path}: column {name!r}: its rows have different lengths"
+        ) from error
 
 
 def _number_column(table: Any, name: str, path: Path, width: int) -> Values:
@@ -214,25 +266,46 @@ def _number_column(table: Any, name: str, path: Path, width: int) -> Values:
 def _read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
     """Yield the episodes of a LeRobotDataset v3: states, or actions without them, with their names."""
     try:
-        info = parse_json(read_file(folder / LEROBOT_INFO, max_bytes=MAX_TABLE_BYTES).decode())
+        info = parse_json(
+            read_file(folder / LEROBOT_INFO, max_bytes=MAX_TABLE_BYTES).decode()
+        )
         features, version = info["features"], str(info["codebase_version"])
         key = next(key for key in ("observation.state", "action") if key in features)
         names = _feature_names(features[key])
-        described = _feature_names(features[LEROBOT_ENVIRONMENT]) if LEROBOT_ENVIRONMENT in features else []
+        described = (
+            _feature_names(features[LEROBOT_ENVIRONMENT])
+            if LEROBOT_ENVIRONMENT in features
+            else []
+        )
     except (ValueError, KeyError, TypeError, IndexError, StopIteration) as error:
-        raise UsageError(f"{folder / LEROBOT_INFO} does not describe a dataset of LeRobot: {error!r:.200}") from error
+        raise UsageError(
+            f"{folder / LEROBOT_INFO} does not describe a dataset of LeRobot: {error!r:.200}"
+        ) from error
     if not version.startswith("v3"):
-        raise UsageError(f"{folder} has LeRobot's format {version}, expected v3.0: convert it with LeRobot")
-    parameters = {name: k for k, name in enumerate(described) if name in PARAMETER_UNITS}
+        raise UsageError(
+            f"{folder} has LeRobot's format {version}, expected v3.0: convert it with LeRobot"
+        )
+    parameters = {
+        name: k for k, name in enumerate(described) if name in PARAMETER_UNITS
+    }
     for path in sorted(folder.glob("data/*/*.parquet")):
         table = read_parquet(path)
-        needed = ("timestamp", "episode_index", key, *([LEROBOT_ENVIRONMENT] if parameters else []))
+        needed = (
+            "timestamp",
+            "episode_index",
+            key,
+            *([LEROBOT_ENVIRONMENT] if parameters else []),
+        )
         missing = [name for name in needed if name not in table.column_names]
         if missing:
-            raise UsageError(f"{path}: there is no column {missing[0]!r}, only {', '.join(table.column_names)}")
+            raise UsageError(
+                f"{path}: there is no column {missing[0]!r}, only {', '.join(table.column_names)}"
+            )
         widths = 1, 1, len(names), *([len(described)] if parameters else [])
         columns_of = zip(needed, widths, strict=True)
-        times, episodes, values, *environment = (_number_column(table, name, path, width) for name, width in columns_of)
+        times, episodes, values, *environment = (
+            _number_column(table, name, path, width) for name, width in columns_of
+        )
         for episode in dict.fromkeys(episodes[:, 0].tolist()):
             rows = episodes[:, 0] == episode
             columns: dict[str, Values] = {MESSAGE_TIME: times[rows, 0]}
@@ -247,11 +320,18 @@ def _feature_names(feature: Any) -> list[str]:
     Raises:
         TypeError, KeyError, ValueError, IndexError: It is no feature.
     """
-    width, names = int(feature["shape"][0]), feature.get("names") if isinstance(feature, dict) else None
+    width, names = (
+        int(feature["shape"][0]),
+        feature.get("names") if isinstance(feature, dict) else None,
+    )
     if not 0 < width <= MAX_FEATURE_WIDTH:
-        raise ValueError(f"a feature has {width} values, expected 1 to {MAX_FEATURE_WIDTH:,}")
+        raise ValueError(
+            f"a feature has {width} values, expected 1 to {MAX_FEATURE_WIDTH:,}"
+        )
     if isinstance(names, dict):
-        names = next((entry for entry in names.values() if isinstance(entry, list)), None)
+        names = next(
+            (entry for entry in names.values() if isinstance(entry, list)), None
+        )
     if isinstance(names, list) and len(names) == width:
         return [str(name) for name in names]
     return [f"q{k}" for k in range(width)]
@@ -269,12 +349,19 @@ def _read_yaml(path: Path) -> Iterator[TrajectoryTable]:
     documents = read_yaml(path, numbers=True)
     for index, document in enumerate(documents):
         if document is not None:  # topics echoed by ROS end with an empty document
-            yield from _from_document(document, f"{path}: document {index}" if len(documents) > 2 else str(path))
+            yield from _from_document(
+                document,
+                f"{path}: document {index}" if len(documents) > 2 else str(path),
+            )
 
 
 def _from_document(document: Any, place: str) -> Iterator[TrajectoryTable]:
     """Yield the trajectories of a message, of a list of messages or rows, or of an object of columns."""
-    if isinstance(document, list) and document and all(isinstance(entry, dict) for entry in document):
+    if (
+        isinstance(document, list)
+        and document
+        and all(isinstance(entry, dict) for entry in document)
+    ):
         if any(key in document[0] for key in ("points", *_NESTING)):
             for index, entry in enumerate(document):
                 yield from _from_document(entry, f"{place}: [{index}]")
@@ -282,16 +369,22 @@ def _from_document(document: Any, place: str) -> Iterator[TrajectoryTable]:
             yield TrajectoryTable(place, _from_rows(document, place))
     elif isinstance(document, dict) and "points" in document:
         yield _from_message(document, place)
-    elif isinstance(document, dict) and (key := next((key for key in _NESTING if document.get(key)), None)):
+    elif isinstance(document, dict) and (
+        key := next((key for key in _NESTING if document.get(key)), None)
+    ):
         yield from _from_document(document[key], f"{place}: {key}")
-    elif isinstance(document, dict) and any(isinstance(values, list) for values in document.values()):
+    elif isinstance(document, dict) and any(
+        isinstance(values, list) for values in document.values()
+    ):
         names = document.get("joint_names", [])
         columns = {
             str(key): _array(values, f"{place}: {key}")
             for key, values in document.items()
             if isinstance(values, list) and values and key != "joint_names"
         }
-        yield TrajectoryTable(place, columns, tuple(map(str, names)) if isinstance(names, list) else ())
+        yield TrajectoryTable(
+            place, columns, tuple(map(str, names)) if isinstance(names, list) else ()
+        )
     else:
         expected = "a JointTrajectory or RobotTrajectory message, a list of rows, or an object of columns"
         raise UsageError(f"{place}: expected {expected}, got {type(document).__name__}")
@@ -303,7 +396,10 @@ def _from_rows(rows: Sequence[Mapping[str, Any]], place: str) -> dict[str, Value
         if row.keys() != rows[0].keys():
             other = sorted(map(str, row.keys() ^ rows[0].keys()))[0]
             raise UsageError(f"{place}: [{index}]: {other!r} is not in every row")
-    return {str(key): _array([row[key] for row in rows], f"{place}: {key}") for key in rows[0]}
+    return {
+        str(key): _array([row[key] for row in rows], f"{place}: {key}")
+        for key in rows[0]
+    }
 
 
 def _array(values: list[Any], place: str) -> Values:
@@ -320,10 +416,18 @@ def _array(values: list[Any], place: str) -> Values:
 def _from_message(message: Mapping[str, Any], place: str) -> TrajectoryTable:
     """Return the points of a ``trajectory_msgs/JointTrajectory``, of ROS 1 or 2."""
     names, points = message.get("joint_names"), message["points"]
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or not names:
-        raise UsageError(f"{place}: joint_names must be a list of names, got {names!r:.60}")
+    if (
+        not isinstance(names, list)
+        or not all(isinstance(name, str) for name in names)
+        or not names
+    ):
+        raise UsageError(
+            f"{place}: joint_names must be a list of names, got {names!r:.60}"
+        )
     if not isinstance(points, list) or not points:
-        raise UsageError(f"{place}: points must be a list of points, got {points!r:.60}")
+        raise UsageError(
+            f"{place}: points must be a list of points, got {points!r:.60}"
+        )
     columns: dict[str, list[Any]] = {MESSAGE_TIME: []}
     for index, point in enumerate(points):
         where = f"{place}: points[{index}]"
@@ -336,25 +440,34 @@ def _from_message(message: Mapping[str, Any], place: str) -> TrajectoryTable:
                 continue
             if not isinstance(values, list) or len(values) != len(names):
                 count = len(values) if isinstance(values, list) else repr(values)[:60]
-                raise UsageError(f"{where}.{key} must have {len(names)} values, one per joint, got {count}")
+                raise UsageError(
+                    f"{where}.{key} must have {len(names)} values, one per joint, got {count}"
+                )
             if len(columns.setdefault(name, [])) != index:
                 raise UsageError(f"{where}.{key}: earlier points have none")
             columns[name].append(values)
     return TrajectoryTable(
-        place, {name: _array(rows, f"{place}: {name}") for name, rows in columns.items()}, tuple(names)
+        place,
+        {name: _array(rows, f"{place}: {name}") for name, rows in columns.items()},
+        tuple(names),
     )
 
 
 def _seconds(stamp: Any, where: str) -> float:
     """Return a time of ROS 1 (secs, nsecs), ROS 2 (sec, nanosec), or a number [s]."""
     if isinstance(stamp, dict):
-        parts = [stamp.get(first, stamp.get(second, 0)) for first, second in (("sec", "secs"), ("nanosec", "nsecs"))]
+        parts = [
+            stamp.get(first, stamp.get(second, 0))
+            for first, second in (("sec", "secs"), ("nanosec", "nsecs"))
+        ]
         whole, nano = parts
         if isinstance(whole, int | float) and isinstance(nano, int | float):
             return float(whole) + 1e-9 * float(nano)
     elif isinstance(stamp, int | float) and not isinstance(stamp, bool):
         return float(stamp)
-    raise UsageError(f"{where}.time_from_start must be a time such as {{sec, nanosec}}, got {stamp!r:.60}")
+    raise UsageError(
+        f"{where}.time_from_start must be a time such as {{sec, nanosec}}, got {stamp!r:.60}"
+    )
 
 
 _READERS: dict[str, Callable[[Path], Iterator[TrajectoryTable]]] = {

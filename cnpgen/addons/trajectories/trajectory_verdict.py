@@ -24,13 +24,13 @@ class Decision(StrEnum):
 class ConditionDecision:
     """Decision on one condition of a problem.
 
-    Attributes:
-        decision: The decision.
-        reason: Reason of a decision that is not valid; empty for a valid one.
-        margin: Smallest margin, or largest violation, of any curve that the samples allow.
-        uncertainty: Largest difference of the value from that of the nominal curve, there [unit of the margin].
-        violated_share: Share of the time in which every curve violates the condition, at the checked times.
-        undecided_share: Share of the time in which some curves may violate it and others not.
+    Attributes: decision: The decision. reason: Reason of a decision that is not valid;
+        empty for a valid one. margin: Smallest margin, or largest violation, of any
+        curve that the samples allow. uncertainty: Largest difference of the value from
+        that of the nominal curve, there [unit of the margin]. violated_share: Share of
+        the time in which every curve violates the condition, at the checked times.
+        undecided_share: Share of the time in which some curves may violate it and
+        others not.
     """
 
     decision: Decision
@@ -56,12 +56,11 @@ class ConditionDecision:
 class TrajectoryVerdict:
     """Verdict on one sampled trajectory.
 
-    Attributes:
-        decision: Invalid if a condition is, valid if all are, else undecided.
-        reason: Reason of a decision that is not valid: of the deciding condition; empty for a valid one.
-        conditions: Condition -> decision; empty if the trajectory could not be evaluated.
-        duration: Duration [s].
-        samples: Number of times that were checked.
+    Attributes: decision: Invalid if a condition is, valid if all are, else undecided.
+        reason: Reason of a decision that is not valid: of the deciding condition; empty
+        for a valid one. conditions: Condition -> decision; empty if the trajectory
+        could not be evaluated. duration: Duration [s]. samples: Number of times that
+        were checked.
     """
 
     decision: Decision
@@ -84,15 +83,23 @@ class TrajectoryVerdict:
     @property
     def decisive(self) -> str:
         """Name of the condition that decides: the worst one of the verdict's decision; empty without conditions."""
-        deciding = {name: entry for name, entry in self.conditions.items() if entry.decision == self.decision}
-        return max(deciding, key=lambda name: deciding[name].margin.severity, default="")
+        deciding = {
+            name: entry
+            for name, entry in self.conditions.items()
+            if entry.decision == self.decision
+        }
+        return max(
+            deciding, key=lambda name: deciding[name].margin.severity, default=""
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict for JSON."""
         return {
             "decision": str(self.decision),
             "reason": self.reason,
-            "conditions": {name: entry.to_dict() for name, entry in self.conditions.items()},
+            "conditions": {
+                name: entry.to_dict() for name, entry in self.conditions.items()
+            },
             "duration_s": self.duration,
             "samples": self.samples,
         }

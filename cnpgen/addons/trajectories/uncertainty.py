@@ -1,8 +1,9 @@
 """Errors of measured conditions whose states are known up to bounds.
 
-Distances change by at most the displacement of the robot's points, which motion bounds give (Schwarzer et al. 2005).
-Other conditions are measured again with every value of the state moved by its bound, one by one and in random
-combinations. The sum of the changes, times a safety factor for curvature, bounds the error.
+Distances change by at most the displacement of the robot's points, which motion bounds
+give (Schwarzer et al. 2005). Other conditions are measured again with every value of
+the state moved by its bound, one by one and in random combinations. The sum of the
+changes, times a safety factor for curvature, bounds the error.
 """
 
 from collections.abc import Sequence
@@ -31,7 +32,9 @@ class Uncertainty:
     """Errors of conditions along a family of curves."""
 
     s: Array  # phases at which the blocks begin, shape (B,)
-    errors: dict[tuple[int, str], Array | float]  # by ``_key``: in every block, shape (m, B), or one of all
+    errors: dict[
+        tuple[int, str], Array | float
+    ]  # by ``_key``: in every block, shape (m, B), or one of all
 
     def add(self, condition: MeasuredCondition, s: Array) -> MeasuredCondition:
         """Return a condition at phases s, shape (K,), with the error of its values."""
@@ -40,11 +43,16 @@ class Uncertainty:
             return replace(condition, uncertainty=error) if error else condition
         block = np.searchsorted(self.s, s, "right") - 1
         near = [np.clip(block + step, 0, len(self.s) - 1) for step in (-1, 0, 1)]
-        return replace(condition, uncertainty=np.max([error[:, k] for k in near], axis=0))
+        return replace(
+            condition, uncertainty=np.max([error[:, k] for k in near], axis=0)
+        )
 
 
 def _key(condition: MeasuredCondition) -> tuple[int, str]:
-    """Return what identifies a condition; two constraints may state conditions of one name."""
+    """Return what identifies a condition.
+
+    Two constraints may state conditions of one name.
+    """
     return id(condition.constraint), condition.condition.name
 
 
@@ -58,12 +66,17 @@ def uncertainty_of(  # noqa: PLR0917 - the family, and everything that measures 
 ) -> Uncertainty:
     """Compute the errors of measured conditions at phases s of the samples, shape (K,), by moving another robot.
 
-    The first scene has the poses and sizes of the nominal curve, shape (width,); others are possible ones.
+    The first scene has the poses and sizes of the nominal curve, shape (width,); others
+    are possible ones.
     """
     reach = world.motion_bounds(family.max_positions())
     displacement = float((family.bounds[0] @ reach).max())
     ends = family.bounds[0][[0, -1]] @ reach
-    placed = float(ends.max()) if any(obstacle.below for obstacle in problem.obstacle) else 0.0
+    placed = (
+        float(ends.max())
+        if any(obstacle.below for obstacle in problem.obstacle)
+        else 0.0
+    )
     errors: dict[tuple[int, str], Array | float] = {}
     smooth = []
     for condition in measured:
@@ -71,7 +84,9 @@ def uncertainty_of(  # noqa: PLR0917 - the family, and everything that measures 
             errors[_key(condition)] = displacement + placed
         else:
             smooth.append(condition)
-    starts = np.unique(np.linspace(0, len(s), min(MAX_BLOCKS, len(s)) + 1).astype(np.intp))[:-1]
+    starts = np.unique(
+        np.linspace(0, len(s), min(MAX_BLOCKS, len(s)) + 1).astype(np.intp)
+    )[:-1]
     is_known = not any(bound.any() for bound in family.bounds)
     if smooth and (len(scenes) > 1 or not is_known):
         found = _changes(problem, family, world, scenes, smooth, s, starts)
@@ -95,16 +110,29 @@ def _changes(  # noqa: PLR0917 - as of uncertainty_of
     """Bound the errors of smooth conditions in every block, shape (m, B) each."""
     centers = np.append(starts[1:], len(s)) + starts
     at = s[centers // 2]
-    states = [values for values in vars(family.evaluate(at, jerk=problem.uses_jerk)).values() if values is not None]
-    bounds = [np.maximum.reduceat(values, starts, axis=1) for values in family.bounds_at(s)[: len(states)]]
+    states = [
+        values
+        for values in vars(family.evaluate(at, jerk=problem.uses_jerk)).values()
+        if values is not None
+    ]
+    bounds = [
+        np.maximum.reduceat(values, starts, axis=1)
+        for values in family.bounds_at(s)[: len(states)]
+    ]
     start_tip = np.zeros(3)  # used by the relaxation only
 
-    def values(offsets: Sequence[Array], obstacle_poses: Array = scenes[0]) -> list[Array]:
-        moved = EvaluatedTrajectory(*(state + offset for state, offset in zip(states, offsets, strict=True)))
+    def values(
+        offsets: Sequence[Array], obstacle_poses: Array = scenes[0]
+    ) -> list[Array]:
+        moved = EvaluatedTrajectory(
+            *(state + offset for state, offset in zip(states, offsets, strict=True))
+        )
         world.set_path(moved.q, moved.dq, moved.ddq, obstacle_poses, moved.jerk)
         every = {
             _key(condition): condition.g
-            for constraint in {id(condition.constraint): condition.constraint for condition in smooth}.values()
+            for constraint in {
+                id(condition.constraint): condition.constraint for condition in smooth
+            }.values()
             for condition in measure(constraint, world, at, start_tip)
         }
         return [every[_key(condition)] for condition in smooth]
@@ -118,16 +146,34 @@ def _changes(  # noqa: PLR0917 - as of uncertainty_of
             for sign in (-1, 1):
                 offsets = [offset.copy() for offset in still]
                 offsets[order][joint] = sign * bound[joint]
-                changes.append([np.abs(g - g0) for g, g0 in zip(values(offsets), nominal, strict=True)])
-            total = [row + np.maximum(low, high) for row, low, high in zip(total, *changes, strict=True)]
+                changes.append(
+                    [
+                        np.abs(g - g0)
+                        for g, g0 in zip(values(offsets), nominal, strict=True)
+                    ]
+                )
+            total = [
+                row + np.maximum(low, high)
+                for row, low, high in zip(total, *changes, strict=True)
+            ]
     of_scenes = [np.zeros_like(g) for g in nominal]
     for scene in scenes[1:]:
-        differences = [np.abs(g - g0) for g, g0 in zip(values(still, scene), nominal, strict=True)]
-        of_scenes = [np.maximum(row, change) for row, change in zip(of_scenes, differences, strict=True)]
-    total = [row + SCENE_FACTOR * change for row, change in zip(total, of_scenes, strict=True)]
+        differences = [
+            np.abs(g - g0) for g, g0 in zip(values(still, scene), nominal, strict=True)
+        ]
+        of_scenes = [
+            np.maximum(row, change)
+            for row, change in zip(of_scenes, differences, strict=True)
+        ]
+    total = [
+        row + SCENE_FACTOR * change
+        for row, change in zip(total, of_scenes, strict=True)
+    ]
     random = np.random.default_rng(0)
     for _ in range(COMBINATIONS):
         offsets = [bound * random.choice([-1.0, 1.0], bound.shape) for bound in bounds]
         for row, g, g0 in zip(total, values(offsets), nominal, strict=True):
             np.maximum(row, np.abs(g - g0), out=row)
-    return [CURVATURE_FACTOR * np.where(np.isfinite(row), row, UNDEFINED) for row in total]
+    return [
+        CURVATURE_FACTOR * np.where(np.isfinite(row), row, UNDEFINED) for row in total
+    ]

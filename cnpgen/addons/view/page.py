@@ -16,7 +16,10 @@ from cnpgen.addons.view.view_scene import View, ViewScene
 from cnpgen.errors import CnpgenError, MachineError, UsageError, requires_extra
 
 HOST = "127.0.0.1"
-_NAMES = (HOST, "localhost")  # accepted Host headers; requests that another site redirected have other ones
+_NAMES = (
+    HOST,
+    "localhost",
+)  # accepted Host headers; requests that another site redirected have other ones
 _RETRY_S = 2  # time after which a browser reloads an error page
 
 Page = Callable[[int | None, str], str]
@@ -30,7 +33,9 @@ def page_of(scene: ViewScene, *, stamp: str = "") -> str:
     """
     template = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
     content = vars(scene) | {"stamp": stamp}
-    data = json.dumps(content, default=_encoded, separators=(",", ":")).replace("<", "\\u003c")
+    data = json.dumps(content, default=_encoded, separators=(",", ":")).replace(
+        "<", "\\u003c"
+    )
     before, between = template.split("/*VIEWER*/")
     return before + _viewer() + between.replace("/*DATA*/", data)
 
@@ -40,28 +45,36 @@ def _viewer() -> str:
     from importlib.metadata import distribution
 
     with requires_extra("view", "MeshCat's viewer"):
-        path = Path(str(distribution("meshcat").locate_file("meshcat/viewer/dist/main.min.js")))
+        path = Path(
+            str(distribution("meshcat").locate_file("meshcat/viewer/dist/main.min.js"))
+        )
         return path.read_text(encoding="utf-8")
 
 
 def _encoded(value: View | Body | NDArray[Any]) -> Any:
-    """Return an object for JSON; arrays as base64 of their bytes, with 4 bytes per number."""
+    """Return an object for JSON.
+
+    Arrays as base64 of their bytes, with 4 bytes per number.
+    """
     if isinstance(value, np.ndarray):
         dtype = "<f4" if value.dtype.kind == "f" else "<u4"
         return base64.b64encode(np.ascontiguousarray(value, dtype).tobytes()).decode()
     return vars(value)
 
 
-def serve(page: Page, watched: Sequence[Path], *, port: int, ready: Callable[[str], None]) -> None:
+def serve(
+    page: Page, watched: Sequence[Path], *, port: int, ready: Callable[[str], None]
+) -> None:
     """Serve a page until the process is interrupted.
 
-    ``/?row=I`` shows another row. An open page checks every second whether it is out of date, and then reloads.
+    ``/?row=I`` shows another row. An open page checks every second whether it is out of
+    date, and then reloads.
 
-    Args:
-        page: (row or None, stamp of the files) -> the page as HTML. Its errors are shown in place of the page.
-        watched: The files that the page depends on; for a recipe also the other files in its folder.
-        port: Port on the loopback address; 0 for any free port. MachineError if it is taken.
-        ready: Called with the address once it is served.
+    Args: page: (row or None, stamp of the files) -> the page as HTML. Its errors are
+        shown in place of the page. watched: The files that the page depends on; for a
+        recipe also the other files in its folder. port: Port on the loopback address; 0
+        for any free port. MachineError if it is taken. ready: Called with the address
+        once it is served.
     """
     from http import HTTPStatus
     from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -70,7 +83,9 @@ def serve(page: Page, watched: Sequence[Path], *, port: int, ready: Callable[[st
         def do_GET(self) -> None:
             address = urlsplit(self.path)
             if (self.headers.get("Host") or "").rpartition(":")[0] not in _NAMES:
-                self._answer("expected the address of this machine", status=HTTPStatus.FORBIDDEN)
+                self._answer(
+                    "expected the address of this machine", status=HTTPStatus.FORBIDDEN
+                )
             elif address.path == "/stamp":
                 self._answer(stamp(watched))
             elif address.path == "/":
@@ -82,11 +97,19 @@ def serve(page: Page, watched: Sequence[Path], *, port: int, ready: Callable[[st
             try:
                 if row and not (row.isascii() and row.isdigit()):
                     raise UsageError(f"row: expected a number from 0, got {row[:20]!r}")
-                self._answer(page(int(row) if row else None, stamp(watched)), kind="text/html")
+                self._answer(
+                    page(int(row) if row else None, stamp(watched)), kind="text/html"
+                )
             except CnpgenError as error:
                 self._answer(str(error), status=HTTPStatus.INTERNAL_SERVER_ERROR)
 
-        def _answer(self, text: str, *, kind: str = "text/plain", status: HTTPStatus = HTTPStatus.OK) -> None:
+        def _answer(
+            self,
+            text: str,
+            *,
+            kind: str = "text/plain",
+            status: HTTPStatus = HTTPStatus.OK,
+        ) -> None:
             body = text.encode()
             self.send_response(status)
             self.send_header("Content-Type", f"{kind}; charset=utf-8")
@@ -103,7 +126,9 @@ def serve(page: Page, watched: Sequence[Path], *, port: int, ready: Callable[[st
     try:
         server = HTTPServer((HOST, port), Handler)
     except OSError as error:
-        raise MachineError(f"--serve: cannot listen on port {port}: {error.strerror}") from error
+        raise MachineError(
+            f"--serve: cannot listen on port {port}: {error.strerror}"
+        ) from error
     with server:
         ready(f"http://{HOST}:{server.server_port}/")
         server.serve_forever()
@@ -111,7 +136,11 @@ def serve(page: Page, watched: Sequence[Path], *, port: int, ready: Callable[[st
 
 def stamp(watched: Sequence[Path]) -> str:
     """Return a text that changes when one of the files does."""
-    files = [each for path in watched for each in (path.parent.glob("*") if path.suffix == ".toml" else (path,))]
+    files = [
+        each
+        for path in watched
+        for each in (path.parent.glob("*") if path.suffix == ".toml" else (path,))
+    ]
     return " ".join(sorted(map(_state, files)))
 
 

@@ -22,7 +22,9 @@ from cnpgen.robots.urdf import urdf_tree
 
 Array = NDArray[np.float64]
 
-LINE_ARM_RADIUS_M = 0.04  # radius of an arm without link geometry, if no constraint gives one
+LINE_ARM_RADIUS_M = (
+    0.04  # radius of an arm without link geometry, if no constraint gives one
+)
 MAX_TRIANGLES = 400_000  # of all visual meshes; larger pages open slowly
 PROBE = 0.5  # joint displacement from which the axis of a joint is computed
 BALL = 12  # directions per quarter of a circle in which round bodies have corners
@@ -39,20 +41,29 @@ class Body:
     smooth: bool = False  # whether the surface is drawn without edges
 
 
-def robot_bodies(problem: Problem, robot: Robot, *, with_meshes: bool = True) -> tuple[list[Body], str]:
+def robot_bodies(
+    problem: Problem, robot: Robot, *, with_meshes: bool = True
+) -> tuple[list[Body], str]:
     """Return the bodies of a robot, and their kind: "meshes", "convex parts" or "line".
 
-    ``with_meshes`` reads the visual meshes that the URDF names; it is false for untrusted files.
+    ``with_meshes`` reads the visual meshes that the URDF names; it is false for
+    untrusted files.
     """
     try:
         visual = list(_visual_bodies(problem, robot)) if with_meshes else []
-    except (RecipeError, ValueError):  # a mesh is missing or unreadable; the verdict does not need it
+    except (
+        RecipeError,
+        ValueError,
+    ):  # a mesh is missing or unreadable; the verdict does not need it
         visual = []
     if visual and sum(len(body.triangles) for body in visual) <= MAX_TRIANGLES:
         return visual, "meshes"
     if robot.shape is not None:
         parts, joints = robot.shape.convex_parts, robot.shape.joints
-        return [wrapped(each.link, joints[each.link], each.vertices, each.radius) for each in parts], "convex parts"
+        return [
+            wrapped(each.link, joints[each.link], each.vertices, each.radius)
+            for each in parts
+        ], "convex parts"
     return list(_line(robot, problem.arm_radius or LINE_ARM_RADIUS_M)), "line"
 
 
@@ -62,7 +73,10 @@ def capsule_bodies(robot: Robot) -> list[Body]:
     joints = robot.shape.joints if robot.shape else {}
     ends = [np.array([each.first, each.second]) for each in found]
     pairs = zip(found, ends, strict=True)
-    return [wrapped(each.link, joints[each.link], points, each.radius, smooth=True) for each, points in pairs]
+    return [
+        wrapped(each.link, joints[each.link], points, each.radius, smooth=True)
+        for each, points in pairs
+    ]
 
 
 def planned_joints(robot: Robot) -> tuple[list[dict[str, Any]], list[float]]:
@@ -74,7 +88,9 @@ def planned_joints(robot: Robot) -> tuple[list[dict[str, Any]], list[float]]:
     joints = []
     for index, name in enumerate(robot.joint_names):
         placement = model.jointPlacements[index + 1]
-        twist = pin.log6(placement.actInv(data.liMi[index + 1])).vector / PROBE  # linear, then angular
+        twist = (
+            pin.log6(placement.actInv(data.liMi[index + 1])).vector / PROBE
+        )  # linear, then angular
         joints.append(
             {
                 "name": name,
@@ -92,7 +108,9 @@ def _by_columns(matrix: NDArray[np.float64]) -> list[float]:
     return [float(value) for value in matrix.T.ravel()]
 
 
-def wrapped(name: str, joint: int, corners: Array, radius: float, *, smooth: bool = False) -> Body:
+def wrapped(
+    name: str, joint: int, corners: Array, radius: float, *, smooth: bool = False
+) -> Body:
     """Return the hull of points [m], shape (V, 3), inflated by a radius [m], as triangles that face outwards."""
     points = (corners[:, None] + radius * _ball()).reshape(-1, 3) if radius else corners
     used, numbers = np.unique(outward_triangles(points), return_inverse=True)
@@ -107,8 +125,14 @@ def tube(name: str, points: Array, radius: float) -> Body:
     level = np.linalg.norm(across, axis=1, keepdims=True)
     across = np.where(level > 1e-3, across / np.maximum(level, 1e-12), [1.0, 0.0, 0.0])
     angles = np.arange(6) * np.pi / 3
-    ring = np.cos(angles)[:, None] * across[:, None] + np.sin(angles)[:, None] * np.cross(along, across)[:, None]
-    first = [(6 * k + i, 6 * k + (i + 1) % 6, 6 * k + 6 + i) for k, i in product(range(len(points) - 1), range(6))]
+    ring = (
+        np.cos(angles)[:, None] * across[:, None]
+        + np.sin(angles)[:, None] * np.cross(along, across)[:, None]
+    )
+    first = [
+        (6 * k + i, 6 * k + (i + 1) % 6, 6 * k + 6 + i)
+        for k, i in product(range(len(points) - 1), range(6))
+    ]
     second = [(b, b + 6, a + 6) for a, b, _ in first]
     corners = (points[:, None] + radius * ring).reshape(-1, 3)
     return Body(name, 0, corners, np.array(first + second).reshape(-1, 3), smooth=True)
@@ -116,7 +140,11 @@ def tube(name: str, points: Array, radius: float) -> Body:
 
 def extent(bodies: Sequence[Body], poses: Array) -> tuple[Array, Array]:
     """Return the corners of the box around bodies [m], shape (3,), at transposed poses, shape (K, joints, 4, 4)."""
-    parts = [body.corners @ pose[body.joint, :3, :3] + pose[body.joint, 3, :3] for body in bodies for pose in poses]
+    parts = [
+        body.corners @ pose[body.joint, :3, :3] + pose[body.joint, 3, :3]
+        for body in bodies
+        for pose in poses
+    ]
     corners = np.concatenate(parts)
     return corners.min(axis=0), corners.max(axis=0)
 
@@ -125,8 +153,16 @@ def _ball() -> Array:
     """Unit vectors along meridians and parallels, shape (N, 3)."""
     angles = np.linspace(0, np.pi, 2 * BALL + 1)
     turns = np.arange(4 * BALL) * np.pi / (2 * BALL)
-    level, height = np.sin(angles)[:, None], np.broadcast_to(np.cos(angles)[:, None], (len(angles), len(turns)))
-    return np.unique(np.stack([level * np.cos(turns), level * np.sin(turns), height], axis=-1).reshape(-1, 3), axis=0)
+    level, height = (
+        np.sin(angles)[:, None],
+        np.broadcast_to(np.cos(angles)[:, None], (len(angles), len(turns))),
+    )
+    return np.unique(
+        np.stack(
+            [level * np.cos(turns), level * np.sin(turns), height], axis=-1
+        ).reshape(-1, 3),
+        axis=0,
+    )
 
 
 def _visual_bodies(problem: Problem, robot: Robot) -> Iterator[Body]:
@@ -151,7 +187,9 @@ def _visual(
         body = wrapped(link, 0, piece.vertices, piece.radius)
         return body.corners, body.triangles
     rotation, translation = origin_of(element.find("origin"))
-    points, loaded = read_mesh(find_named_file(mesh.get("filename", ""), urdf, packages), scale_of(mesh))
+    points, loaded = read_mesh(
+        find_named_file(mesh.get("filename", ""), urdf, packages), scale_of(mesh)
+    )
     return points @ rotation.T + translation, sides_of(loaded)
 
 
@@ -167,5 +205,7 @@ def _line(robot: Robot, radius: float) -> Iterator[Body]:
     if np.ptp(foot, axis=0).any():
         yield wrapped("foot", 0, foot, radius, smooth=True)
     for a, b in robot.capsule_axes:
-        ends = np.array([data.oMi[b].actInv(origins[a]), data.oMi[b].actInv(origins[b])])
+        ends = np.array(
+            [data.oMi[b].actInv(origins[a]), data.oMi[b].actInv(origins[b])]
+        )
         yield wrapped(f"segment {a}-{b}", b, ends, radius, smooth=True)

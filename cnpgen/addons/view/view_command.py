@@ -1,12 +1,15 @@
 """Show a robot, a plan or a sample in a browser.
 
-The page is one file that needs no network: the arm, obstacles, puck, path and frame of the tip, a time slider and a
-slider for every joint. Curves show the joints relative to their limits and the other conditions with their bounds. The
-verdict lists the smallest margin of every condition; for a rejected plan, a click shows the place and time of a
-violation. A sample without a plan is shown at its start and goal, a problem in its base configuration. --rows puts
-several plans on one page. Sampled trajectories need --problem ('cnpgen docs trajectories'). Plans and datasets contain
-collision geometry only; --problem locates the visual meshes. --serve serves the page locally until Ctrl-C and reloads
-it when a file changes; ?row=I shows another sample. Needs MeshCat's viewer: pip install 'cnpgen[view]'.
+The page is one file that needs no network: the arm, obstacles, puck, path and frame of
+the tip, a time slider and a slider for every joint. Curves show the joints relative to
+their limits and the other conditions with their bounds. The verdict lists the smallest
+margin of every condition; for a rejected plan, a click shows the place and time of a
+violation. A sample without a plan is shown at its start and goal, a problem in its base
+configuration. --rows puts several plans on one page. Sampled trajectories need
+--problem ('cnpgen docs trajectories'). Plans and datasets contain collision geometry
+only; --problem locates the visual meshes. --serve serves the page locally until Ctrl-C
+and reloads it when a file changes; ?row=I shows another sample. Needs MeshCat's viewer:
+pip install 'cnpgen[view]'.
 """
 
 import argparse
@@ -48,9 +51,13 @@ def add_options(parser: Parser) -> None:
     option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     where = parser.add_mutually_exclusive_group()
     text = "output file (default: NAME.html)"
-    where.add_argument("-o", "--out", metavar="OUT", type=values.file_in(".html"), help=text)
+    where.add_argument(
+        "-o", "--out", metavar="OUT", type=values.file_in(".html"), help=text
+    )
     text = "serve the page on this machine, and show every change of its files (default port: 8000)"
-    where.add_argument("--serve", metavar="PORT", type=values.port, nargs="?", const=8000, help=text)
+    where.add_argument(
+        "--serve", metavar="PORT", type=values.port, nargs="?", const=8000, help=text
+    )
     add_trajectory_options(parser.add_argument_group("sampled trajectories"))
 
 
@@ -62,7 +69,9 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.serve is not None:
         _serve(arguments)
         return
-    out = Path(arguments.out or f"{what.resolve().name if what.is_dir() else what.stem}.html")
+    out = Path(
+        arguments.out or f"{what.resolve().name if what.is_dir() else what.stem}.html"
+    )
     check_writable(out)
     write_file(out, page_of(_scene(arguments)))
     print(out)
@@ -74,18 +83,34 @@ def _serve(arguments: argparse.Namespace) -> None:
     from cnpgen.store.layout import SPECIFICATION
 
     def page(row: int | None, stamp: str) -> str:
-        chosen = arguments if row is None else argparse.Namespace(**(vars(arguments) | {"row": row, "rows": None}))
+        chosen = (
+            arguments
+            if row is None
+            else argparse.Namespace(**(vars(arguments) | {"row": row, "rows": None}))
+        )
         return page_of(_scene(chosen), stamp=stamp)
 
     _scene(arguments)  # report errors before serving
-    files = [Path(file) for file in (arguments.what, arguments.problem) if file and Path(file).exists()]
+    files = [
+        Path(file)
+        for file in (arguments.what, arguments.problem)
+        if file and Path(file).exists()
+    ]
     watched = [path / SPECIFICATION if path.is_dir() else path for path in files]
-    serve(page, watched, port=arguments.serve, ready=lambda address: print(address, flush=True))
+    serve(
+        page,
+        watched,
+        port=arguments.serve,
+        ready=lambda address: print(address, flush=True),
+    )
 
 
 def _scene(arguments: argparse.Namespace) -> "ViewScene":
     """Build the scene of a problem, of samples or of plans."""
-    from cnpgen.addons.trajectories.trajectory_tables import holds_trajectories, is_trajectory_file
+    from cnpgen.addons.trajectories.trajectory_tables import (
+        holds_trajectories,
+        is_trajectory_file,
+    )
     from cnpgen.addons.view.view_scene import scene_of_plans, scene_of_problem
     from cnpgen.plans import open_problem
     from cnpgen.plans.evaluate import evaluate_plans
@@ -96,17 +121,31 @@ def _scene(arguments: argparse.Namespace) -> "ViewScene":
 
     what, rows = Path(arguments.what), arguments.rows or (arguments.row or 0,)
     if len(rows) > MAX_ROWS_OF_PAGE:
-        raise UsageError(f"--rows: expected at most {MAX_ROWS_OF_PAGE} rows on one page, got {len(rows)}")
-    if what.exists() and (what.is_dir() or is_trajectory_file(what)) and holds_trajectories(what):
+        raise UsageError(
+            f"--rows: expected at most {MAX_ROWS_OF_PAGE} rows on one page, got {len(rows)}"
+        )
+    if (
+        what.exists()
+        and (what.is_dir() or is_trajectory_file(what))
+        and holds_trajectories(what)
+    ):
         return _scene_of_trajectories(arguments, rows)
     refuse_trajectory_options(arguments, what)
     if not what.is_dir() and not file_kind(what) and what.suffix not in HDF5_SUFFIXES:
-        extra = [name for name in ("row", "rows", "split", "problem") if getattr(arguments, name) is not None]
+        extra = [
+            name
+            for name in ("row", "rows", "split", "problem")
+            if getattr(arguments, name) is not None
+        ]
         if extra:
-            raise UsageError(f"--{extra[0]} needs plans or the folder of a dataset, got {arguments.what}")
+            raise UsageError(
+                f"--{extra[0]} needs plans or the folder of a dataset, got {arguments.what}"
+            )
         problem = load_problem_behind(arguments.what)
         return scene_of_problem(problem, load_robot(problem))
-    plans, count = _samples(arguments, rows) if what.is_dir() else _plans(arguments, rows)
+    plans, count = (
+        _samples(arguments, rows) if what.is_dir() else _plans(arguments, rows)
+    )
     if arguments.problem:
         problem = load_problem_behind(arguments.problem)
         robot = load_robot(problem)
@@ -117,28 +156,44 @@ def _scene(arguments: argparse.Namespace) -> "ViewScene":
     verdicts: list[Verdict | None] = list(evaluate_plans(plans, workers=1).verdicts)
     if what.is_dir():  # samples without a plan have a duration of nan and no verdict
         pairs = zip(plans.duration.tolist(), verdicts, strict=True)
-        verdicts = [None if math.isnan(duration) else verdict for duration, verdict in pairs]
-    scene = scene_of_plans(problem, robot, plans, titles, verdicts, with_meshes=bool(arguments.problem))
+        verdicts = [
+            None if math.isnan(duration) else verdict for duration, verdict in pairs
+        ]
+    scene = scene_of_plans(
+        problem, robot, plans, titles, verdicts, with_meshes=bool(arguments.problem)
+    )
     return replace(scene, first_row=rows[0], n_rows=count)
 
 
-def _scene_of_trajectories(arguments: argparse.Namespace, rows: Sequence[int]) -> "ViewScene":
+def _scene_of_trajectories(
+    arguments: argparse.Namespace, rows: Sequence[int]
+) -> "ViewScene":
     """Build the scene of sampled trajectories with their verdicts."""
     from cnpgen.addons.trajectories.evaluate_trajectories import evaluate_trajectories
     from cnpgen.addons.view.view_scene import scene_of_trajectories
     from cnpgen.problems.load_robot import load_robot
     from cnpgen.problems.problem_record import as_problem
 
-    refuse(arguments, ["split"], f"--split is for the folder of a dataset, got {arguments.what}")
+    refuse(
+        arguments,
+        ["split"],
+        f"--split is for the folder of a dataset, got {arguments.what}",
+    )
     problem = as_problem(problem_of(arguments))
-    loaded = load_file(argparse.Namespace(**vars(arguments) | {"file": Path(arguments.what)}), problem)
+    loaded = load_file(
+        argparse.Namespace(**vars(arguments) | {"file": Path(arguments.what)}), problem
+    )
     count = len(loaded.trajectories)
     if (row := max(rows)) >= count:
-        raise UsageError(f"{arguments.what} has no trajectory {row}: {count} are numbered from 0")
+        raise UsageError(
+            f"{arguments.what} has no trajectory {row}: {count} are numbered from 0"
+        )
     chosen = [loaded.trajectories[row] for row in rows]
     titles = [f"{problem.name}: {loaded.labels[row]}" for row in rows]
     verdicts = evaluate_trajectories(problem, chosen).verdicts
-    scene = scene_of_trajectories(problem, load_robot(problem), chosen, titles, verdicts)
+    scene = scene_of_trajectories(
+        problem, load_robot(problem), chosen, titles, verdicts
+    )
     return replace(scene, first_row=rows[0], n_rows=count)
 
 
@@ -151,20 +206,31 @@ def _samples(arguments: argparse.Namespace, rows: Sequence[int]) -> "tuple[Plans
     from cnpgen.store.reader import open_dataset
 
     split = arguments.split or "validation"
-    samples = [load_boundary_problems(arguments.what, split=split, start=row, n=1) for row in rows]
+    samples = [
+        load_boundary_problems(arguments.what, split=split, start=row, n=1)
+        for row in rows
+    ]
     plans = concatenate(samples)
     if arguments.problem:
         wanted = record_problem(load_problem_behind(arguments.problem))
         if where := plans.problem.differences(wanted):
-            raise DatasetError(f"{arguments.what} is not of {wanted.name!r}: they differ in {', '.join(where)}")
+            raise DatasetError(
+                f"{arguments.what} is not of {wanted.name!r}: they differ in {', '.join(where)}"
+            )
     return plans, open_dataset(arguments.what).spec.splits[split]
 
 
 def _plans(arguments: argparse.Namespace, rows: Sequence[int]) -> "tuple[Plans, int]":
     """Read plans, and count those of the file."""
-    refuse(arguments, ["split"], f"--split is for the folder of a dataset, got {arguments.what}")
+    refuse(
+        arguments,
+        ["split"],
+        f"--split is for the folder of a dataset, got {arguments.what}",
+    )
     plans = recipe_names.read_plans(Path(arguments.what), problem=arguments.problem)
     option = "--rows" if arguments.rows else "--row"
     if (row := max(rows)) >= len(plans):
-        raise UsageError(f"{option}: {arguments.what} has no plan {row}: {len(plans)} plans are numbered from 0")
+        raise UsageError(
+            f"{option}: {arguments.what} has no plan {row}: {len(plans)} plans are numbered from 0"
+        )
     return plans[list(rows)], len(plans)

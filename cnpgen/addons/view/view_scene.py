@@ -10,8 +10,20 @@ from numpy.typing import NDArray
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.addons.trajectories.trajectory_plot import along_trajectory
 from cnpgen.addons.trajectories.trajectory_verdict import TrajectoryVerdict
-from cnpgen.addons.view.view_bodies import Body, capsule_bodies, extent, planned_joints, robot_bodies, tube, wrapped
-from cnpgen.judges.plans.condition_curves import ConditionCurve, condition_curves, plot_unit
+from cnpgen.addons.view.view_bodies import (
+    Body,
+    capsule_bodies,
+    extent,
+    planned_joints,
+    robot_bodies,
+    tube,
+    wrapped,
+)
+from cnpgen.judges.plans.condition_curves import (
+    ConditionCurve,
+    condition_curves,
+    plot_unit,
+)
 from cnpgen.judges.plans.plan_plot import along, shares_of_limits
 from cnpgen.judges.plans.verdict import Margin, Reason, Verdict
 from cnpgen.plans.plans import Plans
@@ -29,7 +41,9 @@ from cnpgen.world.path import PathWorld
 Array = NDArray[np.float64]
 
 FRAMES_PER_MOTION = 240
-MIN_DRAWN_HEIGHT_M = 0.1  # of obstacles without a lower end, which are drawn down to the floor
+MIN_DRAWN_HEIGHT_M = (
+    0.1  # of obstacles without a lower end, which are drawn down to the floor
+)
 DRAWN_TABLE_M = 5e-3  # thickness of a drawn table
 TIP_PATH_RADIUS_M = 4e-3
 TRIAD_LENGTH_M, TRIAD_RADIUS_M = 0.12, 4e-3  # axes of a drawn frame
@@ -55,8 +69,12 @@ class View:
     poses: Array  # transposed poses of the joints, the universe first and the tip last, shape (K, joints, 4, 4)
     world: Sequence[Body]  # obstacles, the table and the puck
     path: Sequence[Body] = ()  # path of the tip, of a motion
-    curves: Sequence[dict[str, Any]] = ()  # quantities with their shares of the limits; empty without a motion
-    conditions: Sequence[dict[str, Any]] = ()  # curves of the other conditions; empty without a motion
+    curves: Sequence[
+        dict[str, Any]
+    ] = ()  # quantities with their shares of the limits; empty without a motion
+    conditions: Sequence[
+        dict[str, Any]
+    ] = ()  # curves of the other conditions; empty without a motion
     verdict: dict[str, Any] | None = None  # None without a motion
 
 
@@ -65,7 +83,9 @@ class ViewScene:
     """The content of a page, with the names that its script has."""
 
     note: str  # remark about the bodies of the robot
-    joints: Sequence[dict[str, Any]]  # placements, axes and limits of the planned joints
+    joints: Sequence[
+        dict[str, Any]
+    ]  # placements, axes and limits of the planned joints
     tip: Sequence[float]  # pose of the tip in the frame of the last joint, by columns
     joints_and_tip: int  # number of poses of a frame
     robot: Sequence[Body]
@@ -85,7 +105,9 @@ def scene_of_problem(problem: Problem, robot: Robot) -> ViewScene:
     q = robot.home[:, None]
     tip = _poses(robot, q)[:, -1, :3, 3]
     scene = scene_of(problem, tip, tip, np.zeros((1, 3)))
-    view = _still(problem, robot, f"{problem.name}: base configuration", q, ("base",), scene)
+    view = _still(
+        problem, robot, f"{problem.name}: base configuration", q, ("base",), scene
+    )
     return _scene(problem, robot, [view], with_meshes=True)
 
 
@@ -101,7 +123,10 @@ def scene_of_plans(
     """Show motions or, of rows without a plan, which have no verdict, their starts and goals."""
     scene = plans.scene
     views = [
-        _view(problem, robot, plans[i : i + 1], titles[i], verdicts[i], scene[i : i + 1]) for i in range(len(plans))
+        _view(
+            problem, robot, plans[i : i + 1], titles[i], verdicts[i], scene[i : i + 1]
+        )
+        for i in range(len(plans))
     ]
     return _scene(problem, robot, views, with_meshes=with_meshes)
 
@@ -128,16 +153,33 @@ def scene_of_trajectories(
 
 
 def _view(  # noqa: PLR0917 - all of them are shown
-    problem: Problem, robot: Robot, plan: Plans, title: str, verdict: Verdict | None, scene: Scene
+    problem: Problem,
+    robot: Robot,
+    plan: Plans,
+    title: str,
+    verdict: Verdict | None,
+    scene: Scene,
 ) -> View:
     """Show one motion, or its start and goal if there is none or it cannot be evaluated."""
     if verdict is None or not verdict.margins:
         boundary = plan.boundary
         q = np.array([boundary.start_q[0], boundary.goal_q[0]]).T
-        rejected = None if verdict is None else {"valid": False, "reason": str(verdict.reason), "causes": ()}
+        rejected = (
+            None
+            if verdict is None
+            else {"valid": False, "reason": str(verdict.reason), "causes": ()}
+        )
         return _still(problem, robot, title, q, ("start", "goal"), scene, rejected)
     extra = [margin.time for margin in verdict.margins.values() if not margin.ok]
-    world, s, times = along(problem, robot, plan.motion, 0, samples=FRAMES_PER_MOTION, extra_times=extra, scene=scene)
+    world, s, times = along(
+        problem,
+        robot,
+        plan.motion,
+        0,
+        samples=FRAMES_PER_MOTION,
+        extra_times=extra,
+        scene=scene,
+    )
     return _moving(problem, robot, world, s, times, scene, title, verdict)
 
 
@@ -162,27 +204,45 @@ def _moving(  # noqa: PLR0917 - all of them are shown
         poses=poses.swapaxes(2, 3),
         world=list(_world(problem, scene)),
         path=[tube("path of the tip", poses[:, -1, :3, 3], TIP_PATH_RADIUS_M)],
-        curves=[{"name": name, "shares": share.round(SHARE_DIGITS).tolist()} for name, share in shares.items()],
+        curves=[
+            {"name": name, "shares": share.round(SHARE_DIGITS).tolist()}
+            for name, share in shares.items()
+        ],
         conditions=[_condition(curve) for curve in curves],
         verdict=_verdict(verdict, curves, times, poses, robot.joint_names),
     )
 
 
 def _verdict(
-    verdict: Verdict, curves: Sequence[ConditionCurve], times: Array, poses: Array, joints: Sequence[str]
+    verdict: Verdict,
+    curves: Sequence[ConditionCurve],
+    times: Array,
+    poses: Array,
+    joints: Sequence[str],
 ) -> dict[str, Any]:
     """Return a verdict for JSON, its margins located in time and space, the largest violation first.
 
-    The poses of the joints, the universe first and the tip last, have shape (K, joints, 4, 4), the times [s] (K,).
+    The poses of the joints, the universe first and the tip last, have shape (K, joints,
+    4, 4), the times [s] (K,).
     """
     by_name = {curve.name: curve for curve in curves}
     margins = sorted(verdict.margins.values(), key=lambda margin: -margin.severity)
     causes = []
     for margin in margins:
         frame = int(np.abs(times - margin.time).argmin())
-        point = _point(margin, by_name.get(margin.name), poses[frame], frame, joints).tolist()
+        point = _point(
+            margin, by_name.get(margin.name), poses[frame], frame, joints
+        ).tolist()
         name, text = f"{margin.name} {margin.part}".strip(), _margin_text(margin)
-        causes.append({"name": name, "text": text, "frame": frame, "ok": margin.ok, "point": point})
+        causes.append(
+            {
+                "name": name,
+                "text": text,
+                "frame": frame,
+                "ok": margin.ok,
+                "point": point,
+            }
+        )
     return {"valid": verdict.valid, "reason": str(verdict.reason), "causes": causes}
 
 
@@ -194,7 +254,13 @@ def _margin_text(margin: Margin) -> str:
     return f"{amount:.3g} {unit} {side}, tolerance {tolerance:.3g} {unit}"
 
 
-def _point(margin: Margin, curve: ConditionCurve | None, poses: Array, frame: int, joints: Sequence[str]) -> Array:
+def _point(
+    margin: Margin,
+    curve: ConditionCurve | None,
+    poses: Array,
+    frame: int,
+    joints: Sequence[str],
+) -> Array:
     """Return the place of a margin [m], shape (3,): between the closest points, at the joint, or at the tip."""
     if curve is not None and curve.points is not None:
         return np.asarray(curve.points[frame].mean(axis=0))
@@ -221,7 +287,10 @@ def _condition(curve: ConditionCurve) -> dict[str, Any]:
 
 def _rounded(values: Array) -> list[float | None]:
     """Return values with ``CURVE_DIGITS`` significant digits, None for those that are not finite."""
-    return [float(f"{value:.{CURVE_DIGITS}g}") if np.isfinite(value) else None for value in values.tolist()]
+    return [
+        float(f"{value:.{CURVE_DIGITS}g}") if np.isfinite(value) else None
+        for value in values.tolist()
+    ]
 
 
 def _still(  # noqa: PLR0917 - all of them are shown
@@ -234,18 +303,32 @@ def _still(  # noqa: PLR0917 - all of them are shown
     verdict: dict[str, Any] | None = None,
 ) -> View:
     """Show configurations without a motion."""
-    times, poses = [float(frame) for frame in range(len(labels))], _poses(robot, q).swapaxes(2, 3)
-    return View(title, labels, times, q.T, poses, list(_world(problem, scene)), verdict=verdict)
+    times, poses = (
+        [float(frame) for frame in range(len(labels))],
+        _poses(robot, q).swapaxes(2, 3),
+    )
+    return View(
+        title, labels, times, q.T, poses, list(_world(problem, scene)), verdict=verdict
+    )
 
 
-def _scene(problem: Problem, robot: Robot, views: list[View], *, with_meshes: bool) -> ViewScene:
+def _scene(
+    problem: Problem, robot: Robot, views: list[View], *, with_meshes: bool
+) -> ViewScene:
     bodies, kind = robot_bodies(problem, robot, with_meshes=with_meshes)
     size, contact, tip = problem.object_size, problem.first(PuckContact), robot.n + 1
-    disc = None if contact is None else _disc_corners(np.zeros(3), contact.mallet_radius, MALLET_HEIGHT_M)
+    disc = (
+        None
+        if contact is None
+        else _disc_corners(np.zeros(3), contact.mallet_radius, MALLET_HEIGHT_M)
+    )
     held = [] if size is None else [wrapped("object", tip, CUBE * np.array(size), 0.0)]
     joints, placement = planned_joints(robot)
     low, high = extent((*bodies, *held), views[0].poses[[0, -1]])
-    axes = {f"axis {'xyz'[k]}": np.array([np.zeros(3), TRIAD_LENGTH_M * np.eye(3)[k]]) for k in range(3)}
+    axes = {
+        f"axis {'xyz'[k]}": np.array([np.zeros(3), TRIAD_LENGTH_M * np.eye(3)[k]])
+        for k in range(3)
+    }
     return ViewScene(
         note=_NOTES[kind],
         joints=joints,
@@ -255,7 +338,10 @@ def _scene(problem: Problem, robot: Robot, views: list[View], *, with_meshes: bo
         capsules=capsule_bodies(robot),
         held=held,
         mallet=[] if disc is None else [wrapped("mallet", tip, disc, 0.0)],
-        triad=[wrapped(name, tip, ends, TRIAD_RADIUS_M, smooth=True) for name, ends in axes.items()],
+        triad=[
+            wrapped(name, tip, ends, TRIAD_RADIUS_M, smooth=True)
+            for name, ends in axes.items()
+        ],
         centre=((low + high) / 2).tolist(),
         size=float(np.linalg.norm(high - low)),
         views=views,
@@ -267,39 +353,67 @@ def _poses(robot: Robot, q: Array) -> Array:
     n = robot.n
     rotations, positions = ForwardKinematics(robot.model).poses(q)
     poses = np.zeros((q.shape[1], n + 2, 4, 4))
-    for joint, (rotation, position) in enumerate(zip(rotations, positions, strict=True)):
-        poses[:, joint, :3, :3], poses[:, joint, :3, 3] = rotation.transpose(2, 0, 1), position.T
+    for joint, (rotation, position) in enumerate(
+        zip(rotations, positions, strict=True)
+    ):
+        poses[:, joint, :3, :3], poses[:, joint, :3, 3] = (
+            rotation.transpose(2, 0, 1),
+            position.T,
+        )
     poses[..., 3, 3] = 1.0
-    poses[:, -1] = poses[:, n] @ robot.model.frames[robot.tip_frame].placement.homogeneous
+    poses[:, -1] = (
+        poses[:, n] @ robot.model.frames[robot.tip_frame].placement.homogeneous
+    )
     return poses
 
 
 def _world(problem: Problem, scene: Scene) -> Iterator[Body]:
     """Draw obstacles, a table and a puck."""
     for obstacle, solid in zip(scene.obstacles, scene.bodies(), strict=True):
-        if solid.position[2] <= PARKED_POSITION_M[2]:  # the plan has fewer obstacles than the problem
+        if (
+            solid.position[2] <= PARKED_POSITION_M[2]
+        ):  # the plan has fewer obstacles than the problem
             continue
         if obstacle.upright and obstacle.height is None:
             bottom = min(0.0, solid.high[2] - MIN_DRAWN_HEIGHT_M)
-            yield wrapped(obstacle.name, 0, _corners(np.array([*solid.low[:2], bottom]), solid.high), 0.0)
+            yield wrapped(
+                obstacle.name,
+                0,
+                _corners(np.array([*solid.low[:2], bottom]), solid.high),
+                0.0,
+            )
         else:
-            yield wrapped(obstacle.name, 0, solid.position + solid.corners, solid.radius)
+            yield wrapped(
+                obstacle.name, 0, solid.position + solid.corners, solid.radius
+            )
     contact, table = problem.first(PuckContact), problem.first(Table)
     if table is not None:
         values = scene.poses[0, problem.scene_width - len(problem.parameters) :]
-        low, high = table.bounds_of(dict(zip(problem.parameters.names, values.tolist(), strict=True)))
-        corners = _corners(np.array([*low, table.z - DRAWN_TABLE_M]), np.array([*high, table.z]))
+        low, high = table.bounds_of(
+            dict(zip(problem.parameters.names, values.tolist(), strict=True))
+        )
+        corners = _corners(
+            np.array([*low, table.z - DRAWN_TABLE_M]), np.array([*high, table.z])
+        )
         yield wrapped("table", 0, _on_table(problem, scene, corners), 0.0)
     if contact is not None:
         x, y = scene.poses[0, pose_width(scene.obstacles) :][2:4]
         if x < PUCK_OUT_OF_REACH_M:
-            corners = _disc_corners(np.array([x, y, table.z if table else 0.0]), contact.puck_radius, PUCK_HEIGHT_M)
+            corners = _disc_corners(
+                np.array([x, y, table.z if table else 0.0]),
+                contact.puck_radius,
+                PUCK_HEIGHT_M,
+            )
             yield wrapped("puck", 0, _on_table(problem, scene, corners), 0.0)
 
 
 def _on_table(problem: Problem, scene: Scene, corners: Array) -> Array:
     """Return corners in the frame of the table in the world frame [m], shape (V, 3)."""
-    parameters = np.repeat(scene.poses[:1, problem.scene_width - len(problem.parameters) :], len(corners), axis=0)
+    parameters = np.repeat(
+        scene.poses[:1, problem.scene_width - len(problem.parameters) :],
+        len(corners),
+        axis=0,
+    )
     frame = table_frame_of(problem, parameters)
     return corners if frame is None else frame.to_world(corners)
 
@@ -307,8 +421,12 @@ def _on_table(problem: Problem, scene: Scene, corners: Array) -> Array:
 def _disc_corners(bottom: Array, radius: float, height: float) -> Array:
     """Return the corners of an upright disc on a point [m], shape (V, 3)."""
     angles = np.arange(DISC_CORNERS) * 2 * np.pi / DISC_CORNERS
-    circle = np.column_stack([radius * np.cos(angles), radius * np.sin(angles), np.zeros(DISC_CORNERS)])
-    return np.asarray(bottom + np.concatenate([circle, circle + np.array([0, 0, height])]))
+    circle = np.column_stack(
+        [radius * np.cos(angles), radius * np.sin(angles), np.zeros(DISC_CORNERS)]
+    )
+    return np.asarray(
+        bottom + np.concatenate([circle, circle + np.array([0, 0, height])])
+    )
 
 
 def _corners(low: Array, high: Array) -> Array:

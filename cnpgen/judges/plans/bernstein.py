@@ -1,9 +1,10 @@
 """Proven maxima of a joint's position, velocity, acceleration and jerk over a motion, from Bernstein coefficients.
 
-Between knots they are polynomials in s: q of degree D, dq = p' r of degree 2 D - 1, ddq = (p'' r + p' r') r of degree
-3 D - 2 and jerk = ((p''' r + 3 p'' r') r + p' (r'' r + r'^2)) r of degree 4 D - 3. A polynomial in Bernstein form lies
-between its smallest and its largest coefficient, and halving its interval reduces their distance by a factor of four.
-Subdividing wherever the maximum could still be proves where it is.
+Between knots they are polynomials in s: q of degree D, dq = p' r of degree 2 D - 1, ddq
+= (p'' r + p' r') r of degree 3 D - 2 and jerk = ((p''' r + 3 p'' r') r + p' (r'' r +
+r'^2)) r of degree 4 D - 3. A polynomial in Bernstein form lies between its smallest and
+its largest coefficient, and halving its interval reduces their distance by a factor of
+four. Subdividing wherever the maximum could still be proves where it is.
 """
 
 from collections.abc import Sequence
@@ -34,7 +35,9 @@ class PiecewisePolynomials:
     q: Array  # coefficients [rad], shape (D + 1, S, n)
     dq: Array  # coefficients [rad/s], shape (2 D, S, n)
     ddq: Array  # coefficients [rad/s^2], shape (3 D - 1, S, n)
-    jerk: Array | None = None  # coefficients [rad/s^3], shape (4 D - 2, S, n), or None if no constraint needs them
+    jerk: Array | None = (
+        None  # coefficients [rad/s^3], shape (4 D - 2, S, n), or None if no constraint needs them
+    )
 
 
 def polynomials(motion: Motion, *, jerk: bool = False) -> PiecewisePolynomials:
@@ -54,7 +57,12 @@ def polynomials(motion: Motion, *, jerk: bool = False) -> PiecewisePolynomials:
 
 
 def find_maximum(
-    rows: Array, edges: Array, known: Maximum = (-np.inf, 0, 0.0), *, threshold: float = -np.inf, parts: int = 2
+    rows: Array,
+    edges: Array,
+    known: Maximum = (-np.inf, 0, 0.0),
+    *,
+    threshold: float = -np.inf,
+    parts: int = 2,
 ) -> Maximum:
     """Find the maximum of piecewise polynomials to ``LIMIT_VALUE_TOLERANCE``, and if it is above 1 more precisely.
 
@@ -68,25 +76,43 @@ def find_maximum(
     best, *at = known
     starts = np.arange(parts)[:, None] / parts
     span, of_row = (rows.max(axis=0) > _search_threshold(best, threshold)).nonzero()
-    coefficients, left, width = rows[:, span, of_row], edges[span], (edges[1:] - edges[:-1])[span]
+    coefficients, left, width = (
+        rows[:, span, of_row],
+        edges[span],
+        (edges[1:] - edges[:-1])[span],
+    )
     for _ in range(MAX_SUBDIVISIONS):
         if not len(span):
             break
-        coefficients = (_subdivision(len(rows), parts) @ coefficients).reshape(len(rows), -1)
+        coefficients = (_subdivision(len(rows), parts) @ coefficients).reshape(
+            len(rows), -1
+        )
         left = (left + starts * width).ravel()
-        width, of_row = np.concatenate([width / parts] * parts), np.concatenate([of_row] * parts)
+        width, of_row = (
+            np.concatenate([width / parts] * parts),
+            np.concatenate([of_row] * parts),
+        )
         for values, s in ((coefficients[0], left), (coefficients[-1], left + width)):
             top = int(values.argmax())
             if values[top] > best:
                 best, *at = float(values[top]), int(of_row[top]), float(s[top])
-        (span,) = (coefficients.max(axis=0) > _search_threshold(best, threshold)).nonzero()
-        coefficients, of_row, left, width = coefficients[:, span], of_row[span], left[span], width[span]
+        (span,) = (
+            coefficients.max(axis=0) > _search_threshold(best, threshold)
+        ).nonzero()
+        coefficients, of_row, left, width = (
+            coefficients[:, span],
+            of_row[span],
+            left[span],
+            width[span],
+        )
     return best, int(at[0]), at[1]
 
 
 def _search_threshold(best: float, threshold: float) -> float:
     """Return the largest coefficient above which an interval may contain a relevant larger value."""
-    precise = min(best + LIMIT_VALUE_TOLERANCE, max(1.0, best + LIMIT_DECISION_TOLERANCE))
+    precise = min(
+        best + LIMIT_VALUE_TOLERANCE, max(1.0, best + LIMIT_DECISION_TOLERANCE)
+    )
     return max(threshold, best + LIMIT_VALUE_TOLERANCE if best > 1 else precise)
 
 
@@ -94,27 +120,42 @@ def _search_threshold(best: float, threshold: float) -> float:
 def knots(path_points: int, rate_points: int, degree: int) -> Array:
     """Return the knots of both splines of a motion in ascending order."""
     spans = (path_points - degree, rate_points - degree)
-    return np.array(sorted({round(k / count, 12): k / count for count in spans for k in range(count + 1)}.values()))
+    return np.array(
+        sorted(
+            {
+                round(k / count, 12): k / count
+                for count in spans
+                for k in range(count + 1)
+            }.values()
+        )
+    )
 
 
-def bernstein_coefficients(control: Array, degree: int, orders: Sequence[int], edges: Array) -> list[Array]:
+def bernstein_coefficients(
+    control: Array, degree: int, orders: Sequence[int], edges: Array
+) -> list[Array]:
     """Return derivatives of splines between edges in Bernstein form, shape (D - order + 1, S, n) each.
 
     ``control`` has shape (C, n).
     """
-    matrix = _to_bernstein_form(len(control), degree, tuple(orders), tuple(edges.tolist()))
+    matrix = _to_bernstein_form(
+        len(control), degree, tuple(orders), tuple(edges.tolist())
+    )
     coefficients = (matrix @ control).reshape(-1, len(edges) - 1, control.shape[1])
     ends = accumulate((degree - order + 1 for order in orders), initial=0)
     return [coefficients[first:last] for first, last in pairwise(ends)]
 
 
 @cache
-def _to_bernstein_form(points: int, degree: int, orders: tuple[int, ...], edges: tuple[float, ...]) -> Array:
+def _to_bernstein_form(
+    points: int, degree: int, orders: tuple[int, ...], edges: tuple[float, ...]
+) -> Array:
     """Return the matrix from control points to the Bernstein coefficients of derivatives, one order after the other.
 
-    The coefficients between a and b are the values of the derivative's polar form, with an increasing number of
-    arguments b instead of a (Ramshaw, "Blossoms are polar forms", 1989). The matrix has one row per coefficient: all
-    spans of the first coefficient, then all spans of the second.
+    The coefficients between a and b are the values of the derivative's polar form, with
+    an increasing number of arguments b instead of a (Ramshaw, "Blossoms are polar
+    forms", 1989). The matrix has one row per coefficient: all spans of the first
+    coefficient, then all spans of the second.
     """
     rows = []
     for order in orders:
@@ -164,5 +205,7 @@ def _subdivision(size: int, parts: int) -> Array:
     first = np.array([[comb(k, m) / 2**k for m in range(size)] for k in range(size)])
     matrices = [np.eye(size)]
     while len(matrices) < parts:
-        matrices = [half @ matrix for matrix in matrices for half in (first, first[::-1, ::-1])]
+        matrices = [
+            half @ matrix for matrix in matrices for half in (first, first[::-1, ::-1])
+        ]
     return np.stack(matrices, axis=1).reshape(-1, size)

@@ -19,7 +19,10 @@ Array = NDArray[np.float64]
 
 _UPRIGHT = "upright"  # the angle of "tilt" includes this condition
 _COSINE = "tilt cosine"  # drawn as an angle
-_SCALES = {"m": (1e3, "mm"), "rad": (180 / np.pi, "deg")}  # SI unit -> factor and unit of plots
+_SCALES = {
+    "m": (1e3, "mm"),
+    "rad": (180 / np.pi, "deg"),
+}  # SI unit -> factor and unit of plots
 
 
 @dataclass(frozen=True)
@@ -34,8 +37,12 @@ class ConditionCurve:
     lower: Array  # lower bounds, shape (K,); -inf for none
     upper: Array  # upper bounds, shape (K,); inf for none
     tolerance: float  # violation of a bound that is accepted
-    points: Array | None = None  # closest points of two bodies in the world [m], shape (K, 2, 3); None if no distance
-    pairs: tuple[str, ...] = ()  # names of the closest bodies at every state, empty if it is no distance
+    points: Array | None = (
+        None  # closest points of two bodies in the world [m], shape (K, 2, 3); None if no distance
+    )
+    pairs: tuple[
+        str, ...
+    ] = ()  # names of the closest bodies at every state, empty if it is no distance
 
     @property
     def violated(self) -> NDArray[np.bool_]:
@@ -49,21 +56,28 @@ def plot_unit(unit: str) -> tuple[float, str]:
     return _SCALES.get(unit, (1.0, unit))
 
 
-def condition_curves(problem: Problem, world: PathWorld, s: Array) -> list[ConditionCurve]:
+def condition_curves(
+    problem: Problem, world: PathWorld, s: Array
+) -> list[ConditionCurve]:
     """Measure all conditions that are no limits of joints at phases s, shape (K,), where the robot is."""
     start_tip = world.tip_position[:, 0].copy()
     curves: list[ConditionCurve] = []
     for constraint in problem.constraint:
         if is_proven(constraint) or isinstance(constraint, JointTorque):
             continue
-        if isinstance(constraint, DistanceConstraint) and constraint.bodies != "held object":
+        if (
+            isinstance(constraint, DistanceConstraint)
+            and constraint.bodies != "held object"
+        ):
             curves += _distance_curves(problem, constraint, world)
         else:
             curves += _value_curves(problem, measure(constraint, world, s, start_tip))
     return curves
 
 
-def _value_curves(problem: Problem, measured: list[MeasuredCondition]) -> Iterator[ConditionCurve]:
+def _value_curves(
+    problem: Problem, measured: list[MeasuredCondition]
+) -> Iterator[ConditionCurve]:
     """Convert measured conditions: one value with its bounds, several values as distances from their bounds."""
     for condition in measured:
         stated = condition.condition
@@ -84,36 +98,87 @@ def _value_curves(problem: Problem, measured: list[MeasuredCondition]) -> Iterat
             )
             label = f"{stated.name}, deviation" if center else stated.name
             values = factor * (condition.g - center)
-            yield ConditionCurve(stated.name, label, shown, ("",), values, factor * lower, factor * upper, tolerance)
+            yield ConditionCurve(
+                stated.name,
+                label,
+                shown,
+                ("",),
+                values,
+                factor * lower,
+                factor * upper,
+                tolerance,
+            )
         else:
-            parts = tuple(name_part(problem, condition.constraint, stated, i) for i in range(len(condition.g)))
+            parts = tuple(
+                name_part(problem, condition.constraint, stated, i)
+                for i in range(len(condition.g))
+            )
             inside, unbounded = -factor * condition.violation, np.full(count, np.inf)
             label = f"{stated.name}, distance inside"
-            yield ConditionCurve(stated.name, label, shown, parts, inside, np.zeros(count), unbounded, tolerance)
+            yield ConditionCurve(
+                stated.name,
+                label,
+                shown,
+                parts,
+                inside,
+                np.zeros(count),
+                unbounded,
+                tolerance,
+            )
 
 
 def _tilt_curve(condition: MeasuredCondition) -> ConditionCurve:
     """Convert the cosine of a tilt to an angle."""
     least = float(condition.condition.lower[0])
-    limit, accepted = (float(np.degrees(np.arccos(cosine))) for cosine in (least, least - condition.tolerance[0]))
+    limit, accepted = (
+        float(np.degrees(np.arccos(cosine)))
+        for cosine in (least, least - condition.tolerance[0])
+    )
     angle = np.degrees(np.arccos(np.clip(condition.g, -1.0, 1.0)))
     count = angle.shape[1]
     return ConditionCurve(
-        _COSINE, "tilt", "deg", ("",), angle, np.full(count, -np.inf), np.full(count, limit), accepted - limit
+        _COSINE,
+        "tilt",
+        "deg",
+        ("",),
+        angle,
+        np.full(count, -np.inf),
+        np.full(count, limit),
+        accepted - limit,
     )
 
 
-def _distance_curves(problem: Problem, constraint: DistanceConstraint, world: PathWorld) -> Iterator[ConditionCurve]:
+def _distance_curves(
+    problem: Problem, constraint: DistanceConstraint, world: PathWorld
+) -> Iterator[ConditionCurve]:
     """Measure the smallest distance of a constraint on distances at every state, with the closest points."""
     (stated,) = constraint.judged(cast(World, world))
     if not stated.g:
         return
-    radius = (problem.arm_radius or 0.0) if constraint.bodies == "robot" and world.robot.shape is None else 0.0
+    radius = (
+        (problem.arm_radius or 0.0)
+        if constraint.bodies == "robot" and world.robot.shape is None
+        else 0.0
+    )
     closest = world.pairs(constraint.bodies).closest_points(radius)
     count = len(closest.distance)
     least = np.full(count, 1e3 * (float(stated.lower[0]) - radius))
     names = [name_part(problem, constraint, stated, i) for i in range(len(stated.g))]
-    pairs, tolerance = tuple(names[pair] for pair in closest.pair), 1e3 * float(constraint.allowed(stated)[0])
+    pairs, tolerance = (
+        tuple(names[pair] for pair in closest.pair),
+        1e3 * float(constraint.allowed(stated)[0]),
+    )
     values, unbounded = 1e3 * closest.distance[None], np.full(count, np.inf)
     name = stated.name
-    yield ConditionCurve(name, name, "mm", ("",), values, least, unbounded, tolerance, closest.points, pairs)
+    yield ConditionCurve(
+        name,
+        name,
+        "mm",
+        ("",),
+        values,
+        least,
+        unbounded,
+        tolerance,
+        closest.points,
+        pairs,
+    )

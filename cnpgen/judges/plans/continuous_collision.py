@@ -1,14 +1,17 @@
 """Continuous collision checking by interval subdivision and motion bounds (Schwarzer, Saha and Latombe 2005).
 
-Where edges pass each other, the penetration depth has a maximum that may fall between two samples. Between samples a
-body stays within the convex hull of its two poses, except for the deviation of its points from their chords. Intervals
-in which this does not prove a sufficient distance are subdivided until none is unresolved.
+Where edges pass each other, the penetration depth has a maximum that may fall between
+two samples. Between samples a body stays within the convex hull of its two poses,
+except for the deviation of its points from their chords. Intervals in which this does
+not prove a sufficient distance are subdivided until none is unresolved.
 
-A function whose second derivative is at most C deviates by at most C h^2 / 8 from the chord between two values at a
-distance of h. The path p(s) is a polynomial between knots, so its derivatives lie between their smallest and their
-largest Bernstein coefficients. The second derivative of a point by s is the sum over joints of its partial derivatives
-times p'', and over pairs of joints of its second partial derivatives times p' p'. For a revolute joint, and for a pair
-whose distal joint it is, these are at most as long as the chain from the joint to the point.
+A function whose second derivative is at most C deviates by at most C h^2 / 8 from the
+chord between two values at a distance of h. The path p(s) is a polynomial between
+knots, so its derivatives lie between their smallest and their largest Bernstein
+coefficients. The second derivative of a point by s is the sum over joints of its
+partial derivatives times p'', and over pairs of joints of its second partial
+derivatives times p' p'. For a revolute joint, and for a pair whose distal joint it is,
+these are at most as long as the chain from the joint to the point.
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,7 +33,9 @@ Array = NDArray[np.float64]
 INTERVAL_PARTS = 8  # per subdivision
 MAX_INTERVALS = 256  # that are subdivided at a time
 MAX_LEVELS = 8  # of subdivision: 1 ms becomes 0.06 ns
-MINIMUM_LEVELS = 2  # of subdivision around the smallest margin, even if it cannot change the verdict
+MINIMUM_LEVELS = (
+    2  # of subdivision around the smallest margin, even if it cannot change the verdict
+)
 
 
 def is_contact(constraint: Constraint) -> bool:
@@ -44,7 +49,9 @@ class Intervals:
 
     s: Array  # phases of both ends, shape (I, 2)
     margin: Array  # smallest distance minus the smallest valid one, at both ends [m], shape (I, 2)
-    lower_bound: Array  # proven lower bound of the margin over the interval [m], shape (I,)
+    lower_bound: (
+        Array  # proven lower bound of the margin over the interval [m], shape (I,)
+    )
 
     def around_minimum(self) -> NDArray[np.bool_]:
         """Return a mask of the intervals on both sides of the smallest margin, shape (I,)."""
@@ -63,21 +70,32 @@ def check_continuous_collision(
 ) -> Iterator[tuple[MeasuredCondition, Margin]]:
     """Yield contact conditions and their margins between samples: around the smallest, and in unresolved intervals.
 
-    The world of the context is at its samples, and is moved. With early exit, intervals are subdivided only if it can
-    change the verdict or the size of a violation.
+    The world of the context is at its samples, and is moved. With early exit, intervals
+    are subdivided only if it can change the verdict or the size of a violation.
     """
-    contacts = [condition for condition in context.measured if is_contact(condition.constraint)]
+    contacts = [
+        condition for condition in context.measured if is_contact(condition.constraint)
+    ]
     if not contacts:
         return
     motion_bounds = context.world.motion_bounds(context.curve.max_positions())
-    initial = _intervals(context, context.samples.s[None], contacts, motion_bounds)  # before the world is moved
+    initial = _intervals(
+        context, context.samples.s[None], contacts, motion_bounds
+    )  # before the world is moved
     for contact, intervals in zip(contacts, initial, strict=True):
-        for s, measured in _subdivisions(context, intervals, contact.constraint, motion_bounds, early_exit=early_exit):
+        for s, measured in _subdivisions(
+            context, intervals, contact.constraint, motion_bounds, early_exit=early_exit
+        ):
             yield contact, context.margin(measured, s)
 
 
 def _subdivisions(
-    context: EvaluationContext, intervals: Intervals, constraint: Constraint, motion_bounds: Array, *, early_exit: bool
+    context: EvaluationContext,
+    intervals: Intervals,
+    constraint: Constraint,
+    motion_bounds: Array,
+    *,
+    early_exit: bool,
 ) -> Iterator[tuple[Array, MeasuredCondition]]:
     """Yield phases in subdivided intervals, and the contact condition there."""
     for level in range(MAX_LEVELS):
@@ -95,7 +113,10 @@ def _subdivisions(
 
 
 def _intervals(
-    context: EvaluationContext, s: Array, contacts: Sequence[MeasuredCondition], motion_bounds: Array
+    context: EvaluationContext,
+    s: Array,
+    contacts: Sequence[MeasuredCondition],
+    motion_bounds: Array,
 ) -> list[Intervals]:
     """Return the intervals of each contact between neighbors in rows of phases, shape (rows, K), where the world is."""
     world, last = context.world, s.shape[1] - 1
@@ -104,14 +125,23 @@ def _intervals(
     deviations = chord_deviation_bounds(context.curve, s.ravel(), motion_bounds)
     results = []
     for contact in contacts:
-        min_distances = contact.condition.lower - contact.tolerance + np.ravel(contact.uncertainty)  # one, or of each
+        min_distances = (
+            contact.condition.lower - contact.tolerance + np.ravel(contact.uncertainty)
+        )  # one, or of each
         margin = (contact.g - min_distances[:, None]).min(axis=0).reshape(s.shape)
         proven = np.full(s.size, np.nan)
         if margin.min() >= 0:
             pairs = pairs_of(world, contact.constraint)
-            proven[:-1] = pairs.interval_bounds(min_distances, displacements, deviations)
-        phases, margins = (np.stack([values[:, :-1], values[:, 1:]], axis=-1).reshape(-1, 2) for values in (s, margin))
-        results.append(Intervals(phases, margins, proven.reshape(s.shape)[:, :-1].ravel()))
+            proven[:-1] = pairs.interval_bounds(
+                min_distances, displacements, deviations
+            )
+        phases, margins = (
+            np.stack([values[:, :-1], values[:, 1:]], axis=-1).reshape(-1, 2)
+            for values in (s, margin)
+        )
+        results.append(
+            Intervals(phases, margins, proven.reshape(s.shape)[:, :-1].ravel())
+        )
     return results
 
 
@@ -124,12 +154,15 @@ def pairs_of(world: PathWorld, constraint: Constraint) -> PairDistances:
 def chord_deviation_bounds(curve: Curve, s: Array, motion_bounds: Array) -> Array:
     """Bound the deviation of the robot's points from the chords between neighboring phases [m], shape (K - 1,).
 
-    Phases ascend at distances of at most a part of a span; the bound is 0 where a phase is below its predecessor.
-    Motion bounds of the joints [m] have shape (n,).
+    Phases ascend at distances of at most a part of a span; the bound is 0 where a phase
+    is below its predecessor. Motion bounds of the joints [m] have shape (n,).
     """
     edges, first, second = curve.derivative_bounds()
     proximal = np.cumsum(first, axis=1) - first
     curvature = (second + first * (first + 2 * proximal)) @ motion_bounds
-    low, high = np.searchsorted(edges[1:-1], s[:-1], "right"), np.searchsorted(edges[1:-1], s[1:], "left")
+    low, high = (
+        np.searchsorted(edges[1:-1], s[:-1], "right"),
+        np.searchsorted(edges[1:-1], s[1:], "left"),
+    )
     step = np.maximum(s[1:] - s[:-1], 0.0)
     return np.asarray(step**2 / 8 * np.maximum(curvature[low], curvature[high]))

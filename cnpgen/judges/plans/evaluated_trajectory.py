@@ -1,6 +1,7 @@
 """Curves that the judge evaluates at many phases: joint positions and their time derivatives, joint by joint.
 
-The splines are those of ``scipy_splines``, not those of the planners and solvers that are checked.
+The splines are those of ``scipy_splines``, not those of the planners and solvers that
+are checked.
 """
 
 from dataclasses import dataclass
@@ -11,7 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.judges.plans.bernstein import bernstein_coefficients
-from cnpgen.judges.plans.scipy_splines import basis_matrix, spline_derivatives, states_by_chain_rule
+from cnpgen.judges.plans.scipy_splines import (
+    basis_matrix,
+    spline_derivatives,
+    states_by_chain_rule,
+)
 from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
@@ -33,14 +38,21 @@ class EvaluatedTrajectory:
     q: Array  # joint positions [rad]
     dq: Array  # joint velocities [rad/s]
     ddq: Array  # joint accelerations [rad/s^2]
-    jerk: Array | None = None  # joint jerks [rad/s^3], or None if no constraint needs them
+    jerk: Array | None = (
+        None  # joint jerks [rad/s^3], or None if no constraint needs them
+    )
 
     def is_finite(self) -> bool:
         """Return whether all values are finite."""
-        return all(values is None or bool(np.isfinite(values).all()) for values in vars(self).values())
+        return all(
+            values is None or bool(np.isfinite(values).all())
+            for values in vars(self).values()
+        )
 
 
-def evaluate_trajectory(motion: Motion, s: Array, *, jerk: bool = False) -> EvaluatedTrajectory:
+def evaluate_trajectory(
+    motion: Motion, s: Array, *, jerk: bool = False
+) -> EvaluatedTrajectory:
     """Evaluate one motion at phases s in [0, 1], shape (K,), optionally with jerks.
 
     For many phases of one motion this takes a tenth of the time of ``Motion.at``.
@@ -51,12 +63,18 @@ def evaluate_trajectory(motion: Motion, s: Array, *, jerk: bool = False) -> Eval
     return EvaluatedTrajectory(*states_by_chain_rule(p, r))
 
 
-def evaluate_at_phases(motion: Motion, phases: Phases, *, jerk: bool = False) -> EvaluatedTrajectory:
+def evaluate_at_phases(
+    motion: Motion, phases: Phases, *, jerk: bool = False
+) -> EvaluatedTrajectory:
     """Evaluate one motion as ``evaluate_trajectory``, up to rounding, with cached bases of the splines."""
     orders = PATH_ORDERS + jerk
     path, rate = motion.path[0].T, motion.rate[0]
-    p = (path @ _bases(path.shape[1], motion.degree, orders, phases)).reshape(len(path), orders, -1)
-    r = (rate @ _bases(len(rate), motion.degree, orders - 1, phases)).reshape(orders - 1, -1)
+    p = (path @ _bases(path.shape[1], motion.degree, orders, phases)).reshape(
+        len(path), orders, -1
+    )
+    r = (rate @ _bases(len(rate), motion.degree, orders - 1, phases)).reshape(
+        orders - 1, -1
+    )
     return EvaluatedTrajectory(*states_by_chain_rule(list(p.swapaxes(0, 1)), list(r)))
 
 
@@ -101,7 +119,10 @@ class SplineCurve:
         """Bound derivatives by Bernstein coefficients of the path."""
         path, degree = self.motion.path[0], self.motion.degree
         edges = np.linspace(0, 1, BOUND_PARTS * (len(path) - degree) + 1)
-        first, second = (np.abs(values).max(axis=0) for values in bernstein_coefficients(path, degree, (1, 2), edges))
+        first, second = (
+            np.abs(values).max(axis=0)
+            for values in bernstein_coefficients(path, degree, (1, 2), edges)
+        )
         return edges, first, second
 
     def max_positions(self) -> Array:

@@ -11,7 +11,12 @@ from cnpgen.judges.plans.bernstein import Maximum, PiecewisePolynomials, find_ma
 from cnpgen.judges.plans.sampling import times
 from cnpgen.judges.plans.verdict import Margin
 from cnpgen.problems.constraints.constraint import Condition, Constraint
-from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, JointPosition, JointVelocity
+from cnpgen.problems.constraints.joint import (
+    JointAcceleration,
+    JointJerk,
+    JointPosition,
+    JointVelocity,
+)
 from cnpgen.problems.problem import Problem
 from cnpgen.store.joint_units import unit_of
 from cnpgen.world.path import PathWorld
@@ -22,7 +27,12 @@ Indices = NDArray[np.intp]
 
 MIN_RELATIVE_SCALE = 1e-9  # of a bound: resolution of violations if the tolerance is 0
 EARLY_EXIT_PARTS = 8  # of a span per subdivision with early exit
-_QUANTITIES = {JointPosition: "q", JointVelocity: "dq", JointAcceleration: "ddq", JointJerk: "jerk"}
+_QUANTITIES = {
+    JointPosition: "q",
+    JointVelocity: "dq",
+    JointAcceleration: "ddq",
+    JointJerk: "jerk",
+}
 
 
 def is_proven(constraint: Constraint) -> bool:
@@ -49,7 +59,9 @@ class ProvenJointLimits:
     """L limits of n joints that are proven to hold or to be violated."""
 
     constraints: tuple[Constraint, ...]  # constraints of a problem that are proven
-    conditions: tuple[Condition, ...]  # condition of each constraint, the same at all states
+    conditions: tuple[
+        Condition, ...
+    ]  # condition of each constraint, the same at all states
     joints: tuple[str, ...]  # names of the joints
     tolerance: Array  # accepted violations, shape (L, n)
     bounds: Array  # lower bounds of all joints, then upper ones, shape (L, 2 n)
@@ -57,65 +69,131 @@ class ProvenJointLimits:
 
     def scaled(self, parameters: Mapping[str, float]) -> "ProvenJointLimits":
         """Return the limits of a sample with these parameters, by name."""
-        factors = np.array([_factor_of(constraint, parameters) for constraint in self.constraints])[:, None]
+        factors = np.array(
+            [_factor_of(constraint, parameters) for constraint in self.constraints]
+        )[:, None]
         if (factors == 1).all():
             return self
-        tolerance, bounds, scale = (factors * values for values in (self.tolerance, self.bounds, self.scale))
+        tolerance, bounds, scale = (
+            factors * values for values in (self.tolerance, self.bounds, self.scale)
+        )
         return replace(self, tolerance=tolerance, bounds=bounds, scale=scale)
 
     def margins(
-        self, world: PathWorld, polynomials: PiecewisePolynomials, s: Array, table: Array, *, early_exit: bool
+        self,
+        world: PathWorld,
+        polynomials: PiecewisePolynomials,
+        s: Array,
+        table: Array,
+        *,
+        early_exit: bool,
     ) -> list[Margin]:
         """Find where a motion, as polynomials, comes closest to violating each limit, or violates it most.
 
-        The world is at its samples, phases of shape (K,); the table is that of ``time_table``. With early exit, the
-        margin at the samples is enough if a limit is proven to hold.
+        The world is at its samples, phases of shape (K,); the table is that of
+        ``time_table``. With early exit, the margin at the samples is enough if a limit
+        is proven to hold.
         """
         if not self.constraints:
             return []
         names = [quantity_of(constraint) for constraint in self.constraints]
-        factors = [_factor_of(constraint, world.parameters.values) for constraint in self.constraints]
+        factors = [
+            _factor_of(constraint, world.parameters.values)
+            for constraint in self.constraints
+        ]
         pairs = list(zip(names, factors, strict=True))
-        functions = [_per_factor(getattr(polynomials, name), factor) for name, factor in pairs]
-        maxima = self._at_samples(np.array([_per_factor(getattr(world, name), factor) for name, factor in pairs]), s)
-        low = np.array([coefficients.min(axis=0).min(axis=0) for coefficients in functions])
-        high = np.array([coefficients.max(axis=0).max(axis=0) for coefficients in functions])
+        functions = [
+            _per_factor(getattr(polynomials, name), factor) for name, factor in pairs
+        ]
+        maxima = self._at_samples(
+            np.array(
+                [_per_factor(getattr(world, name), factor) for name, factor in pairs]
+            ),
+            s,
+        )
+        low = np.array(
+            [coefficients.min(axis=0).min(axis=0) for coefficients in functions]
+        )
+        high = np.array(
+            [coefficients.max(axis=0).max(axis=0) for coefficients in functions]
+        )
         upper_bounds = self._relative_violations(low, high)
-        skippable = np.asarray((self.tolerance > 0).all(axis=1) & early_exit)  # without a tolerance, rounding decides
-        for limit in np.flatnonzero(~skippable | ~(upper_bounds.max(axis=1) <= 1)).tolist():
+        skippable = np.asarray(
+            (self.tolerance > 0).all(axis=1) & early_exit
+        )  # without a tolerance, rounding decides
+        for limit in np.flatnonzero(
+            ~skippable | ~(upper_bounds.max(axis=1) <= 1)
+        ).tolist():
             threshold = 1.0 if skippable[limit] else -np.inf
             (rows,) = (~(upper_bounds[limit] <= threshold)).nonzero()
-            maxima[limit] = self._maximum(limit, rows, functions[limit], polynomials.edges, maxima[limit], threshold)
+            maxima[limit] = self._maximum(
+                limit,
+                rows,
+                functions[limit],
+                polynomials.edges,
+                maxima[limit],
+                threshold,
+            )
         t = times(np.array([phase for *_, phase in maxima]), table).tolist()
-        return [self.margin_at(limit, maximum, t[limit]) for limit, maximum in enumerate(maxima)]
+        return [
+            self.margin_at(limit, maximum, t[limit])
+            for limit, maximum in enumerate(maxima)
+        ]
 
     def _at_samples(self, values: Array, s: Array) -> list[Maximum]:
         """Return the maximum relative violation of each limit by values of shape (L, n, K) at phases s."""
-        violations, maxima = self._relative_violations(values.min(axis=2), values.max(axis=2)), []
+        violations, maxima = (
+            self._relative_violations(values.min(axis=2), values.max(axis=2)),
+            [],
+        )
         for limit, row in enumerate(violations.argmax(axis=1).tolist()):
             below, joint = row < len(self.joints), row % len(self.joints)
             series = values[limit, joint]
-            maxima.append((float(violations[limit, row]), row, float(s[series.argmin() if below else series.argmax()])))
+            maxima.append(
+                (
+                    float(violations[limit, row]),
+                    row,
+                    float(s[series.argmin() if below else series.argmax()]),
+                )
+            )
         return maxima
 
     def _relative_violations(self, low: Array, high: Array) -> Array:
         """Return the violations by minima and maxima, shape (L, n), in multiples of ``scale``, shape (L, 2 n)."""
-        return np.asarray((np.concatenate([low, high], axis=1) - self.bounds) / self.scale)
+        return np.asarray(
+            (np.concatenate([low, high], axis=1) - self.bounds) / self.scale
+        )
 
     def _maximum(  # noqa: PLR0917 - the function, the bounds, and the known maximum
-        self, limit: int, rows: Indices, function: Array, edges: Array, known: Maximum, threshold: float
+        self,
+        limit: int,
+        rows: Indices,
+        function: Array,
+        edges: Array,
+        known: Maximum,
+        threshold: float,
     ) -> Maximum:
         """Search for a larger violation than the known one at some of the bounds of a limit."""
         values = function[..., rows % len(self.joints)]
         violations = (values - self.bounds[limit, rows]) / self.scale[limit, rows]
         parts = EARLY_EXIT_PARTS if threshold == 1 else 2
-        value, row, phase = find_maximum(violations, edges, (known[0], -1, known[2]), threshold=threshold, parts=parts)
+        value, row, phase = find_maximum(
+            violations,
+            edges,
+            (known[0], -1, known[2]),
+            threshold=threshold,
+            parts=parts,
+        )
         return value, known[1] if row < 0 else int(rows[row]), phase
 
     def margin_at(self, limit: int, maximum: Maximum, time: float) -> Margin:
         """Return the margin of a limit at its maximum relative violation and the time of it [s]."""
         (relative, row, phase), condition = maximum, self.conditions[limit]
-        bound, offset, part = self.bounds[limit, row], relative * self.scale[limit, row], row % len(self.joints)
+        bound, offset, part = (
+            self.bounds[limit, row],
+            relative * self.scale[limit, row],
+            row % len(self.joints),
+        )
         return Margin(
             condition.name,
             self.constraints[limit].reason,
@@ -131,15 +209,32 @@ class ProvenJointLimits:
 
 
 def joint_limits(problem: Problem, world: PathWorld) -> ProvenJointLimits:
-    """Return the joint limits of a problem that are proven; its robot may be at any state with a jerk."""
-    constraints = tuple(constraint for constraint in problem.constraint if is_proven(constraint))
-    conditions = tuple(constraint.measured(cast(World, world))[0] for constraint in constraints)
+    """Return the joint limits of a problem that are proven.
+
+    Its robot may be at any state with a jerk.
+    """
+    constraints = tuple(
+        constraint for constraint in problem.constraint if is_proven(constraint)
+    )
+    conditions = tuple(
+        constraint.measured(cast(World, world))[0] for constraint in constraints
+    )
     shape = len(constraints), world.robot.n
     lower, upper = (
-        np.array([getattr(condition, end) for condition in conditions]).reshape(shape) for end in ("lower", "upper")
+        np.array([getattr(condition, end) for condition in conditions]).reshape(shape)
+        for end in ("lower", "upper")
     )
     pairs = zip(constraints, conditions, strict=True)
-    tolerance = np.array([constraint.allowed(condition) for constraint, condition in pairs]).reshape(shape)
-    scale = np.maximum(tolerance, MIN_RELATIVE_SCALE * np.maximum(np.abs(lower), np.abs(upper)))
-    both = np.concatenate([lower, upper], axis=1), np.concatenate([-scale, scale], axis=1)
-    return ProvenJointLimits(constraints, conditions, world.robot.joint_names, tolerance, *both)
+    tolerance = np.array(
+        [constraint.allowed(condition) for constraint, condition in pairs]
+    ).reshape(shape)
+    scale = np.maximum(
+        tolerance, MIN_RELATIVE_SCALE * np.maximum(np.abs(lower), np.abs(upper))
+    )
+    both = (
+        np.concatenate([lower, upper], axis=1),
+        np.concatenate([-scale, scale], axis=1),
+    )
+    return ProvenJointLimits(
+        constraints, conditions, world.robot.joint_names, tolerance, *both
+    )

@@ -1,10 +1,12 @@
 """Search for local maxima of smooth conditions between samples, until no further one could change the verdict.
 
-Conditions on torques, tilt or the tip's position are not polynomials, so their bounds cannot be proven. Between two
-samples at a distance of h, a function whose second derivative is at least -D exceeds the chord by at most D h^2 / 8. D
-is estimated from the neighboring second differences, increased by their spread, so that a third derivative, an end of
-the motion or a second maximum next to the first is not missed. Intervals in which the function could exceed its
-tolerance are divided again, which also improves the estimates of D.
+Conditions on torques, tilt or the tip's position are not polynomials, so their bounds
+cannot be proven. Between two samples at a distance of h, a function whose second
+derivative is at least -D exceeds the chord by at most D h^2 / 8. D is estimated from
+the neighboring second differences, increased by their spread, so that a third
+derivative, an end of the motion or a second maximum next to the first is not missed.
+Intervals in which the function could exceed its tolerance are divided again, which also
+improves the estimates of D.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,7 +23,9 @@ from cnpgen.judges.plans.verdict import Margin
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-PEAK_DECISION_TOLERANCE = 1e-8  # relative to the tolerance: error of a maximum that decides about the verdict
+PEAK_DECISION_TOLERANCE = (
+    1e-8  # relative to the tolerance: error of a maximum that decides about the verdict
+)
 PEAK_VALUE_TOLERANCE = 1e-2  # relative to the tolerance: error of any other maximum
 PEAK_PARTS = 6  # of an interval
 MAX_PEAK_ROUNDS = 10  # of division; a smooth maximum needs two or three, a kink one per factor of PEAK_PARTS
@@ -45,7 +49,9 @@ class _SampledValues:
             ``(of, part, ends)`` of I intervals; ends have shape (I, 2).
         """
         threshold = np.maximum(largest + PEAK_VALUE_TOLERANCE, 0.0)
-        threshold = np.where(largest <= 1, np.minimum(threshold, 1 + PEAK_DECISION_TOLERANCE), threshold)
+        threshold = np.where(
+            largest <= 1, np.minimum(threshold, 1 + PEAK_DECISION_TOLERANCE), threshold
+        )
         maxima = _estimated_maxima(self.s, self.violation)
         row, k = (maxima > threshold[self.of, None]).nonzero()
         if not len(row):
@@ -53,12 +59,22 @@ class _SampledValues:
         chosen = np.argsort(-maxima[row, k], kind="stable")[:MAX_PEAK_INTERVALS]
         row, k = row[chosen], k[chosen]
         phases = np.broadcast_to(self.s, self.violation.shape)
-        return self.of[row], self.part[row], np.stack([phases[row, k], phases[row, k + 1]], axis=1)
+        return (
+            self.of[row],
+            self.part[row],
+            np.stack([phases[row, k], phases[row, k + 1]], axis=1),
+        )
 
 
-def check_local_maxima(context: EvaluationContext) -> Iterator[tuple[MeasuredCondition, Margin]]:
+def check_local_maxima(
+    context: EvaluationContext,
+) -> Iterator[tuple[MeasuredCondition, Margin]]:
     """Yield smooth conditions and their margins in intervals that could change the verdict; the world is moved."""
-    smooth = [condition for condition in context.measured if not is_contact(condition.constraint)]
+    smooth = [
+        condition
+        for condition in context.measured
+        if not is_contact(condition.constraint)
+    ]
     largest = np.array([condition.relative_violation.max() for condition in smooth])
     values = _initial_values(context.samples.s, smooth)
     for _ in range(MAX_PEAK_ROUNDS):
@@ -71,23 +87,40 @@ def check_local_maxima(context: EvaluationContext) -> Iterator[tuple[MeasuredCon
         for k in np.unique(of).tolist():
             measured, rows = _measured_again(context, smooth[k], s.ravel()), of == k
             yield smooth[k], context.margin(measured, s.ravel())
-            values.violation[rows] = measured.relative_violation.reshape(-1, *s.shape)[part[rows], rows]
+            values.violation[rows] = measured.relative_violation.reshape(-1, *s.shape)[
+                part[rows], rows
+            ]
             largest[k] = max(largest[k], measured.relative_violation.max())
 
 
-def _measured_again(context: EvaluationContext, condition: MeasuredCondition, s: Array) -> MeasuredCondition:
+def _measured_again(
+    context: EvaluationContext, condition: MeasuredCondition, s: Array
+) -> MeasuredCondition:
     """Measure a condition at other phases."""
     measured = context.measure(condition.constraint, s)
-    return next(other for other in measured if other.condition.name == condition.condition.name)
+    return next(
+        other for other in measured if other.condition.name == condition.condition.name
+    )
 
 
 def _initial_values(s: Array, measured: Sequence[MeasuredCondition]) -> _SampledValues:
     """Return the samples of every value of every condition."""
-    parts = [(k, part) for k, condition in enumerate(measured) for part in range(len(condition.relative_violation))]
+    parts = [
+        (k, part)
+        for k, condition in enumerate(measured)
+        for part in range(len(condition.relative_violation))
+    ]
     of, part = np.array(parts, np.intp).reshape(-1, 2).T
-    violation = np.concatenate([np.empty((0, len(s))), *(condition.relative_violation for condition in measured)])
+    violation = np.concatenate(
+        [
+            np.empty((0, len(s))),
+            *(condition.relative_violation for condition in measured),
+        ]
+    )
     if (s[1:] - s[:-1] <= MIN_PHASE_STEP).any():
-        distinct = np.flatnonzero(np.diff(np.floor(s / MIN_PHASE_STEP), prepend=-1.0) > 0)  # the first of each cell
+        distinct = np.flatnonzero(
+            np.diff(np.floor(s / MIN_PHASE_STEP), prepend=-1.0) > 0
+        )  # the first of each cell
         distinct = distinct[np.diff(s[distinct], prepend=-1.0) > MIN_PHASE_STEP / 2]
         s, violation = s[distinct], violation[:, distinct]
     return _SampledValues(of, part, s[None], violation)
@@ -98,11 +131,18 @@ def _estimated_maxima(s: Array, values: Array) -> Array:
     step, rise = s[:, 1:] - s[:, :-1], values[:, 1:] - values[:, :-1]
     rate = rise / step
     second = (rate[:, 1:] - rate[:, :-1]) / ((step[:, 1:] + step[:, :-1]) / 2)
-    around = np.concatenate([second[:, :1], second[:, :1], second, second[:, -1:], second[:, -1:]], axis=1)
-    low, high = _of_four(np.minimum, around), _of_four(np.maximum, around)  # at both ends of an interval and next to it
+    around = np.concatenate(
+        [second[:, :1], second[:, :1], second, second[:, -1:], second[:, -1:]], axis=1
+    )
+    low, high = (
+        _of_four(np.minimum, around),
+        _of_four(np.maximum, around),
+    )  # at both ends of an interval and next to it
     curvature = np.maximum((high - 2 * low) * (step**2 / 2), MIN_CURVATURE)
     excess = np.maximum(curvature - np.abs(rise), 0.0)
-    return np.asarray(np.maximum(values[:, 1:], values[:, :-1]) + excess**2 / (4 * curvature))
+    return np.asarray(
+        np.maximum(values[:, 1:], values[:, :-1]) + excess**2 / (4 * curvature)
+    )
 
 
 def _of_four(select: np.ufunc, values: Array) -> Array:

@@ -1,7 +1,7 @@
 """Margins of one motion: of its boundary conditions and of the problem's constraints.
 
-Each margin is taken where the motion comes closest to the bound or violates it most, and is named by joint, axis or
-obstacle.
+Each margin is taken where the motion comes closest to the bound or violates it most,
+and is named by joint, axis or obstacle.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,7 +18,13 @@ from cnpgen.judges.plans.sampling import Samples, times
 from cnpgen.judges.plans.verdict import ZERO_TOLERANCE, Margin, Reason
 from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.constraint import Condition, Constraint
-from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, JointPosition, JointTorque, JointVelocity
+from cnpgen.problems.constraints.joint import (
+    JointAcceleration,
+    JointJerk,
+    JointPosition,
+    JointTorque,
+    JointVelocity,
+)
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.store.joint_units import unit_of
@@ -28,8 +34,9 @@ from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 
-# Tolerances of the boundary conditions, with the units of revolute joints. Control points that are rebuilt in float64
-# have errors of 1e-10; those kept in float32 have velocity errors of about 1e-5 rad/s, which are reported.
+# Tolerances of the boundary conditions, with the units of revolute joints. Control
+# points that are rebuilt in float64 have errors of 1e-10; those kept in float32 have
+# velocity errors of about 1e-5 rad/s, which are reported.
 BOUNDARY_TOLERANCES = {
     "q": ("boundary position", "rad", 1e-6),
     "dq": ("boundary velocity", "rad/s", 1e-6),
@@ -38,13 +45,23 @@ BOUNDARY_TOLERANCES = {
 _PER_JOINT = JointPosition | JointVelocity | JointAcceleration | JointJerk | JointTorque
 
 
-def boundary_margins(states: EvaluatedTrajectory, boundary: Boundary, samples: Samples, robot: Robot) -> list[Margin]:
-    """Compare the ends of one motion with its boundary conditions; the states include both ends."""
+def boundary_margins(
+    states: EvaluatedTrajectory, boundary: Boundary, samples: Samples, robot: Robot
+) -> list[Margin]:
+    """Compare the ends of one motion with its boundary conditions.
+
+    The states include both ends.
+    """
     margins = []
     for quantity, (name, unit, tolerance) in BOUNDARY_TOLERANCES.items():
-        start, goal = getattr(boundary, f"start_{quantity}"), getattr(boundary, f"goal_{quantity}")
+        start, goal = (
+            getattr(boundary, f"start_{quantity}"),
+            getattr(boundary, f"goal_{quantity}"),
+        )
         expected = start if goal is None else np.concatenate([start, goal])
-        actual = getattr(states, quantity).T[:: len(samples.s) - 1][: len(expected)]  # at the start and at the goal
+        actual = getattr(states, quantity).T[:: len(samples.s) - 1][
+            : len(expected)
+        ]  # at the start and at the goal
         error = np.abs(actual - expected)
         end, joint = divmod(int(error.argmax()), error.shape[1])
         margins.append(
@@ -73,23 +90,36 @@ class MeasuredCondition:
     g: Array  # values [unit of the condition], shape (m, K)
     relaxation: Array  # distance by which the bounds are relaxed [unit of the condition], shape (K,)
     tolerance: Array  # accepted violation, shape (m,)
-    uncertainty: Array | float = 0.0  # largest errors of the values, shape (m, K), (m, 1), or one of all; 0 if known
+    uncertainty: Array | float = (
+        0.0  # largest errors of the values, shape (m, K), (m, 1), or one of all; 0 if known
+    )
 
     @cached_property
     def violation(self) -> Array:
         """Signed distances of the values outside their bounds at most, negative inside, shape (m, K)."""
-        below, above = self.condition.lower[:, None] - self.g, self.g - self.condition.upper[:, None]
+        below, above = (
+            self.condition.lower[:, None] - self.g,
+            self.g - self.condition.upper[:, None],
+        )
         return np.asarray(np.maximum(below, above) - self.relaxation + self.uncertainty)
 
     @cached_property
     def relative_violation(self) -> Array:
         """Violations in multiples of the tolerance, shape (m, K)."""
-        return np.asarray(self.violation / np.maximum(self.tolerance, ZERO_TOLERANCE)[:, None])
+        return np.asarray(
+            self.violation / np.maximum(self.tolerance, ZERO_TOLERANCE)[:, None]
+        )
 
     def margin(self, problem: Problem, samples: Samples) -> Margin:
         """Return the margin where the motion comes closest to a violation, or violates the condition most."""
-        part, k = divmod(int(self.relative_violation.argmax()), len(samples.s))  # argmax returns the first nan, if any
-        low, high, g = self.condition.lower[part], self.condition.upper[part], self.g[part, k]
+        part, k = divmod(
+            int(self.relative_violation.argmax()), len(samples.s)
+        )  # argmax returns the first nan, if any
+        low, high, g = (
+            self.condition.lower[part],
+            self.condition.upper[part],
+            self.g[part, k],
+        )
         violation = float(self.violation[part, k])
         return Margin(
             self.condition.name,
@@ -97,7 +127,11 @@ class MeasuredCondition:
             unit_of(self.condition.unit, part),
             name_part(problem, self.constraint, self.condition, part),
             value=float(g),
-            bound=float(low - self.relaxation[k] if low - g > g - high else high + self.relaxation[k]),
+            bound=float(
+                low - self.relaxation[k]
+                if low - g > g - high
+                else high + self.relaxation[k]
+            ),
             violation=np.inf if np.isnan(violation) else violation,
             tolerance=float(self.tolerance[part]),
             time=float(samples.t[k]),
@@ -105,19 +139,27 @@ class MeasuredCondition:
         )
 
 
-def measure(constraint: Constraint, world: PathWorld, s: Array, start_tip: Array) -> list[MeasuredCondition]:
+def measure(
+    constraint: Constraint, world: PathWorld, s: Array, start_tip: Array
+) -> list[MeasuredCondition]:
     """Measure the conditions of a constraint where the robot is, at phases of shape (K,).
 
     ``start_tip`` is the position of the tip at the start of the motion [m], shape (3,).
     """
     measured = []
-    for condition in constraint.judged(cast(World, world)):  # PathWorld has the interface of World for K states
+    for condition in constraint.judged(
+        cast(World, world)
+    ):  # PathWorld has the interface of World for K states
         if condition.g:
             g = np.empty((len(condition.g), len(s)))
             for row, value in zip(g, condition.g, strict=True):
                 row[:] = value
             relaxation = constraint.bound_relaxation(condition, s, start_tip)
-            measured.append(MeasuredCondition(constraint, condition, g, relaxation, constraint.allowed(condition)))
+            measured.append(
+                MeasuredCondition(
+                    constraint, condition, g, relaxation, constraint.allowed(condition)
+                )
+            )
     return measured
 
 
@@ -130,7 +172,9 @@ def by_name(margins: list[Margin]) -> dict[str, Margin]:
     return named
 
 
-def name_part(problem: Problem, constraint: Constraint, condition: Condition, part: int) -> str:
+def name_part(
+    problem: Problem, constraint: Constraint, condition: Condition, part: int
+) -> str:
     """Name one of a condition's values by its index: empty if it is the only one, a number for those of plug-ins."""
     if len(condition.g) == 1:
         return ""
@@ -158,20 +202,28 @@ class EvaluationContext:
     start_tip: Array  # tip position at the start [m], shape (3,)
     world: PathWorld  # the robot; ``move`` moves it
     measured: Sequence[MeasuredCondition]  # conditions at the samples
-    with_uncertainty: AddUncertainty | None = None  # adds errors to conditions at phases, if the motion is not known
-    phase_of: Callable[[Array], Array] | None = None  # phases of the curve -> phases of bounds, if they differ
+    with_uncertainty: AddUncertainty | None = (
+        None  # adds errors to conditions at phases, if the motion is not known
+    )
+    phase_of: Callable[[Array], Array] | None = (
+        None  # phases of the curve -> phases of bounds, if they differ
+    )
 
     def move(self, s: Array) -> None:
         """Move the robot to phases s, shape (K,)."""
         states = self.curve.evaluate(s, jerk=self.problem.uses_jerk)
-        self.world.set_path(states.q, states.dq, states.ddq, self.obstacle_poses, states.jerk)
+        self.world.set_path(
+            states.q, states.dq, states.ddq, self.obstacle_poses, states.jerk
+        )
 
     def measure(self, constraint: Constraint, s: Array) -> list[MeasuredCondition]:
         """Measure a constraint at phases s, shape (K,), to which the robot was moved."""
         phases = s if self.phase_of is None else self.phase_of(s)
         measured = measure(constraint, self.world, phases, self.start_tip)
         add = self.with_uncertainty
-        return measured if add is None else [add(condition, s) for condition in measured]
+        return (
+            measured if add is None else [add(condition, s) for condition in measured]
+        )
 
     def margin(self, measured: MeasuredCondition, s: Array) -> Margin:
         """Return the margin of a condition that was measured at phases s."""
@@ -187,11 +239,28 @@ def evaluation_context(  # noqa: PLR0917 - all of them are independent inputs
     table: Array,
     phase_of: Callable[[Array], Array] | None = None,
 ) -> EvaluationContext:
-    """Measure all conditions that are not proven where the robot is; arguments as of ``EvaluationContext``."""
+    """Measure all conditions that are not proven where the robot is.
+
+    Arguments as of ``EvaluationContext``.
+    """
     start_tip = world.tip_position[:, 0].copy()
-    constraints = [constraint for constraint in problem.constraint if not is_proven(constraint)]
+    constraints = [
+        constraint for constraint in problem.constraint if not is_proven(constraint)
+    ]
     phases = samples.s if phase_of is None else phase_of(samples.s)
-    measured = [condition for constraint in constraints for condition in measure(constraint, world, phases, start_tip)]
+    measured = [
+        condition
+        for constraint in constraints
+        for condition in measure(constraint, world, phases, start_tip)
+    ]
     return EvaluationContext(
-        problem, curve, obstacle_poses, samples, table, start_tip, world, measured, phase_of=phase_of
+        problem,
+        curve,
+        obstacle_poses,
+        samples,
+        table,
+        start_tip,
+        world,
+        measured,
+        phase_of=phase_of,
     )

@@ -13,7 +13,9 @@ from cnpgen.world.path import PathWorld
 Array = NDArray[np.float64]
 
 
-def metrics_of(problem: Problem, world: PathWorld, samples: Samples, jerk: Array) -> Metrics:
+def metrics_of(
+    problem: Problem, world: PathWorld, samples: Samples, jerk: Array
+) -> Metrics:
     """Compute the metrics of one motion from its joint jerks at the samples [rad/s^3], shape (n, K); nan if unknown."""
     robot = world.robot
     torque_ratio = world.torque / robot.torque_limit[:, None]
@@ -25,7 +27,9 @@ def metrics_of(problem: Problem, world: PathWorld, samples: Samples, jerk: Array
         jerk=float(np.max(np.abs(jerk) / robot.jerk_limit[:, None])),
         hit_speed=float(np.linalg.norm(world.tip_velocity_at(-1))),
         z_error=np.nan if table is None else samples.integral(np.abs(tip[2] - table.z)),
-        vertical_error=samples.integral(tilt(world.parameters.along_upright(world.tip_rotation)))
+        vertical_error=samples.integral(
+            tilt(world.parameters.along_upright(world.tip_rotation))
+        )
         if upright
         else np.nan,
     )
@@ -33,4 +37,7 @@ def metrics_of(problem: Problem, world: PathWorld, samples: Samples, jerk: Array
 
 def tilt(R: Array) -> Array:
     """Compute |roll| + |pitch| of rotations ``Rz(yaw) Ry(pitch) Rx(roll)`` [rad], shape (3, 3, K) -> (K,)."""
-    return np.asarray(np.abs(np.arctan2(R[2, 1], R[2, 2])) + np.abs(np.arctan2(R[2, 0], np.hypot(R[2, 1], R[2, 2]))))
+    return np.asarray(
+        np.abs(np.arctan2(R[2, 1], R[2, 2]))
+        + np.abs(np.arctan2(R[2, 0], np.hypot(R[2, 1], R[2, 2])))
+    )

@@ -49,9 +49,10 @@ def plot_plan(
 ) -> None:
     """Draw one of N motions: joints relative to their limits, other conditions with their bounds, and the tip.
 
-    States at which a condition is violated are marked, and so are the violations of the verdict. An existing image
-    file, ``.png``, ``.pdf`` or ``.svg``, is overwritten. Obstacles are by default those of the motion's ends. The note
-    is additional text of the title.
+    States at which a condition is violated are marked, and so are the violations of the
+    verdict. An existing image file, ``.png``, ``.pdf`` or ``.svg``, is overwritten.
+    Obstacles are by default those of the motion's ends. The note is additional text of
+    the title.
 
     Raises:
         UsageError: There is no such plan, or it cannot be evaluated.
@@ -60,11 +61,21 @@ def plot_plan(
     if not 0 <= index < len(motion):
         raise UsageError(f"there is no plan {index}, expected 0 to {len(motion) - 1}")
     one = motion[index : index + 1]
-    margins = [] if verdict is None else [margin for margin in verdict.margins.values() if not margin.ok]
+    margins = (
+        []
+        if verdict is None
+        else [margin for margin in verdict.margins.values() if not margin.ok]
+    )
     with np.errstate(all="ignore"):
-        world, s, t = along(problem, robot, one, index, extra_times=[margin.time for margin in margins])
-    title = f"{problem.name}, plan {index}: {t[-1]:.3f} s" + (f"\n{note}" if note else "")
-    draw_path(problem, world, s, t, Path(path), scene=scene, title=title, margins=margins)
+        world, s, t = along(
+            problem, robot, one, index, extra_times=[margin.time for margin in margins]
+        )
+    title = f"{problem.name}, plan {index}: {t[-1]:.3f} s" + (
+        f"\n{note}" if note else ""
+    )
+    draw_path(
+        problem, world, s, t, Path(path), scene=scene, title=title, margins=margins
+    )
 
 
 def draw_path(
@@ -84,11 +95,17 @@ def draw_path(
             ends = world.tip_position[:, :1].T, world.tip_position[:, -1:].T
             scene = scene_of(problem, *ends, world.tip_velocity[:, -1:].T)
         world.set_path(world.q, world.dq, world.ddq, scene.poses[0], world.jerk)
-    curves = [curve for curve in condition_curves(problem, world, s) if curve.name != TABLE_HEIGHT]
+    curves = [
+        curve
+        for curve in condition_curves(problem, world, s)
+        if curve.name != TABLE_HEIGHT
+    ]
     columns = [1.15, 0.85, 1.0] if curves else [1.15, 1.0]
     figure = new_figure(20 if curves else 15, 9)
     figure.suptitle(title)
-    joints, *conditions, tip = figure.subfigures(1, len(columns), width_ratios=columns, squeeze=False)[0]
+    joints, *conditions, tip = figure.subfigures(
+        1, len(columns), width_ratios=columns, squeeze=False
+    )[0]
     _draw_joints(joints, world, t, margins)
     if curves:
         _draw_conditions(conditions[0], curves, t, margins)
@@ -97,8 +114,18 @@ def draw_path(
         _draw_views(tip, problem, world, scene.bodies())
     else:
         _draw_over_table(tip, table, world, s, t)
-    named = {name: item for axis in tip.axes for item, name in zip(*axis.get_legend_handles_labels(), strict=True)}
-    tip.legend(named.values(), named.keys(), loc="outside lower center", ncols=len(named), fontsize=8)
+    named = {
+        name: item
+        for axis in tip.axes
+        for item, name in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
+    tip.legend(
+        named.values(),
+        named.keys(),
+        loc="outside lower center",
+        ncols=len(named),
+        fontsize=8,
+    )
     save_figure(figure, path)
 
 
@@ -114,11 +141,14 @@ def along(
 ) -> tuple[PathWorld, Array, Array]:
     """Place the robot at K times of one motion, uniformly spaced but for extra ones [s].
 
-    The index is that of error messages. Obstacles, by default those of the problem, matter for distances only. Return
-    the world, phases, and times [s], shape (K,) each. A motion that cannot be evaluated raises UsageError.
+    The index is that of error messages. Obstacles, by default those of the problem,
+    matter for distances only. Return the world, phases, and times [s], shape (K,) each.
+    A motion that cannot be evaluated raises UsageError.
     """
     if not motion.runs_forward()[0]:
-        raise UsageError(f"plan {index} cannot be drawn: its rate ds/dt is not positive everywhere")
+        raise UsageError(
+            f"plan {index} cannot be drawn: its rate ds/dt is not positive everywhere"
+        )
     t = plot_times(float(motion.duration()[0]), samples, extra_times)
     s = motion.phase_at(t[None])[0]
     states = motion.at(s)
@@ -134,23 +164,36 @@ def along(
 
 def plot_times(duration: float, samples: int, extra: Sequence[float]) -> Array:
     """Return uniformly spaced times and extra ones within the duration [s], ascending."""
-    return np.union1d(np.linspace(0, duration, samples), np.clip(np.array(extra, float), 0, duration))
+    return np.union1d(
+        np.linspace(0, duration, samples), np.clip(np.array(extra, float), 0, duration)
+    )
 
 
 def shares_of_limits(world: PathWorld) -> dict[str, Array]:
     """Return q, dq, ddq, torque and, if constrained, jerk as fractions of their limits, each of shape (n, K)."""
     robot, factors = world.robot, world.parameters.values
-    center, half = (robot.position_upper + robot.position_lower) / 2, (robot.position_upper - robot.position_lower) / 2
+    center, half = (
+        (robot.position_upper + robot.position_lower) / 2,
+        (robot.position_upper - robot.position_lower) / 2,
+    )
     return {
         "position": (world.q - center[:, None]) / half[:, None],
-        "velocity": world.dq / (factors.get("velocity_factor", 1.0) * robot.velocity_limit[:, None]),
-        "acceleration": world.ddq / (factors.get("acceleration_factor", 1.0) * robot.acceleration_limit[:, None]),
-        **({} if world.jerk is None else {"jerk": world.jerk / robot.jerk_limit[:, None]}),
+        "velocity": world.dq
+        / (factors.get("velocity_factor", 1.0) * robot.velocity_limit[:, None]),
+        "acceleration": world.ddq
+        / (factors.get("acceleration_factor", 1.0) * robot.acceleration_limit[:, None]),
+        **(
+            {}
+            if world.jerk is None
+            else {"jerk": world.jerk / robot.jerk_limit[:, None]}
+        ),
         "torque": world.torque / robot.torque_limit[:, None],
     }
 
 
-def _draw_joints(figure: "SubFigure", world: PathWorld, t: Array, margins: Sequence[Margin]) -> None:
+def _draw_joints(
+    figure: "SubFigure", world: PathWorld, t: Array, margins: Sequence[Margin]
+) -> None:
     """Draw the quantities of ``shares_of_limits`` of every joint over time."""
     robot, shares = world.robot, shares_of_limits(world)
     axes = figure.subplots(len(shares), 1, sharex=True)
@@ -166,31 +209,66 @@ def _draw_joints(figure: "SubFigure", world: PathWorld, t: Array, margins: Seque
         axis.set_ylabel(f"{name} [% of limit]", fontsize=9)
     axes[-1].set_xlabel("t [s]")
     axes[-1].set_xlim(t[0], t[-1])
-    columns = max(1, MAX_LEGEND_CHARACTERS // (max(map(len, robot.joint_names)) + 8))  # with space between entries
+    columns = max(
+        1, MAX_LEGEND_CHARACTERS // (max(map(len, robot.joint_names)) + 8)
+    )  # with space between entries
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=min(robot.n, columns), fontsize=8)
+    figure.legend(
+        handles,
+        labels,
+        loc="outside upper center",
+        ncols=min(robot.n, columns),
+        fontsize=8,
+    )
 
 
-def _draw_conditions(figure: "SubFigure", curves: list[ConditionCurve], t: Array, margins: Sequence[Margin]) -> None:
+def _draw_conditions(
+    figure: "SubFigure",
+    curves: list[ConditionCurve],
+    t: Array,
+    margins: Sequence[Margin],
+) -> None:
     """Draw the values of conditions over time, with their bounds and violations."""
-    for axis, curve in zip(figure.subplots(len(curves), 1, sharex=True, squeeze=False)[:, 0], curves, strict=True):
+    for axis, curve in zip(
+        figure.subplots(len(curves), 1, sharex=True, squeeze=False)[:, 0],
+        curves,
+        strict=True,
+    ):
         for values, part in zip(curve.values, curve.parts, strict=True):
-            axis.plot(t, values, linewidth=1.2, color=None if part else "black", label=part or None)
-            axis.annotate(part, (t[0], values[0]), (2, 3), textcoords="offset points", fontsize=8)
+            axis.plot(
+                t,
+                values,
+                linewidth=1.2,
+                color=None if part else "black",
+                label=part or None,
+            )
+            axis.annotate(
+                part, (t[0], values[0]), (2, 3), textcoords="offset points", fontsize=8
+            )
         low, high = axis.get_ylim()
         for bound, side in ((curve.lower, -1), (curve.upper, 1)):
             if np.isfinite(bound).all():
                 axis.plot(t, bound, color=_LIMIT, linewidth=1, linestyle="--")
                 reach = bound + side * 1.5 * curve.tolerance
                 low, high = min(low, float(reach.min())), max(high, float(reach.max()))
-                axis.fill_between(t, bound, bound + side * 1e6, color="tab:red", alpha=0.08, linewidth=0)
+                axis.fill_between(
+                    t,
+                    bound,
+                    bound + side * 1e6,
+                    color="tab:red",
+                    alpha=0.08,
+                    linewidth=0,
+                )
         axis.set_ylim(low, high)
         outside = np.where(curve.violated, curve.values, np.nan)
         axis.plot(t, outside.T, color=_GOAL, linewidth=2.5, label="_violated")
         for margin in margins:
             if margin.name == curve.name:
                 k = int(np.abs(t - margin.time).argmin())
-                violation = np.maximum(curve.lower[k] - curve.values[:, k], curve.values[:, k] - curve.upper[k])
+                violation = np.maximum(
+                    curve.lower[k] - curve.values[:, k],
+                    curve.values[:, k] - curve.upper[k],
+                )
                 _mark(axis, margin.time, float(curve.values[violation.argmax(), k]))
         axis.set_ylabel(f"{curve.label}\n[{curve.unit}]", fontsize=9)
         axis.grid(axis="x", color="0.9", linewidth=0.6)
@@ -200,7 +278,15 @@ def _draw_conditions(figure: "SubFigure", curves: list[ConditionCurve], t: Array
 
 def _mark(axis: "Axes", time: float, value: float) -> None:
     """Mark a violation."""
-    axis.plot([time], [value], "x", color=_GOAL, markersize=9, markeredgewidth=2, label="violation")
+    axis.plot(
+        [time],
+        [value],
+        "x",
+        color=_GOAL,
+        markersize=9,
+        markeredgewidth=2,
+        label="violation",
+    )
 
 
 def _draw_limits(axis: "Axes", largest: float) -> None:
@@ -209,12 +295,16 @@ def _draw_limits(axis: "Axes", largest: float) -> None:
     axis.set_ylim(-height, height)
     for side in (-1, 1):
         axis.axhline(100 * side, color=_LIMIT, linewidth=1, linestyle="--")
-        axis.axhspan(100 * side, height * side, color="tab:red", alpha=0.08, linewidth=0)
+        axis.axhspan(
+            100 * side, height * side, color="tab:red", alpha=0.08, linewidth=0
+        )
     axis.axhline(0, color="0.8", linewidth=0.6, zorder=0)
     axis.grid(axis="x", color="0.9", linewidth=0.6)
 
 
-def _draw_over_table(figure: "SubFigure", table: Table, world: PathWorld, s: Array, t: Array) -> None:
+def _draw_over_table(
+    figure: "SubFigure", table: Table, world: PathWorld, s: Array, t: Array
+) -> None:
     """Draw the tip from above in the rectangle, and its height over time in the valid band."""
     from matplotlib.patches import Rectangle
 
@@ -222,22 +312,37 @@ def _draw_over_table(figure: "SubFigure", table: Table, world: PathWorld, s: Arr
     x, y, z = world.parameters.on_table(world.tip_position)
     low, high = table.bounds_of(world.parameters.values)
     width, height = high[0] - low[0], high[1] - low[1]
-    above.add_patch(Rectangle((low[0], low[1]), width, height, fill=False, edgecolor=_LIMIT, zorder=0))
+    above.add_patch(
+        Rectangle(
+            (low[0], low[1]), width, height, fill=False, edgecolor=_LIMIT, zorder=0
+        )
+    )
     _draw_tip_path(above, x, y)
     above.set_aspect("equal")
     above.margins(0.08)
-    above.set(xlabel="x [m]", ylabel="y [m]", title="tip over the table, one dot per 20 ms")
+    above.set(
+        xlabel="x [m]", ylabel="y [m]", title="tip over the table, one dot per 20 ms"
+    )
     ticks = np.arange(0.0, t[-1], 0.02)
-    above.plot(np.interp(ticks, t, x), np.interp(ticks, t, y), ".", color="black", markersize=4)
+    above.plot(
+        np.interp(ticks, t, x), np.interp(ticks, t, y), ".", color="black", markersize=4
+    )
     off_table = table.measured(cast(World, world))[1]
-    band = 1e3 * (table.allowed(off_table) + table.bound_relaxation(off_table, s, world.tip_position[:, 0]))
-    beside.fill_between(t, -band, band, color="tab:green", alpha=0.12, linewidth=0, label="valid")
+    band = 1e3 * (
+        table.allowed(off_table)
+        + table.bound_relaxation(off_table, s, world.tip_position[:, 0])
+    )
+    beside.fill_between(
+        t, -band, band, color="tab:green", alpha=0.12, linewidth=0, label="valid"
+    )
     beside.plot(t, 1e3 * (z - table.z), color="black", linewidth=1.2)
     beside.set(xlabel="t [s]", ylabel="z above the table [mm]", xlim=(t[0], t[-1]))
     beside.grid(color="0.9", linewidth=0.6)
 
 
-def _draw_views(figure: "SubFigure", problem: Problem, world: PathWorld, solids: list[Solid]) -> None:
+def _draw_views(
+    figure: "SubFigure", problem: Problem, world: PathWorld, solids: list[Solid]
+) -> None:
     """Draw arm, object and obstacles in two views: from the side with the largest tip motion, and from above."""
     from matplotlib.patches import Polygon
 
@@ -245,18 +350,34 @@ def _draw_views(figure: "SubFigure", problem: Problem, world: PathWorld, solids:
     side = int(np.ptp(world.tip_position[1]) >= np.ptp(world.tip_position[0]))
     colors = [_BETWEEN] * (DRAWN_STATES - 2) + [_START, _GOAL]
     indices = np.linspace(0, world.q.shape[1] - 1, DRAWN_STATES).round().astype(int)
-    indices = np.concatenate([indices[1:-1], indices[[0, -1]]])  # the ends are drawn last, in front
+    indices = np.concatenate(
+        [indices[1:-1], indices[[0, -1]]]
+    )  # the ends are drawn last, in front
     links = [_links(problem, world, k) for k in indices]
-    for axis, (across, up), title in zip(figure.subplots(2, 1), ((side, 2), (1, 0)), ("side", "top"), strict=True):
+    for axis, (across, up), title in zip(
+        figure.subplots(2, 1), ((side, 2), (1, 0)), ("side", "top"), strict=True
+    ):
         for solid in solids:
-            outline = _outline((solid.position + solid.corners)[:, [across, up]], solid.radius)
+            outline = _outline(
+                (solid.position + solid.corners)[:, [across, up]], solid.radius
+            )
             axis.add_patch(Polygon(outline, facecolor=_BOX, edgecolor=_LIMIT, zorder=0))
             axis.update_datalim(outline)
         for k, points, color in zip(indices, links, colors, strict=True):
-            _draw_body(axis, points, None if corners is None else corners[..., k], (across, up), color)
+            _draw_body(
+                axis,
+                points,
+                None if corners is None else corners[..., k],
+                (across, up),
+                color,
+            )
         _draw_tip_path(axis, world.tip_position[across], world.tip_position[up])
         axis.set_aspect("equal")
-        axis.set(xlabel=f"{'xyz'[across]} [m]", ylabel=f"{'xyz'[up]} [m]", title=f"{title} view")
+        axis.set(
+            xlabel=f"{'xyz'[across]} [m]",
+            ylabel=f"{'xyz'[up]} [m]",
+            title=f"{title} view",
+        )
         axis.set_ylim(bottom=max(axis.get_ylim()[0], -0.25))
 
 
@@ -264,29 +385,50 @@ def _links(problem: Problem, world: PathWorld, k: int) -> list[tuple[Array, floa
     """Return the parts of links, or segments, at one state: corners in the world [m], shape (V, 3), and radius [m]."""
     robot = world.robot
     if robot.shape is None:
-        return [(segment, problem.arm_radius or 0.0) for segment in world.segments()[..., k]]
+        return [
+            (segment, problem.arm_radius or 0.0) for segment in world.segments()[..., k]
+        ]
     rotations, positions = ForwardKinematics(robot.model).poses(world.q[:, k : k + 1])
-    places = ((piece, robot.shape.joints[piece.link]) for piece in robot.shape.convex_parts)
+    places = (
+        (piece, robot.shape.joints[piece.link]) for piece in robot.shape.convex_parts
+    )
     return [
-        (piece.vertices @ rotations[joint, :, :, 0].T + positions[joint, :, 0], piece.radius) for piece, joint in places
+        (
+            piece.vertices @ rotations[joint, :, :, 0].T + positions[joint, :, 0],
+            piece.radius,
+        )
+        for piece, joint in places
     ]
 
 
 def _draw_body(
-    axis: "Axes", links: list[tuple[Array, float]], corners: Array | None, plane: tuple[int, int], color: str
+    axis: "Axes",
+    links: list[tuple[Array, float]],
+    corners: Array | None,
+    plane: tuple[int, int],
+    color: str,
 ) -> None:
     """Draw the outlines of the arm's links and of the held object at one state."""
     from matplotlib.collections import PolyCollection
 
     between = color == _BETWEEN
-    style: dict[str, Any] = {"color": color, "linewidth": 0.5 if between else 1.2, "alpha": 0.5 if between else 0.9}
+    style: dict[str, Any] = {
+        "color": color,
+        "linewidth": 0.5 if between else 1.2,
+        "alpha": 0.5 if between else 0.9,
+    }
     for points, radius in links:
         outline = _outline(points[:, list(plane)], radius)
         axis.plot(*outline.T, **style)
-        area = PolyCollection([outline], facecolors=color, alpha=0.03 if between else 0.12, linewidths=0)
+        area = PolyCollection(
+            [outline], facecolors=color, alpha=0.03 if between else 0.12, linewidths=0
+        )
         axis.add_collection(area)
     if corners is not None:
-        axis.plot(*_hull(corners[:, list(plane)]).T, **style | {"linewidth": 2 * style["linewidth"]})
+        axis.plot(
+            *_hull(corners[:, list(plane)]).T,
+            **style | {"linewidth": 2 * style["linewidth"]},
+        )
 
 
 def _outline(points: Array, radius: float) -> Array:

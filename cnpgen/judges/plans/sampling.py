@@ -14,14 +14,19 @@ Array = NDArray[np.float64]
 
 MIN_SAMPLES = 200  # per motion
 MAX_DURATION_S = 2000.0  # of a motion that is judged, for any time step
-MAX_TIME_SAMPLES = 200_000  # take about one second; longer motions get a longer time step
+MAX_TIME_SAMPLES = (
+    200_000  # take about one second; longer motions get a longer time step
+)
 TIME_SAMPLE_FACTOR = 1.05  # additional samples in time, because r varies within a cell of the table of times
 TABLE_CELLS, EARLY_EXIT_CELLS = 4096, 128  # of equal size in the table of times
 SAMPLES_PER_SPAN = 8  # between two knots, uniform in phase
 SAMPLES_PER_END = 64  # additional, at each end
 END_REGION = 0.05  # phases at each end with additional samples
 MIN_PHASE_STEP = 1e-7  # differences between closer samples are rounding errors
-EARLY_EXIT_PER_SPAN, EARLY_EXIT_PER_END = 8, 16  # samples of early_exit, which has none in time
+EARLY_EXIT_PER_SPAN, EARLY_EXIT_PER_END = (
+    8,
+    16,
+)  # samples of early_exit, which has none in time
 
 
 @dataclass(frozen=True)
@@ -39,8 +44,8 @@ class Samples:
 def time_table(rate: Array, degree: int, *, cells: int = TABLE_CELLS) -> Array:
     """Tabulate phases and their times [s], by a two-point Gauss rule in every cell.
 
-    The rate, of positive r, has control points [1/s] of shape (R,). The table has shape (2, C), both rows ascending:
-    phases from 0 to 1, times from 0 to the duration.
+    The rate, of positive r, has control points [1/s] of shape (R,). The table has shape
+    (2, C), both rows ascending: phases from 0 to 1, times from 0 to the duration.
     """
     phases, halves = _table_phases(cells)
     inverse = 1.0 / (_nodes(len(rate), degree, cells) @ rate)
@@ -61,7 +66,9 @@ def _table_phases(cells: int) -> tuple[Array, Array]:
     return phases, np.diff(phases) / 2
 
 
-def sample(table: Array, step: float, spans: int, additional: Collection[float] = ()) -> Samples | None:
+def sample(
+    table: Array, step: float, spans: int, additional: Collection[float] = ()
+) -> Samples | None:
     """Choose samples with a maximum time step [s] that resolve every feature of a B-spline.
 
     * Samples in time, at least ``MIN_SAMPLES`` and at most ``MAX_TIME_SAMPLES``, with steps of at most ``step``.
@@ -69,15 +76,22 @@ def sample(table: Array, step: float, spans: int, additional: Collection[float] 
     * ``SAMPLES_PER_END`` phases near each end, spaced quadratically from 1e-5 on: the clamped basis functions there are
       about 0.01 wide, less than a time step of a fast motion.
 
-    Spans are those between the knots of the finer spline. The result is None for a duration of ``MAX_DURATION_S`` or
-    more.
+    Spans are those between the knots of the finer spline. The result is None for a
+    duration of ``MAX_DURATION_S`` or more.
     """
     duration = table[1, -1]
     if not duration < MAX_DURATION_S:
         return None
-    count = max(MIN_SAMPLES, min(MAX_TIME_SAMPLES, int(np.ceil(TIME_SAMPLE_FACTOR * duration / step)) + 1))
+    count = max(
+        MIN_SAMPLES,
+        min(MAX_TIME_SAMPLES, int(np.ceil(TIME_SAMPLE_FACTOR * duration / step)) + 1),
+    )
     by_time = np.interp(np.linspace(0, duration, count), table[1], table[0])
-    s = np.unique(np.concatenate([by_time, _phases(SAMPLES_PER_SPAN * spans, SAMPLES_PER_END, additional)]))
+    s = np.unique(
+        np.concatenate(
+            [by_time, _phases(SAMPLES_PER_SPAN * spans, SAMPLES_PER_END, additional)]
+        )
+    )
     return Samples(s, times(s, table))
 
 
@@ -94,7 +108,9 @@ def early_exit_phases(spans: int, additional: frozenset[float] = frozenset()) ->
 def _phases(uniform: int, per_end: int, additional: Collection[float]) -> Array:
     """Return phases, not sorted: uniform ones, and quadratically spaced ones near both ends."""
     near = END_REGION * np.linspace(0, 1, per_end + 1) ** 2
-    return np.concatenate([np.linspace(0, 1, uniform + 1), near, 1 - near, list(additional)])
+    return np.concatenate(
+        [np.linspace(0, 1, uniform + 1), near, 1 - near, list(additional)]
+    )
 
 
 def times(s: Array, table: Array) -> Array:
@@ -107,4 +123,6 @@ def _nodes(points: int, degree: int, cells: int) -> Array:
     """Return the basis of r at the Gauss nodes of the table's cells, shape (2 cells, R)."""
     phases, halves = _table_phases(cells)
     centers, offset = (phases[1:] + phases[:-1]) / 2, halves / np.sqrt(3)
-    return basis_matrix(np.stack([centers - offset, centers + offset], axis=1).ravel(), points, degree)
+    return basis_matrix(
+        np.stack([centers - offset, centers + offset], axis=1).ravel(), points, degree
+    )

@@ -1,10 +1,12 @@
 """Tube of states around a plan, which a robot with a bounded tracking error may reach.
 
-The constraints on positions must hold for every state of the tube: limits of joint positions, clearances and the
-manifold. Velocities, accelerations, jerks and torques are judged on the plan itself. Limits of joints are exact.
-Distances change by at most the displacement of the robot's points, which motion bounds give (Schwarzer et al. 2005).
-Other conditions are measured again with every joint moved to both sides, one by one and in random combinations. The sum
-of the changes, times a factor for curvature, bounds their change.
+The constraints on positions must hold for every state of the tube: limits of joint
+positions, clearances and the manifold. Velocities, accelerations, jerks and torques are
+judged on the plan itself. Limits of joints are exact. Distances change by at most the
+displacement of the robot's points, which motion bounds give (Schwarzer et al. 2005).
+Other conditions are measured again with every joint moved to both sides, one by one and
+in random combinations. The sum of the changes, times a factor for curvature, bounds
+their change.
 """
 
 from collections.abc import Sequence
@@ -37,14 +39,17 @@ TUBE_COMBINATIONS = 8  # random ones of all changes
 class TrackingTube:
     """States within a tracking error of a plan.
 
-    The error is the largest one of every joint [rad], shape (n,), or one for all; a negative one raises UsageError.
+    The error is the largest one of every joint [rad], shape (n,), or one for all; a
+    negative one raises UsageError.
     """
 
     def __init__(self, problem: Problem, robot: Robot, error: TrackingError) -> None:
         values = np.asarray(error, float)
         if values.shape not in ((), (robot.n,)) or not np.isfinite(values).all():
             expected = f"one number [rad], or {robot.n}, one per joint"
-            raise UsageError(f"must be {expected}, got {error!r}", argument="tracking_error")
+            raise UsageError(
+                f"must be {expected}, got {error!r}", argument="tracking_error"
+            )
         unit = "m" if all(robot.prismatic) else "rad"
         check_range("tracking_error", values, 0.0, MAX_TRACKING_ERROR, unit)
         self._problem, self._error = problem, np.broadcast_to(values, robot.n).copy()
@@ -54,12 +59,18 @@ class TrackingTube:
         for constraint in problem.constraint:
             orders = measured_needs([constraint.judged], world, jerk=problem.uses_jerk)
             judged = zip(constraint.judged(world), orders, strict=True)
-            self._position_conditions |= {(id(constraint), condition.name) for condition, order in judged if order == 0}
+            self._position_conditions |= {
+                (id(constraint), condition.name)
+                for condition, order in judged
+                if order == 0
+            }
 
     def tighten(self, limits: ProvenJointLimits) -> ProvenJointLimits:
         """Return joint limits whose position limits are moved inwards by the tracking error."""
         inwards = np.concatenate([self._error, -self._error])
-        rows = [isinstance(constraint, JointPosition) for constraint in limits.constraints]
+        rows = [
+            isinstance(constraint, JointPosition) for constraint in limits.constraints
+        ]
         return replace(limits, bounds=limits.bounds + np.outer(rows, inwards))
 
     def widen(self, context: EvaluationContext) -> EvaluationContext:
@@ -69,33 +80,66 @@ class TrackingTube:
 
         def add(condition: MeasuredCondition, s: Array) -> MeasuredCondition:
             if is_contact(condition.constraint):
-                return replace(condition, uncertainty=self._contact_error(condition, displacement))
-            if (id(condition.constraint), condition.condition.name) not in self._position_conditions:
+                return replace(
+                    condition, uncertainty=self._contact_error(condition, displacement)
+                )
+            if (
+                id(condition.constraint),
+                condition.condition.name,
+            ) not in self._position_conditions:
                 return condition
-            return replace(condition, uncertainty=self._largest_change(context, condition, s))
+            return replace(
+                condition, uncertainty=self._largest_change(context, condition, s)
+            )
 
         measured = [add(condition, context.samples.s) for condition in context.measured]
         return replace(context, measured=measured, with_uncertainty=add)
 
-    def _contact_error(self, condition: MeasuredCondition, displacement: float) -> "float | Array":
-        """Return the change of distances [m]; contact of the object with what it stands on is intended."""
+    def _contact_error(
+        self, condition: MeasuredCondition, displacement: float
+    ) -> "float | Array":
+        """Return the change of distances [m].
+
+        Contact of the object with what it stands on is intended.
+        """
         if not isinstance(condition.constraint, ObjectContact):
             return displacement
-        return np.array([[0.0 if obstacle.below else displacement] for obstacle in self._problem.obstacle])
+        return np.array(
+            [
+                [0.0 if obstacle.below else displacement]
+                for obstacle in self._problem.obstacle
+            ]
+        )
 
-    def _largest_change(self, context: EvaluationContext, condition: MeasuredCondition, s: Array) -> Array:
+    def _largest_change(
+        self, context: EvaluationContext, condition: MeasuredCondition, s: Array
+    ) -> Array:
         """Return the largest change of the values of a smooth condition in the tube at phases s, shape (m, K)."""
         states = context.curve.evaluate(s, jerk=self._problem.uses_jerk)
 
         def values(offset: Array) -> Array:
-            self._world.set_path(states.q + offset[:, None], states.dq, states.ddq, context.obstacle_poses, states.jerk)
-            conditions = measure(condition.constraint, self._world, s, context.start_tip)
-            return next(each.g for each in conditions if each.condition.name == condition.condition.name)
+            self._world.set_path(
+                states.q + offset[:, None],
+                states.dq,
+                states.ddq,
+                context.obstacle_poses,
+                states.jerk,
+            )
+            conditions = measure(
+                condition.constraint, self._world, s, context.start_tip
+            )
+            return next(
+                each.g
+                for each in conditions
+                if each.condition.name == condition.condition.name
+            )
 
         nominal = values(np.zeros_like(self._error))
         total = np.zeros_like(nominal)
         for offset in np.diag(self._error):
-            total += np.max([np.abs(values(sign * offset) - nominal) for sign in (-1, 1)], axis=0)
+            total += np.max(
+                [np.abs(values(sign * offset) - nominal) for sign in (-1, 1)], axis=0
+            )
         random = np.random.default_rng(0)
         for signs in random.choice([-1.0, 1.0], (TUBE_COMBINATIONS, len(self._error))):
             np.maximum(total, np.abs(values(signs * self._error) - nominal), out=total)

@@ -15,7 +15,8 @@ ZERO_TOLERANCE = 1e-200  # replaces a tolerance of 0 in relative violations, so 
 class Reason(StrEnum):
     """Reason for which a plan is not valid.
 
-    A plan that violates a constraint has the constraint's own ``reason`` instead, which is a plain text.
+    A plan that violates a constraint has the constraint's own ``reason`` instead, which
+    is a plain text.
     """
 
     OK = "ok"
@@ -31,17 +32,13 @@ class Reason(StrEnum):
 class Margin:
     """Margin of a condition where a plan comes closest to violating it, or its largest violation.
 
-    Attributes:
-        name: Name of the condition.
-        reason: Reason under which a violation is counted.
-        unit: SI unit of value, bound, violation and tolerance.
-        part: Name of the condition's value: a joint, an axis, an obstacle, or empty if it has only one.
-        value: Value of the condition.
-        bound: Bound that is closest or violated.
-        violation: Signed distance outside the bound, negative inside; inf if it could not be evaluated.
-        tolerance: Largest violation that is accepted as valid.
-        time: Time [s].
-        phase: Phase s.
+    Attributes: name: Name of the condition. reason: Reason under which a violation is
+        counted. unit: SI unit of value, bound, violation and tolerance. part: Name of
+        the condition's value: a joint, an axis, an obstacle, or empty if it has only
+        one. value: Value of the condition. bound: Bound that is closest or violated.
+        violation: Signed distance outside the bound, negative inside; inf if it could
+        not be evaluated. tolerance: Largest violation that is accepted as valid. time:
+        Time [s]. phase: Phase s.
     """
 
     name: str
@@ -66,7 +63,10 @@ class Margin:
         return self.violation / max(self.tolerance, ZERO_TOLERANCE)
 
     def __str__(self) -> str:
-        name, side = f"{self.name} {self.part}".strip(), "outside" if self.violation > 0 else "within"
+        name, side = (
+            f"{self.name} {self.part}".strip(),
+            "outside" if self.violation > 0 else "within",
+        )
         distance = f"{abs(self.violation):.3g} {self.unit} {side} {self.bound:.6g}"
         return f"{name}: {distance} (tolerance {self.tolerance:.3g}) at t = {self.time:.4f} s, s = {self.phase:.4f}"
 
@@ -74,7 +74,9 @@ class Margin:
         """Return the margin for JSON; values that are not finite are None."""
         values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         infinite = {
-            name: None for name, value in values.items() if isinstance(value, float) and not math.isfinite(value)
+            name: None
+            for name, value in values.items()
+            if isinstance(value, float) and not math.isfinite(value)
         }
         return {**values, **infinite, "ok": self.ok}
 
@@ -83,13 +85,12 @@ class Margin:
 class Metrics:
     """Metrics of a plan, as defined in the paper's tables; nan if they could not be evaluated.
 
-    Attributes:
-        duration: Motion time [s].
-        effort: Integral of the sum over joints of (torque / limit)^2 over time [s].
-        jerk: Largest jerk of a joint, in multiples of its limit, by default 5/s x that of its acceleration.
-        hit_speed: Speed of the tip at the goal [m/s].
-        z_error: Integral of |z - height of the table| over time [m s]; nan without a table.
-        vertical_error: Integral of |roll| + |pitch| of the tip frame over time [rad s]; nan without a vertical.
+    Attributes: duration: Motion time [s]. effort: Integral of the sum over joints of
+        (torque / limit)^2 over time [s]. jerk: Largest jerk of a joint, in multiples of
+        its limit, by default 5/s x that of its acceleration. hit_speed: Speed of the
+        tip at the goal [m/s]. z_error: Integral of |z - height of the table| over time
+        [m s]; nan without a table. vertical_error: Integral of |roll| + |pitch| of the
+        tip frame over time [rad s]; nan without a vertical.
     """
 
     duration: float = math.nan
@@ -116,10 +117,9 @@ class Metrics:
 class PaperRule:
     """Result of the paper's looser rules, which the add-on ``paper`` evaluates.
 
-    Attributes:
-        finished: Whether the tip ends at the goal.
-        valid: Whether, in addition, no constraint is violated by the paper's tolerances.
-        broken: Reasons of the violated constraints.
+    Attributes: finished: Whether the tip ends at the goal. valid: Whether, in addition,
+        no constraint is violated by the paper's tolerances. broken: Reasons of the
+        violated constraints.
     """
 
     finished: bool = False
@@ -128,19 +128,22 @@ class PaperRule:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result for JSON."""
-        return {"finished": self.finished, "valid": self.valid, "broken": list(self.broken)}
+        return {
+            "finished": self.finished,
+            "valid": self.valid,
+            "broken": list(self.broken),
+        }
 
 
 @dataclass(frozen=True)
 class Verdict:
     """Result of the independent check of one plan.
 
-    Attributes:
-        reason: ``Reason.OK``, another ``Reason``, or the ``reason`` of the constraint with the largest violation.
-        margins: Condition -> margin; empty if the plan could not be evaluated.
-        metrics: Motion time, errors, effort.
-        paper: Result of the paper's rules; None if they were not evaluated, since the add-on is missing.
-        samples: Number of samples.
+    Attributes: reason: ``Reason.OK``, another ``Reason``, or the ``reason`` of the
+        constraint with the largest violation. margins: Condition -> margin; empty if
+        the plan could not be evaluated. metrics: Motion time, errors, effort. paper:
+        Result of the paper's rules; None if they were not evaluated, since the add-on
+        is missing. samples: Number of samples.
     """
 
     reason: str
@@ -165,8 +168,14 @@ class Verdict:
     @property
     def worst(self) -> Margin | None:
         """The margin of the largest severity, among those with the verdict's reason if the plan is not valid."""
-        deciding = [margin for margin in self.margins.values() if margin.reason == self.reason]
-        return max(deciding or self.margins.values(), key=lambda margin: margin.severity, default=None)
+        deciding = [
+            margin for margin in self.margins.values() if margin.reason == self.reason
+        ]
+        return max(
+            deciding or self.margins.values(),
+            key=lambda margin: margin.severity,
+            default=None,
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict for JSON."""
@@ -175,7 +184,9 @@ class Verdict:
             "valid": self.valid,
             "reason": str(self.reason),
             "worst": worst and worst.to_dict(),
-            "margins": {name: margin.to_dict() for name, margin in self.margins.items()},
+            "margins": {
+                name: margin.to_dict() for name, margin in self.margins.items()
+            },
             "metrics": self.metrics.to_dict(),
             "paper": self.paper and self.paper.to_dict(),
             "samples": self.samples,
@@ -185,14 +196,17 @@ class Verdict:
 def summarize_verdicts(verdicts: Sequence[Verdict]) -> dict[str, Any]:
     """Count verdicts and average their metrics.
 
-    Returns:
-        For JSON: ``plans``; ``valid``, and, if the paper's rules were evaluated, ``paper_valid`` and ``finished``, with
-        their ratios; ``reasons``, reason -> number of plans; ``metrics_of_valid``, ``metrics_of_paper_valid`` and
-        ``metrics_of_all`` (those that could be evaluated), metric -> mean, median, 95 % quantile and maximum;
-        ``conditions``, condition -> number of plans that violate it and the worst margin, with its plan's index.
+    Returns: For JSON: ``plans``; ``valid``, and, if the paper's rules were evaluated,
+        ``paper_valid`` and ``finished``, with their ratios; ``reasons``, reason ->
+        number of plans; ``metrics_of_valid``, ``metrics_of_paper_valid`` and
+        ``metrics_of_all`` (those that could be evaluated), metric -> mean, median, 95 %
+        quantile and maximum; ``conditions``, condition -> number of plans that violate
+        it and the worst margin, with its plan's index.
     """
     n_plans = len(verdicts)
-    by_paper = [verdict for verdict in verdicts if verdict.paper and verdict.paper.valid]
+    by_paper = [
+        verdict for verdict in verdicts if verdict.paper and verdict.paper.valid
+    ]
     counts = {"valid": sum(verdict.valid for verdict in verdicts)}
     rules = [verdict.paper for verdict in verdicts if verdict.paper is not None]
     if len(rules) == len(verdicts):
@@ -202,11 +216,18 @@ def summarize_verdicts(verdicts: Sequence[Verdict]) -> dict[str, Any]:
     return {
         "plans": n_plans,
         **counts,
-        **{f"{name}_ratio": number / n_plans if n_plans else None for name, number in counts.items()},
+        **{
+            f"{name}_ratio": number / n_plans if n_plans else None
+            for name, number in counts.items()
+        },
         "reasons": dict(reasons.most_common()),
-        "metrics_of_valid": _statistics([verdict for verdict in verdicts if verdict.valid]),
+        "metrics_of_valid": _statistics(
+            [verdict for verdict in verdicts if verdict.valid]
+        ),
         "metrics_of_paper_valid": _statistics(by_paper),
-        "metrics_of_all": _statistics([verdict for verdict in verdicts if verdict.margins]),
+        "metrics_of_all": _statistics(
+            [verdict for verdict in verdicts if verdict.margins]
+        ),
         "conditions": _conditions(verdicts),
     }
 
@@ -236,5 +257,9 @@ def _conditions(verdicts: Sequence[Verdict]) -> dict[str, dict[str, Any]]:
     for name, margins in margins_of.items():
         worst, margin = max(margins, key=lambda entry: entry[1].severity)
         violating = sum(not margin.ok for _, margin in margins)
-        conditions[name] = {"violating_plans": violating, "worst_plan": worst, **margin.to_dict()}
+        conditions[name] = {
+            "violating_plans": violating,
+            "worst_plan": worst,
+            **margin.to_dict(),
+        }
     return conditions

@@ -1,14 +1,17 @@
 """Checks of the goals of hits, as far as the recorded stages of a dataset determine them: configuration and speed.
 
-A hitting configuration is a maximum of ``f(q) = |J(q)^T d|^2 - |(q0 - q) / L|^2`` among the configurations that put
-the tip at the goal, within the joint limits (reference 2, section on hitting): ``d`` is the direction of the hit, ``J``
-the translational Jacobian of the tip, ``q0`` the base, the start or the home configuration, ``L`` the rated joint
-velocities. There the gradient of f is a combination of the rows of J, except for joints at a limit towards which f
-increases. Any of several maxima is accepted. A hitting velocity is the fastest one or a random fraction of it.
+A hitting configuration is a maximum of ``f(q) = |J(q)^T d|^2 - |(q0 - q) / L|^2`` among
+the configurations that put the tip at the goal, within the joint limits (reference 2,
+section on hitting): ``d`` is the direction of the hit, ``J`` the translational Jacobian
+of the tip, ``q0`` the base, the start or the home configuration, ``L`` the rated joint
+velocities. There the gradient of f is a combination of the rows of J, except for joints
+at a limit towards which f increases. Any of several maxima is accepted. A hitting
+velocity is the fastest one or a random fraction of it.
 
-The highest speed of a hit is the optimum of a linear program: maximize ``a . v`` subject to ``B v = 0`` and
-``|v_i| <= L_i``. Here ``a`` is the tip velocity along the hit per joint velocity, and the two rows of B are the
-velocities across it. The dual, ``min over y of sum_i L_i |a_i - (B^T y)_i|``, is convex and piecewise linear: its
+The highest speed of a hit is the optimum of a linear program: maximize ``a . v``
+subject to ``B v = 0`` and ``|v_i| <= L_i``. Here ``a`` is the tip velocity along the
+hit per joint velocity, and the two rows of B are the velocities across it. The dual,
+``min over y of sum_i L_i |a_i - (B^T y)_i|``, is convex and piecewise linear: its
 minimum is at a vertex, where two of the terms vanish.
 """
 
@@ -25,10 +28,17 @@ from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES
 from cnpgen.robots.robot import Robot
 from cnpgen.world.measured_parameters import MeasuredParameters
 
-# Tolerance of the projected gradient of f [m^2/rad]. In float32 the joints have errors of 1e-7 rad.
+# Tolerance of the projected gradient of f [m^2/rad]. In float32 the joints have errors
+# of 1e-7 rad.
 STATIONARITY_TOLERANCES = {"float64": 1e-8, "float32": 1e-5}
-ACTIVE_LIMIT_TOLERANCES_RAD = {"float64": 1e-9, "float32": 1e-6}  # joints closer to a limit are at the limit
-FRACTION_TOLERANCES = {"float64": 4e-16, "float32": 2.5e-7}  # between quotients of stored numbers that were equal
+ACTIVE_LIMIT_TOLERANCES_RAD = {
+    "float64": 1e-9,
+    "float32": 1e-6,
+}  # joints closer to a limit are at the limit
+FRACTION_TOLERANCES = {
+    "float64": 4e-16,
+    "float32": 2.5e-7,
+}  # between quotients of stored numbers that were equal
 MIN_PROBABILITY = 1e-9  # of equal fractions by chance
 PARALLEL_TOLERANCE = 1e-9  # relative determinant below which two terms have no vertex that can be computed
 
@@ -37,8 +47,9 @@ PARALLEL_TOLERANCE = 1e-9  # relative determinant below which two terms have no 
 class HitRule:
     """Rule by which the stages of a dataset chose its goals.
 
-    They stay close to the configuration "base", "start" or "home", if it is not empty. A fraction of the hits has the
-    highest possible speed; None if no stage chooses the speed.
+    They stay close to the configuration "base", "start" or "home", if it is not empty.
+    A fraction of the hits has the highest possible speed; None if no stage chooses the
+    speed.
     """
 
     near: str = ""
@@ -57,7 +68,8 @@ def judge_goals(
 ) -> list[tuple[Check, Index]]:
     """Check the goals of finite rows against the rule of the stages.
 
-    Columns, field -> values in SI units, have shape (rows, width). The float type is that of the stored rows.
+    Columns, field -> values in SI units, have shape (rows, width). The float type is
+    that of the stored rows.
     """
     judged = []
     if rule.near and "hit_angle" in columns:
@@ -65,23 +77,52 @@ def judge_goals(
         near_base = np.broadcast_to(robot.home, q.shape)
         home = near_base if rule.near == "base" else columns[f"{rule.near}_q"][finite]
         direction = _directions(robot, columns, finite)
-        error = _projected_gradients(robot, q, home, direction, ACTIVE_LIMIT_TOLERANCES_RAD[dtype])
+        error = _projected_gradients(
+            robot, q, home, direction, ACTIVE_LIMIT_TOLERANCES_RAD[dtype]
+        )
         tolerance = STATIONARITY_TOLERANCES[dtype]
-        judged.append(compare("hitting configuration", "m^2/rad", violation=error, tolerance=tolerance, row=finite))
+        judged.append(
+            compare(
+                "hitting configuration",
+                "m^2/rad",
+                violation=error,
+                tolerance=tolerance,
+                row=finite,
+            )
+        )
     if rule.full_speed is not None and "hit_speed_max" in columns:
         fraction = speed_fractions(columns)[finite]
         share = fraction * velocity_factors(robot, columns)[finite]
-        violation = np.abs(columns["goal_dq"][finite]) - share[:, None] * robot.velocity_limit
-        too_slow = np.where(fraction == 1, 0.0, np.inf) if rule.full_speed == 1 else np.zeros(len(finite))
-        error = np.maximum(np.maximum(violation.max(axis=1, initial=0.0), 0.0), too_slow)
+        violation = (
+            np.abs(columns["goal_dq"][finite]) - share[:, None] * robot.velocity_limit
+        )
+        too_slow = (
+            np.where(fraction == 1, 0.0, np.inf)
+            if rule.full_speed == 1
+            else np.zeros(len(finite))
+        )
+        error = np.maximum(
+            np.maximum(violation.max(axis=1, initial=0.0), 0.0), too_slow
+        )
         tolerance = BOUNDARY_TOLERANCES[dtype]["velocity"]
-        judged.append(compare("hitting velocity", "rad/s", violation=error, tolerance=tolerance, row=finite))
+        judged.append(
+            compare(
+                "hitting velocity",
+                "rad/s",
+                violation=error,
+                tolerance=tolerance,
+                row=finite,
+            )
+        )
     return judged
 
 
 def speed_fractions(columns: Mapping[str, Array]) -> Array:
     """Compute the speed of each hit as a fraction of the highest possible one, shape (rows,)."""
-    speed, highest = (np.asarray(columns[name], np.float64).reshape(-1) for name in ("hit_speed", "hit_speed_max"))
+    speed, highest = (
+        np.asarray(columns[name], np.float64).reshape(-1)
+        for name in ("hit_speed", "hit_speed_max")
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(speed / highest)
 
@@ -89,14 +130,20 @@ def speed_fractions(columns: Mapping[str, Array]) -> Array:
 def repeated_fraction(fractions: Array, dtype: str) -> tuple[int, float]:
     """Find a fraction below 1 that more hits have than chance explains: such hits were scaled in time afterwards.
 
-    The fractions are those of all rows of a dataset. Return the number of hits with the fraction, and the fraction; 0
-    if there is none.
+    The fractions are those of all rows of a dataset. Return the number of hits with the
+    fraction, and the fraction; 0 if there is none.
     """
     drawn = np.sort(fractions[(fractions > 0) & (fractions < 1)])
     expected, count = len(drawn) * FRACTION_TOLERANCES[dtype], 2
-    while len(drawn) * expected ** (count - 1) / math.factorial(count - 1) > MIN_PROBABILITY:
+    while (
+        len(drawn) * expected ** (count - 1) / math.factorial(count - 1)
+        > MIN_PROBABILITY
+    ):
         count += 1
-    close = drawn[count - 1 :] - drawn[: max(len(drawn) - count + 1, 0)] <= FRACTION_TOLERANCES[dtype]
+    close = (
+        drawn[count - 1 :] - drawn[: max(len(drawn) - count + 1, 0)]
+        <= FRACTION_TOLERANCES[dtype]
+    )
     if not close.any():
         return 0, 0.0
     value = float(drawn[int(np.argmax(close))])
@@ -123,32 +170,45 @@ def _directions(robot: Robot, columns: Mapping[str, Array], finite: Index) -> Ar
     return direction
 
 
-def _projected_gradients(robot: Robot, q: Array, home: Array, direction: Array, at_limit: float) -> Array:
+def _projected_gradients(
+    robot: Robot, q: Array, home: Array, direction: Array, at_limit: float
+) -> Array:
     """Compute the gradient of f in the directions that the constraints leave free [m^2/rad], shape (rows,)."""
     jacobian, gradient = _gradients(robot, q, home, direction)
     low, high = q - robot.position_lower < at_limit, robot.position_upper - q < at_limit
     free = jacobian * ~(low | high)[:, None]
-    multiplier = np.linalg.pinv(free @ free.swapaxes(1, 2)) @ (free @ gradient[:, :, None])
+    multiplier = np.linalg.pinv(free @ free.swapaxes(1, 2)) @ (
+        free @ gradient[:, :, None]
+    )
     projected = gradient - (jacobian.swapaxes(1, 2) @ multiplier)[:, :, 0]
     # At a limit f may increase towards the limit.
     ascent = np.where(high, -projected, np.where(low, projected, np.abs(projected)))
     return np.asarray(ascent.max(axis=1, initial=0.0))
 
 
-def _gradients(robot: Robot, q: Array, home: Array, direction: Array) -> tuple[Array, Array]:
+def _gradients(
+    robot: Robot, q: Array, home: Array, direction: Array
+) -> tuple[Array, Array]:
     """Return J, shape (rows, 3, n), and the gradient of f, shape (rows, n), by derivatives of the tip's velocity.
 
-    Pinocchio differentiates the velocity of the tip's frame as if its axes turned with it. That adds a combination of
-    the rows of J to the gradient, which the projection removes.
+    Pinocchio differentiates the velocity of the tip's frame as if its axes turned with
+    it. That adds a combination of the rows of J to the gradient, which the projection
+    removes.
     """
     import pinocchio as pin
 
-    model, tip, frame = robot.model, robot.tip_frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    model, tip, frame = (
+        robot.model,
+        robot.tip_frame,
+        pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
+    )
     data, zero = model.createData(), np.zeros(robot.n)
     jacobian, gradient = np.empty((len(q), 3, robot.n)), np.empty((len(q), robot.n))
     for row in range(len(q)):
         jacobian[row] = pin.computeFrameJacobian(model, data, q[row], tip, frame)[:3]
-        pin.computeForwardKinematicsDerivatives(model, data, q[row], direction[row] @ jacobian[row], zero)
+        pin.computeForwardKinematicsDerivatives(
+            model, data, q[row], direction[row] @ jacobian[row], zero
+        )
         by_position, _ = pin.getFrameVelocityDerivatives(model, data, tip, frame)
         gradient[row] = direction[row] @ by_position[:3]
     return jacobian, 2 * gradient + 2 * (home - q) / robot.rated_velocity**2
@@ -157,16 +217,25 @@ def _gradients(robot: Robot, q: Array, home: Array, direction: Array) -> tuple[A
 def highest_speed(jacobian: Array, angle: Array, limit: Array) -> Array:
     """Compute the highest speed of the tip along hits in the x-y plane within velocity limits [m/s], shape (rows,).
 
-    Translational Jacobians in world axes [m] have shape (rows, 3, n), directions [rad] (rows,). The speed is inf where
-    B has less than two independent columns.
+    Translational Jacobians in world axes [m] have shape (rows, 3, n), directions [rad]
+    (rows,). The speed is inf where B has less than two independent columns.
     """
     x, y, z = jacobian.transpose(1, 0, 2)
     cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
     a, b = cosine * x + sine * y, cosine * y - sine * x
     i, j = np.array(list(combinations(range(len(limit)), 2))).T
     first, second = b[:, i] * z[:, j], z[:, i] * b[:, j]
-    vertex = np.abs(first - second) > PARALLEL_TOLERANCE * (np.abs(first) + np.abs(second))
+    vertex = np.abs(first - second) > PARALLEL_TOLERANCE * (
+        np.abs(first) + np.abs(second)
+    )
     scale = 1 / np.where(vertex, first - second, 1.0)
-    u, w = (a[:, i] * z[:, j] - z[:, i] * a[:, j]) * scale, (b[:, i] * a[:, j] - a[:, i] * b[:, j]) * scale
-    residual = np.abs(a[:, :, None] - b[:, :, None] * u[:, None] - z[:, :, None] * w[:, None])
-    return np.asarray(np.where(vertex, limit @ residual, np.inf).min(axis=1, initial=np.inf))
+    u, w = (
+        (a[:, i] * z[:, j] - z[:, i] * a[:, j]) * scale,
+        (b[:, i] * a[:, j] - a[:, i] * b[:, j]) * scale,
+    )
+    residual = np.abs(
+        a[:, :, None] - b[:, :, None] * u[:, None] - z[:, :, None] * w[:, None]
+    )
+    return np.asarray(
+        np.where(vertex, limit @ residual, np.inf).min(axis=1, initial=np.inf)
+    )

@@ -22,14 +22,12 @@ Index = NDArray[np.int64]
 class Check:
     """Result of one check over all states that were verified.
 
-    Attributes:
-        name: Name of the check, that of its condition.
-        unit: SI unit of ``worst`` and ``tolerance``.
-        worst: Violation with the largest ratio to its tolerance; inf if it could not be evaluated.
-        tolerance: Tolerance of that violation.
-        n_failed: Number of rows with a violation above its tolerance, at either end.
-        worst_row: Row of ``worst``, -1 if no row was checked.
-        worst_end: End of the motion of ``worst``.
+    Attributes: name: Name of the check, that of its condition. unit: SI unit of
+        ``worst`` and ``tolerance``. worst: Violation with the largest ratio to its
+        tolerance; inf if it could not be evaluated. tolerance: Tolerance of that
+        violation. n_failed: Number of rows with a violation above its tolerance, at
+        either end. worst_row: Row of ``worst``, -1 if no row was checked. worst_end:
+        End of the motion of ``worst``.
     """
 
     name: str
@@ -80,7 +78,11 @@ class RowReport:
     def to_dict(self) -> dict[str, Any]:
         """Return the report for JSON."""
         checks = [check.to_dict() for check in self.checks]
-        return {"rows": self.rows, "failed_rows": self.failed_rows.tolist(), "checks": checks}
+        return {
+            "rows": self.rows,
+            "failed_rows": self.failed_rows.tolist(),
+            "checks": checks,
+        }
 
 
 def compare(
@@ -94,38 +96,75 @@ def compare(
 ) -> tuple[Check, Index]:
     """Compare k violations of rows, shape (k,), with their tolerances; return also the rows that fail, ascending.
 
-    A violation of nan counts as infinite. Tolerances, and ends as indices of ``ENDS``, have shape (k,) or are those of
-    all; the end is the goal by default.
+    A violation of nan counts as infinite. Tolerances, and ends as indices of ``ENDS``,
+    have shape (k,) or are those of all; the end is the goal by default.
     """
     if violation.size == 0:
         return Check(name, unit, 0.0, 0.0, 0, -1, "start"), np.empty(0, np.int64)
-    tolerance, end = np.broadcast_to(tolerance, violation.shape), np.broadcast_to(end, violation.shape)
+    tolerance, end = (
+        np.broadcast_to(tolerance, violation.shape),
+        np.broadcast_to(end, violation.shape),
+    )
     violation = np.where(np.isnan(violation), np.inf, violation)
     failed = np.unique(row[violation > tolerance])
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         severity = np.where(violation > 0, violation / tolerance, 0.0)
     worst = int(np.argmax(severity))
     worst_row, worst_end = int(row[worst]), ENDS[int(end[worst])]
-    check = Check(name, unit, float(violation[worst]), float(tolerance[worst]), len(failed), worst_row, worst_end)
+    check = Check(
+        name,
+        unit,
+        float(violation[worst]),
+        float(tolerance[worst]),
+        len(failed),
+        worst_row,
+        worst_end,
+    )
     return check, failed
 
 
 def merge(reports: Sequence[RowReport]) -> RowReport:
-    """Merge the reports of consecutive blocks of rows; rows are counted from the start of the first block."""
+    """Merge the reports of consecutive blocks of rows.
+
+    Rows are counted from the start of the first block.
+    """
     first = np.cumsum([0, *(report.rows for report in reports)])
     checks: dict[tuple[str, str], Check] = {}
     for report, shift in zip(reports, first.tolist(), strict=False):
         for check in report.checks:
             key = check.name, check.unit
             checks[key] = _joined(checks.get(key), check, shift)
-    failed = [report.failed_rows + shift for report, shift in zip(reports, first[:-1], strict=True)]
-    return RowReport(int(first[-1]), tuple(checks.values()), np.concatenate([np.empty(0, np.int64), *failed]))
+    failed = [
+        report.failed_rows + shift
+        for report, shift in zip(reports, first[:-1], strict=True)
+    ]
+    return RowReport(
+        int(first[-1]),
+        tuple(checks.values()),
+        np.concatenate([np.empty(0, np.int64), *failed]),
+    )
 
 
 def _joined(before: Check | None, check: Check, shift: int) -> Check:
     """Add the result for rows that start at ``shift`` to the result for the rows before."""
     row = check.worst_row + shift if check.worst_row >= 0 else -1
     n_failed = check.n_failed + (before.n_failed if before else 0)
-    keep_before = before is not None and before.worst_row >= 0 and (row < 0 or before.severity >= check.severity)
-    worst, row = (before, before.worst_row) if before is not None and keep_before else (check, row)
-    return Check(check.name, check.unit, worst.worst, worst.tolerance, n_failed, row, worst.worst_end)
+    keep_before = (
+        before is not None
+        and before.worst_row >= 0
+        and (row < 0 or before.severity >= check.severity)
+    )
+    worst, row = (
+        (before, before.worst_row)
+        if before is not None and keep_before
+        else (check, row)
+    )
+    return Check(
+        check.name,
+        check.unit,
+        worst.worst,
+        worst.tolerance,
+        n_failed,
+        row,
+        worst.worst_end,
+    )

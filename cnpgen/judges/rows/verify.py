@@ -13,8 +13,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import DatasetError
 from cnpgen.judges.plans.judge import judge
-from cnpgen.judges.rows.hits import HitRule, highest_speed, judge_goals, velocity_factors
-from cnpgen.judges.rows.row_report import ENDS, Array, Check, Index, RowReport, compare, merge
+from cnpgen.judges.rows.hits import (
+    HitRule,
+    highest_speed,
+    judge_goals,
+    velocity_factors,
+)
+from cnpgen.judges.rows.row_report import (
+    ENDS,
+    Array,
+    Check,
+    Index,
+    RowReport,
+    compare,
+    merge,
+)
 from cnpgen.problems.conditions import measured_needs
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, Condition
 from cnpgen.problems.obstacles import goal_velocities, scene_of
@@ -27,11 +40,20 @@ from cnpgen.world.world import World
 
 NO_RULE = HitRule()
 VERIFICATION_BLOCK_ROWS = 1024  # measurements of a block need less than 10 MB
-# Tolerances of stored diagnostics, in their units. Coal's distances have errors of 4e-11 m. In float32 the rounding of
-# joint positions moves the arm by 1e-7 m and changes its highest speed by 2e-6 m/s in 40,000 rows.
+# Tolerances of stored diagnostics, in their units. Coal's distances have errors of
+# 4e-11 m. In float32 the rounding of joint positions moves the arm by 1e-7 m and
+# changes its highest speed by 2e-6 m/s in 40,000 rows.
 DIAGNOSTIC_TOLERANCES = {"float64": 1e-8, "float32": 1e-4}
 
-_REQUIRED = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "start_xyz", "goal_xyz")
+_REQUIRED = (
+    "start_q",
+    "start_dq",
+    "start_ddq",
+    "goal_q",
+    "goal_dq",
+    "start_xyz",
+    "goal_xyz",
+)
 _DERIVATIVES = ("q", "dq", "ddq")
 
 Key = tuple[str, str, str]  # name, unit and tolerance of a condition
@@ -62,12 +84,11 @@ def verify_rows(
 
     The tolerances are ``cnpgen.problems.constraints.constraint.BOUNDARY_TOLERANCES``.
 
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        columns: Field -> values in SI units, shape (rows, width) or (rows,): ``start_q``, ``start_dq``, ``start_ddq``,
-            ``goal_q``, ``goal_dq``, ``start_xyz``, ``goal_xyz``; optionally ``goal_ddq``, ``hit_angle``, ``hit_speed``,
-            ``hit_speed_max``, diagnostics, and ``obstacle_poses``, which replace those of the problem. Other fields
+    Args: problem: The problem. robot: Its robot. columns: Field -> values in SI units,
+        shape (rows, width) or (rows,): ``start_q``, ``start_dq``, ``start_ddq``,
+            ``goal_q``, ``goal_dq``, ``start_xyz``, ``goal_xyz``; optionally
+            ``goal_ddq``, ``hit_angle``, ``hit_speed``, ``hit_speed_max``, diagnostics,
+            and ``obstacle_poses``, which replace those of the problem. Other fields
             must be finite.
         dtype: Float type of the stored rows, which determines the tolerances.
         rule: Rule by which the stages chose the goals; none by default.
@@ -79,11 +100,18 @@ def verify_rows(
     rows = len(values["start_q"])
     world = World(robot, problem.obstacle, problem.object_size)
     slices = [
-        slice(first, first + VERIFICATION_BLOCK_ROWS) for first in range(0, max(rows, 1), VERIFICATION_BLOCK_ROWS)
+        slice(first, first + VERIFICATION_BLOCK_ROWS)
+        for first in range(0, max(rows, 1), VERIFICATION_BLOCK_ROWS)
     ]
-    blocks = ({name: column[part] for name, column in values.items()} for part in slices)
-    with np.errstate(over="ignore", invalid="ignore"):  # overflows give inf or nan and fail
-        return merge([_verify_block(problem, world, block, dtype, rule) for block in blocks])
+    blocks = (
+        {name: column[part] for name, column in values.items()} for part in slices
+    )
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # overflows give inf or nan and fail
+        return merge(
+            [_verify_block(problem, world, block, dtype, rule) for block in blocks]
+        )
 
 
 def _read(columns: Mapping[str, ArrayLike], n: int) -> dict[str, Array]:
@@ -93,11 +121,20 @@ def _read(columns: Mapping[str, ArrayLike], n: int) -> dict[str, Array]:
         raise DatasetError(f"the rows have no field {', '.join(missing)}")
     values = {name: np.asarray(column, np.float64) for name, column in columns.items()}
     rows = len(values["start_q"])
-    widths = {f"{end}_{name}": n for end in ENDS for name in _DERIVATIVES} | {f"{end}_xyz": 3 for end in ENDS}
+    widths = {f"{end}_{name}": n for end in ENDS for name in _DERIVATIVES} | {
+        f"{end}_xyz": 3 for end in ENDS
+    }
     for name, column in values.items():
-        if len(column) != rows or (name in widths and column.shape != (rows, widths[name])):
-            raise DatasetError(f"field {name} must have shape ({rows}, {widths.get(name, '...')}), got {column.shape}")
-    return {name: column.reshape(rows, math.prod(column.shape[1:])) for name, column in values.items()}
+        if len(column) != rows or (
+            name in widths and column.shape != (rows, widths[name])
+        ):
+            raise DatasetError(
+                f"field {name} must have shape ({rows}, {widths.get(name, '...')}), got {column.shape}"
+            )
+    return {
+        name: column.reshape(rows, math.prod(column.shape[1:]))
+        for name, column in values.items()
+    }
 
 
 @dataclass
@@ -111,13 +148,20 @@ class _ConditionValues:
         """Judge all states at once."""
         name, unit, quantity = key
         values = list(chain.from_iterable(condition.g for condition in self.conditions))
-        lower, upper = (np.concatenate([getattr(c, side) for c in self.conditions]) for side in ("lower", "upper"))
+        lower, upper = (
+            np.concatenate([getattr(c, side) for c in self.conditions])
+            for side in ("lower", "upper")
+        )
         count = [len(condition.g) for condition in self.conditions]
         row, end = np.repeat(np.array(self.places, np.int64), count, axis=0).T
         g = np.array(values, float)
         violation = np.maximum(np.maximum(lower - g, g - upper), 0.0)
-        tolerance = Condition(name, unit, values, lower, upper, quantity).tolerance(dtype)
-        return compare(name, unit, violation=violation, tolerance=tolerance, row=row, end=end)
+        tolerance = Condition(name, unit, values, lower, upper, quantity).tolerance(
+            dtype
+        )
+        return compare(
+            name, unit, violation=violation, tolerance=tolerance, row=row, end=end
+        )
 
 
 @dataclass(frozen=True)
@@ -136,31 +180,47 @@ class Diagnostic:
         row = finite[index]
         error = np.abs(self.stored[row, end] - self.recomputed[row, end])
         tolerance = DIAGNOSTIC_TOLERANCES[dtype]
-        return compare(self.name, self.unit, violation=error, tolerance=tolerance, row=row, end=end)
+        return compare(
+            self.name, self.unit, violation=error, tolerance=tolerance, row=row, end=end
+        )
 
 
 @dataclass
 class _Measurements:
     """Measurements in a block of rows; nan in rows that were not measured.
 
-    Tip positions [m] have shape (rows, 2, 3). Velocities [m/s], shape (rows, 3), and Jacobians [m], shape (rows, 3, n),
-    of hits are those of the tip at the goal along the axes of the table. Conditions are in order of first use.
+    Tip positions [m] have shape (rows, 2, 3). Velocities [m/s], shape (rows, 3), and
+    Jacobians [m], shape (rows, 3, n), of hits are those of the tip at the goal along
+    the axes of the table. Conditions are in order of first use.
     """
 
     position: Array
     hit_velocity: Array
     hit_jacobian: Array
     diagnostics: list[Diagnostic]
-    conditions: defaultdict[Key, _ConditionValues] = field(default_factory=lambda: defaultdict(_ConditionValues))
+    conditions: defaultdict[Key, _ConditionValues] = field(
+        default_factory=lambda: defaultdict(_ConditionValues)
+    )
 
 
-def _verify_block(problem: Problem, world: World, columns: dict[str, Array], dtype: str, rule: HitRule) -> RowReport:
+def _verify_block(
+    problem: Problem, world: World, columns: dict[str, Array], dtype: str, rule: HitRule
+) -> RowReport:
     rows = len(columns["start_q"])
-    n_invalid = np.sum([np.sum(~np.isfinite(column), axis=1) for column in columns.values()], axis=0)
+    n_invalid = np.sum(
+        [np.sum(~np.isfinite(column), axis=1) for column in columns.values()], axis=0
+    )
     finite = np.flatnonzero(n_invalid == 0)
     measurements = _measure(problem, world, columns, finite)
     judged = [
-        compare("finite", "1", violation=n_invalid.astype(float), tolerance=0.0, row=np.arange(rows), end=0),
+        compare(
+            "finite",
+            "1",
+            violation=n_invalid.astype(float),
+            tolerance=0.0,
+            row=np.arange(rows),
+            end=0,
+        ),
         _judge_position(measurements, columns, finite, dtype),
         *(values.judged(key, dtype) for key, values in measurements.conditions.items()),
         *_judge_hit(world.robot, measurements, columns, finite, dtype),
@@ -171,17 +231,25 @@ def _verify_block(problem: Problem, world: World, columns: dict[str, Array], dty
     return RowReport(rows, tuple(check for check, _ in judged), failed)
 
 
-def _stored_diagnostics(problem: Problem, columns: Mapping[str, Array]) -> list[Diagnostic]:
+def _stored_diagnostics(
+    problem: Problem, columns: Mapping[str, Array]
+) -> list[Diagnostic]:
     """List the diagnostics in columns that can be recomputed: torque ratio, and clearance of an arm with a radius."""
     radius, missing = problem.arm_radius, np.full((len(columns["start_q"]), 1), np.nan)
     kinds: dict[str, tuple[str, str, Callable[[World], float]]] = {
         "torque_ratio": ("holding torque ratio", "1", _holding_torque_ratio)
     }
     if radius is not None and problem.obstacle:
-        kinds["clearance"] = "clearance", "m", lambda world: min(world.segment_distances()) - radius
+        kinds["clearance"] = (
+            "clearance",
+            "m",
+            lambda world: min(world.segment_distances()) - radius,
+        )
     diagnostics = []
     for field_name, kind in kinds.items():
-        stored = np.concatenate([columns.get(f"{end}_{field_name}", missing) for end in ENDS], axis=1)
+        stored = np.concatenate(
+            [columns.get(f"{end}_{field_name}", missing) for end in ENDS], axis=1
+        )
         if not np.isnan(stored).all():
             diagnostics.append(Diagnostic(*kind, stored, np.full_like(stored, np.nan)))
     return diagnostics
@@ -191,55 +259,92 @@ def _holding_torque_ratio(world: World) -> float:
     return float(np.max(np.abs(world.holding_torque) / world.robot.torque_limit))
 
 
-def _measure(problem: Problem, world: World, columns: dict[str, Array], finite: Index) -> _Measurements:
+def _measure(
+    problem: Problem, world: World, columns: dict[str, Array], finite: Index
+) -> _Measurements:
     """Move the world to both ends of every finite row and record the measurements."""
     rows = len(columns["start_q"])
-    velocity = goal_velocities(problem, world.robot, columns["goal_q"], columns["goal_dq"])
-    given = {"parameters": columns.get("parameters"), "obstacle_poses": columns.get(OBSTACLE_POSES)}
-    poses = scene_of(problem, columns["start_xyz"], columns["goal_xyz"], velocity, **given).poses
-    position, velocity, jacobian = (np.full((rows, *shape), np.nan) for shape in ((2, 3), (3,), (3, world.robot.n)))
-    measurements = _Measurements(position, velocity, jacobian, _stored_diagnostics(problem, columns))
+    velocity = goal_velocities(
+        problem, world.robot, columns["goal_q"], columns["goal_dq"]
+    )
+    given = {
+        "parameters": columns.get("parameters"),
+        "obstacle_poses": columns.get(OBSTACLE_POSES),
+    }
+    poses = scene_of(
+        problem, columns["start_xyz"], columns["goal_xyz"], velocity, **given
+    ).poses
+    position, velocity, jacobian = (
+        np.full((rows, *shape), np.nan) for shape in ((2, 3), (3,), (3, world.robot.n))
+    )
+    measurements = _Measurements(
+        position, velocity, jacobian, _stored_diagnostics(problem, columns)
+    )
     for index, end in enumerate(ENDS):
         (q, dq, ddq), orders = _states(columns, end)
-        forms = [partial(constraint.measured_at, end=end) for constraint in problem.constraint]
+        forms = [
+            partial(constraint.measured_at, end=end)
+            for constraint in problem.constraint
+        ]
         needs = measured_needs(forms, world)
         for row in finite.tolist():
             world.set_state(q[row], dq[row], ddq[row], poses[row])
             measurements.position[row, index] = world.tip_position
             measured = chain.from_iterable(form(world) for form in forms)
-            known = (condition for condition, need in zip(measured, needs, strict=True) if need <= orders[row])
+            known = (
+                condition
+                for condition, need in zip(measured, needs, strict=True)
+                if need <= orders[row]
+            )
             for condition in known:
-                values = measurements.conditions[condition.name, condition.unit, condition.tolerance_kind]
+                values = measurements.conditions[
+                    condition.name, condition.unit, condition.tolerance_kind
+                ]
                 values.conditions.append(condition)
                 values.places.append((row, index))
             for diagnostic in measurements.diagnostics:
                 if np.isfinite(diagnostic.stored[row, index]):
                     diagnostic.recomputed[row, index] = diagnostic.compute(world)
             if end == "goal" and "hit_speed" in columns:
-                measurements.hit_velocity[row] = world.parameters.along_table(world.tip_velocity)
+                measurements.hit_velocity[row] = world.parameters.along_table(
+                    world.tip_velocity
+                )
             if end == "goal" and "hit_speed_max" in columns:
-                measurements.hit_jacobian[row] = world.parameters.along_table(world.tip_jacobian)
+                measurements.hit_jacobian[row] = world.parameters.along_table(
+                    world.tip_jacobian
+                )
     return measurements
 
 
 def _states(columns: dict[str, Array], end: str) -> tuple[list[Array], list[int]]:
     """Return q, dq and ddq at an end, 0 if not stored, and the highest known derivative of each row."""
-    q, dq, ddq = (columns.get(f"{end}_{name}", np.zeros_like(columns[f"{end}_q"])) for name in _DERIVATIVES)
+    q, dq, ddq = (
+        columns.get(f"{end}_{name}", np.zeros_like(columns[f"{end}_q"]))
+        for name in _DERIVATIVES
+    )
     if f"{end}_ddq" in columns:
         return [q, dq, ddq], [2] * len(q)
     return [q, dq, ddq], np.where(np.any(dq != 0, axis=1), 1, 2).tolist()
 
 
-def _judge_position(block: _Measurements, columns: dict[str, Array], finite: Index, dtype: str) -> tuple[Check, Index]:
+def _judge_position(
+    block: _Measurements, columns: dict[str, Array], finite: Index, dtype: str
+) -> tuple[Check, Index]:
     claimed = np.stack([columns[f"{end}_xyz"] for end in ENDS], axis=1)
     error = np.linalg.norm(block.position - claimed, axis=2)[finite].ravel()
     row, end = np.repeat(finite, len(ENDS)), np.tile(np.arange(len(ENDS)), len(finite))
     tolerance = BOUNDARY_TOLERANCES[dtype]["position"]
-    return compare("tip position", "m", violation=error, tolerance=tolerance, row=row, end=end)
+    return compare(
+        "tip position", "m", violation=error, tolerance=tolerance, row=row, end=end
+    )
 
 
 def _judge_hit(
-    robot: Robot, block: _Measurements, columns: dict[str, Array], finite: Index, dtype: str
+    robot: Robot,
+    block: _Measurements,
+    columns: dict[str, Array],
+    finite: Index,
+    dtype: str,
 ) -> Iterator[tuple[Check, Index]]:
     """Check direction, speed and highest possible speed of the tip at the goal in the plane of the table."""
     if "hit_angle" not in columns:
@@ -248,17 +353,41 @@ def _judge_hit(
     if "hit_speed" in columns:
         speed, tolerances = columns["hit_speed"][finite, 0], BOUNDARY_TOLERANCES[dtype]
         x, y, _ = block.hit_velocity[finite].T
-        along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+        along, across = (
+            x * np.cos(angle) + y * np.sin(angle),
+            y * np.cos(angle) - x * np.sin(angle),
+        )
         moving = speed > 0
-        direction, error = np.abs(np.arctan2(across, along)[moving]), np.abs(along - speed)
+        direction, error = (
+            np.abs(np.arctan2(across, along)[moving]),
+            np.abs(along - speed),
+        )
         tolerance = tolerances["direction"]
-        yield compare("hit direction", "rad", violation=direction, tolerance=tolerance, row=finite[moving])
-        yield compare("hit speed", "m/s", violation=error, tolerance=tolerances["velocity"], row=finite)
+        yield compare(
+            "hit direction",
+            "rad",
+            violation=direction,
+            tolerance=tolerance,
+            row=finite[moving],
+        )
+        yield compare(
+            "hit speed",
+            "m/s",
+            violation=error,
+            tolerance=tolerances["velocity"],
+            row=finite,
+        )
     if "hit_speed_max" in columns:
         highest = highest_speed(block.hit_jacobian[finite], angle, robot.velocity_limit)
         highest *= velocity_factors(robot, columns)[finite]
         error = np.abs(columns["hit_speed_max"][finite, 0] - highest)
-        yield compare("highest hit speed", "m/s", violation=error, tolerance=DIAGNOSTIC_TOLERANCES[dtype], row=finite)
+        yield compare(
+            "highest hit speed",
+            "m/s",
+            violation=error,
+            tolerance=DIAGNOSTIC_TOLERANCES[dtype],
+            row=finite,
+        )
 
 
 @dataclass(frozen=True)
@@ -270,25 +399,43 @@ class PlanCheck:
     problems: tuple[str, ...] = ()
 
 
-def check_plans(problem: Problem, robot: Robot, columns: Mapping[str, NDArray[Any]]) -> PlanCheck:
-    """Judge the plans in columns of a certified dataset, field -> values; rows of other datasets have none."""
+def check_plans(
+    problem: Problem, robot: Robot, columns: Mapping[str, NDArray[Any]]
+) -> PlanCheck:
+    """Judge the plans in columns of a certified dataset, field -> values.
+
+    Rows of other datasets have none.
+    """
     if "path_control_points" not in columns:
         return PlanCheck()
     rows, spec = len(columns["start_q"]), problem.trajectory
-    path = columns["path_control_points"].reshape(rows, spec.path_control_points, robot.n)
+    path = columns["path_control_points"].reshape(
+        rows, spec.path_control_points, robot.n
+    )
     motion = Motion(path, columns["rate_control_points"], spec.degree)
     boundary = Boundary.from_batch(columns, None)
     velocity = goal_velocities(problem, robot, boundary.goal_q, boundary.goal_dq)
     poses = columns.get(OBSTACLE_POSES)
     scene = scene_of(
-        problem, columns["start_xyz"], columns["goal_xyz"], velocity, boundary.parameters, obstacle_poses=poses
+        problem,
+        columns["start_xyz"],
+        columns["goal_xyz"],
+        velocity,
+        boundary.parameters,
+        obstacle_poses=poses,
     )
     verdicts = judge(problem, robot, motion, boundary, scene, columns["goal_xyz"])
-    invalid = [(row, verdict.reason) for row, verdict in enumerate(verdicts) if not verdict.valid]
+    invalid = [
+        (row, verdict.reason)
+        for row, verdict in enumerate(verdicts)
+        if not verdict.valid
+    ]
     problems = []
     if invalid:
         row, reason = invalid[0]
-        problems.append(f"{len(invalid)} of {rows} plans are not valid, the first one is that of row {row}: {reason}")
+        problems.append(
+            f"{len(invalid)} of {rows} plans are not valid, the first one is that of row {row}: {reason}"
+        )
     if not np.allclose(columns["duration"], motion.duration(), rtol=1e-9, atol=0):
         problems.append("stored durations differ from those of the plans")
     return PlanCheck(rows, rows - len(invalid), tuple(problems))

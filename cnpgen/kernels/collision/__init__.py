@@ -1,1 +1,4 @@
-"""Compiled collision checks of robots among obstacles; both are arrays, so one library serves all of them."""
+"""Compiled collision checks of robots among obstacles.
+
+Both are arrays, so one library serves all of them.
+"""

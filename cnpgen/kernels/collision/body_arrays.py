@@ -21,7 +21,12 @@ LANES = 8  # vertices and obstacles are padded to a multiple of the widest vecto
 BODY = np.dtype(
     [
         *((name, np.int64) for name in ("kind", "count", "first", "frame", "link")),
-        *(("size", np.float64, 3), ("radius", np.float64), ("rotation", np.float64, 9), ("position", np.float64, 3)),
+        *(
+            ("size", np.float64, 3),
+            ("radius", np.float64),
+            ("rotation", np.float64, 9),
+            ("position", np.float64, 3),
+        ),
     ]
 )
 PADDING_DISTANCE_M = 1e6  # of the bounding boxes that pad the obstacles to full vectors
@@ -37,12 +42,15 @@ def hull_vertices(corners: Array) -> Array:
 def bounding_boxes(bodies: Bodies, centers: Array, half: Array) -> Array:
     """Return the bounding boxes of bodies of N samples by rows, shape (N, 16, M padded); see ``obstacle_bodies``.
 
-    Bodies have shape (N, M), centers and half sizes of their boxes without the radius [m] (N, M, 3).
+    Bodies have shape (N, M), centers and half sizes of their boxes without the radius
+    [m] (N, M, 3).
     """
     count = bodies.shape[1]
     boxes = np.zeros((len(bodies), 16, count + -count % LANES))
     boxes[:, :3] = PADDING_DISTANCE_M
-    rows = np.concatenate([centers, half, bodies["rotation"], bodies["radius"][..., None]], axis=-1)
+    rows = np.concatenate(
+        [centers, half, bodies["rotation"], bodies["radius"][..., None]], axis=-1
+    )
     boxes[..., :count] = rows.swapaxes(1, 2)
     return boxes
 
@@ -57,43 +65,71 @@ def primitive_bodies(obstacles: Primitives, first: int) -> tuple[Bodies, Array, 
     bodies = np.zeros(kinds.shape, BODY)
     bodies["kind"] = np.where(mesh, HULL, np.where(cylinder, CYLINDER, BOX))
     centers = np.where((kinds >= 0)[..., None], obstacles.centers, PADDING_DISTANCE_M)
-    bodies["position"], bodies["rotation"] = centers, obstacles.rotations.reshape(*kinds.shape, 9)
-    bodies["first"][mesh], bodies["count"][mesh] = ends[kinds[mesh] - MESH], np.diff(ends)[kinds[mesh] - MESH] // 3
-    bodies["size"][box], bodies["size"][cylinder] = sizes[box], sizes[cylinder][:, [0, 0, 1]]
-    bodies["size"][rounded, 2], bodies["radius"][rounded] = sizes[rounded, 1], sizes[rounded, 0]
+    bodies["position"], bodies["rotation"] = (
+        centers,
+        obstacles.rotations.reshape(*kinds.shape, 9),
+    )
+    bodies["first"][mesh], bodies["count"][mesh] = (
+        ends[kinds[mesh] - MESH],
+        np.diff(ends)[kinds[mesh] - MESH] // 3,
+    )
+    bodies["size"][box], bodies["size"][cylinder] = (
+        sizes[box],
+        sizes[cylinder][:, [0, 0, 1]],
+    )
+    bodies["size"][rounded, 2], bodies["radius"][rounded] = (
+        sizes[rounded, 1],
+        sizes[rounded, 0],
+    )
     half = np.where(mesh[..., None], sizes, bodies["size"])
-    return bodies, np.concatenate([*blocks, np.empty(0)]), bounding_boxes(bodies, centers, half)
+    return (
+        bodies,
+        np.concatenate([*blocks, np.empty(0)]),
+        bounding_boxes(bodies, centers, half),
+    )
 
 
-def obstacle_bodies(obstacles: Sequence[Obstacle], numbers: Array, first: int) -> tuple[Bodies, Array, Array]:
+def obstacle_bodies(
+    obstacles: Sequence[Obstacle], numbers: Array, first: int
+) -> tuple[Bodies, Array, Array]:
     """Return the obstacles of one sample as bodies.
 
-    Cylinders are exact, with the radius of the corners of the prism that judges use: they contain that prism.
+    Cylinders are exact, with the radius of the corners of the prism that judges use:
+    they contain that prism.
 
     Args:
         obstacles: Obstacles of the problem.
         numbers: Their poses and sizes, shape (width,), see ``cnpgen.robots.solid``.
         first: Index of the first vertex of the obstacles among all vertices.
 
-    Returns:
-        ``(bodies, vertices, boxes)``: bodies, shape (O,); vertices of meshes, flat; bounding boxes by rows (center,
-        half sizes, rotation, radius), shape (16, O padded).
+    Returns: ``(bodies, vertices, boxes)``: bodies, shape (O,); vertices of meshes,
+        flat; bounding boxes by rows (center, half sizes, rotation, radius), shape (16,
+        O padded).
     """
     bodies, vertices = np.zeros(len(obstacles), BODY), list[Array]()
     centers, halves = np.empty((2, len(obstacles), 3))
-    for index, (obstacle, part) in enumerate(zip(obstacles, number_slices(obstacles), strict=True)):
+    for index, (obstacle, part) in enumerate(
+        zip(obstacles, number_slices(obstacles), strict=True)
+    ):
         body = bodies[index]
         centers[index], halves[index] = _fill(body, obstacle, numbers[part])
         if body["kind"] == HULL:
             corners = corners_of(obstacle.mesh)
             vertices.append(hull_vertices(corners))
-            body["count"], body["first"], first = len(vertices[-1]) // 3, first, first + len(vertices[-1])
+            body["count"], body["first"], first = (
+                len(vertices[-1]) // 3,
+                first,
+                first + len(vertices[-1]),
+            )
     (boxes,) = bounding_boxes(bodies[None], centers[None], halves[None])
     return bodies, np.concatenate([*vertices, np.empty(0)]), boxes
 
 
 def _fill(body: Any, obstacle: Obstacle, numbers: Array) -> tuple[Array, Array]:
-    """Fill in an obstacle's kind, sizes and pose; return center and half sizes of its bounding box without radius."""
+    """Fill in an obstacle's kind, sizes and pose.
+
+    Return center and half sizes of its bounding box without radius.
+    """
     rotation, half = np.eye(3), np.zeros(3)
     if obstacle.upright:
         (solid,) = solids_of([obstacle], numbers)
@@ -102,7 +138,10 @@ def _fill(body: Any, obstacle: Obstacle, numbers: Array) -> tuple[Array, Array]:
     else:
         center, rest = numbers[:3], numbers[3:]
         if obstacle.kind == "box":
-            half, rotation = rest[:3], rest[3:].reshape(3, 3) if obstacle.is_turned else rotation
+            half, rotation = (
+                rest[:3],
+                rest[3:].reshape(3, 3) if obstacle.is_turned else rotation,
+            )
             body["kind"], body["size"] = BOX, half
         elif obstacle.kind == "sphere":
             body["kind"], body["radius"] = BOX, rest[0]
@@ -114,8 +153,17 @@ def _fill(body: Any, obstacle: Obstacle, numbers: Array) -> tuple[Array, Array]:
             return center + rotation @ (low + high) / 2, (high - low) / 2
         else:
             length = math.hypot(*rest[:3])
-            rotation, flat = frame_along(rest[:3].tolist(), length), obstacle.kind == "cylinder"
-            half = np.array([rest[3], rest[3], length]) if flat else np.array([0.0, 0.0, length])
-            body["kind"], body["size"], body["radius"] = (CYLINDER, half, 0.0) if flat else (BOX, half, rest[3])
+            rotation, flat = (
+                frame_along(rest[:3].tolist(), length),
+                obstacle.kind == "cylinder",
+            )
+            half = (
+                np.array([rest[3], rest[3], length])
+                if flat
+                else np.array([0.0, 0.0, length])
+            )
+            body["kind"], body["size"], body["radius"] = (
+                (CYLINDER, half, 0.0) if flat else (BOX, half, rest[3])
+            )
     body["position"], body["rotation"] = center, rotation.ravel()
     return center, half

@@ -13,7 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.collision.body_arrays import BODY, Bodies, hull_vertices, obstacle_bodies
+from cnpgen.kernels.collision.body_arrays import (
+    BODY,
+    Bodies,
+    hull_vertices,
+    obstacle_bodies,
+)
 from cnpgen.kernels.compiled_kernel import address_of
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.robots.obstacle import Obstacle
@@ -23,32 +28,94 @@ from cnpgen.robots.shape.shape import Shape
 
 Array = NDArray[np.float64]
 
-_NAMES = ("convex.c", "collision.c", "tree_search.c", "manifold_search.c", "hull_rows.c")
+_NAMES = (
+    "convex.c",
+    "collision.c",
+    "tree_search.c",
+    "manifold_search.c",
+    "hull_rows.c",
+)
 SOURCES = [Path(__file__).with_name(name) for name in _NAMES]
 MAX_JOINTS = 56  # of the arrays in collision.c
-MIN_CONTACT_CAPACITY = 1024  # of the first call; a second one follows where it is too small
-CAPSULE = np.dtype([("frame", np.int64), ("first", np.float64, 3), ("second", np.float64, 3), ("radius", np.float64)])
+MIN_CONTACT_CAPACITY = (
+    1024  # of the first call; a second one follows where it is too small
+)
+CAPSULE = np.dtype(
+    [
+        ("frame", np.int64),
+        ("first", np.float64, 3),
+        ("second", np.float64, 3),
+        ("radius", np.float64),
+    ]
+)
 
 
 class _RobotScene(ctypes.Structure):
     """``robot_scene`` of collision.c."""
 
     _fields_ = (
-        *((name, c_long) for name in ("n", "n_parts", "n_links", "n_link_pairs", "n_obstacles", "lanes")),
-        *((name, c_void_p) for name in ("place", "axis", "sliding", "parts", "links", "first_part", "part_of_link")),
-        *((name, c_void_p) for name in ("link_pairs", "first_pair", "pairs", "moving", "moving_frames")),
-        *((name, c_void_p) for name in ("added", "pair_added", "obstacles", "boxes", "vertices")),
+        *(
+            (name, c_long)
+            for name in (
+                "n",
+                "n_parts",
+                "n_links",
+                "n_link_pairs",
+                "n_obstacles",
+                "lanes",
+            )
+        ),
+        *(
+            (name, c_void_p)
+            for name in (
+                "place",
+                "axis",
+                "sliding",
+                "parts",
+                "links",
+                "first_part",
+                "part_of_link",
+            )
+        ),
+        *(
+            (name, c_void_p)
+            for name in ("link_pairs", "first_pair", "pairs", "moving", "moving_frames")
+        ),
+        *(
+            (name, c_void_p)
+            for name in ("added", "pair_added", "obstacles", "boxes", "vertices")
+        ),
     )
 
 
-def load_collision_library(kernels: KernelLibrary, sources: Sequence[Path] = SOURCES) -> ctypes.CDLL | None:
-    """Return the library of collision checks, the same for all robots; None where kernels are not compiled."""
+def load_collision_library(
+    kernels: KernelLibrary, sources: Sequence[Path] = SOURCES
+) -> ctypes.CDLL | None:
+    """Return the library of collision checks, the same for all robots.
+
+    None where kernels are not compiled.
+    """
     library = kernels.load_source(*sources)
     if library is not None:
         library.clear_states.restype = library.joint_poses.restype = None
-        library.clear_states.argtypes = (c_void_p, c_void_p, c_long, c_double, c_double, c_void_p)
+        library.clear_states.argtypes = (
+            c_void_p,
+            c_void_p,
+            c_long,
+            c_double,
+            c_double,
+            c_void_p,
+        )
         library.find_contacts.restype = c_long
-        library.find_contacts.argtypes = (c_void_p, c_void_p, c_long, c_double, c_int, c_long, *(c_void_p,) * 5)
+        library.find_contacts.argtypes = (
+            c_void_p,
+            c_void_p,
+            c_long,
+            c_double,
+            c_int,
+            c_long,
+            *(c_void_p,) * 5,
+        )
         library.joint_poses.argtypes = (c_void_p, c_void_p, c_long, c_void_p)
     return library
 
@@ -56,16 +123,15 @@ def load_collision_library(kernels: KernelLibrary, sources: Sequence[Path] = SOU
 class CollisionChecker:
     """A robot with link geometry among obstacles, in compiled code.
 
-    Args:
-        library: Library of ``load_collision_library``.
-        robot: The robot, with at most ``MAX_JOINTS`` planned joints.
-        shape: Its link geometry, by default the robot's own.
-        added: Link -> distance that is added to its required ones from obstacles [m], by default 0; -inf for no check.
-        pair_added: Two links -> distance that is added to their required one from each other [m], in the same way.
+    Args: library: Library of ``load_collision_library``. robot: The robot, with at most
+        ``MAX_JOINTS`` planned joints. shape: Its link geometry, by default the robot's
+        own. added: Link -> distance that is added to its required ones from obstacles
+        [m], by default 0; -inf for no check. pair_added: Two links -> distance that is
+        added to their required one from each other [m], in the same way.
 
-    Attributes:
-        link_pairs: Pairs of convex parts of links that must not touch, the one nearer to the base first, shape (M, 2).
-        vertices: Vertices of the convex parts by coordinates, flat [m].
+    Attributes: link_pairs: Pairs of convex parts of links that must not touch, the one
+        nearer to the base first, shape (M, 2). vertices: Vertices of the convex parts
+        by coordinates, flat [m].
     """
 
     def __init__(
@@ -81,34 +147,66 @@ class CollisionChecker:
         self.library, self._n, self._arrays = library, robot.n, dict[str, Any]()
         self._scene = _RobotScene()
         links = {capsule.link: i for i, capsule in enumerate(shape.capsules)}
-        chain = [np.append(joint.rotation.ravel(), joint.translation) for joint in robot.chain.joints]
+        chain = [
+            np.append(joint.rotation.ravel(), joint.translation)
+            for joint in robot.chain.joints
+        ]
         self._set("place", np.array(chain, np.float64))
-        self._set("axis", np.array([joint.axis for joint in robot.chain.joints], np.float64))
+        self._set(
+            "axis", np.array([joint.axis for joint in robot.chain.joints], np.float64)
+        )
         self._set("sliding", np.array(robot.prismatic, np.int64))
         parts, blocks, first = np.zeros(len(shape.convex_parts), BODY), list[Array](), 0
         for body, part in zip(parts, shape.convex_parts, strict=True):
             blocks.append(hull_vertices(part.vertices))
-            body["count"], body["first"], body["radius"] = len(blocks[-1]) // 3, first, part.radius
+            body["count"], body["first"], body["radius"] = (
+                len(blocks[-1]) // 3,
+                first,
+                part.radius,
+            )
             body["frame"], body["link"] = shape.joints[part.link], links[part.link]
             first += len(blocks[-1])
         self.vertices = np.concatenate(blocks)
         self._set("parts", parts)
-        capsules = np.array([(shape.joints[c.link], c.first, c.second, c.radius) for c in shape.capsules], CAPSULE)
+        capsules = np.array(
+            [
+                (shape.joints[c.link], c.first, c.second, c.radius)
+                for c in shape.capsules
+            ],
+            CAPSULE,
+        )
         self._set("links", capsules)
-        self._set("added", np.array([(added or {}).get(capsule.link, 0.0) for capsule in shape.capsules]))
-        of_link = [np.flatnonzero(parts["link"] == link) for link in range(len(capsules))]
-        self._set("first_part", np.append(0, np.cumsum([len(each) for each in of_link])))
+        self._set(
+            "added",
+            np.array(
+                [(added or {}).get(capsule.link, 0.0) for capsule in shape.capsules]
+            ),
+        )
+        of_link = [
+            np.flatnonzero(parts["link"] == link) for link in range(len(capsules))
+        ]
+        self._set(
+            "first_part", np.append(0, np.cumsum([len(each) for each in of_link]))
+        )
         self._set("part_of_link", np.concatenate(of_link))
-        checked = [(pair.first, pair.second) for pair in shape.pairs if not pair.left_out]
+        checked = [
+            (pair.first, pair.second) for pair in shape.pairs if not pair.left_out
+        ]
         kept = [(links[first], links[second]) for first, second in checked]
         pairs = [
-            [sorted(both, key=parts["frame"].__getitem__) for both in product(of_link[a], of_link[b])] for a, b in kept
+            [
+                sorted(both, key=parts["frame"].__getitem__)
+                for both in product(of_link[a], of_link[b])
+            ]
+            for a, b in kept
         ]
         self._set("link_pairs", np.array(kept, np.int64).reshape(-1, 2))
         more = [(pair_added or {}).get(frozenset(pair), 0.0) for pair in checked]
         self._set("pair_added", np.array(more, np.float64))
         self._set("first_pair", np.append(0, np.cumsum([len(each) for each in pairs])))
-        self.link_pairs = np.array([both for each in pairs for both in each], np.int64).reshape(-1, 2)
+        self.link_pairs = np.array(
+            [both for each in pairs for both in each], np.int64
+        ).reshape(-1, 2)
         self._set("pairs", self.link_pairs)
         self._set("moving", np.cumsum(parts["frame"] > 0) - 1)
         self._set("moving_frames", parts["frame"][parts["frame"] > 0])
@@ -118,7 +216,9 @@ class CollisionChecker:
 
     def place(self, obstacles: Sequence[Obstacle], numbers: Array) -> None:
         """Set the obstacles, with their poses and sizes, shape (width,) (``cnpgen.robots.solid``)."""
-        bodies, vertices, boxes = obstacle_bodies(obstacles, numbers, len(self.vertices))
+        bodies, vertices, boxes = obstacle_bodies(
+            obstacles, numbers, len(self.vertices)
+        )
         self._set("obstacles", bodies)
         self._set("boxes", boxes)
         self._set("vertices", np.concatenate([self.vertices, vertices]))
@@ -130,56 +230,91 @@ class CollisionChecker:
         return ctypes.addressof(self._scene)
 
     def scene_of(self, bodies: Bodies, boxes: Array, vertices: Array) -> _RobotScene:
-        """Return a copy of the scene with other obstacles for functions in C; the caller keeps their arrays."""
+        """Return a copy of the scene with other obstacles for functions in C.
+
+        The caller keeps their arrays.
+        """
         scene = _RobotScene.from_buffer_copy(self._scene)
-        scene.obstacles, scene.boxes, scene.vertices = map(address_of, (bodies, boxes, vertices))
+        scene.obstacles, scene.boxes, scene.vertices = map(
+            address_of, (bodies, boxes, vertices)
+        )
         scene.n_obstacles, scene.lanes = bodies.shape[-1], boxes.shape[-1]
         return scene
 
     def clear_states(
-        self, q: Array, *, obstacle_distance: float | None = 0.0, self_distance: float | None = 0.0
+        self,
+        q: Array,
+        *,
+        obstacle_distance: float | None = 0.0,
+        self_distance: float | None = 0.0,
     ) -> NDArray[np.bool_]:
         """Return a mask of the states with sufficient distances, shape (K,).
 
-        Args:
-            q: Joint positions [rad], shape (n, K).
-            obstacle_distance: Required distance of moving links from obstacles [m]; None for no check.
-            self_distance: Required distance of links from each other [m]; None for no check.
+        Args: q: Joint positions [rad], shape (n, K). obstacle_distance: Required
+            distance of moving links from obstacles [m]; None for no check.
+            self_distance: Required distance of links from each other [m]; None for no
+            check.
         """
         states = np.ascontiguousarray(q.T)
         clear = np.empty(len(states), np.uint8)
-        limits = [-np.inf if limit is None else limit for limit in (obstacle_distance, self_distance)]
-        self.library.clear_states(self.address, address_of(states), len(states), *limits, address_of(clear))
+        limits = [
+            -np.inf if limit is None else limit
+            for limit in (obstacle_distance, self_distance)
+        ]
+        self.library.clear_states(
+            self.address, address_of(states), len(states), *limits, address_of(clear)
+        )
         return clear.astype(bool)
 
     def close_bodies(self, q: Array, within: float, *, of_obstacles: bool) -> Contacts:
         """Measure all pairs of bodies at states where their signed distance is below ``within``.
 
-        Args:
-            q: Joint positions [rad], shape (n, K).
-            within: Distance below which a pair is returned [m].
-            of_obstacles: Whether to measure pairs (obstacle, moving part), numbered part by part; else ``link_pairs``.
+        Args: q: Joint positions [rad], shape (n, K). within: Distance below which a
+            pair is returned [m]. of_obstacles: Whether to measure pairs (obstacle,
+            moving part), numbered part by part; else ``link_pairs``.
         """
         states, capacity = np.ascontiguousarray(q.T), MIN_CONTACT_CAPACITY
         while True:
-            pair, k, distance = np.empty(capacity, np.int64), np.empty(capacity, np.int64), np.empty(capacity)
+            pair, k, distance = (
+                np.empty(capacity, np.int64),
+                np.empty(capacity, np.int64),
+                np.empty(capacity),
+            )
             normal, points = np.empty((capacity, 3)), np.empty((capacity, 2, 3))
             addresses = map(address_of, (pair, k, distance, normal, points))
             count = self.library.find_contacts(
-                self.address, address_of(states), len(states), within, of_obstacles, capacity, *addresses
+                self.address,
+                address_of(states),
+                len(states),
+                within,
+                of_obstacles,
+                capacity,
+                *addresses,
             )
             if count <= capacity:
-                return Contacts(pair[:count], k[:count], distance[:count], normal[:count], points[:count])
+                return Contacts(
+                    pair[:count],
+                    k[:count],
+                    distance[:count],
+                    normal[:count],
+                    points[:count],
+                )
             capacity = count
 
     def joint_poses(self, q: Array) -> Array:
         """Compute the joints' frames at q [rad], shape (n, K), base first: rows and position, shape (K, n + 1, 12)."""
         states = np.ascontiguousarray(q.T)
         poses = np.empty((len(states), self._n + 1, 12))
-        self.library.joint_poses(self.address, address_of(states), len(states), address_of(poses))
+        self.library.joint_poses(
+            self.address, address_of(states), len(states), address_of(poses)
+        )
         return poses
 
     def _set(self, name: str, array: Any) -> None:
         """Keep an array and store its address in the scene."""
         self._arrays[name] = np.ascontiguousarray(array)
-        setattr(self._scene, name, address_of(self._arrays[name]) if self._arrays[name].size else None)
+        setattr(
+            self._scene,
+            name,
+            address_of(self._arrays[name]) if self._arrays[name].size else None,
+        )

@@ -26,8 +26,14 @@ class _RowContext(ctypes.Structure):
     _fields_ = (
         *((name, c_void_p) for name in ("values", "jacobian", "scene", "scratch")),
         *((name, c_void_p) for name in ("required", "obstacle_column", "pair_column")),
-        *((name, c_long) for name in ("rows", "columns", "width", "capacity", "generation")),
-        *((name, c_double) for name in ("range", "scale", "obstacle_distance", "self_distance")),
+        *(
+            (name, c_long)
+            for name in ("rows", "columns", "width", "capacity", "generation")
+        ),
+        *(
+            (name, c_double)
+            for name in ("range", "scale", "obstacle_distance", "self_distance")
+        ),
     )
 
 
@@ -35,13 +41,13 @@ class _RowContext(ctypes.Structure):
 class DistanceColumns:
     """Rows of distances.
 
-    Attributes:
-        required: Required distance of every row [m], shape (m,).
-        of_obstacles: Row of every pair (obstacle, moving part), part by part.
-        of_links: Row of every pair of ``CollisionChecker.link_pairs``.
-        obstacle_distance: Largest required distance from obstacles [m], None without such rows.
-        self_distance: Largest required distance of links from each other [m], None without such rows.
-        range: Distance above the required one [m] at which measured values end. The residual of larger ones is 100:
+    Attributes: required: Required distance of every row [m], shape (m,). of_obstacles:
+        Row of every pair (obstacle, moving part), part by part. of_links: Row of every
+        pair of ``CollisionChecker.link_pairs``. obstacle_distance: Largest required
+        distance from obstacles [m], None without such rows. self_distance: Largest
+        required distance of links from each other [m], None without such rows. range:
+        Distance above the required one [m] at which measured values end. The residual
+        of larger ones is 100:
             solvers do not select rows without a gradient.
         scale: Distance of a residual of 1 [m].
     """
@@ -58,26 +64,55 @@ class DistanceColumns:
 class RowKernels:
     """The kernels ``(w, poses) -> g`` and ``-> (g, dg/dw)`` of a problem, with rows of distances.
 
-    They call compiled kernels of the other rows, with derivatives column by column; w begins with the joint positions.
+    They call compiled kernels of the other rows, with derivatives column by column; w
+    begins with the joint positions.
 
     Attributes:
         values: Kernel of all rows.
         jacobian: Kernel of all rows and their derivatives.
     """
 
-    def __init__(self, values: Kernel, jacobian: Kernel, checker: CollisionChecker, columns: DistanceColumns) -> None:
-        rows, m, width = values.tape.outputs[0], len(columns.required), values.tape.inputs[0]
-        limits = [-np.inf if x is None else x for x in (columns.obstacle_distance, columns.self_distance)]
+    def __init__(
+        self,
+        values: Kernel,
+        jacobian: Kernel,
+        checker: CollisionChecker,
+        columns: DistanceColumns,
+    ) -> None:
+        rows, m, width = (
+            values.tape.outputs[0],
+            len(columns.required),
+            values.tape.inputs[0],
+        )
+        limits = [
+            -np.inf if x is None else x
+            for x in (columns.obstacle_distance, columns.self_distance)
+        ]
         numbers = NUMBERS_PER_CONTACT * MAX_CONTACTS_PER_STATE + m * (1 + width)
-        arrays = (np.empty(numbers), columns.required, columns.of_obstacles, columns.of_links)
+        arrays = (
+            np.empty(numbers),
+            columns.required,
+            columns.of_obstacles,
+            columns.of_links,
+        )
         self._keep: tuple[Any, ...] = (values, jacobian, checker, *arrays)
-        addresses = *(part.address for part in (values, jacobian, checker)), *map(address_of, arrays)
+        addresses = (
+            *(part.address for part in (values, jacobian, checker)),
+            *map(address_of, arrays),
+        )
         counts = rows, m, width, MAX_CONTACTS_PER_STATE, next(_GENERATIONS)
-        self._context = _RowContext(*addresses, *counts, columns.range, columns.scale, *limits)
+        self._context = _RowContext(
+            *addresses, *counts, columns.range, columns.scale, *limits
+        )
         self._library = checker.library
-        self._library.set_row_context.argtypes, self._library.set_row_context.restype = (c_void_p,), None
+        (
+            self._library.set_row_context.argtypes,
+            self._library.set_row_context.restype,
+        ) = (c_void_p,), None
         self.values = _RowKernel(self, values, "row_values", (rows + m,))
-        self.jacobian = _RowKernel(self, jacobian, "row_jacobian", (rows + m, (rows + m) * width))
+        self.jacobian = _RowKernel(
+            self, jacobian, "row_jacobian", (rows + m, (rows + m) * width)
+        )
 
     def activate(self) -> None:
         """Make these kernels those of the thread: their machine code has one context per thread."""
@@ -87,7 +122,9 @@ class RowKernels:
 class _RowKernel(Kernel):
     """Kernel of hull_rows.c; see ``Kernel``."""
 
-    def __init__(self, kernels: RowKernels, inner: Kernel, name: str, outputs: tuple[int, ...]) -> None:
+    def __init__(
+        self, kernels: RowKernels, inner: Kernel, name: str, outputs: tuple[int, ...]
+    ) -> None:
         super().__init__(replace(inner.tape, outputs=outputs))
         self._kernels, self._function = kernels, getattr(kernels._library, name)
         self._function.restype = None
@@ -104,6 +141,9 @@ class _RowKernel(Kernel):
         arguments = tuple(np.ascontiguousarray(argument) for argument in arguments)
         results = [np.empty((width, n)) for width in self.tape.outputs]
         strides = (c_long * len(arguments))(*([n] * len(arguments)))
-        pointers = [(c_void_p * len(arrays))(*map(address_of, arrays)) for arrays in (arguments, results)]
+        pointers = [
+            (c_void_p * len(arrays))(*map(address_of, arrays))
+            for arrays in (arguments, results)
+        ]
         self._function(c_long(n), pointers[0], strides, pointers[1])
         return results

@@ -23,8 +23,14 @@ class _TreeSettings(ctypes.Structure):
     """``tree_settings`` of tree_search.c."""
 
     _fields_ = (
-        *((name, c_void_p) for name in ("scene", "start", "goal", "lower", "upper", "velocity")),
-        *((name, c_double) for name in ("obstacle_distance", "self_distance", "margin", "ramp")),
+        *(
+            (name, c_void_p)
+            for name in ("scene", "start", "goal", "lower", "upper", "velocity")
+        ),
+        *(
+            (name, c_double)
+            for name in ("obstacle_distance", "self_distance", "margin", "ramp")
+        ),
         *((name, c_double) for name in ("spacing", "extension")),
         *((name, c_long) for name in ("max_extensions", "max_nodes", "shortcuts")),
         *(("corner_time", c_double), ("seed", c_ulonglong)),
@@ -35,16 +41,15 @@ class _TreeSettings(ctypes.Structure):
 class TreeSettings:
     """Settings of a search, in the order of ``tree_settings`` of tree_search.c.
 
-    Attributes:
-        obstacle_distance: Required distance from obstacles [m]; None for no check.
-        self_distance: Required distance of links from each other [m]; None for no check.
-        margin: Additional distance away from both ends [m].
-        margin_ramp: Largest joint difference from an end below which the margin is smaller [rad or m].
-        spacing: Largest joint difference of neighboring checked states [rad or m].
-        extension: Largest length of an edge [rad or m].
-        max_extensions: Largest number of extensions of the trees.
-        max_nodes: Largest number of nodes of both trees: trees that fill so much space are probably not connected.
-        shortcuts: Attempts to shorten a path.
+    Attributes: obstacle_distance: Required distance from obstacles [m]; None for no
+        check. self_distance: Required distance of links from each other [m]; None for
+        no check. margin: Additional distance away from both ends [m]. margin_ramp:
+        Largest joint difference from an end below which the margin is smaller [rad or
+        m]. spacing: Largest joint difference of neighboring checked states [rad or m].
+        extension: Largest length of an edge [rad or m]. max_extensions: Largest number
+        of extensions of the trees. max_nodes: Largest number of nodes of both trees:
+        trees that fill so much space are probably not connected. shortcuts: Attempts to
+        shorten a path.
     """
 
     obstacle_distance: float | None
@@ -62,9 +67,8 @@ class TreeSettings:
 class EqualityKernel:
     """Equalities that the states of a path meet.
 
-    Attributes:
-        residuals: Compiled kernel ``(q, scene) -> (r, dr/dq)``, the Jacobian column by column.
-        scene: Values of the scene that it takes, shape (width,).
+    Attributes: residuals: Compiled kernel ``(q, scene) -> (r, dr/dq)``, the Jacobian
+        column by column. scene: Values of the scene that it takes, shape (width,).
     """
 
     residuals: Kernel
@@ -83,27 +87,46 @@ def find_tree_path(
 ) -> Array | None:
     """Search for a path whose straight lines are clear; it is shortened by its estimated duration.
 
-    On a manifold the path consists of projected states at small distances, and fewer of them make it shorter. The
-    equalities must hold at both ends, which are not checked themselves. Ends and the corners of the box of random
-    configurations [rad] have shape (n,), as velocity limits [rad/s] have.
+    On a manifold the path consists of projected states at small distances, and fewer of
+    them make it shorter. The equalities must hold at both ends, which are not checked
+    themselves. Ends and the corners of the box of random configurations [rad] have
+    shape (n,), as velocity limits [rad/s] have.
 
     Returns:
         Corners of the path [rad], shape (K, n), or None if the trees do not connect.
     """
-    arrays = [np.ascontiguousarray(array, np.float64) for array in (*ends, *box, velocity_limit)]
+    arrays = [
+        np.ascontiguousarray(array, np.float64)
+        for array in (*ends, *box, velocity_limit)
+    ]
     numbers = [-np.inf if value is None else value for value in astuple(settings)]
-    native = _TreeSettings(checker.address, *map(address_of, arrays), *numbers, CORNER_TIME_S, seed + 1)
+    native = _TreeSettings(
+        checker.address, *map(address_of, arrays), *numbers, CORNER_TIME_S, seed + 1
+    )
     path = np.empty((MAX_PATH_POINTS, len(arrays[0])))
     if manifold is None:
         search = checker.library.find_path
         search.restype, search.argtypes = c_long, (c_void_p, c_void_p, c_long)
         count = search(ctypes.addressof(native), address_of(path), len(path))
     else:
-        search, scene = checker.library.find_manifold_path, np.repeat(manifold.scene, STATES_PER_PROJECTION)
-        search.restype, search.argtypes = c_long, (*(c_void_p,) * 3, c_long, c_double, c_void_p, c_long)
+        search, scene = (
+            checker.library.find_manifold_path,
+            np.repeat(manifold.scene, STATES_PER_PROJECTION),
+        )
+        search.restype, search.argtypes = (
+            c_long,
+            (*(c_void_p,) * 3, c_long, c_double, c_void_p, c_long),
+        )
         residuals, rows = manifold.residuals.address, manifold.residuals.tape.outputs[0]
         errors = rows, MAX_PROJECTION_ERROR
-        count = search(ctypes.addressof(native), residuals, address_of(scene), *errors, address_of(path), len(path))
+        count = search(
+            ctypes.addressof(native),
+            residuals,
+            address_of(scene),
+            *errors,
+            address_of(path),
+            len(path),
+        )
     return path[:count].copy() if count else None
 
 

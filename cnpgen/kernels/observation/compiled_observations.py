@@ -1,4 +1,7 @@
-"""Observations of scenes in compiled code, for ``observe.c``; ``ObservationBackend`` is the same in NumPy."""
+"""Observations of scenes in compiled code, for ``observe.c``.
+
+``ObservationBackend`` is the same in NumPy.
+"""
 
 import ctypes
 from ctypes import c_int, c_long, c_void_p
@@ -28,18 +31,35 @@ class _SceneArrays(ctypes.Structure):
         ("scenes", c_long),
         ("bodies", c_long),
         *((name, c_void_p) for name in ("kind", "center", "rotation", "size")),
-        *((name, c_void_p) for name in ("first_triangle", "first_plane", "triangles", "planes")),
+        *(
+            (name, c_void_p)
+            for name in ("first_triangle", "first_plane", "triangles", "planes")
+        ),
     )
 
     def __init__(self, scenes: Primitives) -> None:
-        triangles, planes = ([getattr(mesh, name) for mesh in scenes.meshes] for name in ("triangles", "planes"))
-        types: tuple[Any, ...] = (np.int64, *(np.float64,) * 3, *(np.int64,) * 2, *(np.float32,) * 2)
+        triangles, planes = (
+            [getattr(mesh, name) for mesh in scenes.meshes]
+            for name in ("triangles", "planes")
+        )
+        types: tuple[Any, ...] = (
+            np.int64,
+            *(np.float64,) * 3,
+            *(np.int64,) * 2,
+            *(np.float32,) * 2,
+        )
         parts = (
             *(scenes.kinds, scenes.centers, scenes.rotations, scenes.sizes),
             *(np.cumsum([0, *map(len, rows)]) for rows in (triangles, planes)),
-            *(np.concatenate([*map(np.ravel, rows), np.empty(0)]) for rows in (triangles, planes)),
+            *(
+                np.concatenate([*map(np.ravel, rows), np.empty(0)])
+                for rows in (triangles, planes)
+            ),
         )
-        self._keep = [np.ascontiguousarray(part, dtype) for part, dtype in zip(parts, types, strict=True)]
+        self._keep = [
+            np.ascontiguousarray(part, dtype)
+            for part, dtype in zip(parts, types, strict=True)
+        ]
         super().__init__(*scenes.kinds.shape, *map(address_of, self._keep))
 
 
@@ -52,7 +72,16 @@ class CompiledObservations(ObservationBackend):
         library.scene_distances.argtypes = (pointer, pointer, number, flag, pointer)
         library.scene_clouds.argtypes = (pointer, pointer, number, pointer)
         library.scene_depths.argtypes = (pointer, pointer, number, number, pointer)
-        library.depth_clouds.argtypes = (number, pointer, number, number, pointer, pointer, number, pointer)
+        library.depth_clouds.argtypes = (
+            number,
+            pointer,
+            number,
+            number,
+            pointer,
+            pointer,
+            number,
+            pointer,
+        )
 
     def distances(self, scenes: Primitives, points: Array) -> Values:
         """See ``ObservationBackend``."""
@@ -60,30 +89,51 @@ class CompiledObservations(ObservationBackend):
         distances = np.empty((len(scenes), points.shape[-2]), np.float32)
         shared, arrays = points.ndim == 2, ctypes.byref(_SceneArrays(scenes))
         addresses = address_of(coordinates), address_of(distances)
-        self._library.scene_distances(arrays, addresses[0], points.shape[-2], shared, addresses[1])
+        self._library.scene_distances(
+            arrays, addresses[0], points.shape[-2], shared, addresses[1]
+        )
         return distances
 
     def surface_points(self, scenes: Primitives, count: int, seeds: Seeds) -> Values:
         """See ``ObservationBackend``."""
-        points, seeds = np.empty((len(scenes), count, 3), np.float32), np.ascontiguousarray(seeds)
+        points, seeds = (
+            np.empty((len(scenes), count, 3), np.float32),
+            np.ascontiguousarray(seeds),
+        )
         arrays = ctypes.byref(_SceneArrays(scenes))
         self._library.scene_clouds(arrays, address_of(seeds), count, address_of(points))
         return points
 
     def depth_images(self, scenes: Primitives, camera: Camera) -> Values:
         """See ``ObservationBackend``."""
-        depth, view = np.empty((len(scenes), camera.height, camera.width), np.float32), _view(camera)
+        depth, view = (
+            np.empty((len(scenes), camera.height, camera.width), np.float32),
+            _view(camera),
+        )
         arrays = ctypes.byref(_SceneArrays(scenes))
-        self._library.scene_depths(arrays, address_of(view), camera.width, camera.height, address_of(depth))
+        self._library.scene_depths(
+            arrays, address_of(view), camera.width, camera.height, address_of(depth)
+        )
         return depth
 
-    def depth_points(self, depth: Values, camera: Camera, count: int, seeds: Seeds) -> Values:
+    def depth_points(
+        self, depth: Values, camera: Camera, count: int, seeds: Seeds
+    ) -> Values:
         """See ``ObservationBackend``."""
         points, view = np.empty((len(depth), count, 3), np.float32), _view(camera)
-        depth, seeds = np.ascontiguousarray(depth, np.float32), np.ascontiguousarray(seeds)
+        depth, seeds = (
+            np.ascontiguousarray(depth, np.float32),
+            np.ascontiguousarray(seeds),
+        )
         pointers = (address_of(array) for array in (depth, seeds))
         self._library.depth_clouds(
-            len(depth), address_of(view), camera.width, camera.height, *pointers, count, address_of(points)
+            len(depth),
+            address_of(view),
+            camera.width,
+            camera.height,
+            *pointers,
+            count,
+            address_of(points),
         )
         return points
 

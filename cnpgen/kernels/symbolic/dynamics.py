@@ -42,7 +42,10 @@ class BodyMotion:
 
 
 def body_motions(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> list[BodyMotion]:
-    """Return the motion of every body by the outward recursion of Newton-Euler; see ``inverse_dynamics``."""
+    """Return the motion of every body by the outward recursion of Newton-Euler.
+
+    See ``inverse_dynamics``.
+    """
     omega: Vec = [0.0, 0.0, 0.0]
     alpha: Vec = [0.0, 0.0, 0.0]
     acceleration: Vec = constants(-chain.gravity)
@@ -53,7 +56,9 @@ def body_motions(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> list[BodyMotion]:
         if joint.prismatic:
             offset = add(offset, scale(constants(joint.rotation @ joint.axis), angle))
         acceleration = acceleration_at(acceleration, omega, alpha, offset)
-        acceleration, omega, alpha = (transposed_times(rotation, x) for x in (acceleration, omega, alpha))
+        acceleration, omega, alpha = (
+            transposed_times(rotation, x) for x in (acceleration, omega, alpha)
+        )
         axis = constants(joint.axis)
         if joint.prismatic:
             coriolis = scale(cross(omega, scale(axis, rate)), 2.0)
@@ -68,10 +73,9 @@ def body_motions(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> list[BodyMotion]:
 class Load(NamedTuple):
     """A multiple of the payload that the last body holds in addition.
 
-    Attributes:
-        share: Its mass, as a fraction of that of the payload.
-        centre: Center of mass in the tip frame [m], 3 scalars.
-        shape: Its inertia about the center, as a fraction of that of the payload at equal mass.
+    Attributes: share: Its mass, as a fraction of that of the payload. centre: Center of
+        mass in the tip frame [m], 3 scalars. shape: Its inertia about the center, as a
+        fraction of that of the payload at equal mass.
     """
 
     share: Scalar
@@ -99,11 +103,19 @@ def inverse_dynamics(
     ]
     for load in loads:
         assert payload is not None
-        (force, torque), (more_force, more_torque) = wrenches[-1], _load_wrench(chain, payload, load, motions[-1])
-        wrenches[-1] = add(force, scale(more_force, load.share)), add(torque, scale(more_torque, load.share))
+        (force, torque), (more_force, more_torque) = (
+            wrenches[-1],
+            _load_wrench(chain, payload, load, motions[-1]),
+        )
+        wrenches[-1] = (
+            add(force, scale(more_force, load.share)),
+            add(torque, scale(more_torque, load.share)),
+        )
     force, torque = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
     torques: Vec = []
-    for joint, motion, wrench in zip(chain.joints[::-1], motions[::-1], wrenches[::-1], strict=True):
+    for joint, motion, wrench in zip(
+        chain.joints[::-1], motions[::-1], wrenches[::-1], strict=True
+    ):
         force, torque = add(force, wrench[0]), add(torque, wrench[1])
         torques.append(dot(constants(joint.axis), force if joint.prismatic else torque))
         force = times(motion.rotation, force)
@@ -113,10 +125,14 @@ def inverse_dynamics(
 
 def acceleration_at(acceleration: Vec, omega: Vec, alpha: Vec, offset: Vec) -> Vec:
     """Return the acceleration of a point of a body at ``offset`` from a point with ``acceleration``."""
-    return add(acceleration, add(cross(alpha, offset), cross(omega, cross(omega, offset))))
+    return add(
+        acceleration, add(cross(alpha, offset), cross(omega, cross(omega, offset)))
+    )
 
 
-def _body_wrench(mass: float, com: Vec, inertia: list[Vec], motion: BodyMotion) -> tuple[Vec, Vec]:
+def _body_wrench(
+    mass: float, com: Vec, inertia: list[Vec], motion: BodyMotion
+) -> tuple[Vec, Vec]:
     """Return the force and the torque about the joint origin that move a body of a joint."""
     omega = motion.omega
     force = scale(acceleration_at(motion.acceleration, omega, motion.alpha, com), mass)
@@ -124,9 +140,17 @@ def _body_wrench(mass: float, com: Vec, inertia: list[Vec], motion: BodyMotion) 
     return force, add(spin, cross(com, force))
 
 
-def _load_wrench(chain: Chain, payload: Payload, load: Load, motion: BodyMotion) -> tuple[Vec, Vec]:
-    """Return the wrench of a load of the payload's mass in the last joint frame; see ``_body_wrench``."""
+def _load_wrench(
+    chain: Chain, payload: Payload, load: Load, motion: BodyMotion
+) -> tuple[Vec, Vec]:
+    """Return the wrench of a load of the payload's mass in the last joint frame.
+
+    See ``_body_wrench``.
+    """
     turn = chain.tip_rotation
     com = add(constants(chain.tip_translation), times(rows_of(turn), load.centre))
-    inertia = [scale(row, load.shape) for row in rows_of(turn @ payload.inertia_matrix @ turn.T)]
+    inertia = [
+        scale(row, load.shape)
+        for row in rows_of(turn @ payload.inertia_matrix @ turn.T)
+    ]
     return _body_wrench(payload.mass, com, inertia, motion)

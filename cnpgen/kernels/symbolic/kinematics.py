@@ -56,7 +56,9 @@ def forward_kinematics(chain: Chain, q: Vec) -> Kinematics:
     axes, origins, frames = [], [], []
     for joint, angle in zip(chain.joints, q, strict=True):
         position = add(position, times(rotation, constants(joint.translation)))
-        rotation = product(rotation, product(rows_of(joint.rotation), joint_rotation(joint, angle)))
+        rotation = product(
+            rotation, product(rows_of(joint.rotation), joint_rotation(joint, angle))
+        )
         axis = times(rotation, constants(joint.axis))
         if joint.prismatic:
             position = add(position, scale(axis, angle))
@@ -65,8 +67,19 @@ def forward_kinematics(chain: Chain, q: Vec) -> Kinematics:
         frames.append(rotation)
     tip = add(position, times(rotation, constants(chain.tip_translation)))
     revolute = [not joint.prismatic for joint in chain.joints]
-    jacobian = [cross(z, subtract(tip, o)) if turns else z for z, o, turns in zip(axes, origins, revolute, strict=True)]
-    return Kinematics(axes, origins, tip, product(rotation, rows_of(chain.tip_rotation)), jacobian, revolute, frames)
+    jacobian = [
+        cross(z, subtract(tip, o)) if turns else z
+        for z, o, turns in zip(axes, origins, revolute, strict=True)
+    ]
+    return Kinematics(
+        axes,
+        origins,
+        tip,
+        product(rotation, rows_of(chain.tip_rotation)),
+        jacobian,
+        revolute,
+        frames,
+    )
 
 
 def tip_velocity(kin: Kinematics, dq: Vec) -> Vec:
@@ -81,7 +94,9 @@ def bias_acceleration(kin: Kinematics, dq: Vec) -> Vec:
     bias: Vec = [0.0, 0.0, 0.0]
     previous: Vec = [0.0, 0.0, 0.0]
     tip = tip_velocity(kin, dq)
-    for z, o, column, rate, turns in zip(kin.axes, kin.origins, kin.jacobian, dq, kin.revolute, strict=True):
+    for z, o, column, rate, turns in zip(
+        kin.axes, kin.origins, kin.jacobian, dq, kin.revolute, strict=True
+    ):
         velocity = add(velocity, cross(omega, subtract(o, previous)))
         if turns:
             moving = cross(z, subtract(tip, velocity))
@@ -100,7 +115,9 @@ def tip_position(robot: Robot) -> Any:
     import casadi as ca
 
     q_sx, q = symbols("q", robot.n)
-    return ca.Function("tip_position", [q_sx], [ca.vertcat(*forward_kinematics(robot.chain, q).tip)])
+    return ca.Function(
+        "tip_position", [q_sx], [ca.vertcat(*forward_kinematics(robot.chain, q).tip)]
+    )
 
 
 def joint_rotation(joint: Joint, angle: Scalar) -> list[Vec]:
@@ -111,6 +128,8 @@ def joint_rotation(joint: Joint, angle: Scalar) -> list[Vec]:
         return rows_of(np.eye(3))
     a = joint.axis
     skew = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
-    factors = np.stack([np.outer(a, a), np.eye(3) - np.outer(a, a), skew], axis=2).tolist()
+    factors = np.stack(
+        [np.outer(a, a), np.eye(3) - np.outer(a, a), skew], axis=2
+    ).tolist()
     terms = [1.0, ca.cos(angle), ca.sin(angle)]
     return [[dot(terms, entry) for entry in row] for row in factors]

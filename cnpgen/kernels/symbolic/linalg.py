@@ -17,7 +17,9 @@ def dot(a: Vector, b: Vector) -> Scalar:
 
     CasADi drops them as well, but takes ten times as long to find them.
     """
-    products = [x * y for x, y in zip(a, b, strict=True) if not (_is_zero(x) or _is_zero(y))]
+    products = [
+        x * y for x, y in zip(a, b, strict=True) if not (_is_zero(x) or _is_zero(y))
+    ]
     return sum(products[1:], products[0]) if products else 0.0
 
 
@@ -27,7 +29,11 @@ def _is_zero(x: Scalar) -> bool:
 
 def cross(a: Vector, b: Vector) -> list[Scalar]:
     """Return the cross product of two 3-vectors."""
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    return [
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    ]
 
 
 def add(a: Vector, b: Vector) -> list[Scalar]:
@@ -48,7 +54,10 @@ def scale(a: Vector, factor: Scalar) -> list[Scalar]:
 def gram(rows: Matrix, damping: float = 0.0) -> list[list[Scalar]]:
     """Return the lower triangle of ``A A^T + damping I`` for the rows of A."""
     m = len(rows)
-    return [[dot(rows[i], rows[j]) + (damping if i == j else 0.0) for j in range(i + 1)] for i in range(m)]
+    return [
+        [dot(rows[i], rows[j]) + (damping if i == j else 0.0) for j in range(i + 1)]
+        for i in range(m)
+    ]
 
 
 def factorize(
@@ -94,7 +103,11 @@ def solve(lower: Matrix, right: Vector) -> list[Scalar]:
 
 def inverse3(columns: Matrix) -> list[list[Scalar]]:
     """Return the rows of the inverse of the 3 x 3 matrix with these columns."""
-    rows = [cross(columns[1], columns[2]), cross(columns[2], columns[0]), cross(columns[0], columns[1])]
+    rows = [
+        cross(columns[1], columns[2]),
+        cross(columns[2], columns[0]),
+        cross(columns[0], columns[1]),
+    ]
     reciprocal = 1.0 / dot(columns[0], rows[0])
     return [scale(row, reciprocal) for row in rows]
 
@@ -124,9 +137,13 @@ def times(matrix: list[Vec], vector: Vec) -> Vec:
 
 def transposed_times(matrix: list[Vec], vector: Vec) -> Vec:
     """Return ``A^T x`` for the rows of a 3 x 3 matrix."""
-    return [dot([matrix[row][column] for row in range(3)], vector) for column in range(3)]
+    return [
+        dot([matrix[row][column] for row in range(3)], vector) for column in range(3)
+    ]
 
 
 def product(a: list[Vec], b: list[Vec]) -> list[Vec]:
     """Return the rows of ``A B`` for those of two 3 x 3 matrices."""
-    return [[dot(row, [b[k][column] for k in range(3)]) for column in range(3)] for row in a]
+    return [
+        [dot(row, [b[k][column] for k in range(3)]) for column in range(3)] for row in a
+    ]

@@ -1,8 +1,9 @@
 """Signed distances of the robot's capsules and of the held object from obstacles, as SX: one class per kind.
 
-Sizes and poses are scalar inputs of kernels. All distances are exact or lower bounds: exact for segments and boxes,
-spheres and capsules, bisected for cylinders, and those of a box cut by planes for meshes. The depth of a segment inside
-an obstacle is that of one point: the deepest in a cylinder, the midpoint of the overlap in a box with a pose.
+Sizes and poses are scalar inputs of kernels. All distances are exact or lower bounds:
+exact for segments and boxes, spheres and capsules, bisected for cylinders, and those of
+a box cut by planes for meshes. The depth of a segment inside an obstacle is that of one
+point: the deepest in a cylinder, the midpoint of the overlap in a box with a pose.
 """
 
 from abc import ABC, abstractmethod
@@ -20,7 +21,15 @@ from cnpgen.kernels.symbolic.convex_distances import (
     signed_segment_box_distance,
     upright_box_separation,
 )
-from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, scale, subtract, transposed_times
+from cnpgen.kernels.symbolic.linalg import (
+    Scalar,
+    Vec,
+    add,
+    dot,
+    scale,
+    subtract,
+    transposed_times,
+)
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import supporting_planes
@@ -111,38 +120,54 @@ class SymbolicBox(SymbolicSolid):
     @property
     def bounds(self) -> Bounds:
         """Bounds in the frame [m]."""
-        return [(x - half, x + half) for x, half in zip(self.center, self.half, strict=True)]
+        return [
+            (x - half, x + half) for x, half in zip(self.center, self.half, strict=True)
+        ]
 
     def within(self, point: Vec) -> Vec:
         """Return a point in the frame."""
         from_origin = subtract(point, self.origin)
-        return from_origin if self.rotation is None else transposed_times(self.rotation, from_origin)
+        return (
+            from_origin
+            if self.rotation is None
+            else transposed_times(self.rotation, from_origin)
+        )
 
     def axes_within(self, rotation: list[Vec]) -> list[Vec]:
         """Return the columns of a rotation matrix in the frame."""
         columns = [[row[i] for row in rotation] for i in range(3)]
-        return columns if self.rotation is None else [transposed_times(self.rotation, column) for column in columns]
+        return (
+            columns
+            if self.rotation is None
+            else [transposed_times(self.rotation, column) for column in columns]
+        )
 
     def separation(self, first: Vec, second: Vec, freeze: Freeze) -> Scalar:
         """Return the distance, or inside minus the depth of the overlap's midpoint."""
-        return signed_segment_box_distance(self.within(first), self.within(second), self.bounds, freeze=freeze)
+        return signed_segment_box_distance(
+            self.within(first), self.within(second), self.bounds, freeze=freeze
+        )
 
     def distance(self, first: Vec, second: Vec) -> Scalar:
         """Return the distance, 0 if they overlap."""
-        return segment_box_distance(self.within(first), self.within(second), self.bounds)
+        return segment_box_distance(
+            self.within(first), self.within(second), self.bounds
+        )
 
     def cuboid_separation(self, center: Vec, rotation: list[Vec], size: Size) -> Scalar:
         """Return the largest separation along the 15 separating axes of two cuboids."""
         position = subtract(self.within(center), self.center)
-        return cuboid_separation(position, self.axes_within(rotation), [edge / 2 for edge in size], self.half)
+        return cuboid_separation(
+            position, self.axes_within(rotation), [edge / 2 for edge in size], self.half
+        )
 
 
 @dataclass(frozen=True)
 class SymbolicHull(SymbolicBox):
     """A convex hull: the intersection of a box and half-spaces in one frame.
 
-    Attributes:
-        planes: Outer unit normals and offsets [m] of the half-spaces, each of shape (4,).
+    Attributes: planes: Outer unit normals and offsets [m] of the half-spaces, each of
+        shape (4,).
     """
 
     planes: Sequence[Sequence[float]] = ()
@@ -158,7 +183,10 @@ class SymbolicHull(SymbolicBox):
             gap = ca.fmin(dot(normal, a), dot(normal, b)) - offset
             better = gap > best
             best = ca.fmax(best, gap)
-            plane = [ca.if_else(better, new, old) for new, old in zip((*normal, offset), plane, strict=True)]
+            plane = [
+                ca.if_else(better, new, old)
+                for new, old in zip((*normal, offset), plane, strict=True)
+            ]
         *normal, offset = plane  # constant for differentiation
         gap = ca.fmin(dot(normal, a), dot(normal, b)) - offset if self.planes else best
         return ca.fmax(super().separation(first, second, freeze), gap)
@@ -172,7 +200,10 @@ class SymbolicHull(SymbolicBox):
         best = super().cuboid_separation(center, rotation, size)
         position, axes = self.within(center), self.axes_within(rotation)
         for *normal, offset in self.planes:
-            reach = sum(edge / 2 * ca.fabs(dot(normal, axis)) for edge, axis in zip(size, axes, strict=True))
+            reach = sum(
+                edge / 2 * ca.fabs(dot(normal, axis))
+                for edge, axis in zip(size, axes, strict=True)
+            )
             best = ca.fmax(best, dot(normal, position) - reach - offset)
         return best
 
@@ -193,12 +224,23 @@ class SymbolicCapsule(SymbolicSolid):
 
     def separation(self, first: Vec, second: Vec, freeze: Freeze) -> Scalar:
         """Return the exact signed distance, or minus the radius for crossing segments."""
-        return segment_distance((first, second), (self.first, self.second), freeze=freeze) - self.radius
+        return (
+            segment_distance((first, second), (self.first, self.second), freeze=freeze)
+            - self.radius
+        )
 
     def cuboid_separation(self, center: Vec, rotation: list[Vec], size: Size) -> Scalar:
         """Return the exact signed distance."""
-        first, second = (transposed_times(rotation, subtract(end, center)) for end in (self.first, self.second))
-        return segment_box_separation(first, second, [(-edge / 2, edge / 2) for edge in size]) - self.radius
+        first, second = (
+            transposed_times(rotation, subtract(end, center))
+            for end in (self.first, self.second)
+        )
+        return (
+            segment_box_separation(
+                first, second, [(-edge / 2, edge / 2) for edge in size]
+            )
+            - self.radius
+        )
 
 
 @dataclass(frozen=True)
@@ -218,8 +260,9 @@ class SymbolicCylinder(SymbolicSolid):
     def separation(self, first: Vec, second: Vec, freeze: Freeze) -> Scalar:
         """Return a lower bound of the distance by bisection of the closest point's parameter.
 
-        The distance is convex along the segment. Its minimum is at least the value at the last bisection point minus
-        the remaining interval times the derivative there. The closest point is constant for differentiation.
+        The distance is convex along the segment. Its minimum is at least the value at
+        the last bisection point minus the remaining interval times the derivative
+        there. The closest point is constant for differentiation.
         """
         import casadi as ca
 
@@ -227,21 +270,37 @@ class SymbolicCylinder(SymbolicSolid):
         axis = scale(self.half, 1 / extent)
         from_center, along = subtract(first, self.center), subtract(second, first)
         height, axial = dot(from_center, axis), dot(along, axis)
-        radial, radial_along = subtract(from_center, scale(axis, height)), subtract(along, scale(axis, axial))
-        c0, c1, c2 = dot(radial, radial), dot(radial, radial_along), dot(radial_along, radial_along)
+        radial, radial_along = (
+            subtract(from_center, scale(axis, height)),
+            subtract(along, scale(axis, axial)),
+        )
+        c0, c1, c2 = (
+            dot(radial, radial),
+            dot(radial, radial_along),
+            dot(radial_along, radial_along),
+        )
 
         def gaps(t: Scalar) -> tuple[Scalar, Scalar, Scalar]:
             """Return the distance of a point from the axis, and its distances from the lateral surface and the ends."""
             from_axis = ca.sqrt(ca.fmax(c0 + t * (2 * c1 + t * c2), 0) + SMOOTHING_M2)
-            return from_axis, from_axis - self.radius, ca.fabs(height + t * axial) - extent
+            return (
+                from_axis,
+                from_axis - self.radius,
+                ca.fabs(height + t * axial) - extent,
+            )
 
         def derivative(t: Scalar) -> Scalar:
             from_axis, side, end = gaps(t)
             outside = ca.fmax(side, end) > 0
             by_side = ca.if_else(outside, ca.fmax(side, 0), side >= end)
             by_end = ca.if_else(outside, ca.fmax(end, 0), side < end)
-            weighted = by_side * (c1 + t * c2) / from_axis + by_end * ca.sign(height + t * axial) * axial
-            return weighted / ca.sqrt(by_side * by_side + by_end * by_end + SMOOTHING_M2)
+            weighted = (
+                by_side * (c1 + t * c2) / from_axis
+                + by_end * ca.sign(height + t * axial) * axial
+            )
+            return weighted / ca.sqrt(
+                by_side * by_side + by_end * by_end + SMOOTHING_M2
+            )
 
         t, width = ca.SX(0.5), 0.5
         for _ in range(BISECTION_STEPS):
@@ -261,11 +320,18 @@ class SymbolicCylinder(SymbolicSolid):
         extent = ca.sqrt(dot(half, half))
         axis = scale(half, 1 / extent)
         bounds: Bounds = [(-edge, edge) for edge in edges]
-        best = segment_box_separation(add(position, half), subtract(position, half), bounds) - self.radius
+        best = (
+            segment_box_separation(
+                add(position, half), subtract(position, half), bounds
+            )
+            - self.radius
+        )
         reach = sum(edge * ca.fabs(x) for edge, x in zip(edges, axis, strict=True))
         best = ca.fmax(best, ca.fabs(dot(position, axis)) - extent - reach)
         for x, edge, cosine, along in zip(position, edges, axis, half, strict=True):
-            extent_of_disk = self.radius * ca.sqrt(ca.fmax(1 - cosine * cosine, 0) + SMOOTHING_M2)
+            extent_of_disk = self.radius * ca.sqrt(
+                ca.fmax(1 - cosine * cosine, 0) + SMOOTHING_M2
+            )
             best = ca.fmax(best, ca.fabs(x) - edge - ca.fabs(along) - extent_of_disk)
         return best
 
@@ -279,7 +345,10 @@ def held_cuboid(state: SymbolicState) -> SymbolicBox:
 def symbolic_solids(state: SymbolicState) -> list[SymbolicSolid]:
     """Return the shapes of the obstacles around a robot."""
     parts = [state.obstacle_poses[part] for part in number_slices(state.obstacles)]
-    return [_solid(obstacle, values) for obstacle, values in zip(state.obstacles, parts, strict=True)]
+    return [
+        _solid(obstacle, values)
+        for obstacle, values in zip(state.obstacles, parts, strict=True)
+    ]
 
 
 def _solid(obstacle: Obstacle, values: Vec) -> SymbolicSolid:
@@ -288,21 +357,33 @@ def _solid(obstacle: Obstacle, values: Vec) -> SymbolicSolid:
         return _upright(obstacle, values[0])
     position, rest = values[:3], values[3:]
     if obstacle.kind == "box":
-        return SymbolicBox([0.0] * 3, rest[:3], position, _three_rows(rest[3:]) if obstacle.is_turned else None)
+        return SymbolicBox(
+            [0.0] * 3,
+            rest[:3],
+            position,
+            _three_rows(rest[3:]) if obstacle.is_turned else None,
+        )
     if obstacle.kind == "sphere":
         return SymbolicCapsule(position, position, rest[0])
     if obstacle.kind == "capsule":
-        return SymbolicCapsule(subtract(position, rest[:3]), add(position, rest[:3]), rest[3])
+        return SymbolicCapsule(
+            subtract(position, rest[:3]), add(position, rest[:3]), rest[3]
+        )
     if obstacle.kind == "cylinder":
         return SymbolicCylinder(position, rest[:3], rest[3])
     corners = corners_of(obstacle.mesh)
     low, high = corners.min(axis=0), corners.max(axis=0)
     center, half = ((low + high) / 2).tolist(), ((high - low) / 2).tolist()
-    return SymbolicHull(center, half, position, _three_rows(rest), supporting_planes(corners).tolist())
+    return SymbolicHull(
+        center, half, position, _three_rows(rest), supporting_planes(corners).tolist()
+    )
 
 
 def _upright(obstacle: Obstacle, top: Scalar) -> SymbolicUprightBox:
-    height, ranges = obstacle.height, [bounds for bounds in (obstacle.x, obstacle.y) if bounds is not None]
+    height, ranges = (
+        obstacle.height,
+        [bounds for bounds in (obstacle.x, obstacle.y) if bounds is not None],
+    )
     sides: Bounds = [(bounds.low, bounds.high) for bounds in ranges]
     return SymbolicUprightBox([*sides, (None if height is None else top - height, top)])
 

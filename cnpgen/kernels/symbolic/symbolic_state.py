@@ -5,11 +5,36 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Self
 
-from cnpgen.kernels.symbolic.dynamics import Load, acceleration_at, body_motions, inverse_dynamics
-from cnpgen.kernels.symbolic.kinematics import Kinematics, bias_acceleration, forward_kinematics, tip_velocity
-from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, constants, cross, dot, scale, subtract, symbols, times
+from cnpgen.kernels.symbolic.dynamics import (
+    Load,
+    acceleration_at,
+    body_motions,
+    inverse_dynamics,
+)
+from cnpgen.kernels.symbolic.kinematics import (
+    Kinematics,
+    bias_acceleration,
+    forward_kinematics,
+    tip_velocity,
+)
+from cnpgen.kernels.symbolic.linalg import (
+    Scalar,
+    Vec,
+    add,
+    constants,
+    cross,
+    dot,
+    scale,
+    subtract,
+    symbols,
+    times,
+)
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.parameter_ranges import PAYLOAD_CENTRE, PAYLOAD_PARAMETERS, UPRIGHT_TURN
+from cnpgen.robots.parameter_ranges import (
+    PAYLOAD_CENTRE,
+    PAYLOAD_PARAMETERS,
+    UPRIGHT_TURN,
+)
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.solid import pose_width
@@ -20,12 +45,10 @@ from cnpgen.robots.table_frame import table_axes
 class SymbolicState:
     """A robot state as SX with derived quantities, each built on first use.
 
-    Attributes:
-        robot: The robot.
-        q: Joint positions [rad], n scalars.
-        dq: Joint velocities [rad/s].
-        ddq: Joint accelerations [rad/s^2].
-        obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``), then values for a constraint, then
+    Attributes: robot: The robot. q: Joint positions [rad], n scalars. dq: Joint
+        velocities [rad/s]. ddq: Joint accelerations [rad/s^2]. obstacle_poses: Poses
+        and sizes of the obstacles (``cnpgen.robots.solid``), then values for a
+        constraint, then
             the parameters of the problem.
         obstacles: The obstacles.
         object_size: Edge lengths of the held object [m], or None.
@@ -52,9 +75,15 @@ class SymbolicState:
         uses_jerk: bool = False,
     ) -> tuple[list[Any], Self]:
         """Return the columns q, dq, ddq, the jerk if used, and ``width`` obstacle poses, and the state they define."""
-        widths = dict.fromkeys(("q", "dq", "ddq", "jerk")[: 3 + uses_jerk], robot.n) | {"obstacle_poses": width}
-        columns, (q, dq, ddq, *jerk, poses) = zip(*(symbols(*item) for item in widths.items()), strict=True)
-        return list(columns), cls(robot, q, dq, ddq, poses, obstacles, object_size, *jerk)
+        widths = dict.fromkeys(("q", "dq", "ddq", "jerk")[: 3 + uses_jerk], robot.n) | {
+            "obstacle_poses": width
+        }
+        columns, (q, dq, ddq, *jerk, poses) = zip(
+            *(symbols(*item) for item in widths.items()), strict=True
+        )
+        return list(columns), cls(
+            robot, q, dq, ddq, poses, obstacles, object_size, *jerk
+        )
 
     @property
     def scene_values(self) -> Vec:
@@ -95,7 +124,11 @@ class SymbolicState:
 
     @cached_property
     def _table_axes(self) -> tuple[Vec, ...] | None:
-        return self._turned_axes("table_roll", "table_pitch") if self.robot.parameters.tilts_table else None
+        return (
+            self._turned_axes("table_roll", "table_pitch")
+            if self.robot.parameters.tilts_table
+            else None
+        )
 
     def _turned_axes(self, *names: str) -> tuple[Vec, ...]:
         """Return axes that two parameters turn: a roll, then a pitch."""
@@ -116,16 +149,28 @@ class SymbolicState:
 
     def inverse_dynamics(self, ddq: Vec) -> Vec:
         """Return the torque [N m] of the sample's load at other accelerations [rad/s^2]."""
-        chain, payload, values = self.robot.chain, self.robot.attached.payload, self.parameters
+        chain, payload, values = (
+            self.robot.chain,
+            self.robot.attached.payload,
+            self.parameters,
+        )
         if payload is None or not self.robot.parameters.changes_payload:
             return inverse_dynamics(chain, self.q, self.dq, ddq)
         mass, nominal = values.get("payload_mass", payload.mass), list(payload.centre)
         if values.keys().isdisjoint(PAYLOAD_PARAMETERS[1:]):
             loads = [Load((mass - payload.mass) / payload.mass, nominal, 1.0)]
         else:  # the load in place of the nominal one
-            centre = [values.get(name, value) for name, value in zip(PAYLOAD_CENTRE, nominal, strict=True)]
-            loads = [Load(mass / payload.mass, centre, values.get("payload_inertia", 1.0)), Load(-1.0, nominal, 1.0)]
-        return inverse_dynamics(chain, self.q, self.dq, ddq, payload=payload, loads=loads)
+            centre = [
+                values.get(name, value)
+                for name, value in zip(PAYLOAD_CENTRE, nominal, strict=True)
+            ]
+            loads = [
+                Load(mass / payload.mass, centre, values.get("payload_inertia", 1.0)),
+                Load(-1.0, nominal, 1.0),
+            ]
+        return inverse_dynamics(
+            chain, self.q, self.dq, ddq, payload=payload, loads=loads
+        )
 
     @cached_property
     def tip_velocity(self) -> Vec:
@@ -135,16 +180,27 @@ class SymbolicState:
     @cached_property
     def tip_acceleration(self) -> Vec:
         """Linear acceleration of the tip [m/s^2]."""
-        return add(tip_velocity(self.kinematics, self.ddq), bias_acceleration(self.kinematics, self.dq))
+        return add(
+            tip_velocity(self.kinematics, self.ddq),
+            bias_acceleration(self.kinematics, self.dq),
+        )
 
     @cached_property
     def recursive_tip_acceleration(self) -> Vec:
         """Linear acceleration of the tip [m/s^2] by the recursion of the inverse dynamics, for a third of the cost."""
         chain = self.robot.chain
         last = body_motions(chain, self.q, self.dq, self.ddq)[-1]
-        without_gravity = acceleration_at(last.acceleration, last.omega, last.alpha, chain.tip_translation.tolist())
-        rotation = [[dot(row, column) for column in chain.tip_rotation.tolist()] for row in self.kinematics.rotation]
-        return [dot(row, without_gravity) + g for row, g in zip(rotation, chain.gravity.tolist(), strict=True)]
+        without_gravity = acceleration_at(
+            last.acceleration, last.omega, last.alpha, chain.tip_translation.tolist()
+        )
+        rotation = [
+            [dot(row, column) for column in chain.tip_rotation.tolist()]
+            for row in self.kinematics.rotation
+        ]
+        return [
+            dot(row, without_gravity) + g
+            for row, g in zip(rotation, chain.gravity.tolist(), strict=True)
+        ]
 
     @cached_property
     def tip_angular_velocity(self) -> Vec:
@@ -161,7 +217,9 @@ class SymbolicState:
         omega: Vec = [0.0, 0.0, 0.0]
         alpha: Vec = [0.0, 0.0, 0.0]
         kin = self.kinematics
-        for z, rate, rate2, turns in zip(kin.axes, self.dq, self.ddq, kin.revolute, strict=True):
+        for z, rate, rate2, turns in zip(
+            kin.axes, self.dq, self.ddq, kin.revolute, strict=True
+        ):
             if turns:
                 alpha = add(alpha, add(scale(z, rate2), scale(cross(omega, z), rate)))
                 omega = add(omega, scale(z, rate))
@@ -175,7 +233,10 @@ class SymbolicState:
 
     @cached_property
     def capsules(self) -> dict[str, tuple[Vec, Vec, float]]:
-        """Link -> ends [m] and radius [m] of its capsule; empty for a robot without link geometry."""
+        """Link -> ends [m] and radius [m] of its capsule.
+
+        Empty for a robot without link geometry.
+        """
         return self._placed_capsules(self.robot.shape)
 
     @cached_property
@@ -183,20 +244,34 @@ class SymbolicState:
         """Link -> ends [m] and radius [m] of its capsule, for links that may not touch the held object."""
         return self._placed_capsules(self.robot.held_shape)
 
-    def _placed_capsules(self, shape: Shape | None) -> dict[str, tuple[Vec, Vec, float]]:
+    def _placed_capsules(
+        self, shape: Shape | None
+    ) -> dict[str, tuple[Vec, Vec, float]]:
         if shape is None:
             return {}
         placed = {}
         for capsule in shape.capsules:
-            first, second, joint = constants(capsule.first), constants(capsule.second), shape.joints[capsule.link]
+            first, second, joint = (
+                constants(capsule.first),
+                constants(capsule.second),
+                shape.joints[capsule.link],
+            )
             if joint > 0:
-                rotation, origin = self.kinematics.frames[joint - 1], self.kinematics.origins[joint - 1]
-                first, second = (add(origin, times(rotation, end)) for end in (first, second))
+                rotation, origin = (
+                    self.kinematics.frames[joint - 1],
+                    self.kinematics.origins[joint - 1],
+                )
+                first, second = (
+                    add(origin, times(rotation, end)) for end in (first, second)
+                )
             placed[capsule.link] = first, second, capsule.radius
         return placed
 
     def freeze(self, value: Scalar) -> Scalar:
-        """Return a value that derivatives may treat as constant; here it is returned unchanged."""
+        """Return a value that derivatives may treat as constant.
+
+        Here it is returned unchanged.
+        """
         return value
 
 
@@ -222,15 +297,23 @@ class FrozenState(SymbolicState):
         """Replace the symbols of frozen values by the values."""
         import casadi as ca
 
-        symbols, values = [symbol for symbol, _ in self.frozen], [value for _, value in self.frozen]
-        substituted: list[Any] = ca.substitute(results, symbols, values) if symbols else results
+        symbols, values = (
+            [symbol for symbol, _ in self.frozen],
+            [value for _, value in self.frozen],
+        )
+        substituted: list[Any] = (
+            ca.substitute(results, symbols, values) if symbols else results
+        )
         return substituted
 
 
-def time_derivatives(path: Sequence[Vec], rate: Sequence[Scalar]) -> tuple[Vec, Vec, Vec | None]:
+def time_derivatives(
+    path: Sequence[Vec], rate: Sequence[Scalar]
+) -> tuple[Vec, Vec, Vec | None]:
     """Return ``dq = p' r``, ``ddq = p'' r^2 + p' r r'`` and the jerk ``p''' r^3 + 3 p'' r' r^2 + p' (r'' r + r'^2) r``.
 
-    It is ``cnpgen.trajectory.spline_motion.time_derivatives`` in SX. Without p''' the jerk is None, and r'' not needed.
+    It is ``cnpgen.trajectory.spline_motion.time_derivatives`` in SX. Without p''' the
+    jerk is None, and r'' not needed.
     """
     (p1, p2), (r, r1) = path[:2], rate[:2]
     dq = [a * r for a in p1]
@@ -238,4 +321,8 @@ def time_derivatives(path: Sequence[Vec], rate: Sequence[Scalar]) -> tuple[Vec, 
     if len(path) < 3:
         return dq, ddq, None
     r2, terms = rate[2], zip(p1, p2, path[2], strict=True)
-    return dq, ddq, [c * r**3 + 3 * b * r1 * r**2 + a * (r2 * r + r1**2) * r for a, b, c in terms]
+    return (
+        dq,
+        ddq,
+        [c * r**3 + 3 * b * r1 * r**2 + a * (r2 * r + r1**2) * r for a, b, c in terms],
+    )

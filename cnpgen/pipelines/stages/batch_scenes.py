@@ -9,7 +9,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.collision.body_arrays import BODY, BOX, CYLINDER, Bodies, bounding_boxes
+from cnpgen.kernels.collision.body_arrays import (
+    BODY,
+    BOX,
+    CYLINDER,
+    Bodies,
+    bounding_boxes,
+)
 from cnpgen.pipelines.scene_family import Layout
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import make_scene_table, rotations_of, scene_poses
@@ -18,20 +24,21 @@ from cnpgen.store.scene_table import OBSTACLE_KINDS, SceneTable
 
 Array = NDArray[np.float64]
 
-_PRISM_FACTOR = 1 / np.cos(np.pi / PRISM_SIDES)  # of the radius of a cylinder that contains the prism of judges
+_PRISM_FACTOR = 1 / np.cos(
+    np.pi / PRISM_SIDES
+)  # of the radius of a cylinder that contains the prism of judges
 
 
 @dataclass(frozen=True, eq=False)
 class BatchScenes:
     """S scenes of a batch of candidates.
 
-    Attributes:
-        table: Their obstacles, in the stored float type; ``scene_ids`` are the indices in the batch.
-        poses: Poses and sizes of the problem's obstacles in each scene (``Scene.poses``), shape (S, width).
-        grasp_count: Number of grasps, shape (S,); further entries are padding.
-        grasp_position: Positions of the tip [m], shape (S, G, 3).
-        grasp_approach: Unit vectors of the approaches, shape (S, G, 3).
-        grasp_tilt: Largest angles from the approach [rad], shape (S, G).
+    Attributes: table: Their obstacles, in the stored float type; ``scene_ids`` are the
+        indices in the batch. poses: Poses and sizes of the problem's obstacles in each
+        scene (``Scene.poses``), shape (S, width). grasp_count: Number of grasps, shape
+        (S,); further entries are padding. grasp_position: Positions of the tip [m],
+        shape (S, G, 3). grasp_approach: Unit vectors of the approaches, shape (S, G,
+        3). grasp_tilt: Largest angles from the approach [rad], shape (S, G).
     """
 
     table: SceneTable
@@ -49,11 +56,15 @@ class BatchScenes:
         """Bodies, shape (S, O), and bounding boxes, shape (S, 16, O padded), as of ``obstacle_bodies``."""
         table, rotation = self.table, rotations_of(self.table).reshape(len(self), -1, 9)
         kind, size = table.obstacle_kind, table.obstacle_size.astype(np.float64)
-        box, cylinder = (kind == OBSTACLE_KINDS.index(name) for name in ("box", "cylinder"))
+        box, cylinder = (
+            kind == OBSTACLE_KINDS.index(name) for name in ("box", "cylinder")
+        )
         half = size / 2
         half[~box] = 0.0
         half[..., 2] += np.where(box, 0.0, size[..., 1] / 2)
-        half[..., :2] += np.where(cylinder, size[..., 0] * _PRISM_FACTOR, 0.0)[..., None]
+        half[..., :2] += np.where(cylinder, size[..., 0] * _PRISM_FACTOR, 0.0)[
+            ..., None
+        ]
         bodies = np.zeros(kind.shape, BODY)
         bodies["kind"], bodies["size"] = np.where(cylinder, CYLINDER, BOX), half
         bodies["radius"] = np.where(box | cylinder, 0.0, size[..., 0])
@@ -62,17 +73,27 @@ class BatchScenes:
 
 
 def batch_scenes(
-    layouts: Sequence[Layout], families: Sequence[int], obstacles: Sequence[Obstacle], capacity: int, dtype: str
+    layouts: Sequence[Layout],
+    families: Sequence[int],
+    obstacles: Sequence[Obstacle],
+    capacity: int,
+    dtype: str,
 ) -> BatchScenes:
     """Return scenes of a batch with at most ``capacity`` obstacles each, in the stored float type."""
-    table = make_scene_table([layout.obstacles for layout in layouts], families, capacity).astype(dtype)
+    table = make_scene_table(
+        [layout.obstacles for layout in layouts], families, capacity
+    ).astype(dtype)
     count = np.array([len(layout.grasps) for layout in layouts], np.int64)
     real = np.arange(max(count.max(initial=0), 1)) < count[:, None]
     flat = [grasp for layout in layouts for grasp in layout.grasps]
-    position, approach, tilt = (np.zeros((*real.shape, *tail)) for tail in ((3,), (3,), ()))
+    position, approach, tilt = (
+        np.zeros((*real.shape, *tail)) for tail in ((3,), (3,), ())
+    )
     approach[..., 2] = 1.0
     if flat:
         position[real] = [grasp.position for grasp in flat]
         approach[real] = [grasp.approach for grasp in flat]
         tilt[real] = [grasp.tilt for grasp in flat]
-    return BatchScenes(table, scene_poses(obstacles, table), count, position, approach, tilt)
+    return BatchScenes(
+        table, scene_poses(obstacles, table), count, position, approach, tilt
+    )

@@ -8,9 +8,27 @@ from typing import Any
 import numpy as np
 
 from cnpgen.kernels.symbolic.dynamics import inverse_dynamics
-from cnpgen.kernels.symbolic.kinematics import bias_acceleration, forward_kinematics, tip_velocity
-from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, scale, subtract, symbols
-from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction, fraction
+from cnpgen.kernels.symbolic.kinematics import (
+    bias_acceleration,
+    forward_kinematics,
+    tip_velocity,
+)
+from cnpgen.kernels.symbolic.linalg import (
+    Scalar,
+    Vec,
+    add,
+    dot,
+    scale,
+    subtract,
+    symbols,
+)
+from cnpgen.pipelines.stages.stage import (
+    CandidateBatch,
+    Context,
+    Stage,
+    StageFunction,
+    fraction,
+)
 from cnpgen.problems.constraints.table import Table
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
@@ -18,20 +36,29 @@ from cnpgen.store.field import Field
 
 PROJECTION_STEPS = 3  # Newton steps from a millimetre to rounding error
 MAX_VELOCITY_RATIO = 1.005  # largest ratio of a plan's velocity to its limit
-AT_REST_TOLERANCE = 1e-9  # rad/s and rad/s^2: rounding error of a velocity or acceleration that is zero
+AT_REST_TOLERANCE = (
+    1e-9  # rad/s and rad/s^2: rounding error of a velocity or acceleration that is zero
+)
 
 
 def _motion_fields(context: Context, end: str) -> tuple[Field, Field]:
     role = "input" if end == "start" else "target"
     return (
-        context.joint_field(f"{end}_dq", "rad/s", f"joint velocities at the {end}", role),
-        context.joint_field(f"{end}_ddq", "rad/s^2", f"joint accelerations at the {end}", role),
+        context.joint_field(
+            f"{end}_dq", "rad/s", f"joint velocities at the {end}", role
+        ),
+        context.joint_field(
+            f"{end}_ddq", "rad/s^2", f"joint accelerations at the {end}", role
+        ),
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class AtRest(Stage):
-    """Stage: zero velocity and acceleration at one end; the goal acceleration is prescribed only if requested."""
+    """Stage: zero velocity and acceleration at one end.
+
+    The goal acceleration is prescribed only if requested.
+    """
 
     end: str = field("end that is at rest", choices=("start", "goal"))
     acceleration: str = field(
@@ -43,15 +70,24 @@ class AtRest(Stage):
     )
 
     def describe(self) -> str:
-        kept = ", which motions must end with" if self.end == "goal" and self.acceleration == "zero" else ""
+        kept = (
+            ", which motions must end with"
+            if self.end == "goal" and self.acceleration == "zero"
+            else ""
+        )
         return f"set velocity and acceleration of the {self.end} to zero{kept}"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
         fields = _motion_fields(context, self.end)
-        return fields if self.end == "start" or self.acceleration == "zero" else fields[:1]
+        return (
+            fields if self.end == "start" or self.acceleration == "zero" else fields[:1]
+        )
 
     def writes(self, context: Context) -> tuple[str, ...]:
-        """List velocity and acceleration; the checks use an acceleration that is not stored, too."""
+        """List velocity and acceleration.
+
+        The checks use an acceleration that is not stored, too.
+        """
         return f"{self.end}_dq", f"{self.end}_ddq"
 
     def prepare(self, context: Context) -> StageFunction:
@@ -65,12 +101,16 @@ class AtRest(Stage):
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
         """Reject tasks with a non-zero given velocity or acceleration."""
-        rest, names = self.prepare(context), [name for name in self.writes(context) if name in given]
+        rest, names = (
+            self.prepare(context),
+            [name for name in self.writes(context) if name in given],
+        )
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             for name in names:
                 candidates.reject(
-                    (np.abs(candidates[name]) <= AT_REST_TOLERANCE).all(0), f"not at rest at the {self.end}"
+                    (np.abs(candidates[name]) <= AT_REST_TOLERANCE).all(0),
+                    f"not at rest at the {self.end}",
                 )
             rest(candidates, random)
 
@@ -107,19 +147,29 @@ class TableVelocity(Stage):
                 candidates.draw(random, 1),
             )
             length[choice < self.at_rest] = 0.0
-            candidates["start_dq"], candidates["start_tip_velocity"] = kernel(candidates["start_q"], direction, length)
-            candidates.reject(np.isfinite(candidates["start_dq"]).all(0), "no velocity on the manifold")
+            candidates["start_dq"], candidates["start_tip_velocity"] = kernel(
+                candidates["start_q"], direction, length
+            )
+            candidates.reject(
+                np.isfinite(candidates["start_dq"]).all(0),
+                "no velocity on the manifold",
+            )
 
         return work
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
-        """Load the kernel of the tip velocity; a start without a given velocity is at rest."""
+        """Load the kernel of the tip velocity.
+
+        A start without a given velocity is at rest.
+        """
         kernel, n = context.kernels.load(velocity_of_tip), context.robot.n
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             if "start_dq" not in given:
                 candidates["start_dq"] = np.zeros((n, len(candidates.alive)))
-            (candidates["start_tip_velocity"],) = kernel(candidates["start_q"], candidates["start_dq"])
+            (candidates["start_tip_velocity"],) = kernel(
+                candidates["start_q"], candidates["start_dq"]
+            )
 
         return work
 
@@ -128,7 +178,9 @@ class TableVelocity(Stage):
 class TableAcceleration(Stage):
     """Stage: random acceleration with ``J_z ddq + dJ_z dq = 0`` at one end, within acceleration and torque limits."""
 
-    end: str = field("end whose acceleration is sampled", choices=("start", "goal"), default="start")
+    end: str = field(
+        "end whose acceleration is sampled", choices=("start", "goal"), default="start"
+    )
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -148,12 +200,21 @@ class TableAcceleration(Stage):
         kernel, n = context.kernels.load(table_acceleration), context.robot.n
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
-            direction, length = 2 * candidates.draw(random, n) - 1, candidates.draw(random, 1)
+            direction, length = (
+                2 * candidates.draw(random, n) - 1,
+                candidates.draw(random, 1),
+            )
             acceleration, interval_length = kernel(
-                candidates[f"{self.end}_q"], candidates[f"{self.end}_dq"], direction, length
+                candidates[f"{self.end}_q"],
+                candidates[f"{self.end}_dq"],
+                direction,
+                length,
             )
             candidates[f"{self.end}_ddq"] = acceleration
-            candidates.reject(interval_length[0] >= 0, f"no acceleration within the limits at the {self.end}")
+            candidates.reject(
+                interval_length[0] >= 0,
+                f"no acceleration within the limits at the {self.end}",
+            )
 
         return work
 
@@ -170,61 +231,99 @@ def velocity_of_tip(robot: Robot) -> Any:
 def onto_table(robot: Robot, *, height: float) -> Any:
     """Build the projection ``(q, dq, ddq) -> (q, dq, ddq)`` onto states whose tip moves and accelerates on the table.
 
-    The table has a height [m]. Use it for deviations as small as those of plans: three Newton steps for q, then two
-    projections. Velocities slightly above their limits are scaled to the limits.
+    The table has a height [m]. Use it for deviations as small as those of plans: three
+    Newton steps for q, then two projections. Velocities slightly above their limits are
+    scaled to the limits.
     """
     import casadi as ca
 
-    (q_sx, q), (dq_sx, dq), (ddq_sx, ddq) = (symbols(name, robot.n) for name in ("q", "dq", "ddq"))
+    (q_sx, q), (dq_sx, dq), (ddq_sx, ddq) = (
+        symbols(name, robot.n) for name in ("q", "dq", "ddq")
+    )
     limit = [float(x) for x in robot.velocity_limit]
     for _ in range(PROJECTION_STEPS):
         kin = forward_kinematics(robot.chain, q)
-        q = _project(q, [c[2] for c in kin.jacobian], limit, rest=kin.tip[2] - height, at=q)
+        q = _project(
+            q, [c[2] for c in kin.jacobian], limit, rest=kin.tip[2] - height, at=q
+        )
     kin = forward_kinematics(robot.chain, q)
     row = [c[2] for c in kin.jacobian]
     dq = _project(dq, row, limit)
-    over = ca.mmax(ca.vertcat(*[ca.fabs(x) / bound for x, bound in zip(dq, limit, strict=True)]))
-    dq = scale(dq, 1.0 / ca.if_else(over <= MAX_VELOCITY_RATIO, ca.fmax(over, 1.0), 1.0))
-    ddq = _project(ddq, row, [float(x) for x in robot.acceleration_limit], rest=bias_acceleration(kin, dq)[2])
-    return ca.Function("onto_table", [q_sx, dq_sx, ddq_sx], [ca.vertcat(*values) for values in (q, dq, ddq)])
+    over = ca.mmax(
+        ca.vertcat(*[ca.fabs(x) / bound for x, bound in zip(dq, limit, strict=True)])
+    )
+    dq = scale(
+        dq, 1.0 / ca.if_else(over <= MAX_VELOCITY_RATIO, ca.fmax(over, 1.0), 1.0)
+    )
+    ddq = _project(
+        ddq,
+        row,
+        [float(x) for x in robot.acceleration_limit],
+        rest=bias_acceleration(kin, dq)[2],
+    )
+    return ca.Function(
+        "onto_table",
+        [q_sx, dq_sx, ddq_sx],
+        [ca.vertcat(*values) for values in (q, dq, ddq)],
+    )
 
 
 def table_velocity(robot: Robot) -> Any:
     """Build ``(q, direction, length) -> (dq, tip velocity)`` with ``J_z dq = 0``.
 
-    The direction, in units of the limits, is projected onto the manifold in the metric of the limits. It is scaled
-    until the first joint meets its limit, and multiplied by the length in [0, 1).
+    The direction, in units of the limits, is projected onto the manifold in the metric
+    of the limits. It is scaled until the first joint meets its limit, and multiplied by
+    the length in [0, 1).
     """
     import casadi as ca
 
-    (q_sx, q), (u_sx, u), (s_sx, s) = symbols("q", robot.n), symbols("u", robot.n), symbols("s", 1)
+    (q_sx, q), (u_sx, u), (s_sx, s) = (
+        symbols("q", robot.n),
+        symbols("u", robot.n),
+        symbols("s", 1),
+    )
     kin = forward_kinematics(robot.chain, q)
     limit = [float(x) for x in robot.velocity_limit]
-    on_manifold = _project([x * bound for x, bound in zip(u, limit, strict=True)], [c[2] for c in kin.jacobian], limit)
+    on_manifold = _project(
+        [x * bound for x, bound in zip(u, limit, strict=True)],
+        [c[2] for c in kin.jacobian],
+        limit,
+    )
     ratios = (ca.fabs(x) / bound for x, bound in zip(on_manifold, limit, strict=True))
     dq = scale(on_manifold, s[0] / reduce(ca.fmax, ratios, ca.SX(0)))
-    return ca.Function("table_velocity", [q_sx, u_sx, s_sx], [ca.vertcat(*dq), ca.vertcat(*tip_velocity(kin, dq))])
+    return ca.Function(
+        "table_velocity",
+        [q_sx, u_sx, s_sx],
+        [ca.vertcat(*dq), ca.vertcat(*tip_velocity(kin, dq))],
+    )
 
 
 def table_acceleration(robot: Robot) -> Any:
     """Build ``(q, dq, direction, length) -> (ddq, interval_length)`` with ``J_z ddq + dJ_z dq = 0``.
 
-    ``ddq = particular + t * projected direction`` with the particular solution of minimum weighted maximum norm. Torque
-    is affine in t (two inverse dynamics), so every limit is an interval of t, and t is uniform in their intersection.
-    ``interval_length`` is the length of the intersection, negative if the particular solution violates a limit.
+    ``ddq = particular + t * projected direction`` with the particular solution of
+    minimum weighted maximum norm. Torque is affine in t (two inverse dynamics), so
+    every limit is an interval of t, and t is uniform in their intersection.
+    ``interval_length`` is the length of the intersection, negative if the particular
+    solution violates a limit.
     """
     import casadi as ca
 
     (q_sx, q), (dq_sx, dq), (u_sx, u), (s_sx, s) = (
-        symbols(name, width) for name, width in (("q", robot.n), ("dq", robot.n), ("u", robot.n), ("s", 1))
+        symbols(name, width)
+        for name, width in (("q", robot.n), ("dq", robot.n), ("u", robot.n), ("s", 1))
     )
     kin = forward_kinematics(robot.chain, q)
     limit = [float(x) for x in robot.acceleration_limit]
     row = [column[2] for column in kin.jacobian]
     size = sum((bound * ca.fabs(x) for bound, x in zip(limit, row, strict=True)), 0.0)
     share = -bias_acceleration(kin, dq)[2] / size
-    particular = [share * bound * ca.sign(x) for bound, x in zip(limit, row, strict=True)]
-    direction = _project([x * bound for x, bound in zip(u, limit, strict=True)], row, limit)
+    particular = [
+        share * bound * ca.sign(x) for bound, x in zip(limit, row, strict=True)
+    ]
+    direction = _project(
+        [x * bound for x, bound in zip(u, limit, strict=True)], row, limit
+    )
     torque = inverse_dynamics(robot.chain, q, dq, particular)
     shifted = inverse_dynamics(robot.chain, q, dq, add(particular, direction))
     change = [b - a for a, b in zip(torque, shifted, strict=True)]
@@ -234,17 +333,28 @@ def table_acceleration(robot: Robot) -> Any:
     ddq = add(particular, scale(direction, t))
     admissible = ca.logic_and(low <= 0, high >= 0)
     interval_length = ca.if_else(admissible, high - low, -1.0)
-    return ca.Function("table_acceleration", [q_sx, dq_sx, u_sx, s_sx], [ca.vertcat(*ddq), interval_length])
+    return ca.Function(
+        "table_acceleration",
+        [q_sx, dq_sx, u_sx, s_sx],
+        [ca.vertcat(*ddq), interval_length],
+    )
 
 
-def _project(x: Vec, row: Vec, weight: list[float], *, rest: Scalar = 0.0, at: Vec | None = None) -> Vec:
-    """Project x onto ``{row . (x - at) + rest = 0}`` in the metric ``diag(weight)^-2``; ``at`` is zero by default."""
+def _project(
+    x: Vec, row: Vec, weight: list[float], *, rest: Scalar = 0.0, at: Vec | None = None
+) -> Vec:
+    """Project x onto ``{row .
+
+    (x - at) + rest = 0}`` in the metric ``diag(weight)^-2``; ``at`` is zero by default.
+    """
     spread = [bound * bound * r for bound, r in zip(weight, row, strict=True)]
     miss = (dot(row, x if at is None else subtract(x, at)) + rest) / dot(row, spread)
     return [value - s * miss for value, s in zip(x, spread, strict=True)]
 
 
-def _interval(at_zero: Vec, gradient: Vec, bounds: list[float]) -> tuple[Scalar, Scalar]:
+def _interval(
+    at_zero: Vec, gradient: Vec, bounds: list[float]
+) -> tuple[Scalar, Scalar]:
     """Return the interval of t with ``|at_zero + t gradient| <= bounds`` in every component."""
     import casadi as ca
 

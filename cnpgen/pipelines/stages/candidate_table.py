@@ -12,16 +12,26 @@ from cnpgen.robots.table_frame import TableFrame, moved_box
 
 
 def candidate_table(context: Context, candidates: CandidateBatch) -> TableFrame | None:
-    """Return the frame of the table of every candidate; None if no parameters move the table."""
-    return table_frame_of(context.problem, candidates["parameters"].T if context.problem.parameters else None)
+    """Return the frame of the table of every candidate.
+
+    None if no parameters move the table.
+    """
+    return table_frame_of(
+        context.problem,
+        candidates["parameters"].T if context.problem.parameters else None,
+    )
 
 
 def table_corners(context: Context, candidates: CandidateBatch) -> tuple[Array, Array]:
     """Return the lower and the upper corner of the rectangle of every table: x and y [m], shape (2, n) each."""
-    columns = dict(zip(context.problem.parameters.names, candidates["parameters"], strict=True))
+    columns = dict(
+        zip(context.problem.parameters.names, candidates["parameters"], strict=True)
+    )
     low, high = context.constraint(Table).bounds_of(columns)
     zero = 0 * next(iter(columns.values()))
-    return np.array([value + zero for value in low]), np.array([value + zero for value in high])
+    return np.array([value + zero for value in low]), np.array(
+        [value + zero for value in high]
+    )
 
 
 def upright_axes(context: Context, candidates: CandidateBatch) -> list[Array]:
@@ -36,7 +46,11 @@ def upright_axes(context: Context, candidates: CandidateBatch) -> list[Array]:
 def in_world(context: Context, candidates: CandidateBatch, positions: Array) -> Array:
     """Return positions on the table of every candidate in the world frame [m], shape (3, n)."""
     frame = candidate_table(context, candidates)
-    return positions if frame is None else np.ascontiguousarray(frame.to_world(positions.T).T)
+    return (
+        positions
+        if frame is None
+        else np.ascontiguousarray(frame.to_world(positions.T).T)
+    )
 
 
 def in_world_box(
@@ -46,14 +60,20 @@ def in_world_box(
     ranges = context.problem.parameters
     if not ranges.tilts_table:
         return low, high
-    lower, upper = moved_box(ranges, context.robot.table_origin, np.array(low), np.array(high))
+    lower, upper = moved_box(
+        ranges, context.robot.table_origin, np.array(low), np.array(high)
+    )
     return lower.tolist(), upper.tolist()
 
 
 def on_table(context: Context, candidates: CandidateBatch, positions: Array) -> Array:
     """Return positions in the frame of the table of every candidate [m], shape (3, n)."""
     frame = candidate_table(context, candidates)
-    return positions if frame is None else np.ascontiguousarray(frame.to_table(positions.T).T)
+    return (
+        positions
+        if frame is None
+        else np.ascontiguousarray(frame.to_table(positions.T).T)
+    )
 
 
 def hit_direction(context: Context, candidates: CandidateBatch) -> Array:
@@ -63,7 +83,9 @@ def hit_direction(context: Context, candidates: CandidateBatch) -> Array:
     frame = candidate_table(context, candidates)
     if frame is None:
         return direction
-    return np.ascontiguousarray(frame.along_world(np.concatenate([direction, np.zeros_like(angle)]).T).T)
+    return np.ascontiguousarray(
+        frame.along_world(np.concatenate([direction, np.zeros_like(angle)]).T).T
+    )
 
 
 def table_normal(context: Context, candidates: CandidateBatch) -> list[Array]:
@@ -73,7 +95,10 @@ def table_normal(context: Context, candidates: CandidateBatch) -> list[Array]:
 
 
 def velocity_factor(context: Context, candidates: CandidateBatch) -> Array | None:
-    """Return the factor of the velocity limits of every candidate, shape (1, n); None without this parameter."""
+    """Return the factor of the velocity limits of every candidate, shape (1, n).
+
+    None without this parameter.
+    """
     names = context.problem.parameters.names
     if "velocity_factor" not in names:
         return None

@@ -26,7 +26,10 @@ AT_BASE = "obstacle at the robot's base"
 
 @dataclass(frozen=True, kw_only=True)
 class DrawScenes(Stage):
-    """Stage: draw scenes from families with given shares; consecutive candidates share a scene."""
+    """Stage: draw scenes from families with given shares.
+
+    Consecutive candidates share a scene.
+    """
 
     draws_scenes = True
     capacity: dict[str, int] = field(
@@ -35,17 +38,26 @@ class DrawScenes(Stage):
         high=60,
         pattern=f"^({'|'.join(OBSTACLE_KINDS)})$",
     )
-    per_scene: int = field("candidates of a scene, on average in each batch", default=10, low=1, high=4096)
-    family: tuple[SceneFamily, ...] = field("families of the scenes", form="[[stage.family]] tables")
+    per_scene: int = field(
+        "candidates of a scene, on average in each batch", default=10, low=1, high=4096
+    )
+    family: tuple[SceneFamily, ...] = field(
+        "families of the scenes", form="[[stage.family]] tables"
+    )
 
     @property
     def family_names(self) -> tuple[str, ...]:
         """Registered names of the families, in order."""
-        return tuple(registry.name_of(registry.FAMILIES, type(family)) for family in self.family)
+        return tuple(
+            registry.name_of(registry.FAMILIES, type(family)) for family in self.family
+        )
 
     def describe(self) -> str:
         shares = self._shares()
-        each = (f"{name} {100 * share:.3g} %" for name, share in zip(self.family_names, shares, strict=True))
+        each = (
+            f"{name} {100 * share:.3g} %"
+            for name, share in zip(self.family_names, shares, strict=True)
+        )
         return f"draw scenes for {self.per_scene} candidates each ({', '.join(each)})"
 
     def writes(self, context: Context) -> tuple[str, ...]:
@@ -53,21 +65,39 @@ class DrawScenes(Stage):
 
     def prepare(self, context: Context) -> StageFunction:
         self._check(context)
-        obstacles, capacity, shares = context.problem.obstacle, sum(self.capacity.values()), self._shares()
+        obstacles, capacity, shares = (
+            context.problem.obstacle,
+            sum(self.capacity.values()),
+            self._shares(),
+        )
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             count = max(round(candidates.size / self.per_scene), 1)
-            seeds, families = random.integers(0, 2**63, count), random.choice(len(shares), count, p=shares)
+            seeds, families = (
+                random.integers(0, 2**63, count),
+                random.choice(len(shares), count, p=shares),
+            )
             with _paused_garbage_collection():
                 layouts = [
                     self.family[family].draw(np.random.Generator(np.random.SFC64(seed)))
-                    for family, seed in zip(families.tolist(), seeds.tolist(), strict=True)
+                    for family, seed in zip(
+                        families.tolist(), seeds.tolist(), strict=True
+                    )
                 ]
             fits = np.array([self._fits(layout) for layout in layouts], bool)
-            kept = [layout if fit else Layout((), ()) for layout, fit in zip(layouts, fits, strict=True)]
-            candidates.scenes = batch_scenes(kept, families.tolist(), obstacles, capacity, context.dtype)
-            candidates["scene"] = (candidates.alive * count // candidates.size)[None].astype(float)
-            of_scene = np.stack([fits, base_depths(candidates.scenes.table) <= MAX_BASE_DEPTH_M])
+            kept = [
+                layout if fit else Layout((), ())
+                for layout, fit in zip(layouts, fits, strict=True)
+            ]
+            candidates.scenes = batch_scenes(
+                kept, families.tolist(), obstacles, capacity, context.dtype
+            )
+            candidates["scene"] = (candidates.alive * count // candidates.size)[
+                None
+            ].astype(float)
+            of_scene = np.stack(
+                [fits, base_depths(candidates.scenes.table) <= MAX_BASE_DEPTH_M]
+            )
             candidates.reject_first(of_scene[:, candidates.scene], [TOO_MANY, AT_BASE])
 
         return work
@@ -86,21 +116,31 @@ class DrawScenes(Stage):
 
     def _fits(self, layout: Layout) -> bool:
         counts = Counter(obstacle.kind for obstacle in layout.obstacles)
-        return all(count <= self.capacity.get(kind, 0) for kind, count in counts.items())
+        return all(
+            count <= self.capacity.get(kind, 0) for kind, count in counts.items()
+        )
 
     def _check(self, context: Context) -> None:
         """Raise RecipeError if the problem cannot have these scenes."""
         problem, errors = context.problem, list[str]()
-        places = {kind: len(parked) for kind, parked in sample_obstacles(problem.obstacle).items() if parked}
+        places = {
+            kind: len(parked)
+            for kind, parked in sample_obstacles(problem.obstacle).items()
+            if parked
+        }
         if places != self.capacity:
             errors.append(
                 f"capacity: the problem has places for {places or 'no obstacles of samples'}, expected"
                 f" {self.capacity}: load the pipeline from a file, which adds them"
             )
         if any(obstacle.below for obstacle in problem.obstacle):
-            errors.append("obstacles below the object are not supported in scenes: give them a height")
+            errors.append(
+                "obstacles below the object are not supported in scenes: give them a height"
+            )
         if context.robot.shape is None or problem.first(RobotClearance) is None:
-            errors.append('needs a constraint robot-clearance and geometry = "urdf" in [robot] of the problem')
+            errors.append(
+                'needs a constraint robot-clearance and geometry = "urdf" in [robot] of the problem'
+            )
         if not any(family.share for family in self.family):
             errors.append("family: all shares are 0, expected at least one larger")
         if errors:
@@ -121,7 +161,11 @@ def _paused_garbage_collection() -> Iterator[None]:
 
 def base_depths(table: SceneTable) -> NDArray[np.float64]:
     """Return the depth of the robot's base, the origin, in the obstacles of each scene [m], negative outside."""
-    local = np.abs(np.einsum("soji,soj->soi", rotations_of(table), -table.obstacle_position.astype(float)))
+    local = np.abs(
+        np.einsum(
+            "soji,soj->soi", rotations_of(table), -table.obstacle_position.astype(float)
+        )
+    )
     size, kind = table.obstacle_size.astype(float), table.obstacle_kind
     across, up = np.hypot(local[..., 0], local[..., 1]), local[..., 2]
     radius, half = size[..., 0], size[..., 1] / 2

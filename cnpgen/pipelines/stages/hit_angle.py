@@ -7,7 +7,13 @@ import numpy as np
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.stages.candidate_table import on_table
 from cnpgen.pipelines.stages.draw import position_field
-from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction
+from cnpgen.pipelines.stages.stage import (
+    Array,
+    CandidateBatch,
+    Context,
+    Stage,
+    StageFunction,
+)
 from cnpgen.problems.constraints.puck_contact import PuckContact
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import field
@@ -25,7 +31,17 @@ class _HitAngle(Stage):
     def outputs(self, context: Context) -> tuple[Field, ...]:
         low, high = (-float(np.pi),), (float(np.pi),)
         text = "direction of the hit about world z, from world x"
-        return (Field("hit_angle", "rad", text, role="context", frame="world", valid_min=low, valid_max=high),)
+        return (
+            Field(
+                "hit_angle",
+                "rad",
+                text,
+                role="context",
+                frame="world",
+                valid_min=low,
+                valid_max=high,
+            ),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +50,9 @@ class HitAngleToGoal(_HitAngle):
 
     inputs = ("goal_xyz",)
     target: tuple[float, float] = field("target of the puck: x, y", unit="m")
-    noise: float = field("maximum deviation to either side", unit="rad", default=0.0, low=0.0, high=np.pi)
+    noise: float = field(
+        "maximum deviation to either side", unit="rad", default=0.0, low=0.0, high=np.pi
+    )
 
     def describe(self) -> str:
         x, y = self.target
@@ -45,7 +63,9 @@ class HitAngleToGoal(_HitAngle):
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             x, y = on_table(context, candidates, candidates["goal_xyz"])[:2]
             noise = self.noise * (2 * candidates.draw(random, 1) - 1)
-            candidates["hit_angle"] = wrap(np.arctan2(self.target[1] - y, self.target[0] - x) + noise)
+            candidates["hit_angle"] = wrap(
+                np.arctan2(self.target[1] - y, self.target[0] - x) + noise
+            )
 
         return work
 
@@ -57,7 +77,9 @@ class HitAngleInCone(_HitAngle):
     The distribution equals that of uniform directions with rejection outside the cone.
     """
 
-    half_angle: float = field("half the opening angle of the cone", unit="rad", low=0.0, high=np.pi)
+    half_angle: float = field(
+        "half the opening angle of the cone", unit="rad", low=0.0, high=np.pi
+    )
     origin: str = field(
         'origin of the line to the goal: the "start", or the "home" of an earlier stage',
         choices=("start", "home"),
@@ -89,7 +111,10 @@ class BehindPuck(Stage):
 
     inputs = ("goal_xyz", "hit_angle")
     distance: float = field(
-        "distance of the centres of puck and mallet at contact: sum of the radii", unit="m", low=0.0, plausible=1.0
+        "distance of the centres of puck and mallet at contact: sum of the radii",
+        unit="m",
+        low=0.0,
+        plausible=1.0,
     )
 
     def describe(self) -> str:
@@ -97,18 +122,25 @@ class BehindPuck(Stage):
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
         table = context.constraint(Table)
-        low, high = (table.x.low, table.y.low, table.z), (table.x.high, table.y.high, table.z)
+        low, high = (
+            (table.x.low, table.y.low, table.z),
+            (table.x.high, table.y.high, table.z),
+        )
         return (position_field("goal", low, high),)
 
     def prepare(self, context: Context) -> StageFunction:
         contact = context.problem.first(PuckContact)
         if contact is not None and contact.contact_distance != self.distance:
             raise RecipeError(
-                [f"distance: expected {contact.contact_distance:g} m, as in puck-contact, got {self.distance:g} m"]
+                [
+                    f"distance: expected {contact.contact_distance:g} m, as in puck-contact, got {self.distance:g} m"
+                ]
             )
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
-            candidates["goal_xyz"] = behind(candidates["goal_xyz"], candidates["hit_angle"], self.distance)
+            candidates["goal_xyz"] = behind(
+                candidates["goal_xyz"], candidates["hit_angle"], self.distance
+            )
 
         return work
 

@@ -1,17 +1,19 @@
 """Newton's method for the hitting configuration: steps as SX functions.
 
-Maximize ``f(q) = |J(q)^T d|^2 - |(q0 - q) / L|^2`` subject to ``FK(q) = p`` (reference 2, section on hitting): ``d``
-is the unit hitting direction in the table plane, ``J`` the translational Jacobian of the tip, ``q0`` the home
-configuration, ``L`` the rated joint velocities. The optimality conditions are solved
-in closed form: ``d^2 p / dq_j dq_k = z_min(j,k) x J_max(j,k)``, hence gradient ``2 A a`` with ``a = J^T d`` and
-``A_jk = d . (z_min x J_max)``, and Hessian ``2 A A + 2 d . (dz_min x J_max + z_min x dJ_max)`` with ``dz``, ``dJ``
-the derivatives along ``a``. The constraint is eliminated through three basic joints, so that each step factorizes
-only a (n - 3) x (n - 3) matrix.
+Maximize ``f(q) = |J(q)^T d|^2 - |(q0 - q) / L|^2`` subject to ``FK(q) = p`` (reference
+2, section on hitting): ``d`` is the unit hitting direction in the table plane, ``J``
+the translational Jacobian of the tip, ``q0`` the home configuration, ``L`` the rated
+joint velocities. The optimality conditions are solved in closed form: ``d^2 p / dq_j
+dq_k = z_min(j,k) x J_max(j,k)``, hence gradient ``2 A a`` with ``a = J^T d`` and ``A_jk
+= d . (z_min x J_max)``, and Hessian ``2 A A + 2 d . (dz_min x J_max + z_min x dJ_max)``
+with ``dz``, ``dJ`` the derivatives along ``a``. The constraint is eliminated through
+three basic joints, so that each step factorizes only a (n - 3) x (n - 3) matrix.
 
-These joints must be free to move. If joints are held on their limits, the step is computed in all joints. With ``J_F``
-the Jacobian without the columns of held joints, maximize ``g . s + s^T H s / 2`` subject to ``J_F s = p - FK(q)``.
-Adding a large multiple of ``J_F^T J_F`` to ``-H`` changes no solution and makes it positive definite near a solution.
-Two symmetric solves without pivoting then suffice.
+These joints must be free to move. If joints are held on their limits, the step is
+computed in all joints. With ``J_F`` the Jacobian without the columns of held joints,
+maximize ``g . s + s^T H s / 2`` subject to ``J_F s = p - FK(q)``. Adding a large
+multiple of ``J_F^T J_F`` to ``-H`` changes no solution and makes it positive definite
+near a solution. Two symmetric solves without pivoting then suffice.
 """
 
 from dataclasses import dataclass
@@ -39,21 +41,34 @@ from cnpgen.kernels.symbolic.linalg import (
 from cnpgen.robots.robot import Robot
 
 MAX_NEWTON_STEP_RAD = 0.6  # Euclidean norm of one Newton step
-MIN_PIVOT = 1e-3  # minimum |pivot| of the reduced Hessian: every step is an ascent direction
+MIN_PIVOT = (
+    1e-3  # minimum |pivot| of the reduced Hessian: every step is an ascent direction
+)
 NEWTON_TOLERANCE_RAD = 1e-6  # length of the last step; convergence is quadratic
 MAX_NEWTON_STEPS = 40
-CONSTRAINT_WEIGHT = 1e3  # weight of J_F^T J_F relative to -H: both are in m^2/rad^2, and of order 1
+CONSTRAINT_WEIGHT = (
+    1e3  # weight of J_F^T J_F relative to -H: both are in m^2/rad^2, and of order 1
+)
 
 
 def objective(robot: Robot) -> Any:
     """Build ``(q, d, q0) -> f``: the squared manipulability along d minus the penalty on the distance from q0."""
     import casadi as ca
 
-    (q_sx, q), (d_sx, d), (home_sx, home) = symbols("q", robot.n), direction_symbols(robot), symbols("q0", robot.n)
+    (q_sx, q), (d_sx, d), (home_sx, home) = (
+        symbols("q", robot.n),
+        direction_symbols(robot),
+        symbols("q0", robot.n),
+    )
     jacobian = forward_kinematics(robot.chain, q).jacobian
     gain = [along(d, column) for column in jacobian]
-    away = [(b - a) / float(rated) for a, b, rated in zip(q, home, robot.rated_velocity, strict=True)]
-    return ca.Function("objective", [q_sx, d_sx, home_sx], [dot(gain, gain) - dot(away, away)])
+    away = [
+        (b - a) / float(rated)
+        for a, b, rated in zip(q, home, robot.rated_velocity, strict=True)
+    ]
+    return ca.Function(
+        "objective", [q_sx, d_sx, home_sx], [dot(gain, gain) - dot(away, away)]
+    )
 
 
 def direction_symbols(robot: Robot) -> tuple[Any, Vec]:
@@ -102,9 +117,15 @@ class Expansion:
         hessian: list[list[Scalar]] = [[0.0] * self.n for _ in range(self.n)]
         for j in range(self.n):
             for k in range(j, self.n):
-                third = dot(across_rate[j], kin.jacobian[k]) + dot(across[j], column_rates[k])
-                value = 2.0 * (dot(gain_gradient[j], gain_gradient[k]) + third) - dot(multiplier, self.second[j][k])
-                hessian[j][k] = hessian[k][j] = value - 2.0 * self.weight[j] if j == k else value
+                third = dot(across_rate[j], kin.jacobian[k]) + dot(
+                    across[j], column_rates[k]
+                )
+                value = 2.0 * (dot(gain_gradient[j], gain_gradient[k]) + third) - dot(
+                    multiplier, self.second[j][k]
+                )
+                hessian[j][k] = hessian[k][j] = (
+                    value - 2.0 * self.weight[j] if j == k else value
+                )
         return hessian
 
 
@@ -115,10 +136,18 @@ def expand(robot: Robot, q: Vec, d: Vec, home: Vec) -> Expansion:
     weight = [1.0 / float(value) ** 2 for value in robot.rated_velocity]
     gain = [along(d, column) for column in kin.jacobian]
     pairs = range(robot.n)
-    upper = {(j, k): cross(kin.axes[j], kin.jacobian[k]) for j in pairs for k in pairs if j <= k}  # z_min x J_max
+    upper = {
+        (j, k): cross(kin.axes[j], kin.jacobian[k])
+        for j in pairs
+        for k in pairs
+        if j <= k
+    }  # z_min x J_max
     second = [[upper[min(j, k), max(j, k)] for k in pairs] for j in pairs]
     gain_gradient = [[along(d, entry) for entry in row] for row in second]
-    gradient = [2.0 * dot(gain_gradient[j], gain) + 2.0 * weight[j] * (home[j] - q[j]) for j in range(robot.n)]
+    gradient = [
+        2.0 * dot(gain_gradient[j], gain) + 2.0 * weight[j] * (home[j] - q[j])
+        for j in range(robot.n)
+    ]
     return Expansion(kin, gradient, direction, gain, second, gain_gradient, weight)
 
 
@@ -144,11 +173,19 @@ def newton_step(robot: Robot) -> Any:
     """Build one Newton step of an arm of revolute joints as an SX function ``(q, p, d, q0) -> (next q, |step|)``."""
     import casadi as ca
 
-    (q_sx, q), (p_sx, p), (home_sx, home) = symbols("q", robot.n), symbols("p", 3), symbols("q0", robot.n)
+    (q_sx, q), (p_sx, p), (home_sx, home) = (
+        symbols("q", robot.n),
+        symbols("p", 3),
+        symbols("q0", robot.n),
+    )
     d_sx, d = direction_symbols(robot)
     here = expand(robot, q, d, home)
-    following, length = shortened(q, _reduced_step(here, subtract(p, here.kin.tip), basic_joints(robot)))
-    return ca.Function("hitting_configuration", [q_sx, p_sx, d_sx, home_sx], [following, length])
+    following, length = shortened(
+        q, _reduced_step(here, subtract(p, here.kin.tip), basic_joints(robot))
+    )
+    return ca.Function(
+        "hitting_configuration", [q_sx, p_sx, d_sx, home_sx], [following, length]
+    )
 
 
 def shortened(q: Vec, step: Vec) -> tuple[Any, Scalar]:
@@ -173,7 +210,10 @@ def _reduced_step(here: Expansion, miss: Vec, basic: tuple[int, int, int]) -> Ve
 
     n, jacobian = here.n, here.kin.jacobian
     inverse = inverse3([jacobian[j] for j in basic])
-    multiplier = [dot([inverse[b][row] for b in range(3)], [here.gradient[j] for j in basic]) for row in range(3)]
+    multiplier = [
+        dot([inverse[b][row] for b in range(3)], [here.gradient[j] for j in basic])
+        for row in range(3)
+    ]
     null = _null_space(jacobian, inverse, basic)
     normal: Vec = [0.0] * n
     for b, joint in enumerate(basic):
@@ -182,7 +222,8 @@ def _reduced_step(here: Expansion, miss: Vec, basic: tuple[int, int, int]) -> Ve
     curved = [[dot(row, column) for row in hessian] for column in null]  # H Z
     lower = [[-dot(null[i], curved[j]) for j in range(i + 1)] for i in range(len(null))]
     right = [
-        dot(column, here.gradient) + dot(projected, normal) for column, projected in zip(null, curved, strict=True)
+        dot(column, here.gradient) + dot(projected, normal)
+        for column, projected in zip(null, curved, strict=True)
     ]
     climb = substitute(*factorize(lower, safeguard), right)
     step = normal
@@ -191,7 +232,9 @@ def _reduced_step(here: Expansion, miss: Vec, basic: tuple[int, int, int]) -> Ve
     return [ca.SX(value) for value in step]
 
 
-def _null_space(jacobian: list[Vec], inverse: list[Vec], basic: tuple[int, int, int]) -> list[Vec]:
+def _null_space(
+    jacobian: list[Vec], inverse: list[Vec], basic: tuple[int, int, int]
+) -> list[Vec]:
     """Return the columns of Z, one per free joint: it moves alone, and the basic joints keep the tip in place."""
     columns = []
     for j in range(len(jacobian)):
@@ -207,30 +250,40 @@ def _null_space(jacobian: list[Vec], inverse: list[Vec], basic: tuple[int, int, 
 def held_step(robot: Robot) -> Any:
     """Build one Newton step in the joints that are not held: ``((q, pull), p, d, q0, held) -> (next, |step|)``.
 
-    ``held`` is 1 for joints that stay constant. ``pull`` is the gradient of the Lagrangian, an output that the step
-    does not use.
+    ``held`` is 1 for joints that stay constant. ``pull`` is the gradient of the
+    Lagrangian, an output that the step does not use.
     """
     import casadi as ca
 
     n = robot.n
     widths = (("state", 2 * n), ("p", 3), ("q0", n), ("held", n))
-    (state_sx, state), (p_sx, p), (home_sx, home), (held_sx, held) = (symbols(*item) for item in widths)
+    (state_sx, state), (p_sx, p), (home_sx, home), (held_sx, held) = (
+        symbols(*item) for item in widths
+    )
     d_sx, d = direction_symbols(robot)
     q = state[:n]
     here = expand(robot, q, d, home)
     step, pull = _held_step(here, subtract(p, here.kin.tip), [1.0 - x for x in held])
     moved, length = shortened(q, step)
     following = ca.vertcat(moved, *pull)
-    return ca.Function("hitting_limits", [state_sx, p_sx, d_sx, home_sx, held_sx], [following, length])
+    return ca.Function(
+        "hitting_limits", [state_sx, p_sx, d_sx, home_sx, held_sx], [following, length]
+    )
 
 
 def _held_step(here: Expansion, miss: Vec, free: Vec) -> tuple[Vec, Vec]:
     """Return the Newton step in the joints with ``free`` 1, 0 in the others, and the gradient of the Lagrangian."""
     n, jacobian = here.n, here.kin.jacobian
-    rows = [[column[row] * x for column, x in zip(jacobian, free, strict=True)] for row in range(3)]
+    rows = [
+        [column[row] * x for column, x in zip(jacobian, free, strict=True)]
+        for row in range(3)
+    ]
     gradient = [g * x for g, x in zip(here.gradient, free, strict=True)]
     multiplier = solve(gram(rows), [dot(row, gradient) for row in rows])
-    pull = [g - dot(column, multiplier) for g, column in zip(here.gradient, jacobian, strict=True)]
+    pull = [
+        g - dot(column, multiplier)
+        for g, column in zip(here.gradient, jacobian, strict=True)
+    ]
     hessian = here.hessian(multiplier)
 
     def stiff(i: int, j: int) -> Scalar:
@@ -240,12 +293,16 @@ def _held_step(here: Expansion, miss: Vec, free: Vec) -> tuple[Vec, Vec]:
         )
         return value + (1.0 - free[i]) if i == j else value
 
-    factors = factorize([[stiff(i, j) for j in range(i + 1)] for i in range(n)], safeguard)
+    factors = factorize(
+        [[stiff(i, j) for j in range(i + 1)] for i in range(n)], safeguard
+    )
     towards = [dot([row[j] for row in rows], miss) for j in range(n)]
     step = substitute(*factors, add(gradient, scale(towards, CONSTRAINT_WEIGHT)))
     spread = [substitute(*factors, row) for row in rows]
     lower = [[dot(rows[i], spread[j]) for j in range(i + 1)] for i in range(3)]
-    force = solve(lower, [dot(row, step) - e for row, e in zip(rows, miss, strict=True)])
+    force = solve(
+        lower, [dot(row, step) - e for row, e in zip(rows, miss, strict=True)]
+    )
     for amount, column in zip(force, spread, strict=True):
         step = subtract(step, scale(column, amount))
     return step, pull
@@ -254,22 +311,32 @@ def _held_step(here: Expansion, miss: Vec, free: Vec) -> tuple[Vec, Vec]:
 def basic_joints(robot: Robot) -> tuple[int, int, int]:
     """Choose the three joints that eliminate the tip position.
 
-    They maximize the median of ``|det J_B| / sqrt(det J J^T)`` over configurations near the base. (A few unusual
-    configurations would determine the minimum.)
+    They maximize the median of ``|det J_B| / sqrt(det J J^T)`` over configurations near
+    the base. (A few unusual configurations would determine the minimum.)
     """
     import pinocchio as pin
 
     random = np.random.default_rng(0)
-    low, high = np.maximum(robot.home - 0.7, robot.position_lower), np.minimum(robot.home + 0.7, robot.position_upper)
+    low, high = (
+        np.maximum(robot.home - 0.7, robot.position_lower),
+        np.minimum(robot.home + 0.7, robot.position_upper),
+    )
     data, tip = robot.model.createData(), robot.tip_frame
     frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     jacobians = np.array(
-        [pin.computeFrameJacobian(robot.model, data, random.uniform(low, high), tip, frame)[:3] for _ in range(64)]
+        [
+            pin.computeFrameJacobian(
+                robot.model, data, random.uniform(low, high), tip, frame
+            )[:3]
+            for _ in range(64)
+        ]
     )
     volume = np.sqrt(np.linalg.det(jacobians @ jacobians.transpose(0, 2, 1)))
 
     def share(joints: tuple[int, ...]) -> float:
-        return float(np.median(np.abs(np.linalg.det(jacobians[:, :, list(joints)])) / volume))
+        return float(
+            np.median(np.abs(np.linalg.det(jacobians[:, :, list(joints)])) / volume)
+        )
 
     best = max(combinations(range(robot.n), 3), key=share)
     return best[0], best[1], best[2]

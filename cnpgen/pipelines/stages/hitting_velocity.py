@@ -1,13 +1,15 @@
 """Stage: the fastest joint velocity along the hit, a linear program solved exactly.
 
-Maximize ``a . v`` subject to ``B^T v = 0`` and ``|v_i| <= L_i``, where ``a_i`` is the tip's velocity along the hit
-and ``b_i`` its two components across it per unit of joint i. The dual, ``min over y in R^2 of sum_i L_i |a_i - b_i .
-y|``, has its minimum where two residuals vanish: n (n - 1) / 2 candidates, evaluated without branches. Joints with
+Maximize ``a . v`` subject to ``B^T v = 0`` and ``|v_i| <= L_i``, where ``a_i`` is the
+tip's velocity along the hit and ``b_i`` its two components across it per unit of joint
+i. The dual, ``min over y in R^2 of sum_i L_i |a_i - b_i . y|``, has its minimum where
+two residuals vanish: n (n - 1) / 2 candidates, evaluated without branches. Joints with
 non-zero residual go to the limit of its sign.
 
-In half of the poses of an arm with intersecting axes, three or more residuals vanish together and the optimum is a
-face. The remaining joints then get the velocity ``v_i = t L_i sign(b_i . z)`` with the smallest t that satisfies the
-equations. This is again a linear program, and its dual has its optimum at a ``z`` orthogonal to one of the b_i.
+In half of the poses of an arm with intersecting axes, three or more residuals vanish
+together and the optimum is a face. The remaining joints then get the velocity ``v_i = t
+L_i sign(b_i . z)`` with the smallest t that satisfies the equations. This is again a
+linear program, and its dual has its optimum at a ``z`` orthogonal to one of the b_i.
 """
 
 from collections.abc import Callable, Collection
@@ -20,15 +22,28 @@ import numpy as np
 from cnpgen.errors import UsageError
 from cnpgen.kernels.symbolic.kinematics import forward_kinematics
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, cross, dot, symbols
-from cnpgen.pipelines.stages.candidate_table import hit_direction, table_normal, velocity_factor
+from cnpgen.pipelines.stages.candidate_table import (
+    hit_direction,
+    table_normal,
+    velocity_factor,
+)
 from cnpgen.pipelines.stages.hitting_newton import along, direction_symbols
-from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction, fraction
+from cnpgen.pipelines.stages.stage import (
+    Array,
+    CandidateBatch,
+    Context,
+    Stage,
+    StageFunction,
+    fraction,
+)
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 
 ZERO_RESIDUAL_M = 1e-11  # residuals below this are treated as zero
-SPEED_SHARE_COLUMN = "hit_speed_share"  # task column: hit speed as a fraction of the maximum speed
+SPEED_SHARE_COLUMN = (
+    "hit_speed_share"  # task column: hit speed as a fraction of the maximum speed
+)
 PARALLEL_TOLERANCE = 1e-9  # relative determinants below this are treated as zero
 
 
@@ -37,68 +52,111 @@ class HittingVelocity(Stage):
     """Stage: joint velocities of the goal, exactly along the hit, at the maximum speed or scaled down."""
 
     inputs = ("goal_q", "hit_angle")
-    full_speed: float = fraction("fraction of the hits at the maximum speed; the others are scaled")
-    min_speed: float = field("minimum of the maximum speed of a hit", unit="m/s", default=1e-3, low=1e-9)
+    full_speed: float = fraction(
+        "fraction of the hits at the maximum speed; the others are scaled"
+    )
+    min_speed: float = field(
+        "minimum of the maximum speed of a hit", unit="m/s", default=1e-3, low=1e-9
+    )
 
     def describe(self) -> str:
         slower = (
-            f"; scale it uniformly in [0, 1) in {1 - self.full_speed:.4g} of the cases" if self.full_speed < 1 else ""
+            f"; scale it uniformly in [0, 1) in {1 - self.full_speed:.4g} of the cases"
+            if self.full_speed < 1
+            else ""
         )
         return f"solve the linear program for the fastest joint velocity along the hit{slower}"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
         text = "highest possible speed along the hit at the goal configuration"
         return (
-            context.joint_field("goal_dq", "rad/s", "joint velocities at the goal", "target"),
-            Field("hit_speed", "m/s", "speed of the tip along the hit at the goal", role="context", frame="world"),
+            context.joint_field(
+                "goal_dq", "rad/s", "joint velocities at the goal", "target"
+            ),
+            Field(
+                "hit_speed",
+                "m/s",
+                "speed of the tip along the hit at the goal",
+                role="context",
+                frame="world",
+            ),
             Field("hit_speed_max", "m/s", text, role="diagnostic", frame="world"),
         )
 
     def prepare(self, context: Context) -> StageFunction:
-        def draw_share(candidates: CandidateBatch, random: np.random.Generator, _speed: Array) -> Array:
+        def draw_share(
+            candidates: CandidateBatch, random: np.random.Generator, _speed: Array
+        ) -> Array:
             factor, choice = candidates.draw(random, 1), candidates.draw(random, 1)
             return np.where(choice < self.full_speed, 1.0, factor)
 
         return self._solve(context, draw_share)
 
     def task_inputs(self, context: Context) -> tuple[Field, ...]:
-        """List the speed, and its share of the maximum speed; the share is 1 if neither is given."""
+        """List the speed, and its share of the maximum speed.
+
+        The share is 1 if neither is given.
+        """
         share = Field(
-            SPEED_SHARE_COLUMN, "1", "speed of the hit, as a fraction of the highest possible one", role="context"
+            SPEED_SHARE_COLUMN,
+            "1",
+            "speed of the hit, as a fraction of the highest possible one",
+            role="context",
         )
         return self.outputs(context)[1], share
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
         if {"hit_speed", SPEED_SHARE_COLUMN} <= set(given):
-            raise UsageError(f"hit_speed and {SPEED_SHARE_COLUMN} both define the speed of the hit: give one of them")
+            raise UsageError(
+                f"hit_speed and {SPEED_SHARE_COLUMN} both define the speed of the hit: give one of them"
+            )
 
-        def given_share(candidates: CandidateBatch, _random: np.random.Generator, speed: Array) -> Array:
+        def given_share(
+            candidates: CandidateBatch, _random: np.random.Generator, speed: Array
+        ) -> Array:
             if SPEED_SHARE_COLUMN in given:
                 return candidates[SPEED_SHARE_COLUMN]
-            return candidates["hit_speed"] / speed if "hit_speed" in given else np.ones_like(speed)
+            return (
+                candidates["hit_speed"] / speed
+                if "hit_speed" in given
+                else np.ones_like(speed)
+            )
 
         solve = self._solve(context, given_share)
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             solve(candidates, random)
-            possible = (candidates["hit_speed"] > 0) & (candidates["hit_speed"] <= candidates["hit_speed_max"])
-            candidates.reject(possible[0], "hit speed not between 0 and the highest possible one")
+            possible = (candidates["hit_speed"] > 0) & (
+                candidates["hit_speed"] <= candidates["hit_speed_max"]
+            )
+            candidates.reject(
+                possible[0], "hit speed not between 0 and the highest possible one"
+            )
 
         return work
 
     def _solve(
-        self, context: Context, share: Callable[[CandidateBatch, np.random.Generator, Array], Array]
+        self,
+        context: Context,
+        share: Callable[[CandidateBatch, np.random.Generator, Array], Array],
     ) -> StageFunction:
         kernel = context.kernels.load(hitting_velocity, min_speed=self.min_speed)
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
-            directions = [hit_direction(context, candidates), *table_normal(context, candidates)]
+            directions = [
+                hit_direction(context, candidates),
+                *table_normal(context, candidates),
+            ]
             velocity, speed, found = kernel(candidates["goal_q"], *directions)
             limit = velocity_factor(context, candidates)
             if limit is not None:  # the solution is proportional to the limits
                 velocity, speed = velocity * limit, speed * limit
             factor = share(candidates, random, speed)
-            candidates["goal_dq"], candidates["hit_speed"], candidates["hit_speed_max"] = (
+            (
+                candidates["goal_dq"],
+                candidates["hit_speed"],
+                candidates["hit_speed_max"],
+            ) = (
                 velocity * factor,
                 speed * factor,
                 speed,
@@ -111,26 +169,39 @@ class HittingVelocity(Stage):
 def hitting_velocity(robot: Robot, *, min_speed: float) -> Any:
     """Build the linear program as an SX function ``(q, d) -> (dq, speed, found)``, or of (q, d, normal).
 
-    The joint velocity dq [rad/s] maximizes the tip's speed [m/s] along d, which has width 2. If samples tilt the table,
-    directions have width 3, and the normal of the table is the third argument. ``found`` is 0 for hits that are slower
-    than ``min_speed`` [m/s], and if the Jacobian is singular and dq is not finite.
+    The joint velocity dq [rad/s] maximizes the tip's speed [m/s] along d, which has
+    width 2. If samples tilt the table, directions have width 3, and the normal of the
+    table is the third argument. ``found`` is 0 for hits that are slower than
+    ``min_speed`` [m/s], and if the Jacobian is singular and dq is not finite.
     """
     import casadi as ca
 
-    (q_sx, q), (d_sx, d), (normal_sx, normal) = symbols("q", robot.n), direction_symbols(robot), symbols("normal", 3)
+    (q_sx, q), (d_sx, d), (normal_sx, normal) = (
+        symbols("q", robot.n),
+        direction_symbols(robot),
+        symbols("normal", 3),
+    )
     jacobian = forward_kinematics(robot.chain, q).jacobian
     forward = [along(d, column) for column in jacobian]
     if robot.parameters.tilts_table:
         side = cross(normal, d)
         across = [[dot(side, column), dot(normal, column)] for column in jacobian]
     else:
-        across = [[d[0] * column[1] - d[1] * column[0], column[2]] for column in jacobian]
-    velocity, speed = maximise(forward, across, [float(x) for x in robot.velocity_limit])
+        across = [
+            [d[0] * column[1] - d[1] * column[0], column[2]] for column in jacobian
+        ]
+    velocity, speed = maximise(
+        forward, across, [float(x) for x in robot.velocity_limit]
+    )
     found = ca.logic_and(min_speed <= speed, speed < np.inf)
     for rate in velocity:
         found = ca.logic_and(found, ca.fabs(rate) < np.inf)
-    arguments = [q_sx, d_sx, normal_sx] if robot.parameters.tilts_table else [q_sx, d_sx]
-    return ca.Function("hitting_velocity", arguments, [ca.vertcat(*velocity), speed, found])
+    arguments = (
+        [q_sx, d_sx, normal_sx] if robot.parameters.tilts_table else [q_sx, d_sx]
+    )
+    return ca.Function(
+        "hitting_velocity", arguments, [ca.vertcat(*velocity), speed, found]
+    )
 
 
 def maximise(a: Vec, b: list[Vec], limit: list[float]) -> tuple[Vec, Scalar]:
@@ -148,22 +219,39 @@ def maximise(a: Vec, b: list[Vec], limit: list[float]) -> tuple[Vec, Scalar]:
         size = ca.fabs(b[i][0] * b[j][1]) + ca.fabs(b[i][1] * b[j][0])
         usable = ca.fabs(det) > PARALLEL_TOLERANCE * size
         inverse = 1.0 / ca.if_else(usable, det, 1.0)
-        candidate = [(a[i] * b[j][1] - b[i][1] * a[j]) * inverse, (b[i][0] * a[j] - a[i] * b[j][0]) * inverse]
+        candidate = [
+            (a[i] * b[j][1] - b[i][1] * a[j]) * inverse,
+            (b[i][0] * a[j] - a[i] * b[j][0]) * inverse,
+        ]
         others = (k for k in range(n) if k not in (i, j))
-        value = sum((limit[k] * ca.fabs(a[k] - dot(b[k], candidate)) for k in others), 0.0)
+        value = sum(
+            (limit[k] * ca.fabs(a[k] - dot(b[k], candidate)) for k in others), 0.0
+        )
         better = ca.logic_and(usable, value < best)
         best = ca.if_else(better, value, best)
-        y = [ca.if_else(better, new, old) for new, old in zip(candidate, y, strict=True)]
+        y = [
+            ca.if_else(better, new, old) for new, old in zip(candidate, y, strict=True)
+        ]
     residual = [a[k] - dot(b[k], y) for k in range(n)]
     left = [ca.fabs(r) < ZERO_RESIDUAL_M for r in residual]
-    fixed = [ca.if_else(free, 0.0, bound * ca.sign(r)) for free, bound, r in zip(left, limit, residual, strict=True)]
+    fixed = [
+        ca.if_else(free, 0.0, bound * ca.sign(r))
+        for free, bound, r in zip(left, limit, residual, strict=True)
+    ]
     missing = [-dot([b[k][c] for k in range(n)], fixed) for c in range(2)]
-    rest = _smallest_ratio([[x * free for x in b_k] for b_k, free in zip(b, left, strict=True)], limit, missing)
+    rest = _smallest_ratio(
+        [[x * free for x in b_k] for b_k, free in zip(b, left, strict=True)],
+        limit,
+        missing,
+    )
     return [x + r for x, r in zip(fixed, rest, strict=True)], best
 
 
 def _smallest_ratio(b: list[Vec], limit: list[float], target: Vec) -> Vec:
-    """Solve ``min t, sum_i b_i v_i = target, |v_i| <= t limit_i``; joints with b_i = 0 stay at rest."""
+    """Solve ``min t, sum_i b_i v_i = target, |v_i| <= t limit_i``.
+
+    Joints with b_i = 0 stay at rest.
+    """
     import casadi as ca
 
     n = len(b)
@@ -172,23 +260,39 @@ def _smallest_ratio(b: list[Vec], limit: list[float], target: Vec) -> Vec:
     pivot: Vec = [ca.SX(0), ca.SX(0)]
     for j in range(n):
         normal = [-b[j][1], b[j][0]]
-        weight = sum((limit[k] * ca.fabs(dot(b[k], normal)) for k in range(n) if k != j), 0.0)
+        weight = sum(
+            (limit[k] * ca.fabs(dot(b[k], normal)) for k in range(n) if k != j), 0.0
+        )
         size = dot(normal, normal)
         usable = weight > PARALLEL_TOLERANCE * ca.sqrt(size) * 1e-3
         value = dot(target, normal) / ca.if_else(usable, weight, 1.0)
         better = ca.logic_and(usable, ca.fabs(value) > ratio)
         ratio = ca.if_else(better, ca.fabs(value), ratio)
         sign = ca.if_else(value < 0, -1.0, 1.0)
-        z = [ca.if_else(better, sign * new, old) for new, old in zip(normal, z, strict=True)]
-        pivot = [ca.if_else(better, new, old) for new, old in zip(b[j], pivot, strict=True)]
+        z = [
+            ca.if_else(better, sign * new, old)
+            for new, old in zip(normal, z, strict=True)
+        ]
+        pivot = [
+            ca.if_else(better, new, old) for new, old in zip(b[j], pivot, strict=True)
+        ]
     ratio = ca.fmax(ratio, 0.0)
     length = ca.sqrt(dot(pivot, pivot))
-    parallel = [ca.fabs(dot(x, z)) <= PARALLEL_TOLERANCE * length * ca.sqrt(dot(x, x)) for x in b]
+    parallel = [
+        ca.fabs(dot(x, z)) <= PARALLEL_TOLERANCE * length * ca.sqrt(dot(x, x))
+        for x in b
+    ]
     joints = list(zip(parallel, limit, b, strict=True))
-    v = [ca.if_else(same, 0.0, ratio * bound * ca.sign(dot(x, z))) for same, bound, x in joints]
+    v = [
+        ca.if_else(same, 0.0, ratio * bound * ca.sign(dot(x, z)))
+        for same, bound, x in joints
+    ]
     left = [target[c] - dot([x[c] for x in b], v) for c in range(2)]
     shares = [ca.if_else(same, bound * dot(x, pivot), 0.0) for same, bound, x in joints]
     total = sum(map(ca.fabs, shares), 0.0)
     amount = dot(left, pivot) / ca.if_else(total > 0, total, 1.0)
-    along = [ca.if_else(same, amount * bound * ca.sign(dot(x, pivot)), 0.0) for same, bound, x in joints]
+    along = [
+        ca.if_else(same, amount * bound * ca.sign(dot(x, pivot)), 0.0)
+        for same, bound, x in joints
+    ]
     return [x + w for x, w in zip(v, along, strict=True)]

@@ -8,12 +8,32 @@ from typing import Any
 import numpy as np
 
 from cnpgen.errors import RecipeError
-from cnpgen.kernels.symbolic.kinematics import Kinematics, forward_kinematics, tip_position
-from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, gram, scale, solve, subtract, symbols
+from cnpgen.kernels.symbolic.kinematics import (
+    Kinematics,
+    forward_kinematics,
+    tip_position,
+)
+from cnpgen.kernels.symbolic.linalg import (
+    Scalar,
+    Vec,
+    add,
+    dot,
+    gram,
+    scale,
+    solve,
+    subtract,
+    symbols,
+)
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.stages.candidate_table import upright_axes
 from cnpgen.pipelines.stages.draw import check_reach, uniform
-from cnpgen.pipelines.stages.stage import CandidateBatch, Context, Stage, StageFunction, fraction
+from cnpgen.pipelines.stages.stage import (
+    CandidateBatch,
+    Context,
+    Stage,
+    StageFunction,
+    fraction,
+)
 from cnpgen.robots.plausible_values import find_implausible_value
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import Range, field
@@ -22,9 +42,10 @@ from cnpgen.store.field import Field
 IK_TOLERANCE = 1e-9  # m and rad, before the last step (quadratic convergence, except with joints on their limits)
 MAX_IK_STEPS = 24
 IK_DAMPING = 1e-9
-# Additional damping min(MAX_LIMIT_DAMPING, LIMIT_DAMPING_RATE |e|^2) of the step within joint limits. If the limits
-# leave hardly enough free joints, an undamped step amplifies rounding errors until solutions differ between machines.
-# The damping vanishes with the error e, so convergence stays quadratic.
+# Additional damping min(MAX_LIMIT_DAMPING, LIMIT_DAMPING_RATE |e|^2) of the step within
+# joint limits. If the limits leave hardly enough free joints, an undamped step
+# amplifies rounding errors until solutions differ between machines. The damping
+# vanishes with the error e, so convergence stays quadratic.
 MAX_LIMIT_DAMPING = 1e-2
 LIMIT_DAMPING_RATE = 1e-1
 
@@ -36,39 +57,76 @@ class GuessedIK(Stage):
     Its steps are clipped and saturate at the joint limits.
     """
 
-    orientation: str = field("required orientation of the tip", choices=("free", "vertical"), default="free")
-    max_step: float = field(
-        "maximum change of a joint per iteration", unit="rad", default=0.4, low=1e-3, plausible=np.pi
+    orientation: str = field(
+        "required orientation of the tip", choices=("free", "vertical"), default="free"
     )
-    guess: tuple[Range, ...] = field("box of random guesses; default: the base configuration", unit="rad", default=())
+    max_step: float = field(
+        "maximum change of a joint per iteration",
+        unit="rad",
+        default=0.4,
+        low=1e-3,
+        plausible=np.pi,
+    )
+    guess: tuple[Range, ...] = field(
+        "box of random guesses; default: the base configuration", unit="rad", default=()
+    )
     at_limit: float = fraction(
-        "fraction of the guesses with one random joint held on one of its limits", default=0.0, since_version=2
+        "fraction of the guesses with one random joint held on one of its limits",
+        default=0.0,
+        since_version=2,
     )
 
     def _how(self) -> str:
-        return " with the tip's z axis vertical" if self.orientation == "vertical" else ""
+        return (
+            " with the tip's z axis vertical" if self.orientation == "vertical" else ""
+        )
 
     def _origin(self) -> str:
         """Describe the initial guess."""
         box = " x ".join(f"[{g.low:.4g}, {g.high:.4g}]" for g in self.guess)
-        held = f", with one joint held on a limit in {100 * self.at_limit:.4g} % of the cases" if self.at_limit else ""
-        return (f"a random guess in {box} rad" if self.guess else "the base configuration") + held
+        held = (
+            f", with one joint held on a limit in {100 * self.at_limit:.4g} % of the cases"
+            if self.at_limit
+            else ""
+        )
+        return (
+            f"a random guess in {box} rad" if self.guess else "the base configuration"
+        ) + held
 
-    def _solve(self, context: Context, end: str, initial: str = "guess_q") -> StageFunction:
+    def _solve(
+        self, context: Context, end: str, initial: str = "guess_q"
+    ) -> StageFunction:
         """Return the stage function that solves for the position of an end, from a column of initial positions."""
         hold = initial == "guess_q" and self.at_limit > 0
-        options = {"vertical": self.orientation == "vertical", "max_step": self.max_step, "hold": hold}
-        kernel = context.kernels.load(ik_step, Loop(IK_TOLERANCE, MAX_IK_STEPS), **options)
-        low, high = context.robot.position_lower[:, None], context.robot.position_upper[:, None]
+        options = {
+            "vertical": self.orientation == "vertical",
+            "max_step": self.max_step,
+            "hold": hold,
+        }
+        kernel = context.kernels.load(
+            ik_step, Loop(IK_TOLERANCE, MAX_IK_STEPS), **options
+        )
+        low, high = (
+            context.robot.position_lower[:, None],
+            context.robot.position_upper[:, None],
+        )
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             more = [candidates["held"]] if hold else []
-            more += upright_axes(context, candidates) if self.orientation == "vertical" else []
+            more += (
+                upright_axes(context, candidates)
+                if self.orientation == "vertical"
+                else []
+            )
             q, error = kernel(candidates[initial], candidates[f"{end}_xyz"], *more)
             candidates[f"{end}_q"] = q
-            candidates.reject(error[0] < IK_TOLERANCE, f"no inverse kinematics of the {end}")
+            candidates.reject(
+                error[0] < IK_TOLERANCE, f"no inverse kinematics of the {end}"
+            )
             q = candidates[f"{end}_q"]
-            candidates.reject(((low <= q) & (q <= high)).all(0), f"joint position limit at the {end}")
+            candidates.reject(
+                ((low <= q) & (q <= high)).all(0), f"joint position limit at the {end}"
+            )
 
         return work
 
@@ -85,11 +143,17 @@ class GuessedIK(Stage):
         """Return the stage function that draws initial guesses."""
         robot, n = context.robot, context.robot.n
         if self.guess and len(self.guess) != n:
-            raise RecipeError([f"guess: needs {n} ranges, one per planned joint, got {len(self.guess)}"])
+            raise RecipeError(
+                [
+                    f"guess: needs {n} ranges, one per planned joint, got {len(self.guess)}"
+                ]
+            )
         for index, each in enumerate(() if context.problem.is_stored else self.guess):
             ends = np.full((2, n), robot.home)
             ends[:, index] = each.low, each.high
-            if wrong := find_implausible_value(robot, "guess_q", ends, robot.units("rad")):
+            if wrong := find_implausible_value(
+                robot, "guess_q", ends, robot.units("rad")
+            ):
                 raise RecipeError([f"guess: {robot.joint_names[index]}: {wrong}"])
         guess = self.guess or tuple(Range(float(x), float(x)) for x in robot.home)
 
@@ -97,8 +161,14 @@ class GuessedIK(Stage):
             candidates["guess_q"] = uniform(candidates.draw(random, n), guess)
             if self.at_limit:
                 choice, joint, side = candidates.draw(random, 3)
-                held = (np.arange(n)[:, None] == np.minimum((joint * n).astype(int), n - 1)) & (choice < self.at_limit)
-                limit = np.where(side < 0.5, robot.position_lower[:, None], robot.position_upper[:, None])
+                held = (
+                    np.arange(n)[:, None] == np.minimum((joint * n).astype(int), n - 1)
+                ) & (choice < self.at_limit)
+                limit = np.where(
+                    side < 0.5,
+                    robot.position_lower[:, None],
+                    robot.position_upper[:, None],
+                )
                 candidates["guess_q"] = np.where(held, limit, candidates["guess_q"])
                 candidates["held"] = held.astype(float)
 
@@ -127,7 +197,10 @@ class GoalIK(GuessedIK):
 
     inputs = ("goal_xyz", "start_q")
     guess: tuple[Range, ...] = field(
-        "box of random guesses; default: the start configuration", unit="rad", default=(), since_version=2
+        "box of random guesses; default: the start configuration",
+        unit="rad",
+        default=(),
+        since_version=2,
     )
     from_start: float = fraction(
         "fraction of the goals that start from the start configuration in spite of guesses",
@@ -135,7 +208,11 @@ class GoalIK(GuessedIK):
         since_version=2,
     )
     max_change: float | None = field(
-        "maximum difference of a joint between start and goal", unit="rad", low=1e-3, default=None, since_version=2
+        "maximum difference of a joint between start and goal",
+        unit="rad",
+        low=1e-3,
+        default=None,
+        since_version=2,
     )
 
     def validate(self) -> Iterator[tuple[str, str]]:
@@ -152,7 +229,11 @@ class GoalIK(GuessedIK):
         return f"solve the goal configuration{self._how()} from {origin}"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        return (context.joint_field("goal_q", "rad", "joint positions at the goal", "target"),)
+        return (
+            context.joint_field(
+                "goal_q", "rad", "joint positions at the goal", "target"
+            ),
+        )
 
     def prepare(self, context: Context) -> StageFunction:
         search, max_change = self._search(context), self.max_change
@@ -162,7 +243,9 @@ class GoalIK(GuessedIK):
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             search(candidates, random)
             change = np.abs(candidates["goal_q"] - candidates["start_q"]).max(0)
-            candidates.reject(change <= max_change, "goal configuration too far from the start's")
+            candidates.reject(
+                change <= max_change, "goal configuration too far from the start's"
+            )
 
         return work
 
@@ -174,7 +257,9 @@ class GoalIK(GuessedIK):
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             guess(candidates, random)
             there = candidates.draw(random, 1)[0] < self.from_start
-            candidates["guess_q"] = np.where(there, candidates["start_q"], candidates["guess_q"])
+            candidates["guess_q"] = np.where(
+                there, candidates["start_q"], candidates["guess_q"]
+            )
             if self.at_limit:
                 candidates["held"] = np.where(there, 0.0, candidates["held"])
             solve(candidates, random)
@@ -184,17 +269,23 @@ class GoalIK(GuessedIK):
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
         """Search from the start configuration: goals of tasks are near it."""
         if self.guess:
-            return GoalIK(orientation=self.orientation, max_step=self.max_step).complete(context, given)
+            return GoalIK(
+                orientation=self.orientation, max_step=self.max_step
+            ).complete(context, given)
         return super().complete(context, given)
 
 
-def ik_step(robot: Robot, *, vertical: bool, max_step: float, hold: bool = False) -> Any:
+def ik_step(
+    robot: Robot, *, vertical: bool, max_step: float, hold: bool = False
+) -> Any:
     """Build one step of inverse kinematics as an SX function ``(q, p) -> (next q, |error|)``.
 
-    A joint that would leave its limits is set to the limit. The rest of the step is redistributed once over the other
-    joints; no joint changes more than ``max_step`` [rad]. With ``hold``, a third argument is 1 for joints that stay
-    constant, otherwise 0. With ``vertical``, the tip's z axis must be vertical, too. If parameters of the problem turn
-    the upright direction, the last argument then has three axes, of which the last is the direction, shape (9,).
+    A joint that would leave its limits is set to the limit. The rest of the step is
+    redistributed once over the other joints; no joint changes more than ``max_step``
+    [rad]. With ``hold``, a third argument is 1 for joints that stay constant, otherwise
+    0. With ``vertical``, the tip's z axis must be vertical, too. If parameters of the
+    problem turn the upright direction, the last argument then has three axes, of which
+    the last is the direction, shape (9,).
     """
     import casadi as ca
 
@@ -206,21 +297,36 @@ def ik_step(robot: Robot, *, vertical: bool, max_step: float, hold: bool = False
     turned = vertical and robot.parameters.turns_upright
     axes_sx, axes = symbols("axes", 9)
     if vertical:
-        tilt, tilt_rows = _tilt(kin, [axes[:3], axes[3:6], axes[6:]] if turned else None)
+        tilt, tilt_rows = _tilt(
+            kin, [axes[:3], axes[3:6], axes[6:]] if turned else None
+        )
         error, rows = [*error, *tilt], [*rows, *tilt_rows]
     if hold:
-        rows = [[x * (1 - stays) for x, stays in zip(row, held, strict=True)] for row in rows]
+        rows = [
+            [x * (1 - stays) for x, stays in zip(row, held, strict=True)]
+            for row in rows
+        ]
     square = dot(error, error)
     step, factor = clipped_step(rows, error, max_step, IK_DAMPING)
     target = add(q, step)
     free = [
         ca.logic_and(float(low) <= x, x <= float(high))
-        for x, low, high in zip(target, robot.position_lower, robot.position_upper, strict=True)
+        for x, low, high in zip(
+            target, robot.position_lower, robot.position_upper, strict=True
+        )
     ]
-    moved = [ca.if_else(ok, 0.0, x - at) for ok, x, at in zip(free, clip_to_limits(target, robot), q, strict=True)]
+    moved = [
+        ca.if_else(ok, 0.0, x - at)
+        for ok, x, at in zip(free, clip_to_limits(target, robot), q, strict=True)
+    ]
     rest = [factor * e - dot(row, moved) for e, row in zip(error, rows, strict=True)]
     left = [[x * ok for x, ok in zip(row, free, strict=True)] for row in rows]
-    again, _ = clipped_step(left, rest, max_step, IK_DAMPING + ca.fmin(MAX_LIMIT_DAMPING, LIMIT_DAMPING_RATE * square))
+    again, _ = clipped_step(
+        left,
+        rest,
+        max_step,
+        IK_DAMPING + ca.fmin(MAX_LIMIT_DAMPING, LIMIT_DAMPING_RATE * square),
+    )
     following = clip_to_limits(add(add(q, moved), again), robot)
     given = [q_sx, p_sx, *([held_sx] if hold else []), *([axes_sx] if turned else [])]
     return ca.Function("ik", given, [ca.vertcat(*following), ca.sqrt(square)])
@@ -229,8 +335,9 @@ def ik_step(robot: Robot, *, vertical: bool, max_step: float, hold: bool = False
 def _tilt(kin: Kinematics, frame: list[Vec] | None) -> tuple[Vec, list[Vec]]:
     """Return the angular error of the tip's z axis about x and y of a frame, and its Jacobian rows.
 
-    The frame is the world if it is None. The error is ``z x e_z`` scaled by
-    ``2 / (1 + z_z) = 2 tan(angle / 2) / sin(angle)``, so that the inverted orientation is not a fixed point.
+    The frame is the world if it is None. The error is ``z x e_z`` scaled by ``2 / (1 +
+    z_z) = 2 tan(angle / 2) / sin(angle)``, so that the inverted orientation is not a
+    fixed point.
     """
     import casadi as ca
 
@@ -240,12 +347,18 @@ def _tilt(kin: Kinematics, frame: list[Vec] | None) -> tuple[Vec, list[Vec]]:
         turns_about = [[dot(axis, turning) for axis in frame] for turning in kin.axes]
     stretch = 2.0 / ca.fmax(1.0 + up[2], 1e-3)
     rows = [
-        [axis[row] if turns else 0.0 for axis, turns in zip(turns_about, kin.revolute, strict=True)] for row in range(2)
+        [
+            axis[row] if turns else 0.0
+            for axis, turns in zip(turns_about, kin.revolute, strict=True)
+        ]
+        for row in range(2)
     ]
     return [up[1] * stretch, -up[0] * stretch], rows
 
 
-def clipped_step(rows: list[Vec], error: Vec, max_step: float, damping: Scalar) -> tuple[Vec, Scalar]:
+def clipped_step(
+    rows: list[Vec], error: Vec, max_step: float, damping: Scalar
+) -> tuple[Vec, Scalar]:
     """Return the least-norm step that corrects the error, shortened to ``max_step``, and the factor of shortening."""
     import casadi as ca
 
@@ -260,7 +373,9 @@ def clip_to_limits(q: Vec, robot: Robot) -> Vec:
     """Move joint positions outside their limits to the limits."""
     import casadi as ca
 
-    bounds = zip(q, robot.position_lower.tolist(), robot.position_upper.tolist(), strict=True)
+    bounds = zip(
+        q, robot.position_lower.tolist(), robot.position_upper.tolist(), strict=True
+    )
     return [ca.fmin(ca.fmax(x, low), high) for x, low, high in bounds]
 
 
@@ -270,12 +385,19 @@ class Home(GuessedIK):
 
     inputs = ("start_q", "start_xyz")
     at_start: float = fraction("fraction of homes at the start configuration")
-    at_base: float = fraction("fraction of homes at the base configuration", default=0.0)
-    position: tuple[Range, Range, Range] = field("box of tip positions of the other homes: x, y, z", unit="m")
+    at_base: float = fraction(
+        "fraction of homes at the base configuration", default=0.0
+    )
+    position: tuple[Range, Range, Range] = field(
+        "box of tip positions of the other homes: x, y, z", unit="m"
+    )
 
     def validate(self) -> Iterator[tuple[str, str]]:
         if self.at_start + self.at_base > 1:
-            yield "at_base", f"the fractions must not be more than 1 together, got {self.at_start + self.at_base:g}"
+            yield (
+                "at_base",
+                f"the fractions must not be more than 1 together, got {self.at_start + self.at_base:g}",
+            )
 
     def describe(self) -> str:
         elsewhere = max(1 - self.at_start - self.at_base, 0.0)
@@ -294,7 +416,10 @@ class Home(GuessedIK):
 
     def prepare(self, context: Context) -> StageFunction:
         check_reach(context, (("position", self.position),))
-        guess_home, tip = self._solve_guessed(context, "home"), context.kernels.load(tip_position)
+        guess_home, tip = (
+            self._solve_guessed(context, "home"),
+            context.kernels.load(tip_position),
+        )
         base = context.robot.home[:, None]
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
@@ -303,7 +428,9 @@ class Home(GuessedIK):
             guess_home(candidates, random)
             choice, elsewhere = candidates["home_choice"][0], candidates["home_q"]
             home = np.where(choice < self.at_start + self.at_base, base, elsewhere)
-            candidates["home_q"] = np.where(choice < self.at_start, candidates["start_q"], home)
+            candidates["home_q"] = np.where(
+                choice < self.at_start, candidates["start_q"], home
+            )
             (candidates["home_xyz"],) = tip(candidates["home_q"])
 
         return work
@@ -312,6 +439,9 @@ class Home(GuessedIK):
         """Use the start: goals of tasks are chosen near the start configuration."""
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
-            candidates["home_q"], candidates["home_xyz"] = candidates["start_q"], candidates["start_xyz"]
+            candidates["home_q"], candidates["home_xyz"] = (
+                candidates["start_q"],
+                candidates["start_xyz"],
+            )
 
         return work

@@ -1,9 +1,10 @@
 """Stages: rules of reachability, by which the tip stays over the table.
 
-The paper's ballistic rule checks straight lines along the tip velocity. Full braking is a roll-out forwards in time
-from the start and backwards from the goal. Each step of 10 ms uses the accelerations that decelerate the tip most along
-the normal of the table edge. They satisfy the acceleration and velocity limits and the manifold: a linear program with
-one equality (a continuous knapsack).
+The paper's ballistic rule checks straight lines along the tip velocity. Full braking is
+a roll-out forwards in time from the start and backwards from the goal. Each step of 10
+ms uses the accelerations that decelerate the tip most along the normal of the table
+edge. They satisfy the acceleration and velocity limits and the manifold: a linear
+program with one equality (a continuous knapsack).
 """
 
 from collections.abc import Collection
@@ -14,41 +15,80 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
-from cnpgen.kernels.symbolic.kinematics import bias_acceleration, forward_kinematics, tip_velocity
-from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, scale, subtract, symbols
+from cnpgen.kernels.symbolic.kinematics import (
+    bias_acceleration,
+    forward_kinematics,
+    tip_velocity,
+)
+from cnpgen.kernels.symbolic.linalg import (
+    Scalar,
+    Vec,
+    add,
+    dot,
+    scale,
+    subtract,
+    symbols,
+)
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.stages.candidate_table import on_table, table_corners
-from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction
+from cnpgen.pipelines.stages.stage import (
+    Array,
+    CandidateBatch,
+    Context,
+    Stage,
+    StageFunction,
+)
 from cnpgen.problems.constraints.table import Table
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
 
 BRAKING_STEP_S = 0.01
 MAX_BRAKING_STEPS = 60
-# Ends whose straight line stays over the table for this time can brake (no failure was observed above 46.4 ms).
+# Ends whose straight line stays over the table for this time can brake (no failure was
+# observed above 46.4 ms).
 LOOKAHEAD_S = 0.08
-EDGE_SIDES = np.array([[1.0], [-1.0], [1.0], [-1.0]])  # outward signs of the edges: high and low x, high and low y
+EDGE_SIDES = np.array(
+    [[1.0], [-1.0], [1.0], [-1.0]]
+)  # outward signs of the edges: high and low x, high and low y
 
 
 @dataclass(frozen=True, kw_only=True)
 class BallisticReach(Stage):
     """Stage: the tip at constant velocity, ``p + v t``, stays over the table after the start and around the goal."""
 
-    start_time: float = field("time ahead of the start", unit="s", default=0.0, low=0.0, plausible=5.0)
-    goal_time: float = field("time ahead of the goal and before it", unit="s", default=0.0, low=0.0, plausible=5.0)
+    start_time: float = field(
+        "time ahead of the start", unit="s", default=0.0, low=0.0, plausible=5.0
+    )
+    goal_time: float = field(
+        "time ahead of the goal and before it",
+        unit="s",
+        default=0.0,
+        low=0.0,
+        plausible=5.0,
+    )
 
     @property
     def inputs(self) -> tuple[str, ...]:
         start = ("start_xyz", "start_tip_velocity") if self.start_time else ()
-        return start + (("goal_xyz", "hit_angle", "hit_speed") if self.goal_time else ())
+        return start + (
+            ("goal_xyz", "hit_angle", "hit_speed") if self.goal_time else ()
+        )
 
     def describe(self) -> str:
         rules = []
         if self.start_time:
-            rules.append(f"the start's position + velocity x {1e3 * self.start_time:g} ms")
+            rules.append(
+                f"the start's position + velocity x {1e3 * self.start_time:g} ms"
+            )
         if self.goal_time:
-            rules.append(f"the goal's position +- hit velocity x {1e3 * self.goal_time:g} ms")
-        return "require over the table: " + " and ".join(rules) + " (fast; braking-reach rejects far fewer problems)"
+            rules.append(
+                f"the goal's position +- hit velocity x {1e3 * self.goal_time:g} ms"
+            )
+        return (
+            "require over the table: "
+            + " and ".join(rules)
+            + " (fast; braking-reach rejects far fewer problems)"
+        )
 
     def prepare(self, context: Context) -> StageFunction:
         return self._require(context, "leaves the table")
@@ -58,12 +98,17 @@ class BallisticReach(Stage):
         return self._require(context, "is off the table, or leaves it")
 
     def _require(self, context: Context, reason: str) -> StageFunction:
-        table, varies = context.constraint(Table), context.problem.parameters.changes_rectangle
+        table, varies = (
+            context.constraint(Table),
+            context.problem.parameters.changes_rectangle,
+        )
         sides = [[side.low, side.high] for side in (table.x, table.y)]
         over = context.kernels.load(over_table, sides=None if varies else sides)
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
-            corners = [np.concatenate(table_corners(context, candidates))] if varies else []
+            corners = (
+                [np.concatenate(table_corners(context, candidates))] if varies else []
+            )
             if self.start_time:
                 displacement = self.start_time * candidates["start_tip_velocity"][:2]
                 ahead, _ = over(candidates["start_xyz"][:2], displacement, *corners)
@@ -71,7 +116,9 @@ class BallisticReach(Stage):
             if self.goal_time:
                 goal = on_table(context, candidates, candidates["goal_xyz"])[:2]
                 angle, speed = candidates["hit_angle"], candidates["hit_speed"]
-                velocity = np.concatenate([speed * np.cos(angle), speed * np.sin(angle)])
+                velocity = np.concatenate(
+                    [speed * np.cos(angle), speed * np.sin(angle)]
+                )
                 _, both = over(goal, self.goal_time * velocity, *corners)
                 candidates.reject(both[0] > 0, f"the hit {reason}")
 
@@ -81,16 +128,24 @@ class BallisticReach(Stage):
 def over_table(*, sides: list[list[float]] | None) -> Any:
     """Build ``(p, d) -> (ahead, both)``: whether p + d is over the table, and whether p + d and p - d both are.
 
-    The sides are the bounds of the table along x and y [m]; without them, both corners are a third argument.
+    The sides are the bounds of the table along x and y [m]; without them, both corners
+    are a third argument.
     """
     import casadi as ca
 
-    (p_sx, p), (d_sx, d), (corners_sx, corners) = symbols("p", 2), symbols("d", 2), symbols("corners", 4)
+    (p_sx, p), (d_sx, d), (corners_sx, corners) = (
+        symbols("p", 2),
+        symbols("d", 2),
+        symbols("corners", 4),
+    )
     given = [p_sx, d_sx] if sides else [p_sx, d_sx, corners_sx]
     spans: Any = sides or list(zip(corners[:2], corners[2:], strict=True))
 
     def is_over(position: Vec) -> Scalar:
-        inside = [ca.logic_and(low <= at, at <= high) for at, (low, high) in zip(position, spans, strict=True)]
+        inside = [
+            ca.logic_and(low <= at, at <= high)
+            for at, (low, high) in zip(position, spans, strict=True)
+        ]
         return ca.logic_and(*inside)
 
     ahead, behind = is_over(add(p, d)), is_over(subtract(p, d))
@@ -103,7 +158,11 @@ class BrakingReach(Stage):
 
     inputs = ("start_q", "start_dq", "goal_q", "goal_dq")
     margin: float = field(
-        "distance before the edge at which full braking must end", unit="m", default=1e-3, low=0.0, plausible=1.0
+        "distance before the edge at which full braking must end",
+        unit="m",
+        default=1e-3,
+        low=0.0,
+        plausible=1.0,
     )
 
     def describe(self) -> str:
@@ -116,24 +175,39 @@ class BrakingReach(Stage):
     def prepare(self, context: Context) -> StageFunction:
         table = context.constraint(Table)
         tip = context.kernels.load(tip_state)
-        brake = context.kernels.load(braking_step, Loop(0.5, MAX_BRAKING_STEPS), height=table.z)
+        brake = context.kernels.load(
+            braking_step, Loop(0.5, MAX_BRAKING_STEPS), height=table.z
+        )
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             q = np.concatenate([candidates["start_q"], candidates["goal_q"]], axis=1)
-            dq = np.concatenate([candidates["start_dq"], -candidates["goal_dq"]], axis=1)
-            excess = overshoot(tip, brake, table, q, dq, margin=self.margin).reshape(2, -1)
-            candidates.reject_first(excess <= -self.margin, ["cannot brake at the start", "cannot brake at the goal"])
+            dq = np.concatenate(
+                [candidates["start_dq"], -candidates["goal_dq"]], axis=1
+            )
+            excess = overshoot(tip, brake, table, q, dq, margin=self.margin).reshape(
+                2, -1
+            )
+            candidates.reject_first(
+                excess <= -self.margin,
+                ["cannot brake at the start", "cannot brake at the goal"],
+            )
 
         return work
 
 
 def overshoot(
-    tip: Kernel, brake: Kernel, table: Table, q: Array, dq: Array, *, margin: float = 0.0
+    tip: Kernel,
+    brake: Kernel,
+    table: Table,
+    q: Array,
+    dq: Array,
+    *,
+    margin: float = 0.0,
 ) -> NDArray[np.float64]:
     """Return the overshoot of full braking over the worst edge of the table [m], shape (n,), by both kernels.
 
-    It is -inf if a straight line stays inside by the margin [m] for 80 ms. The states (q, dq) [rad, rad/s] have shape
-    (joints, n) each; those of goals are reversed.
+    It is -inf if a straight line stays inside by the margin [m] for 80 ms. The states
+    (q, dq) [rad, rad/s] have shape (joints, n) each; those of goals are reversed.
     """
     # for both edges across x and across y
     position, velocity = (np.repeat(values[:2], 2, axis=0) for values in tip(q, dq))
@@ -141,15 +215,29 @@ def overshoot(
     ahead = EDGE_SIDES * (position + LOOKAHEAD_S * velocity - edges)
     suspects = (ahead > -margin) & (EDGE_SIDES * velocity > 0)
     worst = np.full(q.shape[1], -np.inf)
-    if not np.count_nonzero(suspects):  # the usual case of single tasks; a fifth of the time of any()
+    if not np.count_nonzero(
+        suspects
+    ):  # the usual case of single tasks; a fifth of the time of any()
         return worst
     for which in np.flatnonzero(suspects.any(axis=1)):
-        suspect, side, edge = np.flatnonzero(suspects[which]), EDGE_SIDES[which, 0], edges[which, 0]
+        suspect, side, edge = (
+            np.flatnonzero(suspects[which]),
+            EDGE_SIDES[which, 0],
+            edges[which, 0],
+        )
         normal = np.zeros((3, len(suspect)))
         normal[which // 2], normal[2] = side, side * edge
-        state = np.concatenate([np.take(q, suspect, 1), np.take(dq, suspect, 1), np.full((1, len(suspect)), -1.0)])
+        state = np.concatenate(
+            [
+                np.take(q, suspect, 1),
+                np.take(dq, suspect, 1),
+                np.full((1, len(suspect)), -1.0),
+            ]
+        )
         final, running = brake(state, normal)
-        worst[suspect] = np.maximum(worst[suspect], np.where(running[0] < 0.5, final[-1], np.inf))
+        worst[suspect] = np.maximum(
+            worst[suspect], np.where(running[0] < 0.5, final[-1], np.inf)
+        )
     return worst
 
 
@@ -159,14 +247,19 @@ def tip_state(robot: Robot) -> Any:
 
     (q_sx, q), (dq_sx, dq) = symbols("q", robot.n), symbols("dq", robot.n)
     kin = forward_kinematics(robot.chain, q)
-    return ca.Function("tip_state", [q_sx, dq_sx], [ca.vertcat(*kin.tip), ca.vertcat(*tip_velocity(kin, dq))])
+    return ca.Function(
+        "tip_state",
+        [q_sx, dq_sx],
+        [ca.vertcat(*kin.tip), ca.vertcat(*tip_velocity(kin, dq))],
+    )
 
 
 def braking_step(robot: Robot, *, height: float) -> Any:
     """Build one step of braking: ``((q, dq, overshoot), (nx, ny, edge)) -> (next state, still running)``.
 
-    ``still running`` is 1 until the tip stops along the normal within the step. ``overshoot`` is then its distance
-    outside ``n . p = edge`` [m]. The roll-out is stabilized to a height [m].
+    ``still running`` is 1 until the tip stops along the normal within the step.
+    ``overshoot`` is then its distance outside ``n . p = edge`` [m]. The roll-out is
+    stabilized to a height [m].
     """
     import casadi as ca
 
@@ -177,17 +270,36 @@ def braking_step(robot: Robot, *, height: float) -> Any:
     velocity, bias = tip_velocity(kin, dq), bias_acceleration(kin, dq)
     along = [edge[0] * column[0] + edge[1] * column[1] for column in kin.jacobian]
     row = [column[2] for column in kin.jacobian]
-    target = -bias[2] - 0.5 * velocity[2] / BRAKING_STEP_S - 0.1 * (kin.tip[2] - height) / BRAKING_STEP_S**2
+    target = (
+        -bias[2]
+        - 0.5 * velocity[2] / BRAKING_STEP_S
+        - 0.1 * (kin.tip[2] - height) / BRAKING_STEP_S**2
+    )
     low, high = _acceleration_box(robot, dq)
     ddq = _knapsack([-x for x in along], row, target, low, high)
     speed = edge[0] * velocity[0] + edge[1] * velocity[1]
     deceleration = -(dot(along, ddq) + edge[0] * bias[0] + edge[1] * bias[1])
-    stops = ca.logic_or(speed <= 0, ca.logic_and(deceleration > 0, speed <= deceleration * BRAKING_STEP_S))
+    stops = ca.logic_or(
+        speed <= 0,
+        ca.logic_and(deceleration > 0, speed <= deceleration * BRAKING_STEP_S),
+    )
     now = edge[0] * kin.tip[0] + edge[1] * kin.tip[1] - edge[2]
-    end = now + ca.if_else(speed > 0, 0.5 * speed * speed / ca.fmax(deceleration, 1e-9), 0.0)
-    following_q = add(q, scale(add(dq, scale(ddq, 0.5 * BRAKING_STEP_S)), BRAKING_STEP_S))
-    following = [*following_q, *add(dq, scale(ddq, BRAKING_STEP_S)), ca.if_else(stops, end, -1.0)]
-    return ca.Function("braking", [state_sx, edge_sx], [ca.vertcat(*following), ca.if_else(stops, 0.0, 1.0)])
+    end = now + ca.if_else(
+        speed > 0, 0.5 * speed * speed / ca.fmax(deceleration, 1e-9), 0.0
+    )
+    following_q = add(
+        q, scale(add(dq, scale(ddq, 0.5 * BRAKING_STEP_S)), BRAKING_STEP_S)
+    )
+    following = [
+        *following_q,
+        *add(dq, scale(ddq, BRAKING_STEP_S)),
+        ca.if_else(stops, end, -1.0),
+    ]
+    return ca.Function(
+        "braking",
+        [state_sx, edge_sx],
+        [ca.vertcat(*following), ca.if_else(stops, 0.0, 1.0)],
+    )
 
 
 def _acceleration_box(robot: Robot, dq: Vec) -> tuple[Vec, Vec]:
@@ -195,7 +307,9 @@ def _acceleration_box(robot: Robot, dq: Vec) -> tuple[Vec, Vec]:
     import casadi as ca
 
     low, high = [], []
-    for rate, most, fastest in zip(dq, robot.acceleration_limit, robot.velocity_limit, strict=True):
+    for rate, most, fastest in zip(
+        dq, robot.acceleration_limit, robot.velocity_limit, strict=True
+    ):
         low.append(ca.fmax(-float(most), (-float(fastest) - rate) / BRAKING_STEP_S))
         high.append(ca.fmin(float(most), (float(fastest) - rate) / BRAKING_STEP_S))
     return low, high
@@ -204,8 +318,9 @@ def _acceleration_box(robot: Robot, dq: Vec) -> tuple[Vec, Vec]:
 def _knapsack(c: Vec, a: Vec, target: Scalar, low: Vec, high: Vec) -> Vec:
     """Maximize ``c . x`` subject to ``a . x = target`` and ``low <= x <= high``.
 
-    All but one x are on a bound, chosen by the sign of ``c - lambda a`` with lambda = c_i / a_i of the remaining x_i.
-    Of these n solutions, the one with the smallest bound violation is the optimum; it is 0 if the problem is feasible.
+    All but one x are on a bound, chosen by the sign of ``c - lambda a`` with lambda =
+    c_i / a_i of the remaining x_i. Of these n solutions, the one with the smallest
+    bound violation is the optimum; it is 0 if the problem is feasible.
     """
     import casadi as ca
 
@@ -214,7 +329,9 @@ def _knapsack(c: Vec, a: Vec, target: Scalar, low: Vec, high: Vec) -> Vec:
     x: Vec = [ca.SX(0)] * n
     for i in range(n):
         ratio = c[i] / a[i]
-        others = [ca.if_else(c[j] - ratio * a[j] > 0, high[j], low[j]) for j in range(n)]
+        others = [
+            ca.if_else(c[j] - ratio * a[j] > 0, high[j], low[j]) for j in range(n)
+        ]
         rest: Scalar = target
         for j in range(n):
             if j != i:

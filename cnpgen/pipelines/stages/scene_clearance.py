@@ -6,8 +6,16 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.collision.body_arrays import LANES, PADDING_DISTANCE_M, obstacle_bodies
-from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CollisionChecker, load_collision_library
+from cnpgen.kernels.collision.body_arrays import (
+    LANES,
+    PADDING_DISTANCE_M,
+    obstacle_bodies,
+)
+from cnpgen.kernels.collision.collision_checker import (
+    MAX_JOINTS,
+    CollisionChecker,
+    load_collision_library,
+)
 from cnpgen.kernels.compiled_kernel import address_of
 from cnpgen.pipelines.resting_states import RestingStates
 from cnpgen.pipelines.stages.batch_scenes import BatchScenes
@@ -40,24 +48,41 @@ class _SceneChecker(CollisionChecker):
         self._boxes = []
         for box, count in zip(boxes, self._counts, strict=True):
             padded = np.zeros((16, count + -count % LANES))
-            padded[:, :fixed], padded[:, fixed:count] = self._fixed_boxes, box[:, : count - fixed]
+            padded[:, :fixed], padded[:, fixed:count] = (
+                self._fixed_boxes,
+                box[:, : count - fixed],
+            )
             padded[:3, count:] = PADDING_DISTANCE_M
             self._boxes.append(padded)
-        self._places = [(address_of(box) if box.size else None, box.shape[1]) for box in self._boxes]
+        self._places = [
+            (address_of(box) if box.size else None, box.shape[1]) for box in self._boxes
+        ]
         self._set("obstacles", together)
-        self._first, self._stride = address_of(self._arrays["obstacles"]), together.strides[0]
+        self._first, self._stride = (
+            address_of(self._arrays["obstacles"]),
+            together.strides[0],
+        )
 
-    def clear_of_scenes(self, q: Array, runs: list[tuple[int, int, int]], limits: tuple[float, float]) -> Mask:
+    def clear_of_scenes(
+        self, q: Array, runs: list[tuple[int, int, int]], limits: tuple[float, float]
+    ) -> Mask:
         """Return a mask of the states q [rad], shape (n, K), with sufficient distances in their scene, shape (K,).
 
-        Runs are scene, first state and end of states in one scene; limits are required distances from obstacles and of
-        links from each other [m], -inf for no check.
+        Runs are scene, first state and end of states in one scene; limits are required
+        distances from obstacles and of links from each other [m], -inf for no check.
         """
         states, clear = np.ascontiguousarray(q.T), np.empty(q.shape[1], np.uint8)
         native, check, address = self._scene, self.library.clear_states, self.address
-        first_state, first_flag, stride = address_of(states), address_of(clear), states.strides[0]
+        first_state, first_flag, stride = (
+            address_of(states),
+            address_of(clear),
+            states.strides[0],
+        )
         for scene, first, end in runs:
-            native.obstacles, native.n_obstacles = self._first + scene * self._stride, self._counts[scene]
+            native.obstacles, native.n_obstacles = (
+                self._first + scene * self._stride,
+                self._counts[scene],
+            )
             native.boxes, native.lanes = self._places[scene]
             place = first_state + first * stride
             check(address, place, end - first, *limits, first_flag + first)
@@ -72,7 +97,9 @@ class SceneClearance:
         self._obstacles = problem.obstacle
         self._obstacle_distance = _required_distance(problem, RobotClearance)
         self._self_distance = _required_distance(problem, SelfClearance)
-        library = load_collision_library(context.kernels) if robot.n <= MAX_JOINTS else None
+        library = (
+            load_collision_library(context.kernels) if robot.n <= MAX_JOINTS else None
+        )
         self._checker: _SceneChecker | None = None
         self._prepared: BatchScenes | None = None
         if library is None:
@@ -82,11 +109,17 @@ class SceneClearance:
         self._checker.place_fixed(problem.own_obstacles)
 
     def are_clear(
-        self, q: Array, scene: NDArray[np.int64], scenes: BatchScenes, margin: float = 0.0, self_margin: float = 0.0
+        self,
+        q: Array,
+        scene: NDArray[np.int64],
+        scenes: BatchScenes,
+        margin: float = 0.0,
+        self_margin: float = 0.0,
     ) -> Mask:
         """Return a mask of the states q [rad], shape (n, K), with sufficient distances in their scene, shape (K,).
 
-        The scenes of the states ascend. Margins [m] are added to the required distances from obstacles and of links.
+        The scenes of the states ascend. Margins [m] are added to the required distances
+        from obstacles and of links.
         """
         if not len(scene):
             return np.zeros(0, bool)
@@ -94,7 +127,12 @@ class SceneClearance:
         runs = [(int(scene[first]), first, end) for first, end in pairwise(bounds)]
         if self._checker is None:
             return np.concatenate(
-                [self._by_coal(q[:, first:end], scenes, run, max(margin, self_margin)) for run, first, end in runs]
+                [
+                    self._by_coal(
+                        q[:, first:end], scenes, run, max(margin, self_margin)
+                    )
+                    for run, first, end in runs
+                ]
             )
         if self._prepared is not scenes:
             self._checker.prepare_scenes(scenes)
@@ -102,11 +140,21 @@ class SceneClearance:
         limits = self._obstacle_distance + margin, self._self_distance + self_margin
         return self._checker.clear_of_scenes(q, runs, limits)
 
-    def _by_coal(self, q: Array, scenes: BatchScenes, scene: int, margin: float) -> Mask:
+    def _by_coal(
+        self, q: Array, scenes: BatchScenes, scene: int, margin: float
+    ) -> Mask:
         self._states.place_solids(solids_of(self._obstacles, scenes.poses[scene]))
         return self._states.are_clear(q, margin=margin)
 
 
-def _required_distance(problem: Problem, kind: type[RobotClearance | SelfClearance]) -> float:
-    """Return the distance that the constraints of a kind require [m]; -inf without such a constraint."""
-    return max((item.distance for item in problem.constraint if isinstance(item, kind)), default=-np.inf)
+def _required_distance(
+    problem: Problem, kind: type[RobotClearance | SelfClearance]
+) -> float:
+    """Return the distance that the constraints of a kind require [m].
+
+    -inf without such a constraint.
+    """
+    return max(
+        (item.distance for item in problem.constraint if isinstance(item, kind)),
+        default=-np.inf,
+    )

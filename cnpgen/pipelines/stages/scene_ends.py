@@ -16,7 +16,15 @@ from cnpgen.pipelines.stages.batch_scenes import BatchScenes
 from cnpgen.pipelines.stages.draw import position_field
 from cnpgen.pipelines.stages.ik import clip_to_limits, clipped_step
 from cnpgen.pipelines.stages.scene_clearance import SceneClearance
-from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Context, Stage, StageFunction, fraction, leave
+from cnpgen.pipelines.stages.stage import (
+    Array,
+    CandidateBatch,
+    Context,
+    Stage,
+    StageFunction,
+    fraction,
+    leave,
+)
 from cnpgen.pipelines.stages.torque import torque_ratio
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
@@ -30,7 +38,9 @@ RANDOM_STATES = 16  # of a scene, most of which collide
 FIRST_PHASES = (0.5, 0.25, 0.75)  # of a straight line, checked first
 OTHER_PHASES = tuple(k / 16 for k in range(1, 16, 2))
 NO_ENDS = "no collision-free start and goal in the scene"
-NUMBERS_PER_PAIR = 5  # random numbers: kind of start, and two for each of two states, less one
+NUMBERS_PER_PAIR = (
+    5  # random numbers: kind of start, and two for each of two states, less one
+)
 # Inverse kinematics of poses
 METERS_PER_RADIAN = 0.3  # weight of an angle against a distance
 POSE_TOLERANCE = 1e-9  # m and weighted rad, before the last step
@@ -45,11 +55,17 @@ class SceneEnds(Stage):
     """Stage: goals at grasps of the scene, and starts at other grasps, near the base configuration or random."""
 
     inputs = ("scene",)
-    neutral: float = fraction("share of starts near the base configuration", default=0.4)
+    neutral: float = fraction(
+        "share of starts near the base configuration", default=0.4
+    )
     grasp: float = fraction("share of starts at another grasp", default=0.4)
     random: float = fraction("share of random starts", default=0.2)
     spread: float = field(
-        "standard deviation of starts around the base configuration", unit="rad", default=0.1, low=0.0, plausible=np.pi
+        "standard deviation of starts around the base configuration",
+        unit="rad",
+        default=0.1,
+        low=0.0,
+        plausible=np.pi,
     )
     margin: float = field(
         "distance of both ends from obstacles, in addition to that of the problem",
@@ -58,7 +74,10 @@ class SceneEnds(Stage):
         low=0.0,
         plausible=1.0,
     )
-    straight: float = fraction("share of the samples whose straight line may be free of collisions", default=0.1)
+    straight: float = fraction(
+        "share of the samples whose straight line may be free of collisions",
+        default=0.1,
+    )
     grasps: int = field("grasps of a scene that are tried", default=8, low=1, high=100)
     poses: int = field("random poses at each grasp", default=12, low=1, high=100)
 
@@ -75,11 +94,19 @@ class SceneEnds(Stage):
         )
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        center, reach = context.robot.chain.joints[0].translation, context.robot.chain.reach
-        low, high = (np.asarray(center) - reach).tolist(), (np.asarray(center) + reach).tolist()
+        center, reach = (
+            context.robot.chain.joints[0].translation,
+            context.robot.chain.reach,
+        )
+        low, high = (
+            (np.asarray(center) - reach).tolist(),
+            (np.asarray(center) + reach).tolist(),
+        )
         return (
             context.joint_field("start_q", "rad", "joint positions at the start"),
-            context.joint_field("goal_q", "rad", "joint positions at the goal", "target"),
+            context.joint_field(
+                "goal_q", "rad", "joint positions at the goal", "target"
+            ),
             position_field("start", low, high),
             position_field("goal", low, high),
         )
@@ -96,9 +123,15 @@ class SceneEnds(Stage):
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             scenes = candidates.scenes
             if scenes is None:  # a plug-in may write the column "scene" without scenes
-                raise RecipeError(["stage 'scene-ends' needs scenes: expected a stage 'draw-scenes' before it"])
+                raise RecipeError(
+                    [
+                        "stage 'scene-ends' needs scenes: expected a stage 'draw-scenes' before it"
+                    ]
+                )
             pools = states.pools(scenes, random)
-            numbers = candidates.draw(random, 1 + NUMBERS_PER_PAIR * MAX_PAIRS_PER_CANDIDATE)
+            numbers = candidates.draw(
+                random, 1 + NUMBERS_PER_PAIR * MAX_PAIRS_PER_CANDIDATE
+            )
             start, goal = states.pairs(scenes, pools, candidates.scene, numbers)
             candidates["start_q"], candidates["goal_q"] = start, goal
             candidates.reject(np.isfinite(start).all(axis=0), NO_ENDS)
@@ -111,27 +144,35 @@ class SceneEnds(Stage):
 class _Pool(NamedTuple):
     """Valid joint positions q [rad], shape (n, M), by scene and group, such as those of one grasp.
 
-    The first state of each group has shape (groups + 1,), the first group of each scene (S + 1,).
+    The first state of each group has shape (groups + 1,), the first group of each scene
+    (S + 1,).
     """
 
     q: Array
     first_state: Indices
     first_group: Indices
 
-    def choose(self, scene: Indices, u: Array, v: Array, other_than: Indices | None = None) -> tuple[Indices, Indices]:
+    def choose(
+        self, scene: Indices, u: Array, v: Array, other_than: Indices | None = None
+    ) -> tuple[Indices, Indices]:
         """Choose a group of each scene and one of its states by random numbers u and v, -1 where there is none.
 
-        All arguments have shape (P,); groups in ``other_than`` are not chosen, -1 excludes none.
+        All arguments have shape (P,); groups in ``other_than`` are not chosen, -1
+        excludes none.
         """
         first = self.first_group[scene]
         count = self.first_group[scene + 1] - first
         excluded = np.full(len(scene), -1) if other_than is None else other_than
         without = count - (excluded >= 0)
-        group = first + np.minimum((u * without).astype(np.int64), np.maximum(without - 1, 0))
+        group = first + np.minimum(
+            (u * without).astype(np.int64), np.maximum(without - 1, 0)
+        )
         group += (excluded >= 0) & (group >= excluded)
         group = np.where(without > 0, group, 0)
         begin = self.first_state[group]
-        size = self.first_state[np.minimum(group + 1, len(self.first_state) - 1)] - begin
+        size = (
+            self.first_state[np.minimum(group + 1, len(self.first_state) - 1)] - begin
+        )
         state = begin + np.minimum((v * size).astype(np.int64), np.maximum(size - 1, 0))
         exists = (without > 0) & (size > 0)
         return np.where(exists, group, -1), np.where(exists, state, -1)
@@ -154,35 +195,64 @@ class _EndStates:
         self._ik: Kernel = context.kernels.load(pose_ik_step, loop)
         self._torque: Kernel = context.kernels.load(torque_ratio)
 
-    def pools(self, scenes: BatchScenes, random: np.random.Generator) -> dict[str, _Pool]:
+    def pools(
+        self, scenes: BatchScenes, random: np.random.Generator
+    ) -> dict[str, _Pool]:
         """Draw states of all scenes and keep the valid ones."""
         robot, count = self._robot, len(scenes)
         low, high = robot.position_lower[:, None], robot.position_upper[:, None]
-        neutral = robot.home[:, None] + self._stage.spread * random.standard_normal((robot.n, count * NEUTRAL_STATES))
+        neutral = robot.home[:, None] + self._stage.spread * random.standard_normal(
+            (robot.n, count * NEUTRAL_STATES)
+        )
         anywhere = low + (high - low) * random.random((robot.n, count * RANDOM_STATES))
         q, key = self._grasp_states(scenes, random)
-        owners = [np.repeat(np.arange(count), each) for each in (NEUTRAL_STATES, RANDOM_STATES)]
+        owners = [
+            np.repeat(np.arange(count), each)
+            for each in (NEUTRAL_STATES, RANDOM_STATES)
+        ]
         states = np.concatenate([q, neutral, anywhere], axis=1)
-        valid = self._are_valid(scenes, states, np.concatenate([key // self._stage.grasps, *owners]))
+        valid = self._are_valid(
+            scenes, states, np.concatenate([key // self._stage.grasps, *owners])
+        )
         masks = np.split(valid, np.cumsum([q.shape[1], neutral.shape[1]]))
-        parts = zip(("grasp", "neutral", "random"), (q, neutral, anywhere), (key, *owners), masks, strict=True)
+        parts = zip(
+            ("grasp", "neutral", "random"),
+            (q, neutral, anywhere),
+            (key, *owners),
+            masks,
+            strict=True,
+        )
         groups = {"grasp": self._stage.grasps, "neutral": 1, "random": 1}
-        return {name: _make_pool(each[:, mask], own[mask], count, groups[name]) for name, each, own, mask in parts}
+        return {
+            name: _make_pool(each[:, mask], own[mask], count, groups[name])
+            for name, each, own, mask in parts
+        }
 
-    def _are_valid(self, scenes: BatchScenes, q: Array, scene: Indices) -> NDArray[np.bool_]:
+    def _are_valid(
+        self, scenes: BatchScenes, q: Array, scene: Indices
+    ) -> NDArray[np.bool_]:
         """Return which states are within limits, can be held, and are clear in their scene, shape (K,)."""
         robot = self._robot
-        valid = ((q >= robot.position_lower[:, None]) & (q <= robot.position_upper[:, None])).all(axis=0)
+        valid = (
+            (q >= robot.position_lower[:, None]) & (q <= robot.position_upper[:, None])
+        ).all(axis=0)
         (ratio,) = self._torque(np.ascontiguousarray(q))
         chosen = np.flatnonzero(valid & (ratio[0] <= 1.0))
         chosen = chosen[np.argsort(scene[chosen], kind="stable")]
-        clear = self._clearance.are_clear(q[:, chosen], scene[chosen], scenes, self._stage.margin)
+        clear = self._clearance.are_clear(
+            q[:, chosen], scene[chosen], scenes, self._stage.margin
+        )
         valid = np.zeros(q.shape[1], bool)
         valid[chosen[clear]] = True
         return valid
 
-    def _grasp_states(self, scenes: BatchScenes, random: np.random.Generator) -> tuple[Array, Indices]:
-        """Solve for poses at random grasps of each scene; return joint positions and keys of the solved ones."""
+    def _grasp_states(
+        self, scenes: BatchScenes, random: np.random.Generator
+    ) -> tuple[Array, Indices]:
+        """Solve for poses at random grasps of each scene.
+
+        Return joint positions and keys of the solved ones.
+        """
         stage, robot, count = self._stage, self._robot, len(scenes)
         order = random.random((count, scenes.grasp_tilt.shape[1]))
         order[np.arange(order.shape[1]) >= scenes.grasp_count[:, None]] = np.inf
@@ -191,14 +261,23 @@ class _EndStates:
         exists = np.take_along_axis(order, chosen, axis=1) < 1.0
         scene, grasp = np.nonzero(exists)
         place = chosen[scene, grasp]
-        u = numbers[:, scene, grasp].reshape(len(numbers), -1)  # pose by pose of every grasp
+        u = numbers[:, scene, grasp].reshape(
+            len(numbers), -1
+        )  # pose by pose of every grasp
         approach, tilt, position = (
             np.repeat(values[scene, place], stage.poses, axis=0)
-            for values in (scenes.grasp_approach, scenes.grasp_tilt, scenes.grasp_position)
+            for values in (
+                scenes.grasp_approach,
+                scenes.grasp_tilt,
+                scenes.grasp_position,
+            )
         )
         rotation = _rotations(approach, tilt, u[:3])
         low, high = robot.position_lower[:, None], robot.position_upper[:, None]
-        lanes = [np.ascontiguousarray(each) for each in (low + (high - low) * u[3:], position.T, rotation)]
+        lanes = [
+            np.ascontiguousarray(each)
+            for each in (low + (high - low) * u[3:], position.T, rotation)
+        ]
         if not len(scene):
             return lanes[0], np.empty(0, np.int64)
         q, error = self._ik(*lanes)
@@ -206,7 +285,11 @@ class _EndStates:
         return q[:, met], np.repeat(scene * stage.grasps + grasp, stage.poses)[met]
 
     def pairs(
-        self, scenes: BatchScenes, pools: dict[str, _Pool], scene: Indices, numbers: Array
+        self,
+        scenes: BatchScenes,
+        pools: dict[str, _Pool],
+        scene: Indices,
+        numbers: Array,
     ) -> tuple[Array, Array]:
         """Return starts and goals of the candidates [rad], nan without one, shape (n, N) each."""
         stage, size = self._stage, (self._robot.n, len(scene))
@@ -215,20 +298,31 @@ class _EndStates:
         used = np.empty(0, np.int64)
         for attempt in range(MAX_PAIRS_PER_CANDIDATE):
             first = 1 + NUMBERS_PER_PAIR * attempt
-            q, aim, key = self._pair(pools, scene[pending], numbers[first : first + NUMBERS_PER_PAIR, pending])
+            q, aim, key = self._pair(
+                pools,
+                scene[pending],
+                numbers[first : first + NUMBERS_PER_PAIR, pending],
+            )
             is_new = _is_first(np.append(used, key))[len(used) :]
             exists = is_new & np.isfinite(q).all(axis=0)
             accepted = exists & may_be_straight[pending]
             lines = np.flatnonzero(exists & ~accepted)
-            accepted[lines] = self._lines_collide(scenes, q[:, lines], aim[:, lines], scene[pending[lines]])
+            accepted[lines] = self._lines_collide(
+                scenes, q[:, lines], aim[:, lines], scene[pending[lines]]
+            )
             used = np.append(used, key[accepted])
-            start[:, pending[accepted]], goal[:, pending[accepted]] = q[:, accepted], aim[:, accepted]
+            start[:, pending[accepted]], goal[:, pending[accepted]] = (
+                q[:, accepted],
+                aim[:, accepted],
+            )
             pending = pending[~accepted]
             if not len(pending):
                 break
         return start, goal
 
-    def _pair(self, pools: dict[str, _Pool], scene: Indices, u: Array) -> tuple[Array, Array, Indices]:
+    def _pair(
+        self, pools: dict[str, _Pool], scene: Indices, u: Array
+    ) -> tuple[Array, Array, Indices]:
         """Choose a start and a goal of each scene, nan without one, shape (n, P) each, and a key of each pair."""
         group, target = pools["grasp"].choose(scene, u[0], u[1])
         chosen = {
@@ -238,20 +332,31 @@ class _EndStates:
         }
         ends = np.cumsum([getattr(self._stage, name) for name in chosen])
         kind = np.minimum(np.searchsorted(ends, u[2], side="right"), len(ends) - 1)
-        start = np.choose(kind, [_taken(pools[name].q, state) for name, state in chosen.items()])
+        start = np.choose(
+            kind, [_taken(pools[name].q, state) for name, state in chosen.items()]
+        )
         state = np.choose(kind, list(chosen.values()))
         goal = _taken(pools["grasp"].q, target)
         key = (target * len(ends) + kind) * 2**31 + state
         return np.where(np.isfinite(goal), start, np.nan), goal, key
 
-    def _lines_collide(self, scenes: BatchScenes, start: Array, goal: Array, scene: Indices) -> NDArray[np.bool_]:
-        """Return which straight lines have a state that is not clear, shape (P,); a few states are checked."""
+    def _lines_collide(
+        self, scenes: BatchScenes, start: Array, goal: Array, scene: Indices
+    ) -> NDArray[np.bool_]:
+        """Return which straight lines have a state that is not clear, shape (P,).
+
+        A few states are checked.
+        """
         collides = np.zeros(len(scene), bool)
         for phases in (FIRST_PHASES, OTHER_PHASES):
             rest = np.flatnonzero(~collides)
-            line = start[:, rest, None] + (goal - start)[:, rest, None] * np.array(phases)
+            line = start[:, rest, None] + (goal - start)[:, rest, None] * np.array(
+                phases
+            )
             states = np.ascontiguousarray(line.reshape(len(start), -1))
-            clear = self._clearance.are_clear(states, np.repeat(scene[rest], len(phases)), scenes)
+            clear = self._clearance.are_clear(
+                states, np.repeat(scene[rest], len(phases)), scenes
+            )
             collides[rest] = ~clear.reshape(-1, len(phases)).all(axis=1)
         return collides
 
@@ -271,11 +376,18 @@ def _is_first(key: Indices) -> NDArray[np.bool_]:
 
 
 def _rotations(approach: Array, tilt: Array, u: Array) -> Array:
-    """Return rotations, by rows, whose z axis is within a tilt of the approach; u are random numbers, shape (3, K)."""
+    """Return rotations, by rows, whose z axis is within a tilt of the approach.
+
+    U are random numbers, shape (3, K).
+    """
     cosine = 1 - u[0] * (1 - np.cos(tilt))
     sine, angle, roll = np.sqrt(1 - cosine**2), 2 * np.pi * u[1], 2 * np.pi * u[2]
     first, second = _across(approach)
-    z = (sine * np.cos(angle))[:, None] * first + (sine * np.sin(angle))[:, None] * second + cosine[:, None] * approach
+    z = (
+        (sine * np.cos(angle))[:, None] * first
+        + (sine * np.sin(angle))[:, None] * second
+        + cosine[:, None] * approach
+    )
     first, second = _across(z)
     x = np.cos(roll)[:, None] * first + np.sin(roll)[:, None] * second
     y = np.cross(z, x)
@@ -293,23 +405,41 @@ def _across(axis: Array) -> tuple[Array, Array]:
 def pose_ik_step(robot: Robot) -> Any:
     """Build ``(q, position, rotation by rows) -> (next q, |error|)``; steps end at the joint limits.
 
-    The error is the distance from the position, and the rotation vector to the rotation times ``METERS_PER_RADIAN``,
-    stretched to twice the tangent of half the angle, so that rotations by 180 degrees are no fixed point.
+    The error is the distance from the position, and the rotation vector to the rotation
+    times ``METERS_PER_RADIAN``, stretched to twice the tangent of half the angle, so
+    that rotations by 180 degrees are no fixed point.
     """
     import casadi as ca
 
-    (q_sx, q), (p_sx, p), (r_sx, r) = symbols("q", robot.n), symbols("p", 3), symbols("r", 9)
+    (q_sx, q), (p_sx, p), (r_sx, r) = (
+        symbols("q", robot.n),
+        symbols("p", 3),
+        symbols("r", 9),
+    )
     kin = forward_kinematics(robot.chain, q)
     target = [r[0:3], r[3:6], r[6:9]]
-    relative = [[dot(a, b) for b in kin.rotation] for a in target]  # target times the transposed rotation
+    relative = [
+        [dot(a, b) for b in kin.rotation] for a in target
+    ]  # target times the transposed rotation
     trace = relative[0][0] + relative[1][1] + relative[2][2]
     stretch = METERS_PER_RADIAN * 2.0 / ca.fmax(1.0 + trace, 1e-2)
-    turn = [relative[2][1] - relative[1][2], relative[0][2] - relative[2][0], relative[1][0] - relative[0][1]]
+    turn = [
+        relative[2][1] - relative[1][2],
+        relative[0][2] - relative[2][0],
+        relative[1][0] - relative[0][1],
+    ]
     error = [*subtract(p, kin.tip), *scale(turn, stretch)]
-    axes = [axis if turns else [0.0] * 3 for axis, turns in zip(kin.axes, kin.revolute, strict=True)]
+    axes = [
+        axis if turns else [0.0] * 3
+        for axis, turns in zip(kin.axes, kin.revolute, strict=True)
+    ]
     rows = [[column[row] for column in kin.jacobian] for row in range(3)]
     rows += [[METERS_PER_RADIAN * axis[row] for axis in axes] for row in range(3)]
     square = dot(error, error)
-    step, _ = clipped_step(rows, error, MAX_POSE_IK_STEP_RAD, POSE_DAMPING * square + MIN_DAMPING)
+    step, _ = clipped_step(
+        rows, error, MAX_POSE_IK_STEP_RAD, POSE_DAMPING * square + MIN_DAMPING
+    )
     following = clip_to_limits(add(q, step), robot)
-    return ca.Function("pose_ik", [q_sx, p_sx, r_sx], [ca.vertcat(*following), ca.sqrt(square)])
+    return ca.Function(
+        "pose_ik", [q_sx, p_sx, r_sx], [ca.vertcat(*following), ca.sqrt(square)]
+    )

@@ -55,9 +55,15 @@ class Context:
         if (constraint := self.problem.first(kind)) is not None:
             return constraint
         name = registry.name_of(registry.CONSTRAINTS, kind)
-        raise RecipeError([f"needs a constraint {name!r}, which the problem {self.problem.path} does not have"])
+        raise RecipeError(
+            [
+                f"needs a constraint {name!r}, which the problem {self.problem.path} does not have"
+            ]
+        )
 
-    def joint_field(self, name: str, unit: str, long_name: str, role: str = "input") -> Field:
+    def joint_field(
+        self, name: str, unit: str, long_name: str, role: str = "input"
+    ) -> Field:
         """Describe a field with one column per planned joint, bounded by the planning limits of its unit.
 
         Args:
@@ -74,30 +80,40 @@ class Context:
         }[unit]
         low, high = (tuple(float(x) for x in bound) for bound in bounds)
         return Field(
-            name, robot.units(unit), long_name, robot.n, robot.joint_names, role, valid_min=low, valid_max=high
+            name,
+            robot.units(unit),
+            long_name,
+            robot.n,
+            robot.joint_names,
+            role,
+            valid_min=low,
+            valid_max=high,
         )
 
 
-def load_context(problem: Problem, backend: Backend, cache_folder: Path, dtype: str = "float64") -> Context:
+def load_context(
+    problem: Problem, backend: Backend, cache_folder: Path, dtype: str = "float64"
+) -> Context:
     """Load the robot of a problem and open its kernel library."""
     robot = load_robot(problem)
-    return Context(problem, robot, problem_kernels(problem, robot, backend, cache_folder), dtype)
+    return Context(
+        problem, robot, problem_kernels(problem, robot, backend, cache_folder), dtype
+    )
 
 
 class CandidateBatch:
     """Batch of candidates and the columns of the remaining ones.
 
-    Attributes:
-        size: Number of candidates in the batch, N.
-        alive: Indices of the remaining candidates in the batch, shape (n,), ascending.
-        outcome: 0 for remaining candidates, otherwise 1 + the index of the rejection reason, shape (N,).
-        reasons: Rejection reasons, in order of first use.
-        columns: Name -> values of the remaining candidates, shape (width, n), contiguous rows.
-        stage: Label of the current stage.
-        origins: Reason -> label of the stage that used it first.
-        drawn: Name -> values of all candidates, shape (width, N), for columns written before any rejection.
-        last: Whether this is the last batch of the pipeline, so that all its candidates are counted.
-        scenes: Scenes of the candidates, whose column ``scene`` has the index of the scene of each, or None.
+    Attributes: size: Number of candidates in the batch, N. alive: Indices of the
+        remaining candidates in the batch, shape (n,), ascending. outcome: 0 for
+        remaining candidates, otherwise 1 + the index of the rejection reason, shape
+        (N,). reasons: Rejection reasons, in order of first use. columns: Name -> values
+        of the remaining candidates, shape (width, n), contiguous rows. stage: Label of
+        the current stage. origins: Reason -> label of the stage that used it first.
+        drawn: Name -> values of all candidates, shape (width, N), for columns written
+        before any rejection. last: Whether this is the last batch of the pipeline, so
+        that all its candidates are counted. scenes: Scenes of the candidates, whose
+        column ``scene`` has the index of the scene of each, or None.
     """
 
     def __init__(self, size: int, *, last: bool = False) -> None:
@@ -122,15 +138,24 @@ class CandidateBatch:
 
     def __setitem__(self, name: str, values: Array) -> None:
         if values.ndim != 2 or values.shape[1] != len(self.alive):
-            raise ValueError(f"column {name!r} must have shape (width, {len(self.alive)}), got {values.shape}")
+            raise ValueError(
+                f"column {name!r} must have shape (width, {len(self.alive)}), got {values.shape}"
+            )
         self.columns[name] = values
         if len(self.alive) == self.size:
             self.drawn[name] = values
 
     def draw(self, random: np.random.Generator, width: int) -> Array:
-        """Draw uniform numbers in [0, 1) for all N candidates; return those of the remaining ones, shape (width, n)."""
+        """Draw uniform numbers in [0, 1) for all N candidates.
+
+        Return those of the remaining ones, shape (width, n).
+        """
         numbers = random.random((width, self.size))
-        return numbers if len(self.alive) == self.size else np.take(numbers, self.alive, axis=1)
+        return (
+            numbers
+            if len(self.alive) == self.size
+            else np.take(numbers, self.alive, axis=1)
+        )
 
     def reject(self, ok: Any, reason: str) -> None:
         """Reject the candidates with a false ``ok``, shape (n,), under a reason, and drop them from every column."""
@@ -152,7 +177,9 @@ class CandidateBatch:
         self.outcome[self.alive[~ok]] = numbers[met[:, ~ok].argmin(axis=0)]
         keep = np.flatnonzero(ok)
         self.alive = self.alive[keep]
-        self.columns = {name: np.take(values, keep, axis=1) for name, values in self.columns.items()}
+        self.columns = {
+            name: np.take(values, keep, axis=1) for name, values in self.columns.items()
+        }
 
 
 StageFunction = Callable[[CandidateBatch, np.random.Generator], None]
@@ -163,12 +190,13 @@ StageFunction = Callable[[CandidateBatch, np.random.Generator], None]
 class Stage(ABC):
     """One step of a pipeline.
 
-    A kind of stage is a frozen dataclass whose fields are the keys of its ``[[stage]]`` table. It is registered under
-    a name in cnpgen's registry or by a package's entry point in the group ``cnpgen.stages``.
+    A kind of stage is a frozen dataclass whose fields are the keys of its ``[[stage]]``
+    table. It is registered under a name in cnpgen's registry or by a package's entry
+    point in the group ``cnpgen.stages``.
 
-    Attributes:
-        block_rows: Maximum number of rows per block; expensive stages use smaller blocks.
-        replaces: Columns that later stages compute again. For tasks, earlier stages that write or read them
+    Attributes: block_rows: Maximum number of rows per block; expensive stages use
+        smaller blocks. replaces: Columns that later stages compute again. For tasks,
+        earlier stages that write or read them
             are omitted.
         draws_scenes: Whether it sets ``CandidateBatch.scenes``.
     """
@@ -179,12 +207,18 @@ class Stage(ABC):
 
     @property
     def tasks(self) -> int | None:
-        """Number of listed tasks, each of which is used once; None for unlimited random candidates."""
+        """Number of listed tasks, each of which is used once.
+
+        None for unlimited random candidates.
+        """
         return None
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Columns that earlier stages must write; a class attribute if they are independent of the keys."""
+        """Columns that earlier stages must write.
+
+        A class attribute if they are independent of the keys.
+        """
         return ()
 
     @abstractmethod
@@ -196,7 +230,10 @@ class Stage(ABC):
         return ()
 
     def writes(self, context: Context) -> tuple[str, ...]:
-        """List the columns that this stage writes, stored or not; by default its outputs."""
+        """List the columns that this stage writes, stored or not.
+
+        By default its outputs.
+        """
         return tuple(field.name for field in self.outputs(context))
 
     @abstractmethod
@@ -206,20 +243,26 @@ class Stage(ABC):
         Args:
             context: Problem, robot and kernel library.
 
-        Returns:
-            A function of (candidates, random) that writes columns of a batch and rejects candidates of it. It must draw
-            random numbers with ``candidates.draw`` only.
+        Returns: A function of (candidates, random) that writes columns of a batch and
+            rejects candidates of it. It must draw random numbers with
+            ``candidates.draw`` only.
         """
 
     def task_inputs(self, context: Context) -> tuple[Field, ...]:
-        """List the fields that tasks may give instead; by default all outputs except diagnostics."""
-        return tuple(field for field in self.outputs(context) if field.role != "diagnostic")
+        """List the fields that tasks may give instead.
+
+        By default all outputs except diagnostics.
+        """
+        return tuple(
+            field for field in self.outputs(context) if field.role != "diagnostic"
+        )
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
         """Prepare the stage for tasks: keep the given columns and compute the missing ones.
 
-        By default the stage does nothing if all its task inputs are given, and runs as usual if none is given. Its
-        random numbers are then replaced by their mean (see ``TaskBatch``).
+        By default the stage does nothing if all its task inputs are given, and runs as
+        usual if none is given. Its random numbers are then replaced by their mean (see
+        ``TaskBatch``).
 
         Args:
             context: Problem, robot and kernel library.
@@ -229,9 +272,14 @@ class Stage(ABC):
             UsageError: Some but not all task inputs of the stage are given.
         """
         names = [field.name for field in self.task_inputs(context)]
-        known, missing = [name for name in names if name in given], [name for name in names if name not in given]
+        known, missing = (
+            [name for name in names if name in given],
+            [name for name in names if name not in given],
+        )
         if known and missing:
-            raise UsageError(f"{', '.join(known)}: tasks that give this must also give {', '.join(missing)}")
+            raise UsageError(
+                f"{', '.join(known)}: tasks that give this must also give {', '.join(missing)}"
+            )
         return leave if known else self.prepare(context)
 
 
@@ -247,7 +295,8 @@ def leave(candidates: CandidateBatch, random: np.random.Generator) -> None:
 class TaskBatch(CandidateBatch):
     """Batch of tasks instead of random candidates.
 
-    All random numbers are replaced by their mean. The result of a task is therefore independent of the other tasks.
+    All random numbers are replaced by their mean. The result of a task is therefore
+    independent of the other tasks.
     """
 
     def draw(self, random: np.random.Generator, width: int) -> Array:
@@ -255,6 +304,9 @@ class TaskBatch(CandidateBatch):
         return np.full((width, len(self.alive)), 0.5)
 
     def why(self) -> tuple[str, ...]:
-        """Return the rejection reason of each of the N tasks; empty for solved tasks."""
+        """Return the rejection reason of each of the N tasks.
+
+        Empty for solved tasks.
+        """
         texts = ["", *self.reasons]
         return tuple(texts[outcome] for outcome in self.outcome.tolist())

@@ -25,13 +25,20 @@ class GravityTorque(Stage):
         return (f"{self.end}_q",)
 
     def describe(self) -> str:
-        return (
-            f"require that the torque that holds the {self.end} configuration, payload included, is within its limits"
-        )
+        return f"require that the torque that holds the {self.end} configuration, payload included, is within its limits"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
         text = f"largest holding torque at the {self.end}, as a fraction of its planning limit"
-        return (Field(f"{self.end}_torque_ratio", "1", text, role="diagnostic", valid_min=(0.0,), valid_max=(1.0,)),)
+        return (
+            Field(
+                f"{self.end}_torque_ratio",
+                "1",
+                text,
+                role="diagnostic",
+                valid_min=(0.0,),
+                valid_max=(1.0,),
+            ),
+        )
 
     def prepare(self, context: Context) -> StageFunction:
         kernel = context.kernels.load(torque_ratio)
@@ -49,9 +56,15 @@ def torque_ratio(robot: Robot) -> Any:
     """Build ``q -> max_i |gravity torque_i| / limit_i``, with the problem's parameters ``(q, parameters) -> ...``."""
     import casadi as ca
 
-    (q_sx, q), (parameters_sx, parameters) = symbols("q", robot.n), symbols("parameters", len(robot.parameters))
+    (q_sx, q), (parameters_sx, parameters) = (
+        symbols("q", robot.n),
+        symbols("parameters", len(robot.parameters)),
+    )
     zero = [0.0] * robot.n
     torque = SymbolicState(robot, q, zero, zero, parameters, (), None).torque
-    ratios = (ca.fabs(value) / limit for value, limit in zip(torque, robot.torque_limit.tolist(), strict=True))
+    ratios = (
+        ca.fabs(value) / limit
+        for value, limit in zip(torque, robot.torque_limit.tolist(), strict=True)
+    )
     arguments = [q_sx, parameters_sx] if parameters else [q_sx]
     return ca.Function("torque_ratio", arguments, [reduce(ca.fmax, ratios, ca.SX(0))])

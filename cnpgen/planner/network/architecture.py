@@ -41,7 +41,9 @@ class Layer:
 
     def weight(self, parameters: Array) -> Array:
         """Return a view of W, shape (inputs, outputs), of a vector of all parameters."""
-        return parameters[self.start : self.stop - self.outputs].reshape(self.inputs, self.outputs)
+        return parameters[self.start : self.stop - self.outputs].reshape(
+            self.inputs, self.outputs
+        )
 
     def bias(self, parameters: Array) -> Array:
         """Return a view of b, shape (outputs,), of a vector of all parameters."""
@@ -52,11 +54,9 @@ class Layer:
 class Architecture:
     """A trunk of tanh layers, a configuration head of two tanh layers, and a time head of one layer and exp.
 
-    Attributes:
-        inputs: Number of features.
-        hidden: Width of the trunk and of the configuration head.
-        layers: Depth of the trunk.
-        path_outputs: Outputs of the configuration head (the paper's phi): interior points times joints.
+    Attributes: inputs: Number of features. hidden: Width of the trunk and of the
+        configuration head. layers: Depth of the trunk. path_outputs: Outputs of the
+        configuration head (the paper's phi): interior points times joints.
         rate_outputs: Outputs of the time head: logarithms of the control points of r.
     """
 
@@ -79,7 +79,9 @@ class Architecture:
         """The tanh layers shared by both heads."""
         layers: list[Layer] = []
         for index in range(self.layers):
-            inputs, start = (layers[-1].outputs, layers[-1].stop) if layers else (self.inputs, 0)
+            inputs, start = (
+                (layers[-1].outputs, layers[-1].stop) if layers else (self.inputs, 0)
+            )
             layers.append(Layer(f"trunk_{index}", inputs, self.hidden, start))
         return tuple(layers)
 
@@ -88,7 +90,11 @@ class Architecture:
         """Hidden and output layer of the configuration head, and the layer of the time head."""
         hidden = Layer("path_hidden", self.hidden, self.hidden, self.trunk[-1].stop)
         path = Layer("path_output", self.hidden, self.path_outputs, hidden.stop)
-        return hidden, path, Layer("rate_output", self.hidden, self.rate_outputs, path.stop)
+        return (
+            hidden,
+            path,
+            Layer("rate_output", self.hidden, self.rate_outputs, path.stop),
+        )
 
     @property
     def all_layers(self) -> tuple[Layer, ...]:
@@ -97,7 +103,10 @@ class Architecture:
 
     def split(self, parameters: Array) -> Weights:
         """Return views of W and b of every layer, of a vector of all parameters, shape (n_parameters,)."""
-        return tuple((layer.weight(parameters), layer.bias(parameters)) for layer in self.all_layers)
+        return tuple(
+            (layer.weight(parameters), layer.bias(parameters))
+            for layer in self.all_layers
+        )
 
     @property
     def n_parameters(self) -> int:
@@ -105,18 +114,25 @@ class Architecture:
         return self.heads[-1].stop
 
 
-def initial_parameters(architecture: Architecture, *, seed: int, head_scale: float, rate_bias: float) -> Array:
+def initial_parameters(
+    architecture: Architecture, *, seed: int, head_scale: float, rate_bias: float
+) -> Array:
     """Draw parameters by Glorot's uniform distribution; biases are zero except that of the time head.
 
-    With small last layers, by the factor ``head_scale`` of both heads' last weights, an untrained network plans the
-    straight line at a constant rate. The bias of the time head is the logarithm of (expected time / duration).
+    With small last layers, by the factor ``head_scale`` of both heads' last weights, an
+    untrained network plans the straight line at a constant rate. The bias of the time
+    head is the logarithm of (expected time / duration).
     """
     random = np.random.Generator(np.random.Philox(key=seed))
     parameters = np.zeros(architecture.n_parameters, np.float32)
     _, path, rate = architecture.heads
     for layer in architecture.all_layers:
-        bound = np.sqrt(6 / (layer.inputs + layer.outputs)) * (head_scale if layer in {path, rate} else 1.0)
-        layer.weight(parameters)[:] = random.uniform(-bound, bound, (layer.inputs, layer.outputs))
+        bound = np.sqrt(6 / (layer.inputs + layer.outputs)) * (
+            head_scale if layer in {path, rate} else 1.0
+        )
+        layer.weight(parameters)[:] = random.uniform(
+            -bound, bound, (layer.inputs, layer.outputs)
+        )
     rate.bias(parameters)[:] = rate_bias
     return parameters
 
@@ -125,11 +141,11 @@ def initial_parameters(architecture: Architecture, *, seed: int, head_scale: flo
 class Activations:
     """Outputs of every layer for N inputs, as needed by the backward pass.
 
-    Attributes:
-        trunk: The input and every trunk layer's output, shape (N, inputs) and (N, hidden).
-        path_hidden: The configuration head's hidden layer, shape (N, hidden).
-        path: The configuration head, in (-1, 1), shape (N, path_outputs): the paper's phi.
-        log_rate: The time head before its exponential, shape (N, rate_outputs).
+    Attributes: trunk: The input and every trunk layer's output, shape (N, inputs) and
+        (N, hidden). path_hidden: The configuration head's hidden layer, shape (N,
+        hidden). path: The configuration head, in (-1, 1), shape (N, path_outputs): the
+        paper's phi. log_rate: The time head before its exponential, shape (N,
+        rate_outputs).
     """
 
     trunk: tuple[Array, ...]
@@ -147,7 +163,9 @@ def forward(weights: Weights, features: Array) -> Activations:
     hidden = _tanh_layer(hidden_weights, trunk[-1])
     log_rate = trunk[-1] @ rate_weight
     log_rate += rate_bias
-    return Activations(tuple(trunk), hidden, _tanh_layer(path_weights, hidden), log_rate)
+    return Activations(
+        tuple(trunk), hidden, _tanh_layer(path_weights, hidden), log_rate
+    )
 
 
 def _tanh_layer(layer: tuple[Array, Array], x: Array) -> Array:
@@ -159,11 +177,17 @@ def _tanh_layer(layer: tuple[Array, Array], x: Array) -> Array:
 
 
 def backward(
-    weights: Weights, activations: Activations, *, path_gradient: Array, log_rate_gradient: Array, out: Weights
+    weights: Weights,
+    activations: Activations,
+    *,
+    path_gradient: Array,
+    log_rate_gradient: Array,
+    out: Weights,
 ) -> None:
     """Write the gradient of a scalar with respect to all weights to ``out``.
 
-    The gradients are those with respect to ``path`` and ``log_rate`` of the activations, and have their shapes.
+    The gradients are those with respect to ``path`` and ``log_rate`` of the
+    activations, and have their shapes.
     """
     top, hidden = activations.trunk[-1], activations.path_hidden
     gradient = _through_tanh(path_gradient, activations.path)

@@ -1,6 +1,7 @@
 """The network's inputs: start and goal states and derived values, standardized by the training rows.
 
-Features of the obstacles that samples place do not depend on their order: they are signed distances at points.
+Features of the obstacles that samples place do not depend on their order: they are
+signed distances at points.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ PARAMETERS = "parameters"  # only for problems with parameters
 LINE = "line"  # only if the network corrects its own path
 BLOCKS = (*USUAL, ARRIVAL, PARAMETERS, SCENE, LINE)
 FEATURE_SETS = ("full", "no-scene", "states", "paper")
-MIN_DEVIATION = 1e-7  # SI units; features with a smaller standard deviation are constant
+MIN_DEVIATION = (
+    1e-7  # SI units; features with a smaller standard deviation are constant
+)
 PATH_PHASES = 12  # states of the path
 STEP_RAD = 0.15  # rad or m: of every joint to both sides of the path
 RANGE_M = 0.12  # clearance below which points count
@@ -50,10 +53,9 @@ TASKS_PER_BLOCK = 256
 class Features:
     """Standardized features.
 
-    Attributes:
-        blocks: Selected names of ``BLOCKS``, in order.
-        mean: Mean of every feature over the training rows, shape (F,).
-        scale: Reciprocal of the standard deviation; 0 for constant features, shape (F,).
+    Attributes: blocks: Selected names of ``BLOCKS``, in order. mean: Mean of every
+        feature over the training rows, shape (F,). scale: Reciprocal of the standard
+        deviation; 0 for constant features, shape (F,).
     """
 
     blocks: tuple[str, ...]
@@ -69,27 +71,41 @@ class Features:
 
 
 def feature_blocks(
-    boundary: Boundary, features: str = "full", *, placed: bool = False, iterated: bool = False
+    boundary: Boundary,
+    features: str = "full",
+    *,
+    placed: bool = False,
+    iterated: bool = False,
 ) -> tuple[str, ...]:
     """Return the feature blocks of tasks with such boundary conditions, for one of ``FEATURE_SETS``.
 
-    These are all blocks ("full"), all but those of placed obstacles ("no-scene"), or boundary states ("states",
-    "paper"). Samples may place obstacles, and the network may correct its own path (``iterated``).
+    These are all blocks ("full"), all but those of placed obstacles ("no-scene"), or
+    boundary states ("states", "paper"). Samples may place obstacles, and the network
+    may correct its own path (``iterated``).
     """
     blocks = USUAL if features in {"full", "no-scene"} else STATES
     optional = {ARRIVAL: boundary.goal_ddq, PARAMETERS: boundary.parameters}
-    blocks = (*blocks, *(name for name, values in optional.items() if values is not None))
+    blocks = (
+        *blocks,
+        *(name for name, values in optional.items() if values is not None),
+    )
     blocks = (*blocks, SCENE) if placed and features == "full" else blocks
     return (*blocks, LINE) if iterated else blocks
 
 
-def published_features(blocks: tuple[str, ...], velocity_limit: Array, acceleration_limit: Array) -> Features:
+def published_features(
+    blocks: tuple[str, ...], velocity_limit: Array, acceleration_limit: Array
+) -> Features:
     """Return states divided by pi and by the limits (paper, section on the neural network: normalized states).
 
-    The paper does not define the normalization; this one is that of the authors' implementation. Limits are those of
-    planning [rad/s, rad/s^2], shape (n,).
+    The paper does not define the normalization; this one is that of the authors'
+    implementation. Limits are those of planning [rad/s, rad/s^2], shape (n,).
     """
-    units = {"q": np.full_like(velocity_limit, np.pi), "dq": velocity_limit, "ddq": acceleration_limit}
+    units = {
+        "q": np.full_like(velocity_limit, np.pi),
+        "dq": velocity_limit,
+        "ddq": acceleration_limit,
+    }
     scale = np.concatenate([1 / units[name.partition("_")[2]] for name in blocks])
     return Features(blocks, np.zeros_like(scale), scale)
 
@@ -101,7 +117,9 @@ def fit_features(parts: Iterable[Tasks], blocks: tuple[str, ...] = USUAL) -> Fea
         raw = raw_features(tasks, blocks)
         line = 0 if tasks.correction is None else tasks.correction[:1].size
         new, total = raw.mean(axis=0) - mean, count + len(raw)
-        squares = squares + raw.var(axis=0) * len(raw) + new**2 * (count * len(raw) / total)  # Chan et al., 1983
+        squares = (
+            squares + raw.var(axis=0) * len(raw) + new**2 * (count * len(raw) / total)
+        )  # Chan et al., 1983
         count, mean = total, mean + new * (len(raw) / total)
     deviation = np.sqrt(squares / count)
     constant = deviation < MIN_DEVIATION
@@ -126,10 +144,24 @@ def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
     return np.concatenate(parts, axis=1, dtype=np.float64)
 
 
-def count_features(blocks: tuple[str, ...], joints: int, parameters: int = 0, line: int = 0) -> int:
-    """Return the number of features of some of ``BLOCKS``; ``line`` counts coordinates of interior control points."""
-    widths = {**dict.fromkeys((*STATES, ARRIVAL), joints), "sin_cos": 4 * joints, "tips": 6}
-    widths |= {"expected_time": 1, PARAMETERS: parameters, SCENE: count_scene_features(joints), LINE: line}
+def count_features(
+    blocks: tuple[str, ...], joints: int, parameters: int = 0, line: int = 0
+) -> int:
+    """Return the number of features of some of ``BLOCKS``.
+
+    ``line`` counts coordinates of interior control points.
+    """
+    widths = {
+        **dict.fromkeys((*STATES, ARRIVAL), joints),
+        "sin_cos": 4 * joints,
+        "tips": 6,
+    }
+    widths |= {
+        "expected_time": 1,
+        PARAMETERS: parameters,
+        SCENE: count_scene_features(joints),
+        LINE: line,
+    }
     return sum(widths[name] for name in blocks)
 
 
@@ -148,7 +180,9 @@ def _block(tasks: Tasks, name: str) -> tuple[Array, ...]:
         return (tasks.observation,)
     if name == LINE and tasks.correction is not None:
         return (tasks.correction.reshape(len(tasks), -1),)
-    raise ValueError(f"unknown feature block {name!r}: expected one of {', '.join(BLOCKS)}")
+    raise ValueError(
+        f"unknown feature block {name!r}: expected one of {', '.join(BLOCKS)}"
+    )
 
 
 def count_scene_features(joints: int) -> int:
@@ -170,23 +204,30 @@ def link_points(robot: Robot) -> Any:
     for capsule in robot.shape.moving_capsules:
         first, second, _ = capsules[capsule.link]
         for share in _shares(capsule):
-            points += [(1 - share) * a + share * b for a, b in zip(first, second, strict=True)]
+            points += [
+                (1 - share) * a + share * b for a, b in zip(first, second, strict=True)
+            ]
     return ca.Function("link_points", [q_sx], [ca.vertcat(*points)])
 
 
 def _shares(capsule: Capsule) -> list[float]:
     """Return the places of the points on a capsule's axis, as shares of its length."""
     length = float(np.linalg.norm(np.subtract(capsule.second, capsule.first)))
-    return np.linspace(0, 1, int(np.ceil(length / POINT_SPACING_M)) + 1).tolist() if length > 0 else [0.5]
+    return (
+        np.linspace(0, 1, int(np.ceil(length / POINT_SPACING_M)) + 1).tolist()
+        if length > 0
+        else [0.5]
+    )
 
 
 @dataclass(frozen=True)
 class SceneFeatures:
     """Features of the obstacles of tasks, made by ``make_scene_features``.
 
-    At some phases of a path they are the smallest clearance of points of the links, the sum of what their clearances
-    lack of ``RANGE_M``, and its differences if each joint moves by ``STEP_RAD`` to both sides. The others are signed
-    distances at the points of ``BASIS``.
+    At some phases of a path they are the smallest clearance of points of the links, the
+    sum of what their clearances lack of ``RANGE_M``, and its differences if each joint
+    moves by ``STEP_RAD`` to both sides. The others are signed distances at the points
+    of ``BASIS``.
 
     Attributes:
         points: Kernel of ``link_points``.
@@ -208,7 +249,9 @@ class SceneFeatures:
             bodies = scene_primitives(scene[rows])
             along = self._along(path[rows], bodies)
             around = self.backend.distances(bodies, BASIS.positions)
-            features[rows] = np.concatenate([along, np.clip(around, MIN_DISTANCE_M, MAX_DISTANCE_M)], axis=1)
+            features[rows] = np.concatenate(
+                [along, np.clip(around, MIN_DISTANCE_M, MAX_DISTANCE_M)], axis=1
+            )
         return features
 
     def _along(self, path: Array, bodies: Primitives) -> Array:
@@ -218,18 +261,45 @@ class SceneFeatures:
         states = ((self.path @ path)[:, :, None] + steps).reshape(-1, n)
         (columns,) = self.points(np.ascontiguousarray(states.T))
         points = columns.T.reshape(count, -1, 3)
-        distances = self.backend.distances(bodies, points).reshape(count, PATH_PHASES, 2 * n + 1, -1) - self.radii
+        distances = (
+            self.backend.distances(bodies, points).reshape(
+                count, PATH_PHASES, 2 * n + 1, -1
+            )
+            - self.radii
+        )
         near = np.maximum(RANGE_M - distances, 0).sum(axis=-1)
-        smallest = np.clip(distances[:, :, 0].min(axis=-1), MIN_DISTANCE_M, MAX_DISTANCE_M)
-        parts = smallest[..., None], near[:, :, :1], near[:, :, 1 : n + 1] - near[:, :, n + 1 :]
+        smallest = np.clip(
+            distances[:, :, 0].min(axis=-1), MIN_DISTANCE_M, MAX_DISTANCE_M
+        )
+        parts = (
+            smallest[..., None],
+            near[:, :, :1],
+            near[:, :, 1 : n + 1] - near[:, :, n + 1 :],
+        )
         return np.concatenate(parts, axis=2).reshape(count, -1)
 
 
-def make_scene_features(robot: Robot, spec: TrajectorySpec, kernels: KernelLibrary) -> SceneFeatures:
-    """Load the features of a robot's scenes; raise UsageError for a robot without link geometry."""
+def make_scene_features(
+    robot: Robot, spec: TrajectorySpec, kernels: KernelLibrary
+) -> SceneFeatures:
+    """Load the features of a robot's scenes.
+
+    Raise UsageError for a robot without link geometry.
+    """
     if robot.shape is None:
-        raise UsageError('features of scenes need geometry = "urdf" in [robot]', concerns="problem")
-    radii = [capsule.radius for capsule in robot.shape.moving_capsules for _ in _shares(capsule)]
+        raise UsageError(
+            'features of scenes need geometry = "urdf" in [robot]', concerns="problem"
+        )
+    radii = [
+        capsule.radius
+        for capsule in robot.shape.moving_capsules
+        for _ in _shares(capsule)
+    ]
     phases = (np.arange(PATH_PHASES) + 1) / (PATH_PHASES + 1)
     path = basis(phases, spec.path_control_points, spec.degree)
-    return SceneFeatures(kernels.load(link_points), np.array(radii), observation_backend(kernels.backend), path)
+    return SceneFeatures(
+        kernels.load(link_points),
+        np.array(radii),
+        observation_backend(kernels.backend),
+        path,
+    )

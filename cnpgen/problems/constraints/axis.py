@@ -22,12 +22,14 @@ if TYPE_CHECKING:
 class TipAxis(Constraint):
     """Base class: the tip's axis a is along the world direction d: ``e1 . R a = e2 . R a = 0`` and ``d . R a > 0``.
 
-    e1 and e2 are orthogonal to d: ``1 - d . R a`` has no gradient at the solution. The two values are the components of
-    the tilt [rad] to first order. The verdict limits the angle between both, so the tolerance of each component is that
-    of the angle divided by the square root of 2.
+    e1 and e2 are orthogonal to d: ``1 - d . R a`` has no gradient at the solution. The
+    two values are the components of the tilt [rad] to first order. The verdict limits
+    the angle between both, so the tolerance of each component is that of the angle
+    divided by the square root of 2.
 
-    Parameters of the problem may turn d and change the tolerance. Vectors are then along axes that turn with d, and the
-    tilt of motions is multiplied by the ratio of the tolerances, so that the bounds are the same for all samples.
+    Parameters of the problem may turn d and change the tolerance. Vectors are then
+    along axes that turn with d, and the tilt of motions is multiplied by the ratio of
+    the tolerances, so that the bounds are the same for all samples.
     """
 
     training_weight = 300.0
@@ -70,7 +72,16 @@ class TipAxis(Constraint):
         angle = np.arctan2(np.hypot(*tilt.g), upright.g[0])
         tolerance = world.parameters.values.get(UPRIGHT_TOLERANCE)
         accepted = None if tolerance is None else np.array([float(tolerance)])
-        return (replace(tilt, g=[angle], lower=np.zeros(1), upper=np.zeros(1), parts=(), accepted=accepted),)
+        return (
+            replace(
+                tilt,
+                g=[angle],
+                lower=np.zeros(1),
+                upper=np.zeros(1),
+                parts=(),
+                accepted=accepted,
+            ),
+        )
 
     def allowed(self, condition: Condition) -> Array:
         """Return the tolerance of the angle, or of each of its components."""
@@ -80,21 +91,33 @@ class TipAxis(Constraint):
 
     def _symbolic_axis(self, state: "SymbolicState") -> list[Any]:
         axis, _ = self.directions
-        return state.along_upright([along(axis, row) for row in state.kinematics.rotation])
+        return state.along_upright(
+            [along(axis, row) for row in state.kinematics.rotation]
+        )
 
     def _measured_axis(self, world: "World") -> list[Any]:
         axis, _ = self.directions
-        return list(world.parameters.along_upright([along(axis, row) for row in world.tip_rotation]))
+        return list(
+            world.parameters.along_upright(
+                [along(axis, row) for row in world.tip_rotation]
+            )
+        )
 
-    def _held(self, pointing: Sequence[Any], parameters: Mapping[str, Any]) -> tuple[Condition, ...]:
+    def _held(
+        self, pointing: Sequence[Any], parameters: Mapping[str, Any]
+    ) -> tuple[Condition, ...]:
         """State the tilt of an axis, which is given along axes that turn with the direction."""
         tilt = [along(row, pointing) for row in self.across]
         if (tolerance := parameters.get(UPRIGHT_TOLERANCE)) is not None:
             tilt = [value * (self.tolerance / tolerance) for value in tilt]
         upright = [along(self.directions[1], pointing)]
         return (
-            Condition("tilt", "rad", tilt, np.zeros(2), np.zeros(2), "angle", ("x", "y")),
-            Condition("upright", "1", upright, np.zeros(1), np.full(1, np.inf), "angle"),
+            Condition(
+                "tilt", "rad", tilt, np.zeros(2), np.zeros(2), "angle", ("x", "y")
+            ),
+            Condition(
+                "upright", "1", upright, np.zeros(1), np.full(1, np.inf), "angle"
+            ),
         )
 
 
@@ -103,10 +126,25 @@ class Axis(TipAxis):
     """Constraint: a tip axis is within an angle of a direction, or aligned with it and at rest at the ends."""
 
     reason = "tool tilted"
-    axis: Vector = field("axis in the tip frame, of any length", default=(0.0, 0.0, 1.0))
-    direction: Vector = field("direction in the world, of any length", default=(0.0, 0.0, 1.0))
-    angle: float = field("maximum angle between axis and direction", unit="rad", default=0.0, low=0.0, high=1.5)
-    tolerance: float = field("additional angle that a valid motion may have", unit="rad", low=1e-9, plausible=1.0)
+    axis: Vector = field(
+        "axis in the tip frame, of any length", default=(0.0, 0.0, 1.0)
+    )
+    direction: Vector = field(
+        "direction in the world, of any length", default=(0.0, 0.0, 1.0)
+    )
+    angle: float = field(
+        "maximum angle between axis and direction",
+        unit="rad",
+        default=0.0,
+        low=0.0,
+        high=1.5,
+    )
+    tolerance: float = field(
+        "additional angle that a valid motion may have",
+        unit="rad",
+        low=1e-9,
+        plausible=1.0,
+    )
 
     def __post_init__(self) -> None:
         """Check both directions; ValueError if one is zero or not finite."""
@@ -116,7 +154,9 @@ class Axis(TipAxis):
     @cached_property
     def directions(self) -> tuple[list[float], list[float]]:
         """The axis in the tip's frame and the direction in the world, unit vectors."""
-        return unit(self.axis, "axis").tolist(), unit(self.direction, "direction").tolist()
+        return unit(self.axis, "axis").tolist(), unit(
+            self.direction, "direction"
+        ).tolist()
 
     @property
     def nominal_tolerance(self) -> float:
@@ -133,46 +173,96 @@ class Axis(TipAxis):
         """Evaluate the angle between axis and direction [rad], or its cosine for a range of angles."""
         if not self.angle:
             return super().judged(world)
-        (condition,), angle = self._held(self._measured_axis(world), {}), world.parameters.values.get(UPRIGHT_TOLERANCE)
+        (condition,), angle = (
+            self._held(self._measured_axis(world), {}),
+            world.parameters.values.get(UPRIGHT_TOLERANCE),
+        )
         if angle is None:
             return (condition,)
-        return (replace(condition, lower=np.cos([angle]), accepted=np.array([self._cosine_tolerance(angle)])),)
+        return (
+            replace(
+                condition,
+                lower=np.cos([angle]),
+                accepted=np.array([self._cosine_tolerance(angle)]),
+            ),
+        )
 
     def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:
         """State the tilt and, for an aligned axis, its rates."""
         if self.angle:
             return self.symbolic(state)
-        turning = map(state.along_upright, (state.tip_angular_velocity, state.tip_angular_acceleration))
-        return (*super().symbolic_at(state, end), *self._resting(self._symbolic_axis(state), *turning))
+        turning = map(
+            state.along_upright,
+            (state.tip_angular_velocity, state.tip_angular_acceleration),
+        )
+        return (
+            *super().symbolic_at(state, end),
+            *self._resting(self._symbolic_axis(state), *turning),
+        )
 
     def measured_at(self, world: "World", end: End) -> tuple[Condition, ...]:
         """Evaluate the tilt and, for an aligned axis, its rates."""
         if self.angle:
             return self.measured(world)
-        turning = map(world.parameters.along_upright, (world.tip_angular_velocity, world.tip_angular_acceleration))
-        return (*super().measured_at(world, end), *self._resting(self._measured_axis(world), *map(list, turning)))
+        turning = map(
+            world.parameters.along_upright,
+            (world.tip_angular_velocity, world.tip_angular_acceleration),
+        )
+        return (
+            *super().measured_at(world, end),
+            *self._resting(self._measured_axis(world), *map(list, turning)),
+        )
 
-    def _held(self, pointing: Sequence[Any], parameters: Mapping[str, Any]) -> tuple[Condition, ...]:
+    def _held(
+        self, pointing: Sequence[Any], parameters: Mapping[str, Any]
+    ) -> tuple[Condition, ...]:
         if not self.angle:
             return super()._held(pointing, parameters)
         cosine, least = along(self.directions[1], pointing), np.cos(self.angle)
         if (angle := parameters.get(UPRIGHT_TOLERANCE)) is not None:
             ratio = self._cosine_tolerance(self.angle) / self._cosine_tolerance(angle)
             cosine = least + (cosine - _cosine(angle)) * ratio
-        return (Condition("tilt cosine", "1", [cosine], np.full(1, least), np.full(1, np.inf), "angle"),)
+        return (
+            Condition(
+                "tilt cosine",
+                "1",
+                [cosine],
+                np.full(1, least),
+                np.full(1, np.inf),
+                "angle",
+            ),
+        )
 
     def _cosine_tolerance(self, angle: Any) -> Any:
         """Return by how much the cosine of a valid tilt may be below that of an angle; ``angle`` may be a symbol."""
         return _cosine(angle) - _cosine(angle + self.tolerance)
 
-    def _resting(self, u: Sequence[Any], omega: Sequence[Any], alpha: Sequence[Any]) -> tuple[Condition, ...]:
+    def _resting(
+        self, u: Sequence[Any], omega: Sequence[Any], alpha: Sequence[Any]
+    ) -> tuple[Condition, ...]:
         """Return the rates of the axis u orthogonal to the direction, from ``w x u`` and ``a x u + w x (w x u)``."""
         rate = _cross(omega, u)
-        second = [a + b for a, b in zip(_cross(alpha, u), _cross(omega, rate), strict=True)]
+        second = [
+            a + b for a, b in zip(_cross(alpha, u), _cross(omega, rate), strict=True)
+        ]
         zero, rows = np.zeros(2), self.across
         return (
-            Condition("tilt rate", "rad/s", [along(row, rate) for row in rows], zero, zero, "velocity"),
-            Condition("tilt acceleration", "rad/s^2", [along(row, second) for row in rows], zero, zero, "acceleration"),
+            Condition(
+                "tilt rate",
+                "rad/s",
+                [along(row, rate) for row in rows],
+                zero,
+                zero,
+                "velocity",
+            ),
+            Condition(
+                "tilt acceleration",
+                "rad/s^2",
+                [along(row, second) for row in rows],
+                zero,
+                zero,
+                "acceleration",
+            ),
         )
 
 
@@ -184,7 +274,9 @@ class Vertical(TipAxis):
     """
 
     reason = "not vertical"
-    tolerance: float = field("tilt that a valid motion may have", unit="rad", low=1e-9, plausible=1.0)
+    tolerance: float = field(
+        "tilt that a valid motion may have", unit="rad", low=1e-9, plausible=1.0
+    )
 
     @cached_property
     def directions(self) -> tuple[list[float], list[float]]:
@@ -193,11 +285,22 @@ class Vertical(TipAxis):
 
 
 def _cosine(angle: Any) -> Any:
-    """Return the cosine of an angle, -1 above a half turn; ``angle`` may be a symbol."""
+    """Return the cosine of an angle, -1 above a half turn.
+
+    ``angle`` may be a symbol.
+    """
     import casadi as ca
 
-    return np.cos(min(angle, np.pi)) if isinstance(angle, float) else ca.cos(ca.fmin(angle, np.pi))
+    return (
+        np.cos(min(angle, np.pi))
+        if isinstance(angle, float)
+        else ca.cos(ca.fmin(angle, np.pi))
+    )
 
 
 def _cross(a: Sequence[Any], b: Sequence[Any]) -> list[Any]:
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    return [
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    ]

@@ -34,21 +34,38 @@ class DistanceConstraint(Constraint):
     bodies: ClassVar[str]
 
     def _at_least(
-        self, distances: list[Any], least: Any, *, parts: tuple[str, ...] = (), sufficient: bool = False
+        self,
+        distances: list[Any],
+        least: Any,
+        *,
+        parts: tuple[str, ...] = (),
+        sufficient: bool = False,
     ) -> tuple[Condition, ...]:
         """State that m distances are at least one bound, or m [m]."""
         m = len(distances)
         lower, upper = np.full(m, least, float), np.full(m, np.inf)
-        return (Condition(self.condition_name, "m", distances, lower, upper, "position", parts, sufficient),)
+        return (
+            Condition(
+                self.condition_name,
+                "m",
+                distances,
+                lower,
+                upper,
+                "position",
+                parts,
+                sufficient,
+            ),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotClearance(DistanceConstraint):
     """Constraint: the robot is further than ``distance`` from every obstacle.
 
-    With the paper's geometry the robot consists of capsules along the chain (Appendix B, robot collision). Unlike the
-    paper's points every 10 cm, capsules have no gaps. With the URDF's geometry, judges use the convex parts of the
-    links. Solvers use the links' capsules, which is conservative.
+    With the paper's geometry the robot consists of capsules along the chain (Appendix
+    B, robot collision). Unlike the paper's points every 10 cm, capsules have no gaps.
+    With the URDF's geometry, judges use the convex parts of the links. Solvers use the
+    links' capsules, which is conservative.
     """
 
     reason, condition_name, bodies = "robot in collision", "robot clearance", "robot"
@@ -61,7 +78,11 @@ class RobotClearance(DistanceConstraint):
         plausible=2.0,
     )
     distance: float = optional_key(
-        "minimum distance of the robot from obstacles", unit="m", low=0.0, default=0.0, plausible=2.0
+        "minimum distance of the robot from obstacles",
+        unit="m",
+        low=0.0,
+        default=0.0,
+        plausible=2.0,
     )
     tolerance: float = field(
         "violation that a valid motion may have; links may enter obstacles by 0.1 mm, the paper's capsules by all"
@@ -73,8 +94,15 @@ class RobotClearance(DistanceConstraint):
 
     @property
     def effective_tolerance(self) -> float:
-        """Tolerance up to a penetration of ``MAX_LINK_PENETRATION_M``; with the paper's capsules all of it."""
-        limit = np.inf if self.radius is not None else self.distance + MAX_LINK_PENETRATION_M
+        """Tolerance up to a penetration of ``MAX_LINK_PENETRATION_M``.
+
+        With the paper's capsules all of it.
+        """
+        limit = (
+            np.inf
+            if self.radius is not None
+            else self.distance + MAX_LINK_PENETRATION_M
+        )
         return min(self.tolerance, limit)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
@@ -82,7 +110,11 @@ class RobotClearance(DistanceConstraint):
         from cnpgen.kernels.symbolic.obstacle_distances import symbolic_solids
 
         (segments, radii), solids = self._capsules(state), symbolic_solids(state)
-        distances = [solid.separation(a, b, state.freeze) for a, b in segments for solid in solids]
+        distances = [
+            solid.separation(a, b, state.freeze)
+            for a, b in segments
+            for solid in solids
+        ]
         return self._clear(distances, radii, sufficient=_is_cautious(state))
 
     def penalized(self, state: "SymbolicState") -> tuple[Condition, ...]:
@@ -90,7 +122,11 @@ class RobotClearance(DistanceConstraint):
         from cnpgen.kernels.symbolic.obstacle_distances import symbolic_solids
 
         (segments, radii), solids = self._capsules(state), symbolic_solids(state)
-        distances = [solid.smooth_separation(a, b, state.freeze) for a, b in segments for solid in solids]
+        distances = [
+            solid.smooth_separation(a, b, state.freeze)
+            for a, b in segments
+            for solid in solids
+        ]
         return self._clear(distances, radii, sufficient=_is_cautious(state))
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
@@ -98,16 +134,32 @@ class RobotClearance(DistanceConstraint):
         shape = world.robot.shape
         if shape is None:
             radius = self.radius or 0.0
-            (found,) = self._clear(world.segment_distances(radius + self.distance), [radius])
-            bodies = [f"segment {number}" for number, _ in enumerate(world.robot.capsule_axes, 1)]
+            (found,) = self._clear(
+                world.segment_distances(radius + self.distance), [radius]
+            )
+            bodies = [
+                f"segment {number}"
+                for number, _ in enumerate(world.robot.capsule_axes, 1)
+            ]
         else:
             (found,) = self._clear(world.shape_distances(self.distance), [0.0])
             bodies = [piece.link for piece in shape.moving_convex_parts]
-        return (replace(found, parts=tuple(f"{body}, {box.name}" for body in bodies for box in world.obstacles)),)
+        return (
+            replace(
+                found,
+                parts=tuple(
+                    f"{body}, {box.name}" for body in bodies for box in world.obstacles
+                ),
+            ),
+        )
 
     def met(self, path: "PathWorld", tolerance: float) -> NDArray[np.bool_] | None:
         """Return a mask of the states with sufficient distance of the convex parts from the obstacles."""
-        return path.pairs(self.bodies).clear_states(self.distance - tolerance) if path.robot.shape else None
+        return (
+            path.pairs(self.bodies).clear_states(self.distance - tolerance)
+            if path.robot.shape
+            else None
+        )
 
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions of the capsules."""
@@ -115,9 +167,13 @@ class RobotClearance(DistanceConstraint):
         if shape is None and not _has_poses(world.obstacles):
             return self.measured(world)
         capsules = (
-            [self.radius or 0.0] * len(capsule_axes) if shape is None else [c.radius for c in shape.moving_capsules]
+            [self.radius or 0.0] * len(capsule_axes)
+            if shape is None
+            else [c.radius for c in shape.moving_capsules]
         )
-        return self._clear([0.0] * (len(capsules) * len(world.obstacles)), capsules, sufficient=True)
+        return self._clear(
+            [0.0] * (len(capsules) * len(world.obstacles)), capsules, sufficient=True
+        )
 
     def _capsules(self, state: "SymbolicState") -> tuple[list[Any], list[float]]:
         """Return both ends of the axes of all moving capsules, and their radii [m]."""
@@ -125,9 +181,13 @@ class RobotClearance(DistanceConstraint):
         if shape is None:
             return state.segments, [self.radius or 0.0] * len(state.segments)
         moving = [state.capsules[capsule.link] for capsule in shape.moving_capsules]
-        return [(first, second) for first, second, _ in moving], [radius for *_, radius in moving]
+        return [(first, second) for first, second, _ in moving], [
+            radius for *_, radius in moving
+        ]
 
-    def _clear(self, distances: list[Any], radii: list[float], *, sufficient: bool = False) -> tuple[Condition, ...]:
+    def _clear(
+        self, distances: list[Any], radii: list[float], *, sufficient: bool = False
+    ) -> tuple[Condition, ...]:
         """State that the distance of every capsule axis is at least its radius plus ``distance``."""
         least = np.repeat(radii, len(distances) // max(len(radii), 1)) + self.distance
         return self._at_least(distances, least, sufficient=sufficient)
@@ -140,15 +200,28 @@ class ObjectContact(DistanceConstraint):
     reason, condition_name, bodies = "object in collision", "object contact", "object"
     training_weight, training_inset = 3e4, 5e-4  # the inset in m
     depth: float = field("depth of legal contact", unit="m", low=0.0, plausible=0.5)
-    tolerance: float = field("additional depth that a valid motion may have", unit="m", low=0.0, plausible=0.5)
+    tolerance: float = field(
+        "additional depth that a valid motion may have",
+        unit="m",
+        low=0.0,
+        plausible=0.5,
+    )
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the separation of the object from every obstacle [m]."""
         from cnpgen.kernels.symbolic.obstacle_distances import symbolic_solids
 
-        kin, size, solids = state.kinematics, state.object_size or (0.0, 0.0, 0.0), symbolic_solids(state)
-        distances = [solid.cuboid_separation(kin.tip, kin.rotation, size) for solid in solids]
-        return self._at_least(distances, -self.depth, sufficient=_has_poses(state.obstacles))
+        kin, size, solids = (
+            state.kinematics,
+            state.object_size or (0.0, 0.0, 0.0),
+            symbolic_solids(state),
+        )
+        distances = [
+            solid.cuboid_separation(kin.tip, kin.rotation, size) for solid in solids
+        ]
+        return self._at_least(
+            distances, -self.depth, sufficient=_has_poses(state.obstacles)
+        )
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Measure the signed distances with Coal [m]."""
@@ -156,7 +229,11 @@ class ObjectContact(DistanceConstraint):
 
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions on the solver's shapes of the obstacles."""
-        return self._at_least([0.0] * len(world.obstacles), -self.depth, sufficient=_has_poses(world.obstacles))
+        return self._at_least(
+            [0.0] * len(world.obstacles),
+            -self.depth,
+            sufficient=_has_poses(world.obstacles),
+        )
 
 
 def _is_cautious(state: "SymbolicState") -> bool:

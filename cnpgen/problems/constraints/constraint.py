@@ -46,16 +46,15 @@ BOUNDARY_TOLERANCES: dict[str, dict[str, float]] = {
 class Condition:
     """Condition ``lower <= g <= upper`` on one state.
 
-    Attributes:
-        name: Name in messages and reports.
-        unit: SI unit of g, or one per value, as ``units_of_joints`` names them.
-        g: m values: SX scalars in the symbolic form, floats in the measured form.
-        lower: Lower bounds, shape (m,), -inf for no bound.
-        upper: Upper bounds, shape (m,); equal to ``lower`` for equalities.
-        tolerance: Key of ``BOUNDARY_TOLERANCES``, the tolerances of boundary states.
-        parts: Names of the m values; empty for numbered values.
-        sufficient: Whether the condition is conservative: only the measured form can prove a violation.
-        accepted: Violation that a valid motion may have if it differs from sample to sample, shape (m,).
+    Attributes: name: Name in messages and reports. unit: SI unit of g, or one per
+        value, as ``units_of_joints`` names them. g: m values: SX scalars in the
+        symbolic form, floats in the measured form. lower: Lower bounds, shape (m,),
+        -inf for no bound. upper: Upper bounds, shape (m,); equal to ``lower`` for
+        equalities. tolerance: Key of ``BOUNDARY_TOLERANCES``, the tolerances of
+        boundary states. parts: Names of the m values; empty for numbered values.
+        sufficient: Whether the condition is conservative: only the measured form can
+        prove a violation. accepted: Violation that a valid motion may have if it
+        differs from sample to sample, shape (m,).
     """
 
     name: str
@@ -79,7 +78,8 @@ class Condition:
         if self.tolerance_kind != "limit":
             return np.full(len(self.g), exact)
         size = np.maximum(
-            np.abs(np.nan_to_num(self.lower, posinf=0, neginf=0)), np.abs(np.nan_to_num(self.upper, posinf=0, neginf=0))
+            np.abs(np.nan_to_num(self.lower, posinf=0, neginf=0)),
+            np.abs(np.nan_to_num(self.upper, posinf=0, neginf=0)),
         )
         return exact * np.maximum(size, 1.0)
 
@@ -94,26 +94,28 @@ class Condition:
 class Constraint(ABC):
     """Constraint on every state of a motion, and on its ends.
 
-    A kind is a frozen dataclass whose fields are the keys of its ``[[constraint]]`` table in ``problem.toml``. It is
-    registered under a name in cnpgen's registry or by a package's entry point in the group ``cnpgen.constraints``.
+    A kind is a frozen dataclass whose fields are the keys of its ``[[constraint]]``
+    table in ``problem.toml``. It is registered under a name in cnpgen's registry or by
+    a package's entry point in the group ``cnpgen.constraints``.
 
-    The unit of ``tolerance`` depends on the kind (unit of the condition, or fraction of a limit), so a kind declares it
-    again with ``cnpgen.plugins.field``.
+    The unit of ``tolerance`` depends on the kind (unit of the condition, or fraction of
+    a limit), so a kind declares it again with ``cnpgen.plugins.field``.
 
-    Attributes:
-        reason: Rejection reason of samples that violate the constraint.
-        boundary_reason: Rejection reason of samples whose ends violate it; by default ``reason``.
-        kinks: Phases at which its ``bound_relaxation`` is not smooth; the verdict checks these.
-        uses_jerk: Whether it uses the jerk, which is computed only for problems with such a constraint.
-        training_weight: Initial weight of the violation in training; None for ``WEIGHT_FACTOR`` times ``weight``.
+    Attributes: reason: Rejection reason of samples that violate the constraint.
+        boundary_reason: Rejection reason of samples whose ends violate it; by default
+        ``reason``. kinks: Phases at which its ``bound_relaxation`` is not smooth; the
+        verdict checks these. uses_jerk: Whether it uses the jerk, which is computed
+        only for problems with such a constraint. training_weight: Initial weight of the
+        violation in training; None for ``WEIGHT_FACTOR`` times ``weight``.
         training_factor: Factor of the limits during training, in (0, 1].
-        training_inset: Distance by which other bounds are moved inwards during training [unit of the condition].
-        has_solver_margin: Whether ``solved`` has a margin for states between grid points; otherwise solvers add one.
-        uses_obstacles: Whether ``measured`` depends on obstacles; otherwise ``met`` checks states of different scenes.
-        scene_width: Number of values that it needs for each motion, see ``scene_values``.
-        tolerance: Maximum violation of a valid motion.
-        budget: Acceptable violation in training.
-        weight: Initial weight of the violation in training, before scaling.
+        training_inset: Distance by which other bounds are moved inwards during training
+        [unit of the condition]. has_solver_margin: Whether ``solved`` has a margin for
+        states between grid points; otherwise solvers add one. uses_obstacles: Whether
+        ``measured`` depends on obstacles; otherwise ``met`` checks states of different
+        scenes. scene_width: Number of values that it needs for each motion, see
+        ``scene_values``. tolerance: Maximum violation of a valid motion. budget:
+        Acceptable violation in training. weight: Initial weight of the violation in
+        training, before scaling.
     """
 
     reason: ClassVar[str]
@@ -128,8 +130,12 @@ class Constraint(ABC):
     scene_width: ClassVar[int] = 0
 
     tolerance: float
-    budget: float = field("accepted violation during training (the paper's C-bar^2)", low=0.0, default=0.0)
-    weight: float = field("initial weight during training (the paper's e^alpha)", low=1e-12, default=1.0)
+    budget: float = field(
+        "accepted violation during training (the paper's C-bar^2)", low=0.0, default=0.0
+    )
+    weight: float = field(
+        "initial weight during training (the paper's e^alpha)", low=1e-12, default=1.0
+    )
 
     def allowed(self, condition: Condition) -> Array:
         """Return the tolerance of a condition for valid motions, in its unit, shape (m,)."""
@@ -140,15 +146,16 @@ class Constraint(ABC):
         """Violation that a valid motion may have: ``tolerance``, or less where it would permit penetration."""
         return self.tolerance
 
-    def bound_relaxation(self, condition: Condition, s: Array, start_tip: Array) -> Array:
+    def bound_relaxation(
+        self, condition: Condition, s: Array, start_tip: Array
+    ) -> Array:
         """Return the relaxation of a condition's bounds at phases s of motions, in its unit, shape (..., K).
 
         By default zero; constraints that motions may violate at the start override it.
 
-        Args:
-            condition: One of the conditions of ``measured``.
-            s: Phases, shape (K,).
-            start_tip: Positions of the tip at the start [m], shape (..., 3): for one motion or many.
+        Args: condition: One of the conditions of ``measured``. s: Phases, shape (K,).
+            start_tip: Positions of the tip at the start [m], shape (..., 3): for one
+            motion or many.
         """
         del condition
         return np.zeros((*start_tip.shape[:-1], len(s)))
@@ -156,7 +163,8 @@ class Constraint(ABC):
     def scene_values(self, goal_xyz: Array, goal_velocity: Array) -> Array:  # noqa: ARG002
         """Return the values of N motions that the constraint depends on, shape (N, scene_width).
 
-        The forms read them as ``scene_values`` of states and worlds. One constraint of a problem may have them.
+        The forms read them as ``scene_values`` of states and worlds. One constraint of
+        a problem may have them.
 
         Args:
             goal_xyz: Tip positions at the goal [m], shape (N, 3).
@@ -171,8 +179,8 @@ class Constraint(ABC):
             values: ``scene_values`` of one motion, shape (scene_width,).
             start_xyz: Tip position at the start [m], shape (3,).
 
-        Returns:
-            Polylines from start to goal [m], shape (K, 3) each, in the order of their use.
+        Returns: Polylines from start to goal [m], shape (K, 3) each, in the order of
+            their use.
         """
         del values, start_xyz
         return []
@@ -184,7 +192,8 @@ class Constraint(ABC):
     def penalized(self, state: SymbolicState) -> tuple[Condition, ...]:
         """State the condition for the training loss, by default ``symbolic``.
 
-        It must be equivalent; override it if the violation of ``symbolic`` has poor gradients.
+        It must be equivalent; override it if the violation of ``symbolic`` has poor
+        gradients.
         """
         return self.symbolic(state)
 
@@ -192,17 +201,20 @@ class Constraint(ABC):
     def measured(self, world: World) -> tuple[Condition, ...]:
         """Evaluate the same condition with Pinocchio and Coal at the state, or at the K states, that ``world`` holds.
 
-        It is written for one state, and also called with ``cnpgen.world.path.PathWorld``, whose arrays have a trailing
-        axis of K states: ``world.q`` of shape (n, K), ``world.tip_position`` (3, K), distances (K,). So it counts
-        indices from the front and uses elementwise operations only: no ``if`` on a value, no ``float()``, ``max()`` or
-        ``sum()`` over a vector. Every entry of a condition's ``g`` is then a float or an array of shape (K,); bounds do
-        not depend on the state.
+        It is written for one state, and also called with
+        ``cnpgen.world.path.PathWorld``, whose arrays have a trailing axis of K states:
+        ``world.q`` of shape (n, K), ``world.tip_position`` (3, K), distances (K,). So
+        it counts indices from the front and uses elementwise operations only: no ``if``
+        on a value, no ``float()``, ``max()`` or ``sum()`` over a vector. Every entry of
+        a condition's ``g`` is then a float or an array of shape (K,); bounds do not
+        depend on the state.
         """
 
     def judged(self, world: World) -> tuple[Condition, ...]:
         """Evaluate the conditions whose violations the verdict limits, by default ``measured``.
 
-        Override it if solvers need several values of one quantity, such as the components of an angle.
+        Override it if solvers need several values of one quantity, such as the
+        components of an angle.
         """
         return self.measured(world)
 
@@ -220,7 +232,8 @@ class Constraint(ABC):
     def solved(self, world: World) -> tuple[Condition, ...]:
         """Return the conditions of ``symbolic`` with numeric values, from which solvers read bounds.
 
-        The default is ``measured``; override it if the two forms state different conditions.
+        The default is ``measured``; override it if the two forms state different
+        conditions.
         """
         return self.measured(world)
 
@@ -229,5 +242,8 @@ class Constraint(ABC):
         return self.symbolic(state)
 
     def measured_at(self, world: World, end: End) -> tuple[Condition, ...]:  # noqa: ARG002
-        """Evaluate the conditions on a boundary state with Pinocchio and Coal; ``world`` holds one state."""
+        """Evaluate the conditions on a boundary state with Pinocchio and Coal.
+
+        ``world`` holds one state.
+        """
         return self.measured(world)

@@ -28,7 +28,9 @@ class _RelativeLimit(Constraint):
     limit: ClassVar[str]
     factor_name: ClassVar[str] = ""  # parameter by which samples scale the limit
 
-    tolerance: float = field("violation that a valid motion may have, as a fraction of the limit", low=0.0)
+    tolerance: float = field(
+        "violation that a valid motion may have, as a fraction of the limit", low=0.0
+    )
 
     def allowed(self, condition: Condition) -> Array:
         """Return the fraction of the limit, shape (m,)."""
@@ -39,10 +41,15 @@ class _RelativeLimit(Constraint):
         return self._within(state, state.parameters.get(self.factor_name))
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
-        """Compare the rates in SI units with the limits; torques are Pinocchio's inverse dynamics."""
+        """Compare the rates in SI units with the limits.
+
+        Torques are Pinocchio's inverse dynamics.
+        """
         return self._within(world, world.parameters.values.get(self.factor_name))
 
-    def _within(self, state: "SymbolicState | World", factor: Any) -> tuple[Condition, ...]:
+    def _within(
+        self, state: "SymbolicState | World", factor: Any
+    ) -> tuple[Condition, ...]:
         """Divide rates by the factor of their limits, so that the bounds are the same for all samples."""
         if (rates := getattr(state, self.rates)) is None:
             return ()
@@ -62,7 +69,9 @@ class JointPosition(Constraint):
 
     reason = "joint position limit"
     training_weight, training_factor = 4000.0, 0.999
-    tolerance: float = field("violation that a valid motion may have", unit="rad", low=0.0, plausible=1.0)
+    tolerance: float = field(
+        "violation that a valid motion may have", unit="rad", low=0.0, plausible=1.0
+    )
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the limits on q [rad]."""
@@ -79,7 +88,12 @@ class JointVelocity(_RelativeLimit):
 
     reason = "joint velocity limit"
     training_weight, training_factor = 100.0, 0.99
-    condition_name, unit, rates, limit = "joint velocity", "rad/s", "dq", "velocity_limit"
+    condition_name, unit, rates, limit = (
+        "joint velocity",
+        "rad/s",
+        "dq",
+        "velocity_limit",
+    )
     factor_name = "velocity_factor"
 
 
@@ -89,7 +103,12 @@ class JointAcceleration(_RelativeLimit):
 
     reason = "joint acceleration limit"
     training_weight, training_factor = 5.0, 0.985
-    condition_name, unit, rates, limit = "joint acceleration", "rad/s^2", "ddq", "acceleration_limit"
+    condition_name, unit, rates, limit = (
+        "joint acceleration",
+        "rad/s^2",
+        "ddq",
+        "acceleration_limit",
+    )
     factor_name = "acceleration_factor"
 
 
@@ -121,11 +140,18 @@ class TipSpeed(Constraint):
 
     reason = "tip too fast"
     limit: float = field("maximum speed of the tip", unit="m/s", low=1e-6)
-    tolerance: float = field("additional speed that a valid motion may have", unit="m/s", low=0.0, plausible=1.0)
+    tolerance: float = field(
+        "additional speed that a valid motion may have",
+        unit="m/s",
+        low=0.0,
+        plausible=1.0,
+    )
 
     def allowed(self, condition: Condition) -> Array:
         """Return the tolerance of the square of the speed [m^2/s^2]."""
-        return np.full(len(condition.g), (self.limit + self.tolerance) ** 2 - self.limit**2)
+        return np.full(
+            len(condition.g), (self.limit + self.tolerance) ** 2 - self.limit**2
+        )
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the square of the tip's speed [m^2/s^2]."""
@@ -138,5 +164,12 @@ class TipSpeed(Constraint):
     def _slow(self, velocity: Sequence[Any]) -> tuple[Condition, ...]:
         square = velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2
         return (
-            Condition("tip speed", "m^2/s^2", [square], np.array([-np.inf]), np.array([self.limit**2]), "velocity"),
+            Condition(
+                "tip speed",
+                "m^2/s^2",
+                [square],
+                np.array([-np.inf]),
+                np.array([self.limit**2]),
+                "velocity",
+            ),
         )

@@ -7,7 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.clearance import MAX_LINK_PENETRATION_M, DistanceConstraint
+from cnpgen.problems.constraints.clearance import (
+    MAX_LINK_PENETRATION_M,
+    DistanceConstraint,
+)
 from cnpgen.problems.constraints.constraint import Array, Condition, End
 from cnpgen.schema.keys import field
 
@@ -20,7 +23,9 @@ if TYPE_CHECKING:
     from cnpgen.world.path import PathWorld
     from cnpgen.world.world import World
 
-MAX_HELD_CAPSULE_ERROR_FRACTION = 0.1  # of the free states, in which the capsule of a usable link overlaps the object
+MAX_HELD_CAPSULE_ERROR_FRACTION = (
+    0.1  # of the free states, in which the capsule of a usable link overlaps the object
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,13 +49,22 @@ class LinkClearance(DistanceConstraint):
 class SelfClearance(LinkClearance):
     """Constraint: the links of every pair that is not left out are further than ``distance`` from each other.
 
-    It requires the geometry of the URDF. Judges measure the convex parts of the links. Solvers use the capsules of
-    pairs whose capsules hardly ever overlap unless the links do; only judges check the other pairs.
+    It requires the geometry of the URDF. Judges measure the convex parts of the links.
+    Solvers use the capsules of pairs whose capsules hardly ever overlap unless the
+    links do; only judges check the other pairs.
     """
 
-    reason, condition_name, bodies = "robot in collision with itself", "self clearance", "self"
-    distance: float = field("minimum distance of links", unit="m", low=0.0, default=0.0, plausible=2.0)
-    tolerance: float = field("violation that a valid motion may have", unit="m", low=0.0, plausible=0.5)
+    reason, condition_name, bodies = (
+        "robot in collision with itself",
+        "self clearance",
+        "self",
+    )
+    distance: float = field(
+        "minimum distance of links", unit="m", low=0.0, default=0.0, plausible=2.0
+    )
+    tolerance: float = field(
+        "violation that a valid motion may have", unit="m", low=0.0, plausible=0.5
+    )
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the distances of the capsules' axes [m] of the pairs for solvers."""
@@ -58,29 +72,45 @@ class SelfClearance(LinkClearance):
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Measure the signed distances of the convex parts with Coal [m]."""
-        distances, parts = world.self_distances(self.distance), names_of_pairs(world.robot.shape)
+        distances, parts = (
+            world.self_distances(self.distance),
+            names_of_pairs(world.robot.shape),
+        )
         return self._at_least(distances, self.distance, parts=parts)
 
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions of the capsules."""
         radii = _radii(world.robot, _for_solvers(world.robot))
-        return self._at_least([0.0] * len(radii), radii + self.distance, sufficient=True)
+        return self._at_least(
+            [0.0] * len(radii), radii + self.distance, sufficient=True
+        )
 
     def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
         """State the distances of all pairs."""
         return self._capsule_distances(state, _looked_at(state.robot))
 
-    def _capsule_distances(self, state: "SymbolicState", pairs: "Sequence[LinkPair]") -> tuple[Condition, ...]:
+    def _capsule_distances(
+        self, state: "SymbolicState", pairs: "Sequence[LinkPair]"
+    ) -> tuple[Condition, ...]:
         from cnpgen.kernels.symbolic.convex_distances import segment_distance
 
-        ends = [(state.capsules[pair.first], state.capsules[pair.second]) for pair in pairs]
-        distances = [segment_distance((a, b), (c, d), freeze=state.freeze) for (a, b, _), (c, d, _) in ends]
-        return self._at_least(distances, _radii(state.robot, pairs) + self.distance, sufficient=True)
+        ends = [
+            (state.capsules[pair.first], state.capsules[pair.second]) for pair in pairs
+        ]
+        distances = [
+            segment_distance((a, b), (c, d), freeze=state.freeze)
+            for (a, b, _), (c, d, _) in ends
+        ]
+        return self._at_least(
+            distances, _radii(state.robot, pairs) + self.distance, sufficient=True
+        )
 
 
 def _looked_at(robot: "Robot") -> "list[LinkPair]":
     """List the pairs of links that must not touch."""
-    return [pair for pair in robot.shape.pairs if not pair.left_out] if robot.shape else []
+    return (
+        [pair for pair in robot.shape.pairs if not pair.left_out] if robot.shape else []
+    )
 
 
 def _for_solvers(robot: "Robot") -> "list[LinkPair]":
@@ -90,7 +120,11 @@ def _for_solvers(robot: "Robot") -> "list[LinkPair]":
 
 def _radii(robot: "Robot", pairs: "Sequence[LinkPair]") -> Array:
     """Return the sums of the capsule radii of pairs [m]."""
-    radius = {capsule.link: capsule.radius for capsule in robot.shape.capsules} if robot.shape else {}
+    radius = (
+        {capsule.link: capsule.radius for capsule in robot.shape.capsules}
+        if robot.shape
+        else {}
+    )
     return np.array([radius[pair.first] + radius[pair.second] for pair in pairs], float)
 
 
@@ -98,17 +132,32 @@ def _radii(robot: "Robot", pairs: "Sequence[LinkPair]") -> Array:
 class ObjectClearance(LinkClearance):
     """Constraint: the held object is further than ``distance`` from the links that may not touch it.
 
-    It requires the geometry of the URDF. ``touch_links`` in [object] may touch the object. Links that the joint of the
-    tip moves do not move relative to the object and are not checked. Judges measure the convex parts of the links.
-    Solvers use the capsules of links whose capsules hardly ever overlap the object unless the links do.
+    It requires the geometry of the URDF. ``touch_links`` in [object] may touch the
+    object. Links that the joint of the tip moves do not move relative to the object and
+    are not checked. Judges measure the convex parts of the links. Solvers use the
+    capsules of links whose capsules hardly ever overlap the object unless the links do.
     """
 
-    reason, condition_name, bodies = "object in collision with the robot", "object clearance", "held object"
+    reason, condition_name, bodies = (
+        "object in collision with the robot",
+        "object clearance",
+        "held object",
+    )
     training_weight = 3000.0
     distance: float = field(
-        "minimum distance of the object from the links", unit="m", low=0.0, default=0.0, plausible=2.0
+        "minimum distance of the object from the links",
+        unit="m",
+        low=0.0,
+        default=0.0,
+        plausible=2.0,
     )
-    tolerance: float = field("violation that a valid motion may have", unit="m", low=0.0, default=0.0, plausible=0.5)
+    tolerance: float = field(
+        "violation that a valid motion may have",
+        unit="m",
+        low=0.0,
+        default=0.0,
+        plausible=0.5,
+    )
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the distances of the capsules' axes from the object [m]."""
@@ -116,21 +165,33 @@ class ObjectClearance(LinkClearance):
 
         cuboid, capsules = held_cuboid(state), _solver_capsules(state.robot)
         axes = [state.held_capsules[capsule.link] for capsule in capsules]
-        distances = [cuboid.separation(first, second, state.freeze) for first, second, _ in axes]
+        distances = [
+            cuboid.separation(first, second, state.freeze) for first, second, _ in axes
+        ]
         return self._clear(distances, capsules)
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Measure the signed distances of the convex parts with Coal [m]."""
-        distances, parts = world.held_object_distances(self.distance), names_of_pairs(world.robot.held_shape)
+        distances, parts = (
+            world.held_object_distances(self.distance),
+            names_of_pairs(world.robot.held_shape),
+        )
         return self._at_least(distances, self.distance, parts=parts)
 
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions of the capsules."""
         capsules = _solver_capsules(world.robot)
-        return self._clear([0.0] * len(capsules), capsules, parts=tuple(capsule.link for capsule in capsules))
+        return self._clear(
+            [0.0] * len(capsules),
+            capsules,
+            parts=tuple(capsule.link for capsule in capsules),
+        )
 
     def _clear(
-        self, distances: list[Any], capsules: "list[Capsule]", parts: tuple[str, ...] = ()
+        self,
+        distances: list[Any],
+        capsules: "list[Capsule]",
+        parts: tuple[str, ...] = (),
     ) -> tuple[Condition, ...]:
         least = np.array([capsule.radius + self.distance for capsule in capsules])
         return self._at_least(distances, least, parts=parts, sufficient=True)
@@ -140,11 +201,20 @@ def _solver_capsules(robot: "Robot") -> "list[Capsule]":
     """List the capsules of the links that solvers keep away from the object."""
     shape = robot.held_shape
     near = [pair for pair in shape.pairs if pair.colliding > 0] if shape else []
-    links = {pair.first for pair in near if pair.mistaken <= MAX_HELD_CAPSULE_ERROR_FRACTION}
-    return [capsule for capsule in shape.capsules if capsule.link in links] if shape else []
+    links = {
+        pair.first for pair in near if pair.mistaken <= MAX_HELD_CAPSULE_ERROR_FRACTION
+    }
+    return (
+        [capsule for capsule in shape.capsules if capsule.link in links]
+        if shape
+        else []
+    )
 
 
 def names_of_pairs(shape: "Shape | None") -> tuple[str, ...]:
     """Return the names of the checked pairs of convex parts."""
     links = [part.link for part in shape.convex_parts] if shape else []
-    return tuple(f"{links[first]}, {links[second]}" for first, second in (shape.checked_pairs if shape else ()))
+    return tuple(
+        f"{links[first]}, {links[second]}"
+        for first, second in (shape.checked_pairs if shape else ())
+    )

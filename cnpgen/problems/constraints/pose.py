@@ -20,31 +20,45 @@ if TYPE_CHECKING:
 class Pose(TipManifold):
     """Constraint: fixed orientation ``R = R_wanted`` in a box of the world, without rotation at the ends.
 
-    A range of a single point fixes that coordinate. The three values of the orientation are the axis times the sine of
-    the angle of ``R_wanted^T R``: angles [rad] to first order, and 0 at half a turn, too, which is excluded. The
-    verdict limits this angle, so the tolerance of each value is that of the angle divided by the square root of 3.
+    A range of a single point fixes that coordinate. The three values of the orientation
+    are the axis times the sine of the angle of ``R_wanted^T R``: angles [rad] to first
+    order, and 0 at half a turn, too, which is excluded. The verdict limits this angle,
+    so the tolerance of each value is that of the angle divided by the square root of 3.
     """
 
     reason = "not in its pose"
     inside_name, held_name = "pose box", "pose position"
-    velocity_name, acceleration_name = "velocity out of the pose", "acceleration out of the pose"
+    velocity_name, acceleration_name = (
+        "velocity out of the pose",
+        "acceleration out of the pose",
+    )
     rpy: tuple[float, float, float] = field(
-        "orientation in the world: roll, pitch, yaw, as in a URDF", unit="rad", plausible=2 * np.pi
+        "orientation in the world: roll, pitch, yaw, as in a URDF",
+        unit="rad",
+        plausible=2 * np.pi,
     )
     x: Range | None = field("range of the tip along world x", unit="m", default=None)
     y: Range | None = field("range of the tip along world y", unit="m", default=None)
     z: Range | None = field("range of the tip along world z", unit="m", default=None)
-    tolerance: float = field("rotation [rad] or offset [m] that a valid motion may have", low=1e-9)
+    tolerance: float = field(
+        "rotation [rad] or offset [m] that a valid motion may have", low=1e-9
+    )
 
     @cached_property
     def place(self) -> TipRegion:
         """Region of the tip: the box, with fixed directions of zero width."""
-        given = [(row, each) for row, each in zip(np.eye(3), (self.x, self.y, self.z), strict=True) if each]
+        given = [
+            (row, each)
+            for row, each in zip(np.eye(3), (self.x, self.y, self.z), strict=True)
+            if each
+        ]
         held = [(row, each.low) for row, each in given if each.low == each.high]
         free = [(row, each) for row, each in given if each.low < each.high]
         point = sum((row * value for row, value in held), start=np.zeros(3))
         rows = [[row.tolist() for row, _ in pairs] for pairs in (held, free)]
-        return TipRegion(point, held=rows[0], bounded=rows[1], ranges=tuple(each for _, each in free))
+        return TipRegion(
+            point, held=rows[0], bounded=rows[1], ranges=tuple(each for _, each in free)
+        )
 
     @property
     def rotation(self) -> Array:
@@ -69,12 +83,19 @@ class Pose(TipManifold):
         """Evaluate the position [m] and the angle of the orientation [rad]."""
         *position, sines, cosine = self.measured(world)
         angle = np.arctan2(np.sqrt(sum(sine**2 for sine in sines.g)), cosine.g[0])
-        return (*position, replace(sines, g=[angle], lower=np.zeros(1), upper=np.zeros(1), parts=()))
+        return (
+            *position,
+            replace(sines, g=[angle], lower=np.zeros(1), upper=np.zeros(1), parts=()),
+        )
 
     def allowed(self, condition: Condition) -> Array:
         """Return the tolerance of an offset, of the angle, or of each component of the angle."""
         allowed = super().allowed(condition)
-        return allowed / np.sqrt(len(condition.g)) if condition.name == "orientation" else allowed
+        return (
+            allowed / np.sqrt(len(condition.g))
+            if condition.name == "orientation"
+            else allowed
+        )
 
     def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
         """State position, orientation and their rates."""
@@ -87,19 +108,53 @@ class Pose(TipManifold):
     def _resting(self, state: "SymbolicState | World") -> tuple[Condition, ...]:
         """State that the tip moves along its free directions only and does not turn."""
         zero, axes = np.zeros(3), ("x", "y", "z")
-        omega, alpha = list(state.tip_angular_velocity), list(state.tip_angular_acceleration)
+        omega, alpha = (
+            list(state.tip_angular_velocity),
+            list(state.tip_angular_acceleration),
+        )
         return (
             *self._moving(state.tip_velocity, state.tip_acceleration),
             Condition("turning", "rad/s", omega, zero, zero, "velocity", axes),
-            Condition("turning acceleration", "rad/s^2", alpha, zero, zero, "acceleration", axes),
+            Condition(
+                "turning acceleration",
+                "rad/s^2",
+                alpha,
+                zero,
+                zero,
+                "acceleration",
+                axes,
+            ),
         )
 
     def _turned(self, rotation: Sequence[Any]) -> tuple[Condition, ...]:
         wanted = self.rotation
-        relative = [[sum(float(wanted[k, i]) * rotation[k][j] for k in range(3)) for j in range(3)] for i in range(3)]
-        sine = [(relative[i][j] - relative[j][i]) / 2 for i, j in ((2, 1), (0, 2), (1, 0))]
+        relative = [
+            [
+                sum(float(wanted[k, i]) * rotation[k][j] for k in range(3))
+                for j in range(3)
+            ]
+            for i in range(3)
+        ]
+        sine = [
+            (relative[i][j] - relative[j][i]) / 2 for i, j in ((2, 1), (0, 2), (1, 0))
+        ]
         cosine = (relative[0][0] + relative[1][1] + relative[2][2] - 1) / 2
         return (
-            Condition("orientation", "rad", sine, np.zeros(3), np.zeros(3), "angle", ("x", "y", "z")),
-            Condition("less than a quarter turn", "1", [cosine], np.zeros(1), np.full(1, np.inf), "angle"),
+            Condition(
+                "orientation",
+                "rad",
+                sine,
+                np.zeros(3),
+                np.zeros(3),
+                "angle",
+                ("x", "y", "z"),
+            ),
+            Condition(
+                "less than a quarter turn",
+                "1",
+                [cosine],
+                np.zeros(1),
+                np.full(1, np.inf),
+                "angle",
+            ),
         )

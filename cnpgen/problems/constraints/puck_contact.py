@@ -1,7 +1,8 @@
 """Contact of the mallet with the puck: only at the end of a hit, and from behind.
 
-The puck of a motion follows from its goal: its centre is ``contact_distance`` ahead of the tip there, along the tip's
-velocity. At this distance the bodies would overlap, so that the mallet touches the puck shortly before the goal.
+The puck of a motion follows from its goal: its centre is ``contact_distance`` ahead of
+the tip there, along the tip's velocity. At this distance the bodies would overlap, so
+that the mallet touches the puck shortly before the goal.
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ if TYPE_CHECKING:
     from cnpgen.world.world import World
 
 
-ADDED_RADIUS_M = 1e-4  # so that motions do not touch the puck within a tolerance of this size
+ADDED_RADIUS_M = (
+    1e-4  # so that motions do not touch the puck within a tolerance of this size
+)
 ROUNDING = 0.02  # of the relaxation near the goal, relative to the overlap
 SOLVER_MARGIN_M, STRAIGHT_HIT_MARGIN_M = 1e-3, 1e-4  # from the puck; of straight hits
 TRAINING_MARGIN_M = 2e-3
@@ -41,9 +44,10 @@ ARC_END_RAD = 0.4  # from the direction opposite to the hit
 class PuckContact(Constraint):
     """Constraint: the mallet touches the puck only on the last part of a hit, behind the puck.
 
-    The distance of the centres is at least ``ADDED_RADIUS_M`` above the sum of the radii. The exception is a disc whose
-    diameter of length ``last`` ends at the goal, opposite to the hit. With 10 mm, the mallet is then within 4 degrees
-    of the direction of the hit.
+    The distance of the centres is at least ``ADDED_RADIUS_M`` above the sum of the
+    radii. The exception is a disc whose diameter of length ``last`` ends at the goal,
+    opposite to the hit. With 10 mm, the mallet is then within 4 degrees of the
+    direction of the hit.
     """
 
     reason = "early contact with the puck"
@@ -51,13 +55,25 @@ class PuckContact(Constraint):
     training_weight = 3e6
     has_solver_margin = True
     scene_width = 4
-    mallet_radius: float = field("radius of the mallet", unit="m", low=1e-6, plausible=0.5)
+    mallet_radius: float = field(
+        "radius of the mallet", unit="m", low=1e-6, plausible=0.5
+    )
     puck_radius: float = field("radius of the puck", unit="m", low=1e-6, plausible=0.5)
     contact_distance: float = field(
-        "distance of the centres of mallet and puck at the goal", unit="m", low=0.0, plausible=1.0
+        "distance of the centres of mallet and puck at the goal",
+        unit="m",
+        low=0.0,
+        plausible=1.0,
     )
-    last: float = field("length of the end of the path on which contact is allowed", unit="m", low=1e-6, plausible=0.5)
-    tolerance: float = field("violation that a valid motion may have", unit="m", low=0.0, plausible=0.5)
+    last: float = field(
+        "length of the end of the path on which contact is allowed",
+        unit="m",
+        low=1e-6,
+        plausible=0.5,
+    )
+    tolerance: float = field(
+        "violation that a valid motion may have", unit="m", low=0.0, plausible=0.5
+    )
 
     def validate(self) -> Iterator[tuple[str, str]]:
         """Yield (key, error) pairs."""
@@ -83,7 +99,9 @@ class PuckContact(Constraint):
         goal, velocity = goal_xyz[:, :2], goal_velocity[:, :2]
         speed = np.hypot(velocity[:, :1], velocity[:, 1:])
         is_hit = speed > MIN_HIT_SPEED_M_S
-        puck = goal + self.contact_distance * velocity / np.maximum(speed, MIN_HIT_SPEED_M_S)
+        puck = goal + self.contact_distance * velocity / np.maximum(
+            speed, MIN_HIT_SPEED_M_S
+        )
         values = np.concatenate([goal, puck], axis=1)
         if np.count_nonzero(is_hit) < len(is_hit):
             values[~is_hit[:, 0]] = PUCK_OUT_OF_REACH_M
@@ -99,27 +117,47 @@ class PuckContact(Constraint):
 
         (condition,) = self._cone(*self._symbolic_distances(state), TRAINING_MARGIN_M)
         violation = ca.fmax(0, condition.lower[0] - condition.g[0])
-        return (replace(condition, g=[condition.lower[0] - violation / ca.sqrt(1 + violation / TRAINING_KNEE_M)]),)
+        return (
+            replace(
+                condition,
+                g=[
+                    condition.lower[0]
+                    - violation / ca.sqrt(1 + violation / TRAINING_KNEE_M)
+                ],
+            ),
+        )
 
     def symbolic_at(self, state: SymbolicState, end: End) -> tuple[Condition, ...]:
-        """State the distance at the start [m], where no contact is allowed; the goal is in contact."""
+        """State the distance at the start [m], where no contact is allowed.
+
+        The goal is in contact.
+        """
         if end == "goal":
             return ()
-        return _at_least(self.contact_range + ADDED_RADIUS_M, self._symbolic_distances(state)[1])
+        return _at_least(
+            self.contact_range + ADDED_RADIUS_M, self._symbolic_distances(state)[1]
+        )
 
     def measured(self, world: World) -> tuple[Condition, ...]:
         """Evaluate the distance of the centres with Pinocchio's tip position [m]."""
         return self._condition(*self._measured_distances(world))
 
     def measured_at(self, world: World, end: End) -> tuple[Condition, ...]:
-        """Evaluate the distance at the start, where no contact is allowed; the goal is in contact."""
+        """Evaluate the distance at the start, where no contact is allowed.
+
+        The goal is in contact.
+        """
         if end == "goal":
             return ()
-        return _at_least(self.contact_range + ADDED_RADIUS_M, self._measured_distances(world)[1])
+        return _at_least(
+            self.contact_range + ADDED_RADIUS_M, self._measured_distances(world)[1]
+        )
 
     def touches(self, tip: Array, scene_values: Array) -> NDArray[np.bool_]:
         """Return whether the mallet touches the pucks of ``scene_values`` at N tip positions [m], shape (N, 3)."""
-        touching: NDArray[np.bool_] = np.hypot(*(tip[:, :2] - scene_values[:, 2:]).T) < self.contact_range
+        touching: NDArray[np.bool_] = (
+            np.hypot(*(tip[:, :2] - scene_values[:, 2:]).T) < self.contact_range
+        )
         return touching
 
     def solved(self, world: World) -> tuple[Condition, ...]:
@@ -132,37 +170,57 @@ class PuckContact(Constraint):
 
         tip = state.on_table(state.kinematics.tip)
         values = state.scene_values or [PUCK_OUT_OF_REACH_M] * self.scene_width
-        from_goal, from_puck = ((tip[0] - x) ** 2 + (tip[1] - y) ** 2 for x, y in (values[:2], values[2:]))
+        from_goal, from_puck = (
+            (tip[0] - x) ** 2 + (tip[1] - y) ** 2 for x, y in (values[:2], values[2:])
+        )
         return from_goal, ca.sqrt(from_puck + MIN_SQUARED_PUCK_DISTANCE_M2)
 
     def _measured_distances(self, world: World) -> tuple[Any, Any]:
-        values = world.scene_values if len(world.scene_values) else [PUCK_OUT_OF_REACH_M] * self.scene_width
-        (x, y), (goal_x, goal_y, puck_x, puck_y) = world.parameters.on_table(world.tip_position)[:2], values
+        values = (
+            world.scene_values
+            if len(world.scene_values)
+            else [PUCK_OUT_OF_REACH_M] * self.scene_width
+        )
+        (x, y), (goal_x, goal_y, puck_x, puck_y) = (
+            world.parameters.on_table(world.tip_position)[:2],
+            values,
+        )
         return (x - goal_x) ** 2 + (y - goal_y) ** 2, np.hypot(x - puck_x, y - puck_y)
 
     def _condition(self, from_goal: Any, distance: Any) -> tuple[Condition, ...]:
         """State the distance of the centres, larger by a relaxation near the goal.
 
-        The relaxation ``h max(1 - rho^2 / (h l), 0)`` at a distance rho from the goal, for the overlap h and the length
-        l, permits contact in the disc of diameter l. The maximum is rounded, so that the verdict finds local maxima.
+        The relaxation ``h max(1 - rho^2 / (h l), 0)`` at a distance rho from the goal,
+        for the overlap h and the length l, permits contact in the disc of diameter l.
+        The maximum is rounded, so that the verdict finds local maxima.
         """
         overlap = self.overlap + ADDED_RADIUS_M
         relaxation = overlap * _positive_part(1 - from_goal / (overlap * self.last))
         return _at_least(self.contact_range + ADDED_RADIUS_M, distance + relaxation)
 
-    def _cone(self, from_goal: Any, distance: Any, margin: float) -> tuple[Condition, ...]:
+    def _cone(
+        self, from_goal: Any, distance: Any, margin: float
+    ) -> tuple[Condition, ...]:
         """State a stricter condition, by a margin [m], that limits all of the last states, not only the first contact.
 
-        The relaxation decreases linearly with the distance from the goal, so that a straight hit has the same margin
-        at all of them. Solvers, which check grid points only, would miss the first contact.
+        The relaxation decreases linearly with the distance from the goal, so that a
+        straight hit has the same margin at all of them. Solvers, which check grid
+        points only, would miss the first contact.
         """
         overlap = self.overlap + ADDED_RADIUS_M + margin
         rho = (from_goal + MIN_SQUARED_PUCK_DISTANCE_M2) ** 0.5
-        relaxation = overlap * _positive_part(1 + (STRAIGHT_HIT_MARGIN_M - rho) / overlap)
-        return _at_least(self.contact_range + ADDED_RADIUS_M + margin, distance + relaxation)
+        relaxation = overlap * _positive_part(
+            1 + (STRAIGHT_HIT_MARGIN_M - rho) / overlap
+        )
+        return _at_least(
+            self.contact_range + ADDED_RADIUS_M + margin, distance + relaxation
+        )
 
     def initial_tip_paths(self, values: Array, start_xyz: Array) -> list[Array]:
-        """Return tip paths around the puck on either side, the shorter one first; none if it is not in the way."""
+        """Return tip paths around the puck on either side, the shorter one first.
+
+        None if it is not in the way.
+        """
         goal, puck, start = values[:2], values[2:], start_xyz[:2]
         hit = (puck - goal) / self.contact_distance
         entry = puck - (self.contact_range + self.overlap) * hit
@@ -171,19 +229,28 @@ class PuckContact(Constraint):
         radius = self.contact_range + GUESS_CLEARANCE_M
         offset = start - puck
         distance = max(float(np.hypot(*offset)), radius)
-        angle = math.atan2(-hit[0] * offset[1] + hit[1] * offset[0], -float(hit @ offset))  # 0 behind the puck
+        angle = math.atan2(
+            -hit[0] * offset[1] + hit[1] * offset[0], -float(hit @ offset)
+        )  # 0 behind the puck
         paths = []
         for begin in (angle, angle - math.copysign(2 * math.pi, angle)):
             side = math.copysign(1.0, begin)
             tangent = abs(begin) - math.acos(radius / distance)
             angles = side * np.linspace(
-                max(tangent, ARC_END_RAD), ARC_END_RAD, max(2, math.ceil((tangent - ARC_END_RAD) / ARC_STEP_RAD))
+                max(tangent, ARC_END_RAD),
+                ARC_END_RAD,
+                max(2, math.ceil((tangent - ARC_END_RAD) / ARC_STEP_RAD)),
             )
             across = np.array([-hit[1], hit[0]])
-            arc = puck - radius * (np.cos(angles)[:, None] * hit + np.sin(angles)[:, None] * across)
+            arc = puck - radius * (
+                np.cos(angles)[:, None] * hit + np.sin(angles)[:, None] * across
+            )
             path = np.stack([start, *arc, goal - APPROACH_LENGTH_M * hit, goal])
             paths.append(np.column_stack([path, np.full(len(path), start_xyz[2])]))
-        return sorted(paths, key=lambda path: float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()))
+        return sorted(
+            paths,
+            key=lambda path: float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
+        )
 
 
 def _positive_part(value: Any) -> Any:
@@ -192,7 +259,16 @@ def _positive_part(value: Any) -> Any:
 
 
 def _at_least(bound: float, distance: Any) -> tuple[Condition, ...]:
-    return (Condition("puck distance", "m", [distance], np.array([bound]), np.array([np.inf]), "position"),)
+    return (
+        Condition(
+            "puck distance",
+            "m",
+            [distance],
+            np.array([bound]),
+            np.array([np.inf]),
+            "position",
+        ),
+    )
 
 
 def distances_from_segments(point: Array, first: Array, second: Array) -> Array:

@@ -20,9 +20,10 @@ if TYPE_CHECKING:
 class Table(TipManifold):
     """Constraint: the tip stays in a rectangle at the table's height, with ``dz/dt = d2z/dt2 = 0`` at the ends.
 
-    It equals a ``plane`` normal to z with a rectangle along x and y. Parameters of the problem may raise the table and
-    turn it about the center of its rectangle; then all coordinates are those of the table. They may also change the
-    rectangle; the table still turns about the center of that in the problem file.
+    It equals a ``plane`` normal to z with a rectangle along x and y. Parameters of the
+    problem may raise the table and turn it about the center of its rectangle; then all
+    coordinates are those of the table. They may also change the rectangle; the table
+    still turns about the center of that in the problem file.
     """
 
     reason = "off the table"
@@ -36,24 +37,43 @@ class Table(TipManifold):
     y: Range = field("range of the tip along world y", unit="m")
     z: float = field("height of the tip with the mallet on the table", unit="m")
     start_band: float = field(
-        "height error that the start of a motion may have", unit="m", default=0.0, low=0.0, plausible=0.5
+        "height error that the start of a motion may have",
+        unit="m",
+        default=0.0,
+        low=0.0,
+        plausible=0.5,
     )
-    tolerance: float = field("violation that a valid motion may have", unit="m", low=1e-9, plausible=0.5)
+    tolerance: float = field(
+        "violation that a valid motion may have", unit="m", low=1e-9, plausible=0.5
+    )
 
     @cached_property
     def place(self) -> TipRegion:
         """Region of the tip: the rectangle."""
         axes = np.eye(3).tolist()
-        return TipRegion(np.array([0.0, 0.0, self.z]), held=axes[2:], bounded=axes[:2], ranges=(self.x, self.y))
+        return TipRegion(
+            np.array([0.0, 0.0, self.z]),
+            held=axes[2:],
+            bounded=axes[:2],
+            ranges=(self.x, self.y),
+        )
 
     @property
     def bounds(self) -> dict[str, float]:
         """Bounds of the rectangle [m], by the names of parameters."""
-        return dict(zip(TABLE_BOUNDS, (self.x.low, self.x.high, self.y.low, self.y.high), strict=True))
+        return dict(
+            zip(
+                TABLE_BOUNDS,
+                (self.x.low, self.x.high, self.y.low, self.y.high),
+                strict=True,
+            )
+        )
 
     def bounds_of(self, parameters: Mapping[str, Any]) -> tuple[Any, Any]:
         """Return the lower and the upper corner of the rectangle of a sample: x and y [m] each."""
-        x_low, x_high, y_low, y_high = (parameters.get(name, value) for name, value in self.bounds.items())
+        x_low, x_high, y_low, y_high = (
+            parameters.get(name, value) for name, value in self.bounds.items()
+        )
         return [x_low, y_low], [x_high, y_high]
 
     def judged(self, world: "World") -> tuple[Condition, ...]:
@@ -64,7 +84,9 @@ class Table(TipManifold):
         inside, height = conditions
         low, high = (np.array(corner, float) for corner in self.bounds_of(values))
         tip = self._measured_tip(world)[:2]
-        return replace(inside, g=list(tip), lower=low, upper=high, parts=self.parts[0]), height
+        return replace(
+            inside, g=list(tip), lower=low, upper=high, parts=self.parts[0]
+        ), height
 
     def _inside(self, tip: Sequence[Any], parameters: Mapping[str, Any]) -> Condition:
         """State the distance from every side separately if sides move: bounds are the same for all samples."""
@@ -72,8 +94,16 @@ class Table(TipManifold):
         if parameters.keys().isdisjoint(TABLE_BOUNDS):
             return condition
         sides = [tip[0], tip[0], tip[1], tip[1]]
-        shifts = [parameters.get(name, bound) - bound for name, bound in self.bounds.items()]
+        shifts = [
+            parameters.get(name, bound) - bound for name, bound in self.bounds.items()
+        ]
         g = [value - shift for value, shift in zip(sides, shifts, strict=True)]
         lower = np.array([self.x.low, -np.inf, self.y.low, -np.inf])
         upper = np.array([np.inf, self.x.high, np.inf, self.y.high])
-        return replace(condition, g=g, lower=lower, upper=upper, parts=("x low", "x high", "y low", "y high"))
+        return replace(
+            condition,
+            g=g,
+            lower=lower,
+            upper=upper,
+            parts=("x low", "x high", "y low", "y high"),
+        )

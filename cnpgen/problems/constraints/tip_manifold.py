@@ -1,7 +1,8 @@
 """Base of ``table``, ``plane``, ``line`` and ``pose``: the tip on a point, a line or a plane of the world.
 
-A manifold is an orthonormal frame at a point with some fixed directions. Along these the tip stays at the point. At its
-ends, a motion has velocity and acceleration along the other directions only (paper, Appendix B, for the table).
+A manifold is an orthonormal frame at a point with some fixed directions. Along these
+the tip stays at the point. At its ends, a motion has velocity and acceleration along
+the other directions only (paper, Appendix B, for the table).
 """
 
 from abc import abstractmethod
@@ -21,18 +22,20 @@ if TYPE_CHECKING:
 
 Vector = tuple[float, float, float]
 Vectors = Sequence[Sequence[float]]  # Python floats, used in scalar products
-BOUND_KINKS = (0.1, 0.3)  # phases between which a motion that starts off the manifold must reach it
+BOUND_KINKS = (
+    0.1,
+    0.3,
+)  # phases between which a motion that starts off the manifold must reach it
 
 
 @dataclass(frozen=True)
 class TipRegion:
     """Region of the tip: a manifold with ranges.
 
-    Attributes:
-        point: A point of the manifold [m], shape (3,).
-        held: Unit vectors along which the tip stays at the point, k of them.
-        bounded: Unit vectors along which it stays in a range, m of them, orthogonal to the others.
-        ranges: Ranges relative to the point [m], m of them.
+    Attributes: point: A point of the manifold [m], shape (3,). held: Unit vectors along
+        which the tip stays at the point, k of them. bounded: Unit vectors along which
+        it stays in a range, m of them, orthogonal to the others. ranges: Ranges
+        relative to the point [m], m of them.
     """
 
     point: Array
@@ -49,7 +52,10 @@ class TipRegion:
     def bounds(self) -> tuple[Array, Array]:
         """Bounds along each of ``bounded``, relative to the world's origin [m], shape (m,) each."""
         origin = np.array(self.bounded) @ self.point
-        low, high = (np.array([getattr(each, end) for each in self.ranges]) for end in ("low", "high"))
+        low, high = (
+            np.array([getattr(each, end) for each in self.ranges])
+            for end in ("low", "high")
+        )
         return origin + low, origin + high
 
 
@@ -64,7 +70,9 @@ class TipManifold(Constraint):
     velocity_name: ClassVar[str]
     acceleration_name: ClassVar[str]
     parts: ClassVar[tuple[tuple[str, ...], tuple[str, ...]]] = ((), ())
-    moves_with_table: ClassVar[bool] = False  # whether parameters of the problem move it
+    moves_with_table: ClassVar[bool] = (
+        False  # whether parameters of the problem move it
+    )
 
     @property
     @abstractmethod
@@ -86,15 +94,30 @@ class TipManifold(Constraint):
 
     def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:
         """State position, velocity and acceleration of a boundary state."""
-        position = self._position(self._symbolic_tip(state), self._band_at(end), state.parameters)
+        position = self._position(
+            self._symbolic_tip(state), self._band_at(end), state.parameters
+        )
         rates = state.tip_velocity, state.tip_acceleration
-        return (*position, *self._moving(*(map(state.along_table, rates) if self.moves_with_table else rates)))
+        return (
+            *position,
+            *self._moving(
+                *(map(state.along_table, rates) if self.moves_with_table else rates)
+            ),
+        )
 
     def measured_at(self, world: "World", end: End) -> tuple[Condition, ...]:
         """Evaluate position, velocity and acceleration with Pinocchio."""
-        position = self._position(self._measured_tip(world), self._band_at(end), world.parameters.values)
-        rates, turned = (world.tip_velocity, world.tip_acceleration), world.parameters.along_table
-        return (*position, *self._moving(*(map(turned, rates) if self.moves_with_table else rates)))
+        position = self._position(
+            self._measured_tip(world), self._band_at(end), world.parameters.values
+        )
+        rates, turned = (
+            (world.tip_velocity, world.tip_acceleration),
+            world.parameters.along_table,
+        )
+        return (
+            *position,
+            *self._moving(*(map(turned, rates) if self.moves_with_table else rates)),
+        )
 
     def _symbolic_tip(self, state: "SymbolicState") -> Sequence[Any]:
         tip = state.kinematics.tip
@@ -104,21 +127,31 @@ class TipManifold(Constraint):
         tip = world.tip_position
         return list(world.parameters.on_table(tip) if self.moves_with_table else tip)
 
-    def bound_relaxation(self, condition: Condition, s: Array, start_tip: Array) -> Array:
+    def bound_relaxation(
+        self, condition: Condition, s: Array, start_tip: Array
+    ) -> Array:
         """Relax the bounds for a start off the manifold: by ``start_off`` until s = 0.1, by zero from s = 0.3 on."""
         if condition.name != self.held_name:
             return super().bound_relaxation(condition, s, start_tip)
-        open_: Array = np.minimum(np.maximum((BOUND_KINKS[1] - s) / (BOUND_KINKS[1] - BOUND_KINKS[0]), 0.0), 1.0)
+        open_: Array = np.minimum(
+            np.maximum((BOUND_KINKS[1] - s) / (BOUND_KINKS[1] - BOUND_KINKS[0]), 0.0),
+            1.0,
+        )
         return self.start_off(start_tip)[..., None] * open_
 
     def start_off(self, start_tip: Array) -> Array:
         """Return the distances of starts, shape (..., 3), from the manifold, at most ``band`` [m]."""
         place = self.place
         pairs = zip(place.held, place.height, strict=True)
-        off = reduce(np.maximum, [np.abs(along(row, start_tip.T).T - height) for row, height in pairs])
+        off = reduce(
+            np.maximum,
+            [np.abs(along(row, start_tip.T).T - height) for row, height in pairs],
+        )
         return np.asarray(np.minimum(off, self.band))
 
-    def _position(self, tip: Sequence[Any], band: float, parameters: Mapping[str, Any]) -> tuple[Condition, ...]:
+    def _position(
+        self, tip: Sequence[Any], band: float, parameters: Mapping[str, Any]
+    ) -> tuple[Condition, ...]:
         place = self.place
         found = []
         if place.ranges:
@@ -126,27 +159,45 @@ class TipManifold(Constraint):
         if place.held:
             low, high = place.height - band, place.height + band
             g = [along(row, tip) for row in place.held]
-            found.append(Condition(self.held_name, "m", g, low, high, "position", self.parts[1]))
+            found.append(
+                Condition(self.held_name, "m", g, low, high, "position", self.parts[1])
+            )
         return tuple(found)
 
     def _inside(self, tip: Sequence[Any], parameters: Mapping[str, Any]) -> Condition:  # noqa: ARG002
         """State the position within the ranges, which parameters of the problem may change."""
         g = [along(row, tip) for row in self.place.bounded]
-        return Condition(self.inside_name, "m", g, *self.place.bounds, "position", self.parts[0])
+        return Condition(
+            self.inside_name, "m", g, *self.place.bounds, "position", self.parts[0]
+        )
 
     def _band_at(self, end: End) -> float:
         return self.band if end == "start" else 0.0
 
-    def _moving(self, velocity: Sequence[Any] | Array, acceleration: Sequence[Any] | Array) -> tuple[Condition, ...]:
+    def _moving(
+        self, velocity: Sequence[Any] | Array, acceleration: Sequence[Any] | Array
+    ) -> tuple[Condition, ...]:
         """State that the tip moves along the manifold only."""
         held, parts = self.place.held, self.parts[1]
         if not held:
             return ()
         zero = np.zeros(len(held))
-        rates = [[along(row, values) for row in held] for values in (velocity, acceleration)]
+        rates = [
+            [along(row, values) for row in held] for values in (velocity, acceleration)
+        ]
         return (
-            Condition(self.velocity_name, "m/s", rates[0], zero, zero, "velocity", parts),
-            Condition(self.acceleration_name, "m/s^2", rates[1], zero, zero, "acceleration", parts),
+            Condition(
+                self.velocity_name, "m/s", rates[0], zero, zero, "velocity", parts
+            ),
+            Condition(
+                self.acceleration_name,
+                "m/s^2",
+                rates[1],
+                zero,
+                zero,
+                "acceleration",
+                parts,
+            ),
         )
 
 
@@ -161,7 +212,10 @@ def along(direction: Sequence[float], vector: Sequence[Any] | Array) -> Any:
 
 
 def unit(vector: Sequence[float] | Array, what: str) -> Array:
-    """Return a vector divided by its length; ValueError if that is zero or not finite."""
+    """Return a vector divided by its length.
+
+    ValueError if that is zero or not finite.
+    """
     given = np.array(vector, float)
     length = np.linalg.norm(given)
     if not (np.isfinite(length) and length > 1e-9):

@@ -25,29 +25,40 @@ MAX_SEED = 2**63 - 1
 @checked_arguments
 @one_thread()
 def observe(
-    scenes: Scenes, kind: str | Observation, *, seed: int = 0, backend: str | None = None
+    scenes: Scenes,
+    kind: str | Observation,
+    *,
+    seed: int = 0,
+    backend: str | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Observe N scenes, in compiled code if there is a C compiler.
 
-    Args:
-        scenes: N scene problems or sequences of obstacles, one scene problem, the scenes of plans or tasks, or their
-            bodies (``scene_bodies``), which saves the conversion of scenes that are observed repeatedly.
-        kind: "cloud", "camera", "distances", "basis" or "tokens", or an observation with parameters, such as
-            ``SurfaceCloud(points=1024)``.
+    Args: scenes: N scene problems or sequences of obstacles, one scene problem, the
+        scenes of plans or tasks, or their
+            bodies (``scene_bodies``), which saves the conversion of scenes that are
+            observed repeatedly.
+        kind: "cloud", "camera", "distances", "basis" or "tokens", or an observation
+            with parameters, such as ``SurfaceCloud(points=1024)``.
         seed: Seed of the points of clouds.
-        backend: "compiled" or "numpy"; by default the fastest that works on this machine.
+        backend: "compiled" or "numpy"; by default the fastest that works on this
+            machine.
 
     Returns:
         Name -> array with a first axis of length N; see the kinds of observations.
 
-    Raises:
-        UsageError: There is no such observation, an obstacle is a mesh file, or there are no scenes.
+    Raises: UsageError: There is no such observation, an obstacle is a mesh file, or
+        there are no scenes.
     """
     from cnpgen.kernels.observation.compiled_observations import observation_backend
 
-    observation, seed = as_observation(kind), integer("seed", seed, least=0, most=MAX_SEED)
+    observation, seed = (
+        as_observation(kind),
+        integer("seed", seed, least=0, most=MAX_SEED),
+    )
     bodies = scene_bodies(scenes)
-    return observation.observe(bodies, scene_seeds(seed, len(bodies)), observation_backend(backend))
+    return observation.observe(
+        bodies, scene_seeds(seed, len(bodies)), observation_backend(backend)
+    )
 
 
 def scene_bodies(scenes: Scenes) -> Primitives:
@@ -64,15 +75,25 @@ def scene_bodies(scenes: Scenes) -> Primitives:
     if isinstance(scenes, SceneProblem):
         scenes = [scenes]
     if not isinstance(scenes, Scene | list | tuple):
-        raise UsageError(f"must be scenes, got {type(scenes).__name__}", argument="scenes")
+        raise UsageError(
+            f"must be scenes, got {type(scenes).__name__}", argument="scenes"
+        )
     if len(scenes) == 0:
         raise UsageError("there are no scenes", concerns="scenes")
     if isinstance(scenes, Scene):
         return scene_primitives(scenes)
-    bodies = [scene.obstacles if isinstance(scene, SceneProblem) else scene for scene in scenes]
+    bodies = [
+        scene.obstacles if isinstance(scene, SceneProblem) else scene
+        for scene in scenes
+    ]
     for scene, obstacles in enumerate(bodies):
-        if not isinstance(obstacles, list | tuple) or not all(isinstance(body, Obstacle) for body in obstacles):
-            raise UsageError(f"must contain scene problems or obstacles, not so at scene {scene}", argument="scenes")
+        if not isinstance(obstacles, list | tuple) or not all(
+            isinstance(body, Obstacle) for body in obstacles
+        ):
+            raise UsageError(
+                f"must contain scene problems or obstacles, not so at scene {scene}",
+                argument="scenes",
+            )
         if error := invalid_obstacle(obstacles):
             raise UsageError(f"scene {scene}: {error}", concerns="scenes")
     return scene_primitives(bodies)

@@ -33,24 +33,29 @@ def obstacles_of_points(
 ) -> tuple[Obstacle, ...]:
     """Cover a point cloud by boxes along the world's axes.
 
-    Each point with its radius is inside one box. Boxes are unions of occupied voxels, shrunk to their points, so that
-    they exceed the points by at most the edge length of a voxel, beside the radius.
+    Each point with its radius is inside one box. Boxes are unions of occupied voxels,
+    shrunk to their points, so that they exceed the points by at most the edge length of
+    a voxel, beside the radius.
 
-    Args:
-        points: Points in the frame of the robot's base [m], shape (N, 3), without points of the robot itself.
-        radius: Radius of every point [m].
-        resolution: Edge length of the voxels [m]; it grows where there would be more than ``max_obstacles`` boxes.
-        max_obstacles: Largest number of boxes.
-        name: Name of the boxes, which are numbered.
+    Args: points: Points in the frame of the robot's base [m], shape (N, 3), without
+        points of the robot itself. radius: Radius of every point [m]. resolution: Edge
+        length of the voxels [m]; it grows where there would be more than
+        ``max_obstacles`` boxes. max_obstacles: Largest number of boxes. name: Name of
+        the boxes, which are numbered.
 
     Raises:
         UsageError: A point is not finite, or an argument is out of its range.
     """
     cloud = numbers("points", points)
     if cloud.ndim != 2 or cloud.shape[1] != 3 or not len(cloud):
-        raise UsageError(f"must have shape (N, 3) with N > 0, got {cloud.shape}", argument="points")
+        raise UsageError(
+            f"must have shape (N, 3) with N > 0, got {cloud.shape}", argument="points"
+        )
     if len(cloud) > MAX_POINTS:
-        raise UsageError(f"has {counted(len(cloud), 'point')}, expected at most {MAX_POINTS:,}", argument="points")
+        raise UsageError(
+            f"has {counted(len(cloud), 'point')}, expected at most {MAX_POINTS:,}",
+            argument="points",
+        )
     limit = PLAUSIBLE_MAX["m"]
     valid = (np.abs(cloud) <= limit).all(axis=1)  # false for nan
     if not valid.all():
@@ -59,14 +64,28 @@ def obstacles_of_points(
         text = f"must be finite and at most {limit:g} m, got {cloud[row]} in point {row}{hint}"
         raise UsageError(text, argument="points")
     check_range("radius", number("radius", radius), 1e-6, MAX_POINT_SIZE_M, "m")
-    check_range("resolution", number("resolution", resolution), MIN_VOXEL_M, MAX_POINT_SIZE_M, "m")
+    check_range(
+        "resolution",
+        number("resolution", resolution),
+        MIN_VOXEL_M,
+        MAX_POINT_SIZE_M,
+        "m",
+    )
     least = integer("max_obstacles", max_obstacles, least=1)
-    edge = max(resolution, float((np.prod(np.ptp(cloud, axis=0) + resolution) / MAX_GRID_VOXELS) ** (1 / 3)))
+    edge = max(
+        resolution,
+        float(
+            (np.prod(np.ptp(cloud, axis=0) + resolution) / MAX_GRID_VOXELS) ** (1 / 3)
+        ),
+    )
     boxes = _boxes(cloud, edge)
     while len(boxes) > least:
         edge *= VOXEL_GROWTH
         boxes = _boxes(cloud, edge)
-    return tuple(_obstacle(f"{name} {index}", low, high, radius) for index, (low, high) in enumerate(boxes, 1))
+    return tuple(
+        _obstacle(f"{name} {index}", low, high, radius)
+        for index, (low, high) in enumerate(boxes, 1)
+    )
 
 
 def _obstacle(name: str, low: Array, high: Array, radius: float) -> Obstacle:

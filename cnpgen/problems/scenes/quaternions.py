@@ -27,7 +27,8 @@ def rotation_matrix(wxyz: Array) -> Array:
 def quaternion_of(rotation: Array) -> Array:
     """Return the quaternion (w, x, y, z) with w >= 0 of a rotation matrix, shape (4,).
 
-    The eigenvector of the largest eigenvalue is exact for all rotations (Bar-Itzhack 2000).
+    The eigenvector of the largest eigenvalue is exact for all rotations (Bar-Itzhack
+    2000).
     """
     (a, b, c), (d, e, f), (g, h, i) = rotation
     symmetric = np.array(
@@ -46,6 +47,13 @@ def roll_pitch_yaw(rotation: Array) -> tuple[float, float, float]:
     """Return roll, pitch and yaw about fixed axes [rad] of a rotation matrix, as ``<origin rpy>`` of a URDF."""
     sine, cosine = -rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0])
     if cosine < 1e-9:  # pitch of 90 degrees: roll and yaw turn about the same axis
-        return math.atan2(-rotation[1, 2], rotation[1, 1]), math.atan2(sine, cosine), 0.0
-    roll, yaw = math.atan2(rotation[2, 1], rotation[2, 2]), math.atan2(rotation[1, 0], rotation[0, 0])
+        return (
+            math.atan2(-rotation[1, 2], rotation[1, 1]),
+            math.atan2(sine, cosine),
+            0.0,
+        )
+    roll, yaw = (
+        math.atan2(rotation[2, 1], rotation[2, 2]),
+        math.atan2(rotation[1, 0], rotation[0, 0]),
+    )
     return roll, math.atan2(sine, cosine), yaw

@@ -10,7 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cnpgen.errors import UsageError
-from cnpgen.problems.scenes.quaternions import quaternion_error, roll_pitch_yaw, rotation_matrix
+from cnpgen.problems.scenes.quaternions import (
+    quaternion_error,
+    roll_pitch_yaw,
+    rotation_matrix,
+)
 from cnpgen.robots.observation.primitives import KINDS, primitives_of, signed_distances
 from cnpgen.robots.obstacle import Obstacle, invalid_obstacle
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, Array, check_solid, hull_corners
@@ -22,10 +26,17 @@ from cnpgen.schema.units import PLAUSIBLE_MAX
 
 MAX_SCENE_OBSTACLES = 100  # as many as a problem may have
 MAX_SCENES = 100_000  # of one call
-MAX_BASE_DEPTH_M = 0.01  # of the robot's base in an obstacle, such as the plate that it stands on
+MAX_BASE_DEPTH_M = (
+    0.01  # of the robot's base in an obstacle, such as the plate that it stands on
+)
 MIN_OBSTACLE_SIZE_M = 1e-6
 MAX_ROTATION_ERROR = 1e-6  # of the products of the rows of a rotation matrix
-_SIZES = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2}  # edge lengths; radius; radius and length
+_SIZES = {
+    "box": 3,
+    "sphere": 1,
+    "cylinder": 2,
+    "capsule": 2,
+}  # edge lengths; radius; radius and length
 
 
 class SceneError(UsageError):
@@ -36,12 +47,11 @@ class SceneError(UsageError):
 class GoalPose:
     """Goal pose of a frame of the robot, in the frame of the robot's base.
 
-    Attributes:
-        frame: Name of the link or frame; empty for the problem's tip.
-        position: Position [m], shape (3,).
-        rotation: Rotation matrix, shape (3, 3).
-        position_tolerance: Accepted displacements along the axes of the pose [m], a number or shape (3,).
-        rotation_tolerance: Accepted components of the rotation vector in these axes [rad], a number or shape (3,).
+    Attributes: frame: Name of the link or frame; empty for the problem's tip. position:
+        Position [m], shape (3,). rotation: Rotation matrix, shape (3, 3).
+        position_tolerance: Accepted displacements along the axes of the pose [m], a
+        number or shape (3,). rotation_tolerance: Accepted components of the rotation
+        vector in these axes [rad], a number or shape (3,).
             About an axis with pi or more, any rotation is accepted.
     """
 
@@ -54,7 +64,10 @@ class GoalPose:
     @property
     def tolerances(self) -> tuple[Array, Array]:
         """Tolerances of position [m] and rotation [rad], shape (3,) each."""
-        position, rotation = (np.asarray(each, float) for each in (self.position_tolerance, self.rotation_tolerance))
+        position, rotation = (
+            np.asarray(each, float)
+            for each in (self.position_tolerance, self.rotation_tolerance)
+        )
         return np.broadcast_to(position, 3), np.broadcast_to(rotation, 3)
 
     def __post_init__(self) -> None:
@@ -65,14 +78,13 @@ class GoalPose:
 class SceneProblem:
     """One planning problem in a scene: obstacles, a start at rest, and a goal at rest.
 
-    Attributes:
-        name: Name of the scene, unique in its file.
-        obstacles: Obstacles with poses in the frame of the robot's base, which is the world frame.
-        start_q: Joint positions at the start [rad], shape (n,); empty if the file has none.
-        goal_q: Goal states [rad], any of which is a goal, shape (G, n); G may be 0 with a goal pose.
-        goal_pose: Goal pose, or None.
-        joint_names: Names of the n joints; empty for the planned joints of the problem in their order.
-        source: File of the scene, for messages.
+    Attributes: name: Name of the scene, unique in its file. obstacles: Obstacles with
+        poses in the frame of the robot's base, which is the world frame. start_q: Joint
+        positions at the start [rad], shape (n,); empty if the file has none. goal_q:
+        Goal states [rad], any of which is a goal, shape (G, n); G may be 0 with a goal
+        pose. goal_pose: Goal pose, or None. joint_names: Names of the n joints; empty
+        for the planned joints of the problem in their order. source: File of the scene,
+        for messages.
     """
 
     name: str
@@ -88,45 +100,82 @@ class SceneProblem:
 
     def __repr__(self) -> str:
         kinds = Counter(obstacle.kind for obstacle in self.obstacles)
-        counts = ", ".join(f"{count} x {kind}" for kind, count in sorted(kinds.items())) or "no obstacles"
+        counts = (
+            ", ".join(f"{count} x {kind}" for kind, count in sorted(kinds.items()))
+            or "no obstacles"
+        )
         return f"<scene {self.name!r}: {counts}>"
 
     @property
     def place(self) -> str:
         """File and scene, for messages."""
-        return f"{self.source}: scene {self.name!r}" if self.source else f"scene {self.name!r}"
+        return (
+            f"{self.source}: scene {self.name!r}"
+            if self.source
+            else f"scene {self.name!r}"
+        )
 
 
 def make_obstacle(
-    name: str, kind: str, sizes: Sequence[float] | Array, position: Array, wxyz: Array, *, place: str
+    name: str,
+    kind: str,
+    sizes: Sequence[float] | Array,
+    position: Array,
+    wxyz: Array,
+    *,
+    place: str,
 ) -> Obstacle:
     """Build an obstacle from the numbers of a file; ``place`` is the file and scene, for messages.
 
-    Sizes [m] are edge lengths, a radius, or a radius and a length along z (of a capsule without its round ends). The
-    center [m], shape (3,), and the quaternion (w, x, y, z) are in the frame of the robot's base.
+    Sizes [m] are edge lengths, a radius, or a radius and a length along z (of a capsule
+    without its round ends). The center [m], shape (3,), and the quaternion (w, x, y, z)
+    are in the frame of the robot's base.
     """
     where = f"{place}: obstacle {name!r}"
     if kind not in _SIZES:
         raise SceneError(f"{where} is a {kind}, expected one of {', '.join(KINDS)}")
-    sizes, position, wxyz = (np.asarray(values, float) for values in (sizes, position, wxyz))
-    for what, values, count in (("size", sizes, _SIZES[kind]), ("position", position, 3), ("quaternion", wxyz, 4)):
+    sizes, position, wxyz = (
+        np.asarray(values, float) for values in (sizes, position, wxyz)
+    )
+    for what, values, count in (
+        ("size", sizes, _SIZES[kind]),
+        ("position", position, 3),
+        ("quaternion", wxyz, 4),
+    ):
         if values.shape != (count,):
-            raise SceneError(f"{where}: {what} must have {count} numbers, got {values.tolist()!r:.60}")
+            raise SceneError(
+                f"{where}: {what} must have {count} numbers, got {values.tolist()!r:.60}"
+            )
         if not (np.abs(values) <= MAX_COORDINATE_M).all():  # also false for nan
-            raise SceneError(f"{where}: {what} must be finite and at most {MAX_COORDINATE_M:g}, got {values.tolist()}")
+            raise SceneError(
+                f"{where}: {what} must be finite and at most {MAX_COORDINATE_M:g}, got {values.tolist()}"
+            )
     if (sizes < MIN_OBSTACLE_SIZE_M).any():
-        raise SceneError(f"{where}: sizes must be at least {MIN_OBSTACLE_SIZE_M:g} m, got {sizes.tolist()}")
+        raise SceneError(
+            f"{where}: sizes must be at least {MIN_OBSTACLE_SIZE_M:g} m, got {sizes.tolist()}"
+        )
     if text := quaternion_error(wxyz):
         raise SceneError(f"{where}: {text}")
     x, y, z = position.tolist()
     turn = roll_pitch_yaw(rotation_matrix(wxyz))
     if kind == "box":
         a, b, c = sizes.tolist()
-        return Obstacle(name=name, kind=kind, position=(x, y, z), rotation=turn, size=(a, b, c))
+        return Obstacle(
+            name=name, kind=kind, position=(x, y, z), rotation=turn, size=(a, b, c)
+        )
     if kind == "sphere":
-        return Obstacle(name=name, kind=kind, position=(x, y, z), radius=float(sizes[0]))
+        return Obstacle(
+            name=name, kind=kind, position=(x, y, z), radius=float(sizes[0])
+        )
     radius, length = sizes.tolist()
-    return Obstacle(name=name, kind=kind, position=(x, y, z), rotation=turn, radius=radius, length=length)
+    return Obstacle(
+        name=name,
+        kind=kind,
+        position=(x, y, z),
+        rotation=turn,
+        radius=radius,
+        length=length,
+    )
 
 
 @checked_arguments
@@ -152,24 +201,44 @@ def make_mesh(
         UsageError: An argument has another shape.
     """
     where = f"{place}: obstacle {name!r}" if place else f"obstacle {name!r}"
-    vertices, origin, turn = numbers("points", points), numbers("position", position), numbers("rotation", rotation)
+    vertices, origin, turn = (
+        numbers("points", points),
+        numbers("position", position),
+        numbers("rotation", rotation),
+    )
     if not vertices.size:
         raise SceneError(f"{where} is a mesh without vertices")
-    shapes = {"points": (vertices, (len(vertices), 3)), "position": (origin, (3,)), "rotation": (turn, (3, 3))}
+    shapes = {
+        "points": (vertices, (len(vertices), 3)),
+        "position": (origin, (3,)),
+        "rotation": (turn, (3, 3)),
+    }
     for argument, (values, shape) in shapes.items():
         if values.shape != shape:
-            raise UsageError(f"must have shape {shape}, got {values.shape}", argument=argument)
+            raise UsageError(
+                f"must have shape {shape}, got {values.shape}", argument=argument
+            )
     if not (np.abs([*vertices.ravel(), *origin]) <= MAX_COORDINATE_M).all():
-        raise SceneError(f"{where}: points and position must be finite and at most {MAX_COORDINATE_M:g}")
+        raise SceneError(
+            f"{where}: points and position must be finite and at most {MAX_COORDINATE_M:g}"
+        )
     if not is_rotation(turn):
-        raise SceneError(f"{where}: its rotation is no rotation matrix: {turn.tolist()}")
+        raise SceneError(
+            f"{where}: its rotation is no rotation matrix: {turn.tolist()}"
+        )
     try:
         corners = hull_corners(vertices)
         check_solid(corners)
     except ValueError as error:
         raise SceneError(f"{where}: {error}") from error
     x, y, z = origin.tolist()
-    return Obstacle(name=name, kind="mesh", mesh=address_of(corners), position=(x, y, z), rotation=roll_pitch_yaw(turn))
+    return Obstacle(
+        name=name,
+        kind="mesh",
+        mesh=address_of(corners),
+        position=(x, y, z),
+        rotation=roll_pitch_yaw(turn),
+    )
 
 
 def is_rotation(matrix: Array) -> bool:
@@ -181,7 +250,9 @@ def is_rotation(matrix: Array) -> bool:
 def check_count(count: int, place: str) -> None:
     """Raise SceneError for more obstacles than a scene may have, before any is built."""
     if count > MAX_SCENE_OBSTACLES:
-        raise SceneError(f"{place} has {count:,} obstacles, expected at most {MAX_SCENE_OBSTACLES}")
+        raise SceneError(
+            f"{place} has {count:,} obstacles, expected at most {MAX_SCENE_OBSTACLES}"
+        )
 
 
 def check_scenes(scenes: Sequence[SceneProblem]) -> None:
@@ -190,13 +261,18 @@ def check_scenes(scenes: Sequence[SceneProblem]) -> None:
         raise UsageError("there are no scenes", concerns="scenes")
     for index, scene in enumerate(scenes):
         if not isinstance(scene, SceneProblem):
-            raise UsageError(f"must be SceneProblems, got {scene!r:.100} at {index}", argument="scenes")
+            raise UsageError(
+                f"must be SceneProblems, got {scene!r:.100} at {index}",
+                argument="scenes",
+            )
         if error := invalid_obstacle(scene.obstacles):
             raise SceneError(f"{scene.place}: {error}")
         for name, axes, expected in (("start_q", 1, "(n,)"), ("goal_q", 2, "(G, n)")):
             shape = np.shape(getattr(scene, name))
             if len(shape) != axes:
-                raise SceneError(f"{scene.place}: {name} must have shape {expected}, got {shape}")
+                raise SceneError(
+                    f"{scene.place}: {name} must have shape {expected}, got {shape}"
+                )
 
 
 def checked_scene(scene: SceneProblem) -> SceneProblem:
@@ -205,24 +281,43 @@ def checked_scene(scene: SceneProblem) -> SceneProblem:
     pose = scene.goal_pose
     if pose is not None:
         tolerances = pose.position_tolerance, pose.rotation_tolerance
-        shapes = np.shape(pose.position), np.shape(pose.rotation), *map(np.shape, tolerances)
+        shapes = (
+            np.shape(pose.position),
+            np.shape(pose.rotation),
+            *map(np.shape, tolerances),
+        )
         if shapes[:2] != ((3,), (3, 3)) or not {(), (3,)}.issuperset(shapes[2:]):
             text = f"of shape (3,), (3, 3), and (3,) or () for tolerances, got {', '.join(map(str, shapes))}"
-            raise SceneError(f"{scene.place}: a goal pose has a position, a rotation and tolerances {text}")
-        if not (np.abs([*pose.position, *pose.rotation.ravel()]) <= MAX_COORDINATE_M).all():
-            raise SceneError(f"{scene.place}: the goal pose has numbers that are not finite or too large")
+            raise SceneError(
+                f"{scene.place}: a goal pose has a position, a rotation and tolerances {text}"
+            )
+        if not (
+            np.abs([*pose.position, *pose.rotation.ravel()]) <= MAX_COORDINATE_M
+        ).all():
+            raise SceneError(
+                f"{scene.place}: the goal pose has numbers that are not finite or too large"
+            )
         if not is_rotation(pose.rotation):
             raise SceneError(
                 f"{scene.place}: the rotation of the goal pose is no rotation matrix: {pose.rotation.tolist()}"
             )
         limits = PLAUSIBLE_MAX["m"], PLAUSIBLE_MAX["rad"]
-        if any((each > limit).any() for each, limit in zip(pose.tolerances, limits, strict=True)):
-            raise SceneError(f"{scene.place}: tolerances of the goal pose are in m and rad, got {pose.tolerances}")
+        if any(
+            (each > limit).any()
+            for each, limit in zip(pose.tolerances, limits, strict=True)
+        ):
+            raise SceneError(
+                f"{scene.place}: tolerances of the goal pose are in m and rad, got {pose.tolerances}"
+            )
         if not all((each >= 0).all() for each in pose.tolerances):
-            raise SceneError(f"{scene.place}: tolerances of the goal pose must not be negative, got {pose.tolerances}")
+            raise SceneError(
+                f"{scene.place}: tolerances of the goal pose must not be negative, got {pose.tolerances}"
+            )
     for what, values in (("start", scene.start_q), ("goal", scene.goal_q)):
         if not np.isfinite(values).all():
-            raise SceneError(f"{scene.place}: the {what} has joint positions that are not finite")
+            raise SceneError(
+                f"{scene.place}: the {what} has joint positions that are not finite"
+            )
     for obstacle in scene.obstacles:
         if obstacle.kind == "mesh" and not is_inline(obstacle.mesh):
             raise SceneError(
@@ -240,7 +335,10 @@ def checked_scene(scene: SceneProblem) -> SceneProblem:
 
 
 def _depth_of_base(obstacle: Obstacle) -> float:
-    """Return the depth of the base, the origin, in an obstacle [m]; negative outside."""
+    """Return the depth of the base, the origin, in an obstacle [m].
+
+    Negative outside.
+    """
     bodies = primitives_of([obstacle], place_obstacles([obstacle]))
     return -float(signed_distances(bodies, np.zeros((1, 3)))[0, 0])
 
@@ -252,5 +350,7 @@ def _uniquely_named(obstacles: tuple[Obstacle, ...]) -> tuple[Obstacle, ...]:
     for obstacle in obstacles:
         seen[obstacle.name] += 1
         suffix = f" {seen[obstacle.name]}" if counts[obstacle.name] > 1 else ""
-        renamed.append(replace(obstacle, name=obstacle.name + suffix) if suffix else obstacle)
+        renamed.append(
+            replace(obstacle, name=obstacle.name + suffix) if suffix else obstacle
+        )
     return tuple(renamed)

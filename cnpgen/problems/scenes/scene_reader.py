@@ -10,7 +10,10 @@ from cnpgen.schema import addons, registry
 
 
 class SceneReader(ABC):
-    """Reader of the scene files of other programs; packages register them in the group ``cnpgen.readers``."""
+    """Reader of the scene files of other programs.
+
+    Packages register them in the group ``cnpgen.readers``.
+    """
 
     @abstractmethod
     def holds(self, path: Path) -> bool:
@@ -20,10 +23,9 @@ class SceneReader(ABC):
     def load(self, path: Path, *, start: int, n: int | None) -> list[SceneProblem]:
         """Read scenes from the number ``start`` on, at most ``n`` of them, or all that follow.
 
-        Raises:
-            UsageError: There are no scenes, or one is invalid; the message names file, scene and element.
-            DatasetError: A file is damaged.
-            MissingExtraError: A package for the format is missing.
+        Raises: UsageError: There are no scenes, or one is invalid; the message names
+            file, scene and element. DatasetError: A file is damaged. MissingExtraError:
+            A package for the format is missing.
         """
 
 
@@ -32,7 +34,9 @@ def holds_scenes(path: Path) -> bool:
     return any(reader.holds(path) for reader in _readers())
 
 
-def read_scenes(path: Path, *, start: int = 0, n: int | None = None) -> list[SceneProblem]:
+def read_scenes(
+    path: Path, *, start: int = 0, n: int | None = None
+) -> list[SceneProblem]:
     """Read the scenes of a path by the reader that accepts it; errors as of ``SceneReader.load``.
 
     Raises:
@@ -46,4 +50,7 @@ def read_scenes(path: Path, *, start: int = 0, n: int | None = None) -> list[Sce
 
 
 def _readers() -> list[SceneReader]:
-    return [registry.load(registry.READERS, name)() for name in registry.names(registry.READERS)]
+    return [
+        registry.load(registry.READERS, name)()
+        for name in registry.names(registry.READERS)
+    ]

@@ -1,8 +1,9 @@
 """Explanations of boundary problems without a valid plan: a proof of infeasibility, or none.
 
-A proof does not depend on splines: it holds for every motion that the verdict would accept, tolerances included. The
-ends, the reachable joint positions and the edges of the table suffice for most infeasible problems. A problem without a
-proof may have a valid plan.
+A proof does not depend on splines: it holds for every motion that the verdict would
+accept, tolerances included. The ends, the reachable joint positions and the edges of
+the table suffice for most infeasible problems. A problem without a proof may have a
+valid plan.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,7 +20,11 @@ from cnpgen.problems.conditions import measured_needs
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.problem import Problem
-from cnpgen.refine.proof.reachable_positions import end_states, joint_limits, sample_times
+from cnpgen.refine.proof.reachable_positions import (
+    end_states,
+    joint_limits,
+    sample_times,
+)
 from cnpgen.refine.proof.table_proof import find_table_exit
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
@@ -30,8 +35,9 @@ from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
-# Relative to the bound, or absolute, by the derivative on which a condition depends: more than the condition changes
-# within the verdict's tolerances of boundary conditions, 1e-6 rad, 1e-6 rad/s and 1e-4 rad/s^2.
+# Relative to the bound, or absolute, by the derivative on which a condition depends:
+# more than the condition changes within the verdict's tolerances of boundary
+# conditions, 1e-6 rad, 1e-6 rad/s and 1e-4 rad/s^2.
 BOUNDARY_MARGIN = (1e-5, 1e-5, 1e-3)
 POSITION_MARGIN_RAD = 1e-4  # for motion between the times of the verdict, and its tolerance of boundary conditions
 
@@ -61,11 +67,15 @@ class Explanation:
         return f"{self.kind}: {self.text}"
 
 
-def explain_failure(problem: Problem, robot: Robot, boundary: Boundary, scene: Scene) -> Explanation:
+def explain_failure(
+    problem: Problem, robot: Robot, boundary: Boundary, scene: Scene
+) -> Explanation:
     """Explain why no valid plan of a boundary problem was found: one motion, with a scene of one sample."""
     conditions = (scene.poses, *vars(boundary).values())
     if not all(values is None or np.isfinite(values).all() for values in conditions):
-        return Explanation(Feasibility.INFEASIBLE, "the boundary conditions are not finite")
+        return Explanation(
+            Feasibility.INFEASIBLE, "the boundary conditions are not finite"
+        )
     violations = (text for _, text in end_violations(problem, robot, boundary, scene))
     for text in chain(violations, _cannot_brake(problem, robot, boundary)):
         return Explanation(Feasibility.INFEASIBLE, text)
@@ -74,12 +84,13 @@ def explain_failure(problem: Problem, robot: Robot, boundary: Boundary, scene: S
 
 
 @checked_arguments
-def explain_plans(plans: Plans, indices: Sequence[int] | None = None) -> dict[int, Explanation]:
+def explain_plans(
+    plans: Plans, indices: Sequence[int] | None = None
+) -> dict[int, Explanation]:
     """Explain why no valid plans of some problems were found.
 
-    Args:
-        plans: The plans.
-        indices: Indices of the plans to explain; by default all whose status is not valid.
+    Args: plans: The plans. indices: Indices of the plans to explain; by default all
+        whose status is not valid.
 
     Returns:
         Index -> explanation.
@@ -95,13 +106,17 @@ def explain_plans(plans: Plans, indices: Sequence[int] | None = None) -> dict[in
         indices = np.flatnonzero(plans.status != PlanStatus.VALID).tolist()
     indices = [integer("indices", index) for index in indices]
     if wrong := [index for index in indices if not 0 <= index < len(plans)]:
-        raise UsageError(f"there are plans 0 to {len(plans) - 1}, got {wrong[0]}", concerns="indices")
+        raise UsageError(
+            f"there are plans 0 to {len(plans) - 1}, got {wrong[0]}", concerns="indices"
+        )
     if not indices:
         return {}
     plans = correct_tips(plans)
     problem, robot = open_problem(plans.problem)
     return {
-        index: explain_failure(problem, robot, plans.boundary[index : index + 1], plans.scene[index])
+        index: explain_failure(
+            problem, robot, plans.boundary[index : index + 1], plans.scene[index]
+        )
         for index in indices
     }
 
@@ -111,8 +126,8 @@ def end_violations(
 ) -> Iterator[tuple[Constraint, str]]:
     """Yield the constraints that an end of one motion violates by more than their tolerance, with a description.
 
-    If the boundary conditions leave the acceleration at the goal free, there must be one within its limits whose
-    torques are within theirs.
+    If the boundary conditions leave the acceleration at the goal free, there must be
+    one within its limits whose torques are within theirs.
     """
     world = World(robot, problem.obstacle, problem.object_size)
     (obstacle_poses,) = scene.poses
@@ -121,30 +136,51 @@ def end_violations(
         "start": (boundary.start_q[0], boundary.start_dq[0], boundary.start_ddq[0]),
         "goal": (boundary.goal_q[0], boundary.goal_dq[0], goal_ddq),
     }
-    orders = measured_needs([constraint.judged for constraint in problem.constraint], world)
+    orders = measured_needs(
+        [constraint.judged for constraint in problem.constraint], world
+    )
     world.set_state(*ends["start"], obstacle_poses)
     tip = world.tip_position
     for end, state in ends.items():
         world.set_state(*state, obstacle_poses)
         free = end == "goal" and boundary.goal_ddq is None
-        pairs = [(constraint, condition) for constraint in problem.constraint for condition in constraint.judged(world)]
+        pairs = [
+            (constraint, condition)
+            for constraint in problem.constraint
+            for condition in constraint.judged(world)
+        ]
         for (constraint, condition), order in zip(pairs, orders, strict=True):
             if not (free and order == 2):
-                texts = _violation(constraint, condition, tip, end, BOUNDARY_MARGIN[order])
+                texts = _violation(
+                    constraint, condition, tip, end, BOUNDARY_MARGIN[order]
+                )
                 yield from ((constraint, text) for text in texts)
     torque = problem.first(JointTorque)
-    if boundary.goal_ddq is None and torque is not None and not _has_acceleration(problem, world, torque):
-        yield torque, "at the goal there is no acceleration within its limits whose torques are within theirs"
+    if (
+        boundary.goal_ddq is None
+        and torque is not None
+        and not _has_acceleration(problem, world, torque)
+    ):
+        yield (
+            torque,
+            "at the goal there is no acceleration within its limits whose torques are within theirs",
+        )
 
 
 def _violation(
-    constraint: Constraint, condition: Condition, start_tip: Array, end: str, margin: float
+    constraint: Constraint,
+    condition: Condition,
+    start_tip: Array,
+    end: str,
+    margin: float,
 ) -> Iterator[str]:
     """Describe a violation of a measured condition by more than tolerance and margin, see ``BOUNDARY_MARGIN``."""
     g = np.array(condition.g, float)
     phase = np.array([0.0 if end == "start" else 1.0])
     relaxation = float(constraint.bound_relaxation(condition, phase, start_tip)[0])
-    bound = np.where(g < condition.lower, condition.lower - relaxation, condition.upper + relaxation)
+    bound = np.where(
+        g < condition.lower, condition.lower - relaxation, condition.upper + relaxation
+    )
     violation = np.maximum(condition.lower - g, g - condition.upper) - relaxation
     tolerance = constraint.allowed(condition)
     worst = int(np.argmax(violation - tolerance))
@@ -164,10 +200,15 @@ def _has_acceleration(problem: Problem, world: World, torque: JointTorque) -> bo
 
     robot, q, dq = world.robot, world.q, world.dq
     acceleration = joint_limits(problem, robot, tolerances=1.0).acceleration
-    limit = robot.torque_limit * (1 + torque.tolerance + BOUNDARY_MARGIN[2]) + BOUNDARY_MARGIN[2]
+    limit = (
+        robot.torque_limit * (1 + torque.tolerance + BOUNDARY_MARGIN[2])
+        + BOUNDARY_MARGIN[2]
+    )
     model, data = world.parameters.model, world.parameters.model.createData()
     bias = np.array(pin.rnea(model, data, q, dq, np.zeros(robot.n)))
-    inertia = np.array([pin.rnea(model, data, q, dq, unit) - bias for unit in np.eye(robot.n)]).T
+    inertia = np.array(
+        [pin.rnea(model, data, q, dq, unit) - bias for unit in np.eye(robot.n)]
+    ).T
     solved = linprog(
         np.zeros(robot.n),
         A_ub=np.vstack([inertia, -inertia]),
@@ -192,7 +233,9 @@ def _cannot_brake(problem: Problem, robot: Robot, boundary: Boundary) -> Iterato
                 yield f"{instant} {name} is {violation:.2g} {unit} or more outside its range, for any acceleration"
 
 
-def _off_table(problem: Problem, robot: Robot, boundary: Boundary) -> Explanation | None:
+def _off_table(
+    problem: Problem, robot: Robot, boundary: Boundary
+) -> Explanation | None:
     """Explain whether the tip must leave a table."""
     table_exit = find_table_exit(problem, robot, boundary)
     if table_exit is None:
@@ -202,8 +245,15 @@ def _off_table(problem: Problem, robot: Robot, boundary: Boundary) -> Explanatio
     if table_exit.proven:
         text = f"{subject} is {distance} or more off the table, for any acceleration"
         return Explanation(Feasibility.INFEASIBLE, text)
-    best = f"has {distance} of the table left" if table_exit.distance < 0 else f"is {distance} off the table"
-    return Explanation(Feasibility.VERGE, f"{subject} {best} at best, by a local search without tolerances")
+    best = (
+        f"has {distance} of the table left"
+        if table_exit.distance < 0
+        else f"is {distance} off the table"
+    )
+    return Explanation(
+        Feasibility.VERGE,
+        f"{subject} {best} at best, by a local search without tolerances",
+    )
 
 
 def _time_text(end: str, time: float) -> str:

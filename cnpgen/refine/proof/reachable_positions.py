@@ -5,7 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.joint import JointAcceleration, JointPosition, JointVelocity
+from cnpgen.problems.constraints.joint import (
+    JointAcceleration,
+    JointPosition,
+    JointVelocity,
+)
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
@@ -13,12 +17,17 @@ from cnpgen.trajectory.boundary import Boundary
 Array = NDArray[np.float64]
 NO_LIMIT = 1e6  # replaces a limit that the problem does not set
 DURATION_STEP_S = 1e-3  # of the search for the minimum duration
-SAMPLED_STEPS = np.arange(10, 151, 10)  # from an end; later, intervals are too wide to prove anything
+SAMPLED_STEPS = np.arange(
+    10, 151, 10
+)  # from an end; later, intervals are too wide to prove anything
 
 
 @dataclass(frozen=True)
 class JointLimits:
-    """Limits of positions, velocities and accelerations, shape (n,) each; the last two are symmetric."""
+    """Limits of positions, velocities and accelerations, shape (n,) each.
+
+    The last two are symmetric.
+    """
 
     lower: Array
     upper: Array
@@ -28,11 +37,16 @@ class JointLimits:
 
 def joint_limits(problem: Problem, robot: Robot, *, tolerances: float) -> JointLimits:
     """Return the limits of a problem's constraints, relaxed by a fraction of their tolerances, from 0 to 1."""
-    lower, upper, velocity, acceleration = (sign * np.full(robot.n, NO_LIMIT) for sign in (-1, 1, 1, 1))
+    lower, upper, velocity, acceleration = (
+        sign * np.full(robot.n, NO_LIMIT) for sign in (-1, 1, 1, 1)
+    )
     for constraint in problem.constraint:
         tolerance = tolerances * constraint.tolerance
         if isinstance(constraint, JointPosition):
-            lower, upper = robot.position_lower - tolerance, robot.position_upper + tolerance
+            lower, upper = (
+                robot.position_lower - tolerance,
+                robot.position_upper + tolerance,
+            )
         elif isinstance(constraint, JointVelocity):
             velocity = robot.velocity_limit * (1 + tolerance)
         elif isinstance(constraint, JointAcceleration):
@@ -48,7 +62,10 @@ class EndState:
     dq: Array  # joint velocities [rad/s], shape (n,); at the goal the opposite of the motion's
 
     def box(self, time: float, limits: JointLimits) -> tuple[Array, Array]:
-        """Bound each joint's position ``time`` [s] later: (lower, upper), shape (n,); empty where lower > upper."""
+        """Bound each joint's position ``time`` [s] later: (lower, upper), shape (n,).
+
+        Empty where lower > upper.
+        """
         upper = _max_position(self.q, self.dq, time, limits)
         lower = -_max_position(-self.q, -self.dq, time, limits)
         return np.maximum(lower, limits.lower), np.minimum(upper, limits.upper)
@@ -70,7 +87,10 @@ def sample_times(boundary: Boundary, limits: JointLimits) -> Array:
         (
             k
             for k in range(1, SAMPLED_STEPS[-1] + 1)
-            if all(_reaches(state, other.q, k * DURATION_STEP_S, limits) for state, other in pairs)
+            if all(
+                _reaches(state, other.q, k * DURATION_STEP_S, limits)
+                for state, other in pairs
+            )
         ),
         SAMPLED_STEPS[-1] + 1,
     )

@@ -17,17 +17,35 @@ from cnpgen.robots.solid import place_obstacles
 from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
-END_POINTS = (0, 1, 2, 4, 7, 11)  # from either end, whose accelerations depend on the last rate control points
-END_RELAXATION = (0.1, 0.3)  # phases between which the relaxation of violated end bounds fades out
+END_POINTS = (
+    0,
+    1,
+    2,
+    4,
+    7,
+    11,
+)  # from either end, whose accelerations depend on the last rate control points
+END_RELAXATION = (
+    0.1,
+    0.3,
+)  # phases between which the relaxation of violated end bounds fades out
 MIN_END_RELAXATION = 1e-5  # of scaled residuals: iterations end with larger violations
-UNKNOWN_TOLERANCE = 1e9  # in scaled units, of conditions that only the verdict can check
+UNKNOWN_TOLERANCE = (
+    1e9  # in scaled units, of conditions that only the verdict can check
+)
 PHASE_FACTOR = 1.03  # time-varying bounds close earlier by this factor: motions overshoot where they level out
-PRECISE_FRACTION = 0.1  # of the tolerance of an equality: the largest error of a precise plan
+PRECISE_FRACTION = (
+    0.1  # of the tolerance of an equality: the largest error of a precise plan
+)
 NEAR_FRACTION = 0.97  # of the distance from a path, on the grid: motions overshoot between its points
-INTERVAL_FRACTION = 0.9  # of the tolerance between grid points: the interpolation has an error
+INTERVAL_FRACTION = (
+    0.9  # of the tolerance between grid points: the interpolation has an error
+)
 
 
-_ORDERS: dict[str, list[int]] = {}  # structure of a problem -> result of ``condition_orders``
+_ORDERS: dict[
+    str, list[int]
+] = {}  # structure of a problem -> result of ``condition_orders``
 _TEMPLATES: dict[tuple[str, bytes, "Tightening"], "BoundsTemplate"] = {}
 MAX_TEMPLATES = 64
 
@@ -37,7 +55,9 @@ class Tightening:
     """Tightening of the problem's bounds against overshoot between grid points."""
 
     limit: float  # fraction of acceleration, torque and jerk limits
-    gentle: float  # fraction of position and velocity limits, on which boundary states lie
+    gentle: (
+        float  # fraction of position and velocity limits, on which boundary states lie
+    )
     clearance: float  # distance added to clearances [m]
     band: float  # half width of equalities, as a fraction of their tolerance
     edge: float  # phase over which the tightening fades in from either end, since boundary states may lie on a limit
@@ -52,11 +72,11 @@ class Bounds:
 
     lower: Array  # lower bounds, shape (K, m), -inf where there are none
     upper: Array  # upper bounds, shape (K, m)
-    # Mask of residuals that change abruptly with the last rate control points, shape (K, m): those of accelerations and
-    # jerks at the ends.
+    # Mask of residuals that change abruptly with the last rate control points, shape
+    # (K, m): those of accelerations and jerks at the ends.
     nonsmooth: NDArray[np.bool_]
-    # Accepted violation between grid points, shape (K, m): that of the verdict, or of a precise plan for equalities;
-    # inf where it is unknown.
+    # Accepted violation between grid points, shape (K, m): that of the verdict, or of a
+    # precise plan for equalities; inf where it is unknown.
     interval_tolerance: Array
 
     @property
@@ -65,7 +85,10 @@ class Bounds:
         return np.asarray(self.nonsmooth.any(axis=0))
 
     def violations(self, g: Array) -> Array:
-        """Return the violations by residuals g, shape (K, m); negative inside the bounds."""
+        """Return the violations by residuals g, shape (K, m).
+
+        Negative inside the bounds.
+        """
         return np.maximum(g - self.upper, self.lower - g)
 
     def end_violations(self, ends: Array) -> Array:
@@ -73,7 +96,10 @@ class Bounds:
         return np.maximum(ends - self.upper[[0, -2]], self.lower[[0, -2]] - ends)
 
     def max_violation(self, g: Array) -> float:
-        """Return the largest violation by residuals g, shape (K, m); inf where g is not finite."""
+        """Return the largest violation by residuals g, shape (K, m).
+
+        Inf where g is not finite.
+        """
         worst = float(self.violations(g).max())
         return max(worst, 0.0) if np.isfinite(worst) else np.inf
 
@@ -83,10 +109,16 @@ class Bounds:
         Midpoints are interpolated with ``Grid.midpoint_weights``.
         """
         centers = sum(
-            weights[:, None] * g[k : k + len(midpoint_weights)] for k, weights in enumerate(midpoint_weights.T)
+            weights[:, None] * g[k : k + len(midpoint_weights)]
+            for k, weights in enumerate(midpoint_weights.T)
         )
-        left, right = slice(1, -2), slice(2, -1)  # of the intervals between the second and the last but one
-        tolerance = INTERVAL_FRACTION * np.minimum(self.interval_tolerance[left], self.interval_tolerance[right])
+        left, right = (
+            slice(1, -2),
+            slice(2, -1),
+        )  # of the intervals between the second and the last but one
+        tolerance = INTERVAL_FRACTION * np.minimum(
+            self.interval_tolerance[left], self.interval_tolerance[right]
+        )
         above = centers - np.maximum(self.upper[left], self.upper[right]) - tolerance
         below = np.minimum(self.lower[left], self.lower[right]) - centers - tolerance
         if not (above.max() > 0 or below.max() > 0):
@@ -103,10 +135,19 @@ def condition_orders(problem: Problem, world: World) -> list[int]:
 
     Problems that differ only in poses and sizes of obstacles share the result.
     """
-    forms, structure = [constraint.solved for constraint in problem.constraint], problem.structure
+    forms, structure = (
+        [constraint.solved for constraint in problem.constraint],
+        problem.structure,
+    )
     rest = [np.zeros(world.robot.n)] * (3 if problem.uses_jerk else 2)
     if structure is not None and structure in _ORDERS:
-        world.set_state(world.robot.home, rest[0], rest[1], place_obstacles(world.obstacles), *rest[2:])
+        world.set_state(
+            world.robot.home,
+            rest[0],
+            rest[1],
+            place_obstacles(world.obstacles),
+            *rest[2:],
+        )
         return _ORDERS[structure]
     orders = measured_needs(forms, world, jerk=problem.uses_jerk)
     if structure is not None:
@@ -114,8 +155,13 @@ def condition_orders(problem: Problem, world: World) -> list[int]:
     return orders
 
 
-def bounds_template(problem: Problem, world: World, s: Array, tightening: Tightening) -> "BoundsTemplate":
-    """Return the bounds of the motions of a problem on one grid; equal problems share them (``BoundsTemplate``)."""
+def bounds_template(
+    problem: Problem, world: World, s: Array, tightening: Tightening
+) -> "BoundsTemplate":
+    """Return the bounds of the motions of a problem on one grid.
+
+    Equal problems share them (``BoundsTemplate``).
+    """
     key = problem.identity, s.tobytes(), tightening
     template = _TEMPLATES.get(key)
     if template is None:
@@ -128,55 +174,92 @@ def bounds_template(problem: Problem, world: World, s: Array, tightening: Tighte
 class BoundsTemplate:
     """Bounds of the motions of a problem on one grid with phases s, shape (K,); the state of its world is changed.
 
-    Per residual, shape (m,), it has tolerances of the verdict in scaled units (``UNKNOWN_TOLERANCE`` for conservative
-    conditions), the highest derivative of q, and masks of equalities, capsules and clearances of the held object.
+    Per residual, shape (m,), it has tolerances of the verdict in scaled units
+    (``UNKNOWN_TOLERANCE`` for conservative conditions), the highest derivative of q,
+    and masks of equalities, capsules and clearances of the held object.
     """
 
-    def __init__(self, problem: Problem, world: World, s: Array, tightening: Tightening) -> None:
+    def __init__(
+        self, problem: Problem, world: World, s: Array, tightening: Tightening
+    ) -> None:
         orders = condition_orders(problem, world)
-        pairs = [(constraint, condition) for constraint in problem.constraint for condition in constraint.solved(world)]
+        pairs = [
+            (constraint, condition)
+            for constraint in problem.constraint
+            for condition in constraint.solved(world)
+        ]
         tables, untightened = (
             np.concatenate(
-                [_bounds(*pair, s, amount, order) for pair, order in zip(pairs, orders, strict=True)], axis=-1
+                [
+                    _bounds(*pair, s, amount, order)
+                    for pair, order in zip(pairs, orders, strict=True)
+                ],
+                axis=-1,
             )
             for amount in (tightening, NO_TIGHTENING)
         )
         self._tightening = tightening
         self._s, self._bound_phases = s, s * (PHASE_FACTOR if tightening.band else 1.0)
-        self._lower, self._upper = map(np.asfortranarray, tables)  # the layout of residuals
+        self._lower, self._upper = map(
+            np.asfortranarray, tables
+        )  # the layout of residuals
         self.conditions = [condition for _, condition in pairs]
         self.tolerances = np.concatenate([_tolerances(*pair) for pair in pairs])
         widths = [len(condition.g) for condition in self.conditions]
         self._time_varying = [
             (*pair, slice(behind - width, behind))
-            for pair, width, behind in zip(pairs, widths, accumulate(widths), strict=True)
+            for pair, width, behind in zip(
+                pairs, widths, accumulate(widths), strict=True
+            )
             if type(pair[0]).bound_relaxation is not Constraint.bound_relaxation
         ]
         self.orders = np.repeat(orders, widths)
-        self.capsules = np.repeat([isinstance(item, RobotClearance | SelfClearance) for item, _ in pairs], widths)
-        self.held_clearances = np.repeat([isinstance(item, ObjectClearance) for item, _ in pairs], widths)
-        scales = [_scale(*pair) if isinstance(pair[0], JointPosition) else np.nan for pair in pairs]
-        self._position_scale = np.concatenate(
-            [np.broadcast_to(scale, width) for scale, width in zip(scales, widths, strict=True)]
+        self.capsules = np.repeat(
+            [isinstance(item, RobotClearance | SelfClearance) for item, _ in pairs],
+            widths,
         )
-        self.equal = np.repeat([condition.is_equality for condition in self.conditions], widths)
+        self.held_clearances = np.repeat(
+            [isinstance(item, ObjectClearance) for item, _ in pairs], widths
+        )
+        scales = [
+            _scale(*pair) if isinstance(pair[0], JointPosition) else np.nan
+            for pair in pairs
+        ]
+        self._position_scale = np.concatenate(
+            [
+                np.broadcast_to(scale, width)
+                for scale, width in zip(scales, widths, strict=True)
+            ]
+        )
+        self.equal = np.repeat(
+            [condition.is_equality for condition in self.conditions], widths
+        )
         with np.errstate(invalid="ignore"):
-            interval_tolerance = np.where(self.equal, PRECISE_FRACTION, 1.0) * self.tolerances + np.fmax(
+            interval_tolerance = np.where(
+                self.equal, PRECISE_FRACTION, 1.0
+            ) * self.tolerances + np.fmax(
                 untightened[1] - self._upper, self._lower - untightened[0]
             )
-        self._interval_tolerance = np.asfortranarray(np.where(np.isnan(interval_tolerance), np.inf, interval_tolerance))
+        self._interval_tolerance = np.asfortranarray(
+            np.where(np.isnan(interval_tolerance), np.inf, interval_tolerance)
+        )
         self._nonsmooth = np.zeros(self._lower.shape, bool, order="F")
-        self._nonsmooth[[*END_POINTS, *(-1 - point for point in END_POINTS)]] = self.orders >= 2
+        self._nonsmooth[[*END_POINTS, *(-1 - point for point in END_POINTS)]] = (
+            self.orders >= 2
+        )
 
     def bounds_for(self, start_tip: Array, *, ends: Array | None = None) -> Bounds:
         """Return the bounds of one motion with the tip at ``start_tip`` [m], shape (3,), at the start.
 
-        Residuals of the boundary states ``ends`` have shape (2, m), nan where they are free. Bounds near an end that
-        violates them within the tolerance are relaxed by the violation: no motion meets narrower ones.
+        Residuals of the boundary states ``ends`` have shape (2, m), nan where they are
+        free. Bounds near an end that violates them within the tolerance are relaxed by
+        the violation: no motion meets narrower ones.
         """
         lower, upper = self._lower, self._upper
         for constraint, condition, columns in self._time_varying:
-            relaxation = constraint.bound_relaxation(condition, self._bound_phases, start_tip)
+            relaxation = constraint.bound_relaxation(
+                condition, self._bound_phases, start_tip
+            )
             if np.any(relaxation > 0):
                 scale = _scale(constraint, condition)
                 lower, upper = lower.copy("F"), upper.copy("F")
@@ -190,17 +273,24 @@ class BoundsTemplate:
         columns = np.isfinite(self._position_scale)
         if columns.sum() != positions.shape[1]:
             return bounds
-        scale, band, inner = self._position_scale[columns], NEAR_FRACTION * distance, self._s < 1
+        scale, band, inner = (
+            self._position_scale[columns],
+            NEAR_FRACTION * distance,
+            self._s < 1,
+        )
         rows = np.ix_(inner, columns)
         lower, upper = bounds.lower.copy("F"), bounds.upper.copy("F")
         lower[rows] = np.maximum(lower[rows], (positions[inner] - band) / scale)
         upper[rows] = np.minimum(upper[rows], (positions[inner] + band) / scale)
         return Bounds(lower, upper, bounds.nonsmooth, bounds.interval_tolerance)
 
-    def with_hull_distances(self, bounds: Bounds, min_distances: Array, extra: Array | float = 0.0) -> Bounds:
+    def with_hull_distances(
+        self, bounds: Bounds, min_distances: Array, extra: Array | float = 0.0
+    ) -> Bounds:
         """Return bounds without those of capsules and with further columns for the distances of hulls.
 
-        Required distances [m] have shape (columns,), additional ones shape (K, columns).
+        Required distances [m] have shape (columns,), additional ones shape (K,
+        columns).
         """
         added = _added_clearance(self._s, self._tightening)[:, None]
         lower = (min_distances + added + extra) / DISTANCE_SCALE_M
@@ -208,25 +298,45 @@ class BoundsTemplate:
         free = np.where(self.capsules, np.inf, 0.0)
         return Bounds(
             np.asfortranarray(np.hstack([bounds.lower - free, lower])),
-            np.asfortranarray(np.hstack([bounds.upper + free, np.full_like(lower, np.inf)])),
-            np.asfortranarray(np.hstack([bounds.nonsmooth, np.zeros(lower.shape, bool)])),
-            np.asfortranarray(np.hstack([bounds.interval_tolerance, np.full_like(lower, np.inf)])),
+            np.asfortranarray(
+                np.hstack([bounds.upper + free, np.full_like(lower, np.inf)])
+            ),
+            np.asfortranarray(
+                np.hstack([bounds.nonsmooth, np.zeros(lower.shape, bool)])
+            ),
+            np.asfortranarray(
+                np.hstack([bounds.interval_tolerance, np.full_like(lower, np.inf)])
+            ),
         )
 
     def _relaxed_at_ends(self, bounds: Bounds, ends: Array) -> Bounds:
         lower, upper = bounds.lower, bounds.upper
-        if not np.fmax.reduce(bounds.end_violations(ends), axis=None) > MIN_END_RELAXATION:
+        if (
+            not np.fmax.reduce(bounds.end_violations(ends), axis=None)
+            > MIN_END_RELAXATION
+        ):
             return bounds
         fades = near_ends(self._s)
-        for g, row, fade in ((ends[0], 0, fades[0]), (ends[1], -2, fades[1])):  # most of the last row is unbounded
+        for g, row, fade in (
+            (ends[0], 0, fades[0]),
+            (ends[1], -2, fades[1]),
+        ):  # most of the last row is unbounded
             above, below = np.fmax(g - upper[row], 0.0), np.fmax(lower[row] - g, 0.0)
             if np.any(above > 0):
-                upper = np.asfortranarray(upper + np.minimum(above, self.tolerances) * fade)
+                upper = np.asfortranarray(
+                    upper + np.minimum(above, self.tolerances) * fade
+                )
             if np.any(below > 0):
-                lower = np.asfortranarray(lower - np.minimum(below, self.tolerances) * fade)
+                lower = np.asfortranarray(
+                    lower - np.minimum(below, self.tolerances) * fade
+                )
         with np.errstate(invalid="ignore"):
-            relaxation = np.nan_to_num(np.fmax(upper - bounds.upper, bounds.lower - lower))
-        interval_tolerance = bounds.interval_tolerance - np.where(self.equal, 0.0, relaxation)
+            relaxation = np.nan_to_num(
+                np.fmax(upper - bounds.upper, bounds.lower - lower)
+            )
+        interval_tolerance = bounds.interval_tolerance - np.where(
+            self.equal, 0.0, relaxation
+        )
         return Bounds(lower, upper, bounds.nonsmooth, interval_tolerance)
 
 
@@ -242,7 +352,9 @@ def accepted_along(shares: Array, accepted: Array) -> Array:
 
 
 def _scale(constraint: Constraint, condition: Condition) -> Array:
-    return residual_scale(condition.lower, condition.upper, constraint.tolerance, condition.tolerance_kind)
+    return residual_scale(
+        condition.lower, condition.upper, constraint.tolerance, condition.tolerance_kind
+    )
 
 
 def _tolerances(constraint: Constraint, condition: Condition) -> Array:
@@ -251,14 +363,23 @@ def _tolerances(constraint: Constraint, condition: Condition) -> Array:
     return constraint.allowed(condition) / _scale(constraint, condition)
 
 
-def _bounds(constraint: Constraint, condition: Condition, s: Array, tightening: Tightening, order: int) -> Array:
+def _bounds(
+    constraint: Constraint,
+    condition: Condition,
+    s: Array,
+    tightening: Tightening,
+    order: int,
+) -> Array:
     """Return scaled bounds, shape (2, K, m), of one condition that depends on derivatives up to ``order``."""
     scale = _scale(constraint, condition)
     lower = np.repeat((condition.lower / scale)[None], len(s), axis=0)
     upper = np.repeat((condition.upper / scale)[None], len(s), axis=0)
     if condition.tolerance_kind == "limit":
         fraction = tightening.limit if order >= 2 else tightening.gentle
-        shrink = 1 - fraction * np.clip(np.minimum(s, 1 - s) / tightening.edge, 0, 1)[:, None]
+        shrink = (
+            1
+            - fraction * np.clip(np.minimum(s, 1 - s) / tightening.edge, 0, 1)[:, None]
+        )
         center, half = (lower + upper) / 2, (upper - lower) / 2
         lower, upper = center - shrink * half, center + shrink * half
     elif condition.is_equality:
@@ -274,4 +395,6 @@ def _bounds(constraint: Constraint, condition: Condition, s: Array, tightening: 
 
 def _added_clearance(s: Array, tightening: Tightening) -> Array:
     """Return the tightening of clearances along the motion [m], shape (K,)."""
-    return np.asarray(tightening.clearance * np.clip(np.minimum(s, 1 - s) / tightening.edge, 0, 1))
+    return np.asarray(
+        tightening.clearance * np.clip(np.minimum(s, 1 - s) / tightening.edge, 0, 1)
+    )

@@ -44,7 +44,10 @@ class _Bases(ctypes.Structure):
 
     _fields_ = (
         *((name, c_long) for name in ("orders", "points")),
-        *((name, c_void_p) for name in ("path", "rate", "path_at", "rate_at", "path_from", "rate_from")),
+        *(
+            (name, c_void_p)
+            for name in ("path", "rate", "path_at", "rate_at", "path_from", "rate_from")
+        ),
     )
 
 
@@ -53,7 +56,18 @@ class _Polyhedron(ctypes.Structure):
 
     _fields_ = (
         *((name, c_long) for name in ("dim", "stride", "count")),
-        *((name, c_void_p) for name in ("rows", "low", "high", "norm", "scratch", "active", "leading_zeros")),
+        *(
+            (name, c_void_p)
+            for name in (
+                "rows",
+                "low",
+                "high",
+                "norm",
+                "scratch",
+                "active",
+                "leading_zeros",
+            )
+        ),
     )
 
 
@@ -61,17 +75,56 @@ class _Motion(ctypes.Structure):
     """``motion`` of step.c."""
 
     _fields_ = (
-        *((name, c_long) for name in ("n", "path", "rate", "support", "fixed", "nx", "stride", "m")),
-        *((name, c_long) for name in ("n_time_nodes", "n_cost_residuals", "n_cost_groups", "thinning")),
+        *(
+            (name, c_long)
+            for name in ("n", "path", "rate", "support", "fixed", "nx", "stride", "m")
+        ),
+        *(
+            (name, c_long)
+            for name in (
+                "n_time_nodes",
+                "n_cost_residuals",
+                "n_cost_groups",
+                "thinning",
+            )
+        ),
         *((name, _Bases) for name in ("grid", "cost_bases")),
         *((name, c_void_p) for name in ("values", "jacobian", "cost_residuals")),
-        *((name, c_void_p) for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "goal_ddq")),
-        *((name, c_void_p) for name in ("obstacle_poses", "time_basis", "time_weights", "cost_weights", "cost_groups")),
-        *((name, c_void_p) for name in ("smoothing", "lower", "upper", "nonsmooth", "accelerated")),
+        *(
+            (name, c_void_p)
+            for name in (
+                "start_q",
+                "start_dq",
+                "start_ddq",
+                "goal_q",
+                "goal_dq",
+                "goal_ddq",
+            )
+        ),
+        *(
+            (name, c_void_p)
+            for name in (
+                "obstacle_poses",
+                "time_basis",
+                "time_weights",
+                "cost_weights",
+                "cost_groups",
+            )
+        ),
+        *(
+            (name, c_void_p)
+            for name in ("smoothing", "lower", "upper", "nonsmooth", "accelerated")
+        ),
         *((name, c_void_p) for name in ("control", "rates", "derivative", "w")),
-        *((name, c_void_p) for name in ("gradient", "hessian", "factor", "scratch", "index", "initial")),
+        *(
+            (name, c_void_p)
+            for name in ("gradient", "hessian", "factor", "scratch", "index", "initial")
+        ),
         ("program", _Polyhedron),
-        *((name, c_double) for name in ("eta", "beta", "rate_eta", "violation", "gain", "remaining")),
+        *(
+            (name, c_double)
+            for name in ("eta", "beta", "rate_eta", "violation", "gain", "remaining")
+        ),
         *((name, c_long * 6) for name in ("point", "variable")),
         *((name, c_long) for name in ("n_derivatives", "n_selected")),
     )
@@ -83,8 +136,22 @@ def load_step_library(kernels: KernelLibrary) -> ctypes.CDLL | None:
     if library is not None:
         library.evaluate.argtypes, library.evaluate.restype = (c_void_p,) * 3, c_double
         build = (*(c_void_p,) * 3, *(c_double,) * 4, *(c_void_p,) * 3)
-        library.build_subproblem.restype, library.build_subproblem.argtypes = None, build
-        solve = (*(c_void_p,) * 3, c_double, c_double, c_int, c_void_p, c_double, c_double, c_int, c_void_p, c_void_p)
+        library.build_subproblem.restype, library.build_subproblem.argtypes = (
+            None,
+            build,
+        )
+        solve = (
+            *(c_void_p,) * 3,
+            c_double,
+            c_double,
+            c_int,
+            c_void_p,
+            c_double,
+            c_double,
+            c_int,
+            c_void_p,
+            c_void_p,
+        )
         library.solve_subproblem.argtypes = solve
     return library
 
@@ -95,9 +162,17 @@ class CompiledBackend:
     def __init__(self, motion: Transcription, bounds: Bounds) -> None:
         library = motion.kernels.step_library
         assert library is not None
-        self._evaluate, self._build, self._solve = library.evaluate, library.build_subproblem, library.solve_subproblem
+        self._evaluate, self._build, self._solve = (
+            library.evaluate,
+            library.build_subproblem,
+            library.solve_subproblem,
+        )
         self._arrays: list[Any] = []  # keeps the memory of step.c alive
-        self._points, self._m, self._nx = len(motion.grid.s), motion.kernels.values.tape.outputs[0], motion.nx
+        self._points, self._m, self._nx = (
+            len(motion.grid.s),
+            motion.kernels.values.tape.outputs[0],
+            motion.nx,
+        )
         self._motion = self._describe(motion, bounds)
         self._address = ctypes.addressof(self._motion)
         self._fallback, self._activate = NumpyBackend(motion, bounds), motion.activate
@@ -110,13 +185,27 @@ class CompiledBackend:
         return cost, g.T, self._motion.violation
 
     def subproblem(
-        self, x: Array, g: Array, selection: ResidualSelection, *, proximal: float, penalty: float
+        self,
+        x: Array,
+        g: Array,
+        selection: ResidualSelection,
+        *,
+        proximal: float,
+        penalty: float,
     ) -> "CompiledSubproblem":
         """Build the subproblem; see ``NumpyBackend``."""
         selected = np.zeros((self._m, self._points), bool)
         missed = np.ascontiguousarray(selection.missed.T)
-        before = None if selection.multipliers is None else np.ascontiguousarray(selection.multipliers.T)
-        addresses = address_of(missed), None if before is None else address_of(before), address_of(selected)
+        before = (
+            None
+            if selection.multipliers is None
+            else np.ascontiguousarray(selection.multipliers.T)
+        )
+        addresses = (
+            address_of(missed),
+            None if before is None else address_of(before),
+            address_of(selected),
+        )
         self._motion.violation = selection.violation
         self._activate()
         self._build(
@@ -129,21 +218,50 @@ class CompiledBackend:
             selection.max_log_rate_change,
             *addresses,
         )
-        fallback = partial(self._fallback.subproblem, x, g, selection, proximal=proximal, penalty=penalty)
-        return CompiledSubproblem(self, fallback, g, selected.T, penalty * selection.violation + ELASTIC_GRADIENT)
+        fallback = partial(
+            self._fallback.subproblem,
+            x,
+            g,
+            selection,
+            proximal=proximal,
+            penalty=penalty,
+        )
+        return CompiledSubproblem(
+            self,
+            fallback,
+            g,
+            selected.T,
+            penalty * selection.violation + ELASTIC_GRADIENT,
+        )
 
-    def solve(self, subproblem: "CompiledSubproblem", box: Array, warm: Array | None, *, relax: bool) -> Step | None:
+    def solve(
+        self,
+        subproblem: "CompiledSubproblem",
+        box: Array,
+        warm: Array | None,
+        *,
+        relax: bool,
+    ) -> Step | None:
         """Solve the program of the last subproblem; return None without a solution."""
         dx, multipliers = np.empty(self._nx), np.zeros((self._m, self._points))
         before = None if warm is None else np.ascontiguousarray(warm.T)
         warm_start = None if before is None else address_of(before), MIN_MULTIPLIER
-        limits, results = (QP_TOLERANCE, MAX_WORKING_SET_CHANGES), (address_of(dx), address_of(multipliers))
+        limits, results = (
+            (QP_TOLERANCE, MAX_WORKING_SET_CHANGES),
+            (address_of(dx), address_of(multipliers)),
+        )
         cost = subproblem.elastic_gradient, ELASTIC_CURVATURE_ROOT
         inputs = address_of(subproblem.g.T), address_of(box)
-        if not self._solve(self._address, *inputs, *cost, relax, *warm_start, *limits, *results):
+        if not self._solve(
+            self._address, *inputs, *cost, relax, *warm_start, *limits, *results
+        ):
             return None
         state = self._motion
-        return Step(dx, state.remaining, multipliers.T, state.gain) if np.isfinite(dx).all() else None
+        return (
+            Step(dx, state.remaining, multipliers.T, state.gain)
+            if np.isfinite(dx).all()
+            else None
+        )
 
     def _describe(self, motion: Transcription, bounds: Bounds) -> _Motion:
         spec, stride = motion.spec, motion.nx + 2 + -(motion.nx + 2) % MAX_LANES
@@ -170,9 +288,17 @@ class CompiledBackend:
     def _constants(self, motion: Transcription, bounds: Bounds) -> dict[str, Any]:
         """Return the arrays and kernels that no step changes."""
         grid, kernels = motion.grid, motion.kernels
-        groups = np.empty((0, 3)) if kernels.cost_term is None else kernels.cost_term.groups(kernels.cost_counts)
+        groups = (
+            np.empty((0, 3))
+            if kernels.cost_term is None
+            else kernels.cost_term.groups(kernels.cost_counts)
+        )
         arrays = {
-            **{name: values for name, values in vars(motion.boundary).items() if name != "parameters"},
+            **{
+                name: values
+                for name, values in vars(motion.boundary).items()
+                if name != "parameters"
+            },
             "obstacle_poses": motion.poses_along,
             "time_basis": grid.time_basis,
             "time_weights": grid.time_weights,
@@ -184,20 +310,46 @@ class CompiledBackend:
             "nonsmooth": bounds.nonsmooth.T,
             "accelerated": bounds.accelerated,
         }
-        fields: dict[str, Any] = {name: None if array is None else self._keep(array) for name, array in arrays.items()}
-        fields |= {"grid": self._bases(grid.bases), "cost_bases": self._bases(grid.cost_bases)}
-        fields |= {"values": kernels.values.address, "jacobian": kernels.jacobian.address}
+        fields: dict[str, Any] = {
+            name: None if array is None else self._keep(array)
+            for name, array in arrays.items()
+        }
+        fields |= {
+            "grid": self._bases(grid.bases),
+            "cost_bases": self._bases(grid.cost_bases),
+        }
+        fields |= {
+            "values": kernels.values.address,
+            "jacobian": kernels.jacobian.address,
+        }
         if (cost := kernels.cost_residuals) is not None:
-            fields |= {"cost_residuals": cost.address, "n_cost_residuals": cost.tape.outputs[0]}
-        return {**fields, "n_time_nodes": len(grid.time_weights), "n_cost_groups": len(groups)}
+            fields |= {
+                "cost_residuals": cost.address,
+                "n_cost_residuals": cost.tape.outputs[0],
+            }
+        return {
+            **fields,
+            "n_time_nodes": len(grid.time_weights),
+            "n_cost_groups": len(groups),
+        }
 
     def _work_arrays(self, motion: Transcription, stride: int) -> dict[str, int]:
         """Allocate the work arrays with the sizes of step.c."""
         spec, n, nx, size = motion.spec, motion.n, motion.nx, self._m * self._points
-        width, nodes = motion.kernels.values.tape.inputs[0], len(motion.grid.cost_weights)
-        count = 0 if motion.kernels.cost_residuals is None else motion.kernels.cost_residuals.tape.outputs[0]
+        width, nodes = (
+            motion.kernels.values.tape.inputs[0],
+            len(motion.grid.cost_weights),
+        )
+        count = (
+            0
+            if motion.kernels.cost_residuals is None
+            else motion.kernels.cost_residuals.tape.outputs[0]
+        )
         cost_term = nodes * ((4 * n + 3) * (count + 1) + (2 + stride) * count) + stride
-        duration = len(motion.grid.time_weights) * (spec.rate_control_points + MAX_LANES) + stride
+        duration = (
+            len(motion.grid.time_weights) * (spec.rate_control_points + MAX_LANES)
+            + stride
+        )
         subproblem = size + (width + 1) * self._m * TILE_POINTS + stride
         sizes = {
             "control": spec.path_control_points * n,
@@ -218,7 +370,15 @@ class CompiledBackend:
         rows = dim + self._m * self._points + ROWS_PER_BLOCK
         scratch = (2 * dim + ROWS_PER_BLOCK) * stride + 8 * (stride + ROWS_PER_BLOCK)
         blocks = rows  # an upper bound: blocks have 8 rows or more
-        sizes = (rows * dim, rows, rows, rows, scratch, dim, blocks)  # in the order of _Polyhedron
+        sizes = (
+            rows * dim,
+            rows,
+            rows,
+            rows,
+            scratch,
+            dim,
+            blocks,
+        )  # in the order of _Polyhedron
         return _Polyhedron(dim, stride, 0, *self._allocate(sizes))
 
     def _allocate(self, sizes: Sequence[int]) -> list[int]:
@@ -227,11 +387,18 @@ class CompiledBackend:
         array = aligned_array(sum(lines))
         self._arrays.append(array)
         begin = address_of(array)
-        return [begin + array.itemsize * before for before in accumulate(lines, initial=0)][:-1]
+        return [
+            begin + array.itemsize * before for before in accumulate(lines, initial=0)
+        ][:-1]
 
     def _bases(self, bases: Bases) -> _Bases:
         orders, points, _ = bases.path.shape
-        arrays = (*bases.phases_last, bases.path_at, bases.rate_at, *bases.first_support)
+        arrays = (
+            *bases.phases_last,
+            bases.path_at,
+            bases.rate_at,
+            *bases.first_support,
+        )
         return _Bases(orders, points, *map(self._keep, arrays))
 
     def _keep(self, array: NDArray[Any]) -> int:
@@ -250,7 +417,14 @@ class CompiledSubproblem:
     selected: Mask
     elastic_gradient: float  # of the elastic variable's cost
 
-    def solve(self, box: Array, *, warm: Array | None = None, relax: bool = False) -> Step | None:
-        """Return the best step within the box; see ``NumpySubproblem``. DAQP solves it if active_set.c does not."""
+    def solve(
+        self, box: Array, *, warm: Array | None = None, relax: bool = False
+    ) -> Step | None:
+        """Return the best step within the box; see ``NumpySubproblem``.
+
+        DAQP solves it if active_set.c does not.
+        """
         step = self.backend.solve(self, box, warm, relax=relax)
-        return self.fallback().solve(box, warm=warm, relax=relax) if step is None else step
+        return (
+            self.fallback().solve(box, warm=warm, relax=relax) if step is None else step
+        )

@@ -30,7 +30,9 @@ class Bases:
     @cached_property
     def phases_last(self) -> tuple[Array, Array]:
         """``path`` and ``rate`` with the phases last, shape (orders, C, K) and (orders - 1, R, K)."""
-        return np.ascontiguousarray(self.path.swapaxes(1, 2)), np.ascontiguousarray(self.rate.swapaxes(1, 2))
+        return np.ascontiguousarray(self.path.swapaxes(1, 2)), np.ascontiguousarray(
+            self.rate.swapaxes(1, 2)
+        )
 
     @cached_property
     def first_support(self) -> tuple[Indices, Indices]:
@@ -55,9 +57,9 @@ class Grid:
     bases: Bases  # bases on the grid, three orders of p and two of r, or four and three where the jerk is constrained
     time_basis: Array  # basis of r at the nodes of the time integral, shape (Q, R)
     time_weights: Array  # quadrature weights of the time integral, shape (Q,)
-    # Bases at the Gauss nodes of the cost term's integral, four orders of p and three of r. The nodes are few, since
-    # their residuals are expensive. The error of the integral is up to a few tenths of a percent, that of the objective
-    # up to 0.1 %.
+    # Bases at the Gauss nodes of the cost term's integral, four orders of p and three
+    # of r. The nodes are few, since their residuals are expensive. The error of the
+    # integral is up to a few tenths of a percent, that of the objective up to 0.1 %.
     cost_bases: Bases
     cost_weights: Array  # quadrature weights of the cost term's integral
 
@@ -68,7 +70,9 @@ class Grid:
         midpoint = (points[:, 1] + points[:, 2]) / 2
         weights = np.ones_like(points)
         for k, other in permutations(range(4), 2):
-            weights[:, k] *= (midpoint - points[:, other]) / (points[:, k] - points[:, other])
+            weights[:, k] *= (midpoint - points[:, other]) / (
+                points[:, k] - points[:, other]
+            )
         return weights
 
 
@@ -92,13 +96,29 @@ def make_grid(spec: TrajectorySpec, points: int, orders: int = 3) -> Grid:
 
 
 def _bases(spec: TrajectorySpec, s: Array, orders: int) -> Bases:
-    path = [basis(s, spec.path_control_points, spec.degree, order) for order in range(orders)]
-    rate = [basis(s, spec.rate_control_points, spec.degree, order) for order in range(orders - 1)]
-    arrays = np.stack(path), np.stack(rate), np.stack(path, axis=-1), np.stack(rate, axis=1)
+    path = [
+        basis(s, spec.path_control_points, spec.degree, order)
+        for order in range(orders)
+    ]
+    rate = [
+        basis(s, spec.rate_control_points, spec.degree, order)
+        for order in range(orders - 1)
+    ]
+    arrays = (
+        np.stack(path),
+        np.stack(rate),
+        np.stack(path, axis=-1),
+        np.stack(rate, axis=1),
+    )
     return Bases(*arrays, support=spec.degree + 1)
 
 
 def _first(bases: Array, support: int) -> Indices:
-    """Return the first control point of the support at every phase, shape (K,); all of the support exists."""
-    first: Indices = np.minimum((bases != 0).any(axis=0).argmax(axis=1), bases.shape[2] - support)
+    """Return the first control point of the support at every phase, shape (K,).
+
+    All of the support exists.
+    """
+    first: Indices = np.minimum(
+        (bases != 0).any(axis=0).argmax(axis=1), bases.shape[2] - support
+    )
     return first

@@ -1,8 +1,9 @@
 """Clearances of the links' convex hulls, which some grid levels use in place of capsules.
 
-A capsule is some centimetres larger than its link. For parts that are close to each other compiled code
-(``cnpgen.kernels.collision``), or Coal without a compiler, returns the distance, the closest points and the direction.
-The derivative of the distance treats the closest points and the direction as constant (envelope theorem): it is the
+A capsule is some centimetres larger than its link. For parts that are close to each
+other compiled code (``cnpgen.kernels.collision``), or Coal without a compiler, returns
+the distance, the closest points and the direction. The derivative of the distance
+treats the closest points and the direction as constant (envelope theorem): it is the
 velocity of the points along the direction.
 """
 
@@ -31,8 +32,13 @@ from cnpgen.world.rigid_bodies import RigidBodies
 
 Array = NDArray[np.float64]
 Pairs = NDArray[np.intp]
-LINK_CONSTRAINTS, OBJECT_CONSTRAINTS = RobotClearance | SelfClearance, ObjectContact | ObjectClearance
-MEASURED_RANGE_M = 0.04  # above the required distance; larger distances are not measured
+LINK_CONSTRAINTS, OBJECT_CONSTRAINTS = (
+    RobotClearance | SelfClearance,
+    ObjectContact | ObjectClearance,
+)
+MEASURED_RANGE_M = (
+    0.04  # above the required distance; larger distances are not measured
+)
 
 
 def has_clearance_constraints(problem: Problem, robot: Robot) -> bool:
@@ -49,108 +55,178 @@ class _Group:
     columns: Pairs  # of their distances, shape (P,)
     required: float  # distance [m]
     of_obstacles: bool  # whether they are obstacles and moving parts, else two links
-    numbers: Pairs  # among all pairs of obstacles and moving parts, or of links, shape (P,)
+    numbers: (
+        Pairs  # among all pairs of obstacles and moving parts, or of links, shape (P,)
+    )
 
 
 class Hulls:
     """Clearances of a robot's convex parts at many states. Not thread-safe: memory is reused.
 
-    ``has_clearance_constraints`` must hold. Without a library of compiled collision checks Coal measures. The held
-    object is a part of the robot only ``with_object``.
+    ``has_clearance_constraints`` must hold. Without a library of compiled collision
+    checks Coal measures. The held object is a part of the robot only ``with_object``.
     """
 
     def __init__(
-        self, problem: Problem, robot: Robot, library: CDLL | None = None, *, with_object: bool = False
+        self,
+        problem: Problem,
+        robot: Robot,
+        library: CDLL | None = None,
+        *,
+        with_object: bool = False,
     ) -> None:
         assert robot.shape is not None
         shape, kinds = robot.shape, LINK_CONSTRAINTS
         if with_object and problem.object_size is not None:
-            shape = with_held_object(robot.shape, robot.held_shape, robot.chain, problem.object_size)
+            shape = with_held_object(
+                robot.shape, robot.held_shape, robot.chain, problem.object_size
+            )
             kinds |= OBJECT_CONSTRAINTS
         constraints = [item for item in problem.constraint if isinstance(item, kinds)]
         self._poses_of_checker: Array | None = None
         self._row_kernels: tuple[Kernel, RowKernels] | None = None
-        self._obstacles, self._n, self._kinematics = problem.obstacle, robot.n, ForwardKinematics(robot.model)
+        self._obstacles, self._n, self._kinematics = (
+            problem.obstacle,
+            robot.n,
+            ForwardKinematics(robot.model),
+        )
         self._bodies = RigidBodies(shape, len(problem.obstacle), robot.n)
         links = [part.link for part in shape.convex_parts]
         names = [*links, *range(len(problem.obstacle))]
         columns: dict[Any, int] = {}
         self._groups, self._uncovered = list[_Group](), list[tuple[Pairs, float]]()
-        covered = {frozenset((pair.first, pair.second)) for pair in shape.pairs if pair.for_solvers}
+        covered = {
+            frozenset((pair.first, pair.second))
+            for pair in shape.pairs
+            if pair.for_solvers
+        }
         for constraint in constraints:
-            of_links, required = isinstance(constraint, SelfClearance | ObjectClearance), _required(constraint)
+            of_links, required = (
+                isinstance(constraint, SelfClearance | ObjectClearance),
+                _required(constraint),
+            )
             pairs, numbers = self._pairs_of(constraint, names, of_links=of_links)
-            indices = [columns.setdefault((names[a], names[b]), len(columns)) for a, b in pairs.tolist()]
-            self._groups.append(_Group(pairs, np.array(indices, np.intp), required, not of_links, numbers))
+            indices = [
+                columns.setdefault((names[a], names[b]), len(columns))
+                for a, b in pairs.tolist()
+            ]
+            self._groups.append(
+                _Group(
+                    pairs, np.array(indices, np.intp), required, not of_links, numbers
+                )
+            )
             if of_links:
-                uncovered = [frozenset((names[a], names[b])) not in covered for a, b in pairs.tolist()]
+                uncovered = [
+                    frozenset((names[a], names[b])) not in covered
+                    for a, b in pairs.tolist()
+                ]
                 self._uncovered.append((pairs[np.array(uncovered, bool)], required))
-        # of pairs of links or of a link and an obstacle [m], shape (m,): required distances, and accepted violations
+        # of pairs of links or of a link and an obstacle [m], shape (m,): required
+        # distances, and accepted violations
         self.min_distances, accepted = np.full((2, len(columns)), -np.inf)
         for constraint, group in zip(constraints, self._groups, strict=True):
             np.maximum.at(self.min_distances, group.columns, group.required)
-            np.maximum.at(accepted, group.columns, group.required - _tolerance(constraint))
+            np.maximum.at(
+                accepted, group.columns, group.required - _tolerance(constraint)
+            )
         self.tolerances = self.min_distances - accepted
-        # largest required distances from obstacles and of links from each other [m]; None without such a constraint
-        self.obstacle_distance, (added_to_links, added_to_object) = _largest(constraints, RobotClearance, ObjectContact)
-        self.self_distance, added = _largest(constraints, SelfClearance, ObjectClearance)
+        # largest required distances from obstacles and of links from each other [m];
+        # None without such a constraint
+        self.obstacle_distance, (added_to_links, added_to_object) = _largest(
+            constraints, RobotClearance, ObjectContact
+        )
+        self.self_distance, added = _largest(
+            constraints, SelfClearance, ObjectClearance
+        )
         self.checker = None
         if library is not None and robot.n <= MAX_JOINTS:
-            of_parts = dict.fromkeys(shape.joints, added_to_links) | {HELD_OBJECT: added_to_object}
-            names_of_pairs = (frozenset((pair.first, pair.second)) for pair in shape.pairs)
+            of_parts = dict.fromkeys(shape.joints, added_to_links) | {
+                HELD_OBJECT: added_to_object
+            }
+            names_of_pairs = (
+                frozenset((pair.first, pair.second)) for pair in shape.pairs
+            )
             of_pairs = {pair: added[HELD_OBJECT in pair] for pair in names_of_pairs}
             self.checker = CollisionChecker(library, robot, shape, of_parts, of_pairs)
         self._axes = np.array([joint.axis for joint in robot.chain.joints])
         self._sliding = np.array(robot.prismatic)
         supports = [list(joints) for joints in robot.model.supports]
-        self._moves = np.array([[joint in above for joint in range(1, robot.n + 1)] for above in supports])
+        self._moves = np.array(
+            [[joint in above for joint in range(1, robot.n + 1)] for above in supports]
+        )
 
-    def _pairs_of(self, constraint: Any, names: list[Any], *, of_links: bool) -> tuple[Pairs, Pairs]:
+    def _pairs_of(
+        self, constraint: Any, names: list[Any], *, of_links: bool
+    ) -> tuple[Pairs, Pairs]:
         """Return the pairs of bodies of a constraint, shape (P, 2), and their numbers among all of their kind."""
         pairs = self._bodies.link_pairs if of_links else self._bodies.obstacle_pairs
-        of_object = np.array([HELD_OBJECT in (names[a], names[b]) for a, b in pairs.tolist()], bool)
-        numbers = np.flatnonzero(of_object == isinstance(constraint, OBJECT_CONSTRAINTS))
+        of_object = np.array(
+            [HELD_OBJECT in (names[a], names[b]) for a, b in pairs.tolist()], bool
+        )
+        numbers = np.flatnonzero(
+            of_object == isinstance(constraint, OBJECT_CONSTRAINTS)
+        )
         return pairs[numbers], numbers
 
     def measure(self, q: Array, obstacle_poses: Array) -> tuple[Array, list[Contacts]]:
         """Measure the distances of close parts at joint positions q [rad], shape (n, K).
 
-        The result are distances [m], shape (K, m), at most ``MEASURED_RANGE_M`` above the required ones, nan if q is
-        not finite; and the contacts of every constraint.
+        The result are distances [m], shape (K, m), at most ``MEASURED_RANGE_M`` above
+        the required ones, nan if q is not finite; and the contacts of every constraint.
         """
         if not np.isfinite(q).all():
             return np.full((q.shape[1], len(self.min_distances)), np.nan), []
-        distances = np.repeat((self.min_distances + MEASURED_RANGE_M)[None], q.shape[1], axis=0)
+        distances = np.repeat(
+            (self.min_distances + MEASURED_RANGE_M)[None], q.shape[1], axis=0
+        )
         groups = self._contacts(q, obstacle_poses)
         for contacts, group in zip(groups, self._groups, strict=True):
-            np.minimum.at(distances, (contacts.k, group.columns[contacts.pair]), contacts.distance)
+            np.minimum.at(
+                distances, (contacts.k, group.columns[contacts.pair]), contacts.distance
+            )
         return distances, groups
 
-    def clear_states(self, q: Array, obstacle_poses: Array, *, uncovered_only: bool = False) -> NDArray[np.bool_]:
+    def clear_states(
+        self, q: Array, obstacle_poses: Array, *, uncovered_only: bool = False
+    ) -> NDArray[np.bool_]:
         """Return a mask of the states q (n, K) with the required distances, shape (K,).
 
-        With ``uncovered_only`` only pairs of links that the solver's capsules do not cover are checked.
+        With ``uncovered_only`` only pairs of links that the solver's capsules do not
+        cover are checked.
         """
         if self.checker is not None:
             limit = None if uncovered_only else self.obstacle_distance
             checker = self.placed_checker(obstacle_poses)
-            return checker.clear_states(q, obstacle_distance=limit, self_distance=self.self_distance)
+            return checker.clear_states(
+                q, obstacle_distance=limit, self_distance=self.self_distance
+            )
         self._place(q, obstacle_poses)
         clear = np.ones(q.shape[1], bool)
-        checked = self._uncovered if uncovered_only else [(group.pairs, group.required) for group in self._groups]
+        checked = (
+            self._uncovered
+            if uncovered_only
+            else [(group.pairs, group.required) for group in self._groups]
+        )
         for pairs, required in checked:
             clear &= self._bodies.pair_distances(pairs).clear_states(required)
         return clear
 
-    def violation(self, q: Array, obstacle_poses: Array, *, above_tolerance: bool = False) -> float:
+    def violation(
+        self, q: Array, obstacle_poses: Array, *, above_tolerance: bool = False
+    ) -> float:
         """Return the largest violation of the required distances, or its part above the tolerance [m].
 
         It is at least 0, and inf if the states q (n, K) are not finite.
         """
         if not np.isfinite(q).all():
             return np.inf
-        least, violation = self.min_distances - (self.tolerances if above_tolerance else 0.0), 0.0
-        for contacts, group in zip(self._contacts(q, obstacle_poses, 0.0), self._groups, strict=True):
+        least, violation = (
+            self.min_distances - (self.tolerances if above_tolerance else 0.0),
+            0.0,
+        )
+        for contacts, group in zip(
+            self._contacts(q, obstacle_poses, 0.0), self._groups, strict=True
+        ):
             below = least[group.columns[contacts.pair]] - contacts.distance
             violation = max(violation, float(below.max(initial=0.0)))
         return violation
@@ -178,84 +254,153 @@ class Hulls:
     def gradients(self, q: Array, distances: Array, groups: list[Contacts]) -> Array:
         """Differentiate the result of ``measure`` in q: shape (n, m, K), 0 for parts out of range."""
         gradients = np.zeros((q.shape[1], len(self.min_distances), self._n))
-        rotations, positions = self._kinematics.poses(q)  # of the joints in the world frame
-        axes, origins = np.einsum("jxyk,jy->kjx", rotations[1:], self._axes), positions[1:].transpose(2, 0, 1)
+        rotations, positions = self._kinematics.poses(
+            q
+        )  # of the joints in the world frame
+        axes, origins = (
+            np.einsum("jxyk,jy->kjx", rotations[1:], self._axes),
+            positions[1:].transpose(2, 0, 1),
+        )
         for contacts, group in zip(groups, self._groups, strict=True):
             k, column = contacts.k, group.columns[contacts.pair]
             normals = np.repeat(contacts.normal[:, None], 2, axis=1)
-            levers = np.cross(contacts.points, normals)  # of a unit force at the points, about the world's origin
+            levers = np.cross(
+                contacts.points, normals
+            )  # of a unit force at the points, about the world's origin
             turning = np.einsum("cjx,cbx->cbj", axes[k], levers)
             turning += np.einsum("cjx,cbx->cbj", np.cross(origins, axes)[k], normals)
-            speeds = np.where(self._sliding, np.einsum("cjx,cbx->cbj", axes[k], normals), turning)
+            speeds = np.where(
+                self._sliding, np.einsum("cjx,cbx->cbj", axes[k], normals), turning
+            )
             speeds *= self._moves[self._bodies.joints_of(group.pairs[contacts.pair])]
             nearest = contacts.distance <= distances[k, column]
-            gradients[k[nearest], column[nearest]] = (speeds[:, 1] - speeds[:, 0])[nearest]
+            gradients[k[nearest], column[nearest]] = (speeds[:, 1] - speeds[:, 0])[
+                nearest
+            ]
         return gradients.transpose(2, 1, 0)
 
-    def row_kernels(self, kernels: ResidualKernels, obstacle_poses: Array) -> RowKernels:
-        """Return kernels whose rows end with the distances of ``measure``; compiled kernels and checks are required."""
+    def row_kernels(
+        self, kernels: ResidualKernels, obstacle_poses: Array
+    ) -> RowKernels:
+        """Return kernels whose rows end with the distances of ``measure``.
+
+        Compiled kernels and checks are required.
+        """
         checker, columns = self.placed_checker(obstacle_poses), self._columns
         if self._row_kernels is None or self._row_kernels[0] is not kernels.values:
-            self._row_kernels = kernels.values, RowKernels(kernels.values, kernels.jacobian, checker, columns)
+            self._row_kernels = (
+                kernels.values,
+                RowKernels(kernels.values, kernels.jacobian, checker, columns),
+            )
         return self._row_kernels[1]
 
     @cached_property
     def _columns(self) -> DistanceColumns:
         pairs = self._bodies.link_pairs, self._bodies.obstacle_pairs
-        of_links, of_obstacles = rows = [np.zeros(len(each), np.int64) for each in pairs]
+        of_links, of_obstacles = rows = [
+            np.zeros(len(each), np.int64) for each in pairs
+        ]
         for group in self._groups:
             rows[group.of_obstacles][group.numbers] = group.columns
         distances = self.obstacle_distance, self.self_distance
         return DistanceColumns(
-            self.min_distances, of_obstacles, of_links, *distances, MEASURED_RANGE_M, DISTANCE_SCALE_M
+            self.min_distances,
+            of_obstacles,
+            of_links,
+            *distances,
+            MEASURED_RANGE_M,
+            DISTANCE_SCALE_M,
         )
 
     def placed_checker(self, obstacle_poses: Array) -> CollisionChecker:
         """Return the compiled collision checks among obstacles with these poses and sizes, shape (width,)."""
         assert self.checker is not None
-        if self._poses_of_checker is None or not np.array_equal(self._poses_of_checker, obstacle_poses):
+        if self._poses_of_checker is None or not np.array_equal(
+            self._poses_of_checker, obstacle_poses
+        ):
             self.checker.place(self._obstacles, obstacle_poses)
             self._poses_of_checker = obstacle_poses.copy()
         return self.checker
 
-    def _contacts(self, q: Array, obstacle_poses: Array, within: float = MEASURED_RANGE_M) -> list[Contacts]:
+    def _contacts(
+        self, q: Array, obstacle_poses: Array, within: float = MEASURED_RANGE_M
+    ) -> list[Contacts]:
         """Measure the contacts of every constraint closer than the required distance plus ``within`` [m]."""
         if self.checker is None:
             self._place(q, obstacle_poses)
-            return [self._bodies.contacts(group.pairs, group.required + within) for group in self._groups]
+            return [
+                self._bodies.contacts(group.pairs, group.required + within)
+                for group in self._groups
+            ]
         checker, found = self.placed_checker(obstacle_poses), dict[bool, Contacts]()
-        for kind, required in ((True, self.obstacle_distance), (False, self.self_distance)):
+        for kind, required in (
+            (True, self.obstacle_distance),
+            (False, self.self_distance),
+        ):
             if required is not None:
-                found[kind] = checker.close_bodies(q, required + within, of_obstacles=kind)
-        return [self._contacts_of(group, found[group.of_obstacles], group.required + within) for group in self._groups]
+                found[kind] = checker.close_bodies(
+                    q, required + within, of_obstacles=kind
+                )
+        return [
+            self._contacts_of(group, found[group.of_obstacles], group.required + within)
+            for group in self._groups
+        ]
 
     def _contacts_of(self, group: _Group, close: Contacts, within: float) -> Contacts:
         """Return the pairs of a group that are closer than ``within`` [m]."""
         pair = np.searchsorted(group.numbers, close.pair)
         pair[pair == len(group.numbers)] = 0
-        kept = np.flatnonzero((close.distance < within) & (group.numbers[pair] == close.pair))
+        kept = np.flatnonzero(
+            (close.distance < within) & (group.numbers[pair] == close.pair)
+        )
         pair = pair[kept].astype(np.intp)
-        k, distance, normal, points = close.k[kept], close.distance[kept], close.normal[kept], close.points[kept]
+        k, distance, normal, points = (
+            close.k[kept],
+            close.distance[kept],
+            close.normal[kept],
+            close.points[kept],
+        )
         return Contacts(pair, k, distance, normal, points)
 
     def _place(self, q: Array, obstacle_poses: Array) -> None:
-        self._bodies.place(*self._kinematics.poses(q), solids_of(self._obstacles, obstacle_poses))
+        self._bodies.place(
+            *self._kinematics.poses(q), solids_of(self._obstacles, obstacle_poses)
+        )
 
 
 def _required(constraint: Any) -> float:
-    """Return the distance that a constraint requires [m]; contacts of the held object have a depth."""
-    return -float(constraint.depth) if isinstance(constraint, ObjectContact) else float(constraint.distance)
+    """Return the distance that a constraint requires [m].
+
+    Contacts of the held object have a depth.
+    """
+    return (
+        -float(constraint.depth)
+        if isinstance(constraint, ObjectContact)
+        else float(constraint.distance)
+    )
 
 
 def _tolerance(constraint: Any) -> float:
     """Return the violation of a constraint that a valid motion may have [m]."""
-    return float(constraint.tolerance if isinstance(constraint, ObjectContact) else constraint.effective_tolerance)
+    return float(
+        constraint.tolerance
+        if isinstance(constraint, ObjectContact)
+        else constraint.effective_tolerance
+    )
 
 
 def _largest(constraints: list[Any], *kinds: type) -> tuple[float | None, list[float]]:
     """Return the largest distance that constraints of some kinds require [m], and what each kind adds to it."""
     largest = [
-        max((_required(item) for item in constraints if isinstance(item, kind)), default=-np.inf) for kind in kinds
+        max(
+            (_required(item) for item in constraints if isinstance(item, kind)),
+            default=-np.inf,
+        )
+        for kind in kinds
     ]
     required = max(largest)
-    return (None, largest) if required == -np.inf else (required, [distance - required for distance in largest])
+    return (
+        (None, largest)
+        if required == -np.inf
+        else (required, [distance - required for distance in largest])
+    )

@@ -1,7 +1,7 @@
 """Quadratic programming subproblem of one SQP step: selection of its residuals, and its solution by DAQP.
 
-DAQP gets variables in which the Hessian is the identity. It would transform the program itself, but takes twice as long
-as BLAS.
+DAQP gets variables in which the Hessian is the identity. It would transform the program
+itself, but takes twice as long as BLAS.
 """
 
 from dataclasses import dataclass
@@ -43,11 +43,16 @@ class ResidualSelection:
     """Rule that selects the residuals of a subproblem."""
 
     violation: float  # largest violation at the current iterate
-    max_distance: float  # residuals are selected at local maxima within this distance of a bound
-    # Bound of the change of log r; nonsmooth residuals that it could move over a bound are selected.
+    max_distance: (
+        float  # residuals are selected at local maxima within this distance of a bound
+    )
+    # Bound of the change of log r; nonsmooth residuals that it could move over a bound
+    # are selected.
     max_log_rate_change: float
     missed: Mask  # residuals that are selected in any case, shape (K, m)
-    multipliers: Array | None  # multipliers of the last step, shape (K, m), or None; residuals with one are selected
+    multipliers: (
+        Array | None
+    )  # multipliers of the last step, shape (K, m), or None; residuals with one are selected
 
 
 class NumpyBackend:
@@ -55,7 +60,9 @@ class NumpyBackend:
 
     def __init__(self, motion: Transcription, bounds: Bounds) -> None:
         self._motion, self._bounds = motion, bounds
-        self._evaluate = cache_last(motion.evaluate)  # after a rejected step the iterate is the same
+        self._evaluate = cache_last(
+            motion.evaluate
+        )  # after a rejected step the iterate is the same
 
     def value(self, x: Array) -> tuple[float, Array, float]:
         """Evaluate the regularized objective, residuals (K, m) and their largest violation."""
@@ -63,18 +70,40 @@ class NumpyBackend:
         return cost, g, self._bounds.max_violation(g)
 
     def subproblem(
-        self, x: Array, g: Array, selection: ResidualSelection, *, proximal: float, penalty: float
+        self,
+        x: Array,
+        g: Array,
+        selection: ResidualSelection,
+        *,
+        proximal: float,
+        penalty: float,
     ) -> "NumpySubproblem":
-        """Build the subproblem at x with residuals g; it is valid until the next one is built."""
+        """Build the subproblem at x with residuals g.
+
+        It is valid until the next one is built.
+        """
         at, bounds, distance = self._evaluate(x), self._bounds, selection.max_distance
-        violations, errors = bounds.violations(g), self._motion.linearization_errors(at, selection.max_log_rate_change)
-        distances = np.where(bounds.accelerated, distance, min(distance, MAX_SPEED_DISTANCE))
+        violations, errors = (
+            bounds.violations(g),
+            self._motion.linearization_errors(at, selection.max_log_rate_change),
+        )
+        distances = np.where(
+            bounds.accelerated, distance, min(distance, MAX_SPEED_DISTANCE)
+        )
         selected: Mask = local_maxima(violations) & (violations > -distances)
         selected |= bounds.nonsmooth & (violations > -errors)
         selected |= selection.missed
         if selection.multipliers is not None:
             selected |= selection.multipliers != 0
-        return NumpySubproblem(self._motion, at, self._bounds, selected, selection.violation, proximal, penalty)
+        return NumpySubproblem(
+            self._motion,
+            at,
+            self._bounds,
+            selected,
+            selection.violation,
+            proximal,
+            penalty,
+        )
 
 
 @dataclass(frozen=True)
@@ -89,11 +118,14 @@ class NumpySubproblem:
     proximal: float  # weight of the proximal term
     penalty: float  # weight of the violation
 
-    def solve(self, box: Array, *, warm: Array | None = None, relax: bool = False) -> Step | None:
+    def solve(
+        self, box: Array, *, warm: Array | None = None, relax: bool = False
+    ) -> Step | None:
         """Return the best step within the box of largest changes, shape (nx,), or None without a solution.
 
-        ``warm`` are the multipliers of the residuals in the initial working set, shape (K, m). With ``relax`` satisfied
-        residuals may be violated, too, up to the remaining largest violation.
+        ``warm`` are the multipliers of the residuals in the initial working set, shape
+        (K, m). With ``relax`` satisfied residuals may be violated, too, up to the
+        remaining largest violation.
         """
         import daqp
 
@@ -105,11 +137,15 @@ class NumpySubproblem:
         sense = np.zeros(nx + 1 + len(k), np.int32)
         if warm is not None:
             before = warm[k, residual]
-            sense[nx + 1 :] = DAQP_UPPER * (before > MIN_MULTIPLIER) + DAQP_LOWER * (before < -MIN_MULTIPLIER)
+            sense[nx + 1 :] = DAQP_UPPER * (before > MIN_MULTIPLIER) + DAQP_LOWER * (
+                before < -MIN_MULTIPLIER
+            )
         elastic_cost = self.penalty * self.violation + ELASTIC_GRADIENT
         solution, _, flag, info = daqp.solve(
             np.eye(nx + 1),
-            np.append(self.at.gradient @ unwhiten, elastic_cost / ELASTIC_CURVATURE_ROOT),
+            np.append(
+                self.at.gradient @ unwhiten, elastic_cost / ELASTIC_CURVATURE_ROOT
+            ),
             rows,
             np.concatenate([box, [1.0], np.minimum(high, DAQP_INFINITY)]),
             np.concatenate([-box, [0.0], np.maximum(low, -DAQP_INFINITY)]),
@@ -122,12 +158,21 @@ class NumpySubproblem:
             return None
         multipliers = np.zeros(self.at.g.shape)
         multipliers[k, residual] = info["lam"][nx + 1 :]
-        cost = float(self.at.gradient @ dx + 0.5 * dx @ self.at.curvature @ dx + 0.5 * self.proximal * dx @ dx)
-        return Step(dx, float(solution[-1]) / ELASTIC_CURVATURE_ROOT, multipliers, gain=-cost)
+        cost = float(
+            self.at.gradient @ dx
+            + 0.5 * dx @ self.at.curvature @ dx
+            + 0.5 * self.proximal * dx @ dx
+        )
+        return Step(
+            dx, float(solution[-1]) / ELASTIC_CURVATURE_ROOT, multipliers, gain=-cost
+        )
 
     @cached_property
     def _unwhiten(self) -> Array | None:
-        """Matrix from variables with unit Hessian to steps, shape (nx, nx); None if the Hessian is not positive."""
+        """Matrix from variables with unit Hessian to steps, shape (nx, nx).
+
+        None if the Hessian is not positive.
+        """
         from scipy.linalg.lapack import dpotrf, dtrtri
 
         hessian = self.at.curvature.copy()
@@ -135,29 +180,46 @@ class NumpySubproblem:
         factor, failed = dpotrf(hessian, lower=True)
         return None if failed else np.asarray(dtrtri(factor, lower=True)[0].T)
 
-    def _rows(self, k: Indices, residual: Indices, unwhiten: Array, *, relax: bool) -> tuple[Array, Array, Array]:
+    def _rows(
+        self, k: Indices, residual: Indices, unwhiten: Array, *, relax: bool
+    ) -> tuple[Array, Array, Array]:
         """Return gradients of box, elastic variable and residuals, (nx + 1 + m, nx + 1), and bounds of their change."""
-        g, lower, upper = self.at.g[k, residual], self.bounds.lower[k, residual], self.bounds.upper[k, residual]
+        g, lower, upper = (
+            self.at.g[k, residual],
+            self.bounds.lower[k, residual],
+            self.bounds.upper[k, residual],
+        )
         nx = self.motion.nx
         rows = np.zeros((nx + 1 + len(k), nx + 1))
         rows[:nx, :-1] = unwhiten
-        np.matmul(self.motion.rows(self.at, k, residual), unwhiten, out=rows[nx + 1 :, :-1])
+        np.matmul(
+            self.motion.rows(self.at, k, residual), unwhiten, out=rows[nx + 1 :, :-1]
+        )
         rows[nx, -1] = 1 / ELASTIC_CURVATURE_ROOT
         elastic = rows[nx + 1 :, -1]
         if relax:
             upper_is_closer = upper - g < g - lower
-            elastic[:] = np.where(upper_is_closer, -self.violation, self.violation) / ELASTIC_CURVATURE_ROOT
+            elastic[:] = (
+                np.where(upper_is_closer, -self.violation, self.violation)
+                / ELASTIC_CURVATURE_ROOT
+            )
             low = np.where(upper_is_closer, -DAQP_INFINITY, lower - g)
             return rows, low, np.where(upper_is_closer, upper - g, DAQP_INFINITY)
         above, below = np.maximum(g - upper, 0), np.maximum(lower - g, 0)
         elastic[:] = (below - above) / ELASTIC_CURVATURE_ROOT
-        return rows, np.where(above > 0, -DAQP_INFINITY, lower - g), np.where(below > 0, DAQP_INFINITY, upper - g)
+        return (
+            rows,
+            np.where(above > 0, -DAQP_INFINITY, lower - g),
+            np.where(below > 0, DAQP_INFINITY, upper - g),
+        )
 
 
 def local_maxima(violations: Array) -> Mask:
     """Return a mask of local maxima along the motion, their neighbors and the thinned grid, shape (K, m)."""
     peak = np.zeros(violations.shape, bool, order="F")
-    peak[1:-1] = (violations[1:-1] >= violations[:-2]) & (violations[1:-1] >= violations[2:])
+    peak[1:-1] = (violations[1:-1] >= violations[:-2]) & (
+        violations[1:-1] >= violations[2:]
+    )
     peak[0], peak[-1] = violations[0] >= violations[1], violations[-1] >= violations[-2]
     mask = peak.copy("F")
     mask[1:] |= peak[:-1]

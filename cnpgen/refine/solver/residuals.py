@@ -8,7 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.symbolic.linalg import symbols
-from cnpgen.kernels.symbolic.symbolic_state import FrozenState, SymbolicState, time_derivatives
+from cnpgen.kernels.symbolic.symbolic_state import (
+    FrozenState,
+    SymbolicState,
+    time_derivatives,
+)
 from cnpgen.problems.constraints.constraint import MIN_TOLERANCE
 from cnpgen.problems.objectives import Centrifugal, ObjectiveTerm, read_objective
 from cnpgen.problems.problem import Problem, resolved
@@ -48,12 +52,22 @@ def stage_jacobian(robot: Robot, problem: Problem) -> Any:
 def _stage(robot: Robot, problem: Problem) -> tuple[list[Any], FrozenState, list[Any]]:
     poses_sx, obstacle_poses = symbols("obstacle_poses", problem.scene_width)
     w_sx, (q, dq, ddq, jerk) = _motion(robot.n, problem.path_orders)
-    state = FrozenState(robot, q, dq, ddq, obstacle_poses, problem.obstacle, problem.object_size, jerk)
+    state = FrozenState(
+        robot, q, dq, ddq, obstacle_poses, problem.obstacle, problem.object_size, jerk
+    )
     g = []
     for constraint in problem.constraint:
         for condition in constraint.symbolic(state):
-            scales = residual_scale(condition.lower, condition.upper, constraint.tolerance, condition.tolerance_kind)
-            g += [value / float(scale) for value, scale in zip(condition.g, scales, strict=True)]
+            scales = residual_scale(
+                condition.lower,
+                condition.upper,
+                constraint.tolerance,
+                condition.tolerance_kind,
+            )
+            g += [
+                value / float(scale)
+                for value, scale in zip(condition.g, scales, strict=True)
+            ]
     return [w_sx, poses_sx], state, g
 
 
@@ -61,7 +75,9 @@ def residual_scale(lower: Array, upper: Array, tolerance: float, kind: str) -> A
     """Return the scale of residuals: the limit itself, 20 tolerances of an equality, or 0.1 m of a distance."""
     if kind == "limit":
         return np.maximum(np.abs(lower), np.abs(upper))
-    return np.where(lower == upper, EQUALITY_SCALE * max(tolerance, MIN_TOLERANCE), DISTANCE_SCALE_M)
+    return np.where(
+        lower == upper, EQUALITY_SCALE * max(tolerance, MIN_TOLERANCE), DISTANCE_SCALE_M
+    )
 
 
 def _motion(n: int, orders: int) -> tuple[Any, tuple[Any, ...]]:
@@ -83,18 +99,25 @@ class CostTerm:
     @property
     def tables(self) -> list[dict[str, Any]]:
         """The kinds of the terms with their keys except the weight, JSON-able."""
-        return [{key: value for key, value in resolved(term).items() if key != "weight"} for term in self.terms]
+        return [
+            {key: value for key, value in resolved(term).items() if key != "weight"}
+            for term in self.terms
+        ]
 
     def groups(self, counts: Iterable[int]) -> Array:
         """Return number of residuals, smoothing and weight of every term, shape (terms, 3)."""
-        rows = [(count, term.smoothing, term.weight) for count, term in zip(counts, self.terms, strict=True)]
+        rows = [
+            (count, term.smoothing, term.weight)
+            for count, term in zip(counts, self.terms, strict=True)
+        ]
         return np.array(rows, float)
 
     def rate(self, e: Array, counts: Iterable[int]) -> tuple[Array, Array]:
         """Evaluate the weighted size rho of the residuals e, shape (m, K), and its curvature.
 
-        ``counts`` are the numbers of residuals of every term. The result is ``(rho, weight)``, shapes (K,) and (m, K):
-        ``weight * e`` is the gradient of rho in e, and the diagonal matrix of ``weight`` bounds its Hessian from above.
+        ``counts`` are the numbers of residuals of every term. The result is ``(rho,
+        weight)``, shapes (K,) and (m, K): ``weight * e`` is the gradient of rho in e,
+        and the diagonal matrix of ``weight`` bounds its Hessian from above.
         """
         rho, weights, first = np.zeros(e.shape[1]), np.empty(e.shape), 0
         for count, smoothing, weight in self.groups(counts).tolist():
@@ -106,11 +129,13 @@ class CostTerm:
         return rho, weights
 
 
-def choose_cost_term(problem: Problem, objective: str = "time", weight: float | None = None) -> CostTerm | None:
+def choose_cost_term(
+    problem: Problem, objective: str = "time", weight: float | None = None
+) -> CostTerm | None:
     """Return the cost term of an objective (``read_objective``), or None if its weight is 0.
 
-    "time" is the problem's own objective. A weight replaces that of each term in ``objective``; of the problem's own
-    objective, that of the centrifugal acceleration.
+    "time" is the problem's own objective. A weight replaces that of each term in
+    ``objective``; of the problem's own objective, that of the centrifugal acceleration.
     """
     terms = read_objective(objective)
     if terms is None:
@@ -128,7 +153,9 @@ def cost_term_residuals(robot: Robot, terms: list[dict[str, Any]]) -> Any:
     import casadi as ca
 
     w_sx, state = _state(robot)
-    residuals = ca.vertcat(*(e for term in _restored(terms) for e in term.residuals(state)))
+    residuals = ca.vertcat(
+        *(e for term in _restored(terms) for e in term.residuals(state))
+    )
     jacobian = ca.densify(ca.jacobian(residuals, w_sx))
     return ca.Function("cost_term", [w_sx], ca.cse([residuals, ca.vec(jacobian)]))
 
@@ -146,7 +173,13 @@ def _state(robot: Robot) -> tuple[Any, SymbolicState]:
 
 def _restored(tables: list[dict[str, Any]]) -> list[ObjectiveTerm]:
     """Return the terms of ``CostTerm.tables``, of weight 1."""
-    keys = [{key: value for key, value in table.items() if key not in {"source", "package"}} for table in tables]
+    keys = [
+        {key: value for key, value in table.items() if key not in {"source", "package"}}
+        for table in tables
+    ]
     errors: list[str] = []
     with stored_values():
-        return [read_kind(registry.OBJECTIVES, table, RecipeLocation(table["use"]), errors) for table in keys]
+        return [
+            read_kind(registry.OBJECTIVES, table, RecipeLocation(table["use"]), errors)
+            for table in keys
+        ]

@@ -1,16 +1,20 @@
 """Sequential quadratic programming with a trust region, for one motion.
 
-Each step minimizes a quadratic model of the objective subject to the linearized residuals. One elastic variable relaxes
-violated residuals: the step may leave a fraction of every violation. The merit function is the objective plus a
-multiple of the largest violation. A proximal term makes the model strictly convex where the objective is flat.
+Each step minimizes a quadratic model of the objective subject to the linearized
+residuals. One elastic variable relaxes violated residuals: the step may leave a
+fraction of every violation. The merit function is the objective plus a multiple of the
+largest violation. A proximal term makes the model strictly convex where the objective
+is flat.
 
-The merit function alone rejects good steps along a curved manifold, since they leave it by their square (the Maratos
-effect). A step that reduces the objective is therefore also accepted within a violation bound, which shrinks each time
-(Gould and Toint, Mathematical Programming 122, 2010).
+The merit function alone rejects good steps along a curved manifold, since they leave it
+by their square (the Maratos effect). A step that reduces the objective is therefore
+also accepted within a violation bound, which shrinks each time (Gould and Toint,
+Mathematical Programming 122, 2010).
 
-Along flat directions of the objective steps never become short, and each violates residuals by its square. The
-objective has converged once a step changes it by less than the tolerance, and predicts no more. Then a heavy proximal
-term restricts further steps to the restoration of feasibility.
+Along flat directions of the objective steps never become short, and each violates
+residuals by its square. The objective has converged once a step changes it by less than
+the tolerance, and predicts no more. Then a heavy proximal term restricts further steps
+to the restoration of feasibility.
 """
 
 import time
@@ -32,22 +36,44 @@ from cnpgen.refine.solver.qp_subproblem import (
 from cnpgen.refine.solver.transcription import Transcription
 
 Array = NDArray[np.float64]
-RATE_RADIUS_FACTOR = 1.5  # trust radius of the logarithms of the rate, relative to that of the path
+RATE_RADIUS_FACTOR = (
+    1.5  # trust radius of the logarithms of the rate, relative to that of the path
+)
 MAX_RADIUS, MIN_RADIUS = 1.0, 1e-5  # of the trust region
 MAX_STEP_GROWTH = 1.5  # expected factor of the length of successive steps
-SELECTION_DISTANCES = ((0.2, 0.4), (0.05, 0.2), (-1.0, 0.1))  # see ``Settings.selection_distances``
+SELECTION_DISTANCES = (
+    (0.2, 0.4),
+    (0.05, 0.2),
+    (-1.0, 0.1),
+)  # see ``Settings.selection_distances``
 CONVERGED_PROXIMAL = 1.0  # weight of the proximal term once the objective has converged
-SHORT_MOTION_S = 0.2  # in shorter motions that weight grows with the cube of the ratio of durations
+SHORT_MOTION_S = (
+    0.2  # in shorter motions that weight grows with the cube of the ratio of durations
+)
 MAX_REMAINING = 0.9  # a step that leaves a larger fraction of the violations is computed again with relaxed residuals
 PENALTY_FACTOR = 3.0  # times the objective: weight of violations where the penalty makes violations profitable
-STALL_STEPS, STALL_FRACTION = 8, 0.9  # stalled: a larger fraction of the violation is left after so many steps
+STALL_STEPS, STALL_FRACTION = (
+    8,
+    0.9,
+)  # stalled: a larger fraction of the violation is left after so many steps
 MAX_RESTORED_VIOLATION = 0.02  # a stalled iteration with a smaller violation restores feasibility before it ends
-BOUND_SHRINKAGE, MIN_GAIN_FRACTION = 0.7, 0.1  # of the violation bound; smallest fraction of the predicted gain
+BOUND_SHRINKAGE, MIN_GAIN_FRACTION = (
+    0.7,
+    0.1,
+)  # of the violation bound; smallest fraction of the predicted gain
 LAST_STEPS = 3  # before a deadline restore feasibility
 DEADLINE_PROXIMAL = 30.0  # weight of the proximal term in these
-MAX_MIDPOINT_CORRECTIONS = 2  # tightenings of the bounds for violations between grid points
-STEP_TIME_FACTOR = 1.3  # times the largest duration of a step so far is reserved for the next
-ACCEPTED_RATIO, GOOD_RATIO, POOR_RATIO = 0.05, 0.7, 0.3  # of reduction to prediction: accept, enlarge, shrink
+MAX_MIDPOINT_CORRECTIONS = (
+    2  # tightenings of the bounds for violations between grid points
+)
+STEP_TIME_FACTOR = (
+    1.3  # times the largest duration of a step so far is reserved for the next
+)
+ACCEPTED_RATIO, GOOD_RATIO, POOR_RATIO = (
+    0.05,
+    0.7,
+    0.3,
+)  # of reduction to prediction: accept, enlarge, shrink
 
 
 @dataclass(frozen=True)
@@ -57,15 +83,17 @@ class Settings:
     max_iterations: int = 40  # largest number of steps tried
     radius: float = 0.3  # initial trust radius, infinity norm [rad and log]
     proximal: float = 0.02  # weight of the proximal term
-    # Initial weight of the largest violation in the merit function. A motion that is 1 % slower costs 1 % of its
-    # duration. Violations are therefore profitable in motions of more seconds than this; there the weight grows.
+    # Initial weight of the largest violation in the merit function. A motion that is 1
+    # % slower costs 1 % of its duration. Violations are therefore profitable in motions
+    # of more seconds than this; there the weight grows.
     penalty: float = 2.0
-    # Initial violation up to which steps are accepted for their reduction of the objective.
+    # Initial violation up to which steps are accepted for their reduction of the
+    # objective.
     violation_bound: float = 0.3
     max_initial_violation: float = np.inf  # largest violation of a usable initial guess
     cost_tolerance: float = 1e-3  # relative change of the objective, predicted and actual, at which it has converged
-    # Pairs (step length, distance): after a step longer than the first, residuals within the second of a bound are
-    # selected.
+    # Pairs (step length, distance): after a step longer than the first, residuals
+    # within the second of a bound are selected.
     selection_distances: tuple[tuple[float, float], ...] = SELECTION_DISTANCES
     violation_tolerance: float = 6e-4  # largest scaled violation of a feasible iterate
 
@@ -86,7 +114,9 @@ class Deadline:
 
     def note(self, begun: float) -> None:
         """Record a step that started at ``begun`` and has just ended."""
-        self.max_duration = max(self.max_duration, STEP_TIME_FACTOR * (time.perf_counter() - begun))
+        self.max_duration = max(
+            self.max_duration, STEP_TIME_FACTOR * (time.perf_counter() - begun)
+        )
 
 
 @dataclass(frozen=True)
@@ -101,13 +131,25 @@ class Result:
 
 
 def minimize(
-    motion: Transcription, bounds: Bounds, x: Array, settings: Settings, *, deadline: Deadline | None = None
+    motion: Transcription,
+    bounds: Bounds,
+    x: Array,
+    settings: Settings,
+    *,
+    deadline: Deadline | None = None,
 ) -> Result:
-    """Minimize from variables x, shape (nx,); the last steps before the deadline restore feasibility."""
+    """Minimize from variables x, shape (nx,).
+
+    The last steps before the deadline restore feasibility.
+    """
     iterate = _Iterate(motion, bounds, settings, x)
     feasible: Result | None = None
     iteration = 0
-    while iteration < settings.max_iterations and not iterate.converged and (deadline is None or deadline.allows(1)):
+    while (
+        iteration < settings.max_iterations
+        and not iterate.converged
+        and (deadline is None or deadline.allows(1))
+    ):
         begun = time.perf_counter()
         iterate.restoring = deadline is not None and not deadline.allows(LAST_STEPS)
         iteration += 1
@@ -115,15 +157,25 @@ def minimize(
         if deadline is None:
             continue
         deadline.note(begun)
-        feasible = None if iterate.tightened else feasible  # earlier iterates met the wider bounds only
+        feasible = (
+            None if iterate.tightened else feasible
+        )  # earlier iterates met the wider bounds only
         if iterate.violation < settings.violation_tolerance:
             found = iterate.result(iteration)
-            feasible = found if feasible is None or found.cost < feasible.cost else feasible
+            feasible = (
+                found if feasible is None or found.cost < feasible.cost else feasible
+            )
     last = iterate.result(iteration)
-    return last if iterate.converged or feasible is None else replace(feasible, iterations=iteration)
+    return (
+        last
+        if iterate.converged or feasible is None
+        else replace(feasible, iterations=iteration)
+    )
 
 
-def make_backend(motion: Transcription, bounds: Bounds) -> NumpyBackend | CompiledBackend:
+def make_backend(
+    motion: Transcription, bounds: Bounds
+) -> NumpyBackend | CompiledBackend:
     """Return the backend of a motion: compiled if its kernels are, else NumPy."""
     compiled = motion.kernels.step_library is not None
     return CompiledBackend(motion, bounds) if compiled else NumpyBackend(motion, bounds)
@@ -135,36 +187,63 @@ class _Iterate:
     restoring = False  # whether steps only restore feasibility, before a deadline
     tightened = False  # whether the last step tightened the bounds for violations between grid points
 
-    def __init__(self, motion: Transcription, bounds: Bounds, settings: Settings, x: Array) -> None:
+    def __init__(
+        self, motion: Transcription, bounds: Bounds, settings: Settings, x: Array
+    ) -> None:
         self._backend, self._motion = make_backend(motion, bounds), motion
         self._corrections = MAX_MIDPOINT_CORRECTIONS
         self.x = self._start = x
         self.cost, self._g, self.violation = self._backend.value(x)
         self.converged = not self.violation < settings.max_initial_violation
-        # of iterates after the initial guess, which may violate less than its successors; it counts only if feasible
-        self._violations = [self.violation] if self.violation <= settings.violation_tolerance else []
+        # of iterates after the initial guess, which may violate less than its
+        # successors; it counts only if feasible
+        self._violations = (
+            [self.violation] if self.violation <= settings.violation_tolerance else []
+        )
         self._bounds, self._settings = bounds, settings
         self._scale = np.ones(motion.nx)
         self._scale[motion.split :] = RATE_RADIUS_FACTOR
-        self._radius, self._violation_bound, self._penalty = settings.radius, settings.violation_bound, settings.penalty
-        self._step_length = MAX_RADIUS  # of the last step, in the norm of the trust region
+        self._radius, self._violation_bound, self._penalty = (
+            settings.radius,
+            settings.violation_bound,
+            settings.penalty,
+        )
+        self._step_length = (
+            MAX_RADIUS  # of the last step, in the norm of the trust region
+        )
         self._multipliers: Array | None = None
         self._cost_converged = self._stalled = False
-        self._missed = np.zeros(self._g.shape, bool)  # residuals that a rejected step violated without their selection
+        self._missed = np.zeros(
+            self._g.shape, bool
+        )  # residuals that a rejected step violated without their selection
 
     def result(self, iterations: int) -> Result:
         """Return the current iterate as a result."""
-        return Result(self.x, self.cost, self.violation, iterations, self.converged and not self.restoring)
+        return Result(
+            self.x,
+            self.cost,
+            self.violation,
+            iterations,
+            self.converged and not self.restoring,
+        )
 
     def advance(self) -> None:
         """Try a step, and accept it or adapt the trust region and the selection."""
         settings, self.tightened = self._settings, False
         restore = self.restoring or self._cost_converged or self._stalled
         proximal = self._restoration_weight() if restore else settings.proximal
-        distance = next(distance for length, distance in settings.selection_distances if self._step_length > length)
+        distance = next(
+            distance
+            for length, distance in settings.selection_distances
+            if self._step_length > length
+        )
         change = MAX_STEP_GROWTH * self._step_length
-        selection = ResidualSelection(self.violation, distance, change, self._missed, self._multipliers)
-        subproblem = self._backend.subproblem(self.x, self._g, selection, proximal=proximal, penalty=self._penalty)
+        selection = ResidualSelection(
+            self.violation, distance, change, self._missed, self._multipliers
+        )
+        subproblem = self._backend.subproblem(
+            self.x, self._g, selection, proximal=proximal, penalty=self._penalty
+        )
         step = self._propose(subproblem)
         if step is None:
             self._radius *= 0.25
@@ -172,29 +251,56 @@ class _Iterate:
             self._try(step, subproblem.selected)
         if self.x is not self._start:
             self._violations.append(self.violation)
-        if self._is_stuck() and self._penalty < self.cost:  # violations may be profitable
-            self._penalty, self._violations = PENALTY_FACTOR * self.cost, [self.violation]
-        if self._is_stuck() and not self._stalled and self.violation < MAX_RESTORED_VIOLATION:
+        if (
+            self._is_stuck() and self._penalty < self.cost
+        ):  # violations may be profitable
+            self._penalty, self._violations = (
+                PENALTY_FACTOR * self.cost,
+                [self.violation],
+            )
+        if (
+            self._is_stuck()
+            and not self._stalled
+            and self.violation < MAX_RESTORED_VIOLATION
+        ):
             self._stalled, self._violations = True, [self.violation]
         self.converged |= self._radius < MIN_RADIUS or self._is_stuck()
 
     def _restoration_weight(self) -> float:
-        ratio = max(SHORT_MOTION_S / self._motion.duration(np.exp(self.x[self._motion.split :])), 1.0)
+        ratio = max(
+            SHORT_MOTION_S
+            / self._motion.duration(np.exp(self.x[self._motion.split :])),
+            1.0,
+        )
         return (DEADLINE_PROXIMAL if self.restoring else CONVERGED_PROXIMAL) * ratio**3
 
     def _is_stuck(self) -> bool:
         """Return whether no iterate was feasible and the smallest violation hardly decreases any more."""
-        before, recent = self._violations[:-STALL_STEPS], self._violations[-STALL_STEPS:]
-        smallest, tolerance = min(before, default=0.0), self._settings.violation_tolerance
-        return smallest > tolerance and min(recent) > max(STALL_FRACTION * smallest, tolerance)
+        before, recent = (
+            self._violations[:-STALL_STEPS],
+            self._violations[-STALL_STEPS:],
+        )
+        smallest, tolerance = (
+            min(before, default=0.0),
+            self._settings.violation_tolerance,
+        )
+        return smallest > tolerance and min(recent) > max(
+            STALL_FRACTION * smallest, tolerance
+        )
 
     def _propose(self, subproblem: NumpySubproblem | CompiledSubproblem) -> Step | None:
         """Solve the subproblem; solve it again, relaxed or without warm start, if the step is of little use."""
         box = self._radius * self._scale
         step = subproblem.solve(box, warm=self._multipliers)
-        if self.violation > self._settings.violation_tolerance and (step is None or step.remaining > MAX_REMAINING):
+        if self.violation > self._settings.violation_tolerance and (
+            step is None or step.remaining > MAX_REMAINING
+        ):
             relaxed = subproblem.solve(box, relax=True)
-            if relaxed is not None and relaxed.remaining > MAX_REMAINING and self._penalty < self.cost:
+            if (
+                relaxed is not None
+                and relaxed.remaining > MAX_REMAINING
+                and self._penalty < self.cost
+            ):
                 self._penalty = PENALTY_FACTOR * self.cost
             return relaxed or step
         if step is None and self._multipliers is not None:
@@ -209,20 +315,37 @@ class _Iterate:
         gain = step.gain
         predicted = gain + self._penalty * self.violation * (1 - step.remaining)
         reduction = self.cost - cost + self._penalty * (self.violation - violation)
-        within_bound = violation <= self._violation_bound and self.cost - cost > MIN_GAIN_FRACTION * gain > 0
+        within_bound = (
+            violation <= self._violation_bound
+            and self.cost - cost > MIN_GAIN_FRACTION * gain > 0
+        )
         size = float(np.abs(step.dx / self._scale).max())
         self._multipliers = step.multipliers
-        if np.isfinite(reduction) and (within_bound or reduction > ACCEPTED_RATIO * predicted):
+        if np.isfinite(reduction) and (
+            within_bound or reduction > ACCEPTED_RATIO * predicted
+        ):
             if reduction <= ACCEPTED_RATIO * predicted:
                 self._violation_bound *= BOUND_SHRINKAGE
             if within_bound or reduction > GOOD_RATIO * predicted:
-                self._radius = min(2.5 * self._radius, MAX_RADIUS) if size > 0.8 * self._radius else self._radius
+                self._radius = (
+                    min(2.5 * self._radius, MAX_RADIUS)
+                    if size > 0.8 * self._radius
+                    else self._radius
+                )
             elif reduction < POOR_RATIO * predicted:
                 self._radius *= 0.5
-            self._cost_converged = max(abs(self.cost - cost), abs(gain)) < settings.cost_tolerance * cost
+            self._cost_converged = (
+                max(abs(self.cost - cost), abs(gain)) < settings.cost_tolerance * cost
+            )
             restored = self._cost_converged or self._stalled or self.restoring
             self.converged = restored and violation < settings.violation_tolerance
-            self.x, self.cost, self._g, self.violation, self._step_length = x, cost, g, violation, size
+            self.x, self.cost, self._g, self.violation, self._step_length = (
+                x,
+                cost,
+                g,
+                violation,
+                size,
+            )
             self._missed[:] = False
             if self.converged and not self.restoring and self._corrections:
                 self._check_midpoints()
@@ -234,12 +357,20 @@ class _Iterate:
         tighter = self._bounds.tightened(self._g, self._motion.grid.midpoint_weights)
         if tighter is None:
             return
-        self.converged, self.tightened, self._corrections, self._bounds = False, True, self._corrections - 1, tighter
+        self.converged, self.tightened, self._corrections, self._bounds = (
+            False,
+            True,
+            self._corrections - 1,
+            tighter,
+        )
         self._backend = make_backend(self._motion, tighter)
         self.violation = tighter.max_violation(self._g)
 
     def _reject(self, violations: Array, selected: Mask, size: float) -> None:
-        """Select the residuals that a rejected step violated; shrink the radius unless they explain the rejection."""
+        """Select the residuals that a rejected step violated.
+
+        Shrink the radius unless they explain the rejection.
+        """
         violated = violations > self._settings.violation_tolerance
         missed = local_maxima(violations) & violated & ~selected
         self._missed |= missed

@@ -1,8 +1,10 @@
 """Transcription of the optimization problem of one motion: variables, residuals on a Chebyshev grid, derivatives.
 
-Variables are the interior path control points and the logarithms of the rate control points. Boundary conditions hold
-by construction: the boundary control points are functions of the first and last rate control points (paper, Appendix
-A). Residuals are the problem's constraints, each divided by its scale (``cnpgen.refine.solver.residuals``).
+Variables are the interior path control points and the logarithms of the rate control
+points. Boundary conditions hold by construction: the boundary control points are
+functions of the first and last rate control points (paper, Appendix A). Residuals are
+the problem's constraints, each divided by its scale
+(``cnpgen.refine.solver.residuals``).
 """
 
 from collections.abc import Callable
@@ -47,41 +49,75 @@ class ResidualKernels:
     values: Kernel  # kernel of ``cnpgen.refine.solver.residuals.stage_values``
     jacobian: Kernel  # kernel of ``cnpgen.refine.solver.residuals.stage_jacobian``
     cost_term: CostTerm | None = None  # cost term in addition to the duration, or None
-    cost_residuals: Kernel | None = None  # kernel of ``cnpgen.refine.solver.residuals.cost_term_residuals``, or None
-    cost_counts: tuple[int, ...] = ()  # number of residuals of every term of the cost term
-    # Library of ``cnpgen.refine.solver.compiled_backend``, or None for the NumPy backend.
+    cost_residuals: Kernel | None = (
+        None  # kernel of ``cnpgen.refine.solver.residuals.cost_term_residuals``, or None
+    )
+    cost_counts: tuple[
+        int, ...
+    ] = ()  # number of residuals of every term of the cost term
+    # Library of ``cnpgen.refine.solver.compiled_backend``, or None for the NumPy
+    # backend.
     step_library: CDLL | None = None
 
 
 class Transcription:
     """One motion on one grid, with poses and sizes of its obstacles, shape (width,)."""
 
-    def __init__(self, kernels: ResidualKernels, grid: Grid, *, boundary: Boundary, obstacle_poses: Array) -> None:
+    def __init__(
+        self,
+        kernels: ResidualKernels,
+        grid: Grid,
+        *,
+        boundary: Boundary,
+        obstacle_poses: Array,
+    ) -> None:
         spec = kernels.spec
-        self.kernels, self.spec, self.grid, self.boundary = kernels, spec, grid, boundary
+        self.kernels, self.spec, self.grid, self.boundary = (
+            kernels,
+            spec,
+            grid,
+            boundary,
+        )
         self.n = boundary.start_q.shape[1]
-        self._goal_points = spec.path_control_points - boundary.fixed_at_goal  # index of the goal's control points
+        self._goal_points = (
+            spec.path_control_points - boundary.fixed_at_goal
+        )  # index of the goal's control points
         self.interior = self._goal_points - 3
         self.split = self.interior * self.n
         self.nx = self.split + spec.rate_control_points
         self.obstacle_poses = obstacle_poses
         self.poses_along = np.repeat(obstacle_poses[:, None], len(grid.s), axis=1)
         self.smoothing = _smoothing(spec.rate_control_points)
-        self._at = cache_last(self._states)  # an accepted step is evaluated again, with derivatives
+        self._at = cache_last(
+            self._states
+        )  # an accepted step is evaluated again, with derivatives
         self._cost_residuals = cache_last(self._evaluate_cost_residuals)
-        self._boundary_derivatives = cache_last(lambda rate: boundary_derivatives(boundary, rate[None], spec))
+        self._boundary_derivatives = cache_last(
+            lambda rate: boundary_derivatives(boundary, rate[None], spec)
+        )
 
     def activate(self) -> None:
-        """Prepare kernels whose machine code has a context; the step library calls them afterwards."""
+        """Prepare kernels whose machine code has a context.
+
+        The step library calls them afterwards.
+        """
 
     def unpack(self, x: Array) -> tuple[Array, Array]:
         """Return path control points (C, n) and rate control points (R,) of the variables."""
         rate = np.exp(x[self.split :])
-        path = assemble(self.boundary, x[: self.split].reshape(1, self.interior, self.n), rate[None], self.spec)
+        path = assemble(
+            self.boundary,
+            x[: self.split].reshape(1, self.interior, self.n),
+            rate[None],
+            self.spec,
+        )
         return path[0], rate
 
     def pack(self, path: Array, rate: Array) -> Array:
-        """Return the variables of a motion; its boundary control points are replaced by the exact ones."""
+        """Return the variables of a motion.
+
+        Its boundary control points are replaced by the exact ones.
+        """
         return np.concatenate([path[3 : self._goal_points].ravel(), np.log(rate)])
 
     def positions(self, x: Array) -> Array:
@@ -105,14 +141,27 @@ class Transcription:
         return self.objective(path, rate), g.T
 
     def end_residuals(self) -> Array:
-        """Evaluate residuals at the start and at the goal, shape (2, m); nan where accelerations or jerks are free."""
+        """Evaluate residuals at the start and at the goal, shape (2, m).
+
+        Nan where accelerations or jerks are free.
+        """
         orders = len(self.grid.bases.path)
-        b, unit = self.boundary, np.eye(1, orders - 1)[0]  # with r = 1 and r' = 0, w is the state itself
+        b, unit = (
+            self.boundary,
+            np.eye(1, orders - 1)[0],
+        )  # with r = 1 and r' = 0, w is the state itself
         free = np.full(self.n, np.nan)
-        goal_ddq, jerk = free if b.goal_ddq is None else b.goal_ddq[0], [free] * (orders - 3)
-        start = np.concatenate([b.start_q[0], b.start_dq[0], b.start_ddq[0], *jerk, unit])
+        goal_ddq, jerk = (
+            free if b.goal_ddq is None else b.goal_ddq[0],
+            [free] * (orders - 3),
+        )
+        start = np.concatenate(
+            [b.start_q[0], b.start_dq[0], b.start_ddq[0], *jerk, unit]
+        )
         goal = np.concatenate([b.goal_q[0], b.goal_dq[0], goal_ddq, *jerk, unit])
-        (g,) = self.kernels.values(np.stack([start, goal], axis=1), self.poses_along[:, :2])
+        (g,) = self.kernels.values(
+            np.stack([start, goal], axis=1), self.poses_along[:, :2]
+        )
         return np.asarray(g.T)
 
     def objective(self, path: Array, rate: Array) -> float:
@@ -120,7 +169,9 @@ class Transcription:
         if self.kernels.cost_term is None:
             return self.duration(rate)
         e, _, weights = self._cost_residuals(path, rate)
-        return self.duration(rate) + float(weights @ self.kernels.cost_term.rate(e, self.kernels.cost_counts)[0])
+        return self.duration(rate) + float(
+            weights @ self.kernels.cost_term.rate(e, self.kernels.cost_counts)[0]
+        )
 
     def duration(self, rate: Array) -> float:
         """Return the motion time [s] of rate control points [1/s], shape (R,)."""
@@ -135,13 +186,21 @@ class Transcription:
         inverse = 1.0 / (self.grid.time_basis @ rate)
         cost = float(inverse @ self.grid.time_weights) + self.regularization(x)
         gradient = np.zeros(self.nx)
-        gradient[self.split :] = -((self.grid.time_weights * inverse**2) @ log_rate_derivative) + self.smoothing @ log
+        gradient[self.split :] = (
+            -((self.grid.time_weights * inverse**2) @ log_rate_derivative)
+            + self.smoothing @ log
+        )
         curvature = np.zeros((self.nx, self.nx))
-        half = log_rate_derivative * np.sqrt(2 * self.grid.time_weights * inverse**3)[:, None]
+        half = (
+            log_rate_derivative
+            * np.sqrt(2 * self.grid.time_weights * inverse**3)[:, None]
+        )
         curvature[self.split :, self.split :] = half.T @ half + self.smoothing
         if self.kernels.cost_term is not None:
             cost += self._add_cost_term(path, rate, gradient, curvature)
-        return Linearization(x, cost, gradient, curvature, g.T, jacobian.reshape(len(w), *g.shape), rate)
+        return Linearization(
+            x, cost, gradient, curvature, g.T, jacobian.reshape(len(w), *g.shape), rate
+        )
 
     def rows(self, at: Linearization, k: Indices, residual: Indices) -> Array:
         """Return the gradients of residuals with indices (m,) at grid points k, (m,), in the variables: (m, nx)."""
@@ -160,7 +219,9 @@ class Transcription:
         path, rate = self.unpack(x)
         return self.grid.bases.states(path, rate), path, rate
 
-    def _evaluate_cost_residuals(self, path: Array, rate: Array) -> tuple[Array, Array, Array]:
+    def _evaluate_cost_residuals(
+        self, path: Array, rate: Array
+    ) -> tuple[Array, Array, Array]:
         """Return the cost term's residuals (m, Q), their Jacobian (4 n + 3, m, Q) and quadrature weights (Q,)."""
         assert self.kernels.cost_residuals is not None
         w = self.grid.cost_bases.states(path, rate)
@@ -168,8 +229,13 @@ class Transcription:
         weights = self.grid.cost_weights / w[4 * self.n]
         return e, jacobian.reshape(len(w), *e.shape), weights
 
-    def _add_cost_term(self, path: Array, rate: Array, gradient: Array, curvature: Array) -> float:
-        """Add the cost term's gradient and its Gauss-Newton Hessian; return its value."""
+    def _add_cost_term(
+        self, path: Array, rate: Array, gradient: Array, curvature: Array
+    ) -> float:
+        """Add the cost term's gradient and its Gauss-Newton Hessian.
+
+        Return its value.
+        """
         assert self.kernels.cost_term is not None
         bases = self.grid.cost_bases
         e, jacobian, weights = self._cost_residuals(path, rate)
@@ -180,19 +246,29 @@ class Transcription:
         row_weights = (weights * rho_derivative)[residual, k]
         gradient += (row_weights * e[residual, k]) @ rows
         half = rows * np.sqrt(row_weights)[:, None]
-        gradient[self.split :] -= (weights * rho / (bases.rate[0] @ rate)) @ bases.rate[0] * rate
+        gradient[self.split :] -= (
+            (weights * rho / (bases.rate[0] @ rate)) @ bases.rate[0] * rate
+        )
         curvature += half.T @ half  # a product of one matrix takes half the time
         return float(weights @ rho)
 
-    def _chain(self, state_gradients: Array, k: Indices, rate: Array, bases: Bases) -> Array:
+    def _chain(
+        self, state_gradients: Array, k: Indices, rate: Array, bases: Bases
+    ) -> Array:
         """Convert gradients in w at nodes k, shape (m, width of w), to gradients in the variables, (m, nx)."""
         n, m, orders = self.n, len(k), len(bases.path)
-        control = bases.path_at[k] @ state_gradients[:, : orders * n].reshape(m, orders, n)
+        control = bases.path_at[k] @ state_gradients[:, : orders * n].reshape(
+            m, orders, n
+        )
         out = np.empty((m, self.nx))
         out[:, : self.split] = control[:, 3 : self._goal_points].reshape(m, self.split)
-        out[:, self.split :] = (state_gradients[:, None, orders * n :] @ bases.rate_at[k])[:, 0] * rate
+        out[:, self.split :] = (
+            state_gradients[:, None, orders * n :] @ bases.rate_at[k]
+        )[:, 0] * rate
         for item in self._boundary_derivatives(rate):
-            out[:, self.split + item.variable] += control[:, item.point] @ (item.derivative[0] * rate[item.variable])
+            out[:, self.split + item.variable] += control[:, item.point] @ (
+                item.derivative[0] * rate[item.variable]
+            )
         return out
 
 
@@ -204,12 +280,17 @@ def _smoothing(points: int) -> Array:
 
 
 def cache_last(function: Callable[..., T]) -> Callable[..., T]:
-    """Cache the last result of a function, keyed by the identity of its arguments; threads may share the cache."""
+    """Cache the last result of a function, keyed by the identity of its arguments.
+
+    Threads may share the cache.
+    """
     last: list[tuple[tuple[Any, ...], T]] = []
 
     def cached(*objects: Any) -> T:
         for arguments, result in last:
-            if len(arguments) == len(objects) and all(a is b for a, b in zip(arguments, objects, strict=True)):
+            if len(arguments) == len(objects) and all(
+                a is b for a, b in zip(arguments, objects, strict=True)
+            ):
                 return result
         result = function(*objects)
         last[:] = [(objects, result)]

@@ -45,11 +45,16 @@ class Camera:
         if not 0 < self.field_of_view < math.pi:
             hint = suggested_unit(self.field_of_view, "rad", 0.0, math.pi)
             raise UsageError(
-                f"must be above 0 and below pi, got {self.field_of_view:g}{hint}", argument="field_of_view"
+                f"must be above 0 and below pi, got {self.field_of_view:g}{hint}",
+                argument="field_of_view",
             )
-        if not np.isfinite([*self.position, *self.target]).all() or math.dist(self.position, self.target) < 1e-6:
+        if (
+            not np.isfinite([*self.position, *self.target]).all()
+            or math.dist(self.position, self.target) < 1e-6
+        ):
             raise UsageError(
-                f"must be finite and away from the position {self.position}, got {self.target}", argument="target"
+                f"must be finite and away from the position {self.position}, got {self.target}",
+                argument="target",
             )
 
     @property
@@ -57,11 +62,21 @@ class Camera:
         """Rows: the unit vector forward, and the vectors from the center to the right and the lower edge at 1 m."""
         forward = np.subtract(self.target, self.position, dtype=float)
         forward /= np.linalg.norm(forward)
-        up = (0.0, 0.0, 1.0) if math.hypot(*forward[:2]) > MIN_VIEW_DISTANCE_M else (0.0, 1.0, 0.0)
+        up = (
+            (0.0, 0.0, 1.0)
+            if math.hypot(*forward[:2]) > MIN_VIEW_DISTANCE_M
+            else (0.0, 1.0, 0.0)
+        )
         right = np.cross(forward, up)
         right /= np.linalg.norm(right)
         half = math.tan(self.field_of_view / 2)
-        return np.stack([forward, half * right, half * self.height / self.width * np.cross(forward, right)])
+        return np.stack(
+            [
+                forward,
+                half * right,
+                half * self.height / self.width * np.cross(forward, right),
+            ]
+        )
 
 
 def depth_image(primitives: Primitives, camera: Camera) -> Array:
@@ -69,7 +84,10 @@ def depth_image(primitives: Primitives, camera: Camera) -> Array:
 
     Pixels that see no body have inf. Bodies that contain the camera are not seen.
     """
-    x, y = ((2 * np.arange(count) + 1) / count - 1 for count in (camera.width, camera.height))
+    x, y = (
+        (2 * np.arange(count) + 1) / count - 1
+        for count in (camera.width, camera.height)
+    )
     forward, right, down = camera.axes
     rays = (forward + x[None, :, None] * right + y[:, None, None] * down).reshape(-1, 3)
     depth = np.full(len(rays), np.inf)
@@ -78,7 +96,11 @@ def depth_image(primitives: Primitives, camera: Camera) -> Array:
         origin = (np.array(camera.position) - primitives.centers[index]) @ rotation
         mesh, local = primitives.mesh(index), rays @ rotation
         local[np.abs(local) < MIN_RAY] = MIN_RAY  # rays along a face
-        hits = [mesh.entries(origin, local)] if mesh else _hits(KINDS[primitives.kinds[index]], size, origin, local)
+        hits = (
+            [mesh.entries(origin, local)]
+            if mesh
+            else _hits(KINDS[primitives.kinds[index]], size, origin, local)
+        )
         for hit in hits:
             depth = np.where((hit > 0) & (hit < depth), hit, depth)
     return depth.reshape(camera.height, camera.width)
@@ -87,12 +109,15 @@ def depth_image(primitives: Primitives, camera: Camera) -> Array:
 def depth_points(depth: Array, camera: Camera, count: int, seed: np.uint64) -> Array:
     """Return points of a depth image [m], evenly distributed over the pixels that see a body, shape (count, 3).
 
-    They repeat if there are fewer such pixels, and are nan if there are none. The seed is that of the scene.
+    They repeat if there are fewer such pixels, and are nan if there are none. The seed
+    is that of the scene.
     """
     seen = np.flatnonzero(np.isfinite(depth))
     if not len(seen):
         return np.full((count, 3), np.nan)
-    places = ((np.arange(count) + unit_offset(seed)) / count * len(seen)).astype(np.int64)
+    places = ((np.arange(count) + unit_offset(seed)) / count * len(seen)).astype(
+        np.int64
+    )
     pixels = seen[np.minimum(places, len(seen) - 1)]
     row, column = np.divmod(pixels, camera.width)
     forward, right, down = camera.axes
@@ -110,13 +135,22 @@ def _hits(kind: str, size: Array, origin: Array, ray: Array) -> list[Array]:
         radius, half = size[0], size[1]
         a = (ray[:, :2] ** 2).sum(axis=1)
         f = ray[:, :2] @ origin[:2]
-        root = np.sqrt(f**2 - a * (origin[:2] @ origin[:2] - radius**2))  # nan: no intersection
+        root = np.sqrt(
+            f**2 - a * (origin[:2] @ origin[:2] - radius**2)
+        )  # nan: no intersection
         enter, leave = (-f - root) / a, (-f + root) / a
         if kind == "cylinder":
             center, width = -origin[2] / ray[:, 2], np.abs(half / ray[:, 2])
-            return [_entry(np.maximum(enter, center - width), np.minimum(leave, center + width))]
+            return [
+                _entry(
+                    np.maximum(enter, center - width), np.minimum(leave, center + width)
+                )
+            ]
         side = np.where(np.abs(origin[2] + enter * ray[:, 2]) <= half, enter, np.nan)
-        return [side, *(_ball(radius, origin - [0, 0, end * half], ray) for end in (-1, 1))]
+        return [
+            side,
+            *(_ball(radius, origin - [0, 0, end * half], ray) for end in (-1, 1)),
+        ]
 
 
 def _entry(enter: Array, leave: Array) -> Array:

@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError, nearest
 from cnpgen.robots.observation.camera import Camera, depth_image, depth_points
-from cnpgen.robots.observation.primitives import KINDS, MESH, Primitives, bodies_of, smallest_signed_distances
+from cnpgen.robots.observation.primitives import (
+    KINDS,
+    MESH,
+    Primitives,
+    bodies_of,
+    smallest_signed_distances,
+)
 from cnpgen.robots.observation.surface_points import Seeds, surface_points
 from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.arguments import integer
@@ -23,7 +29,10 @@ Corner = tuple[float, float, float]
 
 MAX_OBSERVED_POINTS = 10_000_000  # of one observation of one scene
 MIN_GRID_EXTENT_M = 1e-6
-WORKSPACE = (-0.9, -0.9, -0.1), (0.9, 0.9, 1.1)  # corners of the default grids, around an arm like the Panda [m]
+WORKSPACE = (
+    (-0.9, -0.9, -0.1),
+    (0.9, 0.9, 1.1),
+)  # corners of the default grids, around an arm like the Panda [m]
 
 
 class ObservationBackend:
@@ -35,15 +44,25 @@ class ObservationBackend:
     def distances(self, scenes: Primitives, points: Array) -> Values:
         """Return the smallest signed distance of points from the bodies of each scene [m], shape (N, P).
 
-        Points in the world frame [m] have shape (P, 3) for all scenes or (N, P, 3). Without bodies distances are inf.
+        Points in the world frame [m] have shape (P, 3) for all scenes or (N, P, 3).
+        Without bodies distances are inf.
         """
         points = np.broadcast_to(points, (len(scenes), *points.shape[-2:]))
-        parts = [smallest_signed_distances(bodies_of(scenes, i), points[i]) for i in range(len(scenes))]
+        parts = [
+            smallest_signed_distances(bodies_of(scenes, i), points[i])
+            for i in range(len(scenes))
+        ]
         return _stacked(parts, points.shape[1:2])
 
     def surface_points(self, scenes: Primitives, count: int, seeds: Seeds) -> Values:
-        """Return points on the surfaces of each scene [m], shape (N, count, 3); see ``surface_points``."""
-        parts = [surface_points(bodies_of(scenes, i), count, seeds[i]) for i in range(len(scenes))]
+        """Return points on the surfaces of each scene [m], shape (N, count, 3).
+
+        See ``surface_points``.
+        """
+        parts = [
+            surface_points(bodies_of(scenes, i), count, seeds[i])
+            for i in range(len(scenes))
+        ]
         return _stacked(parts, (count, 3))
 
     def depth_images(self, scenes: Primitives, camera: Camera) -> Values:
@@ -51,9 +70,17 @@ class ObservationBackend:
         parts = [depth_image(bodies_of(scenes, i), camera) for i in range(len(scenes))]
         return _stacked(parts, (camera.height, camera.width))
 
-    def depth_points(self, depth: Values, camera: Camera, count: int, seeds: Seeds) -> Values:
-        """Return points of depth images [m], shape (N, count, 3); see ``depth_points``."""
-        parts = [depth_points(image, camera, count, seed) for image, seed in zip(depth, seeds, strict=True)]
+    def depth_points(
+        self, depth: Values, camera: Camera, count: int, seeds: Seeds
+    ) -> Values:
+        """Return points of depth images [m], shape (N, count, 3).
+
+        See ``depth_points``.
+        """
+        parts = [
+            depth_points(image, camera, count, seed)
+            for image, seed in zip(depth, seeds, strict=True)
+        ]
         return _stacked(parts, (count, 3))
 
 
@@ -67,7 +94,9 @@ class Observation(ABC):
     name: ClassVar[str]
 
     @abstractmethod
-    def observe(self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend) -> dict[str, Array]:
+    def observe(
+        self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend
+    ) -> dict[str, Array]:
         """Observe N scenes from their bodies and seeds, shape (N,): name -> array with a first axis of length N."""
 
 
@@ -86,7 +115,9 @@ class SurfaceCloud(Observation):
         check_fields(self)
         integer("points", self.points, least=1, most=MAX_OBSERVED_POINTS)
 
-    def observe(self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend) -> dict[str, Array]:
+    def observe(
+        self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend
+    ) -> dict[str, Array]:
         """See ``Observation``."""
         return {"cloud": backend.surface_points(bodies, self.points, seeds)}
 
@@ -108,10 +139,14 @@ class CameraCloud(Observation):
         check_fields(self)
         integer("points", self.points, least=1, most=MAX_OBSERVED_POINTS)
 
-    def observe(self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend) -> dict[str, Array]:
+    def observe(
+        self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend
+    ) -> dict[str, Array]:
         """See ``Observation``."""
         depth = backend.depth_images(bodies, self.camera)
-        return {"camera_cloud": backend.depth_points(depth, self.camera, self.points, seeds)}
+        return {
+            "camera_cloud": backend.depth_points(depth, self.camera, self.points, seeds)
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,14 +167,26 @@ class DistanceGrid(Observation):
     def __post_init__(self) -> None:
         check_fields(self)
         _check_corners(self.low, self.high)
-        if min(self.shape) < 1 or np.prod(self.shape, dtype=float) > MAX_OBSERVED_POINTS:
+        if (
+            min(self.shape) < 1
+            or np.prod(self.shape, dtype=float) > MAX_OBSERVED_POINTS
+        ):
             raise UsageError(
-                f"must be positive with at most {MAX_OBSERVED_POINTS:,} points, got {self.shape}", argument="shape"
+                f"must be positive with at most {MAX_OBSERVED_POINTS:,} points, got {self.shape}",
+                argument="shape",
             )
 
-    def observe(self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend) -> dict[str, Array]:  # noqa: ARG002
+    def observe(
+        self,
+        bodies: Primitives,
+        seeds: Seeds,  # noqa: ARG002
+        backend: ObservationBackend,
+    ) -> dict[str, Array]:
         """See ``Observation``."""
-        axes = [np.linspace(*ends) for ends in zip(self.low, self.high, self.shape, strict=True)]
+        axes = [
+            np.linspace(*ends)
+            for ends in zip(self.low, self.high, self.shape, strict=True)
+        ]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         return {"distances": backend.distances(bodies, points).reshape(-1, *self.shape)}
 
@@ -169,9 +216,16 @@ class BasisPoints(Observation):
         """The points, a Kronecker sequence [m], shape (points, 3)."""
         root = 1.2207440846057596  # of x^4 = x + 1
         steps = np.arange(1, self.points + 1)[:, None] / root ** np.arange(1, 4)
-        return np.asarray(np.array(self.low) + (steps + 0.5) % 1.0 * np.subtract(self.high, self.low))
+        return np.asarray(
+            np.array(self.low) + (steps + 0.5) % 1.0 * np.subtract(self.high, self.low)
+        )
 
-    def observe(self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend) -> dict[str, Array]:  # noqa: ARG002
+    def observe(
+        self,
+        bodies: Primitives,
+        seeds: Seeds,  # noqa: ARG002
+        backend: ObservationBackend,
+    ) -> dict[str, Array]:
         """See ``Observation``."""
         return {"basis": backend.distances(bodies, self.positions)}
 
@@ -180,9 +234,9 @@ class BasisPoints(Observation):
 class ObjectTokens(Observation):
     """A row per body: ``tokens``, shape (N, capacity, 16), float32, and ``mask``, shape (N, capacity).
 
-    The numbers of a row are the kind (one of box, sphere, cylinder and capsule is 1), the center [m], the first two
-    columns of the rotation matrix, and the sizes [m] as in ``Primitives``. A mesh is its bounding box. Rows without a
-    body are 0.
+    The numbers of a row are the kind (one of box, sphere, cylinder and capsule is 1),
+    the center [m], the first two columns of the rotation matrix, and the sizes [m] as
+    in ``Primitives``. A mesh is its bounding box. Rows without a body are 0.
 
     Attributes:
         capacity: Number of rows; by default the largest number of bodies.
@@ -196,34 +250,50 @@ class ObjectTokens(Observation):
         if self.capacity is not None:
             integer("capacity", self.capacity, least=1)
 
-    def observe(self, bodies: Primitives, seeds: Seeds, backend: ObservationBackend) -> dict[str, Array]:  # noqa: ARG002
+    def observe(
+        self,
+        bodies: Primitives,
+        seeds: Seeds,  # noqa: ARG002
+        backend: ObservationBackend,  # noqa: ARG002
+    ) -> dict[str, Array]:
         """See ``Observation``."""
         real = bodies.kinds >= 0
         order = np.argsort(~real, axis=1, kind="stable")  # bodies first
         most = int(real.sum(axis=1).max(initial=0))
         capacity = most if self.capacity is None else self.capacity
         if most > capacity:
-            raise UsageError(f"must be at least {most}, the largest number of bodies", argument="capacity")
+            raise UsageError(
+                f"must be at least {most}, the largest number of bodies",
+                argument="capacity",
+            )
         axes = bodies.rotations[..., :2].swapaxes(2, 3).reshape(*real.shape, 6)
         shapes = np.where(bodies.kinds >= MESH, KINDS.index("box"), bodies.kinds)
         kinds = shapes[..., None] == np.arange(len(KINDS))
-        rows: Array = np.concatenate([kinds, bodies.centers, axes, bodies.sizes], axis=2).astype(np.float32)
+        rows: Array = np.concatenate(
+            [kinds, bodies.centers, axes, bodies.sizes], axis=2
+        ).astype(np.float32)
         rows[~real] = 0
         padding = ((0, 0), (0, max(capacity - real.shape[1], 0)), (0, 0))
         rows, mask = (
-            np.pad(np.take_along_axis(values, order[..., None], axis=1), padding)[:, :capacity]
+            np.pad(np.take_along_axis(values, order[..., None], axis=1), padding)[
+                :, :capacity
+            ]
             for values in (rows, real[..., None])
         )
         return {"tokens": rows, "mask": mask[..., 0]}
 
 
 OBSERVATIONS: Mapping[str, type[Observation]] = {
-    kind.name: kind for kind in (SurfaceCloud, CameraCloud, DistanceGrid, BasisPoints, ObjectTokens)
+    kind.name: kind
+    for kind in (SurfaceCloud, CameraCloud, DistanceGrid, BasisPoints, ObjectTokens)
 }
 
 
 def as_observation(kind: str | Observation) -> Observation:
-    """Return an observation by its name, with default parameters; return observations unchanged."""
+    """Return an observation by its name, with default parameters.
+
+    Return observations unchanged.
+    """
     if isinstance(kind, Observation):
         return kind
     if kind not in OBSERVATIONS:
@@ -236,5 +306,11 @@ def as_observation(kind: str | Observation) -> Observation:
 
 
 def _check_corners(low: Corner, high: Corner) -> None:
-    if not (np.isfinite([*low, *high]).all() and (np.subtract(high, low) >= MIN_GRID_EXTENT_M).all()):
-        raise UsageError(f"must be finite and above the lower corner {low}, got {high}", argument="high")
+    if not (
+        np.isfinite([*low, *high]).all()
+        and (np.subtract(high, low) >= MIN_GRID_EXTENT_M).all()
+    ):
+        raise UsageError(
+            f"must be finite and above the lower corner {low}, got {high}",
+            argument="high",
+        )

@@ -17,7 +17,12 @@ from cnpgen.robots.scene import PARKED_POSITION_M, Scene
 from cnpgen.robots.shape.convex_part import PRISM_SIDES
 from cnpgen.robots.shape.hull import Array, frames_along
 from cnpgen.robots.shape.inline import corners_of, is_inline
-from cnpgen.robots.solid import UNBOUNDED_OBSTACLE_HEIGHT_M, number_slices, place_obstacles, pose_width
+from cnpgen.robots.solid import (
+    UNBOUNDED_OBSTACLE_HEIGHT_M,
+    number_slices,
+    place_obstacles,
+    pose_width,
+)
 from cnpgen.schema.keys import Range
 
 PLANE_DECIMALS = 9  # to which the planes of triangles of one face agree
@@ -33,12 +38,11 @@ POINTS_PER_CHUNK = 65_536  # keeps the temporary arrays of one primitive in the 
 class ConvexMesh:
     """The convex hull of corners, relative to the center of its bounding box.
 
-    Attributes:
-        center: Center of the bounding box in the frame of the mesh [m], shape (3,).
-        half: Half the edge lengths of the bounding box [m], shape (3,).
-        corners: The corners [m], shape (V, 3).
-        triangles: Triangles of the surface: a corner and the edges to the two others [m], shape (T, 3, 3).
-        planes: Outer unit normals n and offsets c of the faces, shape (F, 4): ``n @ x + c <= 0`` inside.
+    Attributes: center: Center of the bounding box in the frame of the mesh [m], shape
+        (3,). half: Half the edge lengths of the bounding box [m], shape (3,). corners:
+        The corners [m], shape (V, 3). triangles: Triangles of the surface: a corner and
+        the edges to the two others [m], shape (T, 3, 3). planes: Outer unit normals n
+        and offsets c of the faces, shape (F, 4): ``n @ x + c <= 0`` inside.
     """
 
     center: Array
@@ -49,7 +53,9 @@ class ConvexMesh:
 
     def distances(self, points: Array) -> Array:
         """Return the signed distances of points [m], shape (P, 3), negative inside, shape (P,)."""
-        distances: Array = (points @ self.planes[:, :3].T + self.planes[:, 3]).max(axis=1)
+        distances: Array = (points @ self.planes[:, :3].T + self.planes[:, 3]).max(
+            axis=1
+        )
         outside = distances > 0
         distances[outside] = np.sqrt(self._squared_distances(points[outside]))
         return distances
@@ -59,12 +65,24 @@ class ConvexMesh:
         smallest = np.full(len(points), np.inf)
         for corner, first, second in self.triangles:
             normal = np.cross(first, second)
-            ends = (corner, first), (corner + first, second - first), (corner + second, -second)
+            ends = (
+                (corner, first),
+                (corner + first, second - first),
+                (corner + second, -second),
+            )
             offsets = [points - start for start, _ in ends]
-            above = [offset @ np.cross(normal, edge) >= 0 for offset, (_, edge) in zip(offsets, ends, strict=True)]
+            above = [
+                offset @ np.cross(normal, edge) >= 0
+                for offset, (_, edge) in zip(offsets, ends, strict=True)
+            ]
             to_plane = (offsets[0] @ normal) ** 2 / (normal @ normal)
-            to_edges = [_squared_from_segment(offset, edge) for offset, (_, edge) in zip(offsets, ends, strict=True)]
-            squared = np.where(np.all(above, axis=0), to_plane, np.min(to_edges, axis=0))
+            to_edges = [
+                _squared_from_segment(offset, edge)
+                for offset, (_, edge) in zip(offsets, ends, strict=True)
+            ]
+            squared = np.where(
+                np.all(above, axis=0), to_plane, np.min(to_edges, axis=0)
+            )
             np.minimum(smallest, squared, out=smallest)
         return smallest
 
@@ -76,7 +94,9 @@ class ConvexMesh:
             with np.errstate(all="ignore"):
                 crossing = -(plane[:3] @ origin + plane[3]) / speed
             enter = np.where(speed < 0, np.fmax(enter, crossing), enter)
-            leave = np.where(speed < 0, leave, np.fmin(leave, crossing))  # -inf for rays along a face, outside of it
+            leave = np.where(
+                speed < 0, leave, np.fmin(leave, crossing)
+            )  # -inf for rays along a face, outside of it
         return np.where(enter <= leave, enter, np.nan)
 
 
@@ -92,10 +112,19 @@ def convex_mesh(address: str) -> ConvexMesh:
     from scipy.spatial import ConvexHull
 
     corners = corners_of(address)
-    center, half = (corners.max(axis=0) + corners.min(axis=0)) / 2, np.ptp(corners, axis=0) / 2
+    center, half = (
+        (corners.max(axis=0) + corners.min(axis=0)) / 2,
+        np.ptp(corners, axis=0) / 2,
+    )
     hull = ConvexHull(corners - center)
     first, second, third = (hull.points[index] for index in hull.simplices.T)
-    planes = hull.equations[np.sort(np.unique(hull.equations.round(PLANE_DECIMALS), axis=0, return_index=True)[1])]
+    planes = hull.equations[
+        np.sort(
+            np.unique(hull.equations.round(PLANE_DECIMALS), axis=0, return_index=True)[
+                1
+            ]
+        )
+    ]
     triangles = np.stack([first, second - first, third - first], axis=1)
     areas = np.linalg.norm(np.cross(triangles[:, 1], triangles[:, 2]), axis=1) / 2
     return ConvexMesh(center, half, hull.points, triangles[areas > MIN_AREA_M2], planes)
@@ -105,13 +134,14 @@ def convex_mesh(address: str) -> ConvexMesh:
 class Primitives:
     """M bodies of simple shapes in the world frame; or those of N scenes, with a first axis of length N.
 
-    Attributes:
-        kinds: Index of each shape in ``KINDS``, shape (M,); ``MESH`` plus the index of its mesh for others; -1 where
+    Attributes: kinds: Index of each shape in ``KINDS``, shape (M,); ``MESH`` plus the
+        index of its mesh for others; -1 where
             a scene has fewer bodies.
         centers: Centers [m], shape (M, 3).
         rotations: Rotation matrices; columns are the axes of a body, shape (M, 3, 3).
-        sizes: Sizes [m], shape (M, 3): half the edge lengths of a box, or of the bounding box of a mesh; otherwise the
-            radius, half the length along z (of a capsule without its round ends; 0 for a sphere), and 0.
+        sizes: Sizes [m], shape (M, 3): half the edge lengths of a box, or of the
+            bounding box of a mesh; otherwise the radius, half the length along z (of a
+            capsule without its round ends; 0 for a sphere), and 0.
         meshes: The meshes of all bodies.
     """
 
@@ -125,23 +155,33 @@ class Primitives:
         return len(self.kinds)
 
     def __getitem__(self, which: int | slice | NDArray[Any]) -> Primitives:
-        return Primitives(self.kinds[which], self.centers[which], self.rotations[which], self.sizes[which], self.meshes)
+        return Primitives(
+            self.kinds[which],
+            self.centers[which],
+            self.rotations[which],
+            self.sizes[which],
+            self.meshes,
+        )
 
     def mesh(self, index: int) -> ConvexMesh | None:
         """Return the mesh of a body; None for other shapes."""
-        return self.meshes[self.kinds[index] - MESH] if self.kinds[index] >= MESH else None
+        return (
+            self.meshes[self.kinds[index] - MESH] if self.kinds[index] >= MESH else None
+        )
 
 
 def primitives_of(obstacles: Sequence[Obstacle], numbers: Array) -> Primitives:
     """Return obstacles as primitives.
 
-    Poses and sizes (``cnpgen.robots.solid``) have shape (pose_width,), or of N samples (N, pose_width), which gives
-    arrays with a first axis of length N.
+    Poses and sizes (``cnpgen.robots.solid``) have shape (pose_width,), or of N samples
+    (N, pose_width), which gives arrays with a first axis of length N.
     """
     shape, rows = numbers.shape[:-1], np.atleast_2d(numbers)
     kinds, centers, rotations, sizes = _padding(len(rows), len(obstacles))
     meshes: list[ConvexMesh] = []
-    for index, (obstacle, part) in enumerate(zip(obstacles, number_slices(obstacles), strict=True)):
+    for index, (obstacle, part) in enumerate(
+        zip(obstacles, number_slices(obstacles), strict=True)
+    ):
         of_body = centers[:, index], rotations[:, index], sizes[:, index]
         if obstacle.kind in KINDS:
             kinds[:, index] = KINDS.index(obstacle.kind)
@@ -149,21 +189,30 @@ def primitives_of(obstacles: Sequence[Obstacle], numbers: Array) -> Primitives:
         else:
             kinds[:, index] = MESH + len(meshes)
             meshes.append(_fill_mesh(obstacle, rows[:, part], *of_body))
-    arrays = (array.reshape(*shape, *array.shape[1:]) for array in (kinds, centers, rotations, sizes))
+    arrays = (
+        array.reshape(*shape, *array.shape[1:])
+        for array in (kinds, centers, rotations, sizes)
+    )
     return Primitives(*arrays, meshes=tuple(meshes))  # type: ignore[misc,arg-type]
 
 
-def _fill_mesh(obstacle: Obstacle, numbers: Array, center: Array, rotation: Array, size: Array) -> ConvexMesh:
+def _fill_mesh(
+    obstacle: Obstacle, numbers: Array, center: Array, rotation: Array, size: Array
+) -> ConvexMesh:
     """Fill in the arrays of a mesh as ``_fill`` does, and return the mesh."""
     if not is_inline(obstacle.mesh):
-        raise UsageError(f"obstacle {obstacle.name!r} is a mesh file, expected its corners: see make_mesh")
+        raise UsageError(
+            f"obstacle {obstacle.name!r} is a mesh file, expected its corners: see make_mesh"
+        )
     mesh = convex_mesh(obstacle.mesh)
     rotation[:] = numbers[:, 3:].reshape(-1, 3, 3)
     center[:], size[:] = numbers[:, :3] + rotation @ mesh.center, mesh.half
     return mesh
 
 
-def _fill(obstacle: Obstacle, numbers: Array, center: Array, rotation: Array, size: Array) -> None:
+def _fill(
+    obstacle: Obstacle, numbers: Array, center: Array, rotation: Array, size: Array
+) -> None:
     """Fill in centers (N, 3), rotations (N, 3, 3), which are units, and sizes (N, 3), which are 0, of an obstacle."""
     if obstacle.upright:
         x, y = obstacle.x or Range(0, 0), obstacle.y or Range(0, 0)
@@ -182,15 +231,24 @@ def _fill(obstacle: Obstacle, numbers: Array, center: Array, rotation: Array, si
     else:
         half = np.linalg.norm(rest[:, :3], axis=1)
         rotation[:] = frames_along(rest[:, :3], half)
-        size[:, 0] = rest[:, 3] * (math.cos(math.pi / PRISM_SIDES) if obstacle.kind == "cylinder" else 1.0)
+        size[:, 0] = rest[:, 3] * (
+            math.cos(math.pi / PRISM_SIDES) if obstacle.kind == "cylinder" else 1.0
+        )
         size[:, 1] = half
 
 
 def scene_primitives(scenes: Scene | Sequence[Sequence[Obstacle]]) -> Primitives:
-    """Return the bodies of N scenes, arrays with a first axis of length N; without obstacles parked below the robot."""
+    """Return the bodies of N scenes, arrays with a first axis of length N.
+
+    Without obstacles parked below the robot.
+    """
     if isinstance(scenes, Scene):
-        bodies = primitives_of(scenes.obstacles, scenes.poses[:, : pose_width(scenes.obstacles)])
-        bodies.kinds[bodies.centers[:, :, 2] <= PARKED_POSITION_M[2] / 2] = NO_BODY  # meshes have another center
+        bodies = primitives_of(
+            scenes.obstacles, scenes.poses[:, : pose_width(scenes.obstacles)]
+        )
+        bodies.kinds[bodies.centers[:, :, 2] <= PARKED_POSITION_M[2] / 2] = (
+            NO_BODY  # meshes have another center
+        )
         return bodies
     known: dict[int, Primitives] = {}  # problems of one scene share its obstacles
     for obstacles in scenes:
@@ -201,7 +259,9 @@ def scene_primitives(scenes: Scene | Sequence[Sequence[Obstacle]]) -> Primitives
 
 def padded(scenes: Sequence[Primitives]) -> Primitives:
     """Return the bodies of N scenes as arrays with a first axis of length N, padded with bodies of kind -1."""
-    kinds, centers, rotations, sizes = _padding(len(scenes), max(map(len, scenes), default=0))
+    kinds, centers, rotations, sizes = _padding(
+        len(scenes), max(map(len, scenes), default=0)
+    )
     meshes: dict[ConvexMesh, int] = {}  # mesh -> index
     for index, scene in enumerate(scenes):
         count = len(scene)
@@ -215,7 +275,12 @@ def padded(scenes: Sequence[Primitives]) -> Primitives:
 def _padding(*shape: int) -> tuple[NDArray[np.int64], Array, Array, Array]:
     """Return kinds, centers, rotations and sizes of rows of no bodies."""
     centers, sizes = np.zeros((2, *shape, 3))
-    return np.full(shape, NO_BODY, np.int64), centers, np.tile(np.eye(3), (*shape, 1, 1)), sizes
+    return (
+        np.full(shape, NO_BODY, np.int64),
+        centers,
+        np.tile(np.eye(3), (*shape, 1, 1)),
+        sizes,
+    )
 
 
 def bodies_of(scenes: Primitives, index: int) -> Primitives:
@@ -228,11 +293,19 @@ def signed_distances(primitives: Primitives, points: Array) -> Array:
     """Compute the signed distances of P world points from M primitives [m], negative inside, shape (M, P)."""
     distances = np.empty((len(primitives), len(points)))
     for index in range(len(primitives)):
-        mesh, kind, size = primitives.mesh(index), int(primitives.kinds[index]), primitives.sizes[index]
+        mesh, kind, size = (
+            primitives.mesh(index),
+            int(primitives.kinds[index]),
+            primitives.sizes[index],
+        )
         for first in range(0, len(points), POINTS_PER_CHUNK):
             part = slice(first, first + POINTS_PER_CHUNK)
-            local = (points[part] - primitives.centers[index]) @ primitives.rotations[index]
-            distances[index, part] = mesh.distances(local) if mesh else _distance(kind, size, local)
+            local = (points[part] - primitives.centers[index]) @ primitives.rotations[
+                index
+            ]
+            distances[index, part] = (
+                mesh.distances(local) if mesh else _distance(kind, size, local)
+            )
     return distances
 
 
@@ -240,7 +313,11 @@ def smallest_signed_distances(primitives: Primitives, points: Array) -> Array:
     """Compute the smallest signed distance of points from any primitive [m], shape (P,); inf without primitives."""
     smallest = np.full(len(points), np.inf)
     for index in range(len(primitives)):
-        np.minimum(smallest, signed_distances(primitives[np.array([index])], points)[0], out=smallest)
+        np.minimum(
+            smallest,
+            signed_distances(primitives[np.array([index])], points)[0],
+            out=smallest,
+        )
     return smallest
 
 
@@ -251,9 +328,14 @@ def _distance(kind: int, size: Array, local: Array) -> Array:
     radius, half = size[0], size[1]
     if kind == 2:
         radial = np.hypot(local[:, 0], local[:, 1]) - radius
-        return _outside_or_inside(np.stack([radial, np.abs(local[:, 2]) - half], axis=1))
+        return _outside_or_inside(
+            np.stack([radial, np.abs(local[:, 2]) - half], axis=1)
+        )
     along = np.clip(local[:, 2], -half, half)  # half is 0 for a sphere
-    return np.asarray(np.sqrt(local[:, 0] ** 2 + local[:, 1] ** 2 + (local[:, 2] - along) ** 2) - radius)
+    return np.asarray(
+        np.sqrt(local[:, 0] ** 2 + local[:, 1] ** 2 + (local[:, 2] - along) ** 2)
+        - radius
+    )
 
 
 def _outside_or_inside(gaps: Array) -> Array:

@@ -10,8 +10,12 @@ from cnpgen.robots.shape.hull import Array
 
 Seeds = NDArray[np.uint64]
 
-STEPS = np.array([3242174889, 2447445414], np.uint32)  # 2^32 / g and 2^32 / g^2 with g^3 = g + 1: low discrepancy
-_GOLDEN, _FIRST, _SECOND = (np.uint64(x) for x in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
+STEPS = np.array(
+    [3242174889, 2447445414], np.uint32
+)  # 2^32 / g and 2^32 / g^2 with g^3 = g + 1: low discrepancy
+_GOLDEN, _FIRST, _SECOND = (
+    np.uint64(x) for x in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
+)
 
 
 def mixed(values: Seeds) -> Seeds:
@@ -25,7 +29,9 @@ def mixed(values: Seeds) -> Seeds:
 
 def scene_seeds(seed: int, count: int) -> Seeds:
     """Return the seeds of scenes, shape (count,)."""
-    return mixed(mixed(np.full(count, seed, np.uint64)) ^ np.arange(count, dtype=np.uint64))
+    return mixed(
+        mixed(np.full(count, seed, np.uint64)) ^ np.arange(count, dtype=np.uint64)
+    )
 
 
 def unit_offset(seed: np.uint64) -> float:
@@ -37,13 +43,10 @@ def unit_offset(seed: np.uint64) -> float:
 class _Patch:
     """Part of a surface: a rectangle, a triangle, or a surface of revolution.
 
-    Attributes:
-        form: "flat", "triangle", "side", "disc" or "ball".
-        area: Its area [m^2].
-        base: Corner, or center of the lower end [m], shape (3,).
-        axes: Rows: edges of a rectangle or triangle [m], or unit axes, the last one that of revolution.
-        radius: Radius [m].
-        height: Height along the axis at its end [m].
+    Attributes: form: "flat", "triangle", "side", "disc" or "ball". area: Its area
+        [m^2]. base: Corner, or center of the lower end [m], shape (3,). axes: Rows:
+        edges of a rectangle or triangle [m], or unit axes, the last one that of
+        revolution. radius: Radius [m]. height: Height along the axis at its end [m].
     """
 
     form: str
@@ -59,35 +62,54 @@ class _Patch:
             far = u > 1 - v  # in the other half of the parallelogram
             u, v = np.where(far, 1 - u, u), np.where(far, 1 - v, v)
         if self.form in ("flat", "triangle"):
-            return np.asarray(self.base + u[:, None] * self.axes[0] + v[:, None] * self.axes[1])
+            return np.asarray(
+                self.base + u[:, None] * self.axes[0] + v[:, None] * self.axes[1]
+            )
         angle = 2 * np.pi * (u - 0.5)
-        scale = {"side": np.ones_like(v), "disc": np.sqrt(v), "ball": np.sqrt(1 - v * v)}[self.form]
+        scale = {
+            "side": np.ones_like(v),
+            "disc": np.sqrt(v),
+            "ball": np.sqrt(1 - v * v),
+        }[self.form]
         height = np.zeros_like(v) if self.form == "disc" else v * self.height
         across = self.radius * scale
-        local = np.stack([across * np.cos(angle), across * np.sin(angle), height], axis=1)
+        local = np.stack(
+            [across * np.cos(angle), across * np.sin(angle), height], axis=1
+        )
         return np.asarray(self.base + local @ self.axes)
 
 
 def surface_points(primitives: Primitives, count: int, seed: np.uint64) -> Array:
     """Return points on all surfaces [m], by area, ordered by body, shape (count, 3); nan without bodies.
 
-    Points that are inside of another body are kept. Within a part of a surface they form a Kronecker sequence, which
-    is more even than random points. The seed is that of the scene.
+    Points that are inside of another body are kept. Within a part of a surface they
+    form a Kronecker sequence, which is more even than random points. The seed is that
+    of the scene.
     """
-    patches = [patch for index in range(len(primitives)) for patch in _patches(primitives, index)]
+    patches = [
+        patch
+        for index in range(len(primitives))
+        for patch in _patches(primitives, index)
+    ]
     if not patches:
         return np.full((count, 3), np.nan)
     total = np.cumsum([patch.area for patch in patches])
-    ends = np.minimum((total / total[-1] * count + unit_offset(seed)).astype(np.int64), count)
+    ends = np.minimum(
+        (total / total[-1] * count + unit_offset(seed)).astype(np.int64), count
+    )
     ends[-1] = count
     with np.errstate(over="ignore"):
         starts = mixed(seed + np.arange(1, len(patches) + 1, dtype=np.uint64))
     numbers = np.diff(ends, prepend=0).tolist()
     parts = []
     for patch, start, number in zip(patches, starts, numbers, strict=True):
-        first = np.array([start >> np.uint64(32), start & np.uint64(0xFFFFFFFF)], np.uint32)
+        first = np.array(
+            [start >> np.uint64(32), start & np.uint64(0xFFFFFFFF)], np.uint32
+        )
         with np.errstate(over="ignore"):
-            steps = np.asarray(first + np.arange(number, dtype=np.uint32)[:, None] * STEPS, np.uint32)
+            steps = np.asarray(
+                first + np.arange(number, dtype=np.uint32)[:, None] * STEPS, np.uint32
+            )
         u, v = (steps >> np.uint32(8)).T * 2.0**-24
         parts.append(patch.points(u, v))
     return np.concatenate(parts)
@@ -97,9 +119,15 @@ def _patches(primitives: Primitives, index: int) -> list[_Patch]:
     """Return the parts of the surface of one body."""
     center, axes = primitives.centers[index], primitives.rotations[index].T
     if mesh := primitives.mesh(index):
-        corners, edges = center + mesh.triangles[:, 0] @ axes, mesh.triangles[:, 1:] @ axes
+        corners, edges = (
+            center + mesh.triangles[:, 0] @ axes,
+            mesh.triangles[:, 1:] @ axes,
+        )
         areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
-        return [_Patch("triangle", *patch) for patch in zip(areas.tolist(), corners, edges, strict=True)]
+        return [
+            _Patch("triangle", *patch)
+            for patch in zip(areas.tolist(), corners, edges, strict=True)
+        ]
     size, kind = primitives.sizes[index], KINDS[primitives.kinds[index]]
     if kind == "box":
         edges, patches = axes * size[:, None], []
@@ -111,7 +139,21 @@ def _patches(primitives: Primitives, index: int) -> list[_Patch]:
                 patches.append(_Patch("flat", area, base, 2 * edges[[i, j]]))
         return patches
     radius, half = float(size[0]), float(size[1])
-    side = _Patch("side", 4 * np.pi * radius * half, center - half * axes[2], axes, radius, 2 * half)
-    form, area = ("disc", np.pi * radius**2) if kind == "cylinder" else ("ball", 2 * np.pi * radius**2)
-    ends = [_Patch(form, area, center + sign * half * axes[2], axes, radius, sign * radius) for sign in (-1, 1)]
+    side = _Patch(
+        "side",
+        4 * np.pi * radius * half,
+        center - half * axes[2],
+        axes,
+        radius,
+        2 * half,
+    )
+    form, area = (
+        ("disc", np.pi * radius**2)
+        if kind == "cylinder"
+        else ("ball", 2 * np.pi * radius**2)
+    )
+    ends = [
+        _Patch(form, area, center + sign * half * axes[2], axes, radius, sign * radius)
+        for sign in (-1, 1)
+    ]
     return [side, *ends]

@@ -1,7 +1,8 @@
 """Covering capsules of links, used by solvers since their distances are cheap and smooth.
 
-A capsule is convex: if it contains the corners of a link's convex parts, with their radius, it contains the link. The
-search minimizes the overhang of the capsule over the link.
+A capsule is convex: if it contains the corners of a link's convex parts, with their
+radius, it contains the link. The search minimizes the overhang of the capsule over the
+link.
 """
 
 from collections.abc import Sequence
@@ -14,7 +15,9 @@ from cnpgen.robots.shape.convex_part import ConvexPart
 from cnpgen.robots.shape.hull import Array, half_sphere, hull_corners
 
 SEARCH_DIRECTIONS = 3  # initial directions of the search
-POINTS_PER_ROUND = 25  # corners and facets with the largest violations that are added per round
+POINTS_PER_ROUND = (
+    25  # corners and facets with the largest violations that are added per round
+)
 MAX_CAPSULE_ROUNDS = 6  # rounds of the search
 BALL_POINTS = 200  # points that approximate a ball in the computation of facets
 ROUNDING_STEP_M = 1e-5  # ends and radius are multiples of it, so that capsules are equal on all machines
@@ -42,32 +45,45 @@ class Capsule:
 def covering_capsule(convex_parts: Sequence[ConvexPart]) -> Capsule:
     """Find a capsule of small overhang that covers all convex parts of one link, which are in one frame.
 
-    The initial guess is the best of 30 directions, each with the minimum enclosing circle of the link's projection.
-    Sequential quadratic programming then minimizes the radius plus the maximum excess of an end over a facet, which is
-    the overhang for ends inside the hull. The final radius covers every corner.
+    The initial guess is the best of 30 directions, each with the minimum enclosing
+    circle of the link's projection. Sequential quadratic programming then minimizes the
+    radius plus the maximum excess of an end over a facet, which is the overhang for
+    ends inside the hull. The final radius covers every corner.
     """
     corners = np.concatenate([part.vertices for part in convex_parts])
-    thickness = np.concatenate([np.full(len(part.vertices), part.radius) for part in convex_parts])
+    thickness = np.concatenate(
+        [np.full(len(part.vertices), part.radius) for part in convex_parts]
+    )
     normals, offsets = _facets(corners, thickness)
 
     def finished(ends: Array) -> Capsule:
         first, second = np.round(ends / ROUNDING_STEP_M) * ROUNDING_STEP_M
         radius = ROUNDING_STEP_M * np.ceil(
-            (_distances(corners, first, second)[0] + thickness).max() / ROUNDING_STEP_M + 1e-9
+            (_distances(corners, first, second)[0] + thickness).max() / ROUNDING_STEP_M
+            + 1e-9
         )
         excess = (np.array([first, second]) @ normals.T - offsets).max()
-        return Capsule(convex_parts[0].link, first, second, float(radius), float(radius + excess))
+        return Capsule(
+            convex_parts[0].link, first, second, float(radius), float(radius + excess)
+        )
 
-    starts = sorted((finished(_along(axis, corners, thickness)) for axis in _axes(corners)), key=attrgetter("overhang"))
+    starts = sorted(
+        (finished(_along(axis, corners, thickness)) for axis in _axes(corners)),
+        key=attrgetter("overhang"),
+    )
     improved = [
-        finished(_improved(start, corners, thickness, normals, offsets)) for start in starts[:SEARCH_DIRECTIONS]
+        finished(_improved(start, corners, thickness, normals, offsets))
+        for start in starts[:SEARCH_DIRECTIONS]
     ]
     return min([*starts[:1], *improved], key=attrgetter("overhang"))
 
 
 def covers(capsule: Capsule, convex_parts: Sequence[ConvexPart]) -> bool:
     """Return whether a capsule contains all corners, and therefore all convex parts, of its link."""
-    reach = [_distances(each.vertices, capsule.first, capsule.second)[0].max() + each.radius for each in convex_parts]
+    reach = [
+        _distances(each.vertices, capsule.first, capsule.second)[0].max() + each.radius
+        for each in convex_parts
+    ]
     return bool(reach) and max(reach) <= capsule.radius
 
 
@@ -77,7 +93,11 @@ def _facets(corners: Array, thickness: Array) -> tuple[Array, Array]:
 
     half = half_sphere(BALL_POINTS // 2)
     directions = np.concatenate([half, -half])
-    balls = [corner + size * directions for corner, size in zip(corners, thickness, strict=True) if size > 0]
+    balls = [
+        corner + size * directions
+        for corner, size in zip(corners, thickness, strict=True)
+        if size > 0
+    ]
     equations = ConvexHull(hull_corners(np.concatenate([corners, *balls]))).equations
     return equations[:, :3], -equations[:, 3]
 
@@ -85,7 +105,9 @@ def _facets(corners: Array, thickness: Array) -> tuple[Array, Array]:
 def _axes(corners: Array) -> Array:
     """Return the initial directions: principal axes, coordinate axes and 24 more, shape (30, 3)."""
     offsets = corners - corners.mean(axis=0)
-    return np.concatenate([np.linalg.eigh(offsets.T @ offsets)[1].T, np.eye(3), half_sphere(24)])
+    return np.concatenate(
+        [np.linalg.eigh(offsets.T @ offsets)[1].T, np.eye(3), half_sphere(24)]
+    )
 
 
 def _along(axis: Array, corners: Array, thickness: Array) -> Array:
@@ -103,7 +125,9 @@ def _along(axis: Array, corners: Array, thickness: Array) -> Array:
     return np.asarray(center @ across + np.outer([low, high], axis))
 
 
-def _distances(points: Array, first: Array, second: Array) -> tuple[Array, Array, Array]:
+def _distances(
+    points: Array, first: Array, second: Array
+) -> tuple[Array, Array, Array]:
     """Return distances of points from a segment [m], unit vectors away from it, and phases of the closest points."""
     along = second - first
     where = np.clip((points - first) @ along / max(float(along @ along), 1e-18), 0, 1)
@@ -112,26 +136,39 @@ def _distances(points: Array, first: Array, second: Array) -> tuple[Array, Array
     return distance, away / np.maximum(distance, 1e-12)[:, None], where
 
 
-def _improved(start: Capsule, corners: Array, thickness: Array, normals: Array, offsets: Array) -> Array:
-    """Reduce the overhang of a capsule by sequential quadratic programming; return its ends [m], shape (2, 3)."""
+def _improved(
+    start: Capsule, corners: Array, thickness: Array, normals: Array, offsets: Array
+) -> Array:
+    """Reduce the overhang of a capsule by sequential quadratic programming.
+
+    Return its ends [m], shape (2, 3).
+    """
     ends = np.array([start.first, start.second])
     near, facets = np.zeros(0, np.intp), np.zeros(0, np.intp)
     for _ in range(MAX_CAPSULE_ROUNDS):
         covered = _distances(corners, *ends)[0] + thickness
         excess = (ends @ normals.T - offsets).max(axis=0)
         near = np.union1d(near, np.argsort(-covered, kind="stable")[:POINTS_PER_ROUND])
-        facets = np.union1d(facets, np.argsort(-excess, kind="stable")[:POINTS_PER_ROUND])
-        ends = _solved(ends, corners[near], thickness[near], normals[facets], offsets[facets])
+        facets = np.union1d(
+            facets, np.argsort(-excess, kind="stable")[:POINTS_PER_ROUND]
+        )
+        ends = _solved(
+            ends, corners[near], thickness[near], normals[facets], offsets[facets]
+        )
     return ends
 
 
-def _solved(ends: Array, corners: Array, thickness: Array, normals: Array, offsets: Array) -> Array:
+def _solved(
+    ends: Array, corners: Array, thickness: Array, normals: Array, offsets: Array
+) -> Array:
     """Minimize r + t such that corners are within r of the segment and its ends at most t outside the facets."""
     from scipy.optimize import minimize
 
     facets, zeros = len(normals), np.zeros_like(normals)
     linear = np.block([[-normals, zeros], [zeros, -normals]])
-    facet_gradients = np.concatenate([linear, np.zeros((2 * facets, 1)), np.ones((2 * facets, 1))], axis=1)
+    facet_gradients = np.concatenate(
+        [linear, np.zeros((2 * facets, 1)), np.ones((2 * facets, 1))], axis=1
+    )
 
     def margins(x: Array) -> Array:
         near = x[6] - thickness - _distances(corners, x[:3], x[3:6])[0]
@@ -139,10 +176,17 @@ def _solved(ends: Array, corners: Array, thickness: Array, normals: Array, offse
 
     def gradients(x: Array) -> Array:
         _, away, where = _distances(corners, x[:3], x[3:6])
-        columns = (1 - where)[:, None] * away, where[:, None] * away, np.ones((len(away), 1)), np.zeros((len(away), 1))
+        columns = (
+            (1 - where)[:, None] * away,
+            where[:, None] * away,
+            np.ones((len(away), 1)),
+            np.zeros((len(away), 1)),
+        )
         return np.concatenate([np.concatenate(columns, axis=1), facet_gradients])
 
-    start = np.concatenate([ends.ravel(), [(_distances(corners, *ends)[0] + thickness).max()]])
+    start = np.concatenate(
+        [ends.ravel(), [(_distances(corners, *ends)[0] + thickness).max()]]
+    )
     start = np.append(start, (ends @ normals.T - offsets).max())
     solved = minimize(
         lambda x: x[6] + x[7],
@@ -152,4 +196,6 @@ def _solved(ends: Array, corners: Array, thickness: Array, normals: Array, offse
         method="SLSQP",
         options={"maxiter": 60, "ftol": 1e-7},
     )
-    return np.asarray(solved.x[:6].reshape(2, 3) if np.isfinite(solved.x).all() else ends)
+    return np.asarray(
+        solved.x[:6].reshape(2, 3) if np.isfinite(solved.x).all() else ends
+    )

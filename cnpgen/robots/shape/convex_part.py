@@ -13,19 +13,22 @@ from cnpgen.robots.shape.hull import CUBE, MAX_COORDINATE_M, Array, check_solid
 from cnpgen.robots.shape.inline import corners_of, is_inline
 from cnpgen.robots.urdf import urdf_tree
 
-PRISM_SIDES = 64  # of the prism that contains a cylinder; its corners exceed the radius by 0.12 %
+PRISM_SIDES = (
+    64  # of the prism that contains a cylinder; its corners exceed the radius by 0.12 %
+)
 _ANGLES = np.arange(PRISM_SIDES) * (2 * math.pi / PRISM_SIDES)
-_UNIT_PRISM = np.array([[math.cos(angle), math.sin(angle), z] for z in (-1.0, 1.0) for angle in _ANGLES])
+_UNIT_PRISM = np.array(
+    [[math.cos(angle), math.sin(angle), z] for z in (-1.0, 1.0) for angle in _ANGLES]
+)
 
 
 @dataclass(frozen=True)
 class ConvexPart:
     """A convex part of a link: all points within ``radius`` of the convex hull of ``vertices``.
 
-    Attributes:
-        link: Name of the link.
-        vertices: Corners of the hull [m], shape (V, 3); one for a sphere, two for a capsule.
-        radius: Radius around the hull [m]; 0 for boxes, cylinders and meshes.
+    Attributes: link: Name of the link. vertices: Corners of the hull [m], shape (V, 3);
+        one for a sphere, two for a capsule. radius: Radius around the hull [m]; 0 for
+        boxes, cylinders and meshes.
     """
 
     link: str
@@ -34,18 +37,19 @@ class ConvexPart:
 
     def moved(self, rotation: Array, translation: Array) -> "ConvexPart":
         """Return the part in another frame, given rotation and translation [m] of the present frame in it."""
-        return ConvexPart(self.link, self.vertices @ rotation.T + translation, self.radius)
+        return ConvexPart(
+            self.link, self.vertices @ rotation.T + translation, self.radius
+        )
 
 
 class Contacts(NamedTuple):
     """C pairs of bodies that are close to each other at a state.
 
-    Attributes:
-        pair: Indices of the pairs, shape (C,).
-        k: Indices of the states, shape (C,).
-        distance: Signed distances [m], shape (C,).
-        normal: Unit vectors from the first body to the second in the world frame, shape (C, 3).
-        points: Closest points of both bodies without their radii, in the world frame [m], shape (C, 2, 3).
+    Attributes: pair: Indices of the pairs, shape (C,). k: Indices of the states, shape
+        (C,). distance: Signed distances [m], shape (C,). normal: Unit vectors from the
+        first body to the second in the world frame, shape (C, 3). points: Closest
+        points of both bodies without their radii, in the world frame [m], shape (C, 2,
+        3).
     """
 
     pair: NDArray[np.int64]
@@ -58,7 +62,8 @@ class Contacts(NamedTuple):
 def link_convex_parts(urdf: str) -> list[ConvexPart]:
     """Read the collision geometry of a URDF whose meshes are inline, in the frames of its links and in its order.
 
-    A cylinder becomes a prism of ``PRISM_SIDES`` sides that contains it; all other geometry is exact.
+    A cylinder becomes a prism of ``PRISM_SIDES`` sides that contains it; all other
+    geometry is exact.
     """
     found, errors = list[ConvexPart](), list[str]()
     for link in urdf_tree(urdf).iter("link"):
@@ -67,14 +72,19 @@ def link_convex_parts(urdf: str) -> list[ConvexPart]:
             try:
                 found.append(convex_part_of(name, element))
             except (ValueError, TypeError) as error:
-                errors.append(f"the collision geometry of link {name!r} cannot be read: {error}")
+                errors.append(
+                    f"the collision geometry of link {name!r} cannot be read: {error}"
+                )
     if errors:
         raise RecipeError(errors)
     return found
 
 
 def convex_part_of(link: str, element: ElementTree.Element) -> ConvexPart:
-    """Read the geometry of an element of a link, in the frame of the link; ValueError if invalid or not inline."""
+    """Read the geometry of an element of a link, in the frame of the link.
+
+    ValueError if invalid or not inline.
+    """
     shape = element.find("geometry/*")
     if shape is None:
         raise ValueError("it has no <geometry>")
@@ -82,7 +92,9 @@ def convex_part_of(link: str, element: ElementTree.Element) -> ConvexPart:
     if not np.isfinite(part.vertices).all():
         raise ValueError("it has numbers that are not finite")
     if max(np.abs(part.vertices).max(initial=0.0), part.radius) > MAX_COORDINATE_M:
-        raise ValueError(f"it reaches further than {MAX_COORDINATE_M:,.0f} m: are its numbers in m?")
+        raise ValueError(
+            f"it reaches further than {MAX_COORDINATE_M:,.0f} m: are its numbers in m?"
+        )
     if shape.tag == "mesh":
         check_solid(part.vertices)
     return part
@@ -98,7 +110,9 @@ def _core(shape: ElementTree.Element) -> tuple[Array, float]:
     if shape.tag == "box":
         return CUBE * [_positive(each) for each in _numbers(shape, "size", 3)], 0.0
     if shape.tag not in ("sphere", "cylinder", "capsule"):
-        raise ValueError(f"<{shape.tag}> is not a box, sphere, cylinder, capsule or mesh")
+        raise ValueError(
+            f"<{shape.tag}> is not a box, sphere, cylinder, capsule or mesh"
+        )
     radius = _positive(_numbers(shape, "radius", 1)[0])
     if shape.tag == "sphere":
         return np.zeros((1, 3)), radius
@@ -118,7 +132,9 @@ def origin_of(element: ElementTree.Element | None) -> tuple[Array, Array]:
     if element is None:
         return np.eye(3), np.zeros(3)
     place = np.array(_numbers(element, "xyz", 3) if element.get("xyz") else np.zeros(3))
-    return turned(*(_numbers(element, "rpy", 3) if element.get("rpy") else (0.0, 0.0, 0.0))), place
+    return turned(
+        *(_numbers(element, "rpy", 3) if element.get("rpy") else (0.0, 0.0, 0.0))
+    ), place
 
 
 def turned(roll: float, pitch: float, yaw: float) -> Array:
@@ -137,7 +153,9 @@ def _numbers(element: ElementTree.Element, key: str, count: int) -> list[float]:
     text = element.get(key, "")
     values = [float(each) for each in text.split()]
     if len(values) != count:
-        raise ValueError(f"<{element.tag}> needs {count} numbers as {key!r}, got {text!r}")
+        raise ValueError(
+            f"<{element.tag}> needs {count} numbers as {key!r}, got {text!r}"
+        )
     return values
 
 

@@ -1,8 +1,9 @@
 """Convex decomposition of a mesh by planes: each cut reduces the total volume of the convex hulls most.
 
-A plane across an axis of the mesh cuts the triangles of a part in two, as in the search of CoACD (Wei et al. 2022, ACM
-Transactions on Graphics 41(4)), which chooses by concavity. A part is the convex hull of its triangles, so the parts
-together cover the mesh.
+A plane across an axis of the mesh cuts the triangles of a part in two, as in the search
+of CoACD (Wei et al. 2022, ACM Transactions on Graphics 41(4)), which chooses by
+concavity. A part is the convex hull of its triangles, so the parts together cover the
+mesh.
 """
 
 import hashlib
@@ -23,7 +24,9 @@ from cnpgen.store.files.atomic import write_file
 CUTS_PER_AXIS = 9  # planes between both ends of a part along each axis that are tried, and as many at faces
 FACE_TOLERANCE_M = 1e-4  # of the coordinates of points on a face
 MIN_VOLUME_REDUCTION = 0.005  # by a cut, as a fraction of the hull volume of the mesh; smaller cuts are not made
-DECOMPOSITION_REVISION = 2  # of the decomposition; cached parts of another revision are ignored
+DECOMPOSITION_REVISION = (
+    2  # of the decomposition; cached parts of another revision are ignored
+)
 
 
 @dataclass(frozen=True)
@@ -60,17 +63,26 @@ class _Cut:
     halves: tuple[TriangleMesh, ...] = ()
 
 
-def convex_parts(points: Array, triangles: NDArray[np.int64], most: int, keep: Path | None) -> list[Array]:
+def convex_parts(
+    points: Array, triangles: NDArray[np.int64], most: int, keep: Path | None
+) -> list[Array]:
     """Return the corners [m], shape (V, 3), of at most so many convex parts that together cover the surface of a mesh.
 
-    Points [m] have shape (N, 3), triangles are indices of points, shape (T, 3). A cache folder keeps the result, which
-    takes seconds; None for no cache.
+    Points [m] have shape (N, 3), triangles are indices of points, shape (T, 3). A cache
+    folder keeps the result, which takes seconds; None for no cache.
     """
-    kept = None if keep is None else keep / f"parts-{_identity(points, triangles, most)}.npz"
+    kept = (
+        None
+        if keep is None
+        else keep / f"parts-{_identity(points, triangles, most)}.npz"
+    )
     if kept is not None:
         with suppress(OSError, ValueError, KeyError):
             return _read(kept)
-    parts = [hull_corners(part.used_points) for part in cut_parts(TriangleMesh(points, triangles), most)]
+    parts = [
+        hull_corners(part.used_points)
+        for part in cut_parts(TriangleMesh(points, triangles), most)
+    ]
     if kept is not None:
         with suppress(MachineError):
             write_file(kept, _written(parts))
@@ -79,7 +91,10 @@ def convex_parts(points: Array, triangles: NDArray[np.int64], most: int, keep: P
 
 def _identity(points: Array, triangles: NDArray[np.int64], most: int) -> str:
     """Return a digest of the inputs of a decomposition."""
-    numbers = b"".join(np.ascontiguousarray(each).tobytes() for each in (points, triangles.astype("<i8")))
+    numbers = b"".join(
+        np.ascontiguousarray(each).tobytes()
+        for each in (points, triangles.astype("<i8"))
+    )
     about = f"{DECOMPOSITION_REVISION} {most} {len(points)} "
     return hashlib.sha256(about.encode() + numbers).hexdigest()[:32]
 
@@ -111,31 +126,49 @@ def _cut_positions(coordinates: Array) -> list[float]:
     """Return positions of planes: evenly between both ends, and those of most points, such as faces across the axis."""
     low, high = float(coordinates.min()), float(coordinates.max())
     even = np.linspace(low, high, CUTS_PER_AXIS + 2)[1:-1]
-    faces, counts = np.unique(np.round(coordinates / FACE_TOLERANCE_M), return_counts=True)
-    common = faces[np.argsort(-counts, kind="stable")[:CUTS_PER_AXIS]] * FACE_TOLERANCE_M
-    return sorted({float(position) for position in [*even, *common] if low < position < high})
+    faces, counts = np.unique(
+        np.round(coordinates / FACE_TOLERANCE_M), return_counts=True
+    )
+    common = (
+        faces[np.argsort(-counts, kind="stable")[:CUTS_PER_AXIS]] * FACE_TOLERANCE_M
+    )
+    return sorted(
+        {float(position) for position in [*even, *common] if low < position < high}
+    )
 
 
-def cut_mesh(mesh: TriangleMesh, axis: int, position: float) -> tuple[TriangleMesh, TriangleMesh]:
+def cut_mesh(
+    mesh: TriangleMesh, axis: int, position: float
+) -> tuple[TriangleMesh, TriangleMesh]:
     """Cut a mesh by a plane across axis 0, 1 or 2 at a position [m] into the triangles below and above it."""
     height = mesh.points[:, axis] - position
     upper = height[mesh.triangles] > 0
     crossing = upper.any(axis=1) & ~upper.all(axis=1)
     is_tip_upper = upper[crossing].sum(axis=1) == 1
-    tip = np.where(is_tip_upper, upper[crossing].argmax(axis=1), upper[crossing].argmin(axis=1))  # alone on its side
+    tip = np.where(
+        is_tip_upper, upper[crossing].argmax(axis=1), upper[crossing].argmin(axis=1)
+    )  # alone on its side
     order = (tip[:, None] + np.arange(3)) % 3
     a, b, c = np.take_along_axis(mesh.triangles[crossing], order, axis=1).T
     on_ab, on_ac = (
-        mesh.points[a] + (height[a] / (height[a] - height[end]))[:, None] * (mesh.points[end] - mesh.points[a])
+        mesh.points[a]
+        + (height[a] / (height[a] - height[end]))[:, None]
+        * (mesh.points[end] - mesh.points[a])
         for end in (b, c)
     )
     points, count = np.concatenate([mesh.points, on_ab, on_ac]), len(mesh.points)
     ab, ac = count + np.arange(len(a)), count + len(a) + np.arange(len(a))
     tips = np.stack([a, ab, ac], axis=1)
-    rests = np.concatenate([np.stack([ab, b, c], axis=1), np.stack([ab, c, ac], axis=1)])
+    rests = np.concatenate(
+        [np.stack([ab, b, c], axis=1), np.stack([ab, c, ac], axis=1)]
+    )
     is_rest_upper = np.tile(~is_tip_upper, 2)
-    below = np.concatenate([mesh.triangles[~upper.any(axis=1)], tips[~is_tip_upper], rests[~is_rest_upper]])
-    above = np.concatenate([mesh.triangles[upper.all(axis=1)], tips[is_tip_upper], rests[is_rest_upper]])
+    below = np.concatenate(
+        [mesh.triangles[~upper.any(axis=1)], tips[~is_tip_upper], rests[~is_rest_upper]]
+    )
+    above = np.concatenate(
+        [mesh.triangles[upper.all(axis=1)], tips[is_tip_upper], rests[is_rest_upper]]
+    )
     return TriangleMesh(points, below), TriangleMesh(points, above)
 
 
@@ -150,7 +183,10 @@ def _written(parts: Sequence[Array]) -> bytes:
 def _read(file: Path) -> list[Array]:
     """Read parts; raise ValueError if there are none or if they are not finite."""
     with np.load(file, allow_pickle=False) as content:
-        parts = [np.asarray(content[name], float).reshape(-1, 3) for name in sorted(content.files)]
+        parts = [
+            np.asarray(content[name], float).reshape(-1, 3)
+            for name in sorted(content.files)
+        ]
     if not parts or not all(np.isfinite(part).all() for part in parts):
         raise ValueError("no parts")
     return parts

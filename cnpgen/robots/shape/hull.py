@@ -15,12 +15,20 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-CUBE = np.array(list(product((-0.5, 0.5), repeat=3)))  # corners of the unit cube centered at the origin
+CUBE = np.array(
+    list(product((-0.5, 0.5), repeat=3))
+)  # corners of the unit cube centered at the origin
 MAX_PLANES = 24  # that approximate the faces of a hull
-SIMILAR_PLANES_COSINE = math.cos(math.radians(3))  # of the angle below which planes are equivalent
-MIN_THICKNESS_M = 1e-6  # coplanar points are extended by this on both sides, so that they have a hull
+SIMILAR_PLANES_COSINE = math.cos(
+    math.radians(3)
+)  # of the angle below which planes are equivalent
+MIN_THICKNESS_M = (
+    1e-6  # coplanar points are extended by this on both sides, so that they have a hull
+)
 MAX_CORNERS = 10_000  # of a body; finer meshes take minutes without benefit
-ENCLOSING_PLANES = 2_000  # of the body that replaces a finer one; it is about 0.1 % larger
+ENCLOSING_PLANES = (
+    2_000  # of the body that replaces a finer one; it is about 0.1 % larger
+)
 MAX_COORDINATE_M = 1e4  # larger coordinates are treated as errors of units
 
 
@@ -29,12 +37,16 @@ def check_solid(corners: Array) -> None:
     from scipy.spatial import ConvexHull, QhullError
 
     if len(corners) > MAX_CORNERS:
-        raise ValueError(f"it has {len(corners):,} corners, expected at most {MAX_CORNERS:,}")
+        raise ValueError(
+            f"it has {len(corners):,} corners, expected at most {MAX_CORNERS:,}"
+        )
 
     try:
         ConvexHull(corners)
     except (QhullError, ValueError) as error:
-        raise ValueError(f"its {len(corners)} corners are not those of a body") from error
+        raise ValueError(
+            f"its {len(corners)} corners are not those of a body"
+        ) from error
 
 
 def hull_corners(points: Array) -> Array:
@@ -48,7 +60,9 @@ def hull_corners(points: Array) -> Array:
     offsets = points - points.mean(axis=0)
     for axis in np.linalg.eigh(offsets.T @ offsets)[1].T:
         if np.ptp(offsets @ axis) < MIN_THICKNESS_M:
-            points = np.concatenate([points - MIN_THICKNESS_M * axis, points + MIN_THICKNESS_M * axis])
+            points = np.concatenate(
+                [points - MIN_THICKNESS_M * axis, points + MIN_THICKNESS_M * axis]
+            )
     corners: Array = points[np.sort(ConvexHull(points).vertices)]
     return corners
 
@@ -68,7 +82,8 @@ def outward_triangles(points: Array) -> NDArray[np.int64]:
 def enclosing_hull(corners: Array) -> tuple[Array, float]:
     """Return a body with fewer corners that contains a convex hull, and their maximum distance from it [m].
 
-    Supporting planes in ``ENCLOSING_PLANES`` directions bound it, spread evenly after scaling all extents to one.
+    Supporting planes in ``ENCLOSING_PLANES`` directions bound it, spread evenly after
+    scaling all extents to one.
     """
     import coal
     from scipy.spatial import HalfspaceIntersection
@@ -77,13 +92,24 @@ def enclosing_hull(corners: Array) -> tuple[Array, float]:
     scaled, half = (corners - center) / extent, half_sphere(ENCLOSING_PLANES // 2)
     normals = np.concatenate([half, -half])
     offsets = (normals @ scaled.T).max(axis=1) + 1e-9
-    found = HalfspaceIntersection(np.column_stack([normals, -offsets]), np.zeros(3)).intersections
+    found = HalfspaceIntersection(
+        np.column_stack([normals, -offsets]), np.zeros(3)
+    ).intersections
     body = hull_corners(found * extent + center)
-    hull, point, place, request = coal_hull(corners), coal.Sphere(0.0), coal.Transform3s(), coal.DistanceRequest()
+    hull, point, place, request = (
+        coal_hull(corners),
+        coal.Sphere(0.0),
+        coal.Transform3s(),
+        coal.DistanceRequest(),
+    )
     distances = []
     for corner in body:
         place.setTranslation(corner)
-        distances.append(coal.distance(hull, coal.Transform3s(), point, place, request, coal.DistanceResult()))
+        distances.append(
+            coal.distance(
+                hull, coal.Transform3s(), point, place, request, coal.DistanceResult()
+            )
+        )
     return body, max(0.0, *distances)
 
 
@@ -97,8 +123,9 @@ def half_sphere(count: int) -> Array:
 def supporting_planes(corners: Array) -> Array:
     """Return a few bounding planes of a convex hull in all directions, shape (P, 4).
 
-    They are faces of the hull: outer unit normals and offsets [m], ``normal @ x <= offset`` for all of its points. Each
-    next face has the normal most distant from the previous normals and the axes.
+    They are faces of the hull: outer unit normals and offsets [m], ``normal @ x <=
+    offset`` for all of its points. Each next face has the normal most distant from the
+    previous normals and the axes.
     """
     from scipy.spatial import ConvexHull
 
@@ -119,12 +146,19 @@ def ball_round(corners: Array, radius: float) -> tuple[Array, float]:
 
 
 def coal_hull(corners: Array) -> "coal.Convex":
-    """Return a convex hull of corners [m], shape (V, 3), as a Coal shape; three are a triangle, two a segment."""
+    """Return a convex hull of corners [m], shape (V, 3), as a Coal shape.
+
+    Three are a triangle, two a segment.
+    """
     import coal
     from scipy.spatial import ConvexHull, QhullError
 
     try:
-        triangles = ConvexHull(corners).simplices if len(corners) > 3 else [np.arange(3) % len(corners)]
+        triangles = (
+            ConvexHull(corners).simplices
+            if len(corners) > 3
+            else [np.arange(3) % len(corners)]
+        )
     except (QhullError, ValueError) as error:
         raise UsageError(
             f"corners from {corners.min(axis=0)} to {corners.max(axis=0)} m have no convex hull"
@@ -152,7 +186,13 @@ def frame_along(vector: Sequence[float], length: float) -> Array:
     sign = math.copysign(1.0, z)
     a = -1.0 / (sign + z)
     b = x * y * a
-    return np.array([[1.0 + sign * x * x * a, b, x], [sign * b, sign + y * y * a, y], [-sign * x, -y, z]])
+    return np.array(
+        [
+            [1.0 + sign * x * x * a, b, x],
+            [sign * b, sign + y * y * a, y],
+            [-sign * x, -y, z],
+        ]
+    )
 
 
 def frames_along(vectors: Array, lengths: Array) -> Array:
@@ -162,5 +202,15 @@ def frames_along(vectors: Array, lengths: Array) -> Array:
     sign = np.copysign(1.0, z)
     a = -1.0 / (sign + z)
     b = x * y * a
-    rows = [1.0 + sign * x * x * a, b, x, sign * b, sign + y * y * a, y, -sign * x, -y, z]
+    rows = [
+        1.0 + sign * x * x * a,
+        b,
+        x,
+        sign * b,
+        sign + y * y * a,
+        y,
+        -sign * x,
+        -y,
+        z,
+    ]
     return np.stack(rows, axis=1).reshape(-1, 3, 3)

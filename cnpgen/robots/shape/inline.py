@@ -1,6 +1,7 @@
 """Self-contained URDFs: meshes are replaced by the corners of their convex hulls, in ``data:`` addresses.
 
-A plan, a dataset or a planner contains its problem as text, so the geometry of the robot must be in the text, too.
+A plan, a dataset or a planner contains its problem as text, so the geometry of the
+robot must be in the text, too.
 """
 
 import base64
@@ -17,7 +18,14 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.shape.decomposition import convex_parts
-from cnpgen.robots.shape.hull import MAX_COORDINATE_M, MAX_CORNERS, MIN_THICKNESS_M, Array, enclosing_hull, hull_corners
+from cnpgen.robots.shape.hull import (
+    MAX_COORDINATE_M,
+    MAX_CORNERS,
+    MIN_THICKNESS_M,
+    Array,
+    enclosing_hull,
+    hull_corners,
+)
 from cnpgen.robots.shape.mesh_files import find_named_file
 from cnpgen.robots.urdf import urdf_tree
 
@@ -43,21 +51,33 @@ def with_inline_meshes(
 ) -> str:
     """Return a URDF with inline hulls of its collision meshes; a URDF without such meshes is returned unchanged.
 
-    Relative mesh paths begin in the folder of the URDF's file, others in folders of packages. Meshes of all links, or
-    of some, consist of at most so many convex parts, 1 for the hull, which a cache folder keeps.
+    Relative mesh paths begin in the folder of the URDF's file, others in folders of
+    packages. Meshes of all links, or of some, consist of at most so many convex parts,
+    1 for the hull, which a cache folder keeps.
     """
     try:
         tree = urdf_tree(urdf)
     except ValueError:  # the reader of the robot raises the error
         return urdf
-    elements = [(link, element) for link in tree.iter("link") for element in link.findall("collision")]
-    meshes = [(link, element, mesh) for link, element in elements if (mesh := _mesh_file(element)) is not None]
+    elements = [
+        (link, element)
+        for link in tree.iter("link")
+        for element in link.findall("collision")
+    ]
+    meshes = [
+        (link, element, mesh)
+        for link, element in elements
+        if (mesh := _mesh_file(element)) is not None
+    ]
     errors = _unknown_links(tree, links)
     for link, element, mesh in meshes:
         parts = most if not links or link.get("name") in links else 1
         try:
             file = find_named_file(mesh.get("filename", ""), path, packages)
-            addresses = [address_of(part) for part in _parts_of_file(file, scale_of(mesh), parts, keep)]
+            addresses = [
+                address_of(part)
+                for part in _parts_of_file(file, scale_of(mesh), parts, keep)
+            ]
         except RecipeError as error:
             errors += error.errors
         else:
@@ -65,16 +85,25 @@ def with_inline_meshes(
             _replace(link, element, mesh, addresses)
     if errors:
         raise RecipeError(list(dict.fromkeys(errors)))
-    unversioned = tree.find(".//collision/geometry/capsule") is not None and tree.get("version", "1.0") < _CAPSULES
+    unversioned = (
+        tree.find(".//collision/geometry/capsule") is not None
+        and tree.get("version", "1.0") < _CAPSULES
+    )
     if unversioned:  # the URDF parser would ignore capsules, with warnings on stderr
         tree.set("version", _CAPSULES)
-    return ElementTree.tostring(tree, encoding="unicode") if meshes or unversioned else urdf
+    return (
+        ElementTree.tostring(tree, encoding="unicode")
+        if meshes or unversioned
+        else urdf
+    )
 
 
 def _unknown_links(robot: ElementTree.Element, links: Sequence[str]) -> list[str]:
     names = [link.get("name", "") for link in robot.iter("link")]
     return [
-        f"robot.decomposed: the URDF has no link {link!r}{nearest(link, names)}" for link in links if link not in names
+        f"robot.decomposed: the URDF has no link {link!r}{nearest(link, names)}"
+        for link in links
+        if link not in names
     ]
 
 
@@ -85,7 +114,10 @@ def _mesh_file(collision: ElementTree.Element) -> ElementTree.Element | None:
 
 
 def _replace(
-    link: ElementTree.Element, collision: ElementTree.Element, mesh: ElementTree.Element, addresses: list[str]
+    link: ElementTree.Element,
+    collision: ElementTree.Element,
+    mesh: ElementTree.Element,
+    addresses: list[str],
 ) -> None:
     """Replace a mesh by convex parts, one element each."""
     place = list(link).index(collision)
@@ -106,7 +138,9 @@ def mesh_links(urdf: str) -> frozenset[str]:
     """Return the links with mesh files in their collision geometry."""
     links = urdf_tree(urdf).iter("link")
     return frozenset(
-        link.get("name", "") for link in links if any(_mesh_file(each) is not None for each in link.iter("collision"))
+        link.get("name", "")
+        for link in links
+        if any(_mesh_file(each) is not None for each in link.iter("collision"))
     )
 
 
@@ -126,8 +160,15 @@ def is_inline(address: str) -> bool:
 
 
 def corners_of(address: str) -> Array:
-    """Return the corners of an inline mesh [m], shape (V, 3); ValueError if they are not triples of finite numbers."""
-    corners = np.frombuffer(base64.b64decode(address.removeprefix(_INLINE)), "<f8").reshape(-1, 3).astype(float)
+    """Return the corners of an inline mesh [m], shape (V, 3).
+
+    ValueError if they are not triples of finite numbers.
+    """
+    corners = (
+        np.frombuffer(base64.b64decode(address.removeprefix(_INLINE)), "<f8")
+        .reshape(-1, 3)
+        .astype(float)
+    )
     if not len(corners) or not np.isfinite(corners).all():
         raise ValueError("a mesh has no corners, or some that are not finite")
     return corners
@@ -136,21 +177,37 @@ def corners_of(address: str) -> Array:
 def scale_of(mesh: ElementTree.Element) -> Array:
     """Return the scale factors of x, y and z of a mesh, shape (3,)."""
     try:
-        scale = np.array([float(factor) for factor in mesh.get("scale", "1 1 1").split()])
+        scale = np.array(
+            [float(factor) for factor in mesh.get("scale", "1 1 1").split()]
+        )
     except ValueError:
         scale = np.zeros(0)
     if scale.shape != (3,) or not (np.isfinite(scale).all() and (scale != 0).all()):
-        raise RecipeError([f"the scale of a mesh must be three numbers that are not 0, got {mesh.get('scale')!r}"])
+        raise RecipeError(
+            [
+                f"the scale of a mesh must be three numbers that are not 0, got {mesh.get('scale')!r}"
+            ]
+        )
     return scale
 
 
-def _parts_of_file(path: Path, scale: Array, most: int, keep: Path | None) -> list[Array]:
+def _parts_of_file(
+    path: Path, scale: Array, most: int, keep: Path | None
+) -> list[Array]:
     """Return the corners of a mesh's convex hull, or of its convex parts [m]."""
     points, mesh = read_mesh(path, scale)
     if not len(points) or not (np.abs(points) <= MAX_COORDINATE_M).all():
-        raise RecipeError([f"{path}: the mesh has no points, or some further off than {MAX_COORDINATE_M:,.0f} m"])
+        raise RecipeError(
+            [
+                f"{path}: the mesh has no points, or some further off than {MAX_COORDINATE_M:,.0f} m"
+            ]
+        )
     try:
-        parts = [hull_corners(points)] if most == 1 else convex_parts(points, sides_of(mesh), most, keep)
+        parts = (
+            [hull_corners(points)]
+            if most == 1
+            else convex_parts(points, sides_of(mesh), most, keep)
+        )
     except RecipeError as error:
         raise RecipeError([f"{path}: {text}" for text in error.errors]) from error
     _warn_about(path, points, scale)
@@ -174,7 +231,10 @@ def _simplified(path: Path, corners: Array) -> Array:
 def _warn_about(path: Path, points: Array, scale: Array) -> None:
     """Warn about a mesh that is flat, and about the unit of a DAE file, which Coal ignores."""
     offsets = points - points.mean(axis=0)
-    thickness = min(float(np.ptp(offsets @ axis)) for axis in np.linalg.eigh(offsets.T @ offsets)[1].T)
+    thickness = min(
+        float(np.ptp(offsets @ axis))
+        for axis in np.linalg.eigh(offsets.T @ offsets)[1].T
+    )
     if thickness < MIN_THICKNESS_M:
         text = f"the mesh is flat, and a body of {2e3 * MIN_THICKNESS_M:g} mm replaces it: is it a collision mesh?"
         warnings.warn(f"{path}: {text}", RuntimeWarning, stacklevel=2)
@@ -188,7 +248,10 @@ def _warn_about(path: Path, points: Array, scale: Array) -> None:
 def _unit_of_dae(path: Path) -> float:
     """Return the unit of a DAE file [m]; 1 if it states none."""
     with path.open("rb") as file:
-        found = re.search(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']([0-9.eE+-]{1,32})[\"']", file.read(MAX_DAE_HEAD_BYTES))
+        found = re.search(
+            rb"<unit\b[^>]*\bmeter\s*=\s*[\"']([0-9.eE+-]{1,32})[\"']",
+            file.read(MAX_DAE_HEAD_BYTES),
+        )
     try:
         return float(found.group(1)) if found else 1.0
     except ValueError:
@@ -198,7 +261,9 @@ def _unit_of_dae(path: Path) -> float:
 def sides_of(mesh: "coal.BVHModelBase") -> NDArray[np.int64]:
     """Return the triangles of a mesh as indices of its points, shape (T, 3)."""
     sides = [mesh.tri_indices(number) for number in range(mesh.num_tris)]
-    return np.array([[side[0], side[1], side[2]] for side in sides], np.int64).reshape(-1, 3)
+    return np.array([[side[0], side[1], side[2]] for side in sides], np.int64).reshape(
+        -1, 3
+    )
 
 
 def read_mesh(path: Path, scale: Array) -> tuple[Array, "coal.BVHModelBase"]:
@@ -206,12 +271,26 @@ def read_mesh(path: Path, scale: Array) -> tuple[Array, "coal.BVHModelBase"]:
     import coal
 
     if path.suffix.lower() not in _MESHES:
-        raise RecipeError([f"{path}: not a mesh that can be read: expected one of {', '.join(_MESHES)}"])
+        raise RecipeError(
+            [
+                f"{path}: not a mesh that can be read: expected one of {', '.join(_MESHES)}"
+            ]
+        )
     if (size := path.stat().st_size) > MAX_MESH_BYTES:
-        raise RecipeError([f"{path}: has {size:,} bytes, expected a mesh of at most {MAX_MESH_BYTES:,}"])
+        raise RecipeError(
+            [
+                f"{path}: has {size:,} bytes, expected a mesh of at most {MAX_MESH_BYTES:,}"
+            ]
+        )
     try:
         mesh = coal.MeshLoader().load(str(path), scale)
         return np.array(mesh.vertices(), float).reshape(-1, 3), mesh
     except (ValueError, RuntimeError, MemoryError) as error:
-        lines = [line for line in str(error).splitlines() if not line.startswith("Hint:")]
-        raise RecipeError([f"{path}: not a mesh that can be read: {lines[-1] if lines else 'too large'}"]) from error
+        lines = [
+            line for line in str(error).splitlines() if not line.startswith("Hint:")
+        ]
+        raise RecipeError(
+            [
+                f"{path}: not a mesh that can be read: {lines[-1] if lines else 'too large'}"
+            ]
+        ) from error

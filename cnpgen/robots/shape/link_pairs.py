@@ -20,21 +20,18 @@ Mask = NDArray[np.bool_]
 
 SAMPLED_STATES = 10_000  # ten times as many gave the same pairs for a Franka Panda
 ALWAYS_FRACTION = 0.95  # links that overlap in a larger fraction of the states are treated as connected
-MAX_CAPSULE_ERROR_FRACTION = (
-    0.05  # maximum fraction of collision-free states in which the capsules of a usable pair overlap
-)
+MAX_CAPSULE_ERROR_FRACTION = 0.05  # maximum fraction of collision-free states in which the capsules of a usable pair overlap
 
 
 @dataclass(frozen=True)
 class LinkPair:
     """Two links that move relative to each other.
 
-    Attributes:
-        first: Link nearer to the base.
-        second: Other link.
-        left_out: Reason to ignore the pair, "adjacent", "always" (in contact) or "disabled" (by an SRDF); or empty.
-        colliding: Fraction of sampled states in which the links overlap; nan for adjacent links.
-        mistaken: Fraction of the other states in which the capsules overlap.
+    Attributes: first: Link nearer to the base. second: Other link. left_out: Reason to
+        ignore the pair, "adjacent", "always" (in contact) or "disabled" (by an SRDF);
+        or empty. colliding: Fraction of sampled states in which the links overlap; nan
+        for adjacent links. mistaken: Fraction of the other states in which the capsules
+        overlap.
     """
 
     first: str
@@ -44,15 +41,24 @@ class LinkPair:
     mistaken: float
 
     @classmethod
-    def from_samples(cls, first: str, second: str, left_out: str, hit: Mask, near: Mask) -> "LinkPair":
+    def from_samples(
+        cls, first: str, second: str, left_out: str, hit: Mask, near: Mask
+    ) -> "LinkPair":
         """Return a pair from masks of the sampled states in which the links, and their capsules, overlap."""
         mistaken = float(near[~hit].mean()) if not hit.all() else 1.0
         return cls(first, second, left_out, float(hit.mean()), mistaken)
 
     @property
     def for_solvers(self) -> bool:
-        """Whether solvers use the capsules of the pair; judges check every pair that is not left out."""
-        return not self.left_out and self.colliding > 0 and self.mistaken <= MAX_CAPSULE_ERROR_FRACTION
+        """Whether solvers use the capsules of the pair.
+
+        Judges check every pair that is not left out.
+        """
+        return (
+            not self.left_out
+            and self.colliding > 0
+            and self.mistaken <= MAX_CAPSULE_ERROR_FRACTION
+        )
 
 
 def find_pairs(
@@ -66,11 +72,14 @@ def find_pairs(
 ) -> tuple[LinkPair, ...]:
     """Determine the link pairs that can collide, at random states within the position limits of a reduced model.
 
-    Convex parts and covering capsules are in the frames of the joints that move the links; ``joints`` are indices,
-    0 for fixed links. Adjacent links have only links without a shape between them. An SRDF may disable pairs.
+    Convex parts and covering capsules are in the frames of the joints that move the
+    links; ``joints`` are indices, 0 for fixed links. Adjacent links have only links
+    without a shape between them. An SRDF may disable pairs.
     """
     rotations, positions = sample_poses(model, SAMPLED_STATES)
-    contact = LinkContact((rotations, positions), map(body_of_part, convex_parts), joints)
+    contact = LinkContact(
+        (rotations, positions), map(body_of_part, convex_parts), joints
+    )
     found = []
     for first, second in combinations(capsules, 2):
         if joints[first] == joints[second]:
@@ -80,18 +89,38 @@ def find_pairs(
             found.append(LinkPair(first, second, "adjacent", np.nan, np.nan))
             continue
         hit = contact.of(first, second)
-        ends = [_ends(capsules[link], rotations[joints[link]], positions[joints[link]]) for link in (first, second)]
-        near = segment_distances(*ends[0], *ends[1]) < capsules[first].radius + capsules[second].radius
+        ends = [
+            _ends(capsules[link], rotations[joints[link]], positions[joints[link]])
+            for link in (first, second)
+        ]
+        near = (
+            segment_distances(*ends[0], *ends[1])
+            < capsules[first].radius + capsules[second].radius
+        )
         is_always = hit.mean() > ALWAYS_FRACTION
-        left_out = "disabled" if disabled and names in disabled else "always" if is_always else ""
+        left_out = (
+            "disabled"
+            if disabled and names in disabled
+            else "always"
+            if is_always
+            else ""
+        )
         found.append(LinkPair.from_samples(first, second, left_out, hit, near))
     return tuple(found)
 
 
 def sample_poses(model: "pin.Model", count: int) -> tuple[Array, Array]:
-    """Return ``joint_poses`` at random states within the position limits; fewer states are the first of more."""
+    """Return ``joint_poses`` at random states within the position limits.
+
+    Fewer states are the first of more.
+    """
     random = np.random.default_rng(0)
-    return joint_poses(model, random.uniform(model.lowerPositionLimit, model.upperPositionLimit, (count, model.nq)))
+    return joint_poses(
+        model,
+        random.uniform(
+            model.lowerPositionLimit, model.upperPositionLimit, (count, model.nq)
+        ),
+    )
 
 
 def joint_poses(model: "pin.Model", states: Array) -> tuple[Array, Array]:
@@ -110,11 +139,9 @@ def joint_poses(model: "pin.Model", states: Array) -> tuple[Array, Array]:
 class CollisionBody:
     """Collision geometry of Coal in the frame of a joint, with a ball that contains it.
 
-    Attributes:
-        center: Center of the ball [m], shape (3,).
-        radius: Radius of the ball [m].
-        geometry: Geometry of Coal.
-        placement: Pose of the geometry in the frame of the joint, a transform of Coal; None for the identity.
+    Attributes: center: Center of the ball [m], shape (3,). radius: Radius of the ball
+        [m]. geometry: Geometry of Coal. placement: Pose of the geometry in the frame of
+        the joint, a transform of Coal; None for the identity.
     """
 
     center: Array
@@ -133,10 +160,9 @@ def body_of_part(part: ConvexPart) -> tuple[str, CollisionBody]:
 class LinkContact:
     """Collision checks of links with Coal at K states.
 
-    Args:
-        poses: Rotations and positions [m] of the joints, as ``sample_poses`` returns them.
-        bodies: Links and their bodies, in the frames of the joints that move them.
-        joints: Link -> index of the joint that moves it.
+    Args: poses: Rotations and positions [m] of the joints, as ``sample_poses`` returns
+        them. bodies: Links and their bodies, in the frames of the joints that move
+        them. joints: Link -> index of the joint that moves it.
     """
 
     def __init__(
@@ -151,22 +177,36 @@ class LinkContact:
         self._of_link: dict[str, list[CollisionBody]] = {}
         for link, body in bodies:
             self._of_link.setdefault(link, []).append(body)
-        self._request, self._places = coal.CollisionRequest(), (coal.Transform3s(), coal.Transform3s())
+        self._request, self._places = (
+            coal.CollisionRequest(),
+            (coal.Transform3s(), coal.Transform3s()),
+        )
 
     def of(self, first: str, second: str, *, among: Mask | None = None) -> Mask:
         """Return a mask of the states, among all or those of a mask, in which two links overlap, shape (K,)."""
         hit = np.zeros(self._positions.shape[1], bool)
         for one, other in product(self._of_link[first], self._of_link[second]):
             centers = [
-                self._rotations[self._joints[link]] @ body.center + self._positions[self._joints[link]]
+                self._rotations[self._joints[link]] @ body.center
+                + self._positions[self._joints[link]]
                 for link, body in ((first, one), (second, other))
             ]
-            near = np.linalg.norm(centers[0] - centers[1], axis=1) < one.radius + other.radius
-            for k in np.flatnonzero(near & ~hit if among is None else near & ~hit & among):
+            near = (
+                np.linalg.norm(centers[0] - centers[1], axis=1)
+                < one.radius + other.radius
+            )
+            for k in np.flatnonzero(
+                near & ~hit if among is None else near & ~hit & among
+            ):
                 hit[k] = self._touch((first, one), (second, other), int(k))
         return hit
 
-    def _touch(self, first: tuple[str, CollisionBody], second: tuple[str, CollisionBody], k: int) -> bool:
+    def _touch(
+        self,
+        first: tuple[str, CollisionBody],
+        second: tuple[str, CollisionBody],
+        k: int,
+    ) -> bool:
         import coal
 
         poses = []
@@ -175,7 +215,14 @@ class LinkContact:
             place.setTranslation(self._positions[self._joints[link], k])
             poses.append(place if body.placement is None else place * body.placement)
         result = coal.CollisionResult()
-        coal.collide(first[1].geometry, poses[0], second[1].geometry, poses[1], self._request, result)
+        coal.collide(
+            first[1].geometry,
+            poses[0],
+            second[1].geometry,
+            poses[1],
+            self._request,
+            result,
+        )
         return bool(result.isCollision())
 
 
@@ -187,12 +234,18 @@ def _ends(capsule: Capsule, rotations: Array, positions: Array) -> tuple[Array, 
 def segment_distances(a: Array, b: Array, c: Array, d: Array) -> Array:
     """Return the distances between segments a to b and c to d [m], shape (K,), for ends of shape (K, 3).
 
-    The closest points of the lines are clamped to one segment after the other (Ericson 2005, section 5.1.9).
+    The closest points of the lines are clamped to one segment after the other (Ericson
+    2005, section 5.1.9).
     """
     one, other, between = b - a, d - c, a - c
-    aa, bb, ab = (np.einsum("ki,ki->k", x, y) for x, y in ((one, one), (other, other), (one, other)))
+    aa, bb, ab = (
+        np.einsum("ki,ki->k", x, y)
+        for x, y in ((one, one), (other, other), (one, other))
+    )
     ar, br = (np.einsum("ki,ki->k", x, between) for x in (one, other))
     s = np.clip((ab * br - ar * bb) / np.maximum(aa * bb - ab**2, 1e-18), 0, 1)
     t = np.clip((ab * s + br) / np.maximum(bb, 1e-18), 0, 1)
     s = np.clip((ab * t - ar) / np.maximum(aa, 1e-18), 0, 1)
-    return np.asarray(np.linalg.norm(between + s[:, None] * one - t[:, None] * other, axis=1))
+    return np.asarray(
+        np.linalg.norm(between + s[:, None] * one - t[:, None] * other, axis=1)
+    )

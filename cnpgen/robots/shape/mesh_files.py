@@ -13,7 +13,9 @@ from cnpgen.schema.units import show
 _PACKAGE = ("package", "model")  # URI schemes that begin with the name of a package
 _SEARCHED = ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH")
 MAX_PACKAGE_DEPTH = 3  # folders above a URDF that may be its package under another name
-_EXTRAS = {"example-robot-data": "robots"}  # Python packages of robots -> cnpgen's extra that installs them
+_EXTRAS = {
+    "example-robot-data": "robots"
+}  # Python packages of robots -> cnpgen's extra that installs them
 
 
 def find_urdf(name: str, problem: Path, packages: Sequence[Path] = ()) -> Path:
@@ -29,10 +31,12 @@ def find_urdf(name: str, problem: Path, packages: Sequence[Path] = ()) -> Path:
 def find_named_file(name: str, urdf: Path, packages: Sequence[Path] = ()) -> Path:
     """Find a file that a URDF refers to.
 
-    ``package://NAME/REST`` is looked for in the folders of ``packages``, in those of the environment variables
-    ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH``, in the URDF's own folder and all above it, and where pip installs a
-    package of this name; each may hold the package or be it. Finally the folders around the URDF are taken for the
-    package, whose folder may have another name. What is no URI is relative to the URDF's folder.
+    ``package://NAME/REST`` is looked for in the folders of ``packages``, in those of
+    the environment variables ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH``, in the
+    URDF's own folder and all above it, and where pip installs a package of this name;
+    each may hold the package or be it. Finally the folders around the URDF are taken
+    for the package, whose folder may have another name. What is no URI is relative to
+    the URDF's folder.
     """
     try:
         return _find(name, urdf, packages)
@@ -40,13 +44,17 @@ def find_named_file(name: str, urdf: Path, packages: Sequence[Path] = ()) -> Pat
         raise RecipeError([f"{urdf}: {error}" for error in error.errors]) from None
 
 
-def packages_of_environment(names: Iterable[str], urdf: Path, packages: Sequence[Path] = ()) -> tuple[Path, ...]:
+def packages_of_environment(
+    names: Iterable[str], urdf: Path, packages: Sequence[Path] = ()
+) -> tuple[Path, ...]:
     """List the folders from environment variables with packages of file names in a URDF; others are ignored."""
     used = []
     for name in (each for each in names if urlparse(each).scheme in _PACKAGE):
         place = _first(_places(name, urdf.absolute(), packages))
         if place is not None and not any(map(place.is_relative_to, packages)):
-            used += [folder for folder in _of_environment() if place.is_relative_to(folder)][:1]
+            used += [
+                folder for folder in _of_environment() if place.is_relative_to(folder)
+            ][:1]
     return tuple(dict.fromkeys(used))
 
 
@@ -55,8 +63,14 @@ def _find(name: str, beside: Path, packages: Sequence[Path]) -> Path:
     found = _first(places)
     if found is None:
         none = "  none: this kind of address is not read"
-        searched = "\n".join(f"  {str(place)[:MAX_NAME_LENGTH]}" for place in places) or none
-        raise RecipeError([f"the file {show(name)} is missing; searched paths:\n{searched}{_hint(name)}"])
+        searched = (
+            "\n".join(f"  {str(place)[:MAX_NAME_LENGTH]}" for place in places) or none
+        )
+        raise RecipeError(
+            [
+                f"the file {show(name)} is missing; searched paths:\n{searched}{_hint(name)}"
+            ]
+        )
     return found
 
 
@@ -69,11 +83,18 @@ def _places(name: str, beside: Path, packages: Sequence[Path]) -> Iterator[Path]
     parts = urlparse(name)
     if parts.scheme in _PACKAGE:
         package, rest = unquote(parts.netloc), unquote(parts.path).lstrip("/")
-        for folder in (*packages, *_of_environment(), *beside.parents, *_of_distribution(package)):
+        for folder in (
+            *packages,
+            *_of_environment(),
+            *beside.parents,
+            *_of_distribution(package),
+        ):
             yield folder / package / rest
             if folder.name == package:
                 yield folder / rest
-        for folder in list(beside.parents)[:MAX_PACKAGE_DEPTH]:  # the package under another name
+        for folder in list(beside.parents)[
+            :MAX_PACKAGE_DEPTH
+        ]:  # the package under another name
             yield folder / rest
     elif parts.scheme == "file":
         yield Path(unquote(parts.path))
@@ -85,7 +106,11 @@ def _of_environment() -> Iterator[Path]:
     """List the package folders of ROS's environment variables."""
     for variable in _SEARCHED:
         for folder in filter(None, os.environ.get(variable, "").split(os.pathsep)):
-            yield Path(folder) / "share" if variable == "AMENT_PREFIX_PATH" else Path(folder)
+            yield (
+                Path(folder) / "share"
+                if variable == "AMENT_PREFIX_PATH"
+                else Path(folder)
+            )
 
 
 def _of_distribution(name: str) -> Iterator[Path]:
@@ -94,7 +119,11 @@ def _of_distribution(name: str) -> Iterator[Path]:
         installed = metadata.distribution(name)
     except (metadata.PackageNotFoundError, ValueError):
         return
-    for folder in ("cmeel.prefix/share", "share", ""):  # the first one is used by packages of Pinocchio
+    for folder in (
+        "cmeel.prefix/share",
+        "share",
+        "",
+    ):  # the first one is used by packages of Pinocchio
         yield Path(str(installed.locate_file(folder)))
 
 
@@ -105,6 +134,4 @@ def _hint(name: str) -> str:
     if extra := _EXTRAS.get(parts.netloc):
         return f"\nrobots of this package come with pip install 'cnpgen[{extra}]'"
     places = " or ".join(_SEARCHED)
-    return (
-        f"\nname a folder that holds the package as 'packages' in [robot] (--packages of 'cnpgen init'), or in {places}"
-    )
+    return f"\nname a folder that holds the package as 'packages' in [robot] (--packages of 'cnpgen init'), or in {places}"

@@ -47,11 +47,11 @@ SAMPLED_HELD_STATES = 2000  # states in which the object and the links are compa
 class Shape:
     """Collision geometry of a robot.
 
-    Attributes:
-        convex_parts: Convex parts, each in the frame of the joint that moves its link.
-        joints: Link -> number of the planned joint that moves it, counted from 1; 0 for fixed links.
-        capsules: One covering capsule per link, in the frame of the joint that moves it.
-        pairs: Pairs of links that move relative to each other.
+    Attributes: convex_parts: Convex parts, each in the frame of the joint that moves
+        its link. joints: Link -> number of the planned joint that moves it, counted
+        from 1; 0 for fixed links. capsules: One covering capsule per link, in the frame
+        of the joint that moves it. pairs: Pairs of links that move relative to each
+        other.
     """
 
     convex_parts: Parts
@@ -67,9 +67,16 @@ class Shape:
     @cached_property
     def checked_pairs(self) -> tuple[tuple[int, int], ...]:
         """Index pairs of convex parts of links that must not touch, ordered by link pair."""
-        of_link = {link: [i for i, each in enumerate(self.convex_parts) if each.link == link] for link in self.joints}
+        of_link = {
+            link: [i for i, each in enumerate(self.convex_parts) if each.link == link]
+            for link in self.joints
+        }
         kept = [pair for pair in self.pairs if not pair.left_out]
-        return tuple(both for pair in kept for both in product(of_link[pair.first], of_link[pair.second]))
+        return tuple(
+            both
+            for pair in kept
+            for both in product(of_link[pair.first], of_link[pair.second])
+        )
 
     @property
     def moving_capsules(self) -> Capsules:
@@ -80,28 +87,53 @@ class Shape:
 def load_shape(urdf: str, model: "pin.Model", keep: Path | None) -> Shape:
     """Load the shape of a robot from a URDF with inline meshes (``cnpgen.robots.shape.inline``) and its reduced model.
 
-    Capsules and pairs, which take some seconds to compute, are kept in a cache folder, if there is one.
+    Capsules and pairs, which take some seconds to compute, are kept in a cache folder,
+    if there is one.
     """
     convex_parts, joints = place_convex_parts(urdf, model)
     if not any(joints.values()):
-        raise RecipeError(["no link that moves has a <collision> element, so that the robot has no shape"])
+        raise RecipeError(
+            [
+                "no link that moves has a <collision> element, so that the robot has no shape"
+            ]
+        )
 
     def compute() -> tuple[Capsules, Pairs]:
-        capsules = tuple(covering_capsule(_parts_of(link, convex_parts)) for link in joints)
+        capsules = tuple(
+            covering_capsule(_parts_of(link, convex_parts)) for link in joints
+        )
         by_link = {capsule.link: capsule for capsule in capsules}
         adjacent, disabled = _adjacent(urdf, set(joints)), disabled_pairs(urdf)
-        return capsules, find_pairs(model, convex_parts, by_link, joints=joints, adjacent=adjacent, disabled=disabled)
+        return capsules, find_pairs(
+            model,
+            convex_parts,
+            by_link,
+            joints=joints,
+            adjacent=adjacent,
+            disabled=disabled,
+        )
 
-    return Shape(convex_parts, joints, *_cached(keep, [urdf, *_joints_of(model)], convex_parts, compute))
+    return Shape(
+        convex_parts,
+        joints,
+        *_cached(keep, [urdf, *_joints_of(model)], convex_parts, compute),
+    )
 
 
 def _joints_of(model: "pin.Model") -> list[list[Any]]:
     """Return the names and the position limits of joints, on which capsules and pairs depend."""
-    return [list(model.names), list(model.lowerPositionLimit), list(model.upperPositionLimit)]
+    return [
+        list(model.names),
+        list(model.lowerPositionLimit),
+        list(model.upperPositionLimit),
+    ]
 
 
 def _cached(
-    keep: Path | None, numbers: list[Any], convex_parts: Parts, compute: Callable[[], tuple[Capsules, Pairs]]
+    keep: Path | None,
+    numbers: list[Any],
+    convex_parts: Parts,
+    compute: Callable[[], tuple[Capsules, Pairs]],
 ) -> tuple[Capsules, Pairs]:
     """Return capsules, which must cover the parts, and pairs from a cache folder, or compute and store them.
 
@@ -110,7 +142,9 @@ def _cached(
     name = f"shape-{hashlib.sha256(json.dumps([SHAPE_REVISION, *numbers]).encode()).hexdigest()[:32]}.json"
     if keep is not None:
         with suppress(OSError, ValueError, KeyError, TypeError):
-            return _read(json.loads((keep / name).read_text(encoding="utf-8")), convex_parts)
+            return _read(
+                json.loads((keep / name).read_text(encoding="utf-8")), convex_parts
+            )
     capsules, pairs = compute()
     if keep is not None:
         with suppress(MachineError):
@@ -128,7 +162,12 @@ def place_convex_parts(urdf: str, model: "pin.Model") -> tuple[Parts, dict[str, 
     placed, joints = [], {}
     for part in link_convex_parts(urdf):
         frame = model.frames[frame_of(model, part.link)]
-        placed.append(part.moved(np.array(frame.placement.rotation), np.array(frame.placement.translation)))
+        placed.append(
+            part.moved(
+                np.array(frame.placement.rotation),
+                np.array(frame.placement.translation),
+            )
+        )
         joints[part.link] = int(frame.parentJoint)
     return tuple(placed), joints
 
@@ -151,42 +190,67 @@ def _adjacent(urdf: str, shaped: set[str]) -> frozenset[frozenset[str]]:
 
 
 def _written(capsules: Capsules, pairs: Pairs) -> dict[str, Any]:
-    entries = [asdict(each) | {"first": each.first.tolist(), "second": each.second.tolist()} for each in capsules]
+    entries = [
+        asdict(each) | {"first": each.first.tolist(), "second": each.second.tolist()}
+        for each in capsules
+    ]
     return {"capsules": entries, "pairs": [asdict(pair) for pair in pairs]}
 
 
 def _read(content: dict[str, Any], convex_parts: Parts) -> tuple[Capsules, Pairs]:
-    """Return cached capsules and pairs; raise ValueError if a capsule does not cover its link."""
+    """Return cached capsules and pairs.
+
+    Raise ValueError if a capsule does not cover its link.
+    """
     capsules = tuple(
-        Capsule(**each | {"first": np.array(each["first"]), "second": np.array(each["second"])})
+        Capsule(
+            **each
+            | {"first": np.array(each["first"]), "second": np.array(each["second"])}
+        )
         for each in content["capsules"]
     )
-    if not all(covers(capsule, _parts_of(capsule.link, convex_parts)) for capsule in capsules):
+    if not all(
+        covers(capsule, _parts_of(capsule.link, convex_parts)) for capsule in capsules
+    ):
         raise ValueError("a capsule does not cover its link")
     return capsules, tuple(LinkPair(**pair) for pair in content["pairs"])
 
 
-def load_held_shape(urdf: str, model: "pin.Model", held: HeldObject, tip_frame: int, keep: Path | None) -> Shape:
+def load_held_shape(
+    urdf: str, model: "pin.Model", held: HeldObject, tip_frame: int, keep: Path | None
+) -> Shape:
     """Load the link geometry for collisions with the held object, for a URDF with inline meshes and its reduced model.
 
     A cache folder keeps capsules and pairs; None for no cache.
 
-    Returns:
-        The convex parts of all links that may not touch the object, then the object; a capsule and a pair for each of
-        these links. Links that the joint of the tip moves do not move relative to the object and are omitted.
+    Returns: The convex parts of all links that may not touch the object, then the
+        object; a capsule and a pair for each of these links. Links that the joint of
+        the tip moves do not move relative to the object and are omitted.
     """
     convex_parts, joints = place_convex_parts(urdf, model)
     if not joints:
         raise RecipeError(
-            ["no link has a <collision> element, so that contacts with the held object cannot be checked"]
+            [
+                "no link has a <collision> element, so that contacts with the held object cannot be checked"
+            ]
         )
     for link in held.touch_links:
         if link not in joints:
-            raise RecipeError([f"object.touch_links: no link {link!r} has collision geometry{nearest(link, joints)}"])
+            raise RecipeError(
+                [
+                    f"object.touch_links: no link {link!r} has collision geometry{nearest(link, joints)}"
+                ]
+            )
     tip = model.frames[tip_frame]
     carrier = int(tip.parentJoint)
-    checked = [link for link in joints if link not in held.touch_links and joints[link] != carrier]
-    box = _box(held.size, np.array(tip.placement.rotation), np.array(tip.placement.translation))
+    checked = [
+        link
+        for link in joints
+        if link not in held.touch_links and joints[link] != carrier
+    ]
+    box = _box(
+        held.size, np.array(tip.placement.rotation), np.array(tip.placement.translation)
+    )
     parts = (*(part for part in convex_parts if part.link in checked), box)
     joints = {link: joints[link] for link in checked} | {HELD_OBJECT: carrier}
 
@@ -194,40 +258,78 @@ def load_held_shape(urdf: str, model: "pin.Model", held: HeldObject, tip_frame: 
         capsules = tuple(covering_capsule(_parts_of(link, parts)) for link in checked)
         return capsules, _compare(model, parts, capsules, joints)
 
-    about = [HELD_OBJECT, list(held.size), list(held.touch_links), tip.placement.homogeneous.tolist()]
+    about = [
+        HELD_OBJECT,
+        list(held.size),
+        list(held.touch_links),
+        tip.placement.homogeneous.tolist(),
+    ]
     capsules, pairs = _cached(keep, [urdf, *_joints_of(model), *about], parts, compute)
     if fixed := [pair.first for pair in pairs if pair.colliding > ALWAYS_FRACTION]:
         text = f"the held object overlaps {', '.join(fixed)} in nearly all of {SAMPLED_HELD_STATES:,} random states"
-        raise RecipeError([f"object.touch_links: {text}: name the links that may touch it"])
+        raise RecipeError(
+            [f"object.touch_links: {text}: name the links that may touch it"]
+        )
     return Shape(parts, joints, capsules, pairs)
 
 
-def with_held_object(shape: Shape, held: Shape | None, chain: Chain, size: Size) -> Shape:
+def with_held_object(
+    shape: Shape, held: Shape | None, chain: Chain, size: Size
+) -> Shape:
     """Return the link geometry of a robot with the held object, of these edge lengths [m], as a further link.
 
-    The tip of the chain is its center. Pairs of the held shape are added; None for no pairs with the object.
+    The tip of the chain is its center. Pairs of the held shape are added; None for no
+    pairs with the object.
     """
-    box, half = _box(size, chain.tip_rotation, chain.tip_translation), np.array(size) / 2
+    box, half = (
+        _box(size, chain.tip_rotation, chain.tip_translation),
+        np.array(size) / 2,
+    )
     widest = int(np.argmax(half))
-    axis, radius = half[widest] * chain.tip_rotation[:, widest], float(np.linalg.norm(np.delete(half, widest)))
-    capsule = Capsule(HELD_OBJECT, chain.tip_translation - axis, chain.tip_translation + axis, radius, overhang=radius)
+    axis, radius = (
+        half[widest] * chain.tip_rotation[:, widest],
+        float(np.linalg.norm(np.delete(half, widest))),
+    )
+    capsule = Capsule(
+        HELD_OBJECT,
+        chain.tip_translation - axis,
+        chain.tip_translation + axis,
+        radius,
+        overhang=radius,
+    )
     joints = {**shape.joints, HELD_OBJECT: len(chain.joints)}
     pairs = () if held is None else held.pairs
-    return Shape((*shape.convex_parts, box), joints, (*shape.capsules, capsule), (*shape.pairs, *pairs))
+    return Shape(
+        (*shape.convex_parts, box),
+        joints,
+        (*shape.capsules, capsule),
+        (*shape.pairs, *pairs),
+    )
 
 
 def _box(size: Size, rotation: Array, translation: Array) -> ConvexPart:
     return ConvexPart(HELD_OBJECT, CUBE * np.array(size)).moved(rotation, translation)
 
 
-def _compare(model: "pin.Model", parts: Parts, capsules: Capsules, joints: dict[str, int]) -> tuple[LinkPair, ...]:
+def _compare(
+    model: "pin.Model", parts: Parts, capsules: Capsules, joints: dict[str, int]
+) -> tuple[LinkPair, ...]:
     """Compare the object with all links and their capsules in random states."""
     names = {capsule.link: f"capsule of {capsule.link}" for capsule in capsules}
-    covers = [ConvexPart(names[each.link], np.array([each.first, each.second]), each.radius) for each in capsules]
+    covers = [
+        ConvexPart(names[each.link], np.array([each.first, each.second]), each.radius)
+        for each in capsules
+    ]
     all_joints = joints | {name: joints[link] for link, name in names.items()}
     poses = sample_poses(model, SAMPLED_HELD_STATES)
     contact = LinkContact(poses, map(body_of_part, [*parts, *covers]), all_joints)
     return tuple(
-        LinkPair.from_samples(link, HELD_OBJECT, "", contact.of(link, HELD_OBJECT), contact.of(name, HELD_OBJECT))
+        LinkPair.from_samples(
+            link,
+            HELD_OBJECT,
+            "",
+            contact.of(link, HELD_OBJECT),
+            contact.of(name, HELD_OBJECT),
+        )
         for link, name in names.items()
     )

@@ -51,7 +51,9 @@ def check_readable(path: Path) -> None:
     try:
         mode = path.stat().st_mode
         if stat.S_ISDIR(mode):
-            os.scandir(f"{path}/.").close()  # needs the permissions to list and to enter
+            os.scandir(
+                f"{path}/."
+            ).close()  # needs the permissions to list and to enter
         elif stat.S_ISREG(mode):
             path.open("rb").close()
     except PermissionError as error:
@@ -61,7 +63,10 @@ def check_readable(path: Path) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Raise MachineError if a file, or files in a folder, cannot be written; the path may be missing."""
+    """Raise MachineError if a file, or files in a folder, cannot be written.
+
+    The path may be missing.
+    """
     with machine_errors("write", path):
         places = [path.absolute(), *path.absolute().parents]
         if path.is_file():
@@ -75,11 +80,12 @@ def check_writable(path: Path) -> None:
 def committing(path: Path, work: Path | None = None) -> Iterator[Path]:
     """Yield a temporary path for the block to write to, and rename it to ``path`` if the block ends without an error.
 
-    Several processes may write the same ``path`` at once: each has its own temporary file and the last rename wins. The
-    temporary file is in ``work``, on the same file system, or in the folder of ``path``. Both folders are created.
+    Several processes may write the same ``path`` at once: each has its own temporary
+    file and the last rename wins. The temporary file is in ``work``, on the same file
+    system, or in the folder of ``path``. Both folders are created.
 
-    Raises:
-        MachineError: The file cannot be written. ``path`` is unchanged and the temporary file is removed.
+    Raises: MachineError: The file cannot be written. ``path`` is unchanged and the
+        temporary file is removed.
     """
     folder = work or path.parent
     temporary = folder / temporary_name(path.name)
@@ -110,7 +116,10 @@ def _synchronize(path: Path) -> None:
 
 
 def write_file(path: Path, content: bytes | str, *, work: Path | None = None) -> None:
-    """Write a whole file atomically, or raise MachineError; text is encoded as UTF-8."""
+    """Write a whole file atomically, or raise MachineError.
+
+    Text is encoded as UTF-8.
+    """
     with committing(path, work) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
@@ -129,20 +138,24 @@ def _reading(path: Path) -> Iterator[None]:
 def read_file(path: Path, *, max_bytes: int | None = None) -> bytes:
     """Read a whole file of at most ``max_bytes``, by default of any size.
 
-    Raises:
-        DatasetError: The file is missing, too large, or a device or a pipe, whose size is unknown.
-        MachineError: The file cannot be read.
+    Raises: DatasetError: The file is missing, too large, or a device or a pipe, whose
+        size is unknown. MachineError: The file cannot be read.
     """
     with _reading(path):
         status = path.stat()
         if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
             raise DatasetError(f"{path} is not a file")
         if max_bytes is not None and status.st_size > max_bytes:
-            raise DatasetError(f"{path} has {status.st_size:,} bytes, expected at most {max_bytes:,}")
+            raise DatasetError(
+                f"{path} has {status.st_size:,} bytes, expected at most {max_bytes:,}"
+            )
         return path.read_bytes()
 
 
 def file_sha256(path: Path) -> str:
-    """Compute the sha256 of a file in constant memory, as 64 hexadecimal digits; errors are those of ``read_file``."""
+    """Compute the sha256 of a file in constant memory, as 64 hexadecimal digits.
+
+    Errors are those of ``read_file``.
+    """
     with _reading(path), path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,7 +1,7 @@
 """The cache folder of tapes and compiled libraries.
 
-Its files are loaded and executed, so other users must not be able to change them. A folder that other users own or may
-write to is refused; such a file is ignored.
+Its files are loaded and executed, so other users must not be able to change them. A
+folder that other users own or may write to is refused; such a file is ignored.
 """
 
 import atexit
@@ -20,7 +20,9 @@ from cnpgen.errors import MachineError
 from cnpgen.store.files.file_lock import try_lock, unlock
 
 LIBRARIES, TAPES = "lib", "tape"
-_READ_ONLY_LINK = "warm"  # in a temporary folder: a link to a cache that is readable but not writable
+_READ_ONLY_LINK = (
+    "warm"  # in a temporary folder: a link to a cache that is readable but not writable
+)
 _WRITABLE_FOR_OTHERS = stat.S_IWGRP | stat.S_IWOTH
 MAX_LOCK_WAIT_S = 600  # a process that holds a lock longer may have been stopped
 
@@ -30,26 +32,33 @@ def default_cache_folder() -> Path:
     if os.environ.get("CNPGEN_CACHE"):
         return Path(os.environ["CNPGEN_CACHE"])
     try:
-        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cnpgen"
+        return (
+            Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cnpgen"
+        )
     except RuntimeError as error:
-        raise MachineError("this user has no home folder for the kernel cache: set CNPGEN_CACHE to a folder") from error
+        raise MachineError(
+            "this user has no home folder for the kernel cache: set CNPGEN_CACHE to a folder"
+        ) from error
 
 
 def usable_cache_folder(folder: Path) -> Path:
     """Return the folder, created with private permissions if missing, or a temporary folder.
 
-    The temporary folder links to a cache that is readable but not writable. A cache that cannot be created, or that
-    other users may change, is not used; a warning names the reason.
+    The temporary folder links to a cache that is readable but not writable. A cache
+    that cannot be created, or that other users may change, is not used; a warning names
+    the reason.
     """
     try:
         make_private_folder(folder)
     except OSError as error:
         return _temporary_cache(
-            f"cannot write the kernel cache {folder} ({error.strerror or error})", "that is writable"
+            f"cannot write the kernel cache {folder} ({error.strerror or error})",
+            "that is writable",
         )
     if problem := trust_problem(folder):
         return _temporary_cache(
-            f"the kernel cache {folder} is not used, {problem}", "that is not writable for other users"
+            f"the kernel cache {folder} is not used, {problem}",
+            "that is not writable for other users",
         )
     try:
         with tempfile.TemporaryFile(dir=folder):
@@ -76,22 +85,34 @@ def make_private_folder(folder: Path) -> None:
         if not path.is_dir():
             try:
                 path.mkdir()
-            except FileExistsError as error:  # created by another process meanwhile, or a file
+            except (
+                FileExistsError
+            ) as error:  # created by another process meanwhile, or a file
                 if path.is_dir():
                     continue
-                raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(path)) from error
+                raise NotADirectoryError(
+                    errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(path)
+                ) from error
             path.chmod(stat.S_IRWXU)
 
 
 def make_read_only_for_others(path: Path) -> None:
-    """Remove the write permission of other users from a file; its read permissions stay."""
+    """Remove the write permission of other users from a file.
+
+    Its read permissions stay.
+    """
     path.chmod(path.stat().st_mode & ~_WRITABLE_FOR_OTHERS)
 
 
 @contextmanager
 def exclusive_lock(lock: Path) -> Iterator[None]:
-    """Run the context in one process at a time, if the system has file locks; a lock ends with its process."""
-    with os.fdopen(os.open(lock, os.O_CREAT | os.O_RDWR, stat.S_IRUSR | stat.S_IWUSR), "r+b") as file:
+    """Run the context in one process at a time, if the system has file locks.
+
+    A lock ends with its process.
+    """
+    with os.fdopen(
+        os.open(lock, os.O_CREAT | os.O_RDWR, stat.S_IRUSR | stat.S_IWUSR), "r+b"
+    ) as file:
         with suppress(FileNotFoundError):  # another process has finished and removed it
             lock.chmod(stat.S_IRUSR | stat.S_IWUSR)  # independent of the umask
         end = time.monotonic() + MAX_LOCK_WAIT_S
@@ -106,7 +127,11 @@ def exclusive_lock(lock: Path) -> Iterator[None]:
 
 def read_only_cache(folder: Path) -> Path | None:
     """Return the read-only cache that a temporary folder links to, or None."""
-    return (folder / _READ_ONLY_LINK).resolve() if (folder / _READ_ONLY_LINK).is_symlink() else None
+    return (
+        (folder / _READ_ONLY_LINK).resolve()
+        if (folder / _READ_ONLY_LINK).is_symlink()
+        else None
+    )
 
 
 def require_trusted(folder: Path) -> list[Path]:
@@ -118,21 +143,33 @@ def require_trusted(folder: Path) -> list[Path]:
     folders = [folder] if linked is None else [folder, linked]
     for cache in folders:
         if problem := trust_problem(cache):
-            raise MachineError(f"the kernel cache {cache} is not used, {problem}: choose another folder")
+            raise MachineError(
+                f"the kernel cache {cache} is not used, {problem}: choose another folder"
+            )
     return folders
 
 
 def trust_problem(folder: Path) -> str:
     """Return why other users may change files in a cache folder, or an empty text if they cannot.
 
-    The folder, its subfolders, its parents and the targets of symbolic links among them are checked.
+    The folder, its subfolders, its parents and the targets of symbolic links among them
+    are checked.
     """
     for path in filter(os.path.lexists, _path_components(folder.absolute())):
-        sticky = path != folder.absolute() and bool(path.stat().st_mode & stat.S_ISVTX)  # protects entries of others
+        sticky = path != folder.absolute() and bool(
+            path.stat().st_mode & stat.S_ISVTX
+        )  # protects entries of others
         if problem := _permission_problem(path, writable=sticky or path.is_symlink()):
             return problem
     subfolders = (folder / name for name in (LIBRARIES, TAPES))
-    return next((problem for path in subfolders if os.path.lexists(path) and (problem := _entry_problem(path))), "")
+    return next(
+        (
+            problem
+            for path in subfolders
+            if os.path.lexists(path) and (problem := _entry_problem(path))
+        ),
+        "",
+    )
 
 
 def is_trusted(path: Path) -> bool:
@@ -142,16 +179,27 @@ def is_trusted(path: Path) -> bool:
 
 def untrusted_files(folder: Path) -> list[Path]:
     """List the tapes and libraries in a cache folder that other users may have created or changed."""
-    paths = (path for name in (LIBRARIES, TAPES) for path in sorted((folder / name).glob("*.*")))
+    paths = (
+        path
+        for name in (LIBRARIES, TAPES)
+        for path in sorted((folder / name).glob("*.*"))
+    )
     return [path for path in paths if not is_trusted(path)]
 
 
 def _entry_problem(path: Path) -> str:
-    return f"as {path} is a symbolic link" if path.is_symlink() else _permission_problem(path)
+    return (
+        f"as {path} is a symbolic link"
+        if path.is_symlink()
+        else _permission_problem(path)
+    )
 
 
 def _permission_problem(path: Path, *, writable: bool = False) -> str:
-    """Return why other users own or may write a path, or an empty text; ``writable`` permits writing."""
+    """Return why other users own or may write a path, or an empty text.
+
+    ``writable`` permits writing.
+    """
     if not hasattr(os, "geteuid"):  # Windows
         return ""
     try:
@@ -170,11 +218,16 @@ def _path_components(path: Path) -> Iterator[Path]:
     for component in (path, *path.parents):
         yield component
         if component.is_symlink():
-            yield from _path_components(Path(os.path.normpath(component.parent / component.readlink())))
+            yield from _path_components(
+                Path(os.path.normpath(component.parent / component.readlink()))
+            )
 
 
 def temporary_folder() -> Path:
-    """Create a folder that is removed when this process ends; its workers may use it until then."""
+    """Create a folder that is removed when this process ends.
+
+    Its workers may use it until then.
+    """
     folder = Path(tempfile.mkdtemp(prefix="cnpgen-cache-"))
     atexit.register(_remove, folder, os.getpid())
     return folder

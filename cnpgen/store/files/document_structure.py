@@ -46,7 +46,8 @@ class Nullable:
 class StructureError(ValueError):
     """A value that does not have the expected structure.
 
-    Each level appends the key of the value to ``key_path``, which begins with the innermost one.
+    Each level appends the key of the value to ``key_path``, which begins with the
+    innermost one.
     """
 
     def __init__(self, text: str) -> None:
@@ -97,11 +98,18 @@ def _check_table(value: Any, structure: Mapping[str, Structure]) -> None:
 
 
 def _are_all(values: list[Any], leaf: Leaf) -> bool:
-    """Return whether all values have a structure, by a fast check for long lists; False if it cannot decide."""
+    """Return whether all values have a structure, by a fast check for long lists.
+
+    False if it cannot decide.
+    """
     kinds = set(map(type, values))
     if kinds == {int}:
         low = 0 if leaf is WHOLE else -MAX_INTEGER
-        return leaf in {WHOLE, NUMBER, FINITE} and low <= min(values) and max(values) <= MAX_INTEGER
+        return (
+            leaf in {WHOLE, NUMBER, FINITE}
+            and low <= min(values)
+            and max(values) <= MAX_INTEGER
+        )
     return (leaf is NUMBER and kinds == {float}) or (leaf is TEXT and kinds == {str})
 
 
@@ -118,11 +126,19 @@ def _is(value: Any, leaf: Leaf) -> bool:
     if isinstance(value, int):
         return abs(value) <= MAX_INTEGER
     finite = isinstance(value, float) and math.isfinite(value)
-    return finite or (leaf is NUMBER and (isinstance(value, float) or value in _NOT_FINITE))
+    return finite or (
+        leaf is NUMBER and (isinstance(value, float) or value in _NOT_FINITE)
+    )
 
 
 def _structure_error(expected: str, value: Any) -> StructureError:
     if value is _MISSING:
         return StructureError("is missing")
-    shown = f"a list of {len(value)}" if isinstance(value, list) else "a table" if isinstance(value, dict) else ""
+    shown = (
+        f"a list of {len(value)}"
+        if isinstance(value, list)
+        else "a table"
+        if isinstance(value, dict)
+        else ""
+    )
     return StructureError(f"must be {expected}, got {shown or f'{value!r:.60}'}")

@@ -1,6 +1,7 @@
 """JSON documents with a checksum: readable, reproducible, and protected against any changed byte.
 
-The last key of a document, ``self_sha256``, is the sha256 of the text of the file with 64 zeros in place of the value.
+The last key of a document, ``self_sha256``, is the sha256 of the text of the file with
+64 zeros in place of the value.
 """
 
 import hashlib
@@ -21,7 +22,9 @@ from cnpgen.store.files.size_limits import MAX_DOCUMENT_BYTES, MAX_DOCUMENT_DEPT
 
 MAX_SHOWN_CHARACTERS = 80  # longer pairs of values are left out of messages
 _BLANK = "0" * 64
-_SCALARS = frozenset({int, bool, str, type(None)})  # types that JSON has for every value
+_SCALARS = frozenset(
+    {int, bool, str, type(None)}
+)  # types that JSON has for every value
 _NESTED = frozenset({dict, list})
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")  # half of a UTF-16 surrogate pair
 _CHECKSUM = re.compile(r'"self_sha256": "([0-9a-f]{64})"\n}\n\Z')
@@ -35,7 +38,9 @@ def plain(value: Any) -> Any:
         return plain(value.tolist())
     if isinstance(value, list | tuple):
         kinds = set(map(type, value))  # fast paths for long lists of numbers
-        is_plain = kinds <= _SCALARS or (kinds == {float} and all(map(math.isfinite, value)))
+        is_plain = kinds <= _SCALARS or (
+            kinds == {float} and all(map(math.isfinite, value))
+        )
         return list(value) if is_plain else [plain(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
@@ -47,8 +52,13 @@ def plain(value: Any) -> Any:
 
 
 def canonical_sha256(value: Any) -> str:
-    """Compute the sha256 of the compact JSON of a value with sorted keys; equal values have equal digests."""
-    text = json.dumps(plain(value), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    """Compute the sha256 of the compact JSON of a value with sorted keys.
+
+    Equal values have equal digests.
+    """
+    text = json.dumps(
+        plain(value), sort_keys=True, separators=(",", ":"), allow_nan=False
+    )
     return hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -69,14 +79,20 @@ class Difference:
         return len(repr(self.old)) + len(repr(self.new)) < MAX_SHOWN_CHARACTERS
 
     def __str__(self) -> str:
-        return f"{self.key} ({self.old!r}, now {self.new!r})" if self.is_short else self.key
+        return (
+            f"{self.key} ({self.old!r}, now {self.new!r})"
+            if self.is_short
+            else self.key
+        )
 
 
 def differences(old: Any, new: Any, key: str = "") -> Iterator[Difference]:
     """Yield the differences between two JSON-able values, in the order of the keys of the first one."""
     if isinstance(old, Mapping) and isinstance(new, Mapping):
         for name in [*old, *(name for name in new if name not in old)]:
-            yield from differences(old.get(name), new.get(name), f"{key}.{name}" if key else name)
+            yield from differences(
+                old.get(name), new.get(name), f"{key}.{name}" if key else name
+            )
     elif old != new:
         yield Difference(key, old, new)
 
@@ -85,35 +101,60 @@ def render(value: Any, indent: str = "") -> str:
     """Format plain JSON with two spaces per level and each list of scalars on one line."""
     inner = indent + "  "
     if isinstance(value, dict) and value:
-        items = [f"{json.dumps(key, ensure_ascii=False)}: {render(item, inner)}" for key, item in value.items()]
+        items = [
+            f"{json.dumps(key, ensure_ascii=False)}: {render(item, inner)}"
+            for key, item in value.items()
+        ]
         return "{\n" + ",\n".join(inner + item for item in items) + "\n" + indent + "}"
     if isinstance(value, list) and not _NESTED.isdisjoint(map(type, value)):
-        return "[\n" + ",\n".join(inner + render(item, inner) for item in value) + "\n" + indent + "]"
+        return (
+            "[\n"
+            + ",\n".join(inner + render(item, inner) for item in value)
+            + "\n"
+            + indent
+            + "]"
+        )
     return json.dumps(value, ensure_ascii=False, allow_nan=False)
 
 
-def save_document(path: Path, document: Mapping[str, Any], *, work: Path | None = None) -> None:
-    """Write a document with its checksum, atomically; the keys "format" and "format_version" come first."""
+def save_document(
+    path: Path, document: Mapping[str, Any], *, work: Path | None = None
+) -> None:
+    """Write a document with its checksum, atomically.
+
+    The keys "format" and "format_version" come first.
+    """
     text = render(plain({**document, "self_sha256": _BLANK})) + "\n"
     digest = hashlib.sha256(text.encode()).hexdigest()
     write_file(path, _CHECKSUM.sub(f'"self_sha256": "{digest}"\n}}\n', text), work=work)
 
 
-def load_document(path: Path, kind: str, *, version: int, structure: Structure) -> dict[str, Any]:
+def load_document(
+    path: Path, kind: str, *, version: int, structure: Structure
+) -> dict[str, Any]:
     """Read a document with the "format" ``kind``, a "format_version" and a structure, and verify its checksum.
 
-    A missing, too large or damaged file, and another format, version or structure, raise DatasetError.
+    A missing, too large or damaged file, and another format, version or structure,
+    raise DatasetError.
     """
     text, document = _parse(path)
     if document.get("format") != kind:
-        raise DatasetError(f"{path} is not a {kind} file: its format is {document.get('format')!r}")
+        raise DatasetError(
+            f"{path} is not a {kind} file: its format is {document.get('format')!r}"
+        )
     actual = document.get("format_version")
     if isinstance(actual, int) and actual != version:
         remedy = "upgrade cnpgen" if actual > version else "make it again"
-        raise DatasetError(f"{path} has format version {actual}, this cnpgen reads version {version}: {remedy}")
+        raise DatasetError(
+            f"{path} has format version {actual}, this cnpgen reads version {version}: {remedy}"
+        )
     checksum = _CHECKSUM.search(text)
     blank = _CHECKSUM.sub(f'"self_sha256": "{_BLANK}"\n}}\n', text)
-    if actual is None or checksum is None or checksum[1] != hashlib.sha256(blank.encode()).hexdigest():
+    if (
+        actual is None
+        or checksum is None
+        or checksum[1] != hashlib.sha256(blank.encode()).hexdigest()
+    ):
         raise DatasetError(f"{path} is damaged: it was changed after it was written")
     del document["self_sha256"]
     try:
@@ -131,7 +172,9 @@ def parse_json(text: str) -> Any:
         raise _too_deep() from error
     _check_depth(value)
     if _SURROGATE.search(text):
-        json.dumps(value, ensure_ascii=False).encode()  # raises a ValueError for a single surrogate
+        json.dumps(
+            value, ensure_ascii=False
+        ).encode()  # raises a ValueError for a single surrogate
     return value
 
 
@@ -140,8 +183,15 @@ def _check_depth(value: Any) -> None:
     for _ in range(MAX_DOCUMENT_DEPTH + 1):
         if not level:
             return
-        inside = (value.values() if isinstance(value, dict) else value for value in level)
-        level = [item for items in inside if not _NESTED.isdisjoint(map(type, items)) for item in items]
+        inside = (
+            value.values() if isinstance(value, dict) else value for value in level
+        )
+        level = [
+            item
+            for items in inside
+            if not _NESTED.isdisjoint(map(type, items))
+            for item in items
+        ]
         level = [item for item in level if isinstance(item, dict | list)]
     raise _too_deep()
 

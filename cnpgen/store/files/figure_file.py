@@ -11,14 +11,20 @@ if TYPE_CHECKING:
 
 
 def new_figure(width: float, height: float, dpi: int = 110) -> "Figure":
-    """Return an empty figure with a size [inch] and automatic layout; raise MissingExtraError without matplotlib."""
+    """Return an empty figure with a size [inch] and automatic layout.
+
+    Raise MissingExtraError without matplotlib.
+    """
     with requires_extra("plot", "matplotlib"):
         from matplotlib.figure import Figure
     return Figure(figsize=(width, height), layout="constrained", dpi=dpi)
 
 
 def save_figure(figure: "Figure", path: Path) -> None:
-    """Write a figure in the format of the suffix; create its folder if it does not exist."""
+    """Write a figure in the format of the suffix.
+
+    Create its folder if it does not exist.
+    """
     with machine_errors("write", path):
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path)

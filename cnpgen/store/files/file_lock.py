@@ -51,7 +51,10 @@ def output_lock(out: Path, lock: Path) -> Iterator[None]:
 
 
 def _is_present(file: IO[bytes], path: Path) -> bool:
-    """Return whether an open file still has its name; the previous owner of a lock removes its file."""
+    """Return whether an open file still has its name.
+
+    The previous owner of a lock removes its file.
+    """
     with suppress(OSError):
         return os.path.samestat(os.fstat(file.fileno()), path.stat())
     return False

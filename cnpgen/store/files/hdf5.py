@@ -1,7 +1,8 @@
 """The only entry point for reading HDF5 files: it returns plain numbers that are stored in the file itself.
 
-Other features of HDF5 are refused with an error that names the dataset. These are external storage, links to other
-files, references, variable-length texts and filters that are loaded as code.
+Other features of HDF5 are refused with an error that names the dataset. These are
+external storage, links to other files, references, variable-length texts and filters
+that are loaded as code.
 """
 
 import errno
@@ -30,16 +31,37 @@ from cnpgen.store.files.size_limits import (
     MIN_EXPANSION_LIMIT_BYTES,
 )
 
-_DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError)  # errors of h5py for damaged files
-_SYSTEM_ERRORS = {errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.EIO, errno.ENOMEM, errno.ESTALE}
-_FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}  # filters that are built into every h5py
+_DAMAGE = (
+    OSError,
+    KeyError,
+    RuntimeError,
+    ValueError,
+    TypeError,
+    AttributeError,
+)  # errors of h5py for damaged files
+_SYSTEM_ERRORS = {
+    errno.EACCES,
+    errno.EPERM,
+    errno.EMFILE,
+    errno.ENFILE,
+    errno.EIO,
+    errno.ENOMEM,
+    errno.ESTALE,
+}
+_FILTERS = {
+    1: "gzip",
+    2: "shuffle",
+    3: "fletcher32",
+    32000: "lzf",
+}  # filters that are built into every h5py
 
 
 def create_hdf5(buffer: io.BytesIO, *, userblock: int = 0, alignment: int = 64) -> Any:
     """Create an HDF5 file in ``buffer``; wrap it in ``h5py.File``.
 
-    The file format is pinned. The root group stores no times; older versions of ``h5py.File`` cannot switch them off.
-    The file begins with a user block [bytes]. The alignment [bytes] allows to map datasets into memory as arrays.
+    The file format is pinned. The root group stores no times; older versions of
+    ``h5py.File`` cannot switch them off. The file begins with a user block [bytes]. The
+    alignment [bytes] allows to map datasets into memory as arrays.
     """
     from h5py import h5f, h5fd, h5p
 
@@ -63,7 +85,9 @@ class Attributes:
         from h5py import h5a
 
         if (count := h5a.get_num_attrs(self._item)) > MAX_NAMES:
-            raise DatasetError(f"{self.path} has {count:,} attributes, expected at most {MAX_NAMES:,}")
+            raise DatasetError(
+                f"{self.path} has {count:,} attributes, expected at most {MAX_NAMES:,}"
+            )
         names: list[bytes] = []
         h5a.iterate(self._item, names.append)
         return (_decoded(self.path, name) for name in names)
@@ -74,18 +98,29 @@ class Attributes:
         return bool(h5a.exists(self._item, name.encode()))
 
     def __getitem__(self, name: str) -> Any:
-        """Return a text, a number or an array of numbers; other types and large values raise DatasetError."""
+        """Return a text, a number or an array of numbers.
+
+        Other types and large values raise DatasetError.
+        """
         from h5py import AttributeManager, h5a, h5s, h5t
 
         attribute = h5a.open(self._item, name.encode())
         kind, space = attribute.get_type(), attribute.get_space()
         text, count = kind.get_class() == h5t.STRING, space.get_simple_extent_npoints()
         scalar = space.get_simple_extent_type() == h5s.SCALAR
-        plain = scalar if text else kind.get_class() in {h5t.INTEGER, h5t.FLOAT} and count > 0
+        plain = (
+            scalar
+            if text
+            else kind.get_class() in {h5t.INTEGER, h5t.FLOAT} and count > 0
+        )
         if not plain:
-            raise DatasetError(f"{self.path}: the attribute {name!r} must be a text, a number or a list of numbers")
+            raise DatasetError(
+                f"{self.path}: the attribute {name!r} must be a text, a number or a list of numbers"
+            )
         if count * kind.get_size() > MAX_ATTRIBUTE_BYTES:
-            raise DatasetError(f"{self.path}: the attribute {name!r} is larger than {MAX_ATTRIBUTE_BYTES:,} bytes")
+            raise DatasetError(
+                f"{self.path}: the attribute {name!r} is larger than {MAX_ATTRIBUTE_BYTES:,} bytes"
+            )
         return AttributeManager(SimpleNamespace(id=self._item))[name]
 
     def some(self, names: Iterable[str]) -> dict[str, Any]:
@@ -102,14 +137,17 @@ def _decoded(path: Path, name: bytes) -> str:
     try:
         return name.decode()
     except UnicodeDecodeError as error:
-        raise DatasetError(f"{path} is damaged: it has the name {name!r}, which is not UTF-8") from error
+        raise DatasetError(
+            f"{path} is damaged: it has the name {name!r}, which is not UTF-8"
+        ) from error
 
 
 @dataclass(frozen=True, eq=False)
 class Column:
     """A dataset of plain numbers, integers or floats.
 
-    The offset is the position of the first number in the file [bytes]; None if the storage is not contiguous.
+    The offset is the position of the first number in the file [bytes]; None if the
+    storage is not contiguous.
     """
 
     shape: tuple[int, ...]
@@ -132,7 +170,10 @@ class Column:
 
 @dataclass(eq=False)
 class Hdf5:
-    """An open file: a mapping from names at its root to datasets of plain numbers; groups are skipped."""
+    """An open file: a mapping from names at its root to datasets of plain numbers.
+
+    Groups are skipped.
+    """
 
     path: Path
     attributes: Attributes
@@ -145,7 +186,11 @@ class Hdf5:
         """Yield the names of everything that is not a group, also of objects that cannot be read."""
         from h5py import h5g
 
-        return (name for name in self.names() if not isinstance(self._open(name), h5g.GroupID))
+        return (
+            name
+            for name in self.names()
+            if not isinstance(self._open(name), h5g.GroupID)
+        )
 
     def __contains__(self, name: str) -> bool:
         return name.encode() in self._root
@@ -153,7 +198,8 @@ class Hdf5:
     def __getitem__(self, name: str) -> Column:
         """Return a dataset without reading its numbers.
 
-        All but plain numbers in this file, and more of them than possible, raise DatasetError.
+        All but plain numbers in this file, and more of them than possible, raise
+        DatasetError.
         """
         if name not in self._columns:
             self._columns[name] = self._checked(name, self._open(name))
@@ -162,7 +208,9 @@ class Hdf5:
     def names(self) -> list[str]:
         """Return the names of all objects at the root, including groups and links."""
         if (count := len(self._root)) > MAX_NAMES:
-            raise DatasetError(f"{self.path} has {count:,} datasets, expected at most {MAX_NAMES:,}")
+            raise DatasetError(
+                f"{self.path} has {count:,} datasets, expected at most {MAX_NAMES:,}"
+            )
         return [_decoded(self.path, name) for name in self._root]
 
     def columns(self) -> Mapping[str, Column]:
@@ -175,7 +223,9 @@ class Hdf5:
 
         if name not in self._opened:
             if self._root.links.get_info(name.encode()).type != h5l.TYPE_HARD:
-                raise DatasetError(f"{self.path} is damaged: its {name!r} is a link, and links are not followed")
+                raise DatasetError(
+                    f"{self.path} is damaged: its {name!r} is a link, and links are not followed"
+                )
             self._opened[name] = h5o.open(self._root, name.encode())
         return self._opened[name]
 
@@ -184,34 +234,60 @@ class Hdf5:
         from h5py import h5d, h5t
 
         if not isinstance(dataset, h5d.DatasetID):
-            raise DatasetError(f"{self.path}: {name} must be a dataset, got a group or a type")
+            raise DatasetError(
+                f"{self.path}: {name} must be a dataset, got a group or a type"
+            )
         layout = dataset.get_create_plist()
         if layout.get_layout() == h5d.VIRTUAL or layout.get_external_count():
-            raise DatasetError(f"{self.path}: the numbers of {name} are in another file, which is not read")
+            raise DatasetError(
+                f"{self.path}: the numbers of {name} are in another file, which is not read"
+            )
         if dataset.get_type().get_class() not in {h5t.INTEGER, h5t.FLOAT}:
-            raise DatasetError(f"{self.path}: {name} must hold numbers, got {_type_text(dataset)}")
-        filters = [layout.get_filter(index)[0] for index in range(layout.get_nfilters())]
+            raise DatasetError(
+                f"{self.path}: {name} must hold numbers, got {_type_text(dataset)}"
+            )
+        filters = [
+            layout.get_filter(index)[0] for index in range(layout.get_nfilters())
+        ]
         if not _FILTERS.keys() >= set(filters):
             known = ", ".join(_FILTERS.values())
-            raise DatasetError(f"{self.path}: {name} is packed with filter {filters}, expected {known} or none")
+            raise DatasetError(
+                f"{self.path}: {name} is packed with filter {filters}, expected {known} or none"
+            )
         shape = dataset.shape
         if shape is None or len(shape) > MAX_DIMENSIONS:
-            raise DatasetError(f"{self.path}: {name} must have at most {MAX_DIMENSIONS} dimensions, got {shape}")
-        column = Column(shape, dataset.dtype, dataset.get_offset(), Attributes(self.path, dataset), dataset)
-        self._check_size(name, column, layout.get_chunk() if layout.get_layout() == h5d.CHUNKED else ())
+            raise DatasetError(
+                f"{self.path}: {name} must have at most {MAX_DIMENSIONS} dimensions, got {shape}"
+            )
+        column = Column(
+            shape,
+            dataset.dtype,
+            dataset.get_offset(),
+            Attributes(self.path, dataset),
+            dataset,
+        )
+        self._check_size(
+            name,
+            column,
+            layout.get_chunk() if layout.get_layout() == h5d.CHUNKED else (),
+        )
         return column
 
     def _check_size(self, name: str, column: Column, chunk: tuple[int, ...]) -> None:
         """Raise an error if this and all previous columns are larger than a file of this size can contain."""
         previous = sum(item.bytes for item in self._columns.values())
-        declared = max(previous + column.bytes, math.prod(chunk) * column.dtype.itemsize)
+        declared = max(
+            previous + column.bytes, math.prod(chunk) * column.dtype.itemsize
+        )
         if declared > max(MAX_EXPANSION * self._size, MIN_EXPANSION_LIMIT_BYTES):
             raise DatasetError(
                 f"{self.path}: {name} declares the shape {column.shape}: unpacked, the file of {self._size:,} bytes"
                 f" would have {declared:,}, more than {MAX_EXPANSION} times as many"
             )
         if column.offset is not None and column.offset + column.bytes > self._size:
-            raise DatasetError(f"{self.path} is damaged or cut off: {name} reaches outside its end")
+            raise DatasetError(
+                f"{self.path} is damaged or cut off: {name} reaches outside its end"
+            )
 
 
 def _type_text(dataset: Any) -> str:
@@ -228,25 +304,31 @@ def open_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
 
     All handles are closed at the end of the block, so processes cannot share them.
 
-    Raises:
-        DatasetError: The file is missing, not an HDF5 file, too large, damaged or cut off; also raised for errors
+    Raises: DatasetError: The file is missing, not an HDF5 file, too large, damaged or
+        cut off; also raised for errors
             within the block.
         MachineError: The file cannot be read, or does not fit into memory.
     """
     import h5py
 
     if content is None and not path.is_file():
-        raise DatasetError(f"{path} is missing" if not path.exists() else f"{path} is not a file")
+        raise DatasetError(
+            f"{path} is missing" if not path.exists() else f"{path} is not a file"
+        )
     try:
         if content is None:
             require_possible_size(path)
         with path.open("rb") if content is None else io.BytesIO(content) as stream:
             size = check_heaps(path, stream)  # before HDF5 reads the file
         source: Any = path if content is None else io.BytesIO(content)
-        with h5py.File(source, "r", locking="best-effort" if content is None else None) as file:
+        with h5py.File(
+            source, "r", locking="best-effort" if content is None else None
+        ) as file:
             yield Hdf5(path, Attributes(path, file.id), file.id, size)
     except MemoryError as error:
-        raise MachineError(f"cannot read {path}: its content does not fit into memory") from error
+        raise MachineError(
+            f"cannot read {path}: its content does not fit into memory"
+        ) from error
     except _DAMAGE as error:
         if isinstance(error, OSError) and error.errno in _SYSTEM_ERRORS:
             raise machine_error("read", path, error) from error
@@ -259,4 +341,6 @@ def open_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
 def require_possible_size(path: Path) -> None:
     """Raise DatasetError if a file is larger than ``MAX_HDF5_BYTES``, as huge sparse files are."""
     if (size := path.stat().st_size) > MAX_HDF5_BYTES:
-        raise DatasetError(f"{path} has {size:,} bytes, expected at most {MAX_HDF5_BYTES:,}")
+        raise DatasetError(
+            f"{path} has {size:,} bytes, expected at most {MAX_HDF5_BYTES:,}"
+        )

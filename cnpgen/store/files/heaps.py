@@ -9,7 +9,9 @@ import numpy as np
 
 from cnpgen.errors import DatasetError
 
-_BEGIN = np.frombuffer(b"GCOL\x01\0\0\0", "<u8")[0]  # signature and version of a collection; 7e-315 as a float64
+_BEGIN = np.frombuffer(b"GCOL\x01\0\0\0", "<u8")[
+    0
+]  # signature and version of a collection; 7e-315 as a float64
 _HEADER = 16  # bytes, of a collection and of each of its objects
 _CHUNK_BYTES = 1 << 23  # compared at once, which limits the memory of the comparison
 
@@ -17,14 +19,17 @@ _CHUNK_BYTES = 1 << 23  # compared at once, which limits the memory of the compa
 def check_heaps(path: Path, file: BinaryIO) -> int:
     """Raise DatasetError if the objects of a global heap do not fill it; return the size of the file [bytes].
 
-    HDF5 walks from object to object by their sizes. After a damaged size it can reach zeros, an object of size 0, and
-    never ends (HDF5 2.0, function H5HG__cache_heap_deserialize). The content is read and not mapped into memory: using
+    HDF5 walks from object to object by their sizes. After a damaged size it can reach
+    zeros, an object of size 0, and never ends (HDF5 2.0, function
+    H5HG__cache_heap_deserialize). The content is read and not mapped into memory: using
     a map of a file that is cut off meanwhile would end the process.
     """
     begins, size = _collections(file)
     for begin in begins:
         if not _is_consistent(file, begin, size):
-            raise DatasetError(f"{path} is damaged: its texts at byte {begin} cannot be read")
+            raise DatasetError(
+                f"{path} is damaged: its texts at byte {begin} cannot be read"
+            )
     return size
 
 
@@ -34,14 +39,19 @@ def _collections(file: BinaryIO) -> tuple[list[int], int]:
     buffer = bytearray(min(_CHUNK_BYTES, 8 * (file.seek(0, os.SEEK_END) // 8 + 1)))
     file.seek(0)
     while count := file.readinto(buffer):  # type: ignore[attr-defined]
-        words = np.frombuffer(buffer, "<u8", count // 8)  # collections begin at multiples of 8 bytes
+        words = np.frombuffer(
+            buffer, "<u8", count // 8
+        )  # collections begin at multiples of 8 bytes
         begins += (size + 8 * np.flatnonzero(words == _BEGIN)).tolist()
         size += count
     return begins, size
 
 
 def _is_consistent(file: BinaryIO, begin: int, size: int) -> bool:
-    """Walk through a collection as HDF5 does; object 0 is the free space at the end of the collection."""
+    """Walk through a collection as HDF5 does.
+
+    Object 0 is the free space at the end of the collection.
+    """
     if begin + _HEADER > size:
         return False
     end = begin + int(_unpack(file, begin + 8, "<Q")[0])

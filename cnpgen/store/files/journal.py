@@ -1,8 +1,9 @@
 """An append-only journal: records with checksums, which survive a crash except for an incomplete last record.
 
-The file starts with a line that names its format. Every record has its length (8 bytes, little endian), its sha256 and
-its bytes. A reader stops at the first incomplete or damaged record; the next writer overwrites it. Logs that users read
-are text without checksums, line by line (``append_line``).
+The file starts with a line that names its format. Every record has its length (8 bytes,
+little endian), its sha256 and its bytes. A reader stops at the first incomplete or
+damaged record; the next writer overwrites it. Logs that users read are text without
+checksums, line by line (``append_line``).
 """
 
 import hashlib
@@ -19,7 +20,9 @@ from cnpgen.store.files.file_lock import try_lock
 MAX_RECORD_BYTES = 1 << 30
 _LENGTH_BYTES = 8
 _DIGEST_BYTES = hashlib.sha256().digest_size
-_MODE = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)  # the file is not truncated before it is locked
+_MODE = (
+    os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)
+)  # the file is not truncated before it is locked
 
 
 def append_line(path: Path, line: str) -> None:
@@ -66,8 +69,9 @@ class JournalFile:
 def open_journal_file(path: Path, magic: bytes) -> JournalFile:
     """Open a journal for reading and appending, or create it, and remove an incomplete last record.
 
-    ``magic`` is the first line of the file, with format name and version, in ASCII with its newline. A file that does
-    not start with it raises DatasetError, one that another process has locked UsageError.
+    ``magic`` is the first line of the file, with format name and version, in ASCII with
+    its newline. A file that does not start with it raises DatasetError, one that
+    another process has locked UsageError.
     """
     with machine_errors("write", path):
         file = os.fdopen(os.open(path, _MODE, 0o666), "r+b")
@@ -102,7 +106,9 @@ def _read_records(file: IO[bytes]) -> list[bytes]:
     records, end = [], file.tell()
     header_bytes = _LENGTH_BYTES + _DIGEST_BYTES
     while len(header := file.read(header_bytes)) == header_bytes:
-        record = file.read(min(int.from_bytes(header[:_LENGTH_BYTES], "little"), MAX_RECORD_BYTES))
+        record = file.read(
+            min(int.from_bytes(header[:_LENGTH_BYTES], "little"), MAX_RECORD_BYTES)
+        )
         if hashlib.sha256(record).digest() != header[_LENGTH_BYTES:]:
             break
         records.append(record)

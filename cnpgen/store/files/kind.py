@@ -5,7 +5,9 @@ from pathlib import Path
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
 HDF5 = b"\x89HDF\r\n\x1a\n"
-_CNPGEN_HEADER = re.compile(rb"cnpgen[- ](plans|model|checkpoint|proposals|journal) [0-9]")
+_CNPGEN_HEADER = re.compile(
+    rb"cnpgen[- ](plans|model|checkpoint|proposals|journal) [0-9]"
+)
 _SIGNATURES = {
     HDF5: "an HDF5 file",
     b"PK\x03\x04": "a zip archive, as .npz files are",
@@ -16,7 +18,12 @@ _SIGNATURES = {
 }
 PLANS = "a file of plans"
 _HEAD_BYTES = 256
-_SIGNATURE_OFFSETS = (0, 512, 1024, 2048)  # bytes; the offset is the size of the user block
+_SIGNATURE_OFFSETS = (
+    0,
+    512,
+    1024,
+    2048,
+)  # bytes; the offset is the size of the user block
 
 
 def own_kind(head: bytes) -> str:
@@ -33,7 +40,10 @@ def kind_name(word: str) -> str:
 def is_hdf5(path: Path) -> bool:
     """Return whether a file has the signature of HDF5, possibly after a user block."""
     with path.open("rb") as file:
-        return any(file.seek(offset) == offset and file.read(len(HDF5)) == HDF5 for offset in _SIGNATURE_OFFSETS)
+        return any(
+            file.seek(offset) == offset and file.read(len(HDF5)) == HDF5
+            for offset in _SIGNATURE_OFFSETS
+        )
 
 
 def apparent_kind(path: Path) -> str:
@@ -49,11 +59,17 @@ def kind_of_content(path: Path) -> str:
     """Return the kind of a file from its first bytes, "a zip archive" or "a model of cnpgen"; empty if unknown."""
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
-    known = (kind for signature, kind in _SIGNATURES.items() if head.startswith(signature))
+    known = (
+        kind for signature, kind in _SIGNATURES.items() if head.startswith(signature)
+    )
     return own_kind(head) or next(known, "a text file" if _is_text(head) else "")
 
 
 def _is_text(head: bytes) -> bool:
     """Return whether bytes are printable UTF-8, ignoring an incomplete last character."""
     text = head.decode(errors="replace").rstrip("\ufffd")
-    return bool(text) and "\ufffd" not in text and all(letter.isprintable() or letter.isspace() for letter in text)
+    return (
+        bool(text)
+        and "\ufffd" not in text
+        and all(letter.isprintable() or letter.isspace() for letter in text)
+    )

@@ -1,8 +1,9 @@
 """Temporary files and their removal after the process that wrote them was killed.
 
-The name of a temporary file contains the machine and the process. Several machines with different clocks may use one
-folder, so the age of a file is no criterion. A process removes only files of dead processes on its own machine; all
-others are removed when the dataset is finished.
+The name of a temporary file contains the machine and the process. Several machines with
+different clocks may use one folder, so the age of a file is no criterion. A process
+removes only files of dead processes on its own machine; all others are removed when the
+dataset is finished.
 """
 
 import glob
@@ -17,7 +18,10 @@ from pathlib import Path
 
 
 def temporary_name(name: str) -> str:
-    """Return a unique name of a temporary file for the file ``name``; it contains machine and process."""
+    """Return a unique name of a temporary file for the file ``name``.
+
+    It contains machine and process.
+    """
     return f".{name}.{_machine()}-{os.getpid()}.{uuid.uuid4().hex}.tmp"
 
 
@@ -46,7 +50,9 @@ def _remove(paths: Iterable[Path]) -> None:
 def _temporary(work: Path) -> Iterator[Path]:
     if not work.is_symlink():
         with suppress(OSError):
-            yield from [path for path in work.glob(".*.tmp") if path.name.count(".") > 3]
+            yield from [
+                path for path in work.glob(".*.tmp") if path.name.count(".") > 3
+            ]
 
 
 def _is_dead(path: Path) -> bool:

@@ -1,13 +1,18 @@
 """Size limits of untrusted files, checked before memory is allocated.
 
-The limits of recipes are in ``cnpgen.schema.toml``, those of URDFs in ``cnpgen.robots.urdf``.
+The limits of recipes are in ``cnpgen.schema.toml``, those of URDFs in
+``cnpgen.robots.urdf``.
 """
 
 # HDF5
 MAX_HDF5_BYTES = 1 << 36  # of a file
 MAX_CHECKSUM_FILE_BYTES = 1 << 30  # of a model or a checkpoint, which are read at once
-MAX_EXPANSION = 100  # maximum ratio of the unpacked numbers to the size of the file, ...
-MIN_EXPANSION_LIMIT_BYTES = 1 << 24  # ... unless the unpacked numbers are smaller than this
+MAX_EXPANSION = (
+    100  # maximum ratio of the unpacked numbers to the size of the file, ...
+)
+MIN_EXPANSION_LIMIT_BYTES = (
+    1 << 24
+)  # ... unless the unpacked numbers are smaller than this
 MAX_DIMENSIONS = 4  # of a dataset
 MAX_NAMES = 10_000  # of datasets in a file, or of attributes
 MAX_ATTRIBUTE_BYTES = 1 << 24  # of an attribute; the largest ones are URDFs

@@ -21,7 +21,8 @@ MAX_YAML_DEPTH = 32  # nested mappings and lists
 def read_yaml(path: Path, *, numbers: bool = False) -> list[Any]:
     """Read the documents of a YAML file; scalars stay texts, or with ``numbers`` become float, and plain nulls None.
 
-    Anchors and aliases are refused, so the memory is proportional to the size of the file. Keys stay texts.
+    Anchors and aliases are refused, so the memory is proportional to the size of the
+    file. Keys stay texts.
     """
     with requires_extra("ros", "PyYAML"):
         import yaml
@@ -30,19 +31,27 @@ def read_yaml(path: Path, *, numbers: bool = False) -> list[Any]:
         events = yaml.parse(read_file(path, max_bytes=MAX_YAML_BYTES), Loader=loader)
         return list(_documents(path, yaml, events, numbers))
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
-        raise SceneError(f"{path} is not YAML: {' '.join(str(error).split()):.300}") from error
+        raise SceneError(
+            f"{path} is not YAML: {' '.join(str(error).split()):.300}"
+        ) from error
 
 
 def _documents(path: Path, yaml: Any, events: Any, numbers: bool) -> Iterator[Any]:
     """Build documents from the events of a parser, without recursion."""
-    stack: list[Any] = []  # open mappings and lists, and the keys that wait for their values, each in a tuple
+    stack: list[
+        Any
+    ] = []  # open mappings and lists, and the keys that wait for their values, each in a tuple
     for event in events:
         if getattr(event, "anchor", None) is not None:
-            raise SceneError(f"{path} has the anchor {event.anchor!r:.60}, expected a file without anchors")
+            raise SceneError(
+                f"{path} has the anchor {event.anchor!r:.60}, expected a file without anchors"
+            )
         if isinstance(event, yaml.MappingStartEvent | yaml.SequenceStartEvent):
             stack.append({} if isinstance(event, yaml.MappingStartEvent) else [])
             if sum(isinstance(part, dict | list) for part in stack) > MAX_YAML_DEPTH:
-                raise SceneError(f"{path} is nested too deeply, expected at most {MAX_YAML_DEPTH} levels")
+                raise SceneError(
+                    f"{path} is nested too deeply, expected at most {MAX_YAML_DEPTH} levels"
+                )
             continue
         if isinstance(event, yaml.MappingEndEvent | yaml.SequenceEndEvent):
             value = stack.pop()
@@ -94,7 +103,9 @@ def part(document: Any, key: str, kind: type, where: str) -> Any:
 
 def vector(value: Any, keys: str, where: str) -> Array:
     """Return the numbers of a list, or of a mapping by its keys in order, such as "xyz"; without keys, of any list."""
-    entries = [value.get(key) for key in keys] if isinstance(value, dict) and keys else value
+    entries = (
+        [value.get(key) for key in keys] if isinstance(value, dict) and keys else value
+    )
     if not isinstance(entries, list) or (keys and len(entries) != len(keys)):
         expected = f"{len(keys)} numbers" if keys else "a list of numbers"
         raise SceneError(f"{where} must be {expected}, got {value!r:.60}")

@@ -46,7 +46,9 @@ def test_the_suite_has_two_hundred_problems_of_every_family() -> None:
     assert len(scenes) == 200
     assert set(families) == set(shipped_families())
     assert set(families.values()) == {16, 17}
-    assert len({scene.name.rsplit(" ", 1)[0] for scene in scenes}) == 200  # every problem has a scene of its own
+    assert (
+        len({scene.name.rsplit(" ", 1)[0] for scene in scenes}) == 200
+    )  # every problem has a scene of its own
 
 
 @needs_robots
@@ -58,7 +60,9 @@ def test_few_problems_of_a_family_have_a_clear_straight_line() -> None:
         states = RestingStates(problem, robot, scene.obstacles)
         ends = np.stack([scene.start_q, scene.goal_q[0]], axis=1)
         assert states.are_ends(ends).all(), scene.name
-        straight[scene.name.rsplit(" ", 2)[0]] += states.is_line_clear(scene.start_q, scene.goal_q[0])
+        straight[scene.name.rsplit(" ", 2)[0]] += states.is_line_clear(
+            scene.start_q, scene.goal_q[0]
+        )
     assert max(straight.values()) <= 0.2 * 16
 
 
@@ -68,8 +72,12 @@ def test_suites_of_scene_files_are_boundary_problems(posts: Path) -> None:
     assert prefix is None
     assert len(problems) == 2
     assert len(suite.problems(1)[0]) == 1
-    assert suite.problems(1)[0].problem == problems.problem  # one set of kernels for any number
-    assert problems.boundary.goal_q == pytest.approx(np.concatenate([scene.goal_q for scene in SCENES[:2]]))
+    assert (
+        suite.problems(1)[0].problem == problems.problem
+    )  # one set of kernels for any number
+    assert problems.boundary.goal_q == pytest.approx(
+        np.concatenate([scene.goal_q for scene in SCENES[:2]])
+    )
     posts.write_text(SUITE + '[samples]\nrecipe = "heavy-object"\n')
     with pytest.raises(RecipeError, match="exactly one of"):
         load_suite(posts)
@@ -87,20 +95,30 @@ def test_rrtconnect_avoids_obstacles(posts: Path) -> None:
     pytest.importorskip("ompl")
     pytest.importorskip("toppra")
     problems, _ = load_suite(posts).problems()
-    plan = load_planner("rrtconnect", {"simplify_time": 0.3}).prepare(Setting(problems.problem, time_limit=20.0))
+    plan = load_planner("rrtconnect", {"simplify_time": 0.3}).prepare(
+        Setting(problems.problem, time_limit=20.0)
+    )
     model = cnpgen.RobotModel(problems.problem)
     for index in range(2):
         answer = plan(problems[index])
         assert isinstance(answer, Trajectory)
         assert answer.q[0] == pytest.approx(problems.boundary.start_q[index], abs=1e-6)
         assert answer.q[-1] == pytest.approx(problems.boundary.goal_q[index], abs=1e-6)
-        assert model.min_distance(answer.q, scene=problems.scene[index]).min() > -0.01  # splines cut corners
-        line = np.linspace(problems.boundary.start_q[index], problems.boundary.goal_q[index], 100)
+        assert (
+            model.min_distance(answer.q, scene=problems.scene[index]).min() > -0.01
+        )  # splines cut corners
+        line = np.linspace(
+            problems.boundary.start_q[index], problems.boundary.goal_q[index], 100
+        )
         assert model.min_distance(line, scene=problems.scene[index]).min() < -0.01
 
 
 def test_scenes_of_a_suite_must_be_solvable_by_its_robot(posts: Path) -> None:
-    scene: SceneProblem = replace(SCENES[0], start_q=np.zeros(7), goal_q=np.zeros((1, 7)))
+    scene: SceneProblem = replace(
+        SCENES[0], start_q=np.zeros(7), goal_q=np.zeros((1, 7))
+    )
     save_scenes(posts.parent / "posts.h5", [scene])
-    with pytest.raises(cnpgen.CnpgenError, match="7 joint positions at the start, the robot has 4"):
+    with pytest.raises(
+        cnpgen.CnpgenError, match="7 joint positions at the start, the robot has 4"
+    ):
         load_suite(posts).problems()

@@ -18,21 +18,32 @@ from tests.conftest import some
 
 
 @pytest.mark.parametrize("name", some(["replan", "online"], 1, "slow"))
-def test_a_switch_is_continuous_in_position_velocity_and_acceleration(name: str) -> None:
+def test_a_switch_is_continuous_in_position_velocity_and_acceleration(
+    name: str,
+) -> None:
     suite = load_suite(name)
     problems, prefix = suite.problems()
     assert prefix is not None
     assert len(problems) == 24
-    plans = refine_plans(Planner(suite.model).plan_batch(problems.boundary)[::8], workers=1).plans
+    plans = refine_plans(
+        Planner(suite.model).plan_batch(problems.boundary)[::8], workers=1
+    ).plans
     for plan, index in zip(plans, range(0, 24, 8), strict=True):
         first, until = states_of(prefix[index].motion), float(prefix.until[index])
-        before, after = first(np.array([until])), states_of(plan.motion)(np.array([0.0]))
+        before, after = (
+            first(np.array([until])),
+            states_of(plan.motion)(np.array([0.0])),
+        )
         for one, other in zip(before, after, strict=True):
             assert np.abs(one - other).max() < 1e-9
-        around = joined(prefix[index], states_of(plan.motion))(until + np.array([-1e-7, 1e-7]))
+        around = joined(prefix[index], states_of(plan.motion))(
+            until + np.array([-1e-7, 1e-7])
+        )
         assert np.abs(np.diff(around[0], axis=0)).max() < 1e-6
         early = np.array([0.1])
-        assert np.array_equal(joined(prefix[index], states_of(plan.motion))(early)[0], first(early)[0])
+        assert np.array_equal(
+            joined(prefix[index], states_of(plan.motion))(early)[0], first(early)[0]
+        )
 
 
 @pytest.mark.slow
@@ -41,11 +52,18 @@ def test_only_the_opposite_puck_is_hit() -> None:
     suite = load_suite("online")
     problems, prefix = suite.problems(1)
     assert prefix is not None
-    plan = refine_plans(Planner(suite.model).plan_batch(problems.boundary, columns=problems.columns), workers=1).plans
-    execution = execution_of((problems, answer_to_dict(plan), prefix[0]), PLANTS["nominal"])
+    plan = refine_plans(
+        Planner(suite.model).plan_batch(problems.boundary, columns=problems.columns),
+        workers=1,
+    ).plans
+    execution = execution_of(
+        (problems, answer_to_dict(plan), prefix[0]), PLANTS["nominal"]
+    )
     scene, reference = execution.scene, execution.reference
     assert suite.replanning is not None
-    np.testing.assert_allclose(scene.puck, suite.replanning.pucks.positions()[:, -1], atol=1e-6)
+    np.testing.assert_allclose(
+        scene.puck, suite.replanning.pucks.positions()[:, -1], atol=1e-6
+    )
     assert reference.duration == pytest.approx(0.15 + plan.duration[0])
     assert np.abs(reference.dq[0]).max() < 1e-9  # the first motion begins at rest
     assert execution.executed.success
@@ -53,14 +71,25 @@ def test_only_the_opposite_puck_is_hit() -> None:
 
 
 def test_a_switch_after_the_end_of_the_first_motion_is_refused(tmp_path: Path) -> None:
-    text = list_recipes("suite")["online"].read_text(encoding="utf-8").replace("250 ms", "400 ms")
+    text = (
+        list_recipes("suite")["online"]
+        .read_text(encoding="utf-8")
+        .replace("250 ms", "400 ms")
+    )
     (tmp_path / "late.toml").write_text(text, encoding="utf-8")
-    with pytest.raises(RecipeError, match=r"a first motion ends after 0\.3\d+ s, the switch is at 0\.4 s"):
+    with pytest.raises(
+        RecipeError,
+        match=r"a first motion ends after 0\.3\d+ s, the switch is at 0\.4 s",
+    ):
         load_suite(tmp_path / "late.toml").problems()
 
 
 def test_a_grid_with_a_puck_in_its_center_is_refused(tmp_path: Path) -> None:
-    text = list_recipes("suite")["online"].read_text(encoding="utf-8").replace("rows = 4", "rows = 3")
+    text = (
+        list_recipes("suite")["online"]
+        .read_text(encoding="utf-8")
+        .replace("rows = 4", "rows = 3")
+    )
     (tmp_path / "odd.toml").write_text(text, encoding="utf-8")
     with pytest.raises(RecipeError, match="an even number of pucks"):
         load_suite(tmp_path / "odd.toml")

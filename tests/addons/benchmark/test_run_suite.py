@@ -21,9 +21,23 @@ from cnpgen.addons.benchmark.benchmark_report import (
     success_figure,
     success_over_time,
 )
-from cnpgen.addons.benchmark.process import Ending, PlannerProcess, PlanningOutcome, cpu_time_of
-from cnpgen.addons.benchmark.result_tables import failure_summaries, notes, save_benchmark_tables, table_rows
-from cnpgen.addons.benchmark.results_file import answer_from_dict, answer_to_dict, open_results
+from cnpgen.addons.benchmark.process import (
+    Ending,
+    PlannerProcess,
+    PlanningOutcome,
+    cpu_time_of,
+)
+from cnpgen.addons.benchmark.result_tables import (
+    failure_summaries,
+    notes,
+    save_benchmark_tables,
+    table_rows,
+)
+from cnpgen.addons.benchmark.results_file import (
+    answer_from_dict,
+    answer_to_dict,
+    open_results,
+)
 from cnpgen.addons.benchmark.run_suite import Benchmark, run_benchmark
 from cnpgen.addons.benchmark.suite import load_suite
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
@@ -76,13 +90,26 @@ def unreliable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 
 @pytest.mark.slow
 def test_a_failure_of_a_planner_affects_only_its_own_problem(
-    unreliable: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    unreliable: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr("cnpgen.addons.benchmark.process.STOP_MARGIN_S", 0.5)
-    benchmark = run_benchmark("hits-81", tmp_path / "results", planners=[unreliable], n=13, time_limit=0.2)
+    benchmark = run_benchmark(
+        "hits-81", tmp_path / "results", planners=[unreliable], n=13, time_limit=0.2
+    )
     rows = benchmark.results[unreliable]
     endings = [row["ending"] for row in rows]
-    assert endings[:7] == ["crashed", "planned", "failed", "failed", "no plan", "out of time", "planned"]
+    assert endings[:7] == [
+        "crashed",
+        "planned",
+        "failed",
+        "failed",
+        "no plan",
+        "out of time",
+        "planned",
+    ]
     assert endings[7:] == ["failed", *["planned"] * 5]
     assert capfd.readouterr().out == ""  # output of planners does not mix with results
     assert rows[7]["error"] == "the problem has 6 joints, its answer 3"
@@ -93,7 +120,15 @@ def test_a_failure_of_a_planner_affects_only_its_own_problem(
     ]
     assert "garbage" in rows[2]["error"]
     assert "ZeroDivisionError" in rows[3]["error"]
-    assert [row["answer"] is not None for row in rows[:7]] == [False, True, False, False, False, False, True]
+    assert [row["answer"] is not None for row in rows[:7]] == [
+        False,
+        True,
+        False,
+        False,
+        False,
+        False,
+        True,
+    ]
     assert failure_summaries(benchmark)[-1] == (
         "unreliable: 5 of 7 plans not valid by the verdict: boundary conditions 3, not finite 1, too long 1"
     )
@@ -105,9 +140,12 @@ def test_a_planner_that_cannot_be_prepared_affects_only_its_own_rows(
 ) -> None:
     text = (tmp_path / "unreliable.py").read_text(encoding="utf-8")
     (tmp_path / "unreliable.py").write_text(
-        text.replace("good, others =", f"{failure}\n        good, others ="), encoding="utf-8"
+        text.replace("good, others =", f"{failure}\n        good, others ="),
+        encoding="utf-8",
     )
-    benchmark = run_benchmark("hits-81", tmp_path / "results", planners=[unreliable, "cnpgen"], n=2)
+    benchmark = run_benchmark(
+        "hits-81", tmp_path / "results", planners=[unreliable, "cnpgen"], n=2
+    )
     assert [row["ending"] for row in benchmark.results[unreliable]] == ["crashed"] * 2
     assert [row["ending"] for row in benchmark.results["cnpgen"]] == ["planned"] * 2
     messages = {
@@ -122,14 +160,27 @@ def test_a_planner_that_cannot_be_prepared_affects_only_its_own_rows(
 @pytest.mark.slow
 def test_a_report_omits_the_image_of_a_damaged_line(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
-    run_benchmark("hits-81", tmp_path, planners=["cnpgen"], n=1, plants=["nominal"], workers=1)
+    run_benchmark(
+        "hits-81", tmp_path, planners=["cnpgen"], n=1, plants=["nominal"], workers=1
+    )
     file = tmp_path / "cnpgen.jsonl"
     head, planned, *others = map(json.loads, file.read_text().splitlines())
-    planned["answer"]["path_control_points"] = [row[:3] for row in planned["answer"]["path_control_points"]]
+    planned["answer"]["path_control_points"] = [
+        row[:3] for row in planned["answer"]["path_control_points"]
+    ]
     file.write_text("".join(json.dumps(row) + "\n" for row in (head, planned, *others)))
-    benchmark = run_benchmark("hits-81", tmp_path, planners=["cnpgen"], n=1, plants=["nominal", "heavier"], workers=1)
+    benchmark = run_benchmark(
+        "hits-81",
+        tmp_path,
+        planners=["cnpgen"],
+        n=1,
+        plants=["nominal", "heavier"],
+        workers=1,
+    )
     failure = benchmark.results["cnpgen"][0]["executed"]["heavier"]["failure"]
-    assert failure.startswith("path_control_points has 3 joints, but 'airhockey' plans 6")
+    assert failure.startswith(
+        "path_control_points has 3 joints, but 'airhockey' plans 6"
+    )
     report = save_benchmark_report(benchmark, tmp_path / "report.html").read_text()
     assert "cnpgen, problem 0: no image: path_control_points has 3 joints" in report
     assert "1 of 1 (20.7 to 100 %)" in report
@@ -137,7 +188,9 @@ def test_a_report_omits_the_image_of_a_damaged_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_report_uses_the_next_answer_if_the_first_cannot_be_executed(tmp_path: Path) -> None:
+def test_a_report_uses_the_next_answer_if_the_first_cannot_be_executed(
+    tmp_path: Path,
+) -> None:
     pytest.importorskip("mujoco")
     first = run_benchmark("hits-81", tmp_path, planners=["cnpgen"], n=2)
     file = tmp_path / "cnpgen.jsonl"
@@ -145,14 +198,21 @@ def test_a_report_uses_the_next_answer_if_the_first_cannot_be_executed(tmp_path:
     broken = first.results["cnpgen"][0]
     broken["answer"]["rate_control_points"][0] = None
     file.write_text("\n".join([lines[0], json.dumps(broken), *lines[2:]]) + "\n")
-    benchmark = run_benchmark("hits-81", tmp_path, planners=["cnpgen"], n=2, plants=["nominal"], workers=1)
-    assert "cannot be executed" in benchmark.results["cnpgen"][0]["executed"]["nominal"]["failure"]
+    benchmark = run_benchmark(
+        "hits-81", tmp_path, planners=["cnpgen"], n=2, plants=["nominal"], workers=1
+    )
+    assert (
+        "cannot be executed"
+        in benchmark.results["cnpgen"][0]["executed"]["nominal"]["failure"]
+    )
     report = save_benchmark_report(benchmark, tmp_path / "report.html").read_text()
     assert "cnpgen, problem 1" in report or "No images" in report
 
 
 @pytest.mark.slow
-def test_a_run_resumes_and_adds_executions_and_problems(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_resumes_and_adds_executions_and_problems(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("mujoco")
     first = run_benchmark("hits-81", tmp_path, planners=["cnpgen"], n=2)
     file = tmp_path / "cnpgen.jsonl"
@@ -170,29 +230,56 @@ def test_a_run_resumes_and_adds_executions_and_problems(tmp_path: Path, monkeypa
     )
     assert activities == ["cnpgen plans", *["cnpgen, nominal plant"] * 3]
     assert file.read_text().startswith(text)
-    assert second.results["cnpgen"][0]["planning_s"] == first.results["cnpgen"][0]["planning_s"]
+    assert (
+        second.results["cnpgen"][0]["planning_s"]
+        == first.results["cnpgen"][0]["planning_s"]
+    )
     assert all(row["executed"]["nominal"]["scored"] for row in second.results["cnpgen"])
-    third = run_benchmark("hits-81", tmp_path, planners=["cnpgen"], n=3, plants=["nominal"], workers=1)
+    third = run_benchmark(
+        "hits-81", tmp_path, planners=["cnpgen"], n=3, plants=["nominal"], workers=1
+    )
     assert third.results == second.results
     monkeypatch.setattr("cnpgen.addons.benchmark.benchmark_report.MAX_FILM_FRAMES", 3)
-    report = save_benchmark_report(third, tmp_path / "report.html", video=True).read_text()
+    report = save_benchmark_report(
+        third, tmp_path / "report.html", video=True
+    ).read_text()
     assert ": 100 %, planning time" in report
     assert "<svg" in report
-    assert "src='data:video/mp4;base64," in report or "No images: this machine cannot draw" in report
+    assert (
+        "src='data:video/mp4;base64," in report
+        or "No images: this machine cannot draw" in report
+    )
     assert not re.search("(src|href)=['\"](?!data:|#)", report)
-    assert [file.name for file in sorted(tmp_path.iterdir())] == ["cnpgen.jsonl", "report.html", "runs.json"]
+    assert [file.name for file in sorted(tmp_path.iterdir())] == [
+        "cnpgen.jsonl",
+        "report.html",
+        "runs.json",
+    ]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "engine", ["loky", *(pytest.param(name, marks=pytest.mark.extended) for name in ("dask", "ray"))]
+    "engine",
+    [
+        "loky",
+        *(pytest.param(name, marks=pytest.mark.extended) for name in ("dask", "ray")),
+    ],
 )
 @pytest.mark.filterwarnings("default")  # of dask and ray
-def test_parallel_planners_return_the_results_of_one(tmp_path: Path, engine: str) -> None:
+def test_parallel_planners_return_the_results_of_one(
+    tmp_path: Path, engine: str
+) -> None:
     pytest.importorskip({"loky": "joblib", "dask": "distributed"}.get(engine, engine))
-    (serial,) = run_benchmark("hits-81", tmp_path / "serial", planners=["cnpgen"], n=3).results.values()
+    (serial,) = run_benchmark(
+        "hits-81", tmp_path / "serial", planners=["cnpgen"], n=3
+    ).results.values()
     (parallel,) = run_benchmark(
-        "hits-81", tmp_path / "parallel", planners=["cnpgen"], n=3, engine=engine, workers=2
+        "hits-81",
+        tmp_path / "parallel",
+        planners=["cnpgen"],
+        n=3,
+        engine=engine,
+        workers=2,
     ).results.values()
     assert [row["planners_at_once"] for row in parallel] == [2] * 3
     for key in ("problem", "answer", "verdict"):
@@ -205,10 +292,20 @@ def test_results_of_another_run_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="holds results of another run"):
         run_benchmark("hits-110", tmp_path, planners=["cnpgen"], n=1)
     run_benchmark("hits-110", tmp_path, planners=["cnpgen"], n=1, force=True)
-    assert json.loads((tmp_path / "cnpgen.jsonl").read_text().splitlines()[0])["suite"] == "hits-110"
+    assert (
+        json.loads((tmp_path / "cnpgen.jsonl").read_text().splitlines()[0])["suite"]
+        == "hits-110"
+    )
 
 
-PLANNED = {"problem": 0, "ending": "planned", "planning_s": 1.0, "planning_cpu_s": 1.0, "error": "", "answer": None}
+PLANNED = {
+    "problem": 0,
+    "ending": "planned",
+    "planning_s": 1.0,
+    "planning_cpu_s": 1.0,
+    "error": "",
+    "answer": None,
+}
 ANSWER = {"degree": 7, "path_control_points": [[0.0]], "rate_control_points": [1.0]}
 
 
@@ -220,21 +317,39 @@ ANSWER = {"degree": 7, "path_control_points": [[0.0]], "rate_control_points": [1
         ({"problem": "0"}, "problem must be a whole number"),
         ({"problem": 0, "ending": "planned"}, "planning_s is missing"),
         ({**PLANNED, "planning_s": "x"}, "planning_s must be a finite number, got 'x'"),
-        ({**PLANNED, "planning_s": "inf"}, "planning_s must be a finite number, got 'inf'"),
-        ({**PLANNED, "planning_cpu_s": 1e999}, "planning_cpu_s must be a finite number, got inf"),
+        (
+            {**PLANNED, "planning_s": "inf"},
+            "planning_s must be a finite number, got 'inf'",
+        ),
+        (
+            {**PLANNED, "planning_cpu_s": 1e999},
+            "planning_cpu_s must be a finite number, got inf",
+        ),
         ({**PLANNED, "answer": {"t": [0.0]}}, "q is missing"),
-        ({**PLANNED, "answer": {**ANSWER, "rate_control_points": "x"}}, "rate_control_points must be a list, got 'x'"),
+        (
+            {**PLANNED, "answer": {**ANSWER, "rate_control_points": "x"}},
+            "rate_control_points must be a list, got 'x'",
+        ),
         ({**PLANNED, "answer": ANSWER}, "verdict is missing"),
         ({"problem": 0, "executed": 5}, "executed must be a table, got 5"),
-        ({"problem": 0, "executed": {"nominal": {"puck_speed_m_s": "x"}}}, "puck_speed_m_s must be a finite number"),
-        ({"problem": 0, "executed": {"nominal": {"hit_time_s": "nan"}}}, "hit_time_s must be a finite number"),
+        (
+            {"problem": 0, "executed": {"nominal": {"puck_speed_m_s": "x"}}},
+            "puck_speed_m_s must be a finite number",
+        ),
+        (
+            {"problem": 0, "executed": {"nominal": {"hit_time_s": "nan"}}},
+            "hit_time_s must be a finite number",
+        ),
     ],
 )
 def test_an_invalid_line_is_named(tmp_path: Path, row: Any, text: str) -> None:
     open_results(tmp_path / "a.jsonl", {})
     with (tmp_path / "a.jsonl").open("a") as file:
         file.write(json.dumps(row) + "\n")
-    with pytest.raises(DatasetError, match=rf"a.jsonl is damaged: line 2: {re.escape(text)}.*; delete that line"):
+    with pytest.raises(
+        DatasetError,
+        match=rf"a.jsonl is damaged: line 2: {re.escape(text)}.*; delete that line",
+    ):
         open_results(tmp_path / "a.jsonl", {})
 
 
@@ -244,16 +359,21 @@ def test_deeply_nested_lines_are_ignored_and_a_pipe_is_refused(tmp_path: Path) -
         file.write("[" * 100_000 + "\n")
     assert open_results(tmp_path / "a.jsonl", {}).rows == {}
     os.mkfifo(tmp_path / "b.jsonl")
-    with pytest.raises(UsageError, match="is a device or a pipe, expected the results of a planner"):
+    with pytest.raises(
+        UsageError, match="is a device or a pipe, expected the results of a planner"
+    ):
         open_results(tmp_path / "b.jsonl", {})
 
 
 def test_mistakes_are_reported_before_any_work(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"unknown planner 'cnpgn'.*did you mean 'cnpgen'"):
+    with pytest.raises(
+        UsageError, match=r"unknown planner 'cnpgn'.*did you mean 'cnpgen'"
+    ):
         run_benchmark("hits-81", tmp_path, planners=["cnpgn"])
     for old, new in {"cnp-b": "cnpgen", "cnp-b+refine": "cnpgen+refine"}.items():
         with pytest.raises(
-            UsageError, match=rf"unknown planner '{re.escape(old)}' \(its name is now '{re.escape(new)}'\)"
+            UsageError,
+            match=rf"unknown planner '{re.escape(old)}' \(its name is now '{re.escape(new)}'\)",
         ):
             run_benchmark("hits-81", tmp_path, planners=[old])
     with pytest.raises(UsageError, match="unknown plant"):
@@ -262,7 +382,9 @@ def test_mistakes_are_reported_before_any_work(tmp_path: Path) -> None:
         run_benchmark("hits-81", tmp_path, planners=["cnpgen"], time_limit=0)
     for tolerance in (-1e-3, float("inf"), True):
         with pytest.raises(UsageError, match="plane_tolerance must"):
-            run_benchmark("hits-81", tmp_path, planners=["cnpgen"], plane_tolerance=tolerance)
+            run_benchmark(
+                "hits-81", tmp_path, planners=["cnpgen"], plane_tolerance=tolerance
+            )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -282,10 +404,19 @@ def test_an_unsuitable_planner_is_reported_as_not_applicable(tmp_path: Path) -> 
 
 def test_answers_are_read_back_exactly(tmp_path: Path) -> None:
     problem = load_suite("hits-81").problems(1)[0]
-    trajectory = Trajectory(np.array([0.0, 1 / 3]), problem.boundary.start_q[[0, 0]] / 3)
+    trajectory = Trajectory(
+        np.array([0.0, 1 / 3]), problem.boundary.start_q[[0, 0]] / 3
+    )
     results = open_results(tmp_path / "a.jsonl", {})
-    verdict = {"valid": False, "paper": {"valid": False, "finished": False}, "metrics": {}, "value_over_bound": {}}
-    results.append({**PLANNED, "answer": answer_to_dict(trajectory), "verdict": verdict})
+    verdict = {
+        "valid": False,
+        "paper": {"valid": False, "finished": False},
+        "metrics": {},
+        "value_over_bound": {},
+    }
+    results.append(
+        {**PLANNED, "answer": answer_to_dict(trajectory), "verdict": verdict}
+    )
     reread = open_results(tmp_path / "a.jsonl", {})
     read = answer_from_dict(problem, reread.rows[0]["answer"])
     assert isinstance(read, Trajectory)
@@ -318,7 +449,9 @@ class Random(BenchmarkPlanner):
 """
 
 
-def drawn(folder: Path, name: str, indices: slice = slice(None), **options: Any) -> list[Any]:
+def drawn(
+    folder: Path, name: str, indices: slice = slice(None), **options: Any
+) -> list[Any]:
     rows = run_benchmark("hits-81", folder, planners=[name], **options).results[name]
     return [row["answer"]["q"] for row in rows[indices]]
 
@@ -348,48 +481,89 @@ def test_earlier_answers_are_discarded_on_request(random: str, tmp_path: Path) -
     head, *lines = file.read_text().splitlines()
     changed = {**json.loads(lines[0]), "planning_s": 77.0}
     file.write_text("\n".join([head, json.dumps(changed), *lines[1:]]) + "\n")
-    kept = run_benchmark("hits-81", tmp_path / "results", planners=[random], n=1).results[random]
+    kept = run_benchmark(
+        "hits-81", tmp_path / "results", planners=[random], n=1
+    ).results[random]
     assert [row["planning_s"] == 77.0 for row in kept] == [True, False, False]
-    again = run_benchmark("hits-81", tmp_path / "results", planners=[random], n=1, replan=True).results[random]
+    again = run_benchmark(
+        "hits-81", tmp_path / "results", planners=[random], n=1, replan=True
+    ).results[random]
     assert len(again) == 1
     assert again[0]["planning_s"] < 77.0
 
 
-def test_fields_of_planners_in_a_suite_are_those_of_its_runs_unless_the_command_sets_others(tmp_path: Path) -> None:
-    suite, text = tmp_path / "hits-81.toml", list_recipes("suite")["hits-81"].read_text(encoding="utf-8")
-    suite.write_text(f'{text}[planners.aqp]\nacceleration = "300 cm/s^2"\nanchor_time = "700 ms"\n', encoding="utf-8")
+def test_fields_of_planners_in_a_suite_are_those_of_its_runs_unless_the_command_sets_others(
+    tmp_path: Path,
+) -> None:
+    suite, text = (
+        tmp_path / "hits-81.toml",
+        list_recipes("suite")["hits-81"].read_text(encoding="utf-8"),
+    )
+    suite.write_text(
+        f'{text}[planners.aqp]\nacceleration = "300 cm/s^2"\nanchor_time = "700 ms"\n',
+        encoding="utf-8",
+    )
     parameters = {"aqp": {"anchor_time": 0.6}}
     run_benchmark(suite, tmp_path / "out", planners=["aqp"], parameters=parameters, n=1)
     head = json.loads((tmp_path / "out" / "aqp.jsonl").read_text().splitlines()[0])
     assert head["parameters"] == {"acceleration": 3.0, "anchor_time": 0.6}
-    suite.write_text(text, encoding="utf-8")  # the problems are the same, so other planners extend the results
-    assert list(run_benchmark(suite, tmp_path / "out", planners=["ruckig"], n=1).results) == ["ruckig", "aqp"]
+    suite.write_text(
+        text, encoding="utf-8"
+    )  # the problems are the same, so other planners extend the results
+    assert list(
+        run_benchmark(suite, tmp_path / "out", planners=["ruckig"], n=1).results
+    ) == ["ruckig", "aqp"]
 
 
 def test_other_parameters_of_a_planner_are_another_run(tmp_path: Path) -> None:
-    few = run_benchmark("hits-81", tmp_path, planners=["trajopt"], n=1, parameters={"trajopt": {"iterations": 3}})
+    few = run_benchmark(
+        "hits-81",
+        tmp_path,
+        planners=["trajopt"],
+        n=1,
+        parameters={"trajopt": {"iterations": 3}},
+    )
     head = json.loads((tmp_path / "trajopt.jsonl").read_text().splitlines()[0])
     assert head["parameters"] == {"iterations": 3}
     with pytest.raises(UsageError, match=r"another run \(other parameters\)"):
         run_benchmark("hits-81", tmp_path, planners=["trajopt"], n=1)
     more = run_benchmark(
-        "hits-81", tmp_path, planners=["trajopt"], n=1, parameters={"trajopt": {"iterations": 6}}, force=True
+        "hits-81",
+        tmp_path,
+        planners=["trajopt"],
+        n=1,
+        parameters={"trajopt": {"iterations": 6}},
+        force=True,
     )
     assert more.results["trajopt"][0]["answer"] != few.results["trajopt"][0]["answer"]
     with pytest.raises(UsageError, match="trajopt: iterations: 0 is too small"):
-        run_benchmark("hits-81", tmp_path, planners=["trajopt"], n=1, parameters={"trajopt": {"iterations": 0}})
-    with pytest.raises(UsageError, match="parameters must be of planners of this run, got those of aqp"):
-        run_benchmark("hits-81", tmp_path, planners=["trajopt"], n=1, parameters={"aqp": {}})
+        run_benchmark(
+            "hits-81",
+            tmp_path,
+            planners=["trajopt"],
+            n=1,
+            parameters={"trajopt": {"iterations": 0}},
+        )
+    with pytest.raises(
+        UsageError, match="parameters must be of planners of this run, got those of aqp"
+    ):
+        run_benchmark(
+            "hits-81", tmp_path, planners=["trajopt"], n=1, parameters={"aqp": {}}
+        )
 
 
 def test_children_of_a_planner_end_with_its_time_limit(
     random: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     module, touched = tmp_path / "random_planner.py", tmp_path / "touched"
-    module.write_text(module.read_text().replace('default=""', f"default={str(touched)!r}"))
+    module.write_text(
+        module.read_text().replace('default=""', f"default={str(touched)!r}")
+    )
     monkeypatch.setattr("cnpgen.addons.benchmark.process.STOP_MARGIN_S", 0.2)
     start = time.monotonic()
-    (row,) = run_benchmark("hits-81", tmp_path / "results", planners=[random], n=1, time_limit=0.5).results[random]
+    (row,) = run_benchmark(
+        "hits-81", tmp_path / "results", planners=[random], n=1, time_limit=0.5
+    ).results[random]
     assert row["ending"] == "out of time"
     assert time.monotonic() - start < 60
     time.sleep(3.5)
@@ -397,7 +571,9 @@ def test_children_of_a_planner_end_with_its_time_limit(
 
 
 def test_an_answer_after_the_time_limit_does_not_count() -> None:
-    process = PlannerProcess("cnpgen", Setting(load_suite("hits-81").problems(1)[0].problem, time_limit=1.0))
+    process = PlannerProcess(
+        "cnpgen", Setting(load_suite("hits-81").problems(1)[0].problem, time_limit=1.0)
+    )
     late = PlanningOutcome(Ending.PLANNED, {"t": []}, seconds=1.001)
     assert process._in_time(late).ending == "out of time"
     assert process._in_time(late).answer is None
@@ -410,20 +586,31 @@ def test_a_stopped_planner_has_the_cpu_time_that_it_used(
 ) -> None:
     monkeypatch.setattr("cnpgen.addons.benchmark.process.STOP_MARGIN_S", 0.2)
     module = tmp_path / "unreliable.py"
-    module.write_text(module.read_text().replace("time.sleep(1000)", "sum(1 for _ in iter(int, 1))"))
+    module.write_text(
+        module.read_text().replace("time.sleep(1000)", "sum(1 for _ in iter(int, 1))")
+    )
     problems, _ = load_suite("hits-81").problems(6)
-    process = PlannerProcess(unreliable, Setting(problems.problem, "airhockey-hit", time_limit=2.0))
+    process = PlannerProcess(
+        unreliable, Setting(problems.problem, "airhockey-hit", time_limit=2.0)
+    )
     outcome = process.plan(problems[5])
     assert outcome.ending is Ending.OUT_OF_TIME
     assert 0 < outcome.cpu_seconds < 1.1 * outcome.seconds
     assert cpu_time_of(os.getpid()) >= time.process_time()
 
 
-def test_a_report_covers_the_folder_and_nothing_else(random: str, tmp_path: Path) -> None:
+def test_a_report_covers_the_folder_and_nothing_else(
+    random: str, tmp_path: Path
+) -> None:
     folder = tmp_path / "results"
     run_benchmark("hits-81", folder, planners=["cnpgen"], n=3)
-    benchmark = run_benchmark("hits-81", folder, planners=[random], n=2, reference="cnpgen")
-    assert {name: len(rows) for name, rows in benchmark.results.items()} == {random: 2, "cnpgen": 3}
+    benchmark = run_benchmark(
+        "hits-81", folder, planners=[random], n=2, reference="cnpgen"
+    )
+    assert {name: len(rows) for name, rows in benchmark.results.items()} == {
+        random: 2,
+        "cnpgen": 3,
+    }
     assert len(benchmark.problems) == 3
     assert [run.planners for run in benchmark.runs] == [("cnpgen",), (random,)]
     save_benchmark_tables(benchmark, folder)
@@ -432,18 +619,30 @@ def test_a_report_covers_the_folder_and_nothing_else(random: str, tmp_path: Path
     assert [(row["planner"], row["problem"]) for row in csv_rows] == [
         (random, "0"), (random, "1"), ("cnpgen", "0"), ("cnpgen", "1"), ("cnpgen", "2"),
     ]  # fmt: skip
-    assert float(csv_rows[2]["planning_ms"]) == 1e3 * benchmark.results["cnpgen"][0]["planning_s"]
+    assert (
+        float(csv_rows[2]["planning_ms"])
+        == 1e3 * benchmark.results["cnpgen"][0]["planning_s"]
+    )
     for name in ("results.csv", "tables.md", "tables.tex"):
         text = (folder / name).read_text()
-        for needed in (benchmark.runs[-1].date, benchmark.runs[-1].processor, "seed 0", "numpy"):
+        for needed in (
+            benchmark.runs[-1].date,
+            benchmark.runs[-1].processor,
+            "seed 0",
+            "numpy",
+        ):
             assert needed in text, (name, needed)
     assert "| planned | random | cnpgen |" in (folder / "tables.md").read_text()
     latex = (folder / "tables.tex").read_text()
     assert r"planned & random & cnpgen \\" in latex
     assert re.search(r"(?<!\\)%", re.sub(r"^%.*$", "", latex, flags=re.M)) is None
-    with pytest.raises(UsageError, match="reference must be one of cnpgen, random, got 'solve'"):
+    with pytest.raises(
+        UsageError, match="reference must be one of cnpgen, random, got 'solve'"
+    ):
         run_benchmark("hits-81", folder, planners=[random], n=1, reference="solve")
-    (folder / "other.jsonl").write_text('{"format": "cnpgen-benchmark", "suite": "heavy-100"}\n')
+    (folder / "other.jsonl").write_text(
+        '{"format": "cnpgen-benchmark", "suite": "heavy-100"}\n'
+    )
     with pytest.raises(UsageError, match=r"other.jsonl holds results of another run"):
         run_benchmark("hits-81", folder, planners=[random], n=1)
     run_benchmark("hits-81", folder, planners=[random], n=1, force=True)
@@ -453,7 +652,9 @@ def test_a_report_covers_the_folder_and_nothing_else(random: str, tmp_path: Path
     assert (folder / "notes.jsonl").read_text() == '{"mine": 1}\n'
 
 
-def test_figures_have_success_over_planning_time_and_suitable_axes(random: str, tmp_path: Path) -> None:
+def test_figures_have_success_over_planning_time_and_suitable_axes(
+    random: str, tmp_path: Path
+) -> None:
     benchmark = run_benchmark("hits-81", tmp_path, planners=["cnpgen", random], n=3)
     for row, seconds in zip(benchmark.results["cnpgen"], (0.3, 0.1, 0.2), strict=True):
         row["planning_cpu_s"] = seconds
@@ -464,12 +665,20 @@ def test_figures_have_success_over_planning_time_and_suitable_axes(random: str, 
     np.testing.assert_allclose(ratios, [1 / 3, 2 / 3])
     axes = success_figure(values, "").axes[0]
     assert axes.get_xscale() == "log"
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["cnpgen (67 %)", "random (0 %)"]
-    scales = {axes.get_title(): axes.get_yscale() for axes in distribution_figure(values).axes}
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == [
+        "cnpgen (67 %)",
+        "random (0 %)",
+    ]
+    scales = {
+        axes.get_title(): axes.get_yscale() for axes in distribution_figure(values).axes
+    }
     assert scales["planning time, CPU [ms]"] == "log"
     assert scales["motion time [s]"] == "linear"
     paths = save_benchmark_figures(benchmark, tmp_path / "new" / "figures")
-    assert [path.name for path in paths] == ["success-planned.pdf", "distributions-planned.pdf"]
+    assert [path.name for path in paths] == [
+        "success-planned.pdf",
+        "distributions-planned.pdf",
+    ]
     assert all(path.read_bytes().startswith(b"%PDF") for path in paths)
 
 
@@ -481,7 +690,11 @@ def test_a_damaged_record_of_runs_is_named(tmp_path: Path) -> None:
 
 def test_tables_name_the_planners_whose_inner_loops_are_in_python() -> None:
     suite = load_suite("hits-81")
-    benchmark = Benchmark(suite, suite.problems(1)[0], None, {"aqp": [], "cnpgen": [], "cbirrt": []})
+    benchmark = Benchmark(
+        suite, suite.problems(1)[0], None, {"aqp": [], "cnpgen": [], "cbirrt": []}
+    )
     (note,) = (note for note in notes(benchmark) if "Python" in note and "C++" in note)
     assert note.startswith("aqp, cbirrt: inner loops in Python")
-    assert not any("C++" in note for note in notes(replace(benchmark, results={"cnpgen": []})))
+    assert not any(
+        "C++" in note for note in notes(replace(benchmark, results={"cnpgen": []}))
+    )

@@ -22,16 +22,26 @@ def test_hits_81_has_every_puck_of_the_grid_with_a_hit_towards_the_goal() -> Non
     problems, puck = suite.problems()[0], suite.pucks.positions().T
     assert len(problems) == 81
     assert {tuple(row) for row in puck.round(9).tolist()} == {
-        (round(x, 9), round(y, 9)) for x in np.linspace(0.8, 1.2, 9) for y in np.linspace(-0.4, 0.4, 9)
+        (round(x, 9), round(y, 9))
+        for x in np.linspace(0.8, 1.2, 9)
+        for y in np.linspace(-0.4, 0.4, 9)
     }
     tip, direction = problems.columns["goal_xyz"], np.array([2.478, 0.0]) - puck
-    np.testing.assert_allclose(np.linalg.norm(puck - tip[:, :2], axis=1), 0.07, atol=1e-12)
-    across = (puck - tip[:, :2])[:, 0] * direction[:, 1] - (puck - tip[:, :2])[:, 1] * direction[:, 0]
+    np.testing.assert_allclose(
+        np.linalg.norm(puck - tip[:, :2], axis=1), 0.07, atol=1e-12
+    )
+    across = (puck - tip[:, :2])[:, 0] * direction[:, 1] - (puck - tip[:, :2])[
+        :, 1
+    ] * direction[:, 0]
     assert np.abs(across).max() < 1e-12
-    np.testing.assert_allclose(problems.problem.tip_positions(problems.boundary.goal_q), tip, atol=1e-8)
+    np.testing.assert_allclose(
+        problems.problem.tip_positions(problems.boundary.goal_q), tip, atol=1e-8
+    )
     assert np.all(problems.boundary.start_q == robot.home)
     assert not problems.boundary.start_dq.any()
-    assert np.abs(problems.boundary.goal_dq).max() <= robot.velocity_limit.max() * (1 + 1e-12)
+    assert np.abs(problems.boundary.goal_dq).max() <= robot.velocity_limit.max() * (
+        1 + 1e-12
+    )
     assert np.isnan(problems.path_control_points).all()
 
 
@@ -39,7 +49,9 @@ def test_a_suite_of_samples_is_reproducible_for_every_number_of_problems() -> No
     suite = load_suite("heavy-100")
     few, more = suite.problems(2)[0], suite.problems(3)[0]
     assert np.array_equal(few.boundary.goal_q, more.boundary.goal_q[:2])
-    assert len(load_suite("airhockey-replan").problems(4)[0]) == 4  # a dataset is a suite of its samples
+    assert (
+        len(load_suite("airhockey-replan").problems(4)[0]) == 4
+    )  # a dataset is a suite of its samples
 
 
 SAMPLES = 'name = "a"\nversion = "1.0.0"\n[samples]\nrecipe = "heavy-object"\n'
@@ -65,15 +77,21 @@ def test_recipe_errors_in_a_suite_are_named(text: str, tmp_path: Path) -> None:
 
 def test_a_suite_has_pucks_or_samples_and_not_both(tmp_path: Path) -> None:
     text = list_recipes("suite")["hits-81"].read_text(encoding="utf-8")
-    (tmp_path / "both.toml").write_text(text + '\n[samples]\nrecipe = "heavy-object"\n', encoding="utf-8")
+    (tmp_path / "both.toml").write_text(
+        text + '\n[samples]\nrecipe = "heavy-object"\n', encoding="utf-8"
+    )
     with pytest.raises(RecipeError, match="expected exactly one"):
         load_suite(tmp_path / "both.toml")
 
 
 def test_a_grid_without_end_is_refused_before_it_is_made(tmp_path: Path) -> None:
     text = list_recipes("suite")["hits-81"].read_text(encoding="utf-8")
-    (tmp_path / "large.toml").write_text(text.replace("= 9", "= 9000000000"), encoding="utf-8")
-    with pytest.raises(RecipeError, match="a grid of 81,000,000,000,000,000,000 pucks is too large"):
+    (tmp_path / "large.toml").write_text(
+        text.replace("= 9", "= 9000000000"), encoding="utf-8"
+    )
+    with pytest.raises(
+        RecipeError, match="a grid of 81,000,000,000,000,000,000 pucks is too large"
+    ):
         load_suite(tmp_path / "large.toml")
 
 
@@ -81,7 +99,10 @@ def test_too_many_problems_are_refused_before_sampling(tmp_path: Path) -> None:
     replanning = list_recipes("suite")["replan"].read_text(encoding="utf-8")
     sampled = list_recipes("suite")["heavy-100"].read_text(encoding="utf-8")
     for text, message in (
-        (sampled.replace("n = 100", f"n = {10**15}"), "is too large, expected at most 100000"),
+        (
+            sampled.replace("n = 100", f"n = {10**15}"),
+            "is too large, expected at most 100000",
+        ),
         (
             replanning.replace('["350 ms"]', str([0.1] * 500)),
             "switch_times: 12,000 switches are too many, expected at most 10,000",
@@ -94,7 +115,9 @@ def test_too_many_problems_are_refused_before_sampling(tmp_path: Path) -> None:
 
 def test_pucks_need_a_table(tmp_path: Path) -> None:
     text = list_recipes("suite")["hits-81"].read_text(encoding="utf-8")
-    (tmp_path / "heavy.toml").write_text(text.replace('"airhockey"', '"heavy-object"'), encoding="utf-8")
+    (tmp_path / "heavy.toml").write_text(
+        text.replace('"airhockey"', '"heavy-object"'), encoding="utf-8"
+    )
     with pytest.raises(RecipeError, match="no table to put pucks on"):
         load_suite(tmp_path / "heavy.toml").problems()
 
@@ -109,6 +132,9 @@ def test_replans_200_has_distinct_problems_from_moving_states() -> None:
     problems, prefix = load_suite("replans-200").problems()
     assert prefix is not None
     assert len(problems) == 200
-    assert len({tuple(row) for row in problems.columns["goal_xyz"].round(6).tolist()}) == 200
+    assert (
+        len({tuple(row) for row in problems.columns["goal_xyz"].round(6).tolist()})
+        == 200
+    )
     assert np.all(np.abs(problems.boundary.start_dq).max(axis=1) > 0.1)
     assert np.all(prefix.until == 0.25)

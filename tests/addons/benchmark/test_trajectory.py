@@ -20,7 +20,10 @@ T = np.linspace(0, 1, 5)
 def stored(label: str) -> Plans:
     plan = load(label)
     return make_plans(
-        plan.problem, plan.boundary, path_control_points=plan.motion.path, rate_control_points=plan.motion.rate
+        plan.problem,
+        plan.boundary,
+        path_control_points=plan.motion.path,
+        rate_control_points=plan.motion.rate,
     )
 
 
@@ -32,7 +35,10 @@ def sampled(plan: Plans, count: int) -> Trajectory:
 
 @pytest.mark.parametrize("degree", [1, 3, 5])
 def test_interpolation_reproduces_polynomials(degree: int) -> None:
-    expected = [np.polynomial.Polynomial(np.arange(1.0, degree + 2)).deriv(order) for order in range(3)]
+    expected = [
+        np.polynomial.Polynomial(np.arange(1.0, degree + 2)).deriv(order)
+        for order in range(3)
+    ]
     parts = [part(T)[:, None] for part in expected][: (degree + 1) // 2]
     times = np.linspace(0, 1, 37)
     for values, part in zip(Trajectory(T, *parts).states(times), expected, strict=True):
@@ -57,14 +63,19 @@ def test_invalid_samples_are_refused() -> None:
 @pytest.mark.parametrize("label", ["hit", "transport"])
 def test_a_plan_and_its_samples_have_the_same_verdict(label: str) -> None:
     plan = stored(label)
-    of_plan, of_samples = judge_answer(plan, plan), judge_answer(plan, sampled(plan, 400))
+    of_plan, of_samples = (
+        judge_answer(plan, plan),
+        judge_answer(plan, sampled(plan, 400)),
+    )
     assert of_plan.valid
     assert of_samples.valid, str(of_samples)
     assert of_plan.paper == of_samples.paper
     assert of_samples.metrics.duration == pytest.approx(of_plan.metrics.duration)
     assert of_samples.metrics.effort == pytest.approx(of_plan.metrics.effort, rel=1e-3)
     for name in ("z_error", "vertical_error"):
-        assert getattr(of_samples.metrics, name) == pytest.approx(getattr(of_plan.metrics, name), rel=0.02, nan_ok=True)
+        assert getattr(of_samples.metrics, name) == pytest.approx(
+            getattr(of_plan.metrics, name), rel=0.02, nan_ok=True
+        )
 
 
 def test_a_faster_trajectory_exceeds_the_acceleration_limit() -> None:
@@ -89,16 +100,29 @@ def test_positions_alone_have_no_accelerations_that_could_be_valid() -> None:
 
 @pytest.mark.parametrize(("label", "count"), [("hit", 300), ("transport", 300)])
 @pytest.mark.parametrize("speed", [1.0, 1.1])
-def test_the_verdict_is_that_of_the_evaluation_of_the_same_curve(label: str, count: int, speed: float) -> None:
+def test_the_verdict_is_that_of_the_evaluation_of_the_same_curve(
+    label: str, count: int, speed: float
+) -> None:
     plan = stored(label)
     exact = sampled(plan, count)
-    samples = Trajectory(exact.t / speed, exact.q, exact.dq * speed, exact.ddq * speed**2)
+    samples = Trajectory(
+        exact.t / speed, exact.q, exact.dq * speed, exact.ddq * speed**2
+    )
     verdict = judge_answer(plan, samples)
-    (expected,) = evaluate_trajectories(plan.problem, [samples], interpolation="quintic").verdicts
-    assert {name: margin.ok for name, margin in verdict.margins.items() if name in expected.conditions} == {
+    (expected,) = evaluate_trajectories(
+        plan.problem, [samples], interpolation="quintic"
+    ).verdicts
+    assert {
+        name: margin.ok
+        for name, margin in verdict.margins.items()
+        if name in expected.conditions
+    } == {
         name: entry.decision == "valid" for name, entry in expected.conditions.items()
     }
-    assert verdict.margins["joint velocity"] == expected.conditions["joint velocity"].margin
+    assert (
+        verdict.margins["joint velocity"]
+        == expected.conditions["joint velocity"].margin
+    )
 
 
 @pytest.mark.parametrize("known", ["positions", "velocities", "accelerations"])
@@ -106,13 +130,22 @@ def test_jerks_are_judged_if_the_problem_limits_them(known: str) -> None:
     example = jerk_limited_plan("transport")
     motion = example.motion
     plan = make_plans(
-        example.problem, example.boundary, path_control_points=motion.path, rate_control_points=motion.rate
+        example.problem,
+        example.boundary,
+        path_control_points=motion.path,
+        rate_control_points=motion.rate,
     )
     expected = judge_answer(plan, plan)
     samples = sampled(plan, 400)
-    parts = {"positions": (), "velocities": (samples.dq,), "accelerations": (samples.dq, samples.ddq)}[known]
+    parts = {
+        "positions": (),
+        "velocities": (samples.dq,),
+        "accelerations": (samples.dq, samples.ddq),
+    }[known]
     verdict = judge_answer(plan, Trajectory(samples.t, samples.q, *parts))
-    margin, expected_margin = (result.margins["joint jerk"] for result in (verdict, expected))
+    margin, expected_margin = (
+        result.margins["joint jerk"] for result in (verdict, expected)
+    )
     assert margin.severity > 1
     if known == "accelerations":
         assert margin.part == expected_margin.part
@@ -138,7 +171,10 @@ def test_a_trajectory_of_excessive_duration_is_not_executed() -> None:
     plan = stored("transport")
     samples = sampled(plan, 10)
     executed = execute_answer(
-        (plan, answer_to_dict(Trajectory(samples.t * 1000, samples.q)), None), plant=PLANTS["nominal"]
+        (plan, answer_to_dict(Trajectory(samples.t * 1000, samples.q)), None),
+        plant=PLANTS["nominal"],
     )
     assert "cannot be executed" in executed.failure
-    assert judge_answer(plan, Trajectory(samples.t * 1000, samples.q)).reason == "too long"
+    assert (
+        judge_answer(plan, Trajectory(samples.t * 1000, samples.q)).reason == "too long"
+    )

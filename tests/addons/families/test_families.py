@@ -18,7 +18,16 @@ from cnpgen.robots.observation.primitives import primitives_of, signed_distances
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import place_obstacles, solids_of
-from cnpgen.scenes import Grasp, Layout, SceneFamily, SceneProblem, load_family, load_scenes, make_scenes, scene_plans
+from cnpgen.scenes import (
+    Grasp,
+    Layout,
+    SceneFamily,
+    SceneProblem,
+    load_family,
+    load_scenes,
+    make_scenes,
+    scene_plans,
+)
 from cnpgen.world.certified import CertifiedDistance, convex_body
 from cnpgen.world.pose_ik import PoseKinematics
 from tests.examples.example_robots import needs_robots
@@ -37,13 +46,22 @@ def test_layouts_are_valid_and_depend_on_the_random_numbers_only(name: str) -> N
         assert layout.obstacles == again.obstacles
         assert len(layout.grasps) >= 2
         assert all(not list(obstacle.validate()) for obstacle in layout.obstacles)
-        assert len({obstacle.name for obstacle in layout.obstacles}) == len(layout.obstacles) <= 40
-        assert all(np.linalg.norm(grasp.approach) == pytest.approx(1) for grasp in layout.grasps)
+        assert (
+            len({obstacle.name for obstacle in layout.obstacles})
+            == len(layout.obstacles)
+            <= 40
+        )
+        assert all(
+            np.linalg.norm(grasp.approach) == pytest.approx(1)
+            for grasp in layout.grasps
+        )
         counts.add(len(layout.obstacles))
     assert min(counts) >= 3
 
 
-@pytest.mark.parametrize("name", ["tabletop", "table-pick", "bookshelf-tall", "table-under-pick"])
+@pytest.mark.parametrize(
+    "name", ["tabletop", "table-pick", "bookshelf-tall", "table-under-pick"]
+)
 def test_objects_neither_overlap_nor_sink(name: str) -> None:
     """Measure the distances of all objects by Coal."""
     distance = CertifiedDistance()
@@ -51,30 +69,48 @@ def test_objects_neither_overlap_nor_sink(name: str) -> None:
         obstacles = load_family(name).draw(np.random.default_rng(seed)).obstacles
         solids = solids_of(obstacles, place_obstacles(obstacles))
         bodies = [convex_body(solid.corners, solid.radius) for solid in solids]
-        objects = [index for index, obstacle in enumerate(obstacles) if obstacle.name.startswith("object")]
+        objects = [
+            index
+            for index, obstacle in enumerate(obstacles)
+            if obstacle.name.startswith("object")
+        ]
         for index in objects:
             for other in range(len(obstacles)):
                 if other == index:
                     continue
                 poses = [(np.eye(3), solids[body].position) for body in (index, other)]
-                gap, _ = distance.between(bodies[index], poses[0], bodies[other], poses[1])
-                table = name == "tabletop" and other not in objects  # tables may stand under objects of others
-                assert gap > (-np.inf if table else -1e-9), (seed, obstacles[index].name, obstacles[other].name)
+                gap, _ = distance.between(
+                    bodies[index], poses[0], bodies[other], poses[1]
+                )
+                table = (
+                    name == "tabletop" and other not in objects
+                )  # tables may stand under objects of others
+                assert gap > (-np.inf if table else -1e-9), (
+                    seed,
+                    obstacles[index].name,
+                    obstacles[other].name,
+                )
 
 
 def test_grasps_in_shelves_are_outside_of_all_obstacles() -> None:
     for name in ("cubby", "merged-cubby", "box", "cage", "dresser"):
         for seed in range(10):
             layout = load_family(name).draw(np.random.default_rng(seed))
-            primitives = primitives_of(layout.obstacles, place_obstacles(layout.obstacles))
+            primitives = primitives_of(
+                layout.obstacles, place_obstacles(layout.obstacles)
+            )
             points = np.array([grasp.position for grasp in layout.grasps])
             assert (signed_distances(primitives, points).min(axis=0) > 0).mean() > 0.8
 
 
 def test_a_merged_cubby_has_one_wall_less() -> None:
     random = [np.random.default_rng(seed) for seed in (1, 1)]
-    cubby, merged = (load_family(name).draw(random.pop()) for name in ("cubby", "merged-cubby"))
-    names = {obstacle.name for obstacle in cubby.obstacles} - {obstacle.name for obstacle in merged.obstacles}
+    cubby, merged = (
+        load_family(name).draw(random.pop()) for name in ("cubby", "merged-cubby")
+    )
+    names = {obstacle.name for obstacle in cubby.obstacles} - {
+        obstacle.name for obstacle in merged.obstacles
+    }
     assert len(names) == 1
     assert len(cubby.obstacles) == 9
 
@@ -82,7 +118,9 @@ def test_a_merged_cubby_has_one_wall_less() -> None:
 def test_rotations_of_grasps_stay_within_the_tilt() -> None:
     grasp = Grasp(np.zeros(3), np.array([0.6, 0.0, -0.8]), tilt=0.4)
     rotations = grasp_rotations(grasp, 500, np.random.default_rng(0))
-    assert rotations @ rotations.swapaxes(1, 2) == pytest.approx(np.tile(np.eye(3), (500, 1, 1)), abs=1e-12)
+    assert rotations @ rotations.swapaxes(1, 2) == pytest.approx(
+        np.tile(np.eye(3), (500, 1, 1)), abs=1e-12
+    )
     assert np.linalg.det(rotations) == pytest.approx(np.ones(500))
     angle = np.arccos(np.clip(rotations[:, :, 2] @ grasp.approach, -1, 1))
     assert 0.35 < angle.max() <= 0.4 + 1e-9
@@ -92,7 +130,9 @@ def test_parameters_have_units_and_are_checked() -> None:
     family = load_family("tabletop", {"tables": 2, "height": "[10, 20] cm"})
     assert vars(family)["tables"] == Range(2, 2)
     assert vars(family)["height"] == Range(0.1, 0.2)
-    with pytest.raises(UsageError, match=r"unknown family 'tabeltop' \(did you mean 'tabletop'"):
+    with pytest.raises(
+        UsageError, match=r"unknown family 'tabeltop' \(did you mean 'tabletop'"
+    ):
         load_family("tabeltop")
     with pytest.raises(UsageError, match="hight: unknown key"):
         load_family("tabletop", {"hight": 1})
@@ -106,11 +146,22 @@ class Posts(SceneFamily):
 
     def draw(self, random: np.random.Generator) -> Layout:
         posts = tuple(
-            Obstacle(name=f"post {side}", kind="cylinder", position=(0.3, 0.2 * side, 0.2), radius=0.03, length=0.6)
+            Obstacle(
+                name=f"post {side}",
+                kind="cylinder",
+                position=(0.3, 0.2 * side, 0.2),
+                radius=0.03,
+                length=0.6,
+            )
             for side in (-1, 1)
         )
         places = random.uniform([0.2, -0.4, 0.0], [0.4, 0.4, 0.3], (12, 3))
-        return Layout(posts, tuple(Grasp(place, np.array([0.0, 0.0, -1.0]), tilt=3.0) for place in places))
+        return Layout(
+            posts,
+            tuple(
+                Grasp(place, np.array([0.0, 0.0, -1.0]), tilt=3.0) for place in places
+            ),
+        )
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +181,9 @@ def check_problems(problem: Problem, scenes: list[SceneProblem]) -> float:
         low, high = robot.position_lower, robot.position_upper
         assert ((ends >= low) & (ends <= high)).all()
         line = np.linspace(*ends, 100)
-        straight += bool((model.min_distance(line, scene=plans.scene[0]) >= -1e-9).all())
+        straight += bool(
+            (model.min_distance(line, scene=plans.scene[0]) >= -1e-9).all()
+        )
     return straight / len(scenes)
 
 
@@ -138,7 +191,10 @@ def test_families_of_users_give_problems_with_collision_free_ends(arm: Problem) 
     scenes = make_scenes(Posts(), arm, 8, seed=3)
     assert check_problems(arm, scenes) <= 0.2
     again = make_scenes(Posts(), arm, 8, seed=3)
-    assert all(np.array_equal(one.goal_q, other.goal_q) for one, other in zip(scenes, again, strict=True))
+    assert all(
+        np.array_equal(one.goal_q, other.goal_q)
+        for one, other in zip(scenes, again, strict=True)
+    )
     other = make_scenes(Posts(), arm, 12, seed=4)
     assert not np.array_equal(scenes[0].goal_q, other[0].goal_q)
 
@@ -163,14 +219,30 @@ def test_states_of_rest_agree_with_the_model(arm: Problem) -> None:
     robot = load_robot(arm)
     q = np.random.default_rng(1).uniform(-1.5, 1.5, (200, robot.n))
     clear = RestingStates(arm, robot, obstacles).are_clear(q.T.copy())
-    plans = scene_plans(arm, [SceneProblem(name="", obstacles=obstacles, start_q=q[0], goal_q=q[:1])])
-    distances = cnpgen.RobotModel(plans.problem).min_distance(q, scene=Scene(plans.scene.obstacles, plans.scene.poses))
+    plans = scene_plans(
+        arm, [SceneProblem(name="", obstacles=obstacles, start_q=q[0], goal_q=q[:1])]
+    )
+    distances = cnpgen.RobotModel(plans.problem).min_distance(
+        q, scene=Scene(plans.scene.obstacles, plans.scene.poses)
+    )
     assert np.array_equal(clear, distances >= 0)
     assert 20 < clear.sum() < 180
 
 
-def test_the_command_writes_both_formats(arm: Problem, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["make-scenes", "free", "--robot", str(arm.path), "--n", "3", "--seed", "2", "--quiet"]
+def test_the_command_writes_both_formats(
+    arm: Problem, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [
+        "make-scenes",
+        "free",
+        "--robot",
+        str(arm.path),
+        "--n",
+        "3",
+        "--seed",
+        "2",
+        "--quiet",
+    ]
     words += ["--set", "count=3", "radius=[40, 60] cm"]
     assert main([*words, "-o", str(tmp_path / "scenes.h5")]) == 0
     assert main([*words, "-o", str(tmp_path / "scenes")]) == 0
@@ -196,5 +268,7 @@ def test_every_family_has_problems_for_a_panda(name: str) -> None:
 
 @needs_robots
 def test_families_refuse_problems_on_a_manifold():
-    with pytest.raises(UsageError, match="'panda-cup' has the equality constraint 'vertical'"):
+    with pytest.raises(
+        UsageError, match="'panda-cup' has the equality constraint 'vertical'"
+    ):
         make_scenes("tabletop", "panda-cup", 1)

@@ -16,7 +16,10 @@ with warnings.catch_warnings():
 
 from cnpgen.loader.load import load_dataset
 
-pytestmark = [pytest.mark.extended, pytest.mark.filterwarnings("ignore")]  # warnings of Lightning
+pytestmark = [
+    pytest.mark.extended,
+    pytest.mark.filterwarnings("ignore"),
+]  # warnings of Lightning
 
 LOADING = Path(__file__).parents[3] / "docs" / "how-to" / "loading.md"
 EPOCHS, BATCHES = 3, 6  # of 8 rows out of 50
@@ -40,11 +43,16 @@ class Recorder(lightning.LightningModule):
             raise Interruption
         self.seen.append(batch["sample_id"].tolist())
         loss = (self.layer(batch["start_q"]) - batch["goal_p"]).square().mean()
-        self.log("loss", loss, on_epoch=True)  # Lightning reads the number of rows from the batch
+        self.log(
+            "loss", loss, on_epoch=True
+        )  # Lightning reads the number of rows from the batch
         return loss
 
     def validation_step(self, batch: Any, _: int) -> None:
-        self.log("validation", (self.layer(batch["start_q"]) - batch["goal_p"]).square().mean())
+        self.log(
+            "validation",
+            (self.layer(batch["start_q"]) - batch["goal_p"]).square().mean(),
+        )
 
     def configure_optimizers(self) -> Any:
         return torch.optim.Adam(self.parameters(), 0.1)
@@ -58,7 +66,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def block() -> str:
     """Return the code of the documentation."""
-    (found,) = [text for text in re.findall(r"```python\n(.*?)```", LOADING.read_text(), re.S) if "DataModule" in text]
+    (found,) = [
+        text
+        for text in re.findall(r"```python\n(.*?)```", LOADING.read_text(), re.S)
+        if "DataModule" in text
+    ]
     return str(found)
 
 
@@ -70,9 +82,13 @@ def recipe(block: str) -> Any:
     return module["Rows"]
 
 
-def fit(model: Recorder, data: Any, folder: Path, checkpoint: Path | None = None) -> Recorder:
+def fit(
+    model: Recorder, data: Any, folder: Path, checkpoint: Path | None = None
+) -> Recorder:
     """Train, with a checkpoint after every step."""
-    save = lightning.pytorch.callbacks.ModelCheckpoint(folder, "{step}", every_n_train_steps=1, save_top_k=-1)
+    save = lightning.pytorch.callbacks.ModelCheckpoint(
+        folder, "{step}", every_n_train_steps=1, save_top_k=-1
+    )
     trainer = lightning.Trainer(
         accelerator="cpu", max_epochs=EPOCHS, callbacks=[save], logger=False, enable_progress_bar=False,
         enable_model_summary=False,
@@ -91,19 +107,31 @@ def test_training_resumes_after_the_step_of_the_checkpoint(
     recipe: Any, folder: Path, tmp_path: Path, step: int
 ) -> None:
     whole = fit(Recorder(), with_ids(recipe, folder), tmp_path / "whole")
-    expected = [load_dataset(folder).batches(8, fields=["sample_id"], epoch=epoch) for epoch in range(EPOCHS)]
+    expected = [
+        load_dataset(folder).batches(8, fields=["sample_id"], epoch=epoch)
+        for epoch in range(EPOCHS)
+    ]
     assert whole.seen == [rows for batches in expected for rows in ids(batches)]
 
     with pytest.raises(Interruption):
         fit(Recorder(stop_before=step + 1), with_ids(recipe, folder), tmp_path / "part")
-    resumed = fit(Recorder(), with_ids(recipe, folder), tmp_path / "rest", tmp_path / "part" / f"step={step}.ckpt")
+    resumed = fit(
+        Recorder(),
+        with_ids(recipe, folder),
+        tmp_path / "rest",
+        tmp_path / "part" / f"step={step}.ckpt",
+    )
     assert resumed.seen == whole.seen[step:]
     assert torch.equal(resumed.layer.weight, whole.layer.weight)
 
 
-def test_the_first_validation_has_all_rows_after_the_sanity_check(recipe: Any, folder: Path) -> None:
+def test_the_first_validation_has_all_rows_after_the_sanity_check(
+    recipe: Any, folder: Path
+) -> None:
     data = with_ids(recipe, folder)
-    found = [sum(len(batch["start_q"]) for batch in data.val_dataloader()) for _ in range(2)]
+    found = [
+        sum(len(batch["start_q"]) for batch in data.val_dataloader()) for _ in range(2)
+    ]
     assert found == [10, 10]
 
 

@@ -16,7 +16,10 @@ from cnpgen.interop.tensorflow import to_tensorflow
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
 
-pytestmark = [pytest.mark.extended, pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorflow.*")]
+pytestmark = [
+    pytest.mark.extended,
+    pytest.mark.filterwarnings("ignore::DeprecationWarning:tensorflow.*"),
+]
 
 
 @pytest.fixture(scope="module")
@@ -35,14 +38,18 @@ def test_tensors_have_the_values_of_the_batches(dataset: Dataset) -> None:
 
 
 def test_the_signature_is_known_before_the_first_batch(dataset: Dataset) -> None:
-    specification = to_tensorflow(dataset.batches(8, fields=ALL, dtype="float64")).element_spec
+    specification = to_tensorflow(
+        dataset.batches(8, fields=ALL, dtype="float64")
+    ).element_spec
     assert specification["start_q"].shape.as_list() == [None, 3]
     assert specification["clearance"].shape.as_list() == [None]
     assert specification["start_q"].dtype == tensorflow.float64
     assert specification["sample_id"].dtype == tensorflow.int64
 
 
-def test_every_pass_is_the_next_epoch_and_prefetching_changes_nothing(dataset: Dataset) -> None:
+def test_every_pass_is_the_next_epoch_and_prefetching_changes_nothing(
+    dataset: Dataset,
+) -> None:
     wanted = to_tensorflow(dataset.batches(10, fields=ALL)).prefetch(3)
     for epoch in range(3):
         found = [batch["sample_id"].numpy().tolist() for batch in wanted]
@@ -50,8 +57,14 @@ def test_every_pass_is_the_next_epoch_and_prefetching_changes_nothing(dataset: D
 
 
 def test_keras_trains_on_it(dataset: Dataset, tmp_path: Path) -> None:
-    model = tensorflow.keras.Sequential([tensorflow.keras.Input((3,)), tensorflow.keras.layers.Dense(2)])
+    model = tensorflow.keras.Sequential(
+        [tensorflow.keras.Input((3,)), tensorflow.keras.layers.Dense(2)]
+    )
     model.compile(loss="mse", optimizer="adam")
-    batches = to_tensorflow(dataset.batches(10)).map(lambda batch: (batch["start_q"], batch["goal_p"]))
-    history = model.fit(batches.repeat(), epochs=2, steps_per_epoch=5, shuffle=False, verbose=0).history
+    batches = to_tensorflow(dataset.batches(10)).map(
+        lambda batch: (batch["start_q"], batch["goal_p"])
+    )
+    history = model.fit(
+        batches.repeat(), epochs=2, steps_per_epoch=5, shuffle=False, verbose=0
+    ).history
     assert np.isfinite(history["loss"]).all()

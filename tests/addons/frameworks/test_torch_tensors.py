@@ -15,7 +15,12 @@ from cnpgen.interop.torch.tensor_tape import _APPLY, TensorTape
 
 import cnpgen
 from cnpgen.errors import UsageError
-from cnpgen.interop.torch import TensorBoundaryLayer, TensorLoss, TensorRobot, joint_states
+from cnpgen.interop.torch import (
+    TensorBoundaryLayer,
+    TensorLoss,
+    TensorRobot,
+    joint_states,
+)
 from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.kernels.tape import OPERATIONS
 from cnpgen.losses.margins import Margins
@@ -41,8 +46,15 @@ PROBLEMS = {"hit": "airhockey", "transport": "heavy-object"}
 def given(label: str, count: int = 6) -> dict[str, Any]:
     """Return perturbed plans with their obstacles and starts, as tensors."""
     plans = batch(label, count)
-    tips = RobotModel(plans.problem, backend="numpy").forward_kinematics(plans.path[:, 0])[0]
-    arrays = {"path": plans.path, "rate": plans.rate, "obstacle_poses": plans.obstacle_poses, "start_tip": tips}
+    tips = RobotModel(plans.problem, backend="numpy").forward_kinematics(
+        plans.path[:, 0]
+    )[0]
+    arrays = {
+        "path": plans.path,
+        "rate": plans.rate,
+        "obstacle_poses": plans.obstacle_poses,
+        "start_tip": tips,
+    }
     return {name: tensor(values) for name, values in arrays.items()}
 
 
@@ -60,39 +72,73 @@ def gradients(total: Any, variables: list[Any]) -> list[Any]:
 
 @pytest.mark.parametrize("form", ["signed", "paper"])
 @pytest.mark.parametrize("label", LABELS)
-def test_the_loss_and_its_gradient_equal_the_compiled_ones(label: str, form: str) -> None:
+def test_the_loss_and_its_gradient_equal_the_compiled_ones(
+    label: str, form: str
+) -> None:
     margins = Margins(factors={"joint-velocity": 0.9})
-    loss = PlanLoss(PROBLEMS[label], dtype="float64", form=form, margins=margins, nodes=16, backend="numpy")
+    loss = PlanLoss(
+        PROBLEMS[label],
+        dtype="float64",
+        form=form,
+        margins=margins,
+        nodes=16,
+        backend="numpy",
+    )
     arguments, weights = given(label), tensor(loss.weights0).requires_grad_()
-    path, rate = arguments.pop("path").requires_grad_(), arguments.pop("rate").requires_grad_()
+    path, rate = (
+        arguments.pop("path").requires_grad_(),
+        arguments.pop("rate").requires_grad_(),
+    )
     total, terms = TensorLoss(loss)(path, rate, weights=weights, **arguments, shift=0.3)
-    arrays, plain = {name: array(values) for name, values in arguments.items()}, (array(path), array(rate))
+    arrays, plain = (
+        {name: array(values) for name, values in arguments.items()},
+        (array(path), array(rate)),
+    )
     expected = loss(*plain, weights=loss.weights0, **arrays, shift=0.3)
     np.testing.assert_allclose(array(total), expected.total, rtol=1e-9)
     np.testing.assert_allclose(array(terms), expected.terms, rtol=1e-9, atol=1e-12)
     by_path, by_rate, by_weights = gradients(total, [path, rate, weights])
-    for got, wanted in ((by_path, expected.path_gradient), (by_rate, expected.rate_gradient)):
-        np.testing.assert_allclose(array(got), wanted, rtol=1e-7, atol=1e-9 * np.abs(wanted).max())
-    np.testing.assert_allclose(array(by_weights), expected.terms[:, 1:].sum(0), rtol=1e-9)
+    for got, wanted in (
+        (by_path, expected.path_gradient),
+        (by_rate, expected.rate_gradient),
+    ):
+        np.testing.assert_allclose(
+            array(got), wanted, rtol=1e-7, atol=1e-9 * np.abs(wanted).max()
+        )
+    np.testing.assert_allclose(
+        array(by_weights), expected.terms[:, 1:].sum(0), rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize("label", some(LABELS, mark="extended"))
-def test_second_derivatives_of_a_network_are_those_of_finite_differences(label: str) -> None:
+def test_second_derivatives_of_a_network_are_those_of_finite_differences(
+    label: str,
+) -> None:
     """Check products of the Hessian by network outputs through boundary layer and loss."""
     layer = BoundaryLayer(PROBLEMS[label], backend="numpy")
-    loss = TensorLoss(PlanLoss(layer.problem, dtype="float64", nodes=8, backend="numpy"))
+    loss = TensorLoss(
+        PlanLoss(layer.problem, dtype="float64", nodes=8, backend="numpy")
+    )
     tasks, of = layer.tasks(boundary_for_layer(layer, 3)), TensorBoundaryLayer(layer)
     x = tensor(np.concatenate(outputs(layer, 3), axis=1))
-    direction = torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype).to(DEVICE)
+    direction = torch.randn(
+        x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype
+    ).to(DEVICE)
 
     def gradient(x: Any) -> Any:
-        path, rate = of(tasks, *x.split([layer.path_outputs, layer.rate_outputs], dim=1))
-        total, _ = loss(path, rate, weights=loss.loss.weights0, obstacle_poses=tasks.scene.poses)
+        path, rate = of(
+            tasks, *x.split([layer.path_outputs, layer.rate_outputs], dim=1)
+        )
+        total, _ = loss(
+            path, rate, weights=loss.loss.weights0, obstacle_poses=tasks.scene.poses
+        )
         return gradients(total, [x])[0]
 
     x.requires_grad_()
     (product,) = torch.autograd.grad((gradient(x) * direction).sum(), [x])
-    ahead, behind = (gradient((x + h * direction).detach().requires_grad_()) for h in (1e-6, -1e-6))
+    ahead, behind = (
+        gradient((x + h * direction).detach().requires_grad_()) for h in (1e-6, -1e-6)
+    )
     numeric = (ahead - behind).detach() / 2e-6
     assert product.norm() > 1
     assert ((product - numeric).norm(dim=1) < 1e-4 * numeric.norm(dim=1)).all()
@@ -100,15 +146,24 @@ def test_second_derivatives_of_a_network_are_those_of_finite_differences(label: 
 
 @pytest.mark.parametrize("acceleration", some(("free", "given"), mark="extended"))
 @pytest.mark.parametrize("label", LABELS)
-def test_control_points_are_those_of_the_compiled_layer(label: str, acceleration: str) -> None:
-    layer = BoundaryLayer(PROBLEMS[label], goal_acceleration=acceleration, projection_steps=2, backend="numpy")
+def test_control_points_are_those_of_the_compiled_layer(
+    label: str, acceleration: str
+) -> None:
+    layer = BoundaryLayer(
+        PROBLEMS[label],
+        goal_acceleration=acceleration,
+        projection_steps=2,
+        backend="numpy",
+    )
     tasks = layer.tasks(boundary_for_layer(layer, 4))
     phi, log_rate = outputs(layer, 4)
     path, rate = TensorBoundaryLayer(layer)(tasks, tensor(phi), tensor(log_rate))
     expected = layer(tasks, phi, log_rate)
     np.testing.assert_allclose(array(path), expected.path, atol=1e-10)
     np.testing.assert_allclose(array(rate), expected.rate, rtol=1e-12)
-    half, _ = TensorBoundaryLayer(layer)(tasks, tensor(phi).half(), tensor(log_rate).half())
+    half, _ = TensorBoundaryLayer(layer)(
+        tasks, tensor(phi).half(), tensor(log_rate).half()
+    )
     assert half.dtype == torch.float32
 
 
@@ -129,8 +184,14 @@ def test_plans_that_are_not_finite_do_not_affect_others() -> None:
 
 
 def test_tables_of_many_shifts_do_not_accumulate() -> None:
-    loss, arguments = TensorLoss(PlanLoss("airhockey", nodes=4, backend="numpy")), given("hit", 1)
-    totals = [loss(**arguments, weights=loss.loss.weights0, shift=k / 40)[0].item() for k in (*range(40), 0)]
+    loss, arguments = (
+        TensorLoss(PlanLoss("airhockey", nodes=4, backend="numpy")),
+        given("hit", 1),
+    )
+    totals = [
+        loss(**arguments, weights=loss.loss.weights0, shift=k / 40)[0].item()
+        for k in (*range(40), 0)
+    ]
     assert len(loss._tables) == MAX_KEPT_TABLES
     assert totals[0] == totals[-1]
     assert len(set(totals)) > 20
@@ -139,7 +200,8 @@ def test_tables_of_many_shifts_do_not_accumulate() -> None:
 def test_problems_whose_samples_place_obstacles_are_refused(tmp_path: Path) -> None:
     problem = with_capacity(load_problem(write_problem(tmp_path)), {"box": 1})
     with pytest.raises(
-        UsageError, match=r"loss must be of a problem whose obstacles samples do not place, got that of"
+        UsageError,
+        match=r"loss must be of a problem whose obstacles samples do not place, got that of",
     ):
         TensorLoss(PlanLoss(problem, backend="numpy"))
 
@@ -150,31 +212,57 @@ def test_the_loss_can_be_compiled() -> None:
     problem = cnpgen.load_problem("airhockey")
     kernels = problem_kernels(problem, load_robot(problem), *choose_backend("numpy"))
     tape = TensorTape(kernels.tape(inverse_dynamics_of))
-    states = torch.randn((3, 6, 32), dtype=torch.float64, device=DEVICE, requires_grad=True)
+    states = torch.randn(
+        (3, 6, 32), dtype=torch.float64, device=DEVICE, requires_grad=True
+    )
     compiled = torch.compile(lambda states: tape(*states)[0], fullgraph=True)
     torch.testing.assert_close(compiled(states), tape(*states)[0])
-    assert all(torch.autograd.grad(compiled(states).sum(), [states])[0].isfinite().flatten())
+    assert all(
+        torch.autograd.grad(compiled(states).sum(), [states])[0].isfinite().flatten()
+    )
 
 
 @pytest.mark.parametrize("label", LABELS)
 def test_the_robot_equals_the_compiled_one(label: str) -> None:
-    model, robot = RobotModel(PROBLEMS[label], backend="numpy"), TensorRobot(PROBLEMS[label])
+    model, robot = (
+        RobotModel(PROBLEMS[label], backend="numpy"),
+        TensorRobot(PROBLEMS[label]),
+    )
     random = np.random.default_rng(3)
-    q = random.uniform(model.position_lower, model.position_upper, (5, len(model.joint_names)))
+    q = random.uniform(
+        model.position_lower, model.position_upper, (5, len(model.joint_names))
+    )
     dq, ddq = random.standard_normal((2, *q.shape))
-    scene = model.scene(model.forward_kinematics(q)[0], model.forward_kinematics(q[::-1])[0])
-    tensors, expected = [tensor(x) for x in (q, dq, ddq)], model.constraint_values(q, dq, ddq, scene=scene)
-    for got, wanted in zip(robot.forward_kinematics(tensors[0]), model.forward_kinematics(q), strict=True):
+    scene = model.scene(
+        model.forward_kinematics(q)[0], model.forward_kinematics(q[::-1])[0]
+    )
+    tensors, expected = (
+        [tensor(x) for x in (q, dq, ddq)],
+        model.constraint_values(q, dq, ddq, scene=scene),
+    )
+    for got, wanted in zip(
+        robot.forward_kinematics(tensors[0]), model.forward_kinematics(q), strict=True
+    ):
         np.testing.assert_allclose(array(got), wanted, atol=1e-12)
-    np.testing.assert_allclose(array(robot.jacobian(tensors[0])), model.jacobian(q), atol=1e-12)
-    np.testing.assert_allclose(array(robot.inverse_dynamics(*tensors)), model.inverse_dynamics(q, dq, ddq), rtol=1e-9)
+    np.testing.assert_allclose(
+        array(robot.jacobian(tensors[0])), model.jacobian(q), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        array(robot.inverse_dynamics(*tensors)),
+        model.inverse_dynamics(q, dq, ddq),
+        rtol=1e-9,
+    )
     poses = tensor(scene.poses)
     tensors[0].requires_grad_()
     values = robot.constraint_values(*tensors, obstacle_poses=poses)
     np.testing.assert_allclose(array(values), expected.g, rtol=1e-9, atol=1e-9)
-    smooth = [index for index, name in enumerate(expected.names) if name.startswith("joint")]
+    smooth = [
+        index for index, name in enumerate(expected.names) if name.startswith("joint")
+    ]
     (by_q,) = torch.autograd.grad(values[:, smooth].sum(), [tensors[0]])
-    np.testing.assert_allclose(array(by_q), expected.jacobian_q[:, smooth].sum(1), rtol=1e-8, atol=1e-6)
+    np.testing.assert_allclose(
+        array(by_q), expected.jacobian_q[:, smooth].sum(1), rtol=1e-8, atol=1e-6
+    )
     with pytest.raises(UsageError, match=r"obstacle_poses must have shape \(5, "):
         robot.constraint_values(*tensors)
     with pytest.raises(UsageError, match=r"q must have shape \(N, "):
@@ -187,18 +275,24 @@ def test_states_of_motions_are_those_of_scipy_and_differentiable_in_the_phase() 
     path, control_rate = tensor(plans.path), tensor(plans.rate)
     q, dq, ddq = joint_states(path, control_rate, tensor(s), spec)
     p, r = (
-        BSpline(clamped_knots(x.shape[1], spec.degree), np.moveaxis(x, 0, 1), spec.degree)
+        BSpline(
+            clamped_knots(x.shape[1], spec.degree), np.moveaxis(x, 0, 1), spec.degree
+        )
         for x in (plans.path, plans.rate)
     )
     rate, change = (r(s, order).T[..., None] for order in (0, 1))
     first, second = (np.moveaxis(p(s, order), 0, 1) for order in (1, 2))
     np.testing.assert_allclose(array(q), np.moveaxis(p(s), 0, 1), atol=1e-12)
     np.testing.assert_allclose(array(dq), first * rate, atol=1e-9)
-    np.testing.assert_allclose(array(ddq), second * rate**2 + first * rate * change, atol=1e-7)
+    np.testing.assert_allclose(
+        array(ddq), second * rate**2 + first * rate * change, atol=1e-7
+    )
     phase = tensor(np.full((3, 1), 0.37)).requires_grad_()
     position, velocity, _ = joint_states(path, control_rate, phase, spec)
     (by_phase,) = torch.autograd.grad(position[..., 0].sum(), [phase])
-    np.testing.assert_allclose(array(by_phase)[:, 0], array(velocity)[:, 0, 0] / r(0.37), rtol=1e-9)
+    np.testing.assert_allclose(
+        array(by_phase)[:, 0], array(velocity)[:, 0, 0] / r(0.37), rtol=1e-9
+    )
 
 
 def test_every_operation_of_tapes_has_one_on_tensors() -> None:

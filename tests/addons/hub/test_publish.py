@@ -35,7 +35,9 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("publish")
     (folder / "hits.toml").write_text(RECIPE.format(keys=KEYS))
     (folder / "hits.md").write_text("Notes of the author.")
-    return make_dataset(folder / "hits.toml", folder / "hits", workers=1, shard_size=4096).folder
+    return make_dataset(
+        folder / "hits.toml", folder / "hits", workers=1, shard_size=4096
+    ).folder
 
 
 @pytest.mark.slow
@@ -44,7 +46,10 @@ def test_a_dry_run_writes_card_tables_and_dataset(
 ) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     out = tmp_path / "repository"
-    assert main(["publish", str(dataset), "--to", "lab/hits", "--dry-run", "-o", str(out)]) == 0
+    assert (
+        main(["publish", str(dataset), "--to", "lab/hits", "--dry-run", "-o", str(out)])
+        == 0
+    )
     assert capsys.readouterr().out.strip() == str(out)
     table = parquet.read_table(out / "parquet" / "train" / "00000.parquet")
     rows = cnpgen.load_dataset(dataset).arrays("train", fields=["start_q", "hit_speed"])
@@ -52,36 +57,58 @@ def test_a_dry_run_writes_card_tables_and_dataset(
     assert np.array_equal(table["hit_speed"].to_numpy(), rows["hit_speed"])
     unit = table.schema.field("start_q").metadata
     assert unit[b"unit"] == b"rad"
-    assert tuple(json.loads(unit[b"names"])) == cnpgen.load_dataset(dataset).fields["start_q"].names
+    assert (
+        tuple(json.loads(unit[b"names"]))
+        == cnpgen.load_dataset(dataset).fields["start_q"].names
+    )
     assert cnpgen.validate_dataset(out / "hdf5").ok
     card = (out / "README.md").read_text()
     for text in ('license: "mit"', 'path: "parquet/train/*.parquet"', "Made by A. Author.", "@misc{hits}",
                  "Notes of the author.", 'load_dataset("lab/hits")', 'f"hdf5/{split}/shard'):  # fmt: skip
         assert text in card, text
     before = (out / "parquet" / "train" / "00000.parquet").stat().st_mtime_ns
-    assert main(["publish", str(dataset), "--to", "lab/hits", "--dry-run", "-o", str(out)]) == 0
+    assert (
+        main(["publish", str(dataset), "--to", "lab/hits", "--dry-run", "-o", str(out)])
+        == 0
+    )
     assert (out / "parquet" / "train" / "00000.parquet").stat().st_mtime_ns == before
 
 
 @pytest.mark.slow
-def test_croissant_describes_the_columns_of_all_tables(dataset: Path, tmp_path: Path) -> None:
+def test_croissant_describes_the_columns_of_all_tables(
+    dataset: Path, tmp_path: Path
+) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     publish_dataset(dataset, "lab/hits", out=tmp_path, dry_run=True)
     assert not (tmp_path / "hdf5" / "croissant.json").exists()
     croissant = json.loads((tmp_path / "croissant.json").read_text())
-    files = {item["@id"]: item for item in croissant["distribution"] if item["@type"] == "cr:FileObject"}
+    files = {
+        item["@id"]: item
+        for item in croissant["distribution"]
+        if item["@type"] == "cr:FileObject"
+    }
     for path, item in files.items():
-        assert item["sha256"] == hashlib.sha256((tmp_path / path).read_bytes()).hexdigest()
-    sets = {item["@id"]: item for item in croissant["distribution"] if item["@type"] == "cr:FileSet"}
+        assert (
+            item["sha256"] == hashlib.sha256((tmp_path / path).read_bytes()).hexdigest()
+        )
+    sets = {
+        item["@id"]: item
+        for item in croissant["distribution"]
+        if item["@type"] == "cr:FileSet"
+    }
     assert [item["name"] for item in croissant["recordSet"]] == ["train", "validation"]
     for records in croissant["recordSet"]:
         for field in records["field"]:
             contained = sets[field["source"]["fileSet"]["@id"]]["containedIn"]
             for name in (item["@id"] for item in contained):
                 assert name.startswith(f"parquet/{records['name']}/")
-                column = parquet.read_schema(tmp_path / name).field(field["source"]["extract"]["column"])
+                column = parquet.read_schema(tmp_path / name).field(
+                    field["source"]["extract"]["column"]
+                )
                 width = getattr(column.type, "list_size", None)
-                assert field.get("arrayShape") == (None if width is None else str(width))
+                assert field.get("arrayShape") == (
+                    None if width is None else str(width)
+                )
 
 
 @pytest.mark.extended
@@ -102,11 +129,21 @@ def test_mlcroissant_iterates_the_record_sets(dataset: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_files_of_an_earlier_state_are_removed_and_others_kept(dataset: Path, tmp_path: Path) -> None:
+def test_files_of_an_earlier_state_are_removed_and_others_kept(
+    dataset: Path, tmp_path: Path
+) -> None:
     pytest.importorskip("pyarrow")
-    old = ["parquet/train/00007.parquet", "parquet/gone/00000.parquet", "hdf5/train/shard-00007.h5"]
+    old = [
+        "parquet/train/00007.parquet",
+        "parquet/gone/00000.parquet",
+        "hdf5/train/shard-00007.h5",
+    ]
     old += ["hdf5/gone/shard-00000.h5", "hdf5/gone/shard-00000.json"]
-    own = ["parquet/train/notes.txt", "hdf5/gone/notes.md", "figures/train/00007.parquet"]
+    own = [
+        "parquet/train/notes.txt",
+        "hdf5/gone/notes.md",
+        "figures/train/00007.parquet",
+    ]
     for name in old + own:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("earlier")
@@ -118,7 +155,9 @@ def test_files_of_an_earlier_state_are_removed_and_others_kept(dataset: Path, tm
 
 
 @pytest.mark.parametrize("inside", [".", "hub", "train/hub"])
-def test_a_repository_inside_the_dataset_is_refused(inside: str, tmp_path: Path) -> None:
+def test_a_repository_inside_the_dataset_is_refused(
+    inside: str, tmp_path: Path
+) -> None:
     with pytest.raises(UsageError, match="out must be a folder outside the dataset"):
         publish_dataset(tmp_path, "lab/hits", out=tmp_path / inside, dry_run=True)
     assert not list(tmp_path.iterdir())
@@ -126,11 +165,18 @@ def test_a_repository_inside_the_dataset_is_refused(inside: str, tmp_path: Path)
 
 @pytest.mark.slow
 def test_the_repository_is_created_and_uploaded(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    dataset: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     pytest.importorskip("pyarrow")
     calls: list[tuple[str, Any]] = []
-    stale = {"parquet/train/00009.parquet", "hdf5/train/shard-00009.h5", "hdf5/gone/shard-00000.json"}
+    stale = {
+        "parquet/train/00009.parquet",
+        "hdf5/train/shard-00009.h5",
+        "hdf5/gone/shard-00000.json",
+    }
     others = {".gitattributes", "figures/one.png"}
     remote = {*stale, *others}
 
@@ -147,31 +193,62 @@ def test_the_repository_is_created_and_uploaded(
             if len(calls) > 2:
                 raise OSError("connection lost")
             patterns, local = options["delete_patterns"], Path(options["folder_path"])
-            matching = {name for name in remote for pattern in patterns if fnmatch(name, pattern)}
-            present = {path.relative_to(local).as_posix() for path in local.rglob("*") if path.is_file()}
+            matching = {
+                name
+                for name in remote
+                for pattern in patterns
+                if fnmatch(name, pattern)
+            }
+            present = {
+                path.relative_to(local).as_posix()
+                for path in local.rglob("*")
+                if path.is_file()
+            }
             remote.difference_update(matching - present)
             remote.update(present)
 
     monkeypatch.setitem(sys.modules, "huggingface_hub", SimpleNamespace(HfApi=Api))
-    arguments = ["publish", str(dataset), "--to", "lab/hits", "--private", "-o", str(tmp_path / "out")]
+    arguments = [
+        "publish",
+        str(dataset),
+        "--to",
+        "lab/hits",
+        "--private",
+        "-o",
+        str(tmp_path / "out"),
+    ]
     assert main(arguments) == 0
     assert capsys.readouterr().out.strip() == "https://hub.example.org/lab/hits"
-    assert calls[0] == ("lab/hits", {"repo_type": "dataset", "private": True, "exist_ok": True})
+    assert calls[0] == (
+        "lab/hits",
+        {"repo_type": "dataset", "private": True, "exist_ok": True},
+    )
     assert calls[1][1]["folder_path"] == tmp_path / "out"
     assert remote & {*stale, *others} == others
-    assert {"README.md", "parquet/train/00000.parquet", "hdf5/train/shard-00000.h5"} <= remote
+    assert {
+        "README.md",
+        "parquet/train/00000.parquet",
+        "hdf5/train/shard-00000.h5",
+    } <= remote
     assert main(arguments) == 3
     assert "lab/hits was not uploaded: connection lost" in capsys.readouterr().err
 
 
-def test_the_client_accepts_the_arguments(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_client_accepts_the_arguments(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     huggingface_hub = pytest.importorskip("huggingface_hub")
     calls = []
     for name in ("create_repo", "upload_folder"):
         function = create_autospec(getattr(huggingface_hub.HfApi, name))
-        function.side_effect = lambda *_, **options: calls.append(options) or "https://hub.example.org/lab/hits"
+        function.side_effect = lambda *_, **options: (
+            calls.append(options) or "https://hub.example.org/lab/hits"
+        )
         monkeypatch.setattr(huggingface_hub.HfApi, name, function)
-    assert upload_folder(tmp_path, "lab/hits", private=True) == "https://hub.example.org/lab/hits"
+    assert (
+        upload_folder(tmp_path, "lab/hits", private=True)
+        == "https://hub.example.org/lab/hits"
+    )
     assert [options["repo_type"] for options in calls] == ["dataset", "dataset"]
 
 
@@ -184,4 +261,7 @@ def test_a_dataset_without_a_license_and_a_wrong_name_are_refused(
     assert main(["publish", str(folder), "--to", "lab/hits", "--dry-run"]) == 2
     assert "has no license: add license" in capsys.readouterr().err
     assert main(["publish", str(folder), "--to", "hits", "--dry-run"]) == 2
-    assert "--to must be the name of a repository, USER/NAME, got 'hits'" in capsys.readouterr().err
+    assert (
+        "--to must be the name of a repository, USER/NAME, got 'hits'"
+        in capsys.readouterr().err
+    )

@@ -31,7 +31,9 @@ def hit_and_return(planner: Planner, state, puck) -> JoinedPlans:
     """A hit and the way back to the base configuration."""
     hit = plan_hits(planner, state, puck, TARGET, speed_share=SHARE).plans
     q, dq, ddq = hit.states_at(hit.duration)
-    return join_plans(hit, planner.plan(q, planner.robot.home, start_dq=dq, start_ddq=ddq))
+    return join_plans(
+        hit, planner.plan(q, planner.robot.home, start_dq=dq, start_ddq=ddq)
+    )
 
 
 @pytest.fixture
@@ -42,7 +44,9 @@ def runtime(planner) -> PlanRuntime:
 @pytest.fixture
 def executing(planner, runtime) -> PlanRuntime:
     """A runtime that executes a hit and the way back from time 0.1 s on."""
-    assert runtime.switch(hit_and_return(planner, runtime.state_at(0.1), [1.0, 0.2]), 0.1).accepted
+    assert runtime.switch(
+        hit_and_return(planner, runtime.state_at(0.1), [1.0, 0.2]), 0.1
+    ).accepted
     return runtime
 
 
@@ -53,7 +57,10 @@ def states_of_scipy(plan, times):
         knots = np.r_[np.zeros(7), np.linspace(0, 1, len(control) - 6), np.ones(7)]
         return BSpline(knots, control, 7)
 
-    path, rate = spline(plan.path_control_points[0]), spline(plan.rate_control_points[0])
+    path, rate = (
+        spline(plan.path_control_points[0]),
+        spline(plan.rate_control_points[0]),
+    )
     solution = solve_ivp(
         lambda _, s: rate(np.clip(s, 0, 1)),
         (0, times[-1]),
@@ -82,24 +89,34 @@ def test_set_points_are_the_states_of_the_plan(planner, runtime):
     assert runtime.end_time == pytest.approx(float(sequence.duration[0]))
 
 
-def test_a_switch_in_flight_is_continuous_in_position_velocity_and_acceleration(planner, executing):
+def test_a_switch_in_flight_is_continuous_in_position_velocity_and_acceleration(
+    planner, executing
+):
     old = executing.state_at(0.25)
     assert executing.switch(hit_and_return(planner, old, [1.05, -0.1]), 0.25).accepted
-    before, after = (executing.state_at(np.array([0.25 + step])) for step in (-1e-9, 1e-9))
+    before, after = (
+        executing.state_at(np.array([0.25 + step])) for step in (-1e-9, 1e-9)
+    )
     for left, right, tolerance in zip(before, after, (1e-8, 1e-7, 1e-5), strict=True):
         np.testing.assert_allclose(left, right, atol=tolerance)
     assert np.abs(old.dq).max() > 0.2
     times = np.arange(0.0, executing.end_time, 1e-4)
     q, dq, ddq = executing.set_point(times)
     np.testing.assert_allclose((q[2:] - q[:-2]) / 2e-4, dq[1:-1], atol=1e-4)
-    np.testing.assert_allclose((dq[2:] - dq[:-2]) / 2e-4, ddq[1:-1], atol=0.2)  # the jerk jumps
+    np.testing.assert_allclose(
+        (dq[2:] - dq[:-2]) / 2e-4, ddq[1:-1], atol=0.2
+    )  # the jerk jumps
 
 
-def test_plans_that_must_not_be_executed_are_refused_and_the_motion_continues(planner, executing):
+def test_plans_that_must_not_be_executed_are_refused_and_the_motion_continues(
+    planner, executing
+):
     state, end = executing.state_at(0.3), executing.end_time
     sequence = hit_and_return(planner, state, [1.05, -0.1])
     before = executing.state_at(np.linspace(0.1, end, 40))
-    far = planner.plan(state.q, planner.robot.home + 0.6, start_dq=state.dq, start_ddq=state.ddq)
+    far = planner.plan(
+        state.q, planner.robot.home + 0.6, start_dq=state.dq, start_ddq=state.ddq
+    )
     refusals = {
         SwitchOutcome.NO_PLAN: executing.switch(None, 0.3),
         SwitchOutcome.MOVING: executing.switch(sequence.parts[0], 0.3),
@@ -114,13 +131,17 @@ def test_plans_that_must_not_be_executed_are_refused_and_the_motion_continues(pl
     assert "jumps by" in refusals[SwitchOutcome.JUMP].detail
     assert refusals[SwitchOutcome.INVALID].detail
     assert executing.end_time == end
-    for old, new in zip(before, executing.state_at(np.linspace(0.1, end, 40)), strict=True):
+    for old, new in zip(
+        before, executing.state_at(np.linspace(0.1, end, 40)), strict=True
+    ):
         np.testing.assert_array_equal(old, new)
 
 
 def test_replanning_in_the_background_switches_if_it_is_in_time(planner, executing):
     with executing:
-        in_time = executing.replan(lambda state: hit_and_return(planner, state, [1.05, -0.1]), 0.3)
+        in_time = executing.replan(
+            lambda state: hit_and_return(planner, state, [1.05, -0.1]), 0.3
+        )
         assert in_time.result(timeout=60).accepted
         reached = threading.Event()
 
@@ -133,8 +154,13 @@ def test_replanning_in_the_background_switches_if_it_is_in_time(planner, executi
         reached.set()
         assert late.result(timeout=60).outcome is SwitchOutcome.LATE
         failed = executing.replan(lambda _: 1 / 0, 0.5).result(timeout=60)
-        refused = executing.replan(lambda state: planner.plan(state.q[:3], state.q), 0.5).result(timeout=60)
-    assert (failed.outcome, refused.outcome) == (SwitchOutcome.FAILED, SwitchOutcome.FAILED)
+        refused = executing.replan(
+            lambda state: planner.plan(state.q[:3], state.q), 0.5
+        ).result(timeout=60)
+    assert (failed.outcome, refused.outcome) == (
+        SwitchOutcome.FAILED,
+        SwitchOutcome.FAILED,
+    )
     assert failed.detail == "ZeroDivisionError: division by zero"
     assert "start_q" in refused.detail
 
@@ -163,11 +189,15 @@ def test_invalid_arguments_raise_errors(planner, runtime):
     with pytest.raises(UsageError, match=r"q must be finite and have shape \(6,\)"):
         PlanRuntime(planner, np.zeros(5))
     plans = planner.plan(np.zeros((2, 6)), np.ones((2, 6)))
-    with pytest.raises(UsageError, match="plan must be one plan or one sequence, got 2"):
+    with pytest.raises(
+        UsageError, match="plan must be one plan or one sequence, got 2"
+    ):
         runtime.switch(plans, 0.5)
 
 
-def test_a_hit_that_is_replanned_in_flight_scores_in_the_simulator_at_1_khz(planner, runtime):
+def test_a_hit_that_is_replanned_in_flight_scores_in_the_simulator_at_1_khz(
+    planner, runtime
+):
     """The puck turns out to lie elsewhere 0.12 s after the start; the arm hits it there, returns, and rests."""
     pytest.importorskip("mujoco")
     from cnpgen.addons.benchmark.simulator.execute import execute
@@ -187,11 +217,15 @@ def test_a_hit_that_is_replanned_in_flight_scores_in_the_simulator_at_1_khz(plan
     q, dq, ddq = (np.array(values) for values in zip(*points, strict=True))
     scene = simulator_scene(hit, PLANTS["nominal"])
     np.testing.assert_allclose(scene.puck, [1.05, 0.05], atol=1e-6)
-    execution = execute(scene, Reference(q, dq, ddq, contact_end), hit.columns["goal_xyz"][0])
+    execution = execute(
+        scene, Reference(q, dq, ddq, contact_end), hit.columns["goal_xyz"][0]
+    )
     assert execution.executed.success
     assert execution.executed.plane_error < 5e-3
     assert execution.executed.torque_use < 1
-    base = Arm(open_problem(planner.model.problem)[1]).pose(planner.robot.home).translation
+    base = (
+        Arm(open_problem(planner.model.problem)[1]).pose(planner.robot.home).translation
+    )
     resting = execution.tip[min(2400, len(execution.tip) - 1)]
     assert np.linalg.norm(resting - base) < 5e-3
     assert evaluate_plans(hit).valid.all()
@@ -203,7 +237,12 @@ def test_set_points_at_impossible_times_are_refused_and_change_nothing(planner, 
     for evaluate in (runtime.set_point, runtime.state_at):
         with pytest.raises(UsageError, match=r"^time must be"):
             evaluate(time)
-    assert runtime.switch(planner.plan(planner.robot.home, planner.robot.home), 0.0).outcome != SwitchOutcome.LATE
+    assert (
+        runtime.switch(
+            planner.plan(planner.robot.home, planner.robot.home), 0.0
+        ).outcome
+        != SwitchOutcome.LATE
+    )
 
 
 def test_plans_and_stops_have_the_parameters_of_the_runtime():

@@ -12,9 +12,17 @@ RADIUS = 0.005
 
 def covered(points: np.ndarray, boxes: tuple[Obstacle, ...]) -> np.ndarray:
     """Return which points are inside a box with their radius."""
-    low = np.array([box.position for box in boxes]) - np.array([box.size for box in boxes]) / 2
-    high = np.array([box.position for box in boxes]) + np.array([box.size for box in boxes]) / 2
-    inside = (points[:, None] - RADIUS >= low - 1e-12) & (points[:, None] + RADIUS <= high + 1e-12)
+    low = (
+        np.array([box.position for box in boxes])
+        - np.array([box.size for box in boxes]) / 2
+    )
+    high = (
+        np.array([box.position for box in boxes])
+        + np.array([box.size for box in boxes]) / 2
+    )
+    inside = (points[:, None] - RADIUS >= low - 1e-12) & (
+        points[:, None] + RADIUS <= high + 1e-12
+    )
     return inside.all(axis=2).any(axis=1)
 
 
@@ -32,11 +40,20 @@ def test_all_points_are_in_boxes_that_hardly_exceed_them() -> None:
     boxes = obstacles_of_points(points, radius=RADIUS, resolution=0.05)
     assert covered(points, boxes).all()
     assert len({box.name for box in boxes}) == len(boxes) <= 100
-    low = np.array([box.position for box in boxes]) - np.array([box.size for box in boxes]) / 2
+    low = (
+        np.array([box.position for box in boxes])
+        - np.array([box.size for box in boxes]) / 2
+    )
     high = low + np.array([box.size for box in boxes])
-    samples = np.random.default_rng(2).uniform(low.min(axis=0), high.max(axis=0), (4000, 3))
-    inside = ((samples[:, None] >= low) & (samples[:, None] <= high)).all(axis=2).any(axis=1)
-    distance = np.linalg.norm(samples[inside][:, None] - points[::3], axis=2).min(axis=1)
+    samples = np.random.default_rng(2).uniform(
+        low.min(axis=0), high.max(axis=0), (4000, 3)
+    )
+    inside = (
+        ((samples[:, None] >= low) & (samples[:, None] <= high)).all(axis=2).any(axis=1)
+    )
+    distance = np.linalg.norm(samples[inside][:, None] - points[::3], axis=2).min(
+        axis=1
+    )
     assert distance.max() < 0.05 * 3**0.5 + 3**0.5 * RADIUS
     assert not inside.all()
 
@@ -55,12 +72,30 @@ def test_the_number_of_boxes_is_bounded() -> None:
     ("points", "options", "message"),
     [
         ([[0.0, 0.0]], {}, r"points must have shape \(N, 3\)"),
-        ([[0.0, np.nan, 0.0]], {}, "must be finite and at most 100 m, got .* in point 0"),
-        ([[600.0, 0.0, 0.0]], {}, "at most 100 m, got .* in point 0; did you mean 600 mm = 0.6 m"),
-        ([[1.0, 0.0, 0.0]], {"radius": -1.0}, "radius must be from 1e-06 to 1 m, got -1 m"),
-        ([[1.0, 0.0, 0.0]], {"resolution": 0.0}, "resolution must be from 0.01 to 1 m, got 0 m"),
+        (
+            [[0.0, np.nan, 0.0]],
+            {},
+            "must be finite and at most 100 m, got .* in point 0",
+        ),
+        (
+            [[600.0, 0.0, 0.0]],
+            {},
+            "at most 100 m, got .* in point 0; did you mean 600 mm = 0.6 m",
+        ),
+        (
+            [[1.0, 0.0, 0.0]],
+            {"radius": -1.0},
+            "radius must be from 1e-06 to 1 m, got -1 m",
+        ),
+        (
+            [[1.0, 0.0, 0.0]],
+            {"resolution": 0.0},
+            "resolution must be from 0.01 to 1 m, got 0 m",
+        ),
     ],
 )
-def test_invalid_clouds_are_refused(points: list[list[float]], options: dict[str, float], message: str) -> None:
+def test_invalid_clouds_are_refused(
+    points: list[list[float]], options: dict[str, float], message: str
+) -> None:
     with pytest.raises(UsageError, match=message):
         obstacles_of_points(points, **{"radius": RADIUS, **options})

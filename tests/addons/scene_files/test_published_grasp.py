@@ -38,7 +38,9 @@ bookshelf_small_panda:
 def penetration(name: str, scene: cnpgen.scenes.SceneProblem) -> float:
     """Return the largest penetration of the links at the goal by Coal [m]."""
     problem = cnpgen.load_problem(name).with_obstacles(scene.obstacles)
-    return Hulls(problem, load_robot(problem)).violation(scene.goal_q.T.copy(), place_obstacles(scene.obstacles))
+    return Hulls(problem, load_robot(problem)).violation(
+        scene.goal_q.T.copy(), place_obstacles(scene.obstacles)
+    )
 
 
 @pytest.mark.slow
@@ -49,6 +51,8 @@ def test_the_open_gripper_reaches_a_published_grasp(tmp_path):
     (scene,) = load_scenes(path)
     assert np.isclose(scene.goal_q[0, 0], -0.358064085)
     assert penetration("panda", scene) == 0
-    assert penetration("panda-3kg", scene) > 0.004  # the closed gripper is inside of the cylinder
+    assert (
+        penetration("panda-3kg", scene) > 0.004
+    )  # the closed gripper is inside of the cylinder
     solved = solve_scenes("panda", [scene])
     assert all(result.valid for result in solved.results)

@@ -19,19 +19,28 @@ from tests.examples.plans import PROBLEMS, ROBOTS, load
 
 def positions(plans: Plans, rate: float, noise: float = 0.0) -> Trajectory:
     plan = sample_plan(plans.motion, rate)
-    return Trajectory(plan.t, plan.q + noise * np.random.default_rng(0).uniform(-1, 1, plan.q.shape))
+    return Trajectory(
+        plan.t, plan.q + noise * np.random.default_rng(0).uniform(-1, 1, plan.q.shape)
+    )
 
 
 @pytest.mark.parametrize(("rate", "noise"), [(100, 0.0), (30, 0.0), (100, 1e-3)])
 @pytest.mark.parametrize("label", ["hit", "transport"])
-def test_imported_positions_are_valid_after_refining(label: str, rate: float, noise: float) -> None:
+def test_imported_positions_are_valid_after_refining(
+    label: str, rate: float, noise: float
+) -> None:
     original = plans_of(load(label))
     trajectory = positions(original, rate, noise)
     imported = import_trajectories(original.problem, [trajectory], noise=noise)
-    assert imported.deviation[0] == pytest.approx(largest_error(imported.plans.motion, trajectory.t, trajectory.q))
+    assert imported.deviation[0] == pytest.approx(
+        largest_error(imported.plans.motion, trajectory.t, trajectory.q)
+    )
     assert imported.deviation[0] < 2e-3 + 2 * noise
     assert imported.snapped[0] <= max(1e-3, 3 * noise)
-    assert np.abs(imported.plans.boundary.start_q - original.boundary.start_q).max() < 1e-3 + 3 * noise
+    assert (
+        np.abs(imported.plans.boundary.start_q - original.boundary.start_q).max()
+        < 1e-3 + 3 * noise
+    )
     refined = cnpgen.refine_plans(imported.plans, workers=1).plans
     verdict = cnpgen.evaluate_plans(refined, workers=1).verdicts[0]
     assert verdict.valid, verdict
@@ -40,23 +49,38 @@ def test_imported_positions_are_valid_after_refining(label: str, rate: float, no
 def test_given_derivatives_are_the_boundary_conditions() -> None:
     original = plans_of(load("replan"))
     plan = sample_plan(original.motion, 500)
-    imported = import_trajectories(original.problem, [Trajectory(plan.t, plan.q, plan.dq, plan.ddq)])
+    imported = import_trajectories(
+        original.problem, [Trajectory(plan.t, plan.q, plan.dq, plan.ddq)]
+    )
     for name in ("start_q", "start_dq", "goal_q", "goal_dq"):
-        found, expected = getattr(imported.plans.boundary, name), getattr(original.boundary, name)
+        found, expected = (
+            getattr(imported.plans.boundary, name),
+            getattr(original.boundary, name),
+        )
         assert np.allclose(found, expected, atol=1e-5), name
-    assert np.allclose(imported.plans.boundary.start_ddq, original.boundary.start_ddq, atol=1e-2)
+    assert np.allclose(
+        imported.plans.boundary.start_ddq, original.boundary.start_ddq, atol=1e-2
+    )
 
 
 def test_a_motion_at_rest_at_its_ends() -> None:
     original = plans_of(load("hit"))
-    imported = import_trajectories(original.problem, [positions(original, 100)], at_rest=True)
+    imported = import_trajectories(
+        original.problem, [positions(original, 100)], at_rest=True
+    )
     boundary = imported.plans.boundary
-    assert not any(part.any() for part in (boundary.start_dq, boundary.start_ddq, boundary.goal_dq))
+    assert not any(
+        part.any() for part in (boundary.start_dq, boundary.start_ddq, boundary.goal_dq)
+    )
     known = original.boundary.goal_dq
-    boundary = import_trajectories(original.problem, [positions(original, 100)], at_rest="start").plans.boundary
+    boundary = import_trajectories(
+        original.problem, [positions(original, 100)], at_rest="start"
+    ).plans.boundary
     assert not any(part.any() for part in (boundary.start_dq, boundary.start_ddq))
     assert np.abs(boundary.goal_dq - known).max() < 0.1 < np.abs(known).max()
-    boundary = import_trajectories(original.problem, [positions(original, 100)], at_rest="goal").plans.boundary
+    boundary = import_trajectories(
+        original.problem, [positions(original, 100)], at_rest="goal"
+    ).plans.boundary
     assert not boundary.goal_dq.any()
 
 
@@ -78,8 +102,12 @@ def test_a_state_is_moved_onto_the_manifold_and_into_the_limits() -> None:
 def test_estimated_accelerations_outside_the_limits_do_not_prevent_the_import() -> None:
     original = plans_of(load("hit"))
     trajectory = positions(original, 100)
-    jolted = trajectory.q + 2e-3 * np.exp(-trajectory.t / 0.02)[:, None] * np.array([1, -1, 1, -1, 1, -1])
-    imported = import_trajectories(original.problem, [Trajectory(trajectory.t, jolted)], noise=2e-3)
+    jolted = trajectory.q + 2e-3 * np.exp(-trajectory.t / 0.02)[:, None] * np.array(
+        [1, -1, 1, -1, 1, -1]
+    )
+    imported = import_trajectories(
+        original.problem, [Trajectory(trajectory.t, jolted)], noise=2e-3
+    )
     limit = ROBOTS["airhockey"].acceleration_limit
     assert imported.snapped[0] <= 6e-3
     assert (np.abs(imported.plans.boundary.start_ddq) <= limit * (1 + 1e-9)).all()
@@ -100,7 +128,8 @@ def test_the_number_of_control_points_grows_with_the_detail_of_the_samples() -> 
     smooth = Trajectory(t, base + 0.1 * (1 - np.cos(np.pi * t / 4))[:, None])
     detailed = Trajectory(t, base + 0.1 * (1 - np.cos(5 * np.pi * t / 2))[:, None])
     points = [
-        import_trajectories("airhockey", [each]).plans.path_control_points.shape[1] for each in (smooth, detailed)
+        import_trajectories("airhockey", [each]).plans.path_control_points.shape[1]
+        for each in (smooth, detailed)
     ]
     assert points[0] == 15 < points[1]
 
@@ -109,11 +138,17 @@ def test_no_trajectories_and_other_numbers_of_joints_are_refused() -> None:
     with pytest.raises(UsageError, match="no trajectories"):
         import_trajectories("airhockey", [])
     with pytest.raises(UsageError, match="has 2 joints, the problem plans 6"):
-        import_trajectories("airhockey", [Trajectory(np.array([0.0, 1.0]), np.zeros((2, 2)))])
+        import_trajectories(
+            "airhockey", [Trajectory(np.array([0.0, 1.0]), np.zeros((2, 2)))]
+        )
 
 
-def test_the_command_writes_a_plan_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    export_plans(plans_of(load("hit"), load("hit")), tmp_path / "out", to="csv", rate=200)
+def test_the_command_writes_a_plan_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    export_plans(
+        plans_of(load("hit"), load("hit")), tmp_path / "out", to="csv", rate=200
+    )
     out = tmp_path / "plans.h5"
     words = ["import", str(tmp_path / "out"), "--problem", "airhockey", "-o", str(out)]
     assert main(words) == 0
@@ -134,7 +169,9 @@ def test_refining_stays_within_a_distance_of_the_imported_path(
     """Check a motion whose first joint turns away and back: without the bound, the refiner leaves its path."""
     original = plans_of(load("hit"))
     turned = original.path_control_points.copy()
-    turned[:, 6:9, 0] += 0.1  # joint 1 turns about the vertical, so that the tip stays on the table
+    turned[:, 6:9, 0] += (
+        0.1  # joint 1 turns about the vertical, so that the tip stays on the table
+    )
     slow = cnpgen.make_plans(
         original.problem,
         original.boundary,
@@ -142,9 +179,19 @@ def test_refining_stays_within_a_distance_of_the_imported_path(
         rate_control_points=original.rate_control_points,
     )
     export_plans(slow, tmp_path / "slow", to="csv", rate=200)
-    words = ["import", str(tmp_path / "slow"), "--problem", "airhockey", "-o", str(tmp_path / "plans.h5")]
+    words = [
+        "import",
+        str(tmp_path / "slow"),
+        "--problem",
+        "airhockey",
+        "-o",
+        str(tmp_path / "plans.h5"),
+    ]
     assert main([*words, "--stay-within", "1deg"]) == 0
-    assert "1 of 1 valid, at most 0.017 rad from the imported path" in capsys.readouterr().err
+    assert (
+        "1 of 1 valid, at most 0.017 rad from the imported path"
+        in capsys.readouterr().err
+    )
     near = cnpgen.load_plans(tmp_path / "plans.h5")
     assert cnpgen.evaluate_plans(near, workers=1).valid.all()
     imported = import_trajectories(original.problem, [positions(slow, 200)])

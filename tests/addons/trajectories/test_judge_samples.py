@@ -5,7 +5,11 @@ import pytest
 
 import cnpgen
 from cnpgen.addons.trajectories.resolved_curves import is_resolved, resolved_curves
-from cnpgen.addons.trajectories.smooth_curve import AccelerationLimits, estimated_derivative, smooth_curve
+from cnpgen.addons.trajectories.smooth_curve import (
+    AccelerationLimits,
+    estimated_derivative,
+    smooth_curve,
+)
 from cnpgen.errors import UsageError
 from cnpgen.plans.exporter import sample_plan
 from cnpgen.trajectories import Decision, Trajectory
@@ -20,7 +24,9 @@ SAMPLINGS = [(100, 1), (30, 1), (30, 2), (30, 0), (100, 0), (500, 2)]
 
 def wave(times: np.ndarray, order: int = 0) -> np.ndarray:
     """Return derivatives of a motion of two joints, shape (K, 2)."""
-    return np.asarray(RATES**order * np.sin(RATES * times[:, None] + 0.3 + order * np.pi / 2))
+    return np.asarray(
+        RATES**order * np.sin(RATES * times[:, None] + 0.3 + order * np.pi / 2)
+    )
 
 
 def sampled(motion: Motion, rate: float, orders: int) -> Trajectory:
@@ -29,10 +35,19 @@ def sampled(motion: Motion, rate: float, orders: int) -> Trajectory:
 
 
 @pytest.mark.parametrize("orders", [1, 2])
-def test_the_smooth_curve_leads_through_the_samples_within_the_limits(orders: int) -> None:
-    times = np.cumsum(np.concatenate([[0.0], np.random.default_rng(0).uniform(0.5, 1.5, 60)])) * 0.01
+def test_the_smooth_curve_leads_through_the_samples_within_the_limits(
+    orders: int,
+) -> None:
+    times = (
+        np.cumsum(
+            np.concatenate([[0.0], np.random.default_rng(0).uniform(0.5, 1.5, 60)])
+        )
+        * 0.01
+    )
     trajectory = Trajectory(times, *(wave(times, order) for order in range(orders + 1)))
-    limits = AccelerationLimits(1.01 * np.abs(wave(times, 2)).max(axis=0), np.full(2, np.inf))
+    limits = AccelerationLimits(
+        1.01 * np.abs(wave(times, 2)).max(axis=0), np.full(2, np.inf)
+    )
     curve = smooth_curve(trajectory, limits)
     assert curve is not None
     states = curve.evaluate(times / times[-1], jerk=False)
@@ -47,18 +62,31 @@ def test_the_smooth_curve_leads_through_the_samples_within_the_limits(orders: in
 def test_accelerations_that_jump_at_an_end_stay_within_the_limits() -> None:
     fine = np.linspace(0, 0.3, 300_001)
     acceleration = 10 * np.minimum(fine / 1e-3, 1)  # a jump within a tenth of a span
-    velocity = np.concatenate([[0.0], np.cumsum((acceleration[1:] + acceleration[:-1]) / 2) * fine[1]])
-    position = np.concatenate([[0.0], np.cumsum((velocity[1:] + velocity[:-1]) / 2) * fine[1]])
+    velocity = np.concatenate(
+        [[0.0], np.cumsum((acceleration[1:] + acceleration[:-1]) / 2) * fine[1]]
+    )
+    position = np.concatenate(
+        [[0.0], np.cumsum((velocity[1:] + velocity[:-1]) / 2) * fine[1]]
+    )
     chosen = slice(None, None, 10_000)
-    trajectory = Trajectory(fine[chosen], position[chosen, None], velocity[chosen, None])
+    trajectory = Trajectory(
+        fine[chosen], position[chosen, None], velocity[chosen, None]
+    )
     s = np.linspace(0, 1, 20_000)
     limits = AccelerationLimits(np.array([10.02]), np.array([np.inf]))
     curve = smooth_curve(trajectory, limits)
     assert curve is not None
     assert np.abs(curve.evaluate(s, jerk=False).ddq).max() <= 10.02 + 1e-6
     cubic = cnpgen.trajectories.Trajectory(trajectory.t, trajectory.q, trajectory.dq)
-    assert np.abs(cubic.states(s * 0.3)[2]).max() > 10.3, "the cubic curve violates the limit"
-    assert smooth_curve(trajectory, AccelerationLimits(np.array([9.5]), np.array([np.inf]))) is None
+    assert np.abs(cubic.states(s * 0.3)[2]).max() > 10.3, (
+        "the cubic curve violates the limit"
+    )
+    assert (
+        smooth_curve(
+            trajectory, AccelerationLimits(np.array([9.5]), np.array([np.inf]))
+        )
+        is None
+    )
 
 
 def test_a_jerk_limit_holds_at_the_ends() -> None:
@@ -73,9 +101,17 @@ def test_a_jerk_limit_holds_at_the_ends() -> None:
 
 
 def test_derivatives_are_estimated_from_neighbors() -> None:
-    times = np.cumsum(np.concatenate([[0.0], np.random.default_rng(1).uniform(0.5, 1.5, 60)])) * 0.02
+    times = (
+        np.cumsum(
+            np.concatenate([[0.0], np.random.default_rng(1).uniform(0.5, 1.5, 60)])
+        )
+        * 0.02
+    )
     trajectory = Trajectory(times, wave(times), wave(times, 1))
-    errors = [np.abs(estimated_derivative(trajectory, 2, count) - wave(times, 2)).max() for count in (3, 5)]
+    errors = [
+        np.abs(estimated_derivative(trajectory, 2, count) - wave(times, 2)).max()
+        for count in (3, 5)
+    ]
     assert errors[1] < 1e-6
     assert errors[0] > 100 * errors[1]
 
@@ -83,16 +119,27 @@ def test_derivatives_are_estimated_from_neighbors() -> None:
 @pytest.mark.parametrize("label", LABELS)
 @pytest.mark.parametrize(("rate", "orders"), SAMPLINGS)
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
-def test_a_plan_stays_within_the_resolved_curves(label: str, rate: float, orders: int, noise: float) -> None:
+def test_a_plan_stays_within_the_resolved_curves(
+    label: str, rate: float, orders: int, noise: float
+) -> None:
     plans, random = plans_of(load(label)), np.random.default_rng(2)
     exact = sampled(plans.motion, rate, orders)
     parts = [part for part in (exact.q, exact.dq, exact.ddq) if part is not None]
-    noisy = Trajectory(exact.t, *(part + noise * random.uniform(-1, 1, part.shape) for part in parts))
-    limit = np.abs(plans.motion.at_times(np.linspace(0, exact.t[-1], 5000)[None]).ddq[0]).max(axis=0)
+    noisy = Trajectory(
+        exact.t, *(part + noise * random.uniform(-1, 1, part.shape) for part in parts)
+    )
+    limit = np.abs(
+        plans.motion.at_times(np.linspace(0, exact.t[-1], 5000)[None]).ddq[0]
+    ).max(axis=0)
     family = resolved_curves(noisy, np.full(3, noise), limit)
     t = np.linspace(0, exact.t[-1], 2000)
-    states, truth = family.evaluate(t / t[-1], jerk=False), plans.motion.at_times(t[None])
-    for name, bound in zip(("q", "dq", "ddq"), family.bounds_at(t / t[-1]), strict=False):
+    states, truth = (
+        family.evaluate(t / t[-1], jerk=False),
+        plans.motion.at_times(t[None]),
+    )
+    for name, bound in zip(
+        ("q", "dq", "ddq"), family.bounds_at(t / t[-1]), strict=False
+    ):
         error = np.abs(getattr(states, name) - getattr(truth, name)[0].T)
         assert (error <= bound + 1e-9).all(), name
 
@@ -107,9 +154,13 @@ def test_slow_samples_do_not_resolve_a_fast_motion() -> None:
 
 @pytest.mark.parametrize("label", ["hit", "transport"])
 @pytest.mark.parametrize(("rate", "orders"), [(100, 1), (500, 1), (500, 2)])
-def test_a_valid_plan_is_valid_from_its_samples(label: str, rate: float, orders: int) -> None:
+def test_a_valid_plan_is_valid_from_its_samples(
+    label: str, rate: float, orders: int
+) -> None:
     plans = plans_of(load(label))
-    (verdict,) = cnpgen.evaluate_trajectories(plans.problem, [sampled(plans.motion, rate, orders)]).verdicts
+    (verdict,) = cnpgen.evaluate_trajectories(
+        plans.problem, [sampled(plans.motion, rate, orders)]
+    ).verdicts
     assert verdict.valid, verdict
 
 
@@ -120,24 +171,41 @@ def test_a_plan_that_is_too_fast_is_never_valid(label: str, rate: float) -> None
     for name, power in (("joint velocity", 1), ("joint acceleration", 2)):
         margin = cnpgen.evaluate_plans(plans, workers=1).verdicts[0].margins[name]
         wanted = 1 + margin.tolerance / abs(margin.bound) + 0.01
-        fast = plans.motion.time_scaled((abs(margin.value / margin.bound) / wanted) ** (1 / power))
+        fast = plans.motion.time_scaled(
+            (abs(margin.value / margin.bound) / wanted) ** (1 / power)
+        )
         for orders in (0, 1, 2):
-            (verdict,) = cnpgen.evaluate_trajectories(plans.problem, [sampled(fast, rate, orders)]).verdicts
+            (verdict,) = cnpgen.evaluate_trajectories(
+                plans.problem, [sampled(fast, rate, orders)]
+            ).verdicts
             assert verdict.decision != Decision.VALID, (name, orders)
             assert verdict.conditions[name].decision != Decision.VALID, (name, orders)
 
 
 def test_a_velocity_between_positions_that_a_line_hides_is_undecided() -> None:
     plans = plans_of(load("hit"))
-    margin = cnpgen.evaluate_plans(plans, workers=1).verdicts[0].margins["joint velocity"]
-    limit, joint, t = abs(margin.bound), plans.problem.joint_names.index(margin.part), 0.01 * np.arange(21.0)
+    margin = (
+        cnpgen.evaluate_plans(plans, workers=1).verdicts[0].margins["joint velocity"]
+    )
+    limit, joint, t = (
+        abs(margin.bound),
+        plans.problem.joint_names.index(margin.part),
+        0.01 * np.arange(21.0),
+    )
     decisions = []
-    for mean in (0.84, 0.82):  # of the limit: the velocity rises to 101 % and to 99 %, lines to at most 100 %
+    for mean in (
+        0.84,
+        0.82,
+    ):  # of the limit: the velocity rises to 101 % and to 99 %, lines to at most 100 %
         q = np.repeat(plans.boundary.start_q[:1], len(t), axis=0)
-        q[:, joint] = limit * (mean * (t - 0.1) + 0.17 * np.sin(40 * np.pi * t) / (40 * np.pi))
+        q[:, joint] = limit * (
+            mean * (t - 0.1) + 0.17 * np.sin(40 * np.pi * t) / (40 * np.pi)
+        )
         trajectory = Trajectory(t, q)
         for interpolation in (None, "linear"):
-            found = cnpgen.evaluate_trajectories(plans.problem, [trajectory], interpolation=interpolation)
+            found = cnpgen.evaluate_trajectories(
+                plans.problem, [trajectory], interpolation=interpolation
+            )
             decisions.append(found.verdicts[0].conditions["joint velocity"])
     hidden, line, *slower = decisions
     assert hidden.decision == Decision.UNDECIDED
@@ -148,16 +216,27 @@ def test_a_velocity_between_positions_that_a_line_hides_is_undecided() -> None:
 
 
 @pytest.mark.parametrize("label", LABELS)
-@pytest.mark.parametrize(("rate", "orders", "noise"), [(30, 0, 0.0), (30, 1, 5e-5), (30, 2, 1e-3), (100, 1, 5e-5)])
-def test_coarse_or_noisy_samples_give_no_wrong_decision(label: str, rate: float, orders: int, noise: float) -> None:
+@pytest.mark.parametrize(
+    ("rate", "orders", "noise"),
+    [(30, 0, 0.0), (30, 1, 5e-5), (30, 2, 1e-3), (100, 1, 5e-5)],
+)
+def test_coarse_or_noisy_samples_give_no_wrong_decision(
+    label: str, rate: float, orders: int, noise: float
+) -> None:
     plans, random = plans_of(load(label)), np.random.default_rng(3)
     exact = sampled(plans.motion, rate, orders)
     parts = [part for part in (exact.q, exact.dq, exact.ddq) if part is not None]
-    noisy = Trajectory(exact.t, *(part + noise * random.uniform(-1, 1, part.shape) for part in parts))
-    (verdict,) = cnpgen.evaluate_trajectories(plans.problem, [noisy], noise=noise).verdicts
+    noisy = Trajectory(
+        exact.t, *(part + noise * random.uniform(-1, 1, part.shape) for part in parts)
+    )
+    (verdict,) = cnpgen.evaluate_trajectories(
+        plans.problem, [noisy], noise=noise
+    ).verdicts
     truth = cnpgen.evaluate_plans(plans, workers=1).verdicts[0].margins
     for name, entry in verdict.conditions.items():
-        assert entry.decision != (Decision.INVALID if truth[name].ok else Decision.VALID), name
+        assert entry.decision != (
+            Decision.INVALID if truth[name].ok else Decision.VALID
+        ), name
 
 
 def test_an_estimate_needs_velocities() -> None:

@@ -34,7 +34,9 @@ from tests.examples.plans import load, perturbed
 from tests.examples.shaped_robot import WEDGE, write_problem
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+needs_chromium = pytest.mark.skipif(
+    CHROMIUM is None, reason="no Chromium on this machine"
+)
 
 
 def _has_meshcat() -> bool:
@@ -58,7 +60,9 @@ def content(page: Path) -> dict[str, Any]:
 
 def in_page(text: str, view: int = 0) -> dict[str, Any]:
     """Data of a page: those of the robot and of one view."""
-    data: dict[str, Any] = json.loads(re.search(r'type="application/json">(.*?)</script>', text, re.S)[1])
+    data: dict[str, Any] = json.loads(
+        re.search(r'type="application/json">(.*?)</script>', text, re.S)[1]
+    )
     return data | data["views"][view]
 
 
@@ -71,13 +75,20 @@ def plans(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two plans of a carried object, and a folder of rows beside them."""
     folder = tmp_path_factory.mktemp("view")
     cnpgen.make_dataset("heavy-object", folder / "rows", n=40, workers=1)
-    cnpgen.save_plans(folder / "plans.h5", plans_of(load("dragging"), load("transport")))
+    cnpgen.save_plans(
+        folder / "plans.h5", plans_of(load("dragging"), load("transport"))
+    )
     return folder / "plans.h5"
 
 
 @pytest.fixture(scope="module")
 def page(plans: Path) -> Path:
-    assert main(["view", str(plans), "--row", "1", "-o", str(plans.with_name("plan.html"))]) == 0
+    assert (
+        main(
+            ["view", str(plans), "--row", "1", "-o", str(plans.with_name("plan.html"))]
+        )
+        == 0
+    )
     return plans.with_name("plan.html")
 
 
@@ -85,7 +96,9 @@ def page(plans: Path) -> Path:
 def test_the_joints_of_a_plan_are_where_pinocchio_has_them(page, plans):
     shown, problem = content(page), load_problem("heavy-object")
     robot, motion = load_robot(problem), cnpgen.load_plans(plans).motion[1:2]
-    poses = array(shown["poses"], "<f4", -1, shown["joints_and_tip"], 4, 4).transpose(0, 1, 3, 2)
+    poses = array(shown["poses"], "<f4", -1, shown["joints_and_tip"], 4, 4).transpose(
+        0, 1, 3, 2
+    )
     assert len(poses) == len(shown["times"]) == len(shown["labels"]) == 240
     assert shown["times"][-1] == pytest.approx(motion.duration()[0])
     data = robot.model.createData()
@@ -93,7 +106,11 @@ def test_the_joints_of_a_plan_are_where_pinocchio_has_them(page, plans):
         q = motion.at_times(np.array([[shown["times"][k]]])).q[0, 0]
         pin.framesForwardKinematics(robot.model, data, q)
         np.testing.assert_allclose(poses[k, 3], data.oMi[3].homogeneous, atol=1e-6)
-        np.testing.assert_allclose(poses[k, -1], data.oMf[robot.model.getFrameId("object")].homogeneous, atol=1e-6)
+        np.testing.assert_allclose(
+            poses[k, -1],
+            data.oMf[robot.model.getFrameId("object")].homogeneous,
+            atol=1e-6,
+        )
 
 
 @needs_meshcat
@@ -102,10 +119,16 @@ def test_the_curves_are_shares_of_the_limits(page, plans):
     curves = {curve["name"]: np.array(curve["shares"]) for curve in shown["curves"]}
     assert list(curves) == ["position", "velocity", "acceleration", "torque"]
     states = cnpgen.load_plans(plans).motion[1:2].at_times(np.array([shown["times"]]))
-    np.testing.assert_allclose(curves["velocity"], states.dq[0].T / robot.velocity_limit[:, None], atol=1e-4)
+    np.testing.assert_allclose(
+        curves["velocity"], states.dq[0].T / robot.velocity_limit[:, None], atol=1e-4
+    )
     data = robot.model.createData()
-    torque = pin.rnea(robot.model, data, *(each[0, 120] for each in (states.q, states.dq, states.ddq)))
-    np.testing.assert_allclose(curves["torque"][:, 120], torque / robot.torque_limit, atol=1e-4)
+    torque = pin.rnea(
+        robot.model, data, *(each[0, 120] for each in (states.q, states.dq, states.ddq))
+    )
+    np.testing.assert_allclose(
+        curves["torque"][:, 120], torque / robot.torque_limit, atol=1e-4
+    )
 
 
 @needs_meshcat
@@ -129,11 +152,16 @@ def test_names_cannot_become_a_part_of_the_page(plans, tmp_path):
     shutil.copy(plans, named)
     assert main(["view", str(named), "-o", str(tmp_path / "page.html")]) == 0
     assert "<script>alert" not in (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert content(tmp_path / "page.html")["title"] == "heavy-object: <!--<script>alert(1)<b>.h5, plan 0"
+    assert (
+        content(tmp_path / "page.html")["title"]
+        == "heavy-object: <!--<script>alert(1)<b>.h5, plan 0"
+    )
 
 
 @needs_meshcat
-def test_a_row_without_a_plan_is_shown_at_its_start_and_goal(plans, capsys, monkeypatch, tmp_path):
+def test_a_row_without_a_plan_is_shown_at_its_start_and_goal(
+    plans, capsys, monkeypatch, tmp_path
+):
     monkeypatch.chdir(tmp_path)
     folder = plans.with_name("rows")
     assert main(["view", str(folder), "--split", "train", "--row", "3"]) == 0
@@ -142,7 +170,9 @@ def test_a_row_without_a_plan_is_shown_at_its_start_and_goal(plans, capsys, monk
     assert (shown["labels"], shown["curves"]) == (["start", "goal"], [])
     tips = array(shown["poses"], "<f4", 2, -1, 4, 4)[:, -1, 3, :3]
     rows = cnpgen.load_dataset(folder).arrays("train", fields=["start_xyz", "goal_xyz"])
-    np.testing.assert_allclose(tips, [rows["start_xyz"][3], rows["goal_xyz"][3]], atol=1e-6)
+    np.testing.assert_allclose(
+        tips, [rows["start_xyz"][3], rows["goal_xyz"][3]], atol=1e-6
+    )
 
 
 @needs_meshcat
@@ -159,10 +189,15 @@ def test_a_problem_is_shown_in_its_base_configuration(tmp_path):
 
 @needs_meshcat
 def test_a_robot_with_a_shape_has_capsules(tmp_path):
-    assert main(["view", str(write_problem(tmp_path)), "-o", str(tmp_path / "crane.html")]) == 0
+    assert (
+        main(["view", str(write_problem(tmp_path)), "-o", str(tmp_path / "crane.html")])
+        == 0
+    )
     shown = content(tmp_path / "crane.html")
     assert shown["note"].startswith("drawn with the convex parts")
-    assert {body["name"] for body in shown["capsules"]} == {body["name"] for body in shown["robot"]}
+    assert {body["name"] for body in shown["capsules"]} == {
+        body["name"] for body in shown["robot"]
+    }
     assert [body["name"] for body in shown["world"]] == ["wall", "roof"]
 
 
@@ -171,7 +206,9 @@ def _with_visual(folder: Path, name: str) -> Path:
     urdf = folder / "crane" / "crane.urdf"
     mesh = f'<mesh filename="{name}" scale="0.001 0.001 0.001"/>'
     visual = f'<visual><origin xyz="0.1 0 0"/><geometry>{mesh}</geometry></visual>'
-    urdf.write_text(urdf.read_text().replace('<link name="fore">', f'<link name="fore">{visual}'))
+    urdf.write_text(
+        urdf.read_text().replace('<link name="fore">', f'<link name="fore">{visual}')
+    )
     return file
 
 
@@ -179,11 +216,20 @@ def test_visual_meshes_are_shown_where_they_are_found(tmp_path):
     problem = load_problem(_with_visual(tmp_path, "package://crane/meshes/wedge.stl"))
     robot = load_robot(problem)
     (body,), kind = robot_bodies(problem, robot)
-    assert (kind, body.name, body.joint, len(body.triangles)) == ("meshes", "fore", 3, 8)
-    np.testing.assert_allclose(body.corners.max(axis=0), WEDGE.max(axis=0) / 1000 + [0.1, 0, 0], atol=1e-9)
+    assert (kind, body.name, body.joint, len(body.triangles)) == (
+        "meshes",
+        "fore",
+        3,
+        8,
+    )
+    np.testing.assert_allclose(
+        body.corners.max(axis=0), WEDGE.max(axis=0) / 1000 + [0.1, 0, 0], atol=1e-9
+    )
 
 
-@pytest.mark.parametrize("name", some(["meshes/none.stl", "meshes/broken.stl"], 1, "slow"))
+@pytest.mark.parametrize(
+    "name", some(["meshes/none.stl", "meshes/broken.stl"], 1, "slow")
+)
 def test_without_its_meshes_a_robot_is_shown_as_judges_see_it(name, tmp_path):
     problem = load_problem(_with_visual(tmp_path, name))
     (tmp_path / "crane" / "meshes" / "broken.stl").write_bytes(b"no mesh")
@@ -204,11 +250,16 @@ def volume(body) -> float:
     ],
 )
 def test_a_body_is_closed_and_its_triangles_face_outwards(corners, radius, expected):
-    assert volume(wrapped("body", 0, np.array(corners, float), radius)) == pytest.approx(expected, rel=0.02)
+    assert volume(
+        wrapped("body", 0, np.array(corners, float), radius)
+    ) == pytest.approx(expected, rel=0.02)
 
 
 def test_a_line_is_a_tube_round_its_points():
-    points = np.stack([np.linspace(0, 1, 20), np.sin(np.linspace(0, 3, 20)), np.linspace(0, 0.5, 20)], axis=1)
+    points = np.stack(
+        [np.linspace(0, 1, 20), np.sin(np.linspace(0, 3, 20)), np.linspace(0, 0.5, 20)],
+        axis=1,
+    )
     body = tube("line", points, 0.01)
     away = np.linalg.norm(body.corners.reshape(20, 6, 3) - points[:, None], axis=2)
     np.testing.assert_allclose(away, 0.01, rtol=1e-9)
@@ -218,10 +269,22 @@ def test_a_line_is_a_tube_round_its_points():
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["airhockey", "--row", "1"], "--row needs plans or the folder of a dataset, got airhockey"),
-        (["airhockey", "--split", "train"], "--split needs plans or the folder of a dataset, got airhockey"),
-        (["airhockey", "--problem", "airhockey"], "--problem needs plans or the folder of a dataset"),
-        (["airhockey", "-o", "page.png"], "expected a file that ends in .html, got 'page.png'"),
+        (
+            ["airhockey", "--row", "1"],
+            "--row needs plans or the folder of a dataset, got airhockey",
+        ),
+        (
+            ["airhockey", "--split", "train"],
+            "--split needs plans or the folder of a dataset, got airhockey",
+        ),
+        (
+            ["airhockey", "--problem", "airhockey"],
+            "--problem needs plans or the folder of a dataset",
+        ),
+        (
+            ["airhockey", "-o", "page.png"],
+            "expected a file that ends in .html, got 'page.png'",
+        ),
         (["airhockey", "--serve", "65536"], "expected a port, 0 to 65535, got '65536'"),
         (["airhockey", "--serve", "-o", "page.html"], "not allowed with"),
         (
@@ -241,14 +304,42 @@ def test_a_plan_is_shown_with_meshes_where_its_problem_is_named(tmp_path, capsys
     base, still = load_robot(load_problem(file)).base[None], np.zeros((1, 4))
     boundary = cnpgen.Boundary(base, still, still, base, still)
     points, rate = np.tile(base, (1, 15, 1)), np.ones((1, 20))
-    plans = cnpgen.make_plans(str(file), boundary, path_control_points=points, rate_control_points=rate)
+    plans = cnpgen.make_plans(
+        str(file), boundary, path_control_points=points, rate_control_points=rate
+    )
     cnpgen.save_plans(tmp_path / "plans.h5", plans)
     page = tmp_path / "plan.html"
     assert main(["view", str(tmp_path / "plans.h5"), "-o", str(page)]) == 0
-    assert len(content(page)["robot"]) > 3  # the pieces: what a file from elsewhere names is not read
-    assert main(["view", str(tmp_path / "plans.h5"), "--problem", str(file), "-o", str(page)]) == 0
+    assert (
+        len(content(page)["robot"]) > 3
+    )  # the pieces: what a file from elsewhere names is not read
+    assert (
+        main(
+            [
+                "view",
+                str(tmp_path / "plans.h5"),
+                "--problem",
+                str(file),
+                "-o",
+                str(page),
+            ]
+        )
+        == 0
+    )
     assert [body["name"] for body in content(page)["robot"]] == ["fore"]
-    assert main(["view", str(tmp_path / "plans.h5"), "--problem", "airhockey", "-o", str(page)]) == 1
+    assert (
+        main(
+            [
+                "view",
+                str(tmp_path / "plans.h5"),
+                "--problem",
+                "airhockey",
+                "-o",
+                str(page),
+            ]
+        )
+        == 1
+    )
     assert "not of 'airhockey'" in capsys.readouterr().err
 
 
@@ -300,8 +391,14 @@ def test_a_page_is_served_to_this_machine_and_follows_its_files(plans, tmp_path)
     shutil.copy(plans, file)
     with served(str(file)) as address:
         status, _, text = got(address)
-        assert (status, in_page(text)["title"]) == (200, "heavy-object: plans.h5, plan 0")
-        assert in_page(got(f"{address}?row=1")[2])["title"] == "heavy-object: plans.h5, plan 1"
+        assert (status, in_page(text)["title"]) == (
+            200,
+            "heavy-object: plans.h5, plan 0",
+        )
+        assert (
+            in_page(got(f"{address}?row=1")[2])["title"]
+            == "heavy-object: plans.h5, plan 1"
+        )
         assert got(f"{address}stamp")[2] == in_page(text)["stamp"] != ""
         status, headers, said = got(f"{address}?row=2")
         assert (status, headers["Refresh"]) == (500, "2")
@@ -338,12 +435,33 @@ def test_a_port_that_is_taken_is_said(capsys):
     assert f"cannot listen on port {port}" in capsys.readouterr().err
 
 
-def chromium(page: Path, *options: str, address: str = "", state: str = "time=120&ends", stream: str = "stdout") -> str:
+def chromium(
+    page: Path,
+    *options: str,
+    address: str = "",
+    state: str = "time=120&ends",
+    stream: str = "stdout",
+) -> str:
     """Open a page from disk in a browser without a screen; return what it prints."""
-    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    flags += ["--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update"]
+    flags = [
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+    ]
+    flags += [
+        "--disable-quic",
+        "--no-first-run",
+        "--disable-background-networking",
+        "--disable-component-update",
+    ]
     flags += ["--disable-sync", f"--user-data-dir={page.parent / 'browser'}"]
-    flags += [] if any("--window-size" in option for option in options) else ["--window-size=1200,700"]
+    flags += (
+        []
+        if any("--window-size" in option for option in options)
+        else ["--window-size=1200,700"]
+    )
     command = [
         str(CHROMIUM),
         *flags,
@@ -351,7 +469,9 @@ def chromium(page: Path, *options: str, address: str = "", state: str = "time=12
         *options,
         f"{address or page.as_uri()}#{state}",
     ]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=HANGING, check=True)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=HANGING, check=True
+    )
     return str(getattr(done, stream))
 
 
@@ -361,9 +481,13 @@ def test_a_browser_runs_the_page(page):
     found = chromium(page, "--dump-dom")
     assert 'data-ready="yes"' in found
     shown = content(page)
-    assert shown["labels"][120] in re.search(r'<output id="time">(.*?)</output>', found)[1]
+    assert (
+        shown["labels"][120] in re.search(r'<output id="time">(.*?)</output>', found)[1]
+    )
     assert (len(shown["curves"]), len(shown["conditions"])) == (4, 4)
-    assert found.count("<canvas") == 1 + 4 + 4  # the scene, the limits and the conditions
+    assert (
+        found.count("<canvas") == 1 + 4 + 4
+    )  # the scene, the limits and the conditions
 
 
 @needs_meshcat
@@ -386,19 +510,27 @@ def rejected(plans: Path) -> Path:
     backwards = valid.changed(rate=-valid.motion.rate)
     file = plans.with_name("rejected.h5")
     cnpgen.save_plans(file, plans_of(valid, broken, backwards))
-    assert main(["view", str(file), "--rows", "0-2", "-o", str(file.with_suffix(".html"))]) == 0
+    assert (
+        main(["view", str(file), "--rows", "0-2", "-o", str(file.with_suffix(".html"))])
+        == 0
+    )
     return file.with_suffix(".html")
 
 
 @needs_meshcat
 def test_a_rejected_plan_shows_the_time_and_the_place_of_its_violations(rejected):
     text = rejected.read_text(encoding="utf-8")
-    verdict = cnpgen.evaluate_plans(cnpgen.load_plans(rejected.with_suffix(".h5"))).verdicts[1]
+    verdict = cnpgen.evaluate_plans(
+        cnpgen.load_plans(rejected.with_suffix(".h5"))
+    ).verdicts[1]
     valid, broken = in_page(text, 0), in_page(text, 1)
     assert (valid["verdict"]["valid"], valid["verdict"]["reason"]) == (True, "ok")
     assert all(cause["ok"] for cause in valid["verdict"]["causes"])
     causes = {cause["name"]: cause for cause in broken["verdict"]["causes"]}
-    assert (broken["verdict"]["valid"], broken["verdict"]["reason"]) == (False, verdict.reason)
+    assert (broken["verdict"]["valid"], broken["verdict"]["reason"]) == (
+        False,
+        verdict.reason,
+    )
     violated = [margin for margin in verdict.margins.values() if not margin.ok]
     assert len(violated) >= 3
     for margin in violated:
@@ -417,15 +549,37 @@ def test_a_rejected_plan_shows_the_time_and_the_place_of_its_violations(rejected
 def test_a_plan_that_cannot_be_evaluated_is_shown_at_its_ends_with_the_reason(rejected):
     shown = in_page(rejected.read_text(encoding="utf-8"), 2)
     assert shown["labels"] == ["start", "goal"]
-    assert shown["verdict"] == {"valid": False, "reason": "rate not positive", "causes": []}
+    assert shown["verdict"] == {
+        "valid": False,
+        "reason": "rate not positive",
+        "causes": [],
+    }
 
 
 @needs_meshcat
 def test_several_rows_of_a_dataset_are_on_one_page(plans, tmp_path):
     folder, page = plans.with_name("rows"), tmp_path / "rows.html"
-    assert main(["view", str(folder), "--split", "train", "--rows", "0,2-3", "-o", str(page)]) == 0
+    assert (
+        main(
+            [
+                "view",
+                str(folder),
+                "--split",
+                "train",
+                "--rows",
+                "0,2-3",
+                "-o",
+                str(page),
+            ]
+        )
+        == 0
+    )
     data = content(page)
-    assert [view["title"].rpartition(" ")[2] for view in data["views"]] == ["0", "2", "3"]
+    assert [view["title"].rpartition(" ")[2] for view in data["views"]] == [
+        "0",
+        "2",
+        "3",
+    ]
     assert data["n_rows"] == cnpgen.load_dataset(folder).splits["train"]
     assert all(view["verdict"] is None for view in data["views"])
 
@@ -434,15 +588,29 @@ def test_several_rows_of_a_dataset_are_on_one_page(plans, tmp_path):
 def test_the_puck_is_ahead_of_the_goal_and_the_mallet_on_the_tip(tmp_path):
     plan = load("hit")
     cnpgen.save_plans(tmp_path / "hit.h5", plans_of(plan))
-    assert main(["view", str(tmp_path / "hit.h5"), "-o", str(tmp_path / "hit.html")]) == 0
+    assert (
+        main(["view", str(tmp_path / "hit.h5"), "-o", str(tmp_path / "hit.html")]) == 0
+    )
     shown = content(tmp_path / "hit.html")
     (puck,) = (body for body in shown["world"] if body["name"] == "puck")
     corners = array(puck["corners"], "<f4", -1, 3)
-    model, data, frame = plan.robot.model, plan.robot.model.createData(), plan.robot.tip_frame
-    jacobian = pin.computeFrameJacobian(model, data, plan.boundary.goal_q[0], frame, pin.LOCAL_WORLD_ALIGNED)
+    model, data, frame = (
+        plan.robot.model,
+        plan.robot.model.createData(),
+        plan.robot.tip_frame,
+    )
+    jacobian = pin.computeFrameJacobian(
+        model, data, plan.boundary.goal_q[0], frame, pin.LOCAL_WORLD_ALIGNED
+    )
     direction = (jacobian[:3] @ plan.boundary.goal_dq[0])[:2]
-    distance = (corners.min(axis=0) + corners.max(axis=0))[:2] / 2 - plan.goal_xyz[0, :2]
-    np.testing.assert_allclose(distance / np.linalg.norm(distance), direction / np.linalg.norm(direction), atol=1e-4)
+    distance = (corners.min(axis=0) + corners.max(axis=0))[:2] / 2 - plan.goal_xyz[
+        0, :2
+    ]
+    np.testing.assert_allclose(
+        distance / np.linalg.norm(distance),
+        direction / np.linalg.norm(direction),
+        atol=1e-4,
+    )
     assert [body["name"] for body in shown["mallet"]] == ["mallet"]
     assert "puck distance" in [curve["name"] for curve in shown["conditions"]]
 
@@ -470,8 +638,14 @@ def test_a_browser_shows_the_verdict_without_an_error(rejected, width):
     assert "rejected: " in re.search(r'<span id="badge"[^>]*>([^<]*)', found)[1]
     assert found.count('class="violated"') >= 3
     assert ">2 of 3<" in found
-    log = chromium(rejected, f"--screenshot={picture}", *flags, state="plan=1", stream="stderr")
-    messages = [line for line in log.splitlines() if "CONSOLE" in line and "GL Driver Message" not in line]
+    log = chromium(
+        rejected, f"--screenshot={picture}", *flags, state="plan=1", stream="stderr"
+    )
+    messages = [
+        line
+        for line in log.splitlines()
+        if "CONSOLE" in line and "GL Driver Message" not in line
+    ]
     assert messages == []
     image = pytest.importorskip("matplotlib.image").imread(picture)[..., :3]
     scene = image[100:360, : width // 2]
@@ -483,14 +657,27 @@ def test_a_browser_shows_the_verdict_without_an_error(rejected, width):
 @needs_meshcat
 def test_sampled_trajectories_are_shown_with_their_verdicts(tmp_path, capsys):
     hit = load("hit")
-    export_plans(plans_of(hit, perturbed(hit, 0.1)), tmp_path / "csv", to="csv", rate=500)
-    words = ["view", str(tmp_path / "csv"), "--problem", "airhockey", "--rows", "0,1", "-o", str(tmp_path / "a.html")]
+    export_plans(
+        plans_of(hit, perturbed(hit, 0.1)), tmp_path / "csv", to="csv", rate=500
+    )
+    words = [
+        "view",
+        str(tmp_path / "csv"),
+        "--problem",
+        "airhockey",
+        "--rows",
+        "0,1",
+        "-o",
+        str(tmp_path / "a.html"),
+    ]
     assert main(words) == 0
     text = (tmp_path / "a.html").read_text(encoding="utf-8")
     valid, invalid = in_page(text, 0), in_page(text, 1)
     assert (valid["verdict"]["valid"], valid["verdict"]["reason"]) == (True, "ok")
     assert "puck" in {body["name"] for body in valid["world"]}
-    expected = cnpgen.evaluate_trajectories("airhockey", load_trajectories(tmp_path / "csv", "airhockey").trajectories)
+    expected = cnpgen.evaluate_trajectories(
+        "airhockey", load_trajectories(tmp_path / "csv", "airhockey").trajectories
+    )
     verdict = expected.verdicts[1]
     assert invalid["verdict"]["reason"] == str(verdict)
     causes = {cause["name"]: cause for cause in invalid["verdict"]["causes"]}
@@ -498,7 +685,9 @@ def test_sampled_trajectories_are_shown_with_their_verdicts(tmp_path, capsys):
         margin = entry.margin
         cause = causes[f"{margin.name} {margin.part}".strip()]
         assert cause["ok"] == margin.ok
-        assert margin.ok or invalid["times"][cause["frame"]] == pytest.approx(margin.time, abs=1e-9)
+        assert margin.ok or invalid["times"][cause["frame"]] == pytest.approx(
+            margin.time, abs=1e-9
+        )
     assert main([*words[:-4], "--row", "2"]) == 2
     assert "has no trajectory 2: 2 are numbered from 0" in capsys.readouterr().err
     assert main(["view", "airhockey", "--unit", "deg"]) == 2

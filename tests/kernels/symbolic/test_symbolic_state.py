@@ -16,7 +16,11 @@ from cnpgen.kernels.symbolic.convex_distances import (
     upright_box_separation,
 )
 from cnpgen.kernels.symbolic.dynamics import inverse_dynamics
-from cnpgen.kernels.symbolic.kinematics import bias_acceleration, forward_kinematics, tip_velocity
+from cnpgen.kernels.symbolic.kinematics import (
+    bias_acceleration,
+    forward_kinematics,
+    tip_velocity,
+)
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.tape import tape_from_function
 from cnpgen.problems.load_robot import load_robot
@@ -70,20 +74,45 @@ def urdf(joints: list[tuple[str, str, str, str, str]]) -> str:
     names = ["world", *(name + "_link" for name, *_ in joints)]
     parts = ['<?xml version="1.0"?>\n<robot name="synthetic">\n  <link name="world"/>']
     for index, (name, kind, xyz, rpy, axis) in enumerate(joints):
-        parts.append(LINK.format(name=names[index + 1], com=f"0.0{index} -0.0{index + 1} 0.1", mass=1.5 + index))
+        parts.append(
+            LINK.format(
+                name=names[index + 1],
+                com=f"0.0{index} -0.0{index + 1} 0.1",
+                mass=1.5 + index,
+            )
+        )
         where = {"parent": names[index], "child": names[index + 1]}
-        parts.append(JOINT.format(name=name, kind=kind, xyz=xyz, rpy=rpy, axis=axis, **where))
+        parts.append(
+            JOINT.format(name=name, kind=kind, xyz=xyz, rpy=rpy, axis=axis, **where)
+        )
     return "".join([*parts, "\n</robot>\n"])
 
 
 def synthetic(folder: Path, joints: list[tuple[str, str, str, str, str]]) -> Robot:
     (folder / "arm.urdf").write_text(urdf(joints))
-    spec = RobotSpec(urdf="arm.urdf", joints=("j1", "j2", "j3", "j4"), tip="tip_link", base=(0.0,) * 4)
-    return load_robot(Problem(name="synthetic", robot=spec, limits=LimitSpec(), path=folder / "problem.toml"))
+    spec = RobotSpec(
+        urdf="arm.urdf",
+        joints=("j1", "j2", "j3", "j4"),
+        tip="tip_link",
+        base=(0.0,) * 4,
+    )
+    return load_robot(
+        Problem(
+            name="synthetic",
+            robot=spec,
+            limits=LimitSpec(),
+            path=folder / "problem.toml",
+        )
+    )
 
 
-@pytest.fixture(scope="module", params=["airhockey", "heavy-object", "arbitrary axes", "prismatic joint"])
-def robot(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Robot:
+@pytest.fixture(
+    scope="module",
+    params=["airhockey", "heavy-object", "arbitrary axes", "prismatic joint"],
+)
+def robot(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Robot:
     arms = {"arbitrary axes": ARBITRARY, "prismatic joint": PRISMATIC}
     if request.param in arms:
         return synthetic(tmp_path_factory.mktemp("robot"), arms[request.param])
@@ -92,7 +121,9 @@ def robot(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 @pytest.fixture(scope="module")
 def chain_function(robot: Robot) -> ca.Function:
-    (q_sx, q), (dq_sx, dq), (ddq_sx, ddq) = (symbols(name, robot.n) for name in ("q", "dq", "ddq"))
+    (q_sx, q), (dq_sx, dq), (ddq_sx, ddq) = (
+        symbols(name, robot.n) for name in ("q", "dq", "ddq")
+    )
     kin = forward_kinematics(robot.chain, q)
     outputs = {
         "position": kin.tip,
@@ -105,13 +136,21 @@ def chain_function(robot: Robot) -> ca.Function:
         "torque": inverse_dynamics(robot.chain, q, dq, ddq),
     }
     expressions = [ca.vertcat(*values) for values in outputs.values()]
-    return ca.Function("chain", [q_sx, dq_sx, ddq_sx], expressions, ["q", "dq", "ddq"], list(outputs))
+    return ca.Function(
+        "chain", [q_sx, dq_sx, ddq_sx], expressions, ["q", "dq", "ddq"], list(outputs)
+    )
 
 
 def random_states(robot: Robot) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     random = np.random.default_rng(1)
-    normal = [(random.normal(size=robot.n), 5 * random.normal(size=robot.n)) for _ in range(STATES)]
-    return [(random.uniform(robot.position_lower, robot.position_upper), *rates) for rates in normal]
+    normal = [
+        (random.normal(size=robot.n), 5 * random.normal(size=robot.n))
+        for _ in range(STATES)
+    ]
+    return [
+        (random.uniform(robot.position_lower, robot.position_upper), *rates)
+        for rates in normal
+    ]
 
 
 def evaluate(function: ca.Function, **inputs: np.ndarray) -> dict[str, np.ndarray]:
@@ -124,24 +163,40 @@ def test_chain_has_as_many_joints_as_the_model_and_is_driven_by_gravity(robot):
 
 
 def test_forward_kinematics_and_jacobian_agree_with_pinocchio(robot, chain_function):
-    model, data, local = robot.model, robot.model.createData(), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    model, data, local = (
+        robot.model,
+        robot.model.createData(),
+        pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
+    )
     tip = model.getFrameId(robot.tip)
     for q, dq, ddq in random_states(robot):
         found = evaluate(chain_function, q=q, dq=dq, ddq=ddq)
         pin.framesForwardKinematics(model, data, q)
         jacobian = pin.computeFrameJacobian(model, data, q, tip, local)
         close = {"rtol": 0, "atol": 1e-12}
-        np.testing.assert_allclose(found["position"], data.oMf[tip].translation, **close)
-        np.testing.assert_allclose(found["rotation"].reshape(3, 3), data.oMf[tip].rotation, **close)
+        np.testing.assert_allclose(
+            found["position"], data.oMf[tip].translation, **close
+        )
+        np.testing.assert_allclose(
+            found["rotation"].reshape(3, 3), data.oMf[tip].rotation, **close
+        )
         origins = [data.oMi[i].translation for i in range(1, model.njoints)]
         np.testing.assert_allclose(found["origins"].reshape(-1, 3), origins, **close)
-        np.testing.assert_allclose(found["jacobian"].reshape(-1, 3).T, jacobian[:3], **close)
+        np.testing.assert_allclose(
+            found["jacobian"].reshape(-1, 3).T, jacobian[:3], **close
+        )
         turning = [not joint.prismatic for joint in robot.chain.joints]
-        np.testing.assert_allclose(found["axes"].reshape(-1, 3)[turning].T, jacobian[3:, turning], **close)
+        np.testing.assert_allclose(
+            found["axes"].reshape(-1, 3)[turning].T, jacobian[3:, turning], **close
+        )
 
 
 def test_tip_velocity_and_bias_acceleration_agree_with_pinocchio(robot, chain_function):
-    model, data, local = robot.model, robot.model.createData(), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    model, data, local = (
+        robot.model,
+        robot.model.createData(),
+        pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
+    )
     tip = model.getFrameId(robot.tip)
     for q, dq, ddq in random_states(robot):
         found = evaluate(chain_function, q=q, dq=dq, ddq=ddq)
@@ -156,12 +211,19 @@ def test_inverse_dynamics_agree_with_pinocchio(robot, chain_function):
     model, data = robot.model, robot.model.createData()
     for q, dq, ddq in random_states(robot):
         found = evaluate(chain_function, q=q, dq=dq, ddq=ddq)
-        np.testing.assert_allclose(found["torque"], pin.rnea(model, data, q, dq, ddq), rtol=1e-12, atol=1e-10)
+        np.testing.assert_allclose(
+            found["torque"], pin.rnea(model, data, q, dq, ddq), rtol=1e-12, atol=1e-10
+        )
 
 
 def test_a_prismatic_joint_is_read_as_prismatic(tmp_path):
     robot = synthetic(tmp_path, PRISMATIC)
-    assert [joint.prismatic for joint in robot.chain.joints] == [False, False, True, False]
+    assert [joint.prismatic for joint in robot.chain.joints] == [
+        False,
+        False,
+        True,
+        False,
+    ]
 
 
 def test_chain_rounds_a_urdf_pi_half_to_exact_zeros():
@@ -170,19 +232,27 @@ def test_chain_rounds_a_urdf_pi_half_to_exact_zeros():
 
 
 def test_reach_of_a_revolute_chain_is_never_exceeded(tmp_path):
-    for robot in (load_robot(load_problem("heavy-object")), synthetic(tmp_path, ARBITRARY)):
+    for robot in (
+        load_robot(load_problem("heavy-object")),
+        synthetic(tmp_path, ARBITRARY),
+    ):
         model, data = robot.model, robot.model.createData()
         for q, _, _ in random_states(robot):
             pin.framesForwardKinematics(model, data, q)
             tip = data.oMf[model.getFrameId(robot.tip)].translation
-            assert np.linalg.norm(tip - data.oMi[1].translation) <= robot.chain.reach + 1e-12
+            assert (
+                np.linalg.norm(tip - data.oMi[1].translation)
+                <= robot.chain.reach + 1e-12
+            )
 
 
 def test_every_moving_body_counts_once(robot):
     full = pin.buildModelFromUrdf(str(robot.urdf))
     first = full.getJointId(robot.joint_names[0])
     expected = sum(inertia.mass for inertia in list(full.inertias)[first:])
-    assert sum(joint.mass for joint in robot.chain.joints) == pytest.approx(expected, abs=1e-12)
+    assert sum(joint.mass for joint in robot.chain.joints) == pytest.approx(
+        expected, abs=1e-12
+    )
 
 
 # --- distances: one obstacle, random and degenerate segments and cuboids against Coal ---------------------------------
@@ -195,14 +265,26 @@ FACES = np.array([LOW - 0.1, LOW, (LOW + HIGH) / 2, HIGH, HIGH + 0.1])
 def coal_distance(shape: object, rotation: np.ndarray, position: np.ndarray) -> float:
     request = coal.DistanceRequest()
     request.gjk_tolerance, request.epa_tolerance = 1e-12, 1e-9
-    places = coal.Transform3s(rotation, position), coal.Transform3s(np.eye(3), (LOW + HIGH) / 2)
-    return coal.distance(shape, places[0], coal.Box(*(HIGH - LOW)), places[1], request, coal.DistanceResult())
+    places = (
+        coal.Transform3s(rotation, position),
+        coal.Transform3s(np.eye(3), (LOW + HIGH) / 2),
+    )
+    return coal.distance(
+        shape,
+        places[0],
+        coal.Box(*(HIGH - LOW)),
+        places[1],
+        request,
+        coal.DistanceResult(),
+    )
 
 
 def coal_segment_separation(first: np.ndarray, second: np.ndarray) -> float:
     length = float(np.linalg.norm(second - first))
     along = (second - first) / length if length else np.array([0.0, 0.0, 1.0])
-    rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), along).toRotationMatrix()
+    rotation = pin.Quaternion.FromTwoVectors(
+        np.array([0.0, 0.0, 1.0]), along
+    ).toRotationMatrix()
     return coal_distance(coal.Capsule(0.0, length), rotation, (first + second) / 2)
 
 
@@ -218,11 +300,17 @@ def segments(kind: str, count: int = 400) -> Iterator[tuple[np.ndarray, np.ndarr
         if kind == "in the plane of a face":
             first[axis] = second[axis] = random.choice([LOW[axis], HIGH[axis]])
         if kind == "between corners, edges and faces":
-            first, second = (np.array([random.choice(FACES[:, k]) for k in range(3)]) for _ in range(2))
+            first, second = (
+                np.array([random.choice(FACES[:, k]) for k in range(3)])
+                for _ in range(2)
+            )
         if kind == "inside":
             first, second = random.uniform(LOW, HIGH, (2, 3))
         if kind == "touching the top":
-            first, second = np.append(random.uniform(LOW, HIGH)[:2], HIGH[2]), second + np.array([0, 0, 2])
+            first, second = (
+                np.append(random.uniform(LOW, HIGH)[:2], HIGH[2]),
+                second + np.array([0, 0, 2]),
+            )
         if kind == "of no length":
             second = first.copy()
         yield first, second
@@ -235,13 +323,21 @@ def box_bounds() -> list[tuple[float, float]]:
 @pytest.fixture(scope="module")
 def segment_function() -> ca.Function:
     (first_sx, first), (second_sx, second) = symbols("first", 3), symbols("second", 3)
-    return ca.Function("segment", [first_sx, second_sx], [segment_box_distance(first, second, box_bounds())])
+    return ca.Function(
+        "segment",
+        [first_sx, second_sx],
+        [segment_box_distance(first, second, box_bounds())],
+    )
 
 
 @pytest.fixture(scope="module")
 def separation_function() -> ca.Function:
     (first_sx, first), (second_sx, second) = symbols("first", 3), symbols("second", 3)
-    return ca.Function("separation", [first_sx, second_sx], [segment_box_separation(first, second, box_bounds())])
+    return ca.Function(
+        "separation",
+        [first_sx, second_sx],
+        [segment_box_separation(first, second, box_bounds())],
+    )
 
 
 @pytest.mark.parametrize(
@@ -257,32 +353,51 @@ def separation_function() -> ca.Function:
         "of no length",
     ],
 )
-def test_segment_box_distances_agree_with_coal(segment_function, separation_function, kind):
+def test_segment_box_distances_agree_with_coal(
+    segment_function, separation_function, kind
+):
     cases = list(segments(kind))
-    found = np.array([float(segment_function(first, second)) for first, second in cases])
-    expected = np.array([coal_segment_separation(first, second) for first, second in cases])
+    found = np.array(
+        [float(segment_function(first, second)) for first, second in cases]
+    )
+    expected = np.array(
+        [coal_segment_separation(first, second) for first, second in cases]
+    )
     np.testing.assert_allclose(found, np.maximum(expected, 0), rtol=0, atol=1e-9)
-    separation = np.array([float(separation_function(first, second)) for first, second in cases])
+    separation = np.array(
+        [float(separation_function(first, second)) for first, second in cases]
+    )
     np.testing.assert_allclose(separation, expected, rtol=0, atol=2e-9)
     if kind in {"inside", "touching the top"}:
         np.testing.assert_array_equal(found, 0.0)
 
 
-def test_segment_box_distance_is_not_nan_where_numpy_maximum_returns_nan(segment_function):
+def test_segment_box_distance_is_not_nan_where_numpy_maximum_returns_nan(
+    segment_function,
+):
     first, second = (
-        np.array(points).T.copy() for points in zip(*segments("between corners, edges and faces"), strict=True)
+        np.array(points).T.copy()
+        for points in zip(*segments("between corners, edges and faces"), strict=True)
     )
-    expected = [float(segment_function(a, b)) for a, b in zip(first.T, second.T, strict=True)]
+    expected = [
+        float(segment_function(a, b)) for a, b in zip(first.T, second.T, strict=True)
+    ]
     (found,) = InterpretedKernel(tape_from_function(segment_function))(first, second)
     np.testing.assert_allclose(found[0], expected, rtol=0, atol=1e-15)
 
 
 @pytest.fixture(scope="module")
 def cuboid_function() -> ca.Function:
-    (center_sx, center), (rotation_sx, rotation) = symbols("center", 3), symbols("rotation", 9)
+    (center_sx, center), (rotation_sx, rotation) = (
+        symbols("center", 3),
+        symbols("rotation", 9),
+    )
     rows = [rotation[0:3], rotation[3:6], rotation[6:9]]
     endless = [*box_bounds()[:2], (None, HIGH[2])]
-    outputs = [upright_box_separation(center, rows, SIZE, box) for box in (box_bounds(), endless)]
+    outputs = [
+        upright_box_separation(center, rows, SIZE, box)
+        for box in (box_bounds(), endless)
+    ]
     return ca.Function("cuboid", [center_sx, rotation_sx], outputs)
 
 
@@ -290,17 +405,27 @@ def cuboids(tilt: float, count: int = 1500) -> Iterator[tuple[np.ndarray, np.nda
     random = np.random.default_rng(3)
     for index in range(count):
         position = random.uniform(LOW - 0.2, HIGH + 0.2)
-        position[2] = HIGH[2] + 0.15 + random.choice([0.0, 1e-9, -1e-9, 1e-4, -1e-4, *random.uniform(-0.4, 0.1, 3)])
+        position[2] = (
+            HIGH[2]
+            + 0.15
+            + random.choice(
+                [0.0, 1e-9, -1e-9, 1e-4, -1e-4, *random.uniform(-0.4, 0.1, 3)]
+            )
+        )
         turn = [0.0, np.pi / 2, *random.uniform(-np.pi, np.pi, 4)][index % 6]
         lean = random.uniform(-np.pi, np.pi)
-        rotation = pin.exp3(tilt * np.array([np.cos(lean), np.sin(lean), 0.0])) @ pin.exp3(np.array([0.0, 0.0, turn]))
+        rotation = pin.exp3(
+            tilt * np.array([np.cos(lean), np.sin(lean), 0.0])
+        ) @ pin.exp3(np.array([0.0, 0.0, turn]))
         yield position, rotation
 
 
 def test_separation_of_an_upright_cuboid_agrees_with_coal(cuboid_function):
     overlapping = 0
     for position, rotation in cuboids(tilt=0.0):
-        found, _ = (float(value) for value in cuboid_function(position, rotation.ravel()))
+        found, _ = (
+            float(value) for value in cuboid_function(position, rotation.ravel())
+        )
         expected = coal_distance(coal.Box(*SIZE), rotation, position)
         overlapping += expected < 0
         if expected <= 0:
@@ -311,15 +436,21 @@ def test_separation_of_an_upright_cuboid_agrees_with_coal(cuboid_function):
 
 
 @pytest.mark.parametrize("tilt", some([1e-8, 1e-3, np.deg2rad(1.0)], 1, "slow"))
-def test_separation_of_a_tilted_cuboid_is_a_lower_bound_with_an_error_of_tilt_times_edge(cuboid_function, tilt):
+def test_separation_of_a_tilted_cuboid_is_a_lower_bound_with_an_error_of_tilt_times_edge(
+    cuboid_function, tilt
+):
     for position, rotation in cuboids(tilt):
-        found, _ = (float(value) for value in cuboid_function(position, rotation.ravel()))
+        found, _ = (
+            float(value) for value in cuboid_function(position, rotation.ravel())
+        )
         expected = coal_distance(coal.Box(*SIZE), rotation, position)
         assert found <= expected + 1e-9 + tilt**2 * max(-expected, 0.0)
         assert found >= expected - 1e-9 - tilt * max(SIZE) or expected > 0
 
 
-def test_a_box_without_lower_end_separates_from_above_and_from_the_sides_only(cuboid_function):
+def test_a_box_without_lower_end_separates_from_above_and_from_the_sides_only(
+    cuboid_function,
+):
     upright = np.eye(3).ravel()
     below = np.array([0.4, -0.45, LOW[2] - 0.5])
     box, endless = (float(value) for value in cuboid_function(below, upright))

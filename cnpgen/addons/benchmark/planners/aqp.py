@@ -1,8 +1,10 @@
 """Anchored quadratic programming ('cnpgen docs references', 2), a baseline of the paper for hits.
 
-The planner first computes a path of the tip in the plane, two lines and an arc, with constant acceleration up to the
-hit. At each sample, a quadratic program then computes the joint velocity that follows the path. It moves the arm
-towards the hitting configuration in the null space of the tip's Jacobian, within limits of position and velocity only.
+The planner first computes a path of the tip in the plane, two lines and an arc, with
+constant acceleration up to the hit. At each sample, a quadratic program then computes
+the joint velocity that follows the path. It moves the arm towards the hitting
+configuration in the null space of the tip's Jacobian, within limits of position and
+velocity only.
 """
 
 from __future__ import annotations
@@ -14,7 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.benchmark_planner import BenchmarkPlanner, Plan, Setting
-from cnpgen.addons.benchmark.simulator.hockey import HOME_M, LENGTH_M, MALLET_RADIUS_M, WIDTH_M
+from cnpgen.addons.benchmark.simulator.hockey import (
+    HOME_M,
+    LENGTH_M,
+    MALLET_RADIUS_M,
+    WIDTH_M,
+)
 from cnpgen.addons.benchmark.simulator.tip import Tip
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.errors import UsageError
@@ -31,8 +38,18 @@ JOINT_WEIGHTS = (1.0, 1.0, 5.0, 1.0, 10.0, 10.0, 0.01)
 JOINT_LIMIT_FRACTION = 0.95
 SPEED_REDUCTION, MAX_TRIES = 0.9, 10  # after a failure
 BAND_MARGIN_M = 0.02  # between the mallet and a band
-MIN_MALLET_XY_M = np.array([HOME_M + MALLET_RADIUS_M + BAND_MARGIN_M, -WIDTH_M / 2 + MALLET_RADIUS_M + BAND_MARGIN_M])
-MAX_MALLET_XY_M = np.array([HOME_M + LENGTH_M / 2 - MALLET_RADIUS_M, WIDTH_M / 2 - MALLET_RADIUS_M - BAND_MARGIN_M])
+MIN_MALLET_XY_M = np.array(
+    [
+        HOME_M + MALLET_RADIUS_M + BAND_MARGIN_M,
+        -WIDTH_M / 2 + MALLET_RADIUS_M + BAND_MARGIN_M,
+    ]
+)
+MAX_MALLET_XY_M = np.array(
+    [
+        HOME_M + LENGTH_M / 2 - MALLET_RADIUS_M,
+        WIDTH_M / 2 - MALLET_RADIUS_M - BAND_MARGIN_M,
+    ]
+)
 STOP_OFFSET_M = np.array([0.1, 0.15])  # ahead of the hit and towards the centre
 MAX_STOP_XY_M = np.array([HOME_M + 0.9, 0.42085])
 MIN_BEND_RAD = 1e-6
@@ -42,9 +59,17 @@ MIN_BEND_RAD = 1e-6
 class AQP(BenchmarkPlanner):
     """Anchored quadratic programming along a path in the plane (Liu et al., 2021)."""
 
-    acceleration: float = field("largest acceleration of the mallet up to the hit", unit="m/s^2", default=8.0, low=0.1)
+    acceleration: float = field(
+        "largest acceleration of the mallet up to the hit",
+        unit="m/s^2",
+        default=8.0,
+        low=0.1,
+    )
     anchor_time: float = field(
-        "time constant of the motion towards the hitting configuration", unit="s", default=0.5, low=1e-3
+        "time constant of the motion towards the hitting configuration",
+        unit="s",
+        default=0.5,
+        low=1e-3,
     )
 
     def prepare(self, setting: Setting) -> Plan:
@@ -52,7 +77,9 @@ class AQP(BenchmarkPlanner):
         problem, robot = open_problem(setting.problem)
         table = problem.first(Table)
         if table is None or robot.n > len(JOINT_WEIGHTS):
-            raise UsageError(f"aqp plans hits on a table with up to 7 joints, {problem.name!r} is another problem")
+            raise UsageError(
+                f"aqp plans hits on a table with up to 7 joints, {problem.name!r} is another problem"
+            )
         return lambda task: _Follower(robot, task, self).plan(table.z)
 
 
@@ -68,12 +95,20 @@ class _Follower:
     def plan(self, height: float) -> Trajectory | None:
         """Plan the fastest hit that can be followed, down to a third of the required speed."""
         start, _, _ = self._tip.at(self._boundary.start_q[0])
-        velocity = self._tip.at(self._boundary.goal_q[0])[2][:3] @ self._boundary.goal_dq[0]
+        velocity = (
+            self._tip.at(self._boundary.goal_q[0])[2][:3] @ self._boundary.goal_dq[0]
+        )
         speed = float(np.linalg.norm(velocity[:2]))
         if speed == 0:
             raise UsageError("aqp plans hits, this motion ends at rest")
         for _ in range(MAX_TRIES):
-            hit = striking_path(start[:2], self._goal[:2], velocity[:2], speed, self._settings.acceleration)
+            hit = striking_path(
+                start[:2],
+                self._goal[:2],
+                velocity[:2],
+                speed,
+                self._settings.acceleration,
+            )
             stop = stopping_path(hit)
             trajectory = self._follow(hit, stop, height)
             if trajectory is not None:
@@ -81,7 +116,9 @@ class _Follower:
             speed *= SPEED_REDUCTION
         return None
 
-    def _follow(self, hit: PlanePath, stop: PlanePath, height: float) -> Trajectory | None:
+    def _follow(
+        self, hit: PlanePath, stop: PlanePath, height: float
+    ) -> Trajectory | None:
         """Follow both parts; return None if a quadratic program has no solution."""
         from scipy.interpolate import CubicSpline
 
@@ -93,7 +130,10 @@ class _Follower:
         dq = self._boundary.start_dq[0]
         for sample, time in zip(samples, t[1:], strict=True):
             next_dq = self._velocity(
-                q[-1], np.append(sample, height), period, self._anchor_velocity(q[-1], time, t[count], t[-1])
+                q[-1],
+                np.append(sample, height),
+                period,
+                self._anchor_velocity(q[-1], time, t[count], t[-1]),
             )
             if next_dq is None:
                 return None
@@ -104,31 +144,53 @@ class _Follower:
         return Trajectory(t[until], np.array(q)[until], np.asarray(spline(t, 1))[until])
 
     def _anchor_velocity(self, q: Array, t: float, hit: float, end: float) -> Array:
-        """Return the velocity towards the anchor; it increases up to the hit and then decreases."""
+        """Return the velocity towards the anchor.
+
+        It increases up to the hit and then decreases.
+        """
         velocity = (self._boundary.goal_q[0] - q) / self._settings.anchor_time
         if t > hit:
             return np.asarray((end - t) / (end - hit) * velocity)
         share = t / hit
-        return np.asarray(share * velocity + np.clip(1 - share, 0, 1) * self._boundary.start_dq[0])
+        return np.asarray(
+            share * velocity + np.clip(1 - share, 0, 1) * self._boundary.start_dq[0]
+        )
 
-    def _velocity(self, q: Array, position: Array, period: float, anchor_velocity: Array) -> Array | None:
+    def _velocity(
+        self, q: Array, position: Array, period: float, anchor_velocity: Array
+    ) -> Array | None:
         """Return the joint velocity that moves the tip to the sample, closest to the velocity of the anchor."""
         robot, (tip, _, J) = self._robot, self._tip.at(q)
         J = J[:3]
         min_norm = J.T @ np.linalg.solve(J @ J.T, (position - tip) / period)
         null = np.linalg.svd(J)[2][3:].T
-        low = np.maximum(-robot.velocity_limit, (JOINT_LIMIT_FRACTION * robot.position_lower - q) / period)
-        high = np.minimum(robot.velocity_limit, (JOINT_LIMIT_FRACTION * robot.position_upper - q) / period)
+        low = np.maximum(
+            -robot.velocity_limit,
+            (JOINT_LIMIT_FRACTION * robot.position_lower - q) / period,
+        )
+        high = np.minimum(
+            robot.velocity_limit,
+            (JOINT_LIMIT_FRACTION * robot.position_upper - q) / period,
+        )
         bounds = low - min_norm, high - min_norm
-        null_velocity = nearest_in_null_space(null, self._weights, min_norm - anchor_velocity, bounds)
-        return None if null_velocity is None else np.asarray(min_norm + null @ null_velocity)
+        null_velocity = nearest_in_null_space(
+            null, self._weights, min_norm - anchor_velocity, bounds
+        )
+        return (
+            None
+            if null_velocity is None
+            else np.asarray(min_norm + null @ null_velocity)
+        )
 
 
-def nearest_in_null_space(null: Array, weights: Array, ahead: Array, bounds: tuple[Array, Array]) -> Array | None:
+def nearest_in_null_space(
+    null: Array, weights: Array, ahead: Array, bounds: tuple[Array, Array]
+) -> Array | None:
     """Minimize ``a^T N^T W N a / 2 + ahead^T W N a`` with ``low <= N a <= high``, by DAQP.
 
-    N is ``null``, shape (n, k), and W has ``weights`` on its diagonal. ``ahead`` is the velocity without ``a`` minus
-    the desired one [rad/s], shape (n,). Return a, shape (k,), or None if the bounds [rad/s] are infeasible.
+    N is ``null``, shape (n, k), and W has ``weights`` on its diagonal. ``ahead`` is the
+    velocity without ``a`` minus the desired one [rad/s], shape (n,). Return a, shape
+    (k,), or None if the bounds [rad/s] are infeasible.
     """
     import daqp
 
@@ -138,7 +200,11 @@ def nearest_in_null_space(null: Array, weights: Array, ahead: Array, bounds: tup
     if np.any(low > high):
         return None
     solution, _, status, _ = daqp.solve(
-        np.ascontiguousarray(hessian), np.ascontiguousarray(gradient), np.ascontiguousarray(null), high, low
+        np.ascontiguousarray(hessian),
+        np.ascontiguousarray(gradient),
+        np.ascontiguousarray(null),
+        high,
+        low,
     )
     return np.array(solution) if status > 0 else None
 
@@ -147,7 +213,8 @@ def nearest_in_null_space(null: Array, weights: Array, ahead: Array, bounds: tup
 class PlanePath:
     """A path of the mallet, from rest to a hit or, if it stops, from there to rest.
 
-    Two lines lead from the start over the bend to the end [m], shape (2,) each; the speed at the hit is in m/s.
+    Two lines lead from the start over the bend to the end [m], shape (2,) each; the
+    speed at the hit is in m/s.
     """
 
     start: Array
@@ -174,7 +241,12 @@ class PlanePath:
         for k in range(1, round(duration / period + 0.499) + 1):
             t = min(k * period, duration)
             accelerated = t * t / (2 * duration)
-            yield self.at(min(self.speed * (t - accelerated if self.stops else accelerated), length))
+            yield self.at(
+                min(
+                    self.speed * (t - accelerated if self.stops else accelerated),
+                    length,
+                )
+            )
 
     def at(self, s: float) -> Array:
         """Return the position at a length of the path [m], shape (2,)."""
@@ -188,10 +260,16 @@ class PlanePath:
             return np.asarray(self.bend + (cut + along - radius * turn) * other)
         angle = along / radius
         across = _unit(other - (other @ one) * one)
-        return np.asarray(self.bend - cut * one + radius * (np.sin(angle) * one + (1 - np.cos(angle)) * across))
+        return np.asarray(
+            self.bend
+            - cut * one
+            + radius * (np.sin(angle) * one + (1 - np.cos(angle)) * across)
+        )
 
     def _lines(self) -> tuple[float, float]:
-        return float(np.linalg.norm(self.bend - self.start)), float(np.linalg.norm(self.end - self.bend))
+        return float(np.linalg.norm(self.bend - self.start)), float(
+            np.linalg.norm(self.end - self.bend)
+        )
 
     def _arc(self) -> tuple[float, float, float]:
         """Return the distance of the arc's ends from the bend [m], its radius [m] and its angle [rad]."""
@@ -204,13 +282,18 @@ class PlanePath:
         return cut, cut / np.tan(turn / 2), turn
 
 
-def striking_path(start: Array, hit: Array, velocity: Array, speed: float, acceleration: float) -> PlanePath:
+def striking_path(
+    start: Array, hit: Array, velocity: Array, speed: float, acceleration: float
+) -> PlanePath:
     """Plan a path from rest to a hit in a direction: it bends where the line of the hit leaves the box of both ends.
 
-    Positions [m] and the direction have shape (2,). The speed [m/s] is reduced if it needs more than the largest
-    acceleration along the path [m/s^2].
+    Positions [m] and the direction have shape (2,). The speed [m/s] is reduced if it
+    needs more than the largest acceleration along the path [m/s^2].
     """
-    start, hit = np.clip(start, MIN_MALLET_XY_M, MAX_MALLET_XY_M), np.clip(hit, MIN_MALLET_XY_M, MAX_MALLET_XY_M)
+    start, hit = (
+        np.clip(start, MIN_MALLET_XY_M, MAX_MALLET_XY_M),
+        np.clip(hit, MIN_MALLET_XY_M, MAX_MALLET_XY_M),
+    )
     low = np.array([min(start[0], hit[0]), MIN_MALLET_XY_M[1]])
     high = np.array([max(start[0], hit[0]), MAX_MALLET_XY_M[1]])
     path = PlanePath(start, _exit_point(hit, -velocity, low, high), hit, speed)
@@ -226,13 +309,17 @@ def stopping_path(hit_path: PlanePath) -> PlanePath:
     low, high = np.minimum(hit, end), np.maximum(hit, end)
     bends = bool((hit != hit_path.bend).any())
     forwards = hit - (hit_path.bend if bends else hit_path.start)
-    return PlanePath(hit, _exit_point(hit, forwards, low, high), end, hit_path.speed, stops=True)
+    return PlanePath(
+        hit, _exit_point(hit, forwards, low, high), end, hit_path.speed, stops=True
+    )
 
 
 def _exit_point(point: Array, direction: Array, low: Array, high: Array) -> Array:
     """Return the point at which a ray leaves a box."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        reach = np.where(direction > 0, (high - point) / direction, (low - point) / direction)
+        reach = np.where(
+            direction > 0, (high - point) / direction, (low - point) / direction
+        )
     reach = reach[np.isfinite(reach)]
     return np.asarray(point + max(float(reach.min(initial=np.inf)), 0.0) * direction)
 

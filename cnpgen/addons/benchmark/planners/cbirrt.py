@@ -1,7 +1,8 @@
 """CBiRRT: OMPL's RRTConnect on a projected state space.
 
-The constraint has one dimension: the height of the tip or the tilt of the object, to 0.01. The planner ignores
-velocities and accelerations. The path is timed by the velocity limits and followed linearly, as in the paper.
+The constraint has one dimension: the height of the tip or the tilt of the object, to
+0.01. The planner ignores velocities and accelerations. The path is timed by the
+velocity limits and followed linearly, as in the paper.
 """
 
 from abc import ABC, abstractmethod
@@ -12,7 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.addons.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
+from cnpgen.addons.benchmark.benchmark_planner import (
+    Answer,
+    BenchmarkPlanner,
+    Plan,
+    Setting,
+)
 from cnpgen.addons.benchmark.planners.obstacle_boxes import (
     MAX_CORNER_PENETRATION_M,
     MIN_OBJECT_DISTANCE_M,
@@ -45,8 +51,15 @@ STEP_PAUSE_S = 1e-4  # added to the time of every step
 class CBiRRT(BenchmarkPlanner):
     """Bidirectional trees on the constraint manifold (OMPL's RRTConnect on ProjectedStateSpace)."""
 
-    step_size: float = field("largest step of the trees; 0: OMPL's automatic value", unit="rad", default=0.0, low=0.0)
-    delta: float = field("distance of projected states along an edge", unit="rad", default=0.05, low=1e-3)
+    step_size: float = field(
+        "largest step of the trees; 0: OMPL's automatic value",
+        unit="rad",
+        default=0.0,
+        low=0.0,
+    )
+    delta: float = field(
+        "distance of projected states along an edge", unit="rad", default=0.05, low=1e-3
+    )
 
     def prepare(self, setting: Setting) -> Plan:
         """Import OMPL."""
@@ -81,7 +94,9 @@ def seed_ompl(ompl: Any, setting: Setting, task: Plans) -> None:
 def joint_space(base: Any, robot: Robot) -> Any:
     """Return OMPL's space of joint positions within the limits of a robot."""
     space, bounds = base.RealVectorStateSpace(robot.n), base.RealVectorBounds(robot.n)
-    for index, (low, high) in enumerate(zip(robot.position_lower.tolist(), robot.position_upper.tolist(), strict=True)):
+    for index, (low, high) in enumerate(
+        zip(robot.position_lower.tolist(), robot.position_upper.tolist(), strict=True)
+    ):
         bounds.setLow(index, low)
         bounds.setHigh(index, high)
     space.setBounds(bounds)
@@ -90,7 +105,9 @@ def joint_space(base: Any, robot: Robot) -> Any:
 
 def timed(path: Array, velocity_limit: Array) -> Trajectory:
     """Time a path, shape (K, n), so that one joint is at its velocity limit [rad/s] in every step."""
-    steps = np.max(np.abs(np.diff(path, axis=0)) / velocity_limit, axis=1) + STEP_PAUSE_S
+    steps = (
+        np.max(np.abs(np.diff(path, axis=0)) / velocity_limit, axis=1) + STEP_PAUSE_S
+    )
     return Trajectory(np.append(0.0, np.cumsum(steps)), path)
 
 
@@ -100,7 +117,10 @@ class PathSearch(ABC):
     max_goal_error = float(np.finfo(float).eps)  # rad
 
     def __init__(self, robot: Robot, task: Plans) -> None:
-        self._robot, self._ends = robot, (task.boundary.start_q[0], task.boundary.goal_q[0])
+        self._robot, self._ends = (
+            robot,
+            (task.boundary.start_q[0], task.boundary.goal_q[0]),
+        )
 
     @abstractmethod
     def is_valid(self, q: Array) -> bool:
@@ -111,17 +131,28 @@ class PathSearch(ABC):
         """Return OMPL's information about the space, and its states at start and goal."""
 
     def solve(
-        self, ompl: Any, time_limit: float, *, simplify_time: float = 0.0, step_size: float = 0.0
+        self,
+        ompl: Any,
+        time_limit: float,
+        *,
+        simplify_time: float = 0.0,
+        step_size: float = 0.0,
     ) -> Array | None:
         """Search for a path and simplify it; return joint positions [rad], shape (K, n), or None.
 
-        Times are in seconds; without time for simplifying, the path is kept as it was found. The largest step of the
-        trees is in radians; 0 is the automatic value of OMPL.
+        Times are in seconds; without time for simplifying, the path is kept as it was
+        found. The largest step of the trees is in radians; 0 is the automatic value of
+        OMPL.
         """
         information, ends = self.space(ompl)
-        setup, planner = ompl.geometric.SimpleSetup(information), ompl.geometric.RRTConnect(information)
+        setup, planner = (
+            ompl.geometric.SimpleSetup(information),
+            ompl.geometric.RRTConnect(information),
+        )
         joints = range(self._robot.n)
-        setup.setStateValidityChecker(lambda state: self.is_valid(np.array([state[index] for index in joints])))
+        setup.setStateValidityChecker(
+            lambda state: self.is_valid(np.array([state[index] for index in joints]))
+        )
         setup.setStartAndGoalStates(*ends, self.max_goal_error)
         planner.setRange(step_size)
         setup.setPlanner(planner)
@@ -133,15 +164,22 @@ class PathSearch(ABC):
             setup.simplifySolution(simplify_time)
         path = setup.getSolutionPath()
         path.interpolate()
-        return np.array([[state[index] for index in joints] for state in path.getStates()])
+        return np.array(
+            [[state[index] for index in joints] for state in path.getStates()]
+        )
 
 
 class Search(PathSearch):
-    """Search on the constraint manifold; ``delta`` is the distance of projected states along an edge [rad]."""
+    """Search on the constraint manifold.
+
+    ``delta`` is the distance of projected states along an edge [rad].
+    """
 
     max_goal_error = MAX_GOAL_ERROR_RAD
 
-    def __init__(self, problem: Problem, robot: Robot, task: Plans, delta: float = 0.05) -> None:
+    def __init__(
+        self, problem: Problem, robot: Robot, task: Plans, delta: float = 0.05
+    ) -> None:
         super().__init__(robot, task)
         self._tip, self._data, self._delta = Tip(robot), robot.model.createData(), delta
         self._table = problem.first(Table)
@@ -162,21 +200,27 @@ class Search(PathSearch):
         position, rotation, _ = self._tip.at(q)
         if self._table is not None:
             x, y = self._table.x, self._table.y
-            return bool(x.low <= position[0] <= x.high and y.low <= position[1] <= y.high)
+            return bool(
+                x.low <= position[0] <= x.high and y.low <= position[1] <= y.high
+            )
         gravity_torque = pin.computeGeneralizedGravity(self._robot.model, self._data, q)
         if np.any(np.abs(gravity_torque) > self._robot.torque_limit):
             return False
         corners = position + (CUBE * self._size) @ rotation.T
         return all(
             distance(position, box)[0] > MIN_OBJECT_DISTANCE_M
-            and all(depth(corner, box)[0] < MAX_CORNER_PENETRATION_M for corner in corners)
+            and all(
+                depth(corner, box)[0] < MAX_CORNER_PENETRATION_M for corner in corners
+            )
             for box in self._boxes
         )
 
     def space(self, ompl: Any) -> tuple[Any, list[Any]]:
         """Return OMPL's information about the manifold, and its states at start and goal."""
         constraint = _constraint(ompl.base, self._robot.n, self.residual)
-        manifold = ompl.base.ProjectedStateSpace(joint_space(ompl.base, self._robot), constraint)
+        manifold = ompl.base.ProjectedStateSpace(
+            joint_space(ompl.base, self._robot), constraint
+        )
         manifold.setDelta(self._delta)
         manifold.setLambda(LAMBDA)
         ends = [manifold.allocState() for _ in self._ends]
@@ -185,7 +229,9 @@ class Search(PathSearch):
         return ompl.base.ConstrainedSpaceInformation(manifold), ends
 
 
-def _constraint(base: Any, n: int, residual: Callable[[Array], tuple[float, Array]]) -> Any:
+def _constraint(
+    base: Any, n: int, residual: Callable[[Array], tuple[float, Array]]
+) -> Any:
     """Wrap a residual for OMPL."""
 
     class Manifold(base.Constraint):  # type: ignore[misc]

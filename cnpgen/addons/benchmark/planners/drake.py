@@ -1,7 +1,8 @@
 """KinematicTrajectoryOptimization of Drake (Tedrake et al., 2019): a B-spline of least duration.
 
-As in Drake's own examples, the program is first solved with the limits of the joints only, and then again from that
-solution with the manifold, the obstacles and the torques. Drake chooses the solver, which is SNOPT in its wheels.
+As in Drake's own examples, the program is first solved with the limits of the joints
+only, and then again from that solution with the manifold, the obstacles and the
+torques. Drake chooses the solver, which is SNOPT in its wheels.
 """
 
 from __future__ import annotations
@@ -36,7 +37,12 @@ MAX_SAMPLED_HEIGHT_ERROR_M = 5e-4  # half of the verdict's tolerance, because sa
 MAX_PLANE_TILT_RAD = 0.01
 INFLUENCE_DISTANCE_M = 0.05  # closer pairs count in the smooth minimum of distances
 MAX_DEPTH_M = 0.0
-OMITTED_ELEMENTS = ("visual", "collision", "dynamics", "mimic")  # of links and joints; obstacles have own geometry
+OMITTED_ELEMENTS = (
+    "visual",
+    "collision",
+    "dynamics",
+    "mimic",
+)  # of links and joints; obstacles have own geometry
 
 
 @dataclass(frozen=True)
@@ -44,9 +50,15 @@ class Drake(BenchmarkPlanner):
     """B-spline of least duration within limits of joints, torques, manifold and obstacles (Drake)."""
 
     control_points: int = field("number of control points", default=15, low=6)
-    samples: int = field("equidistant samples of manifold, obstacles and torques", default=25, low=2)
-    path_length_weight: float = field("weight of the path's length beside the duration", default=0.01, low=0.0)
-    optimality_tolerance: float = field("optimality tolerance of SNOPT", default=1e-4, low=1e-9)
+    samples: int = field(
+        "equidistant samples of manifold, obstacles and torques", default=25, low=2
+    )
+    path_length_weight: float = field(
+        "weight of the path's length beside the duration", default=0.01, low=0.0
+    )
+    optimality_tolerance: float = field(
+        "optimality tolerance of SNOPT", default=1e-4, low=1e-9
+    )
     iterations: int = field("largest number of iterations of SNOPT", default=300, low=1)
 
     def prepare(self, setting: Setting) -> Plan:
@@ -54,13 +66,21 @@ class Drake(BenchmarkPlanner):
         load_drake()
         problem, robot = open_problem(setting.problem)
         require_table_or_transport(problem)
-        if robot.attached.payload is not None or robot.attached.tip != robot.attached.frame:
-            raise UsageError(f"supported are tips of the URDF without payload, {problem.name!r} has another one")
+        if (
+            robot.attached.payload is not None
+            or robot.attached.tip != robot.attached.frame
+        ):
+            raise UsageError(
+                f"supported are tips of the URDF without payload, {problem.name!r} has another one"
+            )
         return lambda task: self._plan(problem, robot, task)
 
     def _plan(self, problem: Problem, robot: Robot, task: Plans) -> Trajectory | None:
         """Solve both programs; return None if the second one has no solution."""
-        arm, samples = DrakeArm(problem, robot, task.scene), np.linspace(0, 1, self.samples)
+        arm, samples = (
+            DrakeArm(problem, robot, task.scene),
+            np.linspace(0, 1, self.samples),
+        )
         free = self._program(problem, robot, task.boundary)
         program = self._program(problem, robot, task.boundary)
         program.SetInitialGuess(free.ReconstructTrajectory(self._solve(free)))
@@ -69,13 +89,19 @@ class Drake(BenchmarkPlanner):
                 program.AddPathPositionConstraint(constraint, s)
         arm.limit_torques(program, samples)
         result = self._solve(program)
-        return sampled(program.ReconstructTrajectory(result)) if result.is_success() else None
+        return (
+            sampled(program.ReconstructTrajectory(result))
+            if result.is_success()
+            else None
+        )
 
     def _solve(self, program: Any) -> Any:
         from pydrake.solvers import SnoptSolver, Solve, SolverOptions
 
         options, solver = SolverOptions(), SnoptSolver.id()
-        options.SetOption(solver, "Major optimality tolerance", self.optimality_tolerance)
+        options.SetOption(
+            solver, "Major optimality tolerance", self.optimality_tolerance
+        )
         options.SetOption(solver, "Major iterations limit", self.iterations)
         return Solve(program.prog(), None, options)
 
@@ -83,42 +109,65 @@ class Drake(BenchmarkPlanner):
         """Return the program with the limits of the joints and the boundary conditions, guessed as a straight line."""
         from pydrake.planning import KinematicTrajectoryOptimization
 
-        program = KinematicTrajectoryOptimization(robot.n, self.control_points, SPLINE_ORDER)
+        program = KinematicTrajectoryOptimization(
+            robot.n, self.control_points, SPLINE_ORDER
+        )
         program.AddDurationCost(1.0)
         program.AddPathLengthCost(self.path_length_weight)
         program.AddDurationConstraint(MIN_DURATION_S, MAX_DURATION_S)
         program.AddPositionBounds(robot.position_lower, robot.position_upper)
         program.AddVelocityBounds(-robot.velocity_limit, robot.velocity_limit)
-        program.AddAccelerationBounds(-robot.acceleration_limit, robot.acceleration_limit)
+        program.AddAccelerationBounds(
+            -robot.acceleration_limit, robot.acceleration_limit
+        )
         if problem.first(JointJerk) is not None:
             program.AddJerkBounds(-robot.jerk_limit, robot.jerk_limit)
         add_boundary_conditions(program, boundary)
         distance = np.abs(boundary.goal_q[0] - boundary.start_q[0])
-        times = 2 * distance / robot.velocity_limit, np.sqrt(6 * distance / robot.acceleration_limit)
+        times = (
+            2 * distance / robot.velocity_limit,
+            np.sqrt(6 * distance / robot.acceleration_limit),
+        )
         duration = np.clip(np.max(times), MIN_DURATION_S, MAX_DURATION_S)
-        line = np.linspace(boundary.start_q[0], boundary.goal_q[0], self.control_points).T
+        line = np.linspace(
+            boundary.start_q[0], boundary.goal_q[0], self.control_points
+        ).T
         program.get_mutable_prog().SetInitialGuess(program.control_points(), line)
         program.get_mutable_prog().SetInitialGuess(program.duration(), duration)
         return program
 
 
 def add_boundary_conditions(program: Any, boundary: Boundary) -> None:
-    """Add positions and velocities of both ends, and the acceleration at the start; a goal at rest has none, too."""
+    """Add positions and velocities of both ends, and the acceleration at the start.
+
+    A goal at rest has none, too.
+    """
     from pydrake.solvers import Binding, LinearConstraint
     from pydrake.trajectories import BsplineTrajectory
 
     n, still = boundary.start_q.shape[1], not np.any(boundary.goal_dq)
-    for s, q, dq in ((0.0, boundary.start_q[0], boundary.start_dq[0]), (1.0, boundary.goal_q[0], boundary.goal_dq[0])):
+    for s, q, dq in (
+        (0.0, boundary.start_q[0], boundary.start_dq[0]),
+        (1.0, boundary.goal_q[0], boundary.goal_dq[0]),
+    ):
         program.AddPathPositionConstraint(q, q, s)
         velocity = LinearConstraint(np.eye(n), dq, dq)
-        program.AddVelocityConstraintAtNormalizedTime(Binding[LinearConstraint](velocity, program.qdot()), s)
+        program.AddVelocityConstraintAtNormalizedTime(
+            Binding[LinearConstraint](velocity, program.qdot()), s
+        )
     if still:
         program.AddPathAccelerationConstraint(np.zeros(n), np.zeros(n), 1.0)
     points, duration = program.control_points(), program.duration()
     units = [np.eye(points.shape[1])[:, [index]] for index in range(points.shape[1])]
-    second = BsplineTrajectory(program.basis(), units).EvalDerivative(0.0, 2)[:, 0]  # weights of the control points
+    second = BsplineTrajectory(program.basis(), units).EvalDerivative(0.0, 2)[
+        :, 0
+    ]  # weights of the control points
     for row, acceleration in zip(points, boundary.start_ddq[0].tolist(), strict=True):
-        curvature = sum(weight * point for weight, point in zip(second.tolist(), row, strict=True) if weight)
+        curvature = sum(
+            weight * point
+            for weight, point in zip(second.tolist(), row, strict=True)
+            if weight
+        )
         condition = curvature - acceleration * duration**2
         program.get_mutable_prog().AddConstraint(condition == 0.0)
 
@@ -128,7 +177,13 @@ def sampled(spline: Any) -> Trajectory:
     t = np.unique(spline.basis().knots())
     t = np.append(t[:-1][np.diff(t) > MIN_KNOT_DISTANCE_S], t[-1])
     states = (spline, spline.MakeDerivative(1), spline.MakeDerivative(2))
-    return Trajectory(t - t[0], *(np.array([state.value(time)[:, 0] for time in t.tolist()]) for state in states))
+    return Trajectory(
+        t - t[0],
+        *(
+            np.array([state.value(time)[:, 0] for time in t.tolist()])
+            for state in states
+        ),
+    )
 
 
 def load_drake() -> Any:
@@ -140,7 +195,10 @@ def load_drake() -> Any:
 
 
 class DrakeArm:
-    """A robot in the scene of one boundary problem; Drake's objects live as long as this one."""
+    """A robot in the scene of one boundary problem.
+
+    Drake's objects live as long as this one.
+    """
 
     def __init__(self, problem: Problem, robot: Robot, scene: Scene) -> None:
         from pydrake.multibody.parsing import Parser
@@ -149,12 +207,18 @@ class DrakeArm:
 
         self._problem, self._robot = problem, robot
         builder = DiagramBuilder()
-        self._plant, self._scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
+        self._plant, self._scene_graph = AddMultibodyPlantSceneGraph(
+            builder, time_step=0.0
+        )
         text, root = model_text(robot)
         Parser(self._plant).AddModelsFromString(text, "urdf")
         if root != "world":
-            self._plant.WeldFrames(self._plant.world_frame(), self._plant.GetFrameByName(root))
-        for name, limit in zip(robot.joint_names, robot.torque_limit.tolist(), strict=True):
+            self._plant.WeldFrames(
+                self._plant.world_frame(), self._plant.GetFrameByName(root)
+            )
+        for name, limit in zip(
+            robot.joint_names, robot.torque_limit.tolist(), strict=True
+        ):
             self._plant.AddJointActuator(name, self._plant.GetJointByName(name), limit)
         if problem.object_size is not None:
             self._add_boxes(np.array(problem.object_size), scene)
@@ -170,10 +234,17 @@ class DrakeArm:
 
         plant, friction = self._plant, CoulombFriction()
         held = plant.GetFrameByName(self._robot.tip).body()
-        plant.RegisterCollisionGeometry(held, RigidTransform(), Box(*size), "held", friction)
+        plant.RegisterCollisionGeometry(
+            held, RigidTransform(), Box(*size), "held", friction
+        )
         for index, solid in enumerate(scene.bodies()):
-            place, edges = RigidTransform((solid.low + solid.high) / 2), solid.high - solid.low
-            plant.RegisterCollisionGeometry(plant.world_body(), place, Box(*edges), f"obstacle {index}", friction)
+            place, edges = (
+                RigidTransform((solid.low + solid.high) / 2),
+                solid.high - solid.low,
+            )
+            plant.RegisterCollisionGeometry(
+                plant.world_body(), place, Box(*edges), f"obstacle {index}", friction
+            )
 
     def path_constraints(self) -> list[Any]:
         """Return the constraints of the joint positions at a sample: table, or tilt and distance of the object."""
@@ -185,14 +256,28 @@ class DrakeArm:
 
         plant, table = self._plant, self._problem.first(Table)
         context = plant.GetMyMutableContextFromRoot(self._context)
-        tip, world, up = plant.GetFrameByName(self._robot.tip), plant.world_frame(), np.array([0.0, 0.0, 1.0])
+        tip, world, up = (
+            plant.GetFrameByName(self._robot.tip),
+            plant.world_frame(),
+            np.array([0.0, 0.0, 1.0]),
+        )
         if table is not None:
-            low = np.array([table.x.low, table.y.low, table.z - MAX_SAMPLED_HEIGHT_ERROR_M])
-            high = np.array([table.x.high, table.y.high, table.z + MAX_SAMPLED_HEIGHT_ERROR_M])
-            return [PositionConstraint(plant, world, low, high, tip, np.zeros(3), context)]
+            low = np.array(
+                [table.x.low, table.y.low, table.z - MAX_SAMPLED_HEIGHT_ERROR_M]
+            )
+            high = np.array(
+                [table.x.high, table.y.high, table.z + MAX_SAMPLED_HEIGHT_ERROR_M]
+            )
+            return [
+                PositionConstraint(plant, world, low, high, tip, np.zeros(3), context)
+            ]
         return [
-            AngleBetweenVectorsConstraint(plant, world, up, tip, up, 0.0, MAX_PLANE_TILT_RAD, context),
-            MinimumDistanceLowerBoundConstraint(plant, MAX_DEPTH_M, context, None, INFLUENCE_DISTANCE_M),
+            AngleBetweenVectorsConstraint(
+                plant, world, up, tip, up, 0.0, MAX_PLANE_TILT_RAD, context
+            ),
+            MinimumDistanceLowerBoundConstraint(
+                plant, MAX_DEPTH_M, context, None, INFLUENCE_DISTANCE_M
+            ),
         ]
 
     def limit_torques(self, program: Any, samples: Array) -> None:
@@ -201,7 +286,9 @@ class DrakeArm:
             return
         limit = self._robot.torque_limit
         context = self._plant.GetMyMutableContextFromRoot(self._context)
-        program.AddEffortBoundsAtNormalizedTimes(self._plant, samples, -limit, limit, context)
+        program.AddEffortBoundsAtNormalizedTimes(
+            self._plant, samples, -limit, limit, context
+        )
 
 
 def model_text(robot: Robot) -> tuple[str, str]:
@@ -215,4 +302,6 @@ def model_text(robot: Robot) -> tuple[str, str]:
             joint.set("type", "fixed")
     children = {child.get("link") for child in root.iter("child")}
     links = [link.get("name", "") for link in root.findall("link")]
-    return ElementTree.tostring(root, encoding="unicode"), next(name for name in links if name not in children)
+    return ElementTree.tostring(root, encoding="unicode"), next(
+        name for name in links if name not in children
+    )

@@ -1,8 +1,9 @@
 """MPC-MPNet (Li et al., 2021), the variant with one path: a tree that is steered towards proposals of a network.
 
-From the last state, a network proposes the next configuration, or the goal is chosen, and the cross-entropy method
-steers there. After a failure or many steps, the search continues from a node near a random position. Controls, pruning
-of nodes, distances and the goal are those of ``sst.py``.
+From the last state, a network proposes the next configuration, or the goal is chosen,
+and the cross-entropy method steers there. After a failure or many steps, the search
+continues from a node near a random position. Controls, pruning of nodes, distances and
+the goal are those of ``sst.py``.
 """
 
 from __future__ import annotations
@@ -12,7 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.addons.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
+from cnpgen.addons.benchmark.benchmark_planner import (
+    Answer,
+    BenchmarkPlanner,
+    Plan,
+    Setting,
+)
 from cnpgen.addons.benchmark.planners.sst import Tree, radii_of
 from cnpgen.addons.benchmark.planners.state_check import StateCheck
 from cnpgen.addons.paper.proposals import Proposals, load_proposals, shipped_proposals
@@ -36,12 +42,24 @@ class MPCMPNet(BenchmarkPlanner):
     """A tree of states, steered by the cross-entropy method towards proposals of a network (Li et al., 2021)."""
 
     witness_radius: float = field(
-        "distance of the tip within which one node is kept", unit="m", default=0.02, low=0.0, plausible=5.0
+        "distance of the tip within which one node is kept",
+        unit="m",
+        default=0.02,
+        low=0.0,
+        plausible=5.0,
     )
-    samples: int = field("controls per iteration of the cross-entropy method", default=64, low=2)
-    elites: int = field("best controls, which determine the next distribution", default=4, low=1)
-    iterations: int = field("largest number of iterations of the cross-entropy method", default=30, low=1)
-    goal_bias: float = field("share of targets that are the goal", default=0.05, low=0.0, high=1.0)
+    samples: int = field(
+        "controls per iteration of the cross-entropy method", default=64, low=2
+    )
+    elites: int = field(
+        "best controls, which determine the next distribution", default=4, low=1
+    )
+    iterations: int = field(
+        "largest number of iterations of the cross-entropy method", default=30, low=1
+    )
+    goal_bias: float = field(
+        "share of targets that are the goal", default=0.05, low=0.0, high=1.0
+    )
 
     def prepare(self, setting: Setting) -> Plan:
         """Load the network and the kernel that checks states."""
@@ -55,12 +73,31 @@ class MPCMPNet(BenchmarkPlanner):
 
         def plan(task: Plans) -> Answer:
             boundary = task.boundary
-            start_xyz, goal_xyz = task.columns["start_xyz"][0], task.columns["goal_xyz"][0]
+            start_xyz, goal_xyz = (
+                task.columns["start_xyz"][0],
+                task.columns["goal_xyz"][0],
+            )
             start = np.concatenate([boundary.start_q[0], boundary.start_dq[0]])
-            tree = Tree(start, start_xyz, radii_of(problem, self.witness_radius), STEERING_STEP_S)
-            steer = Steering(self, check, task.scene.poses[0], spread_of(problem), setting.random(task))
+            tree = Tree(
+                start,
+                start_xyz,
+                radii_of(problem, self.witness_radius),
+                STEERING_STEP_S,
+            )
+            steer = Steering(
+                self,
+                check,
+                task.scene.poses[0],
+                spread_of(problem),
+                setting.random(task),
+            )
             extend = ProposedExtension(tree, network, steer, boundary.goal_q[0])
-            return tree.grow(extend, goal_xyz, time_limit=setting.time_limit, max_iterations=MAX_PROPOSALS)
+            return tree.grow(
+                extend,
+                goal_xyz,
+                time_limit=setting.time_limit,
+                max_iterations=MAX_PROPOSALS,
+            )
 
         return plan
 
@@ -81,14 +118,22 @@ class ProposedExtension:
 
     def __call__(self) -> int:
         """Take one step; return the new node, or 0 after a failure."""
-        state, target, random = self.tree.state(self.node), self.goal_q, self.steer.random
+        state, target, random = (
+            self.tree.state(self.node),
+            self.goal_q,
+            self.steer.random,
+        )
         if random.random() >= self.steer.settings.goal_bias:
-            target = self.network.propose(state, self.goal_q, self.steer.obstacle_poses, random)
+            target = self.network.propose(
+                state, self.goal_q, self.steer.obstacle_poses, random
+            )
         motion = self.steer(state, target)
         node = 0 if motion is None else self.tree.add(self.node, *motion)
         self.node, self.steps = node, self.steps + 1
         if motion is None or self.steps > MAX_CONSECUTIVE_STEPS:
-            position = self.steer.check.random_position(self.steer.obstacle_poses, random)
+            position = self.steer.check.random_position(
+                self.steer.obstacle_poses, random
+            )
             self.node, self.steps = self.tree.select(position), 0
         return node
 
@@ -97,7 +142,8 @@ class ProposedExtension:
 class Spread:
     """Initial distribution of controls; the mean acceleration is 0.
 
-    The deviation of accelerations is a fraction of the limits. Durations [s] have a mean, a deviation and a maximum.
+    The deviation of accelerations is a fraction of the limits. Durations [s] have a
+    mean, a deviation and a maximum.
     """
 
     acceleration: float
@@ -117,7 +163,10 @@ def spread_of(problem: Problem) -> Spread:
 
 @dataclass(frozen=True)
 class Steering:
-    """Steering from states towards configurations, for one boundary problem; its obstacles have shape (width,)."""
+    """Steering from states towards configurations, for one boundary problem.
+
+    Its obstacles have shape (width,).
+    """
 
     settings: MPCMPNet
     check: StateCheck
@@ -133,8 +182,9 @@ class Steering:
     def __call__(self, state: Array, target: Array) -> tuple[Array, Array] | None:
         """Steer from a state of shape (2 n,) to a configuration of shape (n,) [rad], with any velocity there.
 
-        A control is cut before its first invalid state. Return the states of the best motion, one per
-        ``STEERING_STEP_S``, shape (K, 2 n), and the tip position at its end [m]; None if all controls are invalid.
+        A control is cut before its first invalid state. Return the states of the best
+        motion, one per ``STEERING_STEP_S``, shape (K, 2 n), and the tip position at its
+        end [m]; None if all controls are invalid.
         """
         mean = np.append(np.zeros_like(self.limit), self.spread.mean_time)
         deviation = np.append(self.spread.acceleration * self.limit, self.spread.time)
@@ -143,36 +193,61 @@ class Steering:
             controls = self._sample_controls(mean, deviation)
             paths, tips, lengths = self.integrate(state, controls)
             ends = paths[np.arange(self.settings.samples), lengths - 1, : len(target)]
-            distances = np.where(lengths > 0, np.linalg.norm(ends - target, axis=1), np.inf)
+            distances = np.where(
+                lengths > 0, np.linalg.norm(ends - target, axis=1), np.inf
+            )
             order = np.argsort(distances)[: self.settings.elites]
             first, length = int(order[0]), int(lengths[order[0]])
             if distances[first] < least:
-                best, least = (paths[first, :length], tips[first, length - 1]), float(distances[first])
+                best, least = (
+                    (paths[first, :length], tips[first, length - 1]),
+                    float(distances[first]),
+                )
             elites = controls[order[np.isfinite(distances[order])]]
             if least < TARGET_TOLERANCE_RAD or not len(elites):
                 break
-            mean = (1 - CEM_LEARNING_RATE) * mean + CEM_LEARNING_RATE * elites.mean(axis=0)
-            deviation = (1 - CEM_LEARNING_RATE) * deviation + CEM_LEARNING_RATE * elites.std(axis=0)
+            mean = (1 - CEM_LEARNING_RATE) * mean + CEM_LEARNING_RATE * elites.mean(
+                axis=0
+            )
+            deviation = (
+                1 - CEM_LEARNING_RATE
+            ) * deviation + CEM_LEARNING_RATE * elites.std(axis=0)
         return best
 
     def _sample_controls(self, mean: Array, deviation: Array) -> Array:
         """Sample controls within their limits: accelerations [rad/s^2] and a time [s], shape (samples, n + 1)."""
-        controls = self.random.normal(mean, deviation, (self.settings.samples, len(mean)))
-        low, high = np.append(-self.limit, STEERING_STEP_S), np.append(self.limit, self.spread.max_duration)
+        controls = self.random.normal(
+            mean, deviation, (self.settings.samples, len(mean))
+        )
+        low, high = (
+            np.append(-self.limit, STEERING_STEP_S),
+            np.append(self.limit, self.spread.max_duration),
+        )
         return np.clip(controls, low, high)
 
-    def integrate(self, state: Array, controls: Array) -> tuple[Array, Array, NDArray[np.int64]]:
+    def integrate(
+        self, state: Array, controls: Array
+    ) -> tuple[Array, Array, NDArray[np.int64]]:
         """Integrate controls, accelerations [rad/s^2] and times [s] of shape (N, n + 1), from a state of shape (2 n,).
 
-        Return states every ``STEERING_STEP_S``, shape (N, K, 2 n), tip positions [m], shape (N, K, 3), and the numbers
-        of states before the first invalid one, shape (N,).
+        Return states every ``STEERING_STEP_S``, shape (N, K, 2 n), tip positions [m],
+        shape (N, K, 3), and the numbers of states before the first invalid one, shape
+        (N,).
         """
         (q, dq), n = np.split(state, 2), len(self.limit)
-        ddq = np.repeat(controls[:, None, :n], round(self.spread.max_duration / STEERING_STEP_S), axis=1)
+        ddq = np.repeat(
+            controls[:, None, :n],
+            round(self.spread.max_duration / STEERING_STEP_S),
+            axis=1,
+        )
         t = STEERING_STEP_S * np.arange(1.0, ddq.shape[1] + 1)[:, None]
         paths = np.concatenate([q + t * (dq + t / 2 * ddq), dq + t * ddq], axis=2)
         flat = paths.reshape(-1, 2 * n)
-        tips, valid_states = self.check(flat[:, :n], flat[:, n:], ddq.reshape(-1, n), self.obstacle_poses)
+        tips, valid_states = self.check(
+            flat[:, :n], flat[:, n:], ddq.reshape(-1, n), self.obstacle_poses
+        )
         active = t[:, 0] < controls[:, n:] + STEERING_STEP_S / 2
-        valid = np.logical_and.accumulate(valid_states.reshape(active.shape) & active, axis=1)
+        valid = np.logical_and.accumulate(
+            valid_states.reshape(active.shape) & active, axis=1
+        )
         return paths, tips.reshape(*active.shape, 3), valid.sum(axis=1)

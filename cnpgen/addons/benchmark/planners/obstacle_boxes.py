@@ -17,9 +17,14 @@ MAX_CORNER_PENETRATION_M = 0.01  # of the object's corners, for samplers
 
 
 def boxes_of(problem: Problem, scene: Scene) -> tuple[Array, list[Box]]:
-    """Return the edge lengths of the held object [m], shape (3,), and the obstacles; see ``require_transport``."""
+    """Return the edge lengths of the held object [m], shape (3,), and the obstacles.
+
+    See ``require_transport``.
+    """
     size = require_transport(problem)
-    boxes = [(np.array([*solid.low[:2], -np.inf]), solid.high) for solid in scene.bodies()]
+    boxes = [
+        (np.array([*solid.low[:2], -np.inf]), solid.high) for solid in scene.bodies()
+    ]
     return size, boxes
 
 
@@ -36,10 +41,14 @@ def require_transport(problem: Problem) -> Array:
         UsageError: There is no held object, or an obstacle is not an upright box.
     """
     if problem.object_size is None:
-        raise UsageError(f"supported are hits on a table and transports, {problem.name!r} has neither table nor object")
+        raise UsageError(
+            f"supported are hits on a table and transports, {problem.name!r} has neither table nor object"
+        )
     others = [obstacle.name for obstacle in problem.obstacle if not obstacle.upright]
     if others:
-        raise UsageError(f"supported are upright boxes only, {problem.name!r} has {', '.join(others)}")
+        raise UsageError(
+            f"supported are upright boxes only, {problem.name!r} has {', '.join(others)}"
+        )
     return np.array(problem.object_size)
 
 

@@ -6,7 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from cnpgen.addons.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
+from cnpgen.addons.benchmark.benchmark_planner import (
+    Answer,
+    BenchmarkPlanner,
+    Plan,
+    Setting,
+)
 from cnpgen.errors import UsageError
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.boundary_problems import plans_of_rows
@@ -32,7 +37,9 @@ def near_base(record: ProblemRecord) -> Plans:
     goal, still = base.copy(), np.zeros((1, len(base)))
     goal[0] += 0.1
     ends = {"start_q": base[None], "goal_q": goal[None]}
-    return plans_of_rows(record, {**ends, "start_dq": still, "start_ddq": still, "goal_dq": still})
+    return plans_of_rows(
+        record, {**ends, "start_dq": still, "start_ddq": still, "goal_dq": still}
+    )
 
 
 @dataclass(frozen=True)
@@ -42,7 +49,9 @@ class ShippedNetwork(BenchmarkPlanner):
     def prepare(self, setting: Setting) -> Plan:
         """Load the model."""
         if not setting.model:
-            raise UsageError(f"cnpgen ships no model for these problems of {setting.problem.name!r}")
+            raise UsageError(
+                f"cnpgen ships no model for these problems of {setting.problem.name!r}"
+            )
         return _batch_of_one(Planner(setting.model))
 
 
@@ -76,7 +85,10 @@ class PaperNetwork(BenchmarkPlanner):
                 "cnp-b-paper needs a model file: pass --set cnp-b-paper.model=FILE;"
                 " 'cnpgen train --preset paper' makes one"
             )
-        planner = Planner(Path(self.model) if Path(self.model).suffix else self.model, scale_time=False)
+        planner = Planner(
+            Path(self.model) if Path(self.model).suffix else self.model,
+            scale_time=False,
+        )
         theirs = planner.model.problem
         if theirs.comparable_sha256 != setting.problem.comparable_sha256:
             differs = ", ".join(setting.problem.differences(theirs)[:4])
@@ -88,10 +100,15 @@ class PaperNetwork(BenchmarkPlanner):
 
 
 def _batch_of_one(planner: Planner) -> Callable[[Plans], Plans]:
-    """Return the function that plans one boundary problem; load its kernels before planning is timed."""
+    """Return the function that plans one boundary problem.
+
+    Load its kernels before planning is timed.
+    """
 
     def plan(problem: Plans) -> Plans:
-        return planner.plan_batch(problem.boundary, sample_id=problem.sample_id, columns=problem.columns)
+        return planner.plan_batch(
+            problem.boundary, sample_id=problem.sample_id, columns=problem.columns
+        )
 
     base, nominal = planner.robot.home, planner.robot.nominal_parameters
     planner.plan(base, base, parameters=nominal if len(nominal) else None)

@@ -1,9 +1,10 @@
 """RRT-Connect with path simplification (OMPL), timed by TOPP-RA (Pham and Pham, 2018).
 
-The search is that of CBiRRT on a constraint manifold, and plain RRT-Connect with Coal's collision checks without one.
-The simplified path becomes a cubic spline, which TOPP-RA times within the limits of velocity and acceleration, and of
-torque if the problem limits it and there is no manifold. A goal in motion is met in speed along the path only, as far
-as this is feasible.
+The search is that of CBiRRT on a constraint manifold, and plain RRT-Connect with Coal's
+collision checks without one. The simplified path becomes a cubic spline, which TOPP-RA
+times within the limits of velocity and acceleration, and of torque if the problem
+limits it and there is no manifold. A goal in motion is met in speed along the path
+only, as far as this is feasible.
 """
 
 from collections.abc import Callable
@@ -13,8 +14,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.addons.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
-from cnpgen.addons.benchmark.planners.cbirrt import PathSearch, Search, joint_space, load_ompl, seed_ompl
+from cnpgen.addons.benchmark.benchmark_planner import (
+    Answer,
+    BenchmarkPlanner,
+    Plan,
+    Setting,
+)
+from cnpgen.addons.benchmark.planners.cbirrt import (
+    PathSearch,
+    Search,
+    joint_space,
+    load_ompl,
+    seed_ompl,
+)
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.errors import requires_extra
 from cnpgen.pipelines.resting_states import RestingStates
@@ -29,7 +41,13 @@ Array = NDArray[np.float64]
 
 OUTPUT_PERIOD_S = 0.005
 MIN_WAYPOINT_DISTANCE_RAD = 1e-4  # closer waypoints are joined
-END_RATE_FRACTIONS = (1.0, 0.75, 0.5, 0.25, 0.0)  # of the goal's speed, tried in this order
+END_RATE_FRACTIONS = (
+    1.0,
+    0.75,
+    0.5,
+    0.25,
+    0.0,
+)  # of the goal's speed, tried in this order
 STATE_DISTANCE_RAD = 0.03  # largest distance of checked states of an edge
 
 
@@ -40,8 +58,15 @@ def has_manifold(problem: Problem, robot: Robot) -> bool:
     if robot.shape is None:
         return True
     world = World(robot, problem.obstacle, problem.object_size)
-    conditions = [condition for constraint in problem.constraint for condition in constraint.judged(world)]
-    return any(bool(np.any(np.asarray(item.lower) == np.asarray(item.upper))) for item in conditions)
+    conditions = [
+        condition
+        for constraint in problem.constraint
+        for condition in constraint.judged(world)
+    ]
+    return any(
+        bool(np.any(np.asarray(item.lower) == np.asarray(item.upper)))
+        for item in conditions
+    )
 
 
 class FreeSearch(PathSearch):
@@ -54,13 +79,18 @@ class FreeSearch(PathSearch):
 
     def is_valid(self, q: Array) -> bool:
         """Return whether the robot can hold joint positions q [rad], shape (n,), without collision."""
-        return bool(self._states.can_hold(q[:, None])[0] and self._states.are_clear(q[:, None])[0])
+        return bool(
+            self._states.can_hold(q[:, None])[0]
+            and self._states.are_clear(q[:, None])[0]
+        )
 
     def space(self, ompl: Any) -> tuple[Any, list[Any]]:
         """Return OMPL's information about the joint positions, and its states at start and goal."""
         space = joint_space(ompl.base, self._robot)
         information = ompl.base.SpaceInformation(space)
-        information.setStateValidityCheckingResolution(STATE_DISTANCE_RAD / space.getMaximumExtent())
+        information.setStateValidityCheckingResolution(
+            STATE_DISTANCE_RAD / space.getMaximumExtent()
+        )
         ends = [space.allocState() for _ in self._ends]
         for state, q in zip(ends, self._ends, strict=True):
             for index, position in enumerate(q.tolist()):
@@ -80,8 +110,15 @@ def path_searches(problem: Problem, robot: Robot) -> Callable[[Plans], PathSearc
 class RRTConnect(BenchmarkPlanner):
     """RRT-Connect on the constraint manifold with simplification (OMPL), timed by TOPP-RA."""
 
-    simplify_time: float = field("time for simplifying the path", unit="s", default=1.0, low=0.0)
-    step_size: float = field("largest step of the trees; 0: OMPL's automatic value", unit="rad", default=0.0, low=0.0)
+    simplify_time: float = field(
+        "time for simplifying the path", unit="s", default=1.0, low=0.0
+    )
+    step_size: float = field(
+        "largest step of the trees; 0: OMPL's automatic value",
+        unit="rad",
+        default=0.0,
+        low=0.0,
+    )
 
     def prepare(self, setting: Setting) -> Plan:
         """Import OMPL and TOPP-RA."""
@@ -96,12 +133,16 @@ class RRTConnect(BenchmarkPlanner):
             simplify_time = min(self.simplify_time, setting.time_limit / 2)
             search = search_for(task)
             search_time = setting.time_limit - simplify_time
-            path = search.solve(ompl, search_time, simplify_time=simplify_time, step_size=self.step_size)
+            path = search.solve(
+                ompl, search_time, simplify_time=simplify_time, step_size=self.step_size
+            )
             if path is None:
                 return None
             if isinstance(search, Search):
                 return timed_by_toppra(path, robot, task.boundary.goal_dq[0])
-            return timed_by_toppra(path, robot, np.zeros(robot.n), torque=torque_limited)
+            return timed_by_toppra(
+                path, robot, np.zeros(robot.n), torque=torque_limited
+            )
 
         return plan
 
@@ -116,11 +157,13 @@ def load_toppra() -> Any:
     return toppra
 
 
-def timed_by_toppra(path: Array, robot: Robot, goal_dq: Array, *, torque: bool = False) -> Trajectory | None:
+def timed_by_toppra(
+    path: Array, robot: Robot, goal_dq: Array, *, torque: bool = False
+) -> Trajectory | None:
     """Time a path from rest as fast as possible within the limits of velocity, acceleration and, optionally, torque.
 
-    The path has shape (K, n) [rad], the velocities at the goal shape (n,) [rad/s]. Return None if TOPP-RA finds no
-    timing.
+    The path has shape (K, n) [rad], the velocities at the goal shape (n,) [rad/s].
+    Return None if TOPP-RA finds no timing.
     """
     toppra = load_toppra()
     steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
@@ -140,7 +183,9 @@ def timed_by_toppra(path: Array, robot: Robot, goal_dq: Array, *, torque: bool =
     ]
     if torque:
         limits.append(_torque_constraint(toppra, robot))
-    timing = toppra.algorithm.TOPPRA(limits, spline, parametrizer="ParametrizeConstAccel")
+    timing = toppra.algorithm.TOPPRA(
+        limits, spline, parametrizer="ParametrizeConstAccel"
+    )
     tangent = spline(1.0, 1)
     end_rate = max(float(tangent @ goal_dq / (tangent @ tangent)), 0.0)
     for fraction in END_RATE_FRACTIONS:
@@ -160,7 +205,9 @@ def _torque_constraint(toppra: Any, robot: Robot) -> Any:
         return np.array(pin.rnea(robot.model, data, q, dq, ddq))
 
     limits = np.stack([-robot.torque_limit, robot.torque_limit], axis=1)
-    return toppra.constraint.JointTorqueConstraint(inverse_dynamics, limits, np.zeros(robot.n))
+    return toppra.constraint.JointTorqueConstraint(
+        inverse_dynamics, limits, np.zeros(robot.n)
+    )
 
 
 def _sampled(timed: Any) -> Trajectory:

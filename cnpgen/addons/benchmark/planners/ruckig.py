@@ -1,6 +1,7 @@
 """Ruckig (Berscheid and Kroeger, 2021): time-optimal motions between two states with limited jerk, joint by joint.
 
-It regards the limits of velocity, acceleration and jerk, and neither obstacles nor the table.
+It regards the limits of velocity, acceleration and jerk, and neither obstacles nor the
+table.
 """
 
 from dataclasses import dataclass
@@ -39,7 +40,9 @@ def load_ruckig() -> Any:
     return ruckig
 
 
-def time_optimal_motion(ruckig: Any, robot: Robot, boundary: Boundary) -> Trajectory | None:
+def time_optimal_motion(
+    ruckig: Any, robot: Robot, boundary: Boundary
+) -> Trajectory | None:
     """Return the time-optimal motion of one boundary problem, or None if there is none within the limits.
 
     The acceleration at the goal is 0.
@@ -64,15 +67,23 @@ def time_optimal_motion(ruckig: Any, robot: Robot, boundary: Boundary) -> Trajec
     if result != ruckig.Result.Working or not motion.duration > 0:
         return None
     t = _knots(motion)
-    q, dq, ddq = (np.array(part) for part in zip(*(motion.at_time(time) for time in t.tolist()), strict=True))
+    q, dq, ddq = (
+        np.array(part)
+        for part in zip(*(motion.at_time(time) for time in t.tolist()), strict=True)
+    )
     return Trajectory(t, q, dq, ddq)
 
 
 def _knots(motion: Any) -> Array:
-    """Return the times at which a jerk changes [s]; between them a quintic equals the motion."""
+    """Return the times at which a jerk changes [s].
+
+    Between them a quintic equals the motion.
+    """
     times = [np.array([0.0, motion.duration])]
     for profile in motion.profiles[0]:
-        times.append(profile.brake.duration + np.concatenate([[0.0], np.cumsum(profile.t)]))
+        times.append(
+            profile.brake.duration + np.concatenate([[0.0], np.cumsum(profile.t)])
+        )
         times.append(np.cumsum(profile.brake.t))
     t = np.unique(np.clip(np.concatenate(times), 0.0, motion.duration))
     return np.append(t[:-1][np.diff(t) > MIN_SPAN_S], motion.duration)

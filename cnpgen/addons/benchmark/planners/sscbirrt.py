@@ -1,8 +1,8 @@
 """CBiRRT of the package ``sscbirrt`` (Berenson et al., 2011), with its own shortcuts and timing.
 
-Its Python search is used, because the validity checks are those of the other samplers. The path is shortened and timed
-within the limits of velocity and acceleration by Hauser and Ng-Thow-Hing (2010). It ignores the velocities of both
-ends, which are at rest.
+Its Python search is used, because the validity checks are those of the other samplers.
+The path is shortened and timed within the limits of velocity and acceleration by Hauser
+and Ng-Thow-Hing (2010). It ignores the velocities of both ends, which are at rest.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.benchmark_planner import BenchmarkPlanner, Plan, Setting
-from cnpgen.addons.benchmark.planners.cbirrt import MANIFOLD_TOLERANCE, MAX_PROJECTIONS, SEEDS, PathSearch, Search
+from cnpgen.addons.benchmark.planners.cbirrt import (
+    MANIFOLD_TOLERANCE,
+    MAX_PROJECTIONS,
+    SEEDS,
+    PathSearch,
+    Search,
+)
 from cnpgen.addons.benchmark.planners.rrtconnect import path_searches
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.errors import requires_extra
@@ -24,7 +30,9 @@ from cnpgen.schema.keys import field
 
 Array = NDArray[np.float64]
 
-PROJECTION_TOLERANCE = 1e-3  # default of the package; states of the path may be ten times further away
+PROJECTION_TOLERANCE = (
+    1e-3  # default of the package; states of the path may be ten times further away
+)
 MIN_BREAK_DISTANCE_S = 1e-9  # closer breaks of the acceleration are joined
 
 
@@ -32,7 +40,9 @@ MIN_BREAK_DISTANCE_S = 1e-9  # closer breaks of the acceleration are joined
 class SSCBiRRT(BenchmarkPlanner):
     """CBiRRT with shortcuts in time and timing (package sscbirrt), from rest to rest."""
 
-    step_size: float = field("largest step of the trees", unit="rad", default=0.1, low=1e-3)
+    step_size: float = field(
+        "largest step of the trees", unit="rad", default=0.1, low=1e-3
+    )
 
     def prepare(self, setting: Setting) -> Plan:
         """Import the package."""
@@ -41,20 +51,30 @@ class SSCBiRRT(BenchmarkPlanner):
         search_for = path_searches(problem, robot)
         return lambda task: self._plan(setting, robot, task, search_for(task))
 
-    def _plan(self, setting: Setting, robot: Robot, task: Plans, search: PathSearch) -> Trajectory | None:
+    def _plan(
+        self, setting: Setting, robot: Robot, task: Plans, search: PathSearch
+    ) -> Trajectory | None:
         """Search for a path and time it; return None without a path in time."""
         package = load_sscbirrt()
         manifold = ManifoldSet(search) if isinstance(search, Search) else None
-        joints = SimpleNamespace(dof=robot.n, joint_limits=(robot.position_lower, robot.position_upper))
+        joints = SimpleNamespace(
+            dof=robot.n, joint_limits=(robot.position_lower, robot.position_upper)
+        )
         validity = SimpleNamespace(is_valid=search.is_valid)
-        config = package.CBiRRTConfig(timeout=setting.time_limit, step_size=self.step_size)
+        config = package.CBiRRTConfig(
+            timeout=setting.time_limit, step_size=self.step_size
+        )
         planner = package.CBiRRT(joints, collision_checker=validity, config=config)
         start, goal = (
             package.FiniteSet([q[0]], metric=planner.space.distance)
             for q in (task.boundary.start_q, task.boundary.goal_q)
         )
-        question = package.PlanningProblem(planner.space, start, goal, validity, path_constraint=manifold)
-        limits = package.TrajectoryOptions(robot.velocity_limit, robot.acceleration_limit)
+        question = package.PlanningProblem(
+            planner.space, start, goal, validity, path_constraint=manifold
+        )
+        limits = package.TrajectoryOptions(
+            robot.velocity_limit, robot.acceleration_limit
+        )
         seed = int(setting.random(task).integers(SEEDS))
         try:
             result = planner.solve(question, seed=seed, trajectory=limits)
@@ -74,13 +94,20 @@ class ManifoldSet:
         return abs(self._search.residual(q)[0]) <= MANIFOLD_TOLERANCE
 
     def project(self, _previous: Array, proposed: Array) -> Array | None:
-        """Project a configuration by Newton's method; return None if it does not converge."""
+        """Project a configuration by Newton's method.
+
+        Return None if it does not converge.
+        """
         q = np.array(proposed, float)
         for _ in range(MAX_PROJECTIONS):
             residual, gradient = self._search.residual(q)
             if abs(residual) <= PROJECTION_TOLERANCE:
                 return q
-            q -= residual * gradient / max(float(gradient @ gradient), np.finfo(float).tiny)
+            q -= (
+                residual
+                * gradient
+                / max(float(gradient @ gradient), np.finfo(float).tiny)
+            )
         return None
 
 

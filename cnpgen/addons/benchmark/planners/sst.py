@@ -1,11 +1,14 @@
 """Stable sparse trees (SST; Li, Littlefield, Bekris, 2016) over the arm's states, with random accelerations.
 
-This implementation exists because the Python wheels of OMPL cannot construct its SST. A state is (q, dq). A control is
-an acceleration, constant for 1 to 20 steps of 5 ms and within the torque limits. The distance is that of the tip in the
-workspace, and the cost is time. The goal is a position of the tip, as in the paper. If no state reaches the goal, the
-nearest state is the result. Random torques would exceed a velocity limit within 5 ms.
+This implementation exists because the Python wheels of OMPL cannot construct its SST. A
+state is (q, dq). A control is an acceleration, constant for 1 to 20 steps of 5 ms and
+within the torque limits. The distance is that of the tip in the workspace, and the cost
+is time. The goal is a position of the tip, as in the paper. If no state reaches the
+goal, the nearest state is the result. Random torques would exceed a velocity limit
+within 5 ms.
 
-The trees of ``refine/rrt_connect.py`` have configurations and parents only, so the two share no code.
+The trees of ``refine/rrt_connect.py`` have configurations and parents only, so the two
+share no code.
 """
 
 from collections.abc import Callable
@@ -16,7 +19,12 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.addons.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
+from cnpgen.addons.benchmark.benchmark_planner import (
+    Answer,
+    BenchmarkPlanner,
+    Plan,
+    Setting,
+)
 from cnpgen.addons.benchmark.planners.state_check import StateCheck
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.plans.plans import Plans
@@ -34,8 +42,9 @@ MAX_TREE_ITERATIONS = 300_000
 class Radii:
     """Radii of the tip's position [m].
 
-    The node of least cost is extended within ``select`` around a sampled position, and only it is kept within
-    ``witness`` around a witness. ``goal`` is the maximum distance from the goal.
+    The node of least cost is extended within ``select`` around a sampled position, and
+    only it is kept within ``witness`` around a witness. ``goal`` is the maximum
+    distance from the goal.
     """
 
     select: float
@@ -50,7 +59,8 @@ TRANSPORT_SELECT_M, TRANSPORT_GOAL_M = 0.2, 0.2
 def radii_of(problem: Problem, witness: float) -> Radii:
     """Return the radii for hits or for transports, with the radius of witnesses [m].
 
-    The paper has 0.1 m for the witnesses of transports, which a state from rest cannot leave.
+    The paper has 0.1 m for the witnesses of transports, which a state from rest cannot
+    leave.
     """
     if problem.object_size is None:
         return Radii(HIT_SELECT_M, witness, HIT_GOAL_M)
@@ -60,7 +70,8 @@ def radii_of(problem: Problem, witness: float) -> Radii:
 class Tree:
     """Tree of states from a start of shape (2 n,); each node has the path from its parent, with a step in seconds.
 
-    A state is (q, dq), distances are those of the tip in the workspace, the cost of a node is the time from the start.
+    A state is (q, dq), distances are those of the tip in the workspace, the cost of a
+    node is the time from the start.
     """
 
     def __init__(self, start: Array, tip: Array, radii: Radii, step: float) -> None:
@@ -68,7 +79,12 @@ class Tree:
         self._paths, self._parents = [start[None]], [-1]
         self._tips, self._cost = _GrowingArray((3,)), _GrowingArray(())
         self._witnesses, self._holders = _GrowingArray((3,)), _GrowingArray(())
-        for rows, row in ((self._tips, tip), (self._cost, 0.0), (self._witnesses, tip), (self._holders, 0)):
+        for rows, row in (
+            (self._tips, tip),
+            (self._cost, 0.0),
+            (self._witnesses, tip),
+            (self._holders, 0),
+        ):
             rows.append(row)
 
     def state(self, node: int) -> Array:
@@ -84,7 +100,11 @@ class Tree:
         active = self._holders.rows.astype(int)
         distances = np.linalg.norm(self._tips.rows[active] - position, axis=1)
         close = active[distances < self._radii.select]
-        return int(close[np.argmin(self._cost.rows[close])]) if len(close) else int(active[np.argmin(distances)])
+        return (
+            int(close[np.argmin(self._cost.rows[close])])
+            if len(close)
+            else int(active[np.argmin(distances)])
+        )
 
     def add(self, parent: int, path: Array, tip: Array) -> int:
         """Add a node with states from its parent, shape (K, 2 n), unless a cheaper one exists near the same witness.
@@ -115,14 +135,22 @@ class Tree:
             node = self._parents[node]
         states = np.concatenate(parts[::-1])
         n = states.shape[1] // 2
-        return Trajectory(self._step * np.arange(float(len(states))), states[:, :n], states[:, n:])
+        return Trajectory(
+            self._step * np.arange(float(len(states))), states[:, :n], states[:, n:]
+        )
 
     def grow(
-        self, extend: Callable[[], int], goal: Array, *, time_limit: float, max_iterations: int
+        self,
+        extend: Callable[[], int],
+        goal: Array,
+        *,
+        time_limit: float,
+        max_iterations: int,
     ) -> Trajectory | None:
         """Call ``extend``, which returns the active node, until one is within the goal radius or the time [s] is over.
 
-        Return the trajectory to the node nearest to the goal [m], shape (3,); None if it is the root, node 0.
+        Return the trajectory to the node nearest to the goal [m], shape (3,); None if
+        it is the root, node 0.
         """
         deadline = perf_counter() + time_limit
         best, min_distance = 0, float(np.linalg.norm(self.tip(0) - goal))
@@ -160,38 +188,89 @@ class SST(BenchmarkPlanner):
     """Stable sparse trees over the arm's states with random accelerations, to a position of the tip."""
 
     witness_radius: float = field(
-        "distance of the tip within which one node is kept", unit="m", default=0.02, low=0.0, plausible=5.0
+        "distance of the tip within which one node is kept",
+        unit="m",
+        default=0.02,
+        low=0.0,
+        plausible=5.0,
     )
-    max_steps: int = field("largest number of steps of 5 ms of a control", default=20, low=1)
-    goal_bias: float = field("share of samples that are the goal", default=0.05, low=0.0, high=1.0)
+    max_steps: int = field(
+        "largest number of steps of 5 ms of a control", default=20, low=1
+    )
+    goal_bias: float = field(
+        "share of samples that are the goal", default=0.05, low=0.0, high=1.0
+    )
 
     def prepare(self, setting: Setting) -> Plan:
         """Load the kernel that checks states."""
         problem, robot = open_problem(setting.problem)
-        radii, check = radii_of(problem, self.witness_radius), StateCheck(problem, robot)
+        radii, check = (
+            radii_of(problem, self.witness_radius),
+            StateCheck(problem, robot),
+        )
 
         def plan(task: Plans) -> Answer:
             boundary = task.boundary
-            start_xyz, goal_xyz = task.columns["start_xyz"][0], task.columns["goal_xyz"][0]
-            tree = Tree(np.concatenate([boundary.start_q[0], boundary.start_dq[0]]), start_xyz, radii, CONTROL_STEP_S)
-            extend = partial(self.extend, tree, check, task.scene.poses[0], goal_xyz, setting.random(task))
-            return tree.grow(extend, goal_xyz, time_limit=setting.time_limit, max_iterations=MAX_TREE_ITERATIONS)
+            start_xyz, goal_xyz = (
+                task.columns["start_xyz"][0],
+                task.columns["goal_xyz"][0],
+            )
+            tree = Tree(
+                np.concatenate([boundary.start_q[0], boundary.start_dq[0]]),
+                start_xyz,
+                radii,
+                CONTROL_STEP_S,
+            )
+            extend = partial(
+                self.extend,
+                tree,
+                check,
+                task.scene.poses[0],
+                goal_xyz,
+                setting.random(task),
+            )
+            return tree.grow(
+                extend,
+                goal_xyz,
+                time_limit=setting.time_limit,
+                max_iterations=MAX_TREE_ITERATIONS,
+            )
 
         return plan
 
     def extend(
-        self, tree: Tree, check: StateCheck, obstacle_poses: Array, goal: Array, random: np.random.Generator
+        self,
+        tree: Tree,
+        check: StateCheck,
+        obstacle_poses: Array,
+        goal: Array,
+        random: np.random.Generator,
     ) -> int:
         """Apply a random acceleration for a random time at a node near a random position or the goal [m], shape (3,).
 
         Return the new node of the tree, or 0 if a state is invalid.
         """
-        position = goal if random.random() < self.goal_bias else check.random_position(obstacle_poses, random)
+        position = (
+            goal
+            if random.random() < self.goal_bias
+            else check.random_position(obstacle_poses, random)
+        )
         parent = tree.select(position)
         q, dq = np.split(tree.state(parent), 2)
         limit = check.robot.acceleration_limit
-        ddq = random.uniform(-limit, limit) * random.random()  # often small: 12 kg need much torque
-        t = CONTROL_STEP_S * np.arange(1.0, random.integers(1, self.max_steps + 1) + 1)[:, None]
+        ddq = (
+            random.uniform(-limit, limit) * random.random()
+        )  # often small: 12 kg need much torque
+        t = (
+            CONTROL_STEP_S
+            * np.arange(1.0, random.integers(1, self.max_steps + 1) + 1)[:, None]
+        )
         path_q, path_dq = q + t * (dq + t / 2 * ddq), dq + t * ddq
-        tips, valid = check(path_q, path_dq, np.broadcast_to(ddq, path_q.shape), obstacle_poses)
-        return tree.add(parent, np.concatenate([path_q, path_dq], axis=1), tips[-1]) if valid.all() else 0
+        tips, valid = check(
+            path_q, path_dq, np.broadcast_to(ddq, path_q.shape), obstacle_poses
+        )
+        return (
+            tree.add(parent, np.concatenate([path_q, path_dq], axis=1), tips[-1])
+            if valid.all()
+            else 0
+        )

@@ -30,20 +30,30 @@ class StateCheck:
     def __init__(self, problem: Problem, robot: Robot) -> None:
         require_table_or_transport(problem)
         self.robot = robot
-        self._kernel = problem_kernels(problem, robot, *choose_backend(None)).load(tip_and_violation)
+        self._kernel = problem_kernels(problem, robot, *choose_backend(None)).load(
+            tip_and_violation
+        )
 
-    def __call__(self, q: Array, dq: Array, ddq: Array, obstacle_poses: Array) -> tuple[Array, NDArray[np.bool_]]:
+    def __call__(
+        self, q: Array, dq: Array, ddq: Array, obstacle_poses: Array
+    ) -> tuple[Array, NDArray[np.bool_]]:
         """Check N states of shape (N, n) each among obstacles.
 
-        Return positions of the tip [m], shape (N, 3), and a mask of the valid states, shape (N,).
+        Return positions of the tip [m], shape (N, 3), and a mask of the valid states,
+        shape (N,).
         """
         lanes = [np.ascontiguousarray(values.T) for values in (q, dq, ddq)]
         tip, violation = self._kernel(
-            *lanes, np.ascontiguousarray(np.broadcast_to(obstacle_poses[:, None], (len(obstacle_poses), len(q))))
+            *lanes,
+            np.ascontiguousarray(
+                np.broadcast_to(obstacle_poses[:, None], (len(obstacle_poses), len(q)))
+            ),
         )
         return np.ascontiguousarray(tip.T), violation[0] <= 0
 
-    def random_position(self, obstacle_poses: Array, random: np.random.Generator) -> Array:
+    def random_position(
+        self, obstacle_poses: Array, random: np.random.Generator
+    ) -> Array:
         """Return the tip position of a random configuration [m], shape (3,)."""
         q = random.uniform(self.robot.position_lower, self.robot.position_upper)[None]
         still = np.zeros_like(q)
@@ -54,22 +64,46 @@ def tip_and_violation(robot: Robot, problem: Problem) -> Any:
     """Build ``(q, dq, ddq, obstacle_poses) -> (tip, violation)`` with the largest violation, in its own unit."""
     import casadi as ca
 
-    columns, state = SymbolicState.of_symbols(robot, problem.obstacle, problem.object_size, problem.scene_width)
+    columns, state = SymbolicState.of_symbols(
+        robot, problem.obstacle, problem.object_size, problem.scene_width
+    )
     tip, table = state.kinematics.tip, problem.first(Table)
-    violation = [ca.fabs(value) - limit for value, limit in zip(state.dq, robot.velocity_limit.tolist(), strict=True)]
-    violation += [
-        ca.fabs(value) - limit for value, limit in zip(state.torque, robot.torque_limit.tolist(), strict=True)
+    violation = [
+        ca.fabs(value) - limit
+        for value, limit in zip(state.dq, robot.velocity_limit.tolist(), strict=True)
     ]
-    violation += [low - value for value, low in zip(state.q, robot.position_lower.tolist(), strict=True)]
-    violation += [value - high for value, high in zip(state.q, robot.position_upper.tolist(), strict=True)]
-    violation += _table_violations(table, tip) if table is not None else _obstacle_violations(state)
-    return ca.Function("tip_and_violation", columns, [ca.vertcat(*tip), ca.mmax(ca.vertcat(*violation))])
+    violation += [
+        ca.fabs(value) - limit
+        for value, limit in zip(state.torque, robot.torque_limit.tolist(), strict=True)
+    ]
+    violation += [
+        low - value
+        for value, low in zip(state.q, robot.position_lower.tolist(), strict=True)
+    ]
+    violation += [
+        value - high
+        for value, high in zip(state.q, robot.position_upper.tolist(), strict=True)
+    ]
+    violation += (
+        _table_violations(table, tip)
+        if table is not None
+        else _obstacle_violations(state)
+    )
+    return ca.Function(
+        "tip_and_violation",
+        columns,
+        [ca.vertcat(*tip), ca.mmax(ca.vertcat(*violation))],
+    )
 
 
 def _table_violations(table: Table, tip: Vec) -> list[Scalar]:
     import casadi as ca
 
-    sides = [side for x, span in zip(tip, (table.x, table.y), strict=False) for side in (span.low - x, x - span.high)]
+    sides = [
+        side
+        for x, span in zip(tip, (table.x, table.y), strict=False)
+        for side in (span.low - x, x - span.high)
+    ]
     return [ca.fabs(tip[2] - table.z) - MAX_TIP_HEIGHT_ERROR_M, *sides]
 
 
@@ -86,9 +120,18 @@ def _obstacle_violations(state: SymbolicState) -> list[Scalar]:
     for box, top in zip(state.obstacles, state.obstacle_poses, strict=True):
         spans = [(span.low, span.high) for span in (box.x, box.y) if span is not None]
         sides = (*spans, (-np.inf, top))
-        outside = [ca.fmax(ca.fmax(low - x, x - high), 0) for x, (low, high) in zip(tip, sides, strict=True)]
+        outside = [
+            ca.fmax(ca.fmax(low - x, x - high), 0)
+            for x, (low, high) in zip(tip, sides, strict=True)
+        ]
         violation.append(MIN_OBJECT_DISTANCE_M - ca.sqrt(dot(outside, outside)))
         for corner in corners:
-            depths = [ca.fmin(x - low, high - x) for x, (low, high) in zip(corner, sides, strict=True)]
-            violation.append(ca.fmin(ca.fmin(depths[0], depths[1]), depths[2]) - MAX_CORNER_PENETRATION_M)
+            depths = [
+                ca.fmin(x - low, high - x)
+                for x, (low, high) in zip(corner, sides, strict=True)
+            ]
+            violation.append(
+                ca.fmin(ca.fmin(depths[0], depths[1]), depths[2])
+                - MAX_CORNER_PENETRATION_M
+            )
     return violation

@@ -1,8 +1,9 @@
 """TrajOpt as the paper's authors ran it: direct collocation by SciPy's SLSQP ('cnpgen docs benchmark').
 
-The program has 15 knots and explicit Euler steps of ``T / 15`` between them. SLSQP minimizes T in at most 100
-iterations. The initial guess is a cubic whose derivatives are not scaled by T. The knots are sent with a spacing of
-``T / 14``, so the sent motion is slower than the optimized one by a fifteenth. Both are as in the authors' version.
+The program has 15 knots and explicit Euler steps of ``T / 15`` between them. SLSQP
+minimizes T in at most 100 iterations. The initial guess is a cubic whose derivatives
+are not scaled by T. The knots are sent with a spacing of ``T / 14``, so the sent motion
+is slower than the optimized one by a fifteenth. Both are as in the authors' version.
 Pinocchio computes the derivatives of the constraints at the knots.
 """
 
@@ -14,8 +15,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.addons.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
-from cnpgen.addons.benchmark.planners.obstacle_boxes import Box, boxes_of, depth, distance, require_table_or_transport
+from cnpgen.addons.benchmark.benchmark_planner import (
+    Answer,
+    BenchmarkPlanner,
+    Plan,
+    Setting,
+)
+from cnpgen.addons.benchmark.planners.obstacle_boxes import (
+    Box,
+    boxes_of,
+    depth,
+    distance,
+    require_table_or_transport,
+)
 from cnpgen.addons.benchmark.simulator.tip import Tip
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.plans.plans import Plans
@@ -35,7 +47,9 @@ MIN_DURATION_S = 0.1
 MAX_HEIGHT_ERROR_M = 0.01
 MIN_CENTER_DISTANCE_M = 0.15  # of the object from the obstacles
 
-KnotConstraints = Callable[[Array, Array, Array], tuple[Array, tuple[Array, Array, Array]]]
+KnotConstraints = Callable[
+    [Array, Array, Array], tuple[Array, tuple[Array, Array, Array]]
+]
 """Function of positions, velocities and accelerations at K knots, shape (K, n) each. It returns values that must not be
 negative, shape (K, m), and their three derivatives, shape (K, m, n) each."""
 
@@ -53,7 +67,9 @@ class TrajOpt(BenchmarkPlanner):
 
         def plan(task: Plans) -> Answer:
             at_knots = knot_constraints(problem, robot, task.scene)
-            return TrajOptTranscription(robot, task.boundary, at_knots).solve(self.iterations)
+            return TrajOptTranscription(robot, task.boundary, at_knots).solve(
+                self.iterations
+            )
 
         return plan
 
@@ -61,12 +77,15 @@ class TrajOpt(BenchmarkPlanner):
 class TrajOptTranscription:
     """One boundary problem as a nonlinear program.
 
-    Its variables are positions, velocities and accelerations at the knots where these are free, and T, in this order:
-    ``x = (q_1 .. q_13, dq_1 .. dq_13, ddq, T)``. Accelerations are free at all knots if the motion must not end at
-    rest; else those at both ends are 0. ``at_knots`` are the constraints at the inner knots.
+    Its variables are positions, velocities and accelerations at the knots where these
+    are free, and T, in this order: ``x = (q_1 .. q_13, dq_1 .. dq_13, ddq, T)``.
+    Accelerations are free at all knots if the motion must not end at rest; else those
+    at both ends are 0. ``at_knots`` are the constraints at the inner knots.
     """
 
-    def __init__(self, robot: Robot, boundary: Boundary, at_knots: KnotConstraints) -> None:
+    def __init__(
+        self, robot: Robot, boundary: Boundary, at_knots: KnotConstraints
+    ) -> None:
         self._robot, self._boundary, self._at_knots = robot, boundary, at_knots
         inner = KNOTS - 2
         moving = bool(np.any(boundary.goal_dq))
@@ -107,27 +126,51 @@ class TrajOptTranscription:
         q, dq, free = (part.reshape(-1, n) for part in np.split(x[:-1], self._ends[:2]))
         ddq = np.zeros((KNOTS, n))
         ddq[self._free_ddq] = free
-        return np.vstack([b.start_q, q, b.goal_q]), np.vstack([b.start_dq, dq, b.goal_dq]), ddq, float(x[-1])
+        return (
+            np.vstack([b.start_q, q, b.goal_q]),
+            np.vstack([b.start_dq, dq, b.goal_dq]),
+            ddq,
+            float(x[-1]),
+        )
 
     def start(self) -> Array:
-        """Return the initial guess, a cubic; its derivatives are those in its parameter."""
+        """Return the initial guess, a cubic.
+
+        Its derivatives are those in its parameter.
+        """
         b = self._boundary
-        a = np.vstack([b.start_q, b.start_dq + 3 * b.start_q, 3 * b.goal_q - b.goal_dq, b.goal_q])
+        a = np.vstack(
+            [b.start_q, b.start_dq + 3 * b.start_q, 3 * b.goal_q - b.goal_dq, b.goal_q]
+        )
         s = np.linspace(0, 1, KNOTS)
         shape = np.polynomial.Polynomial
         up, down = shape([0, 1]), shape([1, -1])
         basis = [down**3, down**2 * up, down * up**2, up**3]
-        q, dq, ddq = (np.array([polynomial.deriv(order)(s) for polynomial in basis]).T @ a for order in range(3))
+        q, dq, ddq = (
+            np.array([polynomial.deriv(order)(s) for polynomial in basis]).T @ a
+            for order in range(3)
+        )
         robot = self._robot
-        time = np.max(np.abs(dq) / robot.velocity_limit), np.sqrt(np.max(np.abs(ddq) / robot.acceleration_limit))
-        parts = [q[1:-1].ravel(), dq[1:-1].ravel(), ddq[self._free_ddq].ravel(), np.array([max(time)])]
+        time = (
+            np.max(np.abs(dq) / robot.velocity_limit),
+            np.sqrt(np.max(np.abs(ddq) / robot.acceleration_limit)),
+        )
+        parts = [
+            q[1:-1].ravel(),
+            dq[1:-1].ravel(),
+            ddq[self._free_ddq].ravel(),
+            np.array([max(time)]),
+        ]
         return np.concatenate(parts)
 
     def bounds(self) -> tuple[Array, Array]:
         """Return the lower and upper bounds of the variables."""
         robot, inner = self._robot, KNOTS - 2
         free = self._free_ddq.stop - self._free_ddq.start
-        high = [np.tile(robot.position_upper, inner), np.tile(robot.velocity_limit, inner)]
+        high = [
+            np.tile(robot.position_upper, inner),
+            np.tile(robot.velocity_limit, inner),
+        ]
         low = [np.tile(robot.position_lower, inner), -high[1]]
         acceleration = np.tile(robot.acceleration_limit, free)
         return (
@@ -140,7 +183,10 @@ class TrajOptTranscription:
         q, dq, ddq, duration = self.unpack(x)
         step = duration / KNOTS
         return np.concatenate(
-            [(np.diff(q, axis=0) - step * dq[:-1]).ravel(), (np.diff(dq, axis=0) - step * ddq[:-1]).ravel()]
+            [
+                (np.diff(q, axis=0) - step * dq[:-1]).ravel(),
+                (np.diff(dq, axis=0) - step * ddq[:-1]).ravel(),
+            ]
         )
 
     def defects_jacobian(self, x: Array) -> Array:
@@ -148,7 +194,9 @@ class TrajOptTranscription:
         n, inner = self._robot.n, KNOTS - 2
         _, dq, ddq, duration = self.unpack(x)
         step, rows = duration / KNOTS, (KNOTS - 1) * n
-        differences = np.eye(KNOTS)[1:, 1:-1] - np.eye(KNOTS)[:-1, 1:-1]  # of consecutive knots, in the inner ones
+        differences = (
+            np.eye(KNOTS)[1:, 1:-1] - np.eye(KNOTS)[:-1, 1:-1]
+        )  # of consecutive knots, in the inner ones
         selection = np.eye(KNOTS)[:-1]
         unit = np.eye(n)
         J = np.zeros((2 * rows, self._size))
@@ -181,7 +229,10 @@ class TrajOptTranscription:
 
 
 def knot_constraints(problem: Problem, robot: Robot, scene: Scene) -> KnotConstraints:
-    """Return the constraints of a boundary problem: of a hit, or of a transport; see ``require_table_or_transport``."""
+    """Return the constraints of a boundary problem: of a hit, or of a transport.
+
+    See ``require_table_or_transport``.
+    """
     table = problem.first(Table)
     if table is not None:
         return _on_table(table, robot)
@@ -189,14 +240,25 @@ def knot_constraints(problem: Problem, robot: Robot, scene: Scene) -> KnotConstr
 
 
 def _on_table(table: Table, robot: Robot) -> KnotConstraints:
-    """Bound the tip: over the table and at most 1 cm from its height; |y| and |z| are two inequalities each."""
+    """Bound the tip: over the table and at most 1 cm from its height.
+
+    |y| and |z| are two inequalities each.
+    """
     signs = np.array([[1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
     bound = np.array(
-        [-table.x.low, -table.y.low, table.y.high, MAX_HEIGHT_ERROR_M - table.z, MAX_HEIGHT_ERROR_M + table.z]
+        [
+            -table.x.low,
+            -table.y.low,
+            table.y.high,
+            MAX_HEIGHT_ERROR_M - table.z,
+            MAX_HEIGHT_ERROR_M + table.z,
+        ]
     )
     tip = Tip(robot)
 
-    def at(q: Array, _dq: Array, _ddq: Array) -> tuple[Array, tuple[Array, Array, Array]]:
+    def at(
+        q: Array, _dq: Array, _ddq: Array
+    ) -> tuple[Array, tuple[Array, Array, Array]]:
         poses = [tip.at(position) for position in q]
         g = np.array([signs @ position + bound for position, _, _ in poses])
         J = np.array([signs @ jacobian[:3] for _, _, jacobian in poses])
@@ -206,15 +268,26 @@ def _on_table(table: Table, robot: Robot) -> KnotConstraints:
 
 
 def _with_object(robot: Robot, size: Array, boxes: list[Box]) -> KnotConstraints:
-    """Constrain the object: upright, centre away from the boxes, corners outside; torques within limits."""
+    """Constrain the object: upright, centre away from the boxes, corners outside.
+
+    Torques within limits.
+    """
     import pinocchio as pin
 
-    tip, model, data, limit = Tip(robot), robot.model, robot.model.createData(), robot.torque_limit
+    tip, model, data, limit = (
+        Tip(robot),
+        robot.model,
+        robot.model.createData(),
+        robot.torque_limit,
+    )
 
     def object_values(q: Array) -> tuple[list[float], Array]:
         position, rotation, J = tip.at(q)
         turning = J[3:]
-        values, gradients = [rotation[2, 2] - 1.0], [np.cross(turning.T, rotation[:, 2])[:, 2]]
+        values, gradients = (
+            [rotation[2, 2] - 1.0],
+            [np.cross(turning.T, rotation[:, 2])[:, 2]],
+        )
         for box in boxes:
             separation, normal = distance(position, box)
             values.append(min(separation - MIN_CENTER_DISTANCE_M, 0.0))
@@ -230,12 +303,20 @@ def _with_object(robot: Robot, size: Array, boxes: list[Box]) -> KnotConstraints
         pin.computeRNEADerivatives(model, data, q, dq, ddq)
         inertia, torque = np.triu(data.M) + np.triu(data.M, 1).T, np.array(data.tau)
         g = np.concatenate([values, limit - torque, limit + torque])
-        rows = [(gradient, data.dtau_dq), (np.zeros_like(gradient), data.dtau_dv), (np.zeros_like(gradient), inertia)]
-        of_q, of_dq, of_ddq = (np.vstack([first, -torques, torques]) for first, torques in rows)
+        rows = [
+            (gradient, data.dtau_dq),
+            (np.zeros_like(gradient), data.dtau_dv),
+            (np.zeros_like(gradient), inertia),
+        ]
+        of_q, of_dq, of_ddq = (
+            np.vstack([first, -torques, torques]) for first, torques in rows
+        )
         return g, of_q, of_dq, of_ddq
 
     def at(q: Array, dq: Array, ddq: Array) -> tuple[Array, tuple[Array, Array, Array]]:
-        g, a, b, c = (np.array(part) for part in zip(*map(knot, q, dq, ddq), strict=True))
+        g, a, b, c = (
+            np.array(part) for part in zip(*map(knot, q, dq, ddq), strict=True)
+        )
         return g, (a, b, c)
 
     return at

@@ -11,10 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.simulator.challenge import execute_in_challenge
-from cnpgen.addons.benchmark.simulator.executed import Executed, TickRecord, outcome_of, puck_is_done
+from cnpgen.addons.benchmark.simulator.executed import (
+    Executed,
+    TickRecord,
+    outcome_of,
+    puck_is_done,
+)
 from cnpgen.addons.benchmark.simulator.plant import Plant, rated_torque
 from cnpgen.addons.benchmark.simulator.reference import TICK_S, Reference
-from cnpgen.addons.benchmark.simulator.simulator_scene import SIMULATION_STEP_S, SimulatorScene, scene_xml
+from cnpgen.addons.benchmark.simulator.simulator_scene import (
+    SIMULATION_STEP_S,
+    SimulatorScene,
+    scene_xml,
+)
 from cnpgen.errors import RecipeError, requires_extra
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
@@ -22,15 +31,18 @@ from cnpgen.robots.robot import Robot
 Array = NDArray[np.float64]
 
 OBSERVATION_TIME_S = 0.2  # after a motion without a puck
-GAIN_RAD_S = 80.0  # natural frequency of the closed loop; an error decays within about 1/80 s
+GAIN_RAD_S = (
+    80.0  # natural frequency of the closed loop; an error decays within about 1/80 s
+)
 
 
 class Controller:
     """Computed torque, within the rated torques: ``M(q) (ddq* + w^2 (q* - q) + 2 w (dq* - dq)) + h(q, dq)``.
 
-    w is ``GAIN_RAD_S``. If a torque would exceed its limit, the acceleration is scaled down in its direction, and the
-    holding torque keeps priority. The robot is nominal: of a plant, only the delay counts. ``limit`` has the rated
-    torques [N m], shape (n,).
+    w is ``GAIN_RAD_S``. If a torque would exceed its limit, the acceleration is scaled
+    down in its direction, and the holding torque keeps priority. The robot is nominal:
+    of a plant, only the delay counts. ``limit`` has the rated torques [N m], shape
+    (n,).
     """
 
     def __init__(self, problem: Problem, robot: Robot, plant: Plant) -> None:
@@ -40,19 +52,34 @@ class Controller:
         self._delay = plant.delay
         self._delayed: deque[Array] = deque()
 
-    def __call__(self, q: Array, dq: Array, desired: tuple[Array, Array, Array]) -> Array:
+    def __call__(
+        self, q: Array, dq: Array, desired: tuple[Array, Array, Array]
+    ) -> Array:
         """Compute the torque that takes effect now [N m], shape (n,), from the measured and the desired state."""
         import pinocchio as pin
 
-        acceleration = desired[2] + GAIN_RAD_S**2 * (desired[0] - q) + 2 * GAIN_RAD_S * (desired[1] - dq)
-        holding_torque = np.clip(pin.rnea(self._model, self._data, q, dq, np.zeros_like(q)), -self.limit, self.limit)
-        acceleration_torque = pin.rnea(self._model, self._data, q, dq, acceleration) - holding_torque
+        acceleration = (
+            desired[2]
+            + GAIN_RAD_S**2 * (desired[0] - q)
+            + 2 * GAIN_RAD_S * (desired[1] - dq)
+        )
+        holding_torque = np.clip(
+            pin.rnea(self._model, self._data, q, dq, np.zeros_like(q)),
+            -self.limit,
+            self.limit,
+        )
+        acceleration_torque = (
+            pin.rnea(self._model, self._data, q, dq, acceleration) - holding_torque
+        )
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = np.nanmin(
-                (self.limit - np.sign(acceleration_torque) * holding_torque) / np.abs(acceleration_torque)
+                (self.limit - np.sign(acceleration_torque) * holding_torque)
+                / np.abs(acceleration_torque)
             )
         torque = holding_torque + min(scale, 1.0) * acceleration_torque
-        self._delayed.extend([torque] * (self._delay + 1 - len(self._delayed)))  # the first tick already holds the arm
+        self._delayed.extend(
+            [torque] * (self._delay + 1 - len(self._delayed))
+        )  # the first tick already holds the arm
         return self._delayed.popleft()
 
 
@@ -60,8 +87,9 @@ class Controller:
 class Execution:
     """Record of an execution and its result.
 
-    ``states`` are the positions of all simulated joints, including the puck, shape (K, nq), for rendering. The tip [m]
-    has shape (K, 3). The puck over the table [m] has shape (K, 2); it is nan without one.
+    ``states`` are the positions of all simulated joints, including the puck, shape (K,
+    nq), for rendering. The tip [m] has shape (K, 3). The puck over the table [m] has
+    shape (K, 2); it is nan without one.
     """
 
     scene: SimulatorScene
@@ -75,18 +103,25 @@ class Execution:
 def load_mujoco() -> Any:
     """Import MuJoCo; raise MissingExtraError if it is not installed or broken."""
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-        os.environ.setdefault("MUJOCO_GL", "egl")  # renders without a screen; read when MuJoCo is imported
+        os.environ.setdefault(
+            "MUJOCO_GL", "egl"
+        )  # renders without a screen; read when MuJoCo is imported
     with requires_extra("benchmark", "MuJoCo"):
         import mujoco
     return mujoco
 
 
 def compile_scene(scene: SimulatorScene) -> Any:
-    """Build MuJoCo's model of a scene; raise RecipeError if MuJoCo refuses it, for example impossible inertias."""
+    """Build MuJoCo's model of a scene.
+
+    Raise RecipeError if MuJoCo refuses it, for example impossible inertias.
+    """
     try:
         return _compiled(scene_xml(scene))
     except ValueError as error:
-        raise RecipeError([f"{scene.problem.name}: MuJoCo cannot simulate it: {error}"]) from error
+        raise RecipeError(
+            [f"{scene.problem.name}: MuJoCo cannot simulate it: {error}"]
+        ) from error
 
 
 @lru_cache(maxsize=8)
@@ -94,18 +129,27 @@ def _compiled(text: str) -> Any:
     return load_mujoco().MjModel.from_xml_string(text)
 
 
-def execute(scene: SimulatorScene, reference: Reference, goal_xyz: Array, start_dq: Array | None = None) -> Execution:
+def execute(
+    scene: SimulatorScene,
+    reference: Reference,
+    goal_xyz: Array,
+    start_dq: Array | None = None,
+) -> Execution:
     """Execute one plan, which ends with the tip at ``goal_xyz`` [m], shape (3,).
 
-    The robot starts at the first position of the reference, with the velocities ``start_dq`` [rad/s], shape (n,), or
-    those of the reference.
+    The robot starts at the first position of the reference, with the velocities
+    ``start_dq`` [rad/s], shape (n,), or those of the reference.
     """
     start_dq = reference.dq[0] if start_dq is None else start_dq
     if scene.plant.environment:
         record = execute_in_challenge(scene, reference, start_dq)
     else:
         record = _Run(scene, reference).simulate(start_dq)
-    states = record.q if scene.puck is None else np.concatenate([record.q, record.puck], axis=1)
+    states = (
+        record.q
+        if scene.puck is None
+        else np.concatenate([record.q, record.puck], axis=1)
+    )
     executed = outcome_of(scene, reference, goal_xyz, record)
     return Execution(scene, reference, executed, states, record.tip, record.puck)
 
@@ -123,7 +167,9 @@ class _Run:
         self._tip = self._model.site("tip").id
         self._rows: list[tuple[Array, ...]] = []
         self._max_penetration = 0.0  # m
-        self._mallet, self._puck, self._table = (self._geometry(name) for name in ("mallet", "reach", "support"))
+        self._mallet, self._puck, self._table = (
+            self._geometry(name) for name in ("mallet", "reach", "support")
+        )
 
     def simulate(self, start_dq: Array) -> TickRecord:
         """Simulate to the end and return the record."""
@@ -144,7 +190,16 @@ class _Run:
             puck = velocity = np.full((len(states), 2), np.nan)
         use = torque / self._control.limit
         return TickRecord(
-            states[:, :n], tip, rotation, reference, use, puck, velocity, touched, force, self._max_penetration
+            states[:, :n],
+            tip,
+            rotation,
+            reference,
+            use,
+            puck,
+            velocity,
+            touched,
+            force,
+            self._max_penetration,
         )
 
     def _step(self, tick: int) -> None:
@@ -152,17 +207,24 @@ class _Run:
         data, n = self._data, self._n
         desired = self._reference.at(tick)
         torque = self._control(data.qpos[:n].copy(), data.qvel[:n].copy(), desired)
-        tip, rotation = data.site_xpos[self._tip].copy(), data.site_xmat[self._tip].reshape(3, 3).copy()
+        tip, rotation = (
+            data.site_xpos[self._tip].copy(),
+            data.site_xmat[self._tip].reshape(3, 3).copy(),
+        )
         state = data.qpos.copy(), tip, rotation, desired[0], torque, data.qvel.copy()
         data.qfrc_applied[:n] = torque
         self._mujoco.mj_step(self._model, data, round(TICK_S / SIMULATION_STEP_S))
         if self._scene.puck is None and data.ncon:
-            self._max_penetration = max(self._max_penetration, float(-data.contact.dist.min()))
+            self._max_penetration = max(
+                self._max_penetration, float(-data.contact.dist.min())
+            )
         self._rows.append((*state, *self._contacts()))
 
     def _geometry(self, name: str) -> int:
         """Return the number of a geometry; -1 if the scene does not have it."""
-        return int(self._mujoco.mj_name2id(self._model, self._mujoco.mjtObj.mjOBJ_GEOM, name))
+        return int(
+            self._mujoco.mj_name2id(self._model, self._mujoco.mjtObj.mjOBJ_GEOM, name)
+        )
 
     def _contacts(self) -> tuple[Array, Array]:
         """Return whether the mallet touches the puck, and its normal and friction force on the table [N]."""
@@ -185,4 +247,6 @@ class _Run:
             return False
         if self._scene.puck is None:
             return tick >= reference.ticks + round(OBSERVATION_TIME_S / TICK_S)
-        return puck_is_done(reference, tick, float(data.qpos[n]), float(np.linalg.norm(data.qvel[n:])))
+        return puck_is_done(
+            reference, tick, float(data.qpos[n]), float(np.linalg.norm(data.qvel[n:]))
+        )

@@ -16,9 +16,13 @@ from cnpgen.judges.plans.metrics import tilt
 
 Array = NDArray[np.float64]
 
-PLANE_TOLERANCE_M = 0.02  # of the mallet's height, as in the Air Hockey Challenge (2023)
+PLANE_TOLERANCE_M = (
+    0.02  # of the mallet's height, as in the Air Hockey Challenge (2023)
+)
 MAX_GOAL_DISTANCE_M = 0.01  # of a finished motion, as in the paper
-EARLY_CONTACT_M = hockey.PATH_LEFT_AT_CONTACT_M + 0.01  # a contact with more of the planned path left is early
+EARLY_CONTACT_M = (
+    hockey.PATH_LEFT_AT_CONTACT_M + 0.01
+)  # a contact with more of the planned path left is early
 MIN_PUCK_SPEED_M_S = 0.02  # a slower puck counts as stopped
 MAX_LEGAL_PENETRATION_M = 1e-3
 MAX_PUCK_TIME_S = 4.0  # until the puck arrives
@@ -28,28 +32,28 @@ MAX_PUCK_TIME_S = 4.0  # until the puck arrives
 class Executed:
     """Result of the execution of one plan; inapplicable values are None or nan.
 
-    Attributes:
-        finished: Whether the tip was within 1 cm of the goal when the plan ended.
-        touched_early: Whether the mallet touched the puck more than 10 mm of its planned path before both were to meet.
-        hit: Whether the mallet touched the puck.
-        scored: Whether the puck went into the opponent's goal.
-        collided: Whether object or links penetrated an obstacle by more than 1 mm outside legal contact.
-        hit_time: Time of the first contact of mallet and puck [s].
-        puck_speed: Speed of the puck after the contact [m/s].
-        z_error: Integral of |z - height of the table| over the executed plan [m s].
-        vertical_error: Integral of |roll| + |pitch| of the tip frame over the motion [rad s].
-        tracking_error: Integral of the sum over joints of |q - q planned| over the motion [rad s].
-        torque_use: Maximum torque as a fraction of the rated torque; 1 is a saturated motor.
-        goal_distance: Distance of the tip from the goal when the plan ended [m].
-        contact_distance: Length of the mallet's planned path that was left at the first contact with the puck [m].
+    Attributes: finished: Whether the tip was within 1 cm of the goal when the plan
+        ended. touched_early: Whether the mallet touched the puck more than 10 mm of its
+        planned path before both were to meet. hit: Whether the mallet touched the puck.
+        scored: Whether the puck went into the opponent's goal. collided: Whether object
+        or links penetrated an obstacle by more than 1 mm outside legal contact.
+        hit_time: Time of the first contact of mallet and puck [s]. puck_speed: Speed of
+        the puck after the contact [m/s]. z_error: Integral of |z - height of the table|
+        over the executed plan [m s]. vertical_error: Integral of |roll| + |pitch| of
+        the tip frame over the motion [rad s]. tracking_error: Integral of the sum over
+        joints of |q - q planned| over the motion [rad s]. torque_use: Maximum torque as
+        a fraction of the rated torque; 1 is a saturated motor. goal_distance: Distance
+        of the tip from the goal when the plan ended [m]. contact_distance: Length of
+        the mallet's planned path that was left at the first contact with the puck [m].
         plane_error: Maximum |z - height of the table| of the executed plan [m].
-        commanded_plane_error: The same of the commanded positions, which may be below a table that supports the mallet.
-        table_force: Maximum normal force between mallet and table until the puck's result is final [N].
-        table_friction: Maximum friction force between them [N].
-        table_contact_time: Time for which they touched [s].
-        violated_steps: Constraint of the environment -> number of its steps that violate it; None without such.
-        penalty: Penalty points of the environment's rules, without those of computation times.
-        failure: Reason why nothing was executed, or empty.
+        commanded_plane_error: The same of the commanded positions, which may be below a
+        table that supports the mallet. table_force: Maximum normal force between mallet
+        and table until the puck's result is final [N]. table_friction: Maximum friction
+        force between them [N]. table_contact_time: Time for which they touched [s].
+        violated_steps: Constraint of the environment -> number of its steps that
+        violate it; None without such. penalty: Penalty points of the environment's
+        rules, without those of computation times. failure: Reason why nothing was
+        executed, or empty.
     """
 
     finished: bool = False
@@ -85,7 +89,10 @@ class Executed:
 
     def _values(self) -> dict[str, Any]:
         values = {
-            **{name: getattr(self, name) for name in ("finished", "touched_early", "hit", "scored", "collided")},
+            **{
+                name: getattr(self, name)
+                for name in ("finished", "touched_early", "hit", "scored", "collided")
+            },
             "hit_time_s": self.hit_time,
             "puck_speed_m_s": self.puck_speed,
             "z_error_mm_s": 1e3 * self.z_error,
@@ -99,38 +106,57 @@ class Executed:
             "table_force_n": self.table_force,
             "table_friction_n": self.table_friction,
             "table_contact_s": self.table_contact_time,
-            **{f"{name}_steps": count for name, count in (self.violated_steps or {}).items()},
+            **{
+                f"{name}_steps": count
+                for name, count in (self.violated_steps or {}).items()
+            },
             "penalty_points": self.penalty,
             "failure": self.failure or None,
         }
         known = ((name, value) for name, value in values.items() if value is not None)
-        return {name: value for name, value in known if not (isinstance(value, float) and math.isnan(value))}
+        return {
+            name: value
+            for name, value in known
+            if not (isinstance(value, float) and math.isnan(value))
+        }
 
 
-def succeeded(executed: Mapping[str, Any], plane_tolerance: float = PLANE_TOLERANCE_M) -> bool:
+def succeeded(
+    executed: Mapping[str, Any], plane_tolerance: float = PLANE_TOLERANCE_M
+) -> bool:
     """Return whether an execution succeeded, from the result of ``Executed.to_dict``.
 
-    A hit succeeds if it scores without early contact, and the mallet stays near the plane of the table throughout the
-    plan, within a tolerance [m]. The limit holds for the commanded height, too, because the table supports a mallet
-    that is commanded below it. A motion without a puck succeeds if it reaches its goal without collision.
+    A hit succeeds if it scores without early contact, and the mallet stays near the
+    plane of the table throughout the plan, within a tolerance [m]. The limit holds for
+    the commanded height, too, because the table supports a mallet that is commanded
+    below it. A motion without a puck succeeds if it reaches its goal without collision.
     """
     if "failure" in executed:
         return False
     if "scored" not in executed:
         return bool(executed["finished"]) and not executed.get("collided")
-    errors = [executed.get(name, math.inf) for name in ("plane_error_mm", "commanded_plane_error_mm")]
-    return bool(executed["scored"]) and not executed.get("touched_early") and max(errors) <= 1e3 * plane_tolerance
+    errors = [
+        executed.get(name, math.inf)
+        for name in ("plane_error_mm", "commanded_plane_error_mm")
+    ]
+    return (
+        bool(executed["scored"])
+        and not executed.get("touched_early")
+        and max(errors) <= 1e3 * plane_tolerance
+    )
 
 
 @dataclass(frozen=True)
 class TickRecord:
     """Record of K ticks.
 
-    Joint positions, their reference [rad] and torques as fractions of the rated ones have shape (K, n). The tip [m] has
-    shape (K, 3), its rotation (K, 3, 3). The puck over the table [m] and its velocity [m/s] have shape (K, 2) and are
-    nan without one; ``puck_contact`` is true while the mallet touches it, shape (K,). ``table_force`` has the normal
-    and the friction force of the mallet on the table [N], shape (K, 2), nan if not simulated. ``max_penetration`` is
-    that of an obstacle [m]; see ``Executed`` for the others.
+    Joint positions, their reference [rad] and torques as fractions of the rated ones
+    have shape (K, n). The tip [m] has shape (K, 3), its rotation (K, 3, 3). The puck
+    over the table [m] and its velocity [m/s] have shape (K, 2) and are nan without one;
+    ``puck_contact`` is true while the mallet touches it, shape (K,). ``table_force``
+    has the normal and the friction force of the mallet on the table [N], shape (K, 2),
+    nan if not simulated. ``max_penetration`` is that of an obstacle [m]; see
+    ``Executed`` for the others.
     """
 
     q: Array
@@ -154,10 +180,14 @@ def puck_is_done(reference: Reference, tick: int, x: float, speed: float) -> boo
     """
     stopped = tick > len(reference.q) and speed < MIN_PUCK_SPEED_M_S
     outside = x > hockey.GOAL_LINE_M + hockey.PUCK_RADIUS_M
-    return stopped or outside or tick > reference.ticks + round(MAX_PUCK_TIME_S / TICK_S)
+    return (
+        stopped or outside or tick > reference.ticks + round(MAX_PUCK_TIME_S / TICK_S)
+    )
 
 
-def outcome_of(scene: SimulatorScene, reference: Reference, goal_xyz: Array, record: TickRecord) -> Executed:
+def outcome_of(
+    scene: SimulatorScene, reference: Reference, goal_xyz: Array, record: TickRecord
+) -> Executed:
     """Compute the result of an execution whose plan ends with the tip at ``goal_xyz`` [m], shape (3,)."""
     ticks, height = min(reference.ticks, len(record.q)), scene.height
     during, tip = slice(0, ticks), scene.on_table(record.tip)
@@ -165,25 +195,39 @@ def outcome_of(scene: SimulatorScene, reference: Reference, goal_xyz: Array, rec
     executed = Executed(
         finished=goal_distance < MAX_GOAL_DISTANCE_M,
         goal_distance=goal_distance,
-        z_error=np.nan if height is None else TICK_S * float(np.abs(tip[during, 2] - height).sum()),
+        z_error=np.nan
+        if height is None
+        else TICK_S * float(np.abs(tip[during, 2] - height).sum()),
         vertical_error=np.nan
         if height is not None
-        else TICK_S * float(tilt((scene.upright.T @ record.rotation[during]).transpose(1, 2, 0)).sum()),
-        tracking_error=TICK_S * float(np.abs(record.q[during] - record.reference[during]).sum()),
+        else TICK_S
+        * float(
+            tilt((scene.upright.T @ record.rotation[during]).transpose(1, 2, 0)).sum()
+        ),
+        tracking_error=TICK_S
+        * float(np.abs(record.q[during] - record.reference[during]).sum()),
         torque_use=float(np.abs(record.torque_use).max()),
         violated_steps=record.violated_steps,
         penalty=record.penalty,
     )
     planned = Tip(scene.robot)
-    planned_tip = scene.on_table(np.array([planned.at(q)[0] for q in reference.q[: reference.ticks]]))
+    planned_tip = scene.on_table(
+        np.array([planned.at(q)[0] for q in reference.q[: reference.ticks]])
+    )
     if height is not None:
-        executed = _with_table(executed, record, planned_tip[:, 2] - height, tip[during, 2] - height)
+        executed = _with_table(
+            executed, record, planned_tip[:, 2] - height, tip[during, 2] - height
+        )
     if scene.puck is None:
-        return replace(executed, collided=record.max_penetration > MAX_LEGAL_PENETRATION_M)
+        return replace(
+            executed, collided=record.max_penetration > MAX_LEGAL_PENETRATION_M
+        )
     return _with_puck(executed, record, planned_tip)
 
 
-def _with_table(executed: Executed, record: TickRecord, commanded_height: Array, height: Array) -> Executed:
+def _with_table(
+    executed: Executed, record: TickRecord, commanded_height: Array, height: Array
+) -> Executed:
     """Add the heights of the mallet over the plane [m], commanded and executed, and the forces of the table."""
     executed = replace(
         executed,
@@ -214,7 +258,9 @@ def _with_puck(executed: Executed, record: TickRecord, planned_tip: Array) -> Ex
     return replace(
         executed,
         hit=True,
-        scored=bool(np.any((x > hockey.GOAL_LINE_M) & (np.abs(y) < hockey.GOAL_WIDTH_M / 2))),
+        scored=bool(
+            np.any((x > hockey.GOAL_LINE_M) & (np.abs(y) < hockey.GOAL_WIDTH_M / 2))
+        ),
         touched_early=left > EARLY_CONTACT_M,
         contact_distance=left,
         hit_time=first * TICK_S,

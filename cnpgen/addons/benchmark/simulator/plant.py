@@ -1,7 +1,8 @@
 """Plants: deviations of the simulated robot from the nominal model, such as friction, other masses and a delay.
 
-Dry and viscous friction of the iiwa's joints are those of the Air Hockey Challenge (2023), which simulates the same
-arm ('cnpgen docs references'). The friction of other joints is a fraction of their rated torque.
+Dry and viscous friction of the iiwa's joints are those of the Air Hockey Challenge
+(2023), which simulates the same arm ('cnpgen docs references'). The friction of other
+joints is a fraction of their rated torque.
 """
 
 from dataclasses import dataclass
@@ -33,19 +34,20 @@ IIWA = {
     "joint_6": Friction(0.196149, 0.1),
     "joint_7": Friction(0.299238, 0.1),
 }
-DRY_FRACTION, VISCOUS_FRACTION = 2e-3, 1e-3  # of the rated torque, the second per rad/s; for other joints
+DRY_FRACTION, VISCOUS_FRACTION = (
+    2e-3,
+    1e-3,
+)  # of the rated torque, the second per rad/s; for other joints
 
 
 @dataclass(frozen=True)
 class Plant:
     """A simulated robot.
 
-    Attributes:
-        name: Its name.
-        title: Deviations from the nominal model, in one line.
-        mass: Factor of masses and inertias.
-        delay: Delay of torques in ticks of the controller, 1 ms each.
-        environment: Folder of an external environment; empty for cnpgen's own simulation.
+    Attributes: name: Its name. title: Deviations from the nominal model, in one line.
+        mass: Factor of masses and inertias. delay: Delay of torques in ticks of the
+        controller, 1 ms each. environment: Folder of an external environment; empty for
+        cnpgen's own simulation.
     """
 
     name: str
@@ -70,10 +72,14 @@ def as_plant(plant: Plant | str, *, argument: str = "plant") -> Plant:
     if isinstance(plant, Plant):
         return plant
     if not isinstance(plant, str):
-        raise UsageError(f"must be the name of a plant or a Plant, got {plant!r:.100}", argument=argument)
+        raise UsageError(
+            f"must be the name of a plant or a Plant, got {plant!r:.100}",
+            argument=argument,
+        )
     if plant not in PLANTS:
         raise UsageError(
-            f"unknown plant {plant!r}{nearest(plant, PLANTS)}, expected one of {', '.join(PLANTS)}", concerns=argument
+            f"unknown plant {plant!r}{nearest(plant, PLANTS)}, expected one of {', '.join(PLANTS)}",
+            concerns=argument,
         )
     return PLANTS[plant]
 
@@ -83,7 +89,8 @@ def joint_friction(problem: Problem, robot: Robot) -> tuple[Friction, ...]:
     if set(robot.joint_names) <= IIWA.keys():
         return tuple(IIWA[name] for name in robot.joint_names)
     return tuple(
-        Friction(DRY_FRACTION * rated, VISCOUS_FRACTION * rated) for rated in rated_torque(problem, robot).tolist()
+        Friction(DRY_FRACTION * rated, VISCOUS_FRACTION * rated)
+        for rated in rated_torque(problem, robot).tolist()
     )
 
 

@@ -21,8 +21,8 @@ MAX_EXECUTED_DURATION_S = 60.0
 class Reference:
     """States to follow at the K ticks of the controller; after the last tick, the robot stands still.
 
-    Positions, velocities and accelerations have shape (K, n), in radians. The duration of the plan is in seconds; the
-    stop follows.
+    Positions, velocities and accelerations have shape (K, n), in radians. The duration
+    of the plan is in seconds; the stop follows.
     """
 
     q: Array
@@ -52,11 +52,13 @@ def states_of(motion: Motion) -> StatesAt:
     return states
 
 
-def make_reference(states: StatesAt, duration: float, *, acceleration_limit: Array) -> Reference:
+def make_reference(
+    states: StatesAt, duration: float, *, acceleration_limit: Array
+) -> Reference:
     """Sample a trajectory of a duration [s] and add a stop, in which all joints decelerate uniformly in the same time.
 
-    Raises:
-        UsageError: The plan never arrives, or plan or stop exceed ``MAX_EXECUTED_DURATION_S``.
+    Raises: UsageError: The plan never arrives, or plan or stop exceed
+        ``MAX_EXECUTED_DURATION_S``.
     """
     if not 0 < duration <= MAX_EXECUTED_DURATION_S:
         raise UsageError(
@@ -67,11 +69,17 @@ def make_reference(states: StatesAt, duration: float, *, acceleration_limit: Arr
     q, dq, _ = (values[0] for values in states(np.array([duration])))
     stop = max(float(np.max(np.abs(dq) / acceleration_limit)), TICK_S)
     if not stop <= MAX_EXECUTED_DURATION_S:
-        raise UsageError(f"a plan after which the arm needs {stop:g} s to stop cannot be executed")
+        raise UsageError(
+            f"a plan after which the arm needs {stop:g} s to stop cannot be executed"
+        )
     first = len(during[0]) * TICK_S - duration  # the first tick after the end
     after = np.minimum(np.append(np.arange(first, stop, TICK_S), stop), stop)[:, None]
     left = 1 - after / stop
-    parts = (q + dq * after * (1 + left) / 2, dq * left, np.where(left > 0, -dq / stop, 0.0))
+    parts = (
+        q + dq * after * (1 + left) / 2,
+        dq * left,
+        np.where(left > 0, -dq / stop, 0.0),
+    )
     q, dq, ddq = (np.concatenate([a, b]) for a, b in zip(during, parts, strict=True))
     if not np.isfinite([q, dq, ddq]).all():
         raise UsageError("a plan that is not finite cannot be executed")

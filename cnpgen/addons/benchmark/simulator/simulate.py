@@ -15,7 +15,11 @@ from cnpgen.addons.benchmark.simulator.execute import Execution, execute, load_m
 from cnpgen.addons.benchmark.simulator.executed import Executed
 from cnpgen.addons.benchmark.simulator.hockey import puck_of
 from cnpgen.addons.benchmark.simulator.plant import Plant, as_plant
-from cnpgen.addons.benchmark.simulator.reference import StatesAt, make_reference, states_of
+from cnpgen.addons.benchmark.simulator.reference import (
+    StatesAt,
+    make_reference,
+    states_of,
+)
 from cnpgen.addons.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.addons.benchmark.simulator.tip import Tip
 from cnpgen.errors import UsageError, counted
@@ -61,8 +65,16 @@ class Simulation:
             for name in COUNTED_FLAGS
             if any(name in r for r in rows)
         }
-        names = {name: None for row in rows for name, value in row.items() if isinstance(value, float)}
-        medians = {name: float(np.median([row[name] for row in rows if name in row])) for name in names}
+        names = {
+            name: None
+            for row in rows
+            for name, value in row.items()
+            if isinstance(value, float)
+        }
+        medians = {
+            name: float(np.median([row[name] for row in rows if name in row]))
+            for name in names
+        }
         return {
             "format": SIMULATION_FORMAT,
             "format_version": SIMULATION_VERSION,
@@ -85,21 +97,22 @@ def simulate_plans(
 ) -> Simulation:
     """Execute plans in MuJoCo: computed torque at 1 kHz on a robot with friction that its controller does not model.
 
-    On a table, a plan that ends in motion is a hit, and the puck lies 7 cm ahead of its end. Plans are executed
-    independently of each other and of the number of processes.
+    On a table, a plan that ends in motion is a hit, and the puck lies 7 cm ahead of its
+    end. Plans are executed independently of each other and of the number of processes.
 
-    Args:
-        plans: The plans.
-        plant: The robot, or its name: "nominal", "heavier" or "delayed".
-        environment: A clone of the Air Hockey Challenge's environment, which replaces ``plant``.
-        workers: Processes; default one per available core, or one for few plans.
-        progress: Called with the number of plans executed since the last call.
+    Args: plans: The plans. plant: The robot, or its name: "nominal", "heavier" or
+        "delayed". environment: A clone of the Air Hockey Challenge's environment, which
+        replaces ``plant``. workers: Processes; default one per available core, or one
+        for few plans. progress: Called with the number of plans executed since the last
+        call.
 
-    Raises:
-        UsageError: The plant is unknown, there is less than one worker, or ``environment`` is not a clone or does not
+    Raises: UsageError: The plant is unknown, there is less than one worker, or
+        ``environment`` is not a clone or does not
             support the plans.
-        RecipeError: MuJoCo cannot simulate the robot, or the problem needs a plug-in that is not installed.
-        MachineError: MuJoCo is missing, the environment cannot be imported, or a worker died.
+        RecipeError: MuJoCo cannot simulate the robot, or the problem needs a plug-in
+            that is not installed.
+        MachineError: MuJoCo is missing, the environment cannot be imported, or a worker
+            died.
     """
     plant, plans = as_plant(plant), correct_tips(plans)
     load_mujoco()
@@ -112,10 +125,15 @@ def simulate_plans(
         plant = challenge_plant(environment)
         check_challenge(*open_problem(plans.problem))
     count = worker_count(
-        1 if workers is None and len(plans) <= MAX_SIMULATIONS_OF_ONE_PROCESS else workers, max(len(plans), 1)
+        1
+        if workers is None and len(plans) <= MAX_SIMULATIONS_OF_ONE_PROCESS
+        else workers,
+        max(len(plans), 1),
     )
     executed: list[Executed] = []
-    with closing(distribute(partial(_simulate, plant=plant), iter(plans), count, ordered=True)) as results:
+    with closing(
+        distribute(partial(_simulate, plant=plant), iter(plans), count, ordered=True)
+    ) as results:
         for result in results:
             executed.append(result)
             if progress is not None:
@@ -136,32 +154,62 @@ def execute_plan(plan: Plans, plant: Plant) -> Execution:
 
 
 def execute_states(
-    problem: Plans, states: StatesAt, duration: float, plant: Plant, start_dq: Array | None = None
+    problem: Plans,
+    states: StatesAt,
+    duration: float,
+    plant: Plant,
+    start_dq: Array | None = None,
 ) -> Execution:
-    """Execute a trajectory of a duration [s] for one boundary problem; see ``execute`` and ``execute_plan``."""
+    """Execute a trajectory of a duration [s] for one boundary problem.
+
+    See ``execute`` and ``execute_plan``.
+    """
     _, robot = open_problem(problem.problem)
-    reference = make_reference(states, duration, acceleration_limit=robot.acceleration_limit)
-    return execute(simulator_scene(problem, plant), reference, problem.columns["goal_xyz"][0], start_dq)
+    reference = make_reference(
+        states, duration, acceleration_limit=robot.acceleration_limit
+    )
+    return execute(
+        simulator_scene(problem, plant),
+        reference,
+        problem.columns["goal_xyz"][0],
+        start_dq,
+    )
 
 
 def simulator_scene(problem: Plans, plant: Plant) -> SimulatorScene:
     """Build the simulated world of one boundary problem: obstacles, and the puck if the goal is a hit.
 
-    Parameters of the problem determine the load, the pose of the table and the upright direction. The columns
-    ``puck_xy`` [m] and ``puck_velocity`` [m/s] of hits of moving pucks define the puck at the start.
+    Parameters of the problem determine the load, the pose of the table and the upright
+    direction. The columns ``puck_xy`` [m] and ``puck_velocity`` [m/s] of hits of moving
+    pucks define the puck at the start.
     """
     record, values = problem.problem, problem.boundary.parameters
-    loaded, robot = open_problem(record if values is None else with_payload_of(record, values[0]))
+    loaded, robot = open_problem(
+        record if values is None else with_payload_of(record, values[0])
+    )
     scene = SimulatorScene(loaded, robot, plant, problem.scene.poses[0])
     if values is not None:
-        table, up = table_frame(record.parameters, loaded.table_origin, values), upright_axes(record.parameters, values)
+        table, up = (
+            table_frame(record.parameters, loaded.table_origin, values),
+            upright_axes(record.parameters, values),
+        )
         position = table.to_world(np.zeros((1, 3)))[0]
-        scene = replace(scene, table_rotation=table.axes[0], table_position=position, upright=up[0].T)
+        scene = replace(
+            scene,
+            table_rotation=table.axes[0],
+            table_position=position,
+            upright=up[0].T,
+        )
     if scene.height is None:
         return scene
     if "puck_xy" in problem.columns:
-        puck, (vx, vy) = problem.columns["puck_xy"][0], problem.columns["puck_velocity"][0].tolist()
+        puck, (vx, vy) = (
+            problem.columns["puck_xy"][0],
+            problem.columns["puck_velocity"][0].tolist(),
+        )
         return replace(scene, puck=puck, puck_velocity=(vx, vy))
-    velocity = Tip(robot).at(problem.boundary.goal_q[0])[2][:3] @ problem.boundary.goal_dq[0]
+    velocity = (
+        Tip(robot).at(problem.boundary.goal_q[0])[2][:3] @ problem.boundary.goal_dq[0]
+    )
     goal_xyz = scene.on_table(problem.columns["goal_xyz"][0])
     return replace(scene, puck=puck_of(goal_xyz, velocity @ scene.table_rotation))

@@ -1,9 +1,11 @@
 """Simulated world in MuJoCo's format (MJCF): the arm of the problem's URDF and its environment.
 
-Only listed pairs collide: mallet and puck, mallet and table, puck and bands, held object or links and obstacles. The
-puck moves in the plane of the table only. The mallet is rigid, so the table supports the tip at its height.
+Only listed pairs collide: mallet and puck, mallet and table, puck and bands, held
+object or links and obstacles. The puck moves in the plane of the table only. The mallet
+is rigid, so the table supports the tip at its height.
 
-Joints and obstacles have numbers as names, because their own names are untrusted input and MJCF can refer to files.
+Joints and obstacles have numbers as names, because their own names are untrusted input
+and MJCF can refer to files.
 """
 
 from collections.abc import Iterator
@@ -27,24 +29,41 @@ Array = NDArray[np.float64]
 SIMULATION_STEP_S = 2.5e-4  # four per tick of the controller
 LINK_RADIUS_M = 0.07  # of the iiwa's links, about half of the clearance of plans
 PUCK_INERTIA = 2.5e-6  # kg m^2; the puck does not turn
-MIN_LINK_LENGTH_M = 1e-3  # shorter links have no shape; the first link collides with nothing
+MIN_LINK_LENGTH_M = (
+    1e-3  # shorter links have no shape; the first link collides with nothing
+)
 UNBOUNDED_DEPTH_M = 5.0  # depth of obstacles without lower end
 MALLET_POINT_RADIUS_M = 1e-3  # of the sphere at the tip that collides
 SUPPORT_DEPTH_M = 0.05  # half thickness of the body that supports the tip
 _SOFT = 'condim="3" solref="0.004 1" solimp="0.95 0.99 0.001"'  # contact of object and obstacles without bouncing
-_TABLE = (
-    'condim="3" friction="0.08 0.08" solref="0.0125 0.5" solimp="0.9 0.999 0.001"'  # as in the Air Hockey Challenge
+# as in the Air Hockey Challenge
+_TABLE = 'condim="3" friction="0.08 0.08" solref="0.0125 0.5" solimp="0.9 0.999 0.001"'
+_CENTER_M, _HALF_SIDE_M = (
+    hockey.HOME_M + hockey.LENGTH_M / 2,
+    (hockey.WIDTH_M - hockey.GOAL_WIDTH_M) / 4,
 )
-_CENTER_M, _HALF_SIDE_M = hockey.HOME_M + hockey.LENGTH_M / 2, (hockey.WIDTH_M - hockey.GOAL_WIDTH_M) / 4
 _SIDES = (("left", 1), ("right", -1))
 _RIMS = {  # the bands and the four halves of both goals' sides: centre and half sizes over the table [m]
     **{
-        side: (_CENTER_M, sign * (hockey.WIDTH_M / 2 + hockey.BAND_M), hockey.LENGTH_M / 2, hockey.BAND_M)
+        side: (
+            _CENTER_M,
+            sign * (hockey.WIDTH_M / 2 + hockey.BAND_M),
+            hockey.LENGTH_M / 2,
+            hockey.BAND_M,
+        )
         for side, sign in _SIDES
     },
     **{
-        f"{end} {side}": (x, sign * (hockey.GOAL_WIDTH_M + hockey.WIDTH_M) / 4, hockey.BAND_M, _HALF_SIDE_M)
-        for end, x in (("home", hockey.HOME_M - hockey.BAND_M), ("far", hockey.GOAL_LINE_M + hockey.BAND_M))
+        f"{end} {side}": (
+            x,
+            sign * (hockey.GOAL_WIDTH_M + hockey.WIDTH_M) / 4,
+            hockey.BAND_M,
+            _HALF_SIDE_M,
+        )
+        for end, x in (
+            ("home", hockey.HOME_M - hockey.BAND_M),
+            ("far", hockey.GOAL_LINE_M + hockey.BAND_M),
+        )
         for side, sign in _SIDES
     },
 }
@@ -54,9 +73,10 @@ _RIMS = {  # the bands and the four halves of both goals' sides: centre and half
 class SimulatorScene:
     """Simulated world: a problem with its robot, deviations of the plant, and poses of the obstacles, shape (width,).
 
-    The puck on the table [m], shape (2,), is None without one; its velocity at the start is in m/s. ``table_rotation``
-    has the table's axes in the world as columns: x, y and the normal. ``table_position`` is the origin of its
-    coordinates [m]. The last column of ``upright`` is the upright direction.
+    The puck on the table [m], shape (2,), is None without one; its velocity at the
+    start is in m/s. ``table_rotation`` has the table's axes in the world as columns: x,
+    y and the normal. ``table_position`` is the origin of its coordinates [m]. The last
+    column of ``upright`` is the upright direction.
     """
 
     problem: Problem
@@ -104,7 +124,10 @@ def scene_xml(scene: SimulatorScene) -> str:
 
 
 def _arm(scene: SimulatorScene) -> Iterator[str]:
-    """Yield the nested bodies of the arm; the last one has the tip and the attached bodies."""
+    """Yield the nested bodies of the arm.
+
+    The last one has the tip and the attached bodies.
+    """
     chain = scene.robot.chain
     last = len(chain.joints) - 1
     ends = [joint.translation for joint in chain.joints[1:]] + [chain.tip_translation]
@@ -112,35 +135,58 @@ def _arm(scene: SimulatorScene) -> Iterator[str]:
         zip(chain.joints, ends, joint_friction(scene.problem, scene.robot), strict=True)
     ):
         kind = "slide" if joint.prismatic else "hinge"
-        place = f'pos="{_numbers(joint.translation)}" quat="{quaternion(joint.rotation)}"'
+        place = (
+            f'pos="{_numbers(joint.translation)}" quat="{quaternion(joint.rotation)}"'
+        )
         yield f'<body name="link {index + 1}" {place}>{_inertial(joint, scene.plant.mass)}'
         yield f'<joint name="joint {index + 1}" type="{kind}" axis="{_numbers(joint.axis)}"'
         yield f' damping="{friction.viscous}" frictionloss="{friction.dry}"/>'
         if np.linalg.norm(end) > MIN_LINK_LENGTH_M:
             is_last = index == last
-            radius, color = (0.012, "0.3 0.3 0.3 1") if is_last else (LINK_RADIUS_M, "1 0.55 0.15 1")
+            radius, color = (
+                (0.012, "0.3 0.3 0.3 1")
+                if is_last
+                else (LINK_RADIUS_M, "1 0.55 0.15 1")
+            )
             yield f'<geom name="link {index + 1}" type="capsule" fromto="0 0 0 {_numbers(end)}" size="{radius}"'
             yield f' rgba="{color}"/>'
     yield f'<body name="tip" pos="{_numbers(chain.tip_translation)}" quat="{quaternion(chain.tip_rotation)}">'
     yield '<site name="tip" size="0.001"/>'
     yield f'<geom name="mallet" type="sphere" size="{MALLET_POINT_RADIUS_M}"/>'
     if scene.problem.object_size is not None:
-        size = _numbers(np.array(scene.problem.object_size) / 2 - _legal_depth(scene.problem))
+        size = _numbers(
+            np.array(scene.problem.object_size) / 2 - _legal_depth(scene.problem)
+        )
         yield f'<geom name="object" type="box" size="{size}" rgba="0.2 0.4 0.8 1"/>'
     yield "</body>" * (len(chain.joints) + 1)
 
 
 def _legal_depth(problem: Problem) -> float:
-    """Return the legal penetration of the object [m]; the colliding shape is smaller by it."""
+    """Return the legal penetration of the object [m].
+
+    The colliding shape is smaller by it.
+    """
     return max(
-        (item.depth + item.tolerance for item in problem.constraint if isinstance(item, ObjectContact)), default=0.0
+        (
+            item.depth + item.tolerance
+            for item in problem.constraint
+            if isinstance(item, ObjectContact)
+        ),
+        default=0.0,
     )
 
 
 def _inertial(joint: Joint, mass: float) -> str:
     """Write the inertia of a link about its centre of mass, in joint axes."""
     tensor = mass * joint.inertia
-    rows = [tensor[0, 0], tensor[1, 1], tensor[2, 2], tensor[0, 1], tensor[0, 2], tensor[1, 2]]
+    rows = [
+        tensor[0, 0],
+        tensor[1, 1],
+        tensor[2, 2],
+        tensor[0, 1],
+        tensor[0, 2],
+        tensor[1, 2],
+    ]
     numbers = _numbers(np.array(rows))
     return f'<inertial pos="{_numbers(joint.com)}" mass="{mass * joint.mass!r}" fullinertia="{numbers}"/>'
 
@@ -175,7 +221,9 @@ def _shape(name: str, obstacle: Obstacle, solid: Solid) -> str:
     """Return shape and pose of an obstacle as MJCF attributes."""
     if isinstance(solid, Box):
         low = (
-            solid.low if obstacle.height is not None else np.array([*solid.low[:2], solid.high[2] - UNBOUNDED_DEPTH_M])
+            solid.low
+            if obstacle.height is not None
+            else np.array([*solid.low[:2], solid.high[2] - UNBOUNDED_DEPTH_M])
         )
         return f'type="box" pos="{_numbers((low + solid.high) / 2)}" size="{_numbers((solid.high - low) / 2)}"'
     if obstacle.kind == "sphere":
@@ -197,15 +245,18 @@ def _meshes(scene: SimulatorScene) -> Iterator[str]:
 def _obstacles(scene: SimulatorScene) -> Iterator[tuple[str, Obstacle, Solid]]:
     """Yield name, definition and body of every obstacle."""
     obstacles = scene.problem.obstacle
-    for number, pair in enumerate(zip(obstacles, solids_of(obstacles, scene.obstacle_poses), strict=True), start=1):
+    for number, pair in enumerate(
+        zip(obstacles, solids_of(obstacles, scene.obstacle_poses), strict=True), start=1
+    ):
         yield f"obstacle {number}", *pair
 
 
 def _puck(surface: float, height: float) -> Iterator[str]:
     """Yield the puck: a disc for the bands, and a disc with the sum of both radii for the mallet.
 
-    The coordinates are those of its centre on the table. The larger disc extends from below the table to the height at
-    which the mallet's lower face passes over the puck. Gravity does not move the puck on a tilted table.
+    The coordinates are those of its centre on the table. The larger disc extends from
+    below the table to the height at which the mallet's lower face passes over the puck.
+    Gravity does not move the puck on a tilted table.
     """
     inertia = f"{PUCK_INERTIA} {PUCK_INERTIA} {2 * PUCK_INERTIA}"
     low, high = height - 0.05, height + hockey.PUCK_HEIGHT_M
@@ -234,7 +285,9 @@ def _pairs(scene: SimulatorScene) -> Iterator[str]:
     chain = scene.robot.chain
     lengths = [float(np.linalg.norm(joint.translation)) for joint in chain.joints[1:]]
     names = [
-        f"link {index}" for index, length in enumerate(lengths, start=1) if index > 1 and length > MIN_LINK_LENGTH_M
+        f"link {index}"
+        for index, length in enumerate(lengths, start=1)
+        if index > 1 and length > MIN_LINK_LENGTH_M
     ]
     names += ["object"] if scene.problem.object_size is not None else []
     for obstacle, _, _ in _obstacles(scene):

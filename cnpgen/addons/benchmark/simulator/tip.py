@@ -22,6 +22,12 @@ class Tip:
         """
         import pinocchio as pin
 
-        J = pin.computeFrameJacobian(self._model, self._data, q, self._frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+        J = pin.computeFrameJacobian(
+            self._model,
+            self._data,
+            q,
+            self._frame,
+            pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
+        )
         pose = pin.updateFramePlacement(self._model, self._data, self._frame)
         return np.array(pose.translation), np.array(pose.rotation), np.array(J)

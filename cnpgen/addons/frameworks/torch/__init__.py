@@ -6,8 +6,15 @@ with requires_extra("torch", "torch"):
     from cnpgen.addons.frameworks.torch.tensor_boundary_layer import TensorBoundaryLayer
     from cnpgen.addons.frameworks.torch.tensor_loss import TensorLoss
     from cnpgen.addons.frameworks.torch.tensor_robot import TensorRobot
-    from cnpgen.addons.frameworks.torch.tensor_splines import joint_states, spline_derivatives
-    from cnpgen.addons.frameworks.torch.torch_batches import BatchDataset, TensorBatch, to_torch
+    from cnpgen.addons.frameworks.torch.tensor_splines import (
+        joint_states,
+        spline_derivatives,
+    )
+    from cnpgen.addons.frameworks.torch.torch_batches import (
+        BatchDataset,
+        TensorBatch,
+        to_torch,
+    )
     from cnpgen.addons.frameworks.torch.torch_plans import control_points, plan_loss
     from cnpgen.addons.frameworks.torch.torch_rows import RowDataset
 

@@ -12,7 +12,12 @@ from cnpgen.addons.frameworks.torch.tensor_tape import TensorTape
 from cnpgen.addons.frameworks.torch.torch_plans import real_tensor
 from cnpgen.errors import UsageError
 from cnpgen.kernels.library import choose_backend, problem_kernels
-from cnpgen.losses.integrand import loss_values, relaxation_argument, relaxation_of, time_varying_conditions
+from cnpgen.losses.integrand import (
+    loss_values,
+    relaxation_argument,
+    relaxation_of,
+    time_varying_conditions,
+)
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.losses.quadrature import BasisTable, basis_table
 from cnpgen.problems.load_robot import load_robot
@@ -25,13 +30,14 @@ MAX_KEPT_TABLES = 16  # of one loss: twice the shifts of ``rotating_shift``
 class TensorLoss:
     """The loss of ``PlanLoss`` without a copy to the CPU; ``plan_loss`` is faster for tensors on the CPU.
 
-    The same operations as those of the compiled loss run in torch, so that results agree to rounding. Gradients are
-    those of torch's automatic differentiation, which may be repeated. ``start_tip`` is read on the CPU. Problems whose
-    obstacles samples place (planners of scenes) are refused: their clearance is measured on the CPU.
+    The same operations as those of the compiled loss run in torch, so that results
+    agree to rounding. Gradients are those of torch's automatic differentiation, which
+    may be repeated. ``start_tip`` is read on the CPU. Problems whose obstacles samples
+    place (planners of scenes) are refused: their clearance is measured on the CPU.
 
-    Args:
-        loss: The loss whose problem, nodes, rule, form and margins are used.
-        compiled: Whether ``torch.compile`` fuses the operations, which takes minutes on first use; the gradient is then
+    Args: loss: The loss whose problem, nodes, rule, form and margins are used.
+        compiled: Whether ``torch.compile`` fuses the operations, which takes minutes on
+        first use; the gradient is then
             differentiable once only.
 
     Raises:
@@ -49,13 +55,18 @@ class TensorLoss:
         self.loss, robot = loss, load_robot(loss.problem)
         kernels = problem_kernels(loss.problem, robot, *choose_backend("numpy"))
         tape = kernels.tape(loss_values, form=loss.form)
-        self._tape, self._relaxed_values = TensorTape(tape), tape.inputs[relaxation_argument(loss.problem)]
+        self._tape, self._relaxed_values = (
+            TensorTape(tape),
+            tape.inputs[relaxation_argument(loss.problem)],
+        )
         self._time_varying = time_varying_conditions(loss.problem, robot, loss.form)
         self._tables: dict[tuple[Any, ...], tuple[torch.Tensor, ...]] = {}  # the latest
         self._integrate = torch.compile(self._terms) if compiled else self._terms
 
     def __repr__(self) -> str:
-        return f"<TensorLoss of {self.loss.problem.name!r}: {len(self._tape)} operations>"
+        return (
+            f"<TensorLoss of {self.loss.problem.name!r}: {len(self._tape)} operations>"
+        )
 
     def __call__(
         self,
@@ -69,31 +80,49 @@ class TensorLoss:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Evaluate the loss of N plans in the type of the path, at least float32.
 
-        A plan that is not finite or has a rate that is not positive has a loss of nan and a gradient of 0, so that it
-        does not affect other plans.
+        A plan that is not finite or has a rate that is not positive has a loss of nan
+        and a gradient of 0, so that it does not affect other plans.
 
-        Args:
-            path: Path control points [rad], shape (N, C, n).
-            rate: Rate control points [1/s], shape (N, R), positive, on the same device.
-            weights: Weight of every constraint term (e^alpha), shape (m,); or term -> weight, see ``PlanLoss``.
-            obstacle_poses: Poses and sizes of the obstacles, shape (N, width).
-            start_tip: Positions of the tip at the start [m], shape (N, 3), for time-varying bounds; a constant.
-            shift: Shift of the quadrature nodes, in [0, 1).
+        Args: path: Path control points [rad], shape (N, C, n). rate: Rate control
+            points [1/s], shape (N, R), positive, on the same device. weights: Weight of
+            every constraint term (e^alpha), shape (m,); or term -> weight, see
+            ``PlanLoss``. obstacle_poses: Poses and sizes of the obstacles, shape (N,
+            width). start_tip: Positions of the tip at the start [m], shape (N, 3), for
+            time-varying bounds; a constant. shift: Shift of the quadrature nodes, in
+            [0, 1).
 
-        Returns:
-            The totals, shape (N,), and the integrals without weights, shape (N, 1 + m), both differentiable.
+        Returns: The totals, shape (N,), and the integrals without weights, shape (N, 1
+            + m), both differentiable.
 
         Raises:
             UsageError: A shape is wrong, or a tensor is not real.
         """
-        given = {"path": path, "rate": rate, "weights": self.loss.ordered_weights(weights)}
+        given = {
+            "path": path,
+            "rate": rate,
+            "weights": self.loss.ordered_weights(weights),
+        }
         given |= {"obstacle_poses": obstacle_poses, "start_tip": start_tip}
-        tensors = {name: real_tensor(name, values) for name, values in given.items() if values is not None}
-        self.loss.check_shapes(**{name: tuple(tensor.shape) for name, tensor in tensors.items()})
-        kind = {"device": tensors["path"].device, "dtype": torch.promote_types(tensors["path"].dtype, torch.float32)}
-        path, rate, weights = (tensors[name].to(**kind) for name in ("path", "rate", "weights"))
+        tensors = {
+            name: real_tensor(name, values)
+            for name, values in given.items()
+            if values is not None
+        }
+        self.loss.check_shapes(
+            **{name: tuple(tensor.shape) for name, tensor in tensors.items()}
+        )
+        kind = {
+            "device": tensors["path"].device,
+            "dtype": torch.promote_types(tensors["path"].dtype, torch.float32),
+        }
+        path, rate, weights = (
+            tensors[name].to(**kind) for name in ("path", "rate", "weights")
+        )
         poses = tensors.get("obstacle_poses", path.new_zeros((len(path), 0))).to(**kind)
-        relaxation, shift = path.new_zeros((self._relaxed_values, 1, 1)), number("shift", shift)
+        relaxation, shift = (
+            path.new_zeros((self._relaxed_values, 1, 1)),
+            number("shift", shift),
+        )
         if start_tip is not None and self._relaxed_values:
             tip = tensors["start_tip"].detach().to("cpu", torch.float64).numpy()
             bound = relaxation_of(self._time_varying, self._basis(shift).s, tip)
@@ -103,22 +132,44 @@ class TensorLoss:
         return self._evaluate(path, rate, arguments)
 
     def _evaluate(
-        self, path: torch.Tensor, rate: torch.Tensor, arguments: tuple[torch.Tensor, ...]
+        self,
+        path: torch.Tensor,
+        rate: torch.Tensor,
+        arguments: tuple[torch.Tensor, ...],
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return totals and terms; invalid plans are replaced by ones before and by nan after the evaluation."""
-        valid = (rate > 0).all(1) & path.isfinite().flatten(1).all(1) & rate.isfinite().all(1)
-        path, rate = torch.where(valid[:, None, None], path, 1.0), torch.where(valid[:, None], rate, 1.0)
+        """Return totals and terms.
+
+        Invalid plans are replaced by ones before and by nan after the evaluation.
+        """
+        valid = (
+            (rate > 0).all(1)
+            & path.isfinite().flatten(1).all(1)
+            & rate.isfinite().all(1)
+        )
+        path, rate = (
+            torch.where(valid[:, None, None], path, 1.0),
+            torch.where(valid[:, None], rate, 1.0),
+        )
         terms = self._integrate(*_FiniteGradient.apply(path, rate), *arguments)
         terms = torch.where(valid[:, None], terms, torch.nan)
         return terms[:, 0] + terms[:, 1:] @ arguments[-1], terms
 
-    def _terms(self, path: torch.Tensor, rate: torch.Tensor, *constants: torch.Tensor) -> torch.Tensor:
-        """Return the integrals, shape (N, 1 + m); constants are the arguments of ``_evaluate``."""
-        poses, relaxation, path_basis, rate_basis, nodes, tightening, weights = constants
+    def _terms(
+        self, path: torch.Tensor, rate: torch.Tensor, *constants: torch.Tensor
+    ) -> torch.Tensor:
+        """Return the integrals, shape (N, 1 + m).
+
+        Constants are the arguments of ``_evaluate``.
+        """
+        poses, relaxation, path_basis, rate_basis, nodes, tightening, weights = (
+            constants
+        )
         p = torch.einsum("okc,ncj->ojkn", path_basis, path)
         r = torch.einsum("okc,nc->okn", rate_basis, rate)
         fixed = (tightening[:, None, None], weights[:, None, None])
-        (summands,) = self._tape(*p.unbind(0), r, poses.T[:, None], relaxation, nodes[None, :, None], *fixed)
+        (summands,) = self._tape(
+            *p.unbind(0), r, poses.T[:, None], relaxation, nodes[None, :, None], *fixed
+        )
         return summands.sum(1).T
 
     def _table(self, shift: float, kind: dict[str, Any]) -> tuple[torch.Tensor, ...]:
@@ -128,7 +179,10 @@ class TensorLoss:
             if len(self._tables) == MAX_KEPT_TABLES:
                 self._tables.pop(next(iter(self._tables)))
             table = self._basis(shift)
-            path, rate = (x.reshape(-1, self.loss.nodes, x.shape[1]) for x in (table.path, table.rate))
+            path, rate = (
+                x.reshape(-1, self.loss.nodes, x.shape[1])
+                for x in (table.path, table.rate)
+            )
             arrays = (path, rate, table.weights[0])
             self._tables[key] = tuple(torch.tensor(array, **kind) for array in arrays)
         return self._tables[key]
@@ -136,7 +190,12 @@ class TensorLoss:
     def _basis(self, shift: float) -> BasisTable:
         problem = self.loss.problem
         return basis_table(
-            problem.trajectory, self.loss.rule, self.loss.nodes, shift, "float64", orders=problem.path_orders
+            problem.trajectory,
+            self.loss.rule,
+            self.loss.nodes,
+            shift,
+            "float64",
+            orders=problem.path_orders,
         )
 
 
@@ -146,7 +205,9 @@ class _FiniteGradient(torch.autograd.Function):  # type: ignore[misc]
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(path: torch.Tensor, rate: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(
+        path: torch.Tensor, rate: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         return path.clone(), rate.clone()
 
     @staticmethod
@@ -154,6 +215,10 @@ class _FiniteGradient(torch.autograd.Function):  # type: ignore[misc]
         """Save nothing."""
 
     @staticmethod
-    def backward(_: Any, by_path: torch.Tensor, by_rate: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def backward(
+        _: Any, by_path: torch.Tensor, by_rate: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         finite = by_path.isfinite().flatten(1).all(1) & by_rate.isfinite().all(1)
-        return torch.where(finite[:, None, None], by_path, 0.0), torch.where(finite[:, None], by_rate, 0.0)
+        return torch.where(finite[:, None, None], by_path, 0.0), torch.where(
+            finite[:, None], by_rate, 0.0
+        )

@@ -15,11 +15,9 @@ def spline_derivatives(
 ) -> tuple[torch.Tensor, ...]:
     """Evaluate clamped uniform B-splines and their derivatives; differentiable in control points and phases.
 
-    Args:
-        control: Control points, shape (N, C, ...).
-        s: Phases in [0, 1], shape (N, K) or (K,).
-        degree: Degree D.
-        orders: Number of results: the value, the first derivative with respect to s, and so on.
+    Args: control: Control points, shape (N, C, ...). s: Phases in [0, 1], shape (N, K)
+        or (K,). degree: Degree D. orders: Number of results: the value, the first
+        derivative with respect to s, and so on.
 
     Returns:
         Tensors of shape (N, K, ...).
@@ -29,7 +27,11 @@ def spline_derivatives(
     span = (s.detach() * spans).long().clamp(0, spans - 1)
     table = _taylor_table(points, degree, control.dtype, control.device)
     coefficients = torch.einsum("nkdc,nc...->dnk...", table[span], control)
-    offset = (s - span.to(s.dtype) / spans).to(control.dtype).reshape(*s.shape, *(1,) * (control.ndim - 2))
+    offset = (
+        (s - span.to(s.dtype) / spans)
+        .to(control.dtype)
+        .reshape(*s.shape, *(1,) * (control.ndim - 2))
+    )
     results = []
     for order in range(orders):
         value = torch.zeros_like(coefficients[0])
@@ -59,11 +61,16 @@ def joint_states(
 
 
 def start_points(
-    q: torch.Tensor, dq: torch.Tensor, ddq: torch.Tensor, rate: torch.Tensor, spec: TrajectorySpec
+    q: torch.Tensor,
+    dq: torch.Tensor,
+    ddq: torch.Tensor,
+    rate: torch.Tensor,
+    spec: TrajectorySpec,
 ) -> torch.Tensor:
     """Compute the first three path control points from the state at the start (paper, Appendix A).
 
-    The last three, in reverse, are those of a start at the goal with the velocity ``-goal_dq`` and ``rate.flip(1)``.
+    The last three, in reverse, are those of a start at the goal with the velocity
+    ``-goal_dq`` and ``rate.flip(1)``.
 
     Args:
         q: Positions [rad], shape (N, n).
@@ -75,7 +82,10 @@ def start_points(
     Returns:
         Control points [rad], shape (N, 3, n).
     """
-    path, speed = (end_derivatives(n, spec.degree) for n in (spec.path_control_points, spec.rate_control_points))
+    path, speed = (
+        end_derivatives(n, spec.degree)
+        for n in (spec.path_control_points, spec.rate_control_points)
+    )
     first_rate, change = rate[:, :1], speed.eta * (rate[:, 1:2] - rate[:, :1])
     first = dq / first_rate
     second = (ddq - first * change * first_rate) / first_rate**2
@@ -86,4 +96,6 @@ def start_points(
 @lru_cache(maxsize=16)
 def _taylor_table(points: int, degree: int, dtype: Any, device: Any) -> torch.Tensor:
     """Return the Taylor coefficients of the basis functions in every span, shape (spans, D + 1, C)."""
-    return torch.tensor(taylor_coefficients(points, degree).swapaxes(0, 1), dtype=dtype, device=device)
+    return torch.tensor(
+        taylor_coefficients(points, degree).swapaxes(0, 1), dtype=dtype, device=device
+    )

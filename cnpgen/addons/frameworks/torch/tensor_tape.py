@@ -1,7 +1,8 @@
 """Tapes in torch: an SX function as elementwise operations on tensors of any device, differentiable repeatedly.
 
-The tape is the one that becomes C code. Each operation runs on all points of a batch, so that batches of thousands of
-motions are efficient; ``torch.compile`` fuses the operations.
+The tape is the one that becomes C code. Each operation runs on all points of a batch,
+so that batches of thousands of motions are efficient; ``torch.compile`` fuses the
+operations.
 """
 
 from __future__ import annotations
@@ -16,23 +17,30 @@ from cnpgen.kernels.tape import NAMES, OPERATIONS, Tape
 
 Value = Any  # a tensor, or a constant as a Python number
 MAX_GUARD = 1e-12  # a denominator ``fmax(x, guard)`` with a smaller constant is that of a closest point
-# Below, segment and face or segment are parallel, and their closest points are arbitrary.
+# Below, segment and face or segment are parallel, and their closest points are
+# arbitrary.
 MIN_REGULAR_DENOMINATOR_M2 = 1e-6
 
 
 def _maximum(a: Value, b: Value) -> torch.Tensor:
     if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
         return torch.maximum(a, b)
-    return torch.clamp(a, min=b) if isinstance(a, torch.Tensor) else torch.clamp(b, min=a)
+    return (
+        torch.clamp(a, min=b) if isinstance(a, torch.Tensor) else torch.clamp(b, min=a)
+    )
 
 
 def _minimum(a: Value, b: Value) -> torch.Tensor:
     if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
         return torch.minimum(a, b)
-    return torch.clamp(a, max=b) if isinstance(a, torch.Tensor) else torch.clamp(b, max=a)
+    return (
+        torch.clamp(a, max=b) if isinstance(a, torch.Tensor) else torch.clamp(b, max=a)
+    )
 
 
-def _compared(compare: Callable[[Value, Value], Any]) -> Callable[[Value, Value], torch.Tensor]:
+def _compared(
+    compare: Callable[[Value, Value], Any],
+) -> Callable[[Value, Value], torch.Tensor]:
     """Return a comparison whose results are 0 and 1 in the type of its operands."""
 
     def compared(a: Value, b: Value) -> torch.Tensor:
@@ -44,13 +52,17 @@ def _compared(compare: Callable[[Value, Value], Any]) -> Callable[[Value, Value]
 
 
 def _if_else_zero(condition: Value, value: Value) -> torch.Tensor:
-    return torch.where(condition != 0, value, 0.0)  # a product would turn 0 * inf into nan
+    return torch.where(
+        condition != 0, value, 0.0
+    )  # a product would turn 0 * inf into nan
 
 
 def _guarded_quotient(a: Value, b: Value) -> torch.Tensor:
     """Return a / b, constant for differentiation where b is small, so that second derivatives stay finite."""
     regular = b.detach() > MIN_REGULAR_DENOMINATOR_M2
-    quotient = a.detach() / b.detach() if isinstance(a, torch.Tensor) else a / b.detach()
+    quotient = (
+        a.detach() / b.detach() if isinstance(a, torch.Tensor) else a / b.detach()
+    )
     return torch.where(regular, a / torch.where(regular, b, 1.0), quotient)
 
 
@@ -67,9 +79,8 @@ _APPLY: dict[str, Callable[..., Any]] = {
 class TensorTape:
     """A tape that runs on tensors.
 
-    Args:
-        tape: The program, without a loop.
-        results: Indices of the results to compute; operations that they do not need are omitted.
+    Args: tape: The program, without a loop. results: Indices of the results to compute;
+        operations that they do not need are omitted.
     """
 
     def __init__(self, tape: Tape, results: Sequence[int] | None = None) -> None:
@@ -78,13 +89,20 @@ class TensorTape:
         self._rows = [[-1] * tape.outputs[index] for index in selected]
         self._constants: dict[int, float] = {}
         self._inputs: list[tuple[int, int, int]] = []  # value, argument, component
-        self._steps: list[tuple[int, Callable[..., Any], tuple[int, ...], tuple[int, ...]]] = []
+        self._steps: list[
+            tuple[int, Callable[..., Any], tuple[int, ...], tuple[int, ...]]
+        ] = []
         names = [NAMES[code] for code in tape.operation]
-        operands = [(int(tape.a[k]), int(tape.b[k]))[: OPERATIONS[name]] for k, name in enumerate(names)]
+        operands = [
+            (int(tape.a[k]), int(tape.b[k]))[: OPERATIONS[name]]
+            for k, name in enumerate(names)
+        ]
         last: dict[int, int] = {}  # value -> the last operation that uses it
         for k in reversed(range(len(tape))):
             if names[k] == "OUTPUT" and int(tape.b[k]) in selected:
-                self._rows[selected.index(int(tape.b[k]))][int(tape.constant[k])] = operands[k][0]
+                self._rows[selected.index(int(tape.b[k]))][int(tape.constant[k])] = (
+                    operands[k][0]
+                )
                 last[operands[k][0]] = len(tape)
             elif k in last:
                 for operand in operands[k]:
@@ -95,8 +113,14 @@ class TensorTape:
             elif names[k] == "INPUT":
                 self._inputs.append((k, int(tape.a[k]), int(tape.b[k])))
             else:
-                dead = tuple(operand for operand in set(operands[k]) if last[operand] == k)
-                apply = _guarded_quotient if _divides_by_guarded(tape, k) else _APPLY[names[k]]
+                dead = tuple(
+                    operand for operand in set(operands[k]) if last[operand] == k
+                )
+                apply = (
+                    _guarded_quotient
+                    if _divides_by_guarded(tape, k)
+                    else _APPLY[names[k]]
+                )
                 self._steps.append((k, apply, operands[k], dead))
 
     def __len__(self) -> int:
@@ -105,8 +129,8 @@ class TensorTape:
     def __call__(self, *arguments: torch.Tensor) -> list[torch.Tensor]:
         """Evaluate the tape.
 
-        Args:
-            arguments: One tensor per input of the tape, shape (width, ...); their further axes are broadcast.
+        Args: arguments: One tensor per input of the tape, shape (width, ...); their
+            further axes are broadcast.
 
         Returns:
             One tensor of shape (width, ...) per selected result.
@@ -119,7 +143,9 @@ class TensorTape:
             values[k] = apply(*[values[operand] for operand in operands])
             for operand in dead:
                 del values[operand]
-        return [_stacked([values[row] for row in rows], arguments) for rows in self._rows]
+        return [
+            _stacked([values[row] for row in rows], arguments) for rows in self._rows
+        ]
 
 
 def _divides_by_guarded(tape: Tape, k: int) -> bool:
@@ -127,13 +153,21 @@ def _divides_by_guarded(tape: Tape, k: int) -> bool:
     if NAMES[tape.operation[k]] != "DIV" or NAMES[tape.operation[tape.b[k]]] != "FMAX":
         return False
     bounds = (tape.a[tape.b[k]], tape.b[tape.b[k]])
-    return any(NAMES[tape.operation[i]] == "CONST" and 0 < tape.constant[i] <= MAX_GUARD for i in bounds)
+    return any(
+        NAMES[tape.operation[i]] == "CONST" and 0 < tape.constant[i] <= MAX_GUARD
+        for i in bounds
+    )
 
 
 def _stacked(rows: list[Value], arguments: Sequence[torch.Tensor]) -> torch.Tensor:
     """Stack rows, which may be constants, in the shape that the arguments broadcast to."""
-    like, shape = arguments[0], torch.broadcast_shapes(*(argument.shape[1:] for argument in arguments))
+    like, shape = (
+        arguments[0],
+        torch.broadcast_shapes(*(argument.shape[1:] for argument in arguments)),
+    )
     if not rows:
         return like.new_zeros((0, *shape))
-    tensors = [row if isinstance(row, torch.Tensor) else like.new_tensor(row) for row in rows]
+    tensors = [
+        row if isinstance(row, torch.Tensor) else like.new_tensor(row) for row in rows
+    ]
     return torch.stack([tensor.expand(shape) for tensor in tensors])

@@ -19,15 +19,14 @@ Tensors = dict[str, torch.Tensor]
 class RowDataset(data.Dataset[Tensors]):  # type: ignore[misc]
     """Rows with random access, for the samplers of torch; slower than :class:`BatchDataset`.
 
-    ``DataLoader(rows, batch_size=1024, shuffle=True, collate_fn=rows.collate)`` uses a batch as it was read. Without
-    ``collate_fn`` torch splits it into rows and stacks them again, with the same result.
+    ``DataLoader(rows, batch_size=1024, shuffle=True, collate_fn=rows.collate)`` uses a
+    batch as it was read. Without ``collate_fn`` torch splits it into rows and stacks
+    them again, with the same result.
 
-    Args:
-        dataset: The dataset.
-        split: Name of the split.
-        fields: Names of the fields; by default all fields of real numbers that are not diagnostics.
-        normalize: Whether to normalize, or a normalization other than that of the dataset.
-        dtype: Type of the fields of real numbers.
+    Args: dataset: The dataset. split: Name of the split. fields: Names of the fields;
+        by default all fields of real numbers that are not diagnostics. normalize:
+        Whether to normalize, or a normalization other than that of the dataset. dtype:
+        Type of the fields of real numbers.
     """
 
     def __init__(
@@ -48,13 +47,23 @@ class RowDataset(data.Dataset[Tensors]):  # type: ignore[misc]
         return self._length
 
     def __getitem__(self, index: int) -> Tensors:
-        return {name: values[0] for name, values in self.__getitems__([index]).fields.items()}
+        return {
+            name: values[0]
+            for name, values in self.__getitems__([index]).fields.items()
+        }
 
     def __getitems__(self, indices: Sequence[int]) -> ReadRows:
         rows = self._dataset.rows(
-            self._split, indices, fields=self._fields, normalize=self._normalize, dtype=self._dtype
+            self._split,
+            indices,
+            fields=self._fields,
+            normalize=self._normalize,
+            dtype=self._dtype,
         )
-        return ReadRows({name: torch.from_numpy(values) for name, values in rows.items()}, len(indices))
+        return ReadRows(
+            {name: torch.from_numpy(values) for name, values in rows.items()},
+            len(indices),
+        )
 
     @staticmethod
     def collate(rows: Sequence[Tensors]) -> Tensors:
@@ -78,4 +87,6 @@ class ReadRows(Sequence[Tensors]):
         return self.rows
 
     def __getitem__(self, row: Any) -> Any:
-        return {name: values[row] for name, values in self.fields.items()}  # torch's IndexError ends iteration
+        return {
+            name: values[row] for name, values in self.fields.items()
+        }  # torch's IndexError ends iteration

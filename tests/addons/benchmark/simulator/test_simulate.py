@@ -9,9 +9,18 @@ import pytest
 
 from cnpgen.addons.benchmark.simulator.execute import _Run, execute
 from cnpgen.addons.benchmark.simulator.executed import succeeded
-from cnpgen.addons.benchmark.simulator.plant import PLANTS, as_plant, joint_friction, rated_torque
+from cnpgen.addons.benchmark.simulator.plant import (
+    PLANTS,
+    as_plant,
+    joint_friction,
+    rated_torque,
+)
 from cnpgen.addons.benchmark.simulator.reference import TICK_S, Reference
-from cnpgen.addons.benchmark.simulator.simulate import execute_plan, simulate_plans, simulator_scene
+from cnpgen.addons.benchmark.simulator.simulate import (
+    execute_plan,
+    simulate_plans,
+    simulator_scene,
+)
 from cnpgen.addons.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.addons.benchmark.simulator.tip import Tip
 from cnpgen.errors import UsageError
@@ -29,7 +38,10 @@ def hit_towards(folder: Path, target: str) -> Plans:
     """Return a valid hit that sends its puck towards a target."""
     recipe = (list_recipes("pipeline")["airhockey-hit"]).read_text(encoding="utf-8")
     path = folder / "pipeline.toml"
-    path.write_text(recipe.replace("0.3 rad", "0 rad").replace("[2.49, 0] m", target), encoding="utf-8")
+    path.write_text(
+        recipe.replace("0.3 rad", "0 rad").replace("[2.49, 0] m", target),
+        encoding="utf-8",
+    )
     solved = solve_plans(draw_boundary_problems(path, 1, seed=3), workers=1)
     assert solved.valid.all()
     return solved.plans
@@ -43,7 +55,10 @@ def hit(tmp_path_factory: pytest.TempPathFactory) -> Plans:
 def stored(label: str) -> Plans:
     plan = load(label)
     return make_plans(
-        plan.problem, plan.boundary, path_control_points=plan.motion.path, rate_control_points=plan.motion.rate
+        plan.problem,
+        plan.boundary,
+        path_control_points=plan.motion.path,
+        rate_control_points=plan.motion.rate,
     )
 
 
@@ -62,7 +77,10 @@ def test_a_valid_hit_scores_on_every_plant(hit: Plans, plant: str) -> None:
 
 def test_a_hit_with_an_angle_error_of_03_rad_does_not_score(tmp_path: Path) -> None:
     plan = hit_towards(tmp_path, "[2.49, 0.47] m")
-    goal, (velocity, _, _) = plan.columns["goal_xyz"][0], np.array([2.49, 0.0, 0.16]) - plan.columns["goal_xyz"][0]
+    goal, (velocity, _, _) = (
+        plan.columns["goal_xyz"][0],
+        np.array([2.49, 0.0, 0.16]) - plan.columns["goal_xyz"][0],
+    )
     (executed,) = simulate_plans(plan, workers=1).executed
     angle = np.arctan2(0.47 - goal[1], 2.49 - goal[0]) - np.arctan2(-goal[1], velocity)
     assert angle == pytest.approx(0.3, abs=0.05)
@@ -92,8 +110,12 @@ def test_a_motion_5_cm_too_high_misses_the_puck(hit: Plans) -> None:
     raise AssertionError("neither change lifts the tip by 5 cm")
 
 
-def test_the_puck_is_placed_by_the_tip_frame_if_a_joint_has_the_same_name(hit: Plans) -> None:
-    urdf = hit.problem.urdf.replace('joint name="world_F_base_joint"', 'joint name="striker_tip"')
+def test_the_puck_is_placed_by_the_tip_frame_if_a_joint_has_the_same_name(
+    hit: Plans,
+) -> None:
+    urdf = hit.problem.urdf.replace(
+        'joint name="world_F_base_joint"', 'joint name="striker_tip"'
+    )
     assert urdf != hit.problem.urdf
     same = replace(hit, problem=replace(hit.problem, urdf=urdf))
     puck = simulator_scene(hit, PLANTS["nominal"]).puck
@@ -127,7 +149,9 @@ def test_an_object_dragged_through_a_pedestal_collides() -> None:
     execution = execute_plan(stored("transport"), PLANTS["nominal"])
     scene, reference = execution.scene, execution.reference
     higher = replace(scene, obstacle_poses=scene.obstacle_poses + 0.1)
-    executed = execute(higher, reference, stored("transport").columns["goal_xyz"][0]).executed
+    executed = execute(
+        higher, reference, stored("transport").columns["goal_xyz"][0]
+    ).executed
     assert executed.collided
     assert not executed.success
 
@@ -152,7 +176,9 @@ def lowered(reference: Reference, scene: SimulatorScene, depth: float) -> Refere
     return replace(reference, q=q, dq=np.gradient(q, TICK_S, axis=0))
 
 
-def test_a_mallet_commanded_below_the_table_is_supported_and_fails_by_the_plane(hit: Plans) -> None:
+def test_a_mallet_commanded_below_the_table_is_supported_and_fails_by_the_plane(
+    hit: Plans,
+) -> None:
     execution = execute_plan(hit, PLANTS["nominal"])
     scene, reference = execution.scene, execution.reference
     goal = hit.columns["goal_xyz"][0]
@@ -163,7 +189,10 @@ def test_a_mallet_commanded_below_the_table_is_supported_and_fails_by_the_plane(
     assert low.table_friction == pytest.approx(0.08 * low.table_force, rel=0.2)
     assert low.scored
     assert not low.success
-    values = {**low.to_dict(), "touched_early": False}  # the executed path is shorter than the commanded one
+    values = {
+        **low.to_dict(),
+        "touched_early": False,
+    }  # the executed path is shorter than the commanded one
     assert not succeeded(values, 0.029)
     assert succeeded(values, 0.031)
 
@@ -171,17 +200,29 @@ def test_a_mallet_commanded_below_the_table_is_supported_and_fails_by_the_plane(
 def test_a_mallet_on_the_table_is_carried_by_it() -> None:
     """Compare the normal force of a mallet at rest, commanded below the table, with the arm's static equilibrium."""
     scene = simulator_scene(
-        solve_plans(draw_boundary_problems("airhockey-pucks", 1, seed=1), workers=1).plans, PLANTS["nominal"]
+        solve_plans(
+            draw_boundary_problems("airhockey-pucks", 1, seed=1), workers=1
+        ).plans,
+        PLANTS["nominal"],
     )
     base = scene.robot.home
-    still = Reference(np.repeat(base[None], 500, axis=0), np.zeros((500, 6)), np.zeros((500, 6)), 0.499)
+    still = Reference(
+        np.repeat(base[None], 500, axis=0),
+        np.zeros((500, 6)),
+        np.zeros((500, 6)),
+        0.499,
+    )
     run = _Run(replace(scene, puck=np.array([2.0, 0.0])), lowered(still, scene, 0.002))
     record = run.simulate(np.zeros(6))
     J, force = Tip(scene.robot).at(record.q[499])[2][:3], record.table_force[499, 0]
-    holding = pin.computeGeneralizedGravity(scene.robot.model, scene.robot.model.createData(), record.q[499])
+    holding = pin.computeGeneralizedGravity(
+        scene.robot.model, scene.robot.model.createData(), record.q[499]
+    )
     torque = record.torque_use[499] * rated_torque(scene.problem, scene.robot)
     excess = np.linalg.lstsq(J.T, holding - torque, rcond=None)[0][2]
-    friction = np.abs(np.linalg.pinv(J.T)[2]) @ [item.dry for item in joint_friction(scene.problem, scene.robot)]
+    friction = np.abs(np.linalg.pinv(J.T)[2]) @ [
+        item.dry for item in joint_friction(scene.problem, scene.robot)
+    ]
     assert force > 10
     assert force == pytest.approx(excess, abs=friction + 0.08 * force)
 
@@ -200,12 +241,16 @@ def test_an_invalid_plan_does_not_affect_the_others(hit: Plans) -> None:
 def test_a_plan_that_cannot_be_stopped_is_not_executed(hit: Plans) -> None:
     rate = hit.rate_control_points.copy()
     rate[:, -1] = 1e9
-    (executed,) = simulate_plans(replace(hit, rate_control_points=rate), workers=1).executed
+    (executed,) = simulate_plans(
+        replace(hit, rate_control_points=rate), workers=1
+    ).executed
     assert "s to stop cannot be executed" in executed.failure
 
 
 def test_an_unknown_plant_is_refused_by_name() -> None:
-    with pytest.raises(UsageError, match=r"unknown plant 'heavyer'.*did you mean 'heavier'"):
+    with pytest.raises(
+        UsageError, match=r"unknown plant 'heavyer'.*did you mean 'heavier'"
+    ):
         as_plant("heavyer")
 
 
@@ -215,8 +260,13 @@ def test_the_robot_stops_after_a_hit_within_its_limits(hit: Plans) -> None:
     after = slice(reference.ticks, None)
     assert np.abs(reference.dq[-1]).max() == 0
     assert np.all(np.abs(reference.ddq[after]) <= limit * (1 + 1e-12))
-    step = np.diff(reference.q, axis=0) - TICK_S * (reference.dq[1:] + reference.dq[:-1]) / 2
-    assert np.abs(step).max() < 1e-5  # consistent positions and velocities, also across the end of the plan
+    step = (
+        np.diff(reference.q, axis=0)
+        - TICK_S * (reference.dq[1:] + reference.dq[:-1]) / 2
+    )
+    assert (
+        np.abs(step).max() < 1e-5
+    )  # consistent positions and velocities, also across the end of the plan
 
 
 def test_holding_torque_has_priority_if_a_motor_saturates() -> None:
@@ -226,6 +276,8 @@ def test_holding_torque_has_priority_if_a_motor_saturates() -> None:
     q = np.vstack([reference.q[-1:] - 0.1, np.repeat(reference.q[-1:], 2000, axis=0)])
     jump = Reference(q, np.zeros_like(q), np.zeros_like(q), 2.0)
     without_obstacles = replace(scene, obstacle_poses=scene.obstacle_poses - 2)
-    execution = execute(without_obstacles, jump, stored("transport").columns["goal_xyz"][0])
+    execution = execute(
+        without_obstacles, jump, stored("transport").columns["goal_xyz"][0]
+    )
     assert execution.executed.torque_use == pytest.approx(1)
     assert execution.executed.finished

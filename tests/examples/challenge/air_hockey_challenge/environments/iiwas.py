@@ -15,9 +15,19 @@ STEPS = 4  # of MuJoCo in a tick
 def model() -> mujoco.MjModel:
     """The simulator's own scene under the environment's names, with the seventh joint as one that does nothing."""
     problem = load_problem("airhockey")
-    text = scene_xml(SimulatorScene(problem, load_robot(problem), PLANTS["nominal"], np.zeros(0), np.array([1.0, 0.0])))
+    text = scene_xml(
+        SimulatorScene(
+            problem,
+            load_robot(problem),
+            PLANTS["nominal"],
+            np.zeros(0),
+            np.array([1.0, 0.0]),
+        )
+    )
     for number in range(1, 7):
-        text = text.replace(f'joint name="joint {number}"', f'joint name="iiwa_1/joint_{number}"')
+        text = text.replace(
+            f'joint name="joint {number}"', f'joint name="iiwa_1/joint_{number}"'
+        )
     for axis in "xy":
         text = text.replace(f'joint name="puck {axis}"', f'joint name="puck_{axis}"')
     idle = '<body pos="0 0 9" gravcomp="1"><joint name="iiwa_1/joint_7" type="hinge"/><inertial pos="0 0 0" mass="1"'
@@ -35,7 +45,10 @@ class AirHockeySingle:
         frame = np.eye(4)
         frame[:3, 3] = BASE
         self.env_info = {"robot": {"base_frame": [frame]}}
-        self.env_info |= {"joint_pos_ids": np.arange(7), "joint_vel_ids": np.arange(7, 14)}
+        self.env_info |= {
+            "joint_pos_ids": np.arange(7),
+            "joint_vel_ids": np.arange(7, 14),
+        }
         self.init_state = np.zeros(7)
 
     def reset(self, obs: object = None) -> np.ndarray:
@@ -45,7 +58,9 @@ class AirHockeySingle:
 
     def setup(self, obs: object) -> None:
         for number in range(7):
-            self._data.joint(f"iiwa_1/joint_{number + 1}").qpos = self.init_state[number]
+            self._data.joint(f"iiwa_1/joint_{number + 1}").qpos = self.init_state[
+                number
+            ]
         mujoco.mj_forward(self._model, self._data)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, dict]:
@@ -59,16 +74,24 @@ class AirHockeySingle:
 
     def _observation(self) -> np.ndarray:
         joints = [self._data.joint(f"iiwa_1/joint_{number}") for number in range(1, 8)]
-        return np.concatenate([*(joint.qpos for joint in joints), *(joint.qvel for joint in joints)])
+        return np.concatenate(
+            [*(joint.qpos for joint in joints), *(joint.qvel for joint in joints)]
+        )
 
     def _read_data(self, name: str) -> np.ndarray:
         joint = self._data.joint(name.rpartition("_")[0])
-        return joint.qvel.copy() if name.endswith("vel") else joint.qpos + BASE["xy".index(name[5])]
+        return (
+            joint.qvel.copy()
+            if name.endswith("vel")
+            else joint.qpos + BASE["xy".index(name[5])]
+        )
 
     def _check_collision(self, one: str, other: str) -> bool:
         assert (one, other) == ("puck", "robot_1/ee")
         pair = {self._model.geom("mallet").id, self._model.geom("reach").id}
-        return any({contact.geom1, contact.geom2} == pair for contact in self._data.contact)
+        return any(
+            {contact.geom1, contact.geom2} == pair for contact in self._data.contact
+        )
 
     def _write_data(self, name: str, value: float) -> None:
         joint = self._data.joint(name.rpartition("_")[0])

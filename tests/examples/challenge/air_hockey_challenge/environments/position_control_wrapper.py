@@ -19,8 +19,15 @@ class PositionControlIIWA:
 
     def _compute_action(self, obs: object, action: np.ndarray) -> np.ndarray:
         q, dq, ddq = (part[:6] for part in next(self._trajectory))
-        q, dq = q - TICK_S * dq, dq - TICK_S * ddq  # from the end of the tick to its beginning
-        towards = ddq + GAIN**2 * (q - self._data.qpos[:6]) + 2 * GAIN * (dq - self._data.qvel[:6])
+        q, dq = (
+            q - TICK_S * dq,
+            dq - TICK_S * ddq,
+        )  # from the end of the tick to its beginning
+        towards = (
+            ddq
+            + GAIN**2 * (q - self._data.qpos[:6])
+            + 2 * GAIN * (dq - self._data.qvel[:6])
+        )
         mass = np.zeros((self._model.nv, self._model.nv))
         mujoco.mj_fullM(self._model, self._data, mass)
         return np.append(mass[:6, :6] @ towards + self._data.qfrc_bias[:6], 0.0)
