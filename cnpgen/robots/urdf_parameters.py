@@ -198,8 +198,8 @@ def _joint(element: Element) -> UrdfJoint:
     if kind in _TURNING_OR_SLIDING and not math.isfinite(
         1 / length if length else math.inf
     ):
-        axis = element.find("axis")
-        text = None if axis is None else axis.get("xyz")
+        written = element.find("axis")
+        text = None if written is None else written.get("xyz")
         raise ValueError(f"<axis xyz={text!r}> has no direction")
     return UrdfJoint(
         name=element.get("name", ""),
