@@ -54,8 +54,9 @@ def is_command(name: str) -> bool:
 def load_command(name: str) -> ModuleType:
     """Import the module of a command.
 
-    Raises: MissingAddonError: The command belongs to an add-on that this installation
-        lacks.
+    Raises:
+        MissingAddonError: The command belongs to an add-on that this installation
+            lacks.
     """
     if name in _CORE:
         return import_module(f"cnpgen.cli.{_CORE[name]}")

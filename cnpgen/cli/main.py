@@ -147,8 +147,9 @@ def _run(words: list[str], given: argparse.Namespace) -> int:
 def build_parser(names: Sequence[str] | None = None) -> Parser:
     """Build the parser of some commands, by default of all; importing the modules of all commands takes time.
 
-    Raises: MissingAddonError: A named command belongs to an add-on that this
-        installation lacks.
+    Raises:
+        MissingAddonError: A named command belongs to an add-on that this installation
+            lacks.
     """
     parser = _LinkedParser(prog="cnpgen", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version")

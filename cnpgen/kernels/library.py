@@ -62,13 +62,16 @@ NUMPY_SLOWDOWN = (
 class KernelLibrary:
     """Loader of kernels for one robot and problem, which builds those that are not cached.
 
-    Attributes: backend: "compiled", "numpy" (interpreted tape) or "casadi" (CasADi's
-        map; slow, for reference). cache_folder: Folder of cached tapes and libraries.
-        identity: Digest of all ``arguments``. arguments: Objects passed to builders
-        that have a parameter of that name (robot, problem). structure: Digest of the
-        arguments without the poses and sizes of obstacles, or None; see
-        ``load_by_structure``. compiler_pool: Pool that compiles kernels, inside
-        ``compile_in_parallel``.
+    Attributes:
+        backend: "compiled", "numpy" (interpreted tape) or "casadi" (CasADi's map; slow,
+            for reference).
+        cache_folder: Folder of cached tapes and libraries.
+        identity: Digest of all ``arguments``.
+        arguments: Objects passed to builders that have a parameter of that name (robot,
+            problem).
+        structure: Digest of the arguments without the poses and sizes of obstacles, or
+            None; see ``load_by_structure``.
+        compiler_pool: Pool that compiles kernels, inside ``compile_in_parallel``.
     """
 
     backend: Backend
@@ -94,9 +97,9 @@ class KernelLibrary:
     ) -> Kernel:
         """Return the kernel of an SX function.
 
-        Args: builder: A module-level function that returns a ``casadi.Function``.
-            Parameters named like entries of
-                ``arguments`` are filled from there.
+        Args:
+            builder: A module-level function that returns a ``casadi.Function``.
+                Parameters named like entries of ``arguments`` are filled from there.
             loop: The iteration of the function, or None.
             parameters: Further JSON-able keyword arguments of the builder; part of the
                 cache key.
@@ -234,8 +237,8 @@ def _source_digests(builder: Callable[..., Any]) -> list[str]:
     """Return digests of the sources that a builder may use; kernels are rebuilt when one of them changes.
 
     In this package these are ``BUILDER_PACKAGES`` and the builder's own subpackage. A
-    plug-in's builder may import
-    anything: the digests cover this package and the plug-in's.
+    plug-in's builder may import anything: the digests cover this package and the
+    plug-in's.
     """
     package, _, module = builder.__module__.partition(".")
     if package != "cnpgen":

@@ -77,15 +77,17 @@ def cluster_engine(name: str) -> ClusterEngine:
 class Engine:
     """User's choice of the engine.
 
-    Attributes: name: "loky" for processes of this machine, which end with this one, or
-        a cluster engine, such as "dask" or
-            "ray". None for loky, or the backend of ``joblib.parallel_config``.
+    Attributes:
+        name: "loky" for processes of this machine, which end with this one, or a
+            cluster engine, such as "dask" or "ray". None for loky, or the backend of
+            ``joblib.parallel_config``.
         address: Address of dask's scheduler ("tcp://host:8786") or ray's head
             ("host:6379", "auto"). None for a temporary cluster on this machine.
         workers: Number of tasks that run at once; None for one per available core.
 
-    Raises: UsageError: The engine does not exist or has no address, or there is less
-        than one worker.
+    Raises:
+        UsageError: The engine does not exist or has no address, or there is less than
+            one worker.
     """
 
     name: str | None = None
@@ -130,8 +132,10 @@ def check_engine_name(name: object) -> None:
 class LocalPool:
     """Processes of this machine, or a backend of joblib.
 
-    Attributes: size: Number of tasks that run at once. is_remote: Whether workers may
-        be on other machines, with other working directories and caches.
+    Attributes:
+        size: Number of tasks that run at once.
+        is_remote: Whether workers may be on other machines, with other working
+            directories and caches.
     """
 
     size: int
@@ -158,10 +162,11 @@ def assembled(
 ) -> Iterator[WorkerPool]:
     """Provide a worker pool for the block: start processes or connect to a cluster.
 
-    Args: engine: Choice of the engine. tasks: Number of tasks, the maximum number of
-        local workers. quick: Whether one process finishes before a second one has
-        started; ignored if the user chose a number of
-            workers or a cluster.
+    Args:
+        engine: Choice of the engine.
+        tasks: Number of tasks, the maximum number of local workers.
+        quick: Whether one process finishes before a second one has started; ignored if
+            the user chose a number of workers or a cluster.
 
     Raises:
         UsageError: The engine's package is not installed.

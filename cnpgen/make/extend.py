@@ -45,15 +45,20 @@ def extend_dataset(
     and statistics cover all rows afterwards. Until then the dataset is unfinished and
     has no manifest.
 
-    Args: folder: Folder of the dataset. n: Final number of rows over all splits.
+    Args:
+        folder: Folder of the dataset.
+        n: Final number of rows over all splits.
         workers: Number of processes; this and the following arguments as for
-        ``make_dataset``. engine: Engine that runs the workers. address: Address of a
-        cluster. begin: Callback before rows are compared and before they are generated.
+            ``make_dataset``.
+        engine: Engine that runs the workers.
+        address: Address of a cluster.
+        begin: Callback before rows are compared and before they are generated.
         progress: Callback with the rows of every shard.
 
-    Raises: UsageError: The folder does not exist or contains no dataset, the dataset
-        has more rows or is unfinished, or
-            this version of cnpgen or of its plug-ins generates other rows.
+    Raises:
+        UsageError: The folder does not exist or contains no dataset, the dataset has
+            more rows or is unfinished, or this version of cnpgen or of its plug-ins
+            generates other rows.
         DatasetError: The specification.json of the dataset is damaged.
         RecipeError: This version of cnpgen does not support the recipe in the
             specification.

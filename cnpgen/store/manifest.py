@@ -114,7 +114,7 @@ def lists_shards_of(manifest: dict[str, Any], spec: DatasetSpec) -> bool:
     """Return whether a manifest lists exactly the shards of a specification, in order.
 
     Only these file names are opened: no path in a manifest can lead outside the folder
-    of the dataset.
+        of the dataset.
     """
     if manifest["splits"].keys() != spec.splits.keys():
         return False

@@ -1,7 +1,6 @@
 """The registry of stages and constraints."""
 
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, EntryPoints
 
 import pytest
 
@@ -15,6 +14,7 @@ from cnpgen.problems.objectives import ObjectiveTerm
 from cnpgen.problems.published_rules import PublishedRules
 from cnpgen.problems.scenes.scene_reader import SceneReader
 from cnpgen.schema import addons, registry
+from cnpgen.schema.entry_points import EntryPoint
 from cnpgen.schema.keys import field
 from cnpgen.schema.registry import CONSTRAINTS, STAGES, load, name_of, names
 from cnpgen.store.dataset_document import DatasetDocument
@@ -52,22 +52,19 @@ THE_STRING = "not a class"
 @pytest.fixture
 def register(monkeypatch):
     """Return a function that installs entry points (group, name, value)."""
-    entries: list[EntryPoint] = []
-
-    def fake():
-        return EntryPoints(entries)
+    entries: dict[str, tuple[EntryPoint, ...]] = {}
 
     def add(group, name, value):
-        entries.append(EntryPoint(name=name, value=value, group=group))
-        addons.entry_points.cache_clear()
+        entries[group] = (*entries.get(group, ()), EntryPoint(group, name, value))
 
-    monkeypatch.setattr("importlib.metadata.entry_points", fake)
+    monkeypatch.setattr(addons, "entry_points", lambda: entries)
+    monkeypatch.setattr(registry, "entry_points", lambda: entries)
     monkeypatch.setattr(
-        registry, "BUILT_IN", {STAGES: {"roll": f"{__name__}:Roll"}, CONSTRAINTS: {}}
+        registry,
+        "BUILT_IN",
+        {STAGES: {"roll": f"{__name__}:Roll"}, CONSTRAINTS: {}},
     )
-    addons.entry_points.cache_clear()
-    yield add
-    addons.entry_points.cache_clear()
+    return add
 
 
 def test_a_built_in_kind_is_imported_by_name(register):

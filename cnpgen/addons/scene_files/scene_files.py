@@ -51,9 +51,12 @@ def load_scenes(
         start: First scene.
         n: Number of scenes; by default all that follow.
 
-    Raises: UsageError: There are no scenes. SceneError: A scene is invalid; the message
-        names file, scene and obstacle. A subclass of UsageError. DatasetError: An HDF5
-        file is damaged. MissingExtraError: PyYAML is missing.
+    Raises:
+        UsageError: There are no scenes.
+        SceneError: A scene is invalid; the message names file, scene and obstacle. A
+            subclass of UsageError.
+        DatasetError: An HDF5 file is damaged.
+        MissingExtraError: PyYAML is missing.
     """
     path, start = Path(path), integer("start", start, least=0)
     stop = None if n is None else start + integer("n", n, least=1)
