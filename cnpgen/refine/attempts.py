@@ -26,14 +26,13 @@ from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
 
-NEARLY_VALID = (
-    30.0  # tolerances; attempts with larger violations are left for joint-space paths
-)
+# Tolerances; attempts with larger violations are left for joint-space paths.
+
+NEARLY_VALID = 30.0
 MAX_PENETRATION_M = 0.02  # of links in a plan that hull levels continue from
 MIN_END_PENETRATION_M = 1e-5  # of an end: smaller ones may be rounding errors
-MAX_LINE_PENETRATION_M = (
-    0.05  # of the initial line, above which joint-space paths come first
-)
+# Of the initial line, above which joint-space paths come first.
+MAX_LINE_PENETRATION_M = 0.05
 
 
 def make_attempts(

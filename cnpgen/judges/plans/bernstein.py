@@ -31,13 +31,14 @@ MAX_SUBDIVISIONS = 40  # intervals are then shorter than a picosecond
 class PiecewisePolynomials:
     """Joint positions and their time derivatives as polynomials between knots, in Bernstein form."""
 
-    edges: Array  # phases between which they are polynomials, ascending from 0 to 1, shape (S + 1,)
+    # Phases between which they are polynomials, ascending from 0 to 1, shape (S + 1,).
+    edges: Array
     q: Array  # coefficients [rad], shape (D + 1, S, n)
     dq: Array  # coefficients [rad/s], shape (2 D, S, n)
     ddq: Array  # coefficients [rad/s^2], shape (3 D - 1, S, n)
-    jerk: Array | None = (
-        None  # coefficients [rad/s^3], shape (4 D - 2, S, n), or None if no constraint needs them
-    )
+    # Coefficients [rad/s^3], shape (4 D - 2, S, n), or None if no constraint needs
+    # them.
+    jerk: Array | None = None
 
 
 def polynomials(motion: Motion, *, jerk: bool = False) -> PiecewisePolynomials:

@@ -33,9 +33,8 @@ Array = NDArray[np.float64]
 INTERVAL_PARTS = 8  # per subdivision
 MAX_INTERVALS = 256  # that are subdivided at a time
 MAX_LEVELS = 8  # of subdivision: 1 ms becomes 0.06 ns
-MINIMUM_LEVELS = (
-    2  # of subdivision around the smallest margin, even if it cannot change the verdict
-)
+# Of subdivision around the smallest margin, even if it cannot change the verdict.
+MINIMUM_LEVELS = 2
 
 
 def is_contact(constraint: Constraint) -> bool:
@@ -48,10 +47,10 @@ class Intervals:
     """I intervals between samples."""
 
     s: Array  # phases of both ends, shape (I, 2)
-    margin: Array  # smallest distance minus the smallest valid one, at both ends [m], shape (I, 2)
-    lower_bound: (
-        Array  # proven lower bound of the margin over the interval [m], shape (I,)
-    )
+    # Smallest distance minus the smallest valid one, at both ends [m], shape (I, 2).
+    margin: Array
+    # Proven lower bound of the margin over the interval [m], shape (I,).
+    lower_bound: Array
 
     def around_minimum(self) -> NDArray[np.bool_]:
         """Return a mask of the intervals on both sides of the smallest margin, shape (I,)."""

@@ -23,12 +23,13 @@ from cnpgen.judges.plans.verdict import Margin
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-PEAK_DECISION_TOLERANCE = (
-    1e-8  # relative to the tolerance: error of a maximum that decides about the verdict
-)
+# Relative to the tolerance: error of a maximum that decides about the verdict.
+
+PEAK_DECISION_TOLERANCE = 1e-8
 PEAK_VALUE_TOLERANCE = 1e-2  # relative to the tolerance: error of any other maximum
 PEAK_PARTS = 6  # of an interval
-MAX_PEAK_ROUNDS = 10  # of division; a smooth maximum needs two or three, a kink one per factor of PEAK_PARTS
+# Of division; a smooth maximum needs two or three, a kink one per factor of PEAK_PARTS.
+MAX_PEAK_ROUNDS = 10
 MAX_PEAK_INTERVALS = 256  # of all conditions that are divided at a time
 MIN_CURVATURE = 1e-30  # relative to the tolerance
 
@@ -39,7 +40,8 @@ class _SampledValues:
 
     of: Indices  # index of the row's condition among the measured ones, shape (R,)
     part: Indices  # index of the row's value in the condition, shape (R,)
-    s: Array  # phases, ascending, shape (R, K); (1, K) if they are the same in every row
+    # Phases, ascending, shape (R, K); (1, K) if they are the same in every row.
+    s: Array
     violation: Array  # violations in multiples of the tolerance, shape (R, K)
 
     def promising(self, largest: Array) -> tuple[Indices, Indices, Array]:
@@ -134,10 +136,8 @@ def _estimated_maxima(s: Array, values: Array) -> Array:
     around = np.concatenate(
         [second[:, :1], second[:, :1], second, second[:, -1:], second[:, -1:]], axis=1
     )
-    low, high = (
-        _of_four(np.minimum, around),
-        _of_four(np.maximum, around),
-    )  # at both ends of an interval and next to it
+    # At both ends of an interval and next to it.
+    low, high = _of_four(np.minimum, around), _of_four(np.maximum, around)
     curvature = np.maximum((high - 2 * low) * (step**2 / 2), MIN_CURVATURE)
     excess = np.maximum(curvature - np.abs(rise), 0.0)
     return np.asarray(

@@ -17,30 +17,22 @@ from cnpgen.robots.solid import place_obstacles
 from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
-END_POINTS = (
-    0,
-    1,
-    2,
-    4,
-    7,
-    11,
-)  # from either end, whose accelerations depend on the last rate control points
-END_RELAXATION = (
-    0.1,
-    0.3,
-)  # phases between which the relaxation of violated end bounds fades out
+# From either end, whose accelerations depend on the last rate control points.
+END_POINTS = 0, 1, 2, 4, 7, 11
+# Phases between which the relaxation of violated end bounds fades out.
+END_RELAXATION = 0.1, 0.3
 MIN_END_RELAXATION = 1e-5  # of scaled residuals: iterations end with larger violations
-UNKNOWN_TOLERANCE = (
-    1e9  # in scaled units, of conditions that only the verdict can check
-)
-PHASE_FACTOR = 1.03  # time-varying bounds close earlier by this factor: motions overshoot where they level out
-PRECISE_FRACTION = (
-    0.1  # of the tolerance of an equality: the largest error of a precise plan
-)
-NEAR_FRACTION = 0.97  # of the distance from a path, on the grid: motions overshoot between its points
-INTERVAL_FRACTION = (
-    0.9  # of the tolerance between grid points: the interpolation has an error
-)
+# In scaled units, of conditions that only the verdict can check.
+UNKNOWN_TOLERANCE = 1e9
+# Time-varying bounds close earlier by this factor: motions overshoot where they level
+# out.
+PHASE_FACTOR = 1.03
+# Of the tolerance of an equality: the largest error of a precise plan.
+PRECISE_FRACTION = 0.1
+# Of the distance from a path, on the grid: motions overshoot between its points.
+NEAR_FRACTION = 0.97
+# Of the tolerance between grid points: the interpolation has an error.
+INTERVAL_FRACTION = 0.9
 
 
 _ORDERS: dict[
@@ -55,12 +47,13 @@ class Tightening:
     """Tightening of the problem's bounds against overshoot between grid points."""
 
     limit: float  # fraction of acceleration, torque and jerk limits
-    gentle: (
-        float  # fraction of position and velocity limits, on which boundary states lie
-    )
+    # Fraction of position and velocity limits, on which boundary states lie.
+    gentle: float
     clearance: float  # distance added to clearances [m]
     band: float  # half width of equalities, as a fraction of their tolerance
-    edge: float  # phase over which the tightening fades in from either end, since boundary states may lie on a limit
+    # Phase over which the tightening fades in from either end, since boundary states
+    # may lie on a limit.
+    edge: float
 
 
 NO_TIGHTENING = Tightening(limit=0.0, gentle=0.0, clearance=0.0, band=0.0, edge=1.0)
@@ -112,10 +105,8 @@ class Bounds:
             weights[:, None] * g[k : k + len(midpoint_weights)]
             for k, weights in enumerate(midpoint_weights.T)
         )
-        left, right = (
-            slice(1, -2),
-            slice(2, -1),
-        )  # of the intervals between the second and the last but one
+        # Of the intervals between the second and the last but one.
+        left, right = slice(1, -2), slice(2, -1)
         tolerance = INTERVAL_FRACTION * np.minimum(
             self.interval_tolerance[left], self.interval_tolerance[right]
         )

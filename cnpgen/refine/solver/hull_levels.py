@@ -34,10 +34,11 @@ Array = NDArray[np.float64]
 TEMPLATE_POINTS = 32  # of a grid that is only used to find equalities
 STATES_PER_INTERVAL = 10
 FEEDBACK_MARGIN_M = 2e-4  # added to the required distances between grid points
-MARGIN_EDGE = 0.05  # phase over which the margin fades in from either end, where the clearance may be smaller
-MIN_FED_BACK_M = (
-    1e-6  # an object that stands on something at an end touches it up to rounding
-)
+# Phase over which the margin fades in from either end, where the clearance may be
+# smaller.
+MARGIN_EDGE = 0.05
+# An object that stands on something at an end touches it up to rounding.
+MIN_FED_BACK_M = 1e-6
 MAX_FED_BACK_M = 0.02  # larger collisions are not between grid points
 
 

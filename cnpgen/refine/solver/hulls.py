@@ -36,9 +36,8 @@ LINK_CONSTRAINTS, OBJECT_CONSTRAINTS = (
     RobotClearance | SelfClearance,
     ObjectContact | ObjectClearance,
 )
-MEASURED_RANGE_M = (
-    0.04  # above the required distance; larger distances are not measured
-)
+# Above the required distance; larger distances are not measured.
+MEASURED_RANGE_M = 0.04
 
 
 def has_clearance_constraints(problem: Problem, robot: Robot) -> bool:
@@ -55,9 +54,8 @@ class _Group:
     columns: Pairs  # of their distances, shape (P,)
     required: float  # distance [m]
     of_obstacles: bool  # whether they are obstacles and moving parts, else two links
-    numbers: (
-        Pairs  # among all pairs of obstacles and moving parts, or of links, shape (P,)
-    )
+    # Among all pairs of obstacles and moving parts, or of links, shape (P,).
+    numbers: Pairs
 
 
 class Hulls:

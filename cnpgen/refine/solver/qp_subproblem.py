@@ -18,13 +18,16 @@ Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 DAQP_INFINITY = 1e30  # DAQP's value of no bound
-ELASTIC_CURVATURE_ROOT = 0.1  # of the elastic variable's cost; far smaller ones triple the working-set changes
+# Of the elastic variable's cost; far smaller ones triple the working-set changes.
+ELASTIC_CURVATURE_ROOT = 0.1
 ELASTIC_GRADIENT = 1e-3  # of the elastic variable's cost where nothing is violated
 MIN_MULTIPLIER = 1e-9  # smaller multipliers belong to inactive residuals
 QP_TOLERANCE = 1e-6  # primal tolerance of DAQP and of active_set.c
 MAX_WORKING_SET_CHANGES = 3000
-THINNING = 6  # interval of grid points at which residuals are selected without being a local maximum
-MAX_SPEED_DISTANCE = 0.4  # selection distance without accelerations, which grow with the square of the rate
+# Interval of grid points at which residuals are selected without being a local maximum.
+THINNING = 6
+# Selection distance without accelerations, which grow with the square of the rate.
+MAX_SPEED_DISTANCE = 0.4
 DAQP_LOWER, DAQP_UPPER = 3, 1  # DAQP's codes of initially active bounds
 
 
@@ -34,7 +37,8 @@ class Step:
 
     dx: Array  # step of the variables, shape (nx,)
     remaining: float  # fraction of the violations that remains after the step
-    multipliers: Array  # multipliers of all residuals, shape (K, m); 0 for those that are not selected
+    # Multipliers of all residuals, shape (K, m); 0 for those that are not selected.
+    multipliers: Array
     gain: float  # predicted reduction of the objective
 
 
@@ -43,9 +47,8 @@ class ResidualSelection:
     """Rule that selects the residuals of a subproblem."""
 
     violation: float  # largest violation at the current iterate
-    max_distance: (
-        float  # residuals are selected at local maxima within this distance of a bound
-    )
+    # Residuals are selected at local maxima within this distance of a bound.
+    max_distance: float
     # Bound of the change of log r; nonsmooth residuals that it could move over a bound
     # are selected.
     max_log_rate_change: float

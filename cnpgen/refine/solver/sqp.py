@@ -36,44 +36,35 @@ from cnpgen.refine.solver.qp_subproblem import (
 from cnpgen.refine.solver.transcription import Transcription
 
 Array = NDArray[np.float64]
-RATE_RADIUS_FACTOR = (
-    1.5  # trust radius of the logarithms of the rate, relative to that of the path
-)
+# Trust radius of the logarithms of the rate, relative to that of the path.
+RATE_RADIUS_FACTOR = 1.5
 MAX_RADIUS, MIN_RADIUS = 1.0, 1e-5  # of the trust region
 MAX_STEP_GROWTH = 1.5  # expected factor of the length of successive steps
-SELECTION_DISTANCES = (
-    (0.2, 0.4),
-    (0.05, 0.2),
-    (-1.0, 0.1),
-)  # see ``Settings.selection_distances``
+# See ``Settings.selection_distances``.
+SELECTION_DISTANCES = (0.2, 0.4), (0.05, 0.2), (-1.0, 0.1)
 CONVERGED_PROXIMAL = 1.0  # weight of the proximal term once the objective has converged
-SHORT_MOTION_S = (
-    0.2  # in shorter motions that weight grows with the cube of the ratio of durations
-)
-MAX_REMAINING = 0.9  # a step that leaves a larger fraction of the violations is computed again with relaxed residuals
-PENALTY_FACTOR = 3.0  # times the objective: weight of violations where the penalty makes violations profitable
-STALL_STEPS, STALL_FRACTION = (
-    8,
-    0.9,
-)  # stalled: a larger fraction of the violation is left after so many steps
-MAX_RESTORED_VIOLATION = 0.02  # a stalled iteration with a smaller violation restores feasibility before it ends
-BOUND_SHRINKAGE, MIN_GAIN_FRACTION = (
-    0.7,
-    0.1,
-)  # of the violation bound; smallest fraction of the predicted gain
+# In shorter motions that weight grows with the cube of the ratio of durations.
+SHORT_MOTION_S = 0.2
+# A step that leaves a larger fraction of the violations is computed again with relaxed
+# residuals.
+MAX_REMAINING = 0.9
+# Times the objective: weight of violations where the penalty makes violations
+# profitable.
+PENALTY_FACTOR = 3.0
+# Stalled: a larger fraction of the violation is left after so many steps.
+STALL_STEPS, STALL_FRACTION = 8, 0.9
+# A stalled iteration with a smaller violation restores feasibility before it ends.
+MAX_RESTORED_VIOLATION = 0.02
+# Of the violation bound; smallest fraction of the predicted gain.
+BOUND_SHRINKAGE, MIN_GAIN_FRACTION = 0.7, 0.1
 LAST_STEPS = 3  # before a deadline restore feasibility
 DEADLINE_PROXIMAL = 30.0  # weight of the proximal term in these
-MAX_MIDPOINT_CORRECTIONS = (
-    2  # tightenings of the bounds for violations between grid points
-)
-STEP_TIME_FACTOR = (
-    1.3  # times the largest duration of a step so far is reserved for the next
-)
-ACCEPTED_RATIO, GOOD_RATIO, POOR_RATIO = (
-    0.05,
-    0.7,
-    0.3,
-)  # of reduction to prediction: accept, enlarge, shrink
+# Tightenings of the bounds for violations between grid points.
+MAX_MIDPOINT_CORRECTIONS = 2
+# Times the largest duration of a step so far is reserved for the next.
+STEP_TIME_FACTOR = 1.3
+# Of reduction to prediction: accept, enlarge, shrink.
+ACCEPTED_RATIO, GOOD_RATIO, POOR_RATIO = 0.05, 0.7, 0.3
 
 
 @dataclass(frozen=True)
@@ -91,7 +82,8 @@ class Settings:
     # objective.
     violation_bound: float = 0.3
     max_initial_violation: float = np.inf  # largest violation of a usable initial guess
-    cost_tolerance: float = 1e-3  # relative change of the objective, predicted and actual, at which it has converged
+    # Relative change of the objective, predicted and actual, at which it has converged.
+    cost_tolerance: float = 1e-3
     # Pairs (step length, distance): after a step longer than the first, residuals
     # within the second of a bound are selected.
     selection_distances: tuple[tuple[float, float], ...] = SELECTION_DISTANCES
@@ -106,7 +98,8 @@ class Deadline:
     """Time at which a sequence of steps must have ended: iterations of a solver, or verdicts."""
 
     until: float  # in the clock of ``time.perf_counter`` [s]
-    max_duration: float = 0.0  # time reserved for one step: the largest so far, times ``STEP_TIME_FACTOR`` [s]
+    # Time reserved for one step: the largest so far, times ``STEP_TIME_FACTOR`` [s].
+    max_duration: float = 0.0
 
     def allows(self, steps: int) -> bool:
         """Return whether there is time for so many steps."""
@@ -185,7 +178,8 @@ class _Iterate:
     """State of the iteration: variables, regularized objective, largest violation."""
 
     restoring = False  # whether steps only restore feasibility, before a deadline
-    tightened = False  # whether the last step tightened the bounds for violations between grid points
+    # Whether the last step tightened the bounds for violations between grid points.
+    tightened = False
 
     def __init__(
         self, motion: Transcription, bounds: Bounds, settings: Settings, x: Array
@@ -208,9 +202,8 @@ class _Iterate:
             settings.violation_bound,
             settings.penalty,
         )
-        self._step_length = (
-            MAX_RADIUS  # of the last step, in the norm of the trust region
-        )
+        # Of the last step, in the norm of the trust region.
+        self._step_length = MAX_RADIUS
         self._multipliers: Array | None = None
         self._cost_converged = self._stalled = False
         self._missed = np.zeros(

@@ -25,7 +25,9 @@ from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 T = TypeVar("T")
-RATE_SMOOTHING = 1e-4  # weight of the squared second differences of log r, which selects one of many parametrizations
+# Weight of the squared second differences of log r, which selects one of many
+# parametrizations.
+RATE_SMOOTHING = 1e-4
 
 
 @dataclass(frozen=True)
@@ -49,9 +51,8 @@ class ResidualKernels:
     values: Kernel  # kernel of ``cnpgen.refine.solver.residuals.stage_values``
     jacobian: Kernel  # kernel of ``cnpgen.refine.solver.residuals.stage_jacobian``
     cost_term: CostTerm | None = None  # cost term in addition to the duration, or None
-    cost_residuals: Kernel | None = (
-        None  # kernel of ``cnpgen.refine.solver.residuals.cost_term_residuals``, or None
-    )
+    # Kernel of ``cnpgen.refine.solver.residuals.cost_term_residuals``, or None.
+    cost_residuals: Kernel | None = None
     cost_counts: tuple[
         int, ...
     ] = ()  # number of residuals of every term of the cost term
@@ -146,10 +147,8 @@ class Transcription:
         Nan where accelerations or jerks are free.
         """
         orders = len(self.grid.bases.path)
-        b, unit = (
-            self.boundary,
-            np.eye(1, orders - 1)[0],
-        )  # with r = 1 and r' = 0, w is the state itself
+        # With r = 1 and r' = 0, w is the state itself.
+        b, unit = self.boundary, np.eye(1, orders - 1)[0]
         free = np.full(self.n, np.nan)
         goal_ddq, jerk = (
             free if b.goal_ddq is None else b.goal_ddq[0],
