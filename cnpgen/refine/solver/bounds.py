@@ -1,4 +1,14 @@
-"""Bounds of the residuals on a grid, tightened against overshoot between grid points."""
+"""Bounds of the residuals on a grid, tightened against overshoot between grid points.
+
+Between two grid points a residual may exceed what it has at both. Bounds are therefore
+tightened in advance, by a share of their half width for limits or a length for
+clearances, fading in from both ends over the phase ``edge``:
+
+    u(s) = c + h (1 - fraction min(s, 1 - s, edge) / edge),    c, h: center, half width.
+
+After convergence midpoints are interpolated by cubic polynomials through four grid
+points, and bounds whose residuals still overshoot there are tightened by the overshoot.
+"""
 
 from dataclasses import dataclass
 from itertools import accumulate
@@ -101,6 +111,7 @@ class Bounds:
 
         Midpoints are interpolated with ``Grid.midpoint_weights``.
         """
+        # value at the midpoint of points k + 1 and k + 2 from those at k, ..., k + 3
         centers = sum(
             weights[:, None] * g[k : k + len(midpoint_weights)]
             for k, weights in enumerate(midpoint_weights.T)
@@ -115,6 +126,7 @@ class Bounds:
         if not (above.max() > 0 or below.max() > 0):
             return None
         lower, upper = self.lower.copy("F"), self.upper.copy("F")
+        # Both neighbors of a midpoint move inwards by the overshoot there.
         for side in (left, right):
             upper[side] -= np.maximum(above, 0.0)
             lower[side] += np.maximum(below, 0.0)
@@ -269,6 +281,7 @@ class BoundsTemplate:
             NEAR_FRACTION * distance,
             self._s < 1,
         )
+        # |q - q_path| <= distance, in scaled units: the tighter of both bounds holds
         rows = np.ix_(inner, columns)
         lower, upper = bounds.lower.copy("F"), bounds.upper.copy("F")
         lower[rows] = np.maximum(lower[rows], (positions[inner] - band) / scale)
@@ -283,6 +296,8 @@ class BoundsTemplate:
         Required distances [m] have shape (columns,), additional ones shape (K,
         columns).
         """
+        # d >= required + tightening + what collisions between grid points have added; the
+        # last grid point is the goal itself, which no variable moves
         added = _added_clearance(self._s, self._tightening)[:, None]
         lower = (min_distances + added + extra) / DISTANCE_SCALE_M
         lower[self._s == 1] = -np.inf
@@ -366,6 +381,8 @@ def _bounds(
     lower = np.repeat((condition.lower / scale)[None], len(s), axis=0)
     upper = np.repeat((condition.upper / scale)[None], len(s), axis=0)
     if condition.tolerance_kind == "limit":
+        # Boundary states may lie on limits of positions and velocities: these shrink by
+        # the smaller share ``gentle``.
         fraction = tightening.limit if order >= 2 else tightening.gentle
         shrink = (
             1
@@ -374,6 +391,7 @@ def _bounds(
         center, half = (lower + upper) / 2, (upper - lower) / 2
         lower, upper = center - shrink * half, center + shrink * half
     elif condition.is_equality:
+        # An equality gets a band within its tolerance, so that the program has an interior.
         band = tightening.band * constraint.tolerance / scale
         lower, upper = lower - band, upper + band
     elif not constraint.has_solver_margin:

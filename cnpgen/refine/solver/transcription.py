@@ -1,10 +1,20 @@
 """Transcription of the optimization problem of one motion: variables, residuals on a Chebyshev grid, derivatives.
 
 Variables are the interior path control points and the logarithms of the rate control
-points. Boundary conditions hold by construction: the boundary control points are
-functions of the first and last rate control points (paper, Appendix A). Residuals are
-the problem's constraints, each divided by its scale
-(``cnpgen.refine.solver.residuals``).
+points, x = (C_3, ..., log R_0, ...), which keeps rates positive. Boundary conditions
+hold by construction: the boundary control points are functions of the first and last
+rate control points (paper, Appendix A). Residuals are the problem's constraints, each
+divided by its scale (``cnpgen.refine.solver.residuals``). They are functions of the
+splines w = (p, p', p'', r, r') at a phase s, which are linear in the control points:
+
+    T = integral of 1 / r(s) ds,    dg/dx = dg/dw (dw/dC dC/dx + dw/dR dR/dx),
+
+with dR/d(log R) = R, and with the boundary control points' dependence on R in dC/dx.
+The objective's Hessian in log R keeps the positive part of that of T,
+
+    H = integral of 2 r^-3 (dr/dlog R)(dr/dlog R)' ds,
+
+so that it is positive semidefinite.
 """
 
 from collections.abc import Callable
@@ -181,15 +191,18 @@ class Transcription:
         w, path, rate = self._at(x)
         g, jacobian = self.kernels.jacobian(w, self.poses_along)
         log = x[self.split :]
+        # dr/d(log R_j) = B_j R_j at the nodes of the time integral
         log_rate_derivative = self.grid.time_basis * rate
         inverse = 1.0 / (self.grid.time_basis @ rate)
         cost = float(inverse @ self.grid.time_weights) + self.regularization(x)
         gradient = np.zeros(self.nx)
+        # dT/d(log R) = -sum of weight r^-2 dr/d(log R)
         gradient[self.split :] = (
             -((self.grid.time_weights * inverse**2) @ log_rate_derivative)
             + self.smoothing @ log
         )
         curvature = np.zeros((self.nx, self.nx))
+        # H = half' half: a square root, so that one product of matrices builds it
         half = (
             log_rate_derivative
             * np.sqrt(2 * self.grid.time_weights * inverse**3)[:, None]
@@ -207,6 +220,7 @@ class Transcription:
 
     def linearization_errors(self, at: Linearization, step: float) -> Array:
         """Bound the change of residuals by derivatives of r if no log r changes by more than ``step``: (K, m)."""
+        # |r^(i) after - before| <= sum_j |B_j^(i)| R_j step, to first order in the step
         orders, errors = len(self.grid.bases.path), np.zeros(at.g.shape)
         for order in range(1, orders - 1):
             change = np.abs(self.grid.bases.rate[order]) @ at.rate * step
@@ -256,6 +270,8 @@ class Transcription:
     ) -> Array:
         """Convert gradients in w at nodes k, shape (m, width of w), to gradients in the variables, (m, nx)."""
         n, m, orders = self.n, len(k), len(bases.path)
+        # dg/dC = sum over orders of B^(i) dg/dp^(i), for all control points, also those
+        # that the boundary conditions determine
         control = bases.path_at[k] @ state_gradients[:, : orders * n].reshape(
             m, orders, n
         )
@@ -264,6 +280,7 @@ class Transcription:
         out[:, self.split :] = (
             state_gradients[:, None, orders * n :] @ bases.rate_at[k]
         )[:, 0] * rate
+        # Boundary control points depend on the first and last rates: chain rule through them.
         for item in self._boundary_derivatives(rate):
             out[:, self.split + item.variable] += control[:, item.point] @ (
                 item.derivative[0] * rate[item.variable]
@@ -274,6 +291,7 @@ class Transcription:
 @cache
 def _smoothing(points: int) -> Array:
     """Return the Hessian of the regularization, shape (R, R)."""
+    # |D log r|^2 with second differences D: constant and exponential rates cost nothing
     second = np.diff(np.eye(points), 2, axis=0)
     return np.asarray(2 * RATE_SMOOTHING * second.T @ second)
 
