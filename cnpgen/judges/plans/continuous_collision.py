@@ -98,6 +98,8 @@ def _subdivisions(
 ) -> Iterator[tuple[Array, MeasuredCondition]]:
     """Yield phases in subdivided intervals, and the contact condition there."""
     for level in range(MAX_LEVELS):
+        # Intervals that may hide a violation, the most doubtful first, and those around
+        # the smallest margin, so that the printed value is that of the motion.
         chosen = intervals.unresolved()
         if level < MINIMUM_LEVELS and not (early_exit and intervals.margin.min() >= 0):
             chosen |= intervals.around_minimum()
@@ -119,6 +121,7 @@ def _intervals(
 ) -> list[Intervals]:
     """Return the intervals of each contact between neighbors in rows of phases, shape (rows, K), where the world is."""
     world, last = context.world, s.shape[1] - 1
+    # |x(q2) - x(q1)| <= sum over joints of (reach of the joint) |q2_j - q1_j|
     displacements = motion_bounds @ np.abs(world.q[:, 1:] - world.q[:, :-1])
     displacements[last :: last + 1] = -np.inf  # between rows there is no interval
     deviations = chord_deviation_bounds(context.curve, s.ravel(), motion_bounds)
@@ -129,6 +132,7 @@ def _intervals(
         )  # one, or of each
         margin = (contact.g - min_distances[:, None]).min(axis=0).reshape(s.shape)
         proven = np.full(s.size, np.nan)
+        # With a violation at a sample the verdict is decided, and no bound is needed.
         if margin.min() >= 0:
             pairs = pairs_of(world, contact.constraint)
             proven[:-1] = pairs.interval_bounds(

@@ -113,6 +113,7 @@ class ProvenJointLimits:
             ),
             s,
         )
+        # The coefficients bound the function: limits that they meet need no search.
         low = np.array(
             [coefficients.min(axis=0).min(axis=0) for coefficients in functions]
         )

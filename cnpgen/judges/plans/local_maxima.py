@@ -50,6 +50,8 @@ class _SampledValues:
         Returns:
             ``(of, part, ends)`` of I intervals; ends have shape (I, 2).
         """
+        # A maximum matters if it would change the verdict (cross 1), or the printed value
+        # by more than its tolerance.
         threshold = np.maximum(largest + PEAK_VALUE_TOLERANCE, 0.0)
         threshold = np.where(
             largest <= 1, np.minimum(threshold, 1 + PEAK_DECISION_TOLERANCE), threshold
@@ -130,6 +132,10 @@ def _initial_values(s: Array, measured: Sequence[MeasuredCondition]) -> _Sampled
 
 def _estimated_maxima(s: Array, values: Array) -> Array:
     """Estimate upper bounds of functions between neighboring samples, shape (rows, K - 1)."""
+    # Divided differences estimate the second derivative C at every inner sample. Between
+    # two samples the function is at most the parabola with the largest plausible |C|
+    # through them: its apex lies (c - |rise|)^2 / (4 c) above the higher sample, with
+    # c = C step^2 / 2, if it lies between them at all (c > |rise|).
     step, rise = s[:, 1:] - s[:, :-1], values[:, 1:] - values[:, :-1]
     rate = rise / step
     second = (rate[:, 1:] - rate[:, :-1]) / ((step[:, 1:] + step[:, :-1]) / 2)
