@@ -113,6 +113,8 @@ class Expansion:
         across = [cross(self.direction, axis) for axis in kin.axes]
         across_rate = [cross(self.direction, rate) for rate in axis_rates]
         hessian: list[list[Scalar]] = [[0.0] * self.n for _ in range(self.n)]
+        # H_jk = 2 (A A)_jk + 2 d . (dz_j x J_k + z_j x dJ_k) - multiplier . d2p/dq_j dq_k,
+        # with d . (u x v) = (d x u) . v, so that the cross products with d are shared.
         for j in range(self.n):
             for k in range(j, self.n):
                 third = dot(across_rate[j], kin.jacobian[k]) + dot(
@@ -154,6 +156,8 @@ def _rates(kin: Kinematics, rate: Vec) -> tuple[list[Vec], list[Vec]]:
     turning: Vec = [0.0, 0.0, 0.0]
     origin_rate: Vec = [0.0, 0.0, 0.0]
     previous: Vec = [0.0, 0.0, 0.0]
+    # Forward recursion: joint j moves its origin with the angular velocity of the joints
+    # before it, and dz/dt = omega x z, dJ/dt = dz/dt x (tip - o) + z x (d tip - d o).
     tip_rate = [dot([column[row] for column in kin.jacobian], rate) for row in range(3)]
     axis_rates, column_rates = [], []
     for axis, origin, speed in zip(kin.axes, kin.origins, rate, strict=True):
