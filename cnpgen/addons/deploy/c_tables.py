@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 BLOCK = 16  # outputs of a layer that are accumulated together
 INPUTS = 4  # of a layer that pass at once
-GAUSS_NODES = 8  # as in ``Motion.duration``
+GAUSS_NODES = 4  # half of those of ``Motion.duration``: errors of 1e-9 in the same cells
 NEWTON_STEPS = 5  # three or four reach rounding (``Motion.phase_at``)
 
 
@@ -238,7 +238,7 @@ def _step(layer: Layer, source: str, target: str, *, activated: bool) -> str:
     inputs, width = padded(layer.inputs, INPUTS), padded(layer.outputs)
     arrays = f"{layer.name}_weight, {layer.name}_bias"
     text = f"  affine({arrays}, {inputs}, {width // BLOCK}, {source}, {target});\n"
-    return text + (f"  hyperbolic_tangent({target}, {width});\n" if activated else "")
+    return text + (f"  hyperbolic_tangent({target}, {width // BLOCK});\n" if activated else "")
 
 
 def _filled(matrix: NDArray[Any]) -> NDArray[Any]:

@@ -47,7 +47,7 @@ from cnpgen.trajectory.spline import chebyshev
 Array = NDArray[np.float64]
 
 LANES = 8  # phases that are evaluated together
-CHECK_INTERVALS = 63  # between phases, of models whose rates are not fitted
+CHECK_INTERVALS = 39  # between phases, of models whose rates are not fitted
 MAX_POSITION_WORK = (
     60_000  # operations of the position check, above which it has fewer phases
 )

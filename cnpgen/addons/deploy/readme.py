@@ -28,10 +28,10 @@ Joints, in the order of all arrays: {joints}.
 | {name}.c | the planner: C11 and the mathematics library, without malloc, locks, threads, input and output |
 
 ```
-cc -std=c11 -O2 -fno-math-errno -c {name}.c     # link with -lm
+cc -std=c11 -O2 -fno-math-errno -fno-trapping-math -c {name}.c     # link with -lm
 ```
 
-The second option changes no number: square roots need not set errno, so loops with them become vector instructions.
+The last two options change no number: without errno and floating-point traps, more loops become vector instructions.
 -O3 and -march=native are faster; fused operations change the last digits. -ffast-math is refused.
 
 ## Functions

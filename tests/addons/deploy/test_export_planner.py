@@ -82,12 +82,12 @@ def test_plans_equal_those_of_python(planned, plans):
 
 
 def test_the_duration_is_that_of_its_own_rates(planned, plans):
-    """The quadrature is that of Python: differences are rounding errors, not those of the network."""
+    """The quadrature has the cells of Python, and half of its nodes."""
     from cnpgen.trajectory.spline_motion import Motion
 
     valid = planned.code == VALID
     own = Motion(planned.path[valid], planned.rate[valid], plans.degree)
-    np.testing.assert_allclose(planned.duration[valid], own.duration(), rtol=1e-13)
+    np.testing.assert_allclose(planned.duration[valid], own.duration(), rtol=1e-8)
 
 
 def test_code_0_agrees_with_the_verdict(planned, plans):

@@ -2,8 +2,8 @@
 is accumulated while the inputs pass once; the last block is padded with zeros. */
 
 /* tanh by the rational function of Eigen, at most 4 ulp from the exact value; nan stays nan. */
-static void hyperbolic_tangent(float *y, int count) {
-  for (int i = 0; i < count; i++) {
+static void hyperbolic_tangent(float *y, int blocks) {
+  for (int i = 0; i < blocks * BLOCK; i++) {
     float x = y[i];
     x = x > 7.90531110763549805f ? 7.90531110763549805f : x;
     x = x < -7.90531110763549805f ? -7.90531110763549805f : x;

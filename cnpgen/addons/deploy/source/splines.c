@@ -28,12 +28,12 @@ static void rate_coefficients(const double *rate, int span, double coefficients[
 
 /* The time from `offset` to `offset + width` [s], the integral of 1 / r by Gauss's rule of NODES points. */
 static double time_of(const double *coefficients, double offset, double width) {
-  double sum = 0;
-  for (int i = 0; i < NODES; i++) {
-    double x = offset + width * node[i], r = 0;
-    for (int k = DEGREE; k >= 0; k--) r = r * x + coefficients[k];
-    sum += node_weight[i] / r;
-  }
+  double x[NODES], r[NODES] = {0}, sum = 0;
+  for (int i = 0; i < NODES; i++) x[i] = offset + width * node[i];
+  for (int k = DEGREE; k >= 0; k--)
+    for (int i = 0; i < NODES; i++) r[i] = r[i] * x[i] + coefficients[k];
+  for (int i = 0; i < NODES; i++) x[i] = node_weight[i] / r[i];
+  for (int i = 0; i < NODES; i++) sum += x[i];
   return sum * width;
 }
 
