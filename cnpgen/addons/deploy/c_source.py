@@ -25,7 +25,7 @@ GRID_TAPES = {  # tape -> number of phases
     "speed_violation": "PHASES",
     "speed_coefficients": "PHASES",
 }
-CODES = {  # code -> meaning, in the order of their numbers
+CODES = {  # code -> cause, in the order of their numbers
     "VALID": "the motion meets all conditions of the problem at the phases of the grid",
     "NOT_FINITE": "a number of the request is not finite",
     "MUST_BE_ZERO": "a condition is not zero that was zero in all training rows",
@@ -182,8 +182,8 @@ def header_text(parts: PlannerParts, names: Names) -> str:
         "INTRODUCTION": _introduction(parts, names),
         "CONSTANTS": _public_constants(parts, names),
         "CODES": "".join(
-            f"#define UPPER_{code} {value} /* {meaning} */\n"
-            for value, (code, meaning) in enumerate(CODES.items())
+            f"#define UPPER_{code} {value} /* {cause} */\n"
+            for value, (code, cause) in enumerate(CODES.items())
         ),
         "REQUEST": _request(parts),
         "MOTION": f"""  int code;              /* of the call that wrote it */
@@ -268,7 +268,7 @@ def _memory(parts: PlannerParts) -> str:
     )
     inputs = {name: sum(t.inputs) for name, t in parts.tapes.items()}
     phases, rows = size["PHASES"], size["CHECKED_PHASES"]
-    longest = max(size["MOVING_ROWS"] * phases, size["POSITION_ROWS"] * rows, 1)
+    most_rows = max(size["MOVING_ROWS"] * phases, size["POSITION_ROWS"] * rows, 1)
     points = [
         inputs[name]
         for name in ("task", "line_change", "projected_path")
@@ -283,7 +283,7 @@ def _memory(parts: PlannerParts) -> str:
         "points": outputs["projected_path"],
         "column": size["COLUMNS"] * phases,
         "positions": inputs["position_violations"] * rows,
-        "rows": longest,
+        "rows": most_rows,
     }
     if "speed_violation" in parts.tapes:
         fields["violation"] = phases

@@ -23,7 +23,9 @@ Array = NDArray[np.float64]
 
 BLOCK = 16  # outputs of a layer that are accumulated together
 INPUTS = 4  # of a layer that pass at once
-GAUSS_NODES = 4  # half of those of ``Motion.duration``: errors of 1e-9 in the same cells
+GAUSS_NODES = (
+    4  # half of those of ``Motion.duration``: errors of 1e-9 in the same cells
+)
 NEWTON_STEPS = 5  # three or four reach rounding (``Motion.phase_at``)
 
 
@@ -148,12 +150,12 @@ def _task_tables(parts: PlannerParts) -> Iterable[str]:
 def _spline_tables(parts: PlannerParts) -> Iterable[str]:
     spec = parts.problem.trajectory
     edges, spans = cells(parts), spec.rate_control_points - spec.degree
-    middles = (edges[1:] + edges[:-1]) / 2
+    midpoints = (edges[1:] + edges[:-1]) / 2
     nodes, weights = np.polynomial.legendre.leggauss(GAUSS_NODES)
     yield table("double", "path_taylor", _taylor(spec.path_control_points, spec.degree))
     yield table("double", "rate_taylor", _taylor(spec.rate_control_points, spec.degree))
     yield table("double", "cell_edge", edges)
-    yield table("int", "cell_span", np.floor(middles * spans))
+    yield table("int", "cell_span", np.floor(midpoints * spans))
     yield table("double", "node", (nodes + 1) / 2)
     yield table("double", "node_weight", weights / 2)
 
@@ -238,7 +240,9 @@ def _step(layer: Layer, source: str, target: str, *, activated: bool) -> str:
     inputs, width = padded(layer.inputs, INPUTS), padded(layer.outputs)
     arrays = f"{layer.name}_weight, {layer.name}_bias"
     text = f"  affine({arrays}, {inputs}, {width // BLOCK}, {source}, {target});\n"
-    return text + (f"  hyperbolic_tangent({target}, {width // BLOCK});\n" if activated else "")
+    return text + (
+        f"  hyperbolic_tangent({target}, {width // BLOCK});\n" if activated else ""
+    )
 
 
 def _filled(matrix: NDArray[Any]) -> NDArray[Any]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-MAX_NAME_LENGTH = 40  # compilers distinguish 63 characters, with suffixes
+MAX_PREFIX_LENGTH = 40  # compilers distinguish 63 characters, with suffixes
 FALLBACK_NAME = "planner"
 NUMBERS_PER_LINE = 10
 _SAFE_IN_COMMENT = re.compile(
@@ -17,11 +17,11 @@ _SAFE_IN_COMMENT = re.compile(
 
 def identifier(text: str) -> str:
     """Map a name to [a-z0-9_], beginning with a letter: the prefix of all names of a planner."""
-    name = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")[:MAX_NAME_LENGTH]
+    name = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")[:MAX_PREFIX_LENGTH]
     name = name.rstrip("_")
     if not name:
         return FALLBACK_NAME
-    return name if name[0].isalpha() else f"{FALLBACK_NAME}_{name}"[:MAX_NAME_LENGTH]
+    return name if name[0].isalpha() else f"{FALLBACK_NAME}_{name}"[:MAX_PREFIX_LENGTH]
 
 
 def comment_text(text: str) -> str:

@@ -151,15 +151,17 @@ def _violations(
     held = (
         isinstance(constraint, TipManifold) and condition.name == constraint.held_name
     )
-    slack = relaxation if held else 0.0
+    relaxed_by = relaxation if held else 0.0
     units = np.maximum(constraint.allowed(condition), MIN_TOLERANCE)
     violations = []
     for value, low, high, unit in zip(
         condition.g, condition.lower, condition.upper, units.tolist(), strict=True
     ):
-        violations += [(float(low) - value - slack) / unit] if np.isfinite(low) else []
         violations += (
-            [(value - float(high) - slack) / unit] if np.isfinite(high) else []
+            [(float(low) - value - relaxed_by) / unit] if np.isfinite(low) else []
+        )
+        violations += (
+            [(value - float(high) - relaxed_by) / unit] if np.isfinite(high) else []
         )
     return violations
 

@@ -20,9 +20,11 @@ from cnpgen.planner.task_preprocessor import make_task_preprocessor
 Array = NDArray[np.float64]
 
 MAX_DEVIATIONS = 6.0  # of inputs of a model that stores no ranges
-SLACK = 1e-5  # of a standard deviation, since the stored ranges are rounded
+ROUNDING_TOLERANCE = (
+    1e-5  # of a standard deviation, since the stored ranges are rounded
+)
 ROWS_PER_BLOCK = 4096
-_BEYOND_ALL = 1e300  # no range
+_UNLIMITED = 1e300  # no range
 _NO_RANGES = "since the model stores no ranges"
 
 
@@ -51,21 +53,21 @@ def input_ranges(
     if rows is not None:
         low, high, count = _of_dataset(model, loaded, rows)
         source = f"smallest and largest values in {count:,} training rows of a dataset"
-        return InputRanges(low - SLACK, high + SLACK, source)
+        return InputRanges(low - ROUNDING_TOLERANCE, high + ROUNDING_TOLERANCE, source)
     if stored is not None:
         low, high = np.array(stored["low"], float), np.array(stored["high"], float)
         source = "smallest and largest values in the training rows, stored in the model"
-        return InputRanges(low - SLACK, high + SLACK, source)
+        return InputRanges(low - ROUNDING_TOLERANCE, high + ROUNDING_TOLERANCE, source)
     return _substitute(model)
 
 
 def _substitute(model: Model) -> InputRanges:
     """Return ranges from the standardization, if that is of the model's own rows."""
     if not model.features.mean.any():  # preset "paper": states in units of the limits
-        limit = 1 + SLACK
+        limit = 1 + ROUNDING_TOLERANCE
         source = f"positions within pi, velocities and accelerations within the limits, {_NO_RANGES}"
     elif model.training.get("start_from"):  # its features are those of other rows
-        limit = _BEYOND_ALL
+        limit = _UNLIMITED
         source = f"unknown, {_NO_RANGES}: no input is refused as outside of it"
     else:
         limit = MAX_DEVIATIONS

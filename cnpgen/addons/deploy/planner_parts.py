@@ -113,8 +113,8 @@ class PlannerParts:
         """Bounds of the parameters, relaxed by rounding errors, shape (P,) each."""
         spans = self.problem.parameters.ranges
         rounding = [RANGE_ROUNDING * max(abs(s.low), abs(s.high)) for s in spans]
-        low = [span.low - slack for span, slack in zip(spans, rounding, strict=True)]
-        high = [span.high + slack for span, slack in zip(spans, rounding, strict=True)]
+        low = [span.low - error for span, error in zip(spans, rounding, strict=True)]
+        high = [span.high + error for span, error in zip(spans, rounding, strict=True)]
         return np.array(low), np.array(high)
 
 

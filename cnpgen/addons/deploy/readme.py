@@ -11,8 +11,8 @@ def readme_text(parts: PlannerParts, names: Names) -> str:
     name = names.name
     joints = ", ".join(map(comment_text, parts.robot.joint_names))
     rows = "\n".join(
-        f"| {value} | `{name.upper()}_{code}` | {meaning} |"
-        for value, (code, meaning) in enumerate(CODES.items())
+        f"| {value} | `{name.upper()}_{code}` | {cause} |"
+        for value, (code, cause) in enumerate(CODES.items())
     )
     constraints = ", ".join(
         comment_text(type(each).__name__) for each in parts.problem.constraint
@@ -41,7 +41,7 @@ The last two options change no number: without errno and floating-point traps, m
 - `{name}_duration` is the duration [s].
 - `{name}_check` checks a motion on the grid again, and writes the violation of each constraint.
 
-| code | name | meaning |
+| code | name | cause |
 |---|---|---|
 {rows}
 

@@ -211,7 +211,7 @@ def test_the_flag_admits_values_outside_of_the_range_but_not_an_invalid_motion(
 ):
     row = int(np.flatnonzero(planned.code == VALID)[0])
     request = requests_of(boundary)[row].copy()
-    request[0] += 4.0  # beyond the joint's limit
+    request[0] += 4.0  # outside the joint's limits
     assert compiled.plan(request[None]).code[0] == OUTSIDE
     found = compiled.plan(request[None], admit=True)
     assert found.code[0] == NO_PATH
@@ -224,7 +224,7 @@ def test_the_flag_admits_values_outside_of_the_range_but_not_an_invalid_motion(
     assert compiled.plan(requests_of(boundary)[[row]], admit=True).code[0] == VALID
 
 
-def test_a_rate_beyond_the_limits_has_its_own_code(compiled, planned, boundary, plans):
+def test_a_rate_outside_the_limits_has_its_own_code(compiled, planned, boundary, plans):
     """Plans that Python's verdict calls too fast get the code of rates, without a motion."""
     requests = requests_of(boundary)[planned.code == VALID]
     requests[:, 24:30] *= np.linspace(1.0, 1.6, len(requests))[:, None]

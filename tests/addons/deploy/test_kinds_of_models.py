@@ -133,7 +133,7 @@ def test_parameters_outside_of_their_range_have_their_own_code(tmp_path: Path):
 def test_a_moving_start_that_no_rate_can_slow_down_is_refused(tmp_path: Path):
     _, compiled, requests, planned = prepared("airhockey-online", tmp_path)
     fast = requests[planned.code == VALID][:20].copy()
-    fast[:, 6:12] *= 8  # beyond the velocity limits at the very start
+    fast[:, 6:12] *= 8  # outside the velocity limits at the very start
     found = compiled.plan(fast, admit=True)
     assert (found.code == NO_RATE).any()
     assert np.all(found.duration[found.code != VALID] == 0)

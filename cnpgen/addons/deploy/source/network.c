@@ -21,7 +21,7 @@ static void hyperbolic_tangent(float *y, int blocks) {
   }
 }
 
-/* y = x W + b. Four inputs pass at once; rows beyond the last input are zero. */
+/* y = x W + b. Four inputs pass at once; rows after the last input are zero. */
 static void affine(const float *restrict weight, const float *restrict bias, int inputs, int blocks,
                    const float *restrict x, float *restrict y) {
   for (int block = 0; block < blocks; block++) {

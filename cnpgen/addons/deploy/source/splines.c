@@ -57,9 +57,9 @@ static void fill_times(NAME_motion *motion) {
 static double phase_at(const NAME_motion *motion, double time) {
   int first = 0, last = CELLS; /* the cell is at or after the first, and before the last */
   for (int step = 0; step < CELL_STEPS; step++) {
-    int middle = (first + last) / 2;
-    if (motion->time[middle] <= time && middle < CELLS) first = middle;
-    else last = middle;
+    int midpoint = (first + last) / 2;
+    if (motion->time[midpoint] <= time && midpoint < CELLS) first = midpoint;
+    else last = midpoint;
   }
   double coefficients[DEGREE + 1], low = cell_edge[first], width = cell_edge[first + 1] - low;
   double left = time - motion->time[first], whole = motion->time[first + 1] - motion->time[first];

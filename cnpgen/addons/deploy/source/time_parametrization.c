@@ -48,7 +48,7 @@ static int quadratics(NAME_memory *memory, int k, double up) {
 static double advance(NAME_memory *memory, int from, int to) {
   steps found = {MAX_INCREASE, 0, 0};
   int blocks = (to - from) / LANES;
-  for (int i = 0; i < blocks; i++) { /* from the middle outwards: outer phases rarely limit the step further */
+  for (int i = 0; i < blocks; i++) { /* from the midpoint outwards: outer phases rarely limit the step further */
     int k = from + (blocks / 2 + (i % 2 ? -(i + 1) / 2 : i / 2)) * LANES;
     if (!quadratics(memory, k, found.up)) continue;
     for (int row = 0; row < ROWS; row++)
@@ -70,10 +70,10 @@ static double sweep(double *rate, NAME_memory *memory) {
   double increase = 0, *r = memory->column + ORDERS * JOINTS * PHASES, *r1 = r + PHASES;
   for (int move = 0; move < MOVES; move++) {
     int j = move_order[move], from = move_range[2 * j], to = move_range[2 * j + 1];
-    const double *basis = rate_basis + j * PHASES, *slope = basis + RATE_POINTS * PHASES;
+    const double *basis = rate_basis + j * PHASES, *derivative = basis + RATE_POINTS * PHASES;
     for (int k = from; k < to; k++) {
       memory->direction[0][k] = rate[j] * basis[k];
-      memory->direction[1][k] = rate[j] * slope[k];
+      memory->direction[1][k] = rate[j] * derivative[k];
     }
     double x = advance(memory, from, to);
     if (x > 0) x *= step_fraction[move];
