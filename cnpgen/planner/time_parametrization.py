@@ -134,7 +134,9 @@ class TimeParametrization(PhaseGrid):
                 rate[block], violation[block] = self._parametrize_interpreted(
                     motion[block], obstacle_poses[block]
                 )
-        return Motion(motion.path, rate, motion.degree), violation <= self._tolerance
+        return Motion(
+            motion.path, rate, motion.degree
+        ), violation <= self.violation_tolerance
 
     def _parametrize_interpreted(
         self, motion: Motion, obstacle_poses: Array
@@ -152,7 +154,7 @@ class TimeParametrization(PhaseGrid):
             self.violation(states)[0].reshape(len(motion), -1).max(axis=1)
             for states in (column, new_column)
         )
-        better = after <= np.maximum(before, self._tolerance)
+        better = after <= np.maximum(before, self.violation_tolerance)
         violation = np.where(twice, np.inf, np.where(better, after, before))
         return np.where(better[:, None], rate, motion.rate), violation
 
@@ -166,31 +168,31 @@ class TimeParametrization(PhaseGrid):
             for coefficient in coefficients
         ]
         table, movable = self.rate, slice(self.fixed, rate.shape[1] - self.fixed)
-        increase = _sweep(rate, shaped, self._bounds, table, self.fixed)
+        increase = _sweep(rate, shaped, self.relaxed_bounds, table, self.fixed)
         again = increase > self.min_increase
         some = rate[again]
         _sweep(
             some,
             [coefficient[:, again] for coefficient in shaped],
-            self._bounds,
+            self.relaxed_bounds,
             table,
             self.fixed,
         )
         rate[again] = some
         along = rate[:, movable] @ table[:, :, movable].swapaxes(1, 2)
-        step = advance(shaped, self._bounds, rate @ table.swapaxes(1, 2), along)
+        step = advance(shaped, self.relaxed_bounds, rate @ table.swapaxes(1, 2), along)
         rate[:, movable] *= (1 + step[:, None]) * (1 - self.margin)
         return again
 
     @cached_property
-    def _bounds(self) -> tuple[Array, Array]:
+    def relaxed_bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds, relaxed by rounding errors."""
         return self.lower - BOUND_ROUNDING * np.abs(
             self.lower
         ), self.upper + BOUND_ROUNDING * np.abs(self.upper)
 
     @cached_property
-    def _tolerance(self) -> float:
+    def violation_tolerance(self) -> float:
         """Tolerance of the violation [SI units of the largest bound]."""
         bounds = np.abs(np.concatenate([self.lower, self.upper]))
         return 10 * BOUND_ROUNDING * float(bounds[np.isfinite(bounds)].max(initial=0.0))
@@ -199,7 +201,7 @@ class TimeParametrization(PhaseGrid):
     def _c_arguments(self) -> tuple[_TimeParametrization, list[NDArray[Any]]]:
         """Arguments of time_parametrization.c for the problem, and the arrays that they point to."""
         lower, upper, order, fractions = (
-            *self._bounds,
+            *self.relaxed_bounds,
             *moves_of(self.rate.shape[2], self.fixed),
         )
         tables, spans = [[of(self.path), of(self.rate)] for of in (_by_point, _span_of)]
@@ -222,7 +224,7 @@ class TimeParametrization(PhaseGrid):
             MAX_RATE_DECREASE,
             self.margin,
             self.min_increase,
-            self._tolerance,
+            self.violation_tolerance,
         )
         return _TimeParametrization(*counts, *moves, *addresses, *bounds), arrays
 
