@@ -86,7 +86,8 @@ class Metrics:
     """Metrics of a plan, as defined in the paper's tables; nan if they could not be evaluated.
 
     Attributes: duration: Motion time [s]. effort: Integral of the sum over joints of
-        (torque / limit)^2 over time [s]. jerk: Largest jerk of a joint, in multiples of
+        (torque / limit)^2 over time [s], with drives that of the motors without dry
+        friction. jerk: Largest jerk of a joint, in multiples of
         its limit, by default 5/s x that of its acceleration. hit_speed: Speed of the
         tip at the goal [m/s]. z_error: Integral of |z - height of the table| over time
         [m s]; nan without a table. vertical_error: Integral of |roll| + |pitch| of the
