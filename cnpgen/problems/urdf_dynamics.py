@@ -73,8 +73,32 @@ def warn_of_friction(tree: Element, planned: Sequence[str], path: Path) -> None:
         )
 
 
-def joint_notes(tree: Element, joints: Sequence[UrdfJoint]) -> Iterator[str]:
-    """Yield a sentence for each further element of planned joints: soft limits, rates, controllers, transmissions."""
+def joint_notes(
+    tree: Element, joints: Sequence[UrdfJoint], *, soft: bool = True
+) -> Iterator[str]:
+    """Yield a sentence for each further element of planned joints: soft limits, rates, controllers, transmissions.
+
+    ``soft`` is whether soft limits are used.
+    """
+    yield from _controller_notes(tree, joints, soft=soft)
+    for rate in ("acceleration", "jerk"):
+        if given := [each.name for each in joints if rate in each.rates]:
+            yield f"the URDF limits the {rate} of {', '.join(given)}; [limits] replaces it"
+    reduced = {
+        joint.get("name", "")
+        for transmission in tree.findall("transmission")
+        for joint in transmission.findall("joint")
+        if transmission.find(".//mechanicalReduction") is not None
+    }
+    if found := [each.name for each in joints if each.name in reduced]:
+        text = "a gear ratio without a rotor inertia has no effect, and is not used"
+        yield f"<transmission> of {', '.join(found)}: {text}"
+
+
+def _controller_notes(
+    tree: Element, joints: Sequence[UrdfJoint], *, soft: bool
+) -> Iterator[str]:
+    """Yield sentences about the <safety_controller> elements of joints."""
     names = {each.name for each in joints}
     elements = {
         name: controller
@@ -82,11 +106,14 @@ def joint_notes(tree: Element, joints: Sequence[UrdfJoint]) -> Iterator[str]:
         if (name := joint.get("name", "")) in names
         and (controller := joint.find("safety_controller")) is not None
     }
-    soft = [each for each in joints if each.soft != NO_SOFT_LIMITS]
-    if soft:
-        ranges = (f"{each.name} [{each.soft[0]:g}, {each.soft[1]:g}]" for each in soft)
-        yield f"soft limits of the URDF narrow the position limits: {', '.join(ranges)}"
-    limited = {each.name for each in soft}
+    limited = {each.name: each.soft for each in joints if each.soft != NO_SOFT_LIMITS}
+    narrower = [each for each in joints if _is_narrowed(each)]
+    if narrower:
+        ranges = ", ".join(
+            f"{each.name} [{each.soft[0]:g}, {each.soft[1]:g}]" for each in narrower
+        )
+        effect = "narrow the position limits" if soft else "are ignored"
+        yield f"soft limits of the URDF {effect}: {ranges}"
     if none := [name for name in elements if name not in limited]:
         yield f"no soft limits, or zero for both, which stands for none: {', '.join(none)}"
     gains = [
@@ -95,16 +122,12 @@ def joint_notes(tree: Element, joints: Sequence[UrdfJoint]) -> Iterator[str]:
         if any(each.get(key) is not None for each in elements.values())
     ]
     if gains:
-        yield f"{' and '.join(gains)} of <safety_controller> are not used"
-    for rate in ("acceleration", "jerk"):
-        if given := [each.name for each in joints if rate in each.rates]:
-            yield f"limits of the URDF bound the {rate} of {', '.join(given)}"
-    reduced = {
-        joint.get("name", "")
-        for transmission in tree.findall("transmission")
-        for joint in transmission.findall("joint")
-        if transmission.find(".//mechanicalReduction") is not None
-    }
-    if found := sorted(reduced & names):
-        text = "a gear ratio without a rotor inertia has no effect, and is not used"
-        yield f"<transmission> of {', '.join(found)}: {text}"
+        yield f"not used of <safety_controller>: {', '.join(gains)}"
+
+
+def _is_narrowed(joint: UrdfJoint) -> bool:
+    """Return whether a soft limit of a joint is within its hard limits."""
+    low, high = joint.soft
+    return low > joint.limits.get("lower", -math.inf) or high < joint.limits.get(
+        "upper", math.inf
+    )

@@ -132,9 +132,7 @@ class Drive:
     def resting_friction(self) -> Array:
         """Largest friction of the envelope at dq = 0 [N m], shape (n,): ``c + (1 - h) b w``."""
         uncertain = 1 - self.friction_help
-        return np.asarray(
-            self.coulomb + uncertain * self.viscous * self.reversal_speed
-        )
+        return np.asarray(self.coulomb + uncertain * self.viscous * self.reversal_speed)
 
     @property
     def summary(self) -> str:

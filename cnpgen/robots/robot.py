@@ -268,7 +268,7 @@ def _narrow_to_soft_limits(
             soft = f"[{joint.soft[0]:g}, {joint.soft[1]:g}]"
             text = f"joint {joint.name!r}: its soft limits {soft} leave nothing of its limits"
             errors.append(
-                f"{text} [{hard[0]:g}, {hard[1]:g}]; [limits] soft = \"ignore\" drops them"
+                f'{text} [{hard[0]:g}, {hard[1]:g}]; [limits] soft = "ignore" drops them'
             )
         model.lowerPositionLimit[place], model.upperPositionLimit[place] = low, high
     if errors:

@@ -97,7 +97,7 @@ class RobotWorld(ABC, Generic[Value]):
     def linear_torque(self) -> Array:
         """Torques at the motors without dry friction [N m], those of the rigid body without drives."""
         if self.robot.drive is None:
-            return self.torque
+            return np.asarray(self.torque)
         return linear_torque(self.robot.drive, self.torque, self.dq, self.ddq)
 
     def segment_distances(self, sufficient: float = np.inf) -> list[Value]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from cnpgen.problems.constraints.constraint import Array, Condition, Constraint
+from cnpgen.robots.drive import RIGID
 from cnpgen.schema.keys import field
 from cnpgen.store.joint_units import units_of_joints
 
@@ -147,13 +148,17 @@ class JointTorque(_RelativeLimit):
         joint = super()._within(state, factor) if drive.limits_joint else ()
         low, high = state.motor_torque
         # Both rows have both bounds: the redundant ones never bind, since high >= low.
-        highest = _of_joints(state.robot, "highest motor torque", high, drive.motor_rows)
-        lowest = _of_joints(state.robot, "lowest motor torque", low, drive.uncertain_rows)
+        highest = _of_joints(
+            state.robot, "highest motor torque", high, drive.motor_rows
+        )
+        lowest = _of_joints(
+            state.robot, "lowest motor torque", low, drive.uncertain_rows
+        )
         return (*joint, *highest, *lowest)
 
 
 def _of_joints(
-    robot: "Robot", name: str, torque: Sequence[Any], joints: tuple[int, ...]
+    robot: "Robot", name: str, torque: Sequence[Any] | Array, joints: tuple[int, ...]
 ) -> tuple[Condition, ...]:
     """Return the condition that motor torques of some joints are within their limits, none without joints."""
     if robot.drive is None or not joints:
@@ -163,6 +168,13 @@ def _of_joints(
     parts = tuple(robot.joint_names[joint] for joint in joints)
     g = [torque[joint] for joint in joints]
     return (Condition(name, unit, g, -limit, limit, "limit", parts),)
+
+
+def judged_torque(constraints: Sequence[Constraint], robot: "Robot") -> str:
+    """Return which torque the constraints limit, in words; empty if they limit none."""
+    if not any(isinstance(each, JointTorque) for each in constraints):
+        return ""
+    return RIGID if robot.drive is None else robot.drive.summary
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -231,8 +231,14 @@ def _limited_torques(
         return inertia, bias, robot.torque_limit
     lowest, highest = friction_bounds(drive, dq)
     with_rotors = inertia + np.diag(drive.armature)
-    rows = [(with_rotors[joint], bias[joint] + highest[joint], drive.torque_limit[joint]) for joint in drive.motor_rows]
-    rows += [(with_rotors[joint], bias[joint] + lowest[joint], drive.torque_limit[joint]) for joint in drive.uncertain_rows]
+    rows = [
+        (with_rotors[joint], bias[joint] + highest[joint], drive.torque_limit[joint])
+        for joint in drive.motor_rows
+    ]
+    rows += [
+        (with_rotors[joint], bias[joint] + lowest[joint], drive.torque_limit[joint])
+        for joint in drive.uncertain_rows
+    ]
     if drive.limits_joint:
         rows += list(zip(inertia, bias, robot.torque_limit, strict=True))
     matrices, values, limits = zip(*rows, strict=True)
