@@ -20,8 +20,8 @@ from cnpgen.addons.trajectories.trajectory_verdict import Decision, TrajectoryVe
 from cnpgen.errors import UsageError, counted
 from cnpgen.judges.plans.judge import check_step
 from cnpgen.plans.evaluate import MAX_VERDICT_STEP_S, judged_in_parts
-from cnpgen.problems.problem import Problem
 from cnpgen.problems.constraints.joint import judged_torque
+from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import number, numbers
