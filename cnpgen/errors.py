@@ -27,9 +27,9 @@ def _limited(text: str) -> str:
 class CnpgenError(Exception):
     """Base class of all exceptions that cnpgen raises intentionally.
 
-    Args: message: The error. With ``argument`` it is a predicate: "must be positive,
-        got 0". ``{name}`` stands for an
-            argument of ``remedies``.
+    Args:
+        message: The error. With ``argument`` it is a predicate: "must be positive, got
+            0". ``{name}`` stands for an argument of ``remedies``.
         argument: Name of the invalid argument, which begins the text.
         concerns: Name of the invalid argument if the message is a whole sentence; by
             default the first of ``remedies``.

@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.search is not None:
         return _search(arguments.search, pages, as_json=arguments.json)
     if arguments.url:
-        print(page_url(pages[name] if name else pages["index"]))
+        _print_url(pages[name] if name else pages["index"])
     elif name is None:
         _list(pages, as_json=arguments.json)
     elif arguments.json:
@@ -48,6 +48,14 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         print(_text(pages[name]), end="")
     return 0
+
+
+def _print_url(page: Path) -> None:
+    url = page_url(page)
+    if url is None:
+        text = "the documentation has no address yet: 'cnpgen docs PAGE' prints a page"
+        raise UsageError(text)
+    print(url)
 
 
 def docs_folder() -> Path:
@@ -95,22 +103,26 @@ def page_name(text: str, pages: dict[str, Path]) -> str:
     return name
 
 
-def page_url(page: Path) -> str:
-    """Return the address of a page on the site."""
-    from cnpgen.machine.versions import DOCUMENTATION_URL
+def page_url(page: Path) -> str | None:
+    """Return the address of a page on the site; None if the site has no address."""
+    from cnpgen.machine import versions
 
-    return f"{DOCUMENTATION_URL}docs/{page.relative_to(docs_folder()).with_suffix('.html').as_posix()}"
+    if not versions.DOCUMENTATION_URL:
+        return None
+    path = page.relative_to(docs_folder()).with_suffix(".html").as_posix()
+    return f"{versions.DOCUMENTATION_URL}docs/{path}"
 
 
 def mentioned_addresses(text: str) -> list[str]:
     """Return the addresses of the pages that a text names as ``'cnpgen docs PAGE'``.
 
-    None without installed pages.
+    None without installed pages or an address of the site.
     """
     names = re.findall(r"'cnpgen docs ([\w/-]+)'", " ".join(text.split()))
     with suppress(CnpgenError):
         pages = list_pages() if names else {}
-        return [page_url(pages[name]) for name in dict.fromkeys(names) if name in pages]
+        named = [pages[name] for name in dict.fromkeys(names) if name in pages]
+        return list(filter(None, map(page_url, named)))
     return []
 
 

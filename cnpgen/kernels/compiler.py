@@ -44,7 +44,7 @@ def find_compiler() -> str | None:
     """Return the command of the C compiler: ``$CC``, else cc, gcc, clang or that of ziglang; None if there is none.
 
     It is quoted for a shell: CC may be a path with spaces, or a program with options
-    ("ccache gcc").
+        ("ccache gcc").
     """
     if configured := os.environ.get("CC"):
         return _command([configured]) or _command(_words(configured))

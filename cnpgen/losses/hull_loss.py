@@ -34,8 +34,9 @@ class HullLoss:
 
     ``tightening`` has the factors, then the insets of all constraints, shape (2 m,).
 
-    Raises: UsageError: The problem has no constraint ``robot-clearance``, or its robot
-        no link geometry.
+    Raises:
+        UsageError: The problem has no constraint ``robot-clearance``, or its robot no
+            link geometry.
     """
 
     def __init__(

@@ -244,8 +244,9 @@ def relaxation_of(
     It is that of motions that may start outside a constraint: at phases s, shape (K,),
     with positions of the tip at the start [m], shape (N, 3).
 
-    Raises: UsageError: ``bound_relaxation`` of a constraint returns another shape than
-        its contract states.
+    Raises:
+        UsageError: ``bound_relaxation`` of a constraint returns another shape than its
+            contract states.
     """
     rows = []
     for constraint, condition in time_varying:

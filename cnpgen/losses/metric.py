@@ -35,17 +35,23 @@ TRIMMED_FRACTION = (
 class MetricSettings:
     """The dependence of weights on the progress of a run (0 at its start, 1 at its end) and on the losses of plans.
 
-    Attributes: kind: "fixed": the first weights; "ramped": growing weights; "learned":
-        the published rule. growth: Factor by which ramped weights grow, and budgets of
-        the learned metric shrink, during the ramp. ramp: Progress at the start and the
-        end of the ramp, which is geometric. gamma: Step size of the learned metric.
-        every: Interval of its steps: "epoch", as published, or "batch". largest_log:
-        Bound on ``|log(mean L_i / C_i)|`` in a step, from the authors' implementation.
+    Attributes:
+        kind: "fixed": the first weights; "ramped": growing weights; "learned": the
+            published rule.
+        growth: Factor by which ramped weights grow, and budgets of the learned metric
+            shrink, during the ramp.
+        ramp: Progress at the start and the end of the ramp, which is geometric.
+        gamma: Step size of the learned metric.
+        every: Interval of its steps: "epoch", as published, or "batch".
+        largest_log: Bound on ``|log(mean L_i / C_i)|`` in a step, from the authors'
+            implementation.
         lowest: Lower bound of a learned weight; without it the weight of a term without
-        violations decreases forever. highest: Upper bound of a learned weight.
-        budget_factor: Factor of all budgets of the learned metric. average: Average
-        over the plans of a batch: "mean" as published, "median" or "trimmed". frozen:
-        Progress after which a learned metric is constant.
+            violations decreases forever.
+        highest: Upper bound of a learned weight.
+        budget_factor: Factor of all budgets of the learned metric.
+        average: Average over the plans of a batch: "mean" as published, "median" or
+            "trimmed".
+        frozen: Progress after which a learned metric is constant.
     """
 
     kind: Kind = "ramped"
@@ -149,9 +155,12 @@ def average_loss(terms: ArrayLike, average: Average) -> Array:
 class Metric:
     """The weights of one training run.
 
-    Args: weights: First weights (e^alpha), shape (m,); a term of weight 0 is omitted
-        and keeps this weight. budgets: Acceptable value of every term (the paper's
-        C-bar^2), shape (m,); 0 where there is none. settings: Settings of the metric.
+    Args:
+        weights: First weights (e^alpha), shape (m,); a term of weight 0 is omitted and
+            keeps this weight.
+        budgets: Acceptable value of every term (the paper's C-bar^2), shape (m,); 0
+            where there is none.
+        settings: Settings of the metric.
 
     Attributes:
         alpha: Logarithms of the present weights, shape (m,).

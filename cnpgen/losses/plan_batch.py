@@ -75,8 +75,9 @@ def check_batch(
 ) -> PlanBatch:
     """Check the caller's arguments and make a batch of them.
 
-    Raises: UsageError: A shape is wrong, the obstacle poses are missing, or a value is
-        not a real number.
+    Raises:
+        UsageError: A shape is wrong, the obstacle poses are missing, or a value is not
+            a real number.
     """
     arguments = {
         "path": (path, dtype),

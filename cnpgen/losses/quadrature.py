@@ -30,8 +30,9 @@ def quadrature(rule: str, nodes: int, shift: float = 0.0) -> tuple[Array, Array]
     nodes of the cosine rule are offset by a fraction of their spacing in theta, in [0,
     1). The average over shifts covers the intervals between nodes.
 
-    Raises: UsageError: The rule does not exist, the number of nodes is no positive
-        integer, or the shift is not in [0, 1).
+    Raises:
+        UsageError: The rule does not exist, the number of nodes is no positive integer,
+            or the shift is not in [0, 1).
     """
     check_quadrature(rule, nodes, shift)
     if rule == "gauss":

@@ -44,10 +44,11 @@ def signals_handled(
     Ignored signals stay ignored. Outside the main thread, which alone may set handlers,
     nothing changes.
 
-    Args: first: Called with the number of the first signal. again: Called with the
-        number of a later signal. stay: Whether the handlers stay after the block once a
-        signal was received; otherwise the previous ones are
-            restored.
+    Args:
+        first: Called with the number of the first signal.
+        again: Called with the number of a later signal.
+        stay: Whether the handlers stay after the block once a signal was received;
+            otherwise the previous ones are restored.
     """
     received, before = Received(), _handlers()
 

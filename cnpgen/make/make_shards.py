@@ -43,12 +43,16 @@ MAX_SPOT_CHECK_ROWS = (
 class Job:
     """Picklable input of a worker.
 
-    Attributes: folder: Folder of the dataset. spec: Specification of the dataset.
+    Attributes:
+        folder: Folder of the dataset.
+        spec: Specification of the dataset.
         pipeline: Pipeline of the dataset; None to rebuild it from the specification,
-        for workers without its files. backend: Backend of the kernels. cache_folder:
-        Folder of compiled kernels; None for the default folder of the worker's machine.
+            for workers without its files.
+        backend: Backend of the kernels.
+        cache_folder: Folder of compiled kernels; None for the default folder of the
+            worker's machine.
         date: Date of all records, from SOURCE_DATE_EPOCH; None for the current time and
-        durations.
+            durations.
     """
 
     folder: Path

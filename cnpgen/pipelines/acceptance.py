@@ -2,9 +2,8 @@
 
 The check is independent of the stages: it makes no assumption about their convergence,
 order or tolerances. States that conservative conditions do not accept go to a narrow
-phase: exact checks with Pinocchio and Coal. A capsule contains its
-link: if the capsule has clearance, so has the link. Otherwise the convex parts of the
-    link are checked.
+phase: exact checks with Pinocchio and Coal. A capsule contains its link: if the capsule
+has clearance, so has the link. Otherwise the convex parts of the link are checked.
 """
 
 from collections.abc import Callable, Collection
@@ -194,9 +193,10 @@ def narrow_phase_of(context: Context, end: End, *, exact: bool = True) -> Decide
     The tolerances of boundary states apply if it is ``exact``, otherwise those of
     motions.
 
-    Returns: A function of states ``(q, dq, ddq)``, shape (n, N) each, obstacle poses,
-        shape (width, N), a mask of the states to check, shape (N,), and the candidates.
-        It returns a mask of the violated constraints, shape (constraints, N).
+    Returns:
+        A function of states ``(q, dq, ddq)``, shape (n, N) each, obstacle poses, shape
+        (width, N), a mask of the states to check, shape (N,), and the candidates. It
+        returns a mask of the violated constraints, shape (constraints, N).
     """
     problem, robot = context.problem, context.robot
     if (

@@ -34,9 +34,11 @@ class Completion:
     A task without start columns starts at rest at the base configuration. Tip positions
     follow from given joint positions.
 
-    Attributes: context: Problem, robot and kernels. given: Columns of the tasks: name
-        -> field. height: Tip height on the problem's table [m], the default z of
-        positions; None without a table.
+    Attributes:
+        context: Problem, robot and kernels.
+        given: Columns of the tasks: name -> field.
+        height: Tip height on the problem's table [m], the default z of positions; None
+            without a table.
     """
 
     def __init__(

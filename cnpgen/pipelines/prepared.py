@@ -40,10 +40,11 @@ BOOKKEEPING = (SCENE_ID, "attempts", "sample_id")  # fields that no stage writes
 class Block:
     """Accepted rows in sampling order, and the statistics of all candidates up to the last row.
 
-    Attributes: columns: Field name -> values, shape (width, rows); (1, rows) for
-        scalars. sampling: Counts of candidates and rejections, and density maps.
+    Attributes:
+        columns: Field name -> values, shape (width, rows); (1, rows) for scalars.
+        sampling: Counts of candidates and rejections, and density maps.
         scenes: Scenes of the rows, whose IDs are those of the column ``scene_id``; None
-        without scenes.
+            without scenes.
     """
 
     columns: dict[str, NDArray[Any]]

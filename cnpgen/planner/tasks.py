@@ -33,13 +33,17 @@ EXPECTED_TIMES = (
 class Tasks:
     """N planning tasks of one problem with n joints.
 
-    Attributes: boundary: Boundary conditions, shape (N, n) each. start_xyz: Tip
-        positions at the start, world frame [m], shape (N, 3). goal_xyz: Tip positions
-        at the goal, world frame [m], shape (N, 3). expected_time: Unit of durations
-        [s], shape (N,): network outputs are rates times this. scene: Obstacles of the
-        tasks. correction: Offsets of the projected line from the straight one [rad],
-        shape (N, m, n); None if it is straight. placed: Obstacles of a problem whose
-        samples place them; ``scene`` has none then. None for other problems.
+    Attributes:
+        boundary: Boundary conditions, shape (N, n) each.
+        start_xyz: Tip positions at the start, world frame [m], shape (N, 3).
+        goal_xyz: Tip positions at the goal, world frame [m], shape (N, 3).
+        expected_time: Unit of durations [s], shape (N,): network outputs are rates
+            times this.
+        scene: Obstacles of the tasks.
+        correction: Offsets of the projected line from the straight one [rad], shape (N,
+            m, n); None if it is straight.
+        placed: Obstacles of a problem whose samples place them; ``scene`` has none
+            then. None for other problems.
         observation: Features of the placed obstacles, shape (N, F), or None.
     """
 

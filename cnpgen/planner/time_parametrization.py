@@ -97,13 +97,17 @@ class _TimeParametrization(ctypes.Structure):
 class TimeParametrization(PhaseGrid):
     """Time parametrization of one problem's motions; made by ``make_time_parametrization``.
 
-    Attributes: coefficients: Kernel of ``expressions.speed_coefficients``. lower: Lower
-        bounds of its rows, shape (m,). upper: Upper bounds of its rows, shape (m,).
-        joints: Number of joints. fixed: Number of control points of the rate at either
-        end that stay; 0 from rest to rest. margin: Relative decrease of the rates after
-        the last step. min_increase: Largest increase of a control point in a sweep
-        above which all control points move again. library: Library of
-        time_parametrization.c; None if kernels are not compiled.
+    Attributes:
+        coefficients: Kernel of ``expressions.speed_coefficients``.
+        lower: Lower bounds of its rows, shape (m,).
+        upper: Upper bounds of its rows, shape (m,).
+        joints: Number of joints.
+        fixed: Number of control points of the rate at either end that stay; 0 from rest
+            to rest.
+        margin: Relative decrease of the rates after the last step.
+        min_increase: Largest increase of a control point in a sweep above which all
+            control points move again.
+        library: Library of time_parametrization.c; None if kernels are not compiled.
     """
 
     coefficients: Kernel
@@ -125,8 +129,8 @@ class TimeParametrization(PhaseGrid):
         necessary.
 
         The mask of motions that meet the limits, shape (N,), is False also for motions
-        whose control points moved
-        twice: they exceed the limits more between the phases.
+        whose control points moved twice: they exceed the limits more between the
+        phases.
         """
         rate, violation = (
             np.array(motion.rate, np.float64, order="C"),

@@ -71,15 +71,17 @@ def scene_plans(
 ) -> Plans:
     """Return the boundary problems of scenes, from rest to rest, as plans without motions.
 
-    Args: problem: The robot's problem. Obstacles of the scenes are added to its own.
-        scenes: The scenes. goals: Joint positions at the goals in the order of the
-        planned joints, shape (n,) each; by default the first
-            goal state of each scene.
+    Args:
+        problem: The robot's problem. Obstacles of the scenes are added to its own.
+        scenes: The scenes.
+        goals: Joint positions at the goals in the order of the planned joints, shape
+            (n,) each; by default the first goal state of each scene.
         capacity: Numbers of obstacles, see ``capacity_of``.
         sample_id: Sample IDs; by default the indices of the scenes.
 
-    Raises: SceneError: A scene lacks a planned joint or a goal state, or a position is
-        outside its limits.
+    Raises:
+        SceneError: A scene lacks a planned joint or a goal state, or a position is
+            outside its limits.
     """
     check_scenes(scenes)
     problem.urdf_text  # noqa: B018 - read once for all capacities

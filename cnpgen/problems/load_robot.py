@@ -43,9 +43,10 @@ MAX_OBSTACLE_RATIO = 10.0  # distance of an obstacle / reach
 def load_robot(problem: Problem) -> Robot:
     """Load the robot of a problem.
 
-    Raises: RecipeError: The URDF cannot be read, or is inconsistent with the joints,
-        tip, base configuration or limits. PluginError: The URDF belongs to a package
-        that is not installed.
+    Raises:
+        RecipeError: The URDF cannot be read, or is inconsistent with the joints, tip,
+            base configuration or limits.
+        PluginError: The URDF belongs to a package that is not installed.
     """
     spec, limits = problem.robot, problem.limits
     with recipe_errors_in(problem.path):

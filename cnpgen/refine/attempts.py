@@ -5,8 +5,8 @@
 3. Other initial guesses, and the best attempt so far after uniform time scaling.
 4. Step 2 again, from a straight line at constant rate, then from the best attempt so far.
 5. Without a deadline: levels on hulls in place of capsules, and joint-space paths of RRT-Connect. If compiled trees can
-   search these paths, they come right after step 2, whose finer levels run only for nearly valid attempts. Without a
-   path there are no further attempts.
+   search these paths, they come right after step 2, whose finer levels run only for
+   nearly valid attempts. Without a path there are no further attempts.
 """
 
 from collections.abc import Generator, Iterator

@@ -133,12 +133,15 @@ class Attempt:
     ``violation``, ``severity``, ``is_precise``, ``touches`` and ``x`` are used by the
     search, not part of its result.
 
-    Attributes: path: Path control points [rad], shape (C, n). rate: Rate control points
-        [1/s], shape (R,). cost: Objective [s]. outcome: Outcome of the refinement if
-        this attempt is its result. iterations: Iterations of the solver. reason: Reason
-        of the independent verdict: "ok", or why the plan is not valid; None before it
-        is judged. For
-            ends that violate a constraint, the reason of that constraint.
+    Attributes:
+        path: Path control points [rad], shape (C, n).
+        rate: Rate control points [1/s], shape (R,).
+        cost: Objective [s].
+        outcome: Outcome of the refinement if this attempt is its result.
+        iterations: Iterations of the solver.
+        reason: Reason of the independent verdict: "ok", or why the plan is not valid;
+            None before it is judged. For ends that violate a constraint, the reason of
+            that constraint.
         violation: Largest violation on the 600-point grid, as a multiple of its
             tolerance; at most 1 is accepted. It is 0 where it was not evaluated because
             the solver converged within its bounds.

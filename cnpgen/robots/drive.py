@@ -96,12 +96,14 @@ NO_DRIVE = DriveSpec()
 class Drive:
     """Drives of a robot; values are seen at the joints, for prismatic ones with kg, N s/m, N and m/s.
 
-    Attributes: armature: Inertia of the rotors J [kg m^2], shape (n,). viscous: Viscous
-        friction b [N m s/rad], shape (n,). coulomb: Dry friction c [N m], shape (n,).
-        friction_help: Certain fraction h of the friction. reversal_speed: Speed w
-        [rad/s] below which its direction is uncertain. limits: "both", "joint" or
-        "motor". torque_limit: Symmetric planning limit of motor torques [N m], shape
-        (n,).
+    Attributes:
+        armature: Inertia of the rotors J [kg m^2], shape (n,).
+        viscous: Viscous friction b [N m s/rad], shape (n,).
+        coulomb: Dry friction c [N m], shape (n,).
+        friction_help: Certain fraction h of the friction.
+        reversal_speed: Speed w [rad/s] below which its direction is uncertain.
+        limits: "both", "joint" or "motor".
+        torque_limit: Symmetric planning limit of motor torques [N m], shape (n,).
     """
 
     armature: Array

@@ -41,9 +41,10 @@ class SampleIndexError(UsageError, IndexError):
 class Scene:
     """The obstacles of N samples, created where samples enter and passed along.
 
-    Attributes: obstacles: The obstacles, the same for all samples. poses: Poses and
-        sizes of the obstacles of each sample (``cnpgen.robots.solid``), shape (N,
-        width).
+    Attributes:
+        obstacles: The obstacles, the same for all samples.
+        poses: Poses and sizes of the obstacles of each sample
+            (``cnpgen.robots.solid``), shape (N, width).
     """
 
     obstacles: tuple[Obstacle, ...]
@@ -84,11 +85,13 @@ class Scene:
     def with_poses(self, poses: Array) -> Scene:
         """Return the scene with other poses and sizes of the obstacles; values for a constraint are kept.
 
-        Args: poses: Poses and sizes of the obstacles of each sample, shape (N,
-            ``pose_width(obstacles)``).
+        Args:
+            poses: Poses and sizes of the obstacles of each sample, shape (N,
+                ``pose_width(obstacles)``).
 
-        Raises: UsageError: The shape is wrong, or a number is not finite or larger than
-            ``MAX_COORDINATE_M``.
+        Raises:
+            UsageError: The shape is wrong, or a number is not finite or larger than
+                ``MAX_COORDINATE_M``.
         """
         expected = len(self), pose_width(self.obstacles)
         if poses.shape != expected:

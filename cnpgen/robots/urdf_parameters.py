@@ -65,13 +65,17 @@ class LinkInertia:
 class UrdfJoint:
     """Joint of a URDF, which moves the link ``child`` on the link ``parent``.
 
-    Attributes: origin: LinkFrame of the child at position zero in the parent. axis:
-        Unit axis, shape (3,). limits: Limit -> value [rad, rad/s, N m, or with m and
-        N]: "lower", "upper", "velocity" and "effort". rates: Limits of URDF 1.2:
-        "acceleration" [rad/s^2], the smaller one if "deceleration" is given, too, and
-        "jerk" [rad/s^3]; without those that are absent or zero. damping: Viscous
-        friction [N m s/rad]. friction: Dry friction [N m]. soft: Lower and upper soft
-        limits of the position [rad]; infinite ones for none.
+    Attributes:
+        origin: LinkFrame of the child at position zero in the parent.
+        axis: Unit axis, shape (3,).
+        limits: Limit -> value [rad, rad/s, N m, or with m and N]: "lower", "upper",
+            "velocity" and "effort".
+        rates: Limits of URDF 1.2: "acceleration" [rad/s^2], the smaller one if
+            "deceleration" is given, too, and "jerk" [rad/s^3]; without those that are
+            absent or zero.
+        damping: Viscous friction [N m s/rad].
+        friction: Dry friction [N m].
+        soft: Lower and upper soft limits of the position [rad]; infinite for none.
     """
 
     name: str

@@ -220,9 +220,11 @@ def open_training_data(
 ) -> TrainingData:
     """Open a dataset for training or, with the problem of a robot, a scene file or a folder of scene files.
 
-    Raises: DatasetError: It is missing, unfinished or damaged, or has no rows for
-        training or validation. UsageError: There is no such robot or file. SceneError:
-        A scene does not fit the robot.
+    Raises:
+        DatasetError: It is missing, unfinished or damaged, or has no rows for training
+            or validation.
+        UsageError: There is no such robot or file.
+        SceneError: A scene does not fit the robot.
     """
     if robot is not None:
         with concerning("robot"):

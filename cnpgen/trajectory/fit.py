@@ -51,17 +51,22 @@ def fit_motion(
 ) -> Motion:
     """Fit a motion to samples of one trajectory; ``largest_error`` returns the error of the fit.
 
-    Args: t: Times of the samples [s], shape (K,), increasing; the motion starts at the
-        first one. q: Joint positions [rad], shape (K, n). dq: Joint velocities [rad/s],
-        shape (K, n): with them, samples are connected by cubics. spec: Degree and
-        numbers of control points. boundary: Boundary conditions of the motion, met
-        exactly; ``sampled_boundary`` by default.
+    Args:
+        t: Times of the samples [s], shape (K,), increasing; the motion starts at the
+            first one.
+        q: Joint positions [rad], shape (K, n).
+        dq: Joint velocities [rad/s], shape (K, n): with them, samples are connected by
+            cubics.
+        spec: Degree and numbers of control points.
+        boundary: Boundary conditions of the motion, met exactly; ``sampled_boundary``
+            by default.
 
     Returns:
         One motion of duration ``t[-1] - t[0]``.
 
-    Raises: UsageError: A shape is wrong, the times do not increase, or a value is not
-        finite.
+    Raises:
+        UsageError: A shape is wrong, the times do not increase, or a value is not
+            finite.
     """
     times, positions, velocities = checked_samples(t, q, dq)
     if boundary is None:

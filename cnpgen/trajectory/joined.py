@@ -27,8 +27,9 @@ class JoinedMotion:
         parts: Parts, N motions each, of the same joints.
         start_times: Start time of each part [s], shape (P, N), ascending from 0.
 
-    Raises: UsageError: A part does not start in the state at which the previous part is
-        cut.
+    Raises:
+        UsageError: A part does not start in the state at which the previous part is
+            cut.
     """
 
     parts: tuple[Motion, ...]

@@ -33,8 +33,9 @@ def checked_samples(
 ) -> tuple[Array, Array, Array | None]:
     """Return times (K,) [s], positions and velocities (K, n) of one trajectory as arrays of float64.
 
-    Raises: UsageError: A shape is wrong, the times do not increase, or a value is not
-        finite.
+    Raises:
+        UsageError: A shape is wrong, the times do not increase, or a value is not
+            finite.
     """
     times, positions = numbers("t", t), numbers("q", q)
     velocities = None if dq is None else numbers("dq", dq)
@@ -107,8 +108,9 @@ def sampled_boundary(
     Returns:
         Boundary conditions of one motion with a free goal acceleration.
 
-    Raises: UsageError: A shape is wrong, the times do not increase, or a value is not
-        finite.
+    Raises:
+        UsageError: A shape is wrong, the times do not increase, or a value is not
+            finite.
     """
     times, positions, velocities = checked_samples(t, q, dq)
     times, path = resampled(times - times[0], positions, velocities)

@@ -109,7 +109,8 @@ class CollisionWorld:
     ) -> tuple[float, Array]:
         """Measure the signed distance of the segment from a to b [m] from one obstacle.
 
-        Returns: The distance [m], minus the penetration depth if they overlap, and the
+        Returns:
+            The distance [m], minus the penetration depth if they overlap, and the
             separating unit vector from the obstacle to the segment, shape (3,).
         """
         self._place_segment(a, b)

@@ -42,9 +42,10 @@ class ForwardKinematics:
     def poses(self, q: Array) -> tuple[Array, Array]:
         """Compute the poses of all joints at K > 0 states q [rad], shape (n, K).
 
-        Returns: ``(rotations, positions)``: rotation matrices in the world frame, that
-            of the base first, shape (n + 1, 3, 3, K), and positions [m], shape (n + 1,
-            3, K).
+        Returns:
+            ``(rotations, positions)``: rotation matrices in the world frame, that of
+            the base first, shape (n + 1, 3, 3, K), and positions [m], shape (n + 1, 3,
+            K).
 
         Raises:
             MachineError: The poses differ from Pinocchio's.

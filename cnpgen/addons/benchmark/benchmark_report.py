@@ -163,9 +163,11 @@ def save_benchmark_report(
 ) -> Path:
     """Write the report of a benchmark as one self-contained file; an existing file is replaced.
 
-    Args: benchmark: Result of ``run_benchmark``. path: Output file, ``.html``. video:
-        Whether to film the first plan of every planner, instead of an image; takes some
-        seconds each.
+    Args:
+        benchmark: Result of ``run_benchmark``.
+        path: Output file, ``.html``.
+        video: Whether to film the first plan of every planner, instead of an image;
+            takes some seconds each.
 
     Raises:
         MachineError: matplotlib is missing, or the file cannot be written.

@@ -68,8 +68,9 @@ class Cluster(ABC):
     ) -> Generator[R, None, None]:
         """Run a function on every task and yield the results.
 
-        Raises: MachineError: A task has crashed several workers, or the connection to
-            the cluster is lost.
+        Raises:
+            MachineError: A task has crashed several workers, or the connection to the
+                cluster is lost.
         """
         submit, left = self.prepared(function), enumerate(tasks)
         under_way: dict[Any, int] = {}

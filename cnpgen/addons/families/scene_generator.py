@@ -65,9 +65,10 @@ def shipped_families() -> dict[str, type[SceneFamily]]:
 def load_family(name: str, parameters: Mapping[str, Any] | None = None) -> SceneFamily:
     """Return a family by its name.
 
-    Args: name: Its name among ``shipped_families``, or that of an installed package.
+    Args:
+        name: Its name among ``shipped_families``, or that of an installed package.
         parameters: Values of its fields, as in recipes: ``{"tables": [1, 2], "height":
-        "[0, 30] cm"}``.
+            "[0, 30] cm"}``.
 
     Raises:
         UsageError: The family or a parameter is unknown, or a value is invalid.
@@ -117,9 +118,9 @@ def make_scenes(
         parameters: Values of the fields of a named family.
         progress: Called with the number of problems since the last call.
 
-    Raises: UsageError: An argument is invalid, the problem has an equality constraint,
-        or no problems are found for this
-            robot.
+    Raises:
+        UsageError: An argument is invalid, the problem has an equality constraint, or
+            no problems are found for this robot.
     """
     n, seed = integer("n", n, least=1, most=MAX_SCENES), integer("seed", seed, least=0)
     per_scene = integer("per_scene", per_scene, least=1)

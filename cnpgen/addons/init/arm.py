@@ -78,9 +78,10 @@ class Arm:
 def read_arm(urdf: Path, tip: str | None) -> Arm:
     """Read an arm, whose tip frame is a link or a joint, by default the only link without a child.
 
-    Raises: RecipeError: The file cannot be read, needs xacro, or has no joint that
-        moves the tip. UsageError: The frame does not exist, or several links have no
-        child.
+    Raises:
+        RecipeError: The file cannot be read, needs xacro, or has no joint that moves
+            the tip.
+        UsageError: The frame does not exist, or several links have no child.
     """
     try:
         tree = urdf_tree(read_urdf(urdf))

@@ -54,7 +54,8 @@ def comfortable_base(
     the distance from the nearest limit. If no state is free of collisions and within
     the torque limits, the best of the others is returned.
 
-    Returns: Joint positions [rad], rounded, and notes about conditions that it does not
+    Returns:
+        Joint positions [rad], rounded, and notes about conditions that it does not
         meet.
     """
     world, states = World(robot), _states(robot)

@@ -62,11 +62,13 @@ SCALES = (
 class ImportedTrajectories:
     """Plans of N sampled trajectories.
 
-    Attributes: plans: The plans, with one number of control points for all. deviation:
-        Largest distance of a plan from its samples over all joints [rad], shape (N,).
+    Attributes:
+        plans: The plans, with one number of control points for all.
+        deviation: Largest distance of a plan from its samples over all joints [rad],
+            shape (N,).
         snapped: Largest change of a boundary position [rad], shape (N,); nan where the
-        constraints cannot be met by a
-            small change, so that the boundary conditions are those of the samples.
+            constraints cannot be met by a small change, so that the boundary conditions
+            are those of the samples.
     """
 
     plans: Plans
@@ -91,17 +93,18 @@ def import_trajectories(
     the constraints of the problem, by a change of positions of at most three times the
     noise or 1 mrad. The path has as many control points as the samples require.
 
-    Args: problem: Problem, record, or name or path of a problem, pipeline or dataset.
-        trajectories: The trajectories, with the problem's joints in their order. noise:
-        Largest error of the samples in SI units: one number for positions, velocities
-        and accelerations, or
-            three.
+    Args:
+        problem: Problem, record, or name or path of a problem, pipeline or dataset.
+        trajectories: The trajectories, with the problem's joints in their order.
+        noise: Largest error of the samples in SI units: one number for positions,
+            velocities and accelerations, or three.
         at_rest: Ends at which all motions are at rest: "start", "goal", or True for
             both.
         source: Source of the plans, a line of text.
 
-    Raises: UsageError: An argument is invalid, or a trajectory has another number of
-        joints.
+    Raises:
+        UsageError: An argument is invalid, or a trajectory has another number of
+            joints.
     """
     record = as_record(problem)
     check_trajectories(trajectories, record)

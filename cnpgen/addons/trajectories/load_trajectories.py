@@ -74,11 +74,11 @@ def load_trajectories(
 ) -> LoadedTrajectories:
     """Load sampled trajectories from a file or a folder; 'cnpgen docs trajectories' lists formats and columns.
 
-    Args: path: CSV, JSON, YAML, NPZ, HDF5 or Parquet file, or a folder of them.
+    Args:
+        path: CSV, JSON, YAML, NPZ, HDF5 or Parquet file, or a folder of them.
         problem: Problem, record, or name or path of a problem, pipeline or dataset.
         joints: Names of the problem's joints in the file, in the problem's order; by
-        default the same names. For arrays
-            without names: indices.
+            default the same names. For arrays without names: indices.
         unit: Unit of revolute joints in columns without a unit in their name.
         rate: Samples per second [Hz] of a file without times.
         separate_by: Column whose value differs from trajectory to trajectory.
@@ -87,10 +87,12 @@ def load_trajectories(
         parameters: Values of the problem's parameters that the file does not have, by
             name, in SI units.
 
-    Raises: UsageError: A column is missing, a value is not finite, times do not
-        increase, or the file is damaged. UnitError: Positions without a unit are
-        probably in degrees or millimetres, or times in milliseconds. MissingExtraError:
-        The format needs a package that is not installed.
+    Raises:
+        UsageError: A column is missing, a value is not finite, times do not increase,
+            or the file is damaged.
+        UnitError: Positions without a unit are probably in degrees or millimetres, or
+            times in milliseconds.
+        MissingExtraError: The format needs a package that is not installed.
     """
     record = as_record(problem)
     names = record.joint_names if joints is None else tuple(joints)

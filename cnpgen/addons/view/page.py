@@ -70,11 +70,14 @@ def serve(
     ``/?row=I`` shows another row. An open page checks every second whether it is out of
     date, and then reloads.
 
-    Args: page: (row or None, stamp of the files) -> the page as HTML. Its errors are
-        shown in place of the page. watched: The files that the page depends on; for a
-        recipe also the other files in its folder. port: Port on the loopback address; 0
-        for any free port. MachineError if it is taken. ready: Called with the address
-        once it is served.
+    Args:
+        page: (row or None, stamp of the files) -> the page as HTML. Its errors are
+            shown in place of the page.
+        watched: The files that the page depends on; for a recipe also the other files
+            in its folder.
+        port: Port on the loopback address; 0 for any free port. MachineError if it is
+            taken.
+        ready: Called with the address once it is served.
     """
     from http import HTTPStatus
     from http.server import BaseHTTPRequestHandler, HTTPServer

@@ -1,7 +1,7 @@
 """The network's inputs: start and goal states and derived values, standardized by the training rows.
 
 Features of the obstacles that samples place do not depend on their order: they are
-signed distances at points.
+    signed distances at points.
 """
 
 from __future__ import annotations
@@ -53,9 +53,11 @@ TASKS_PER_BLOCK = 256
 class Features:
     """Standardized features.
 
-    Attributes: blocks: Selected names of ``BLOCKS``, in order. mean: Mean of every
-        feature over the training rows, shape (F,). scale: Reciprocal of the standard
-        deviation; 0 for constant features, shape (F,).
+    Attributes:
+        blocks: Selected names of ``BLOCKS``, in order.
+        mean: Mean of every feature over the training rows, shape (F,).
+        scale: Reciprocal of the standard deviation; 0 for constant features, shape
+            (F,).
     """
 
     blocks: tuple[str, ...]

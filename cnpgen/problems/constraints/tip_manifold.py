@@ -32,10 +32,12 @@ BOUND_KINKS = (
 class TipRegion:
     """Region of the tip: a manifold with ranges.
 
-    Attributes: point: A point of the manifold [m], shape (3,). held: Unit vectors along
-        which the tip stays at the point, k of them. bounded: Unit vectors along which
-        it stays in a range, m of them, orthogonal to the others. ranges: Ranges
-        relative to the point [m], m of them.
+    Attributes:
+        point: A point of the manifold [m], shape (3,).
+        held: Unit vectors along which the tip stays at the point, k of them.
+        bounded: Unit vectors along which it stays in a range, m of them, orthogonal to
+            the others.
+        ranges: Ranges relative to the point [m], m of them.
     """
 
     point: Array

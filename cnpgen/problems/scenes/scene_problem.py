@@ -47,12 +47,15 @@ class SceneError(UsageError):
 class GoalPose:
     """Goal pose of a frame of the robot, in the frame of the robot's base.
 
-    Attributes: frame: Name of the link or frame; empty for the problem's tip. position:
-        Position [m], shape (3,). rotation: Rotation matrix, shape (3, 3).
+    Attributes:
+        frame: Name of the link or frame; empty for the problem's tip.
+        position: Position [m], shape (3,).
+        rotation: Rotation matrix, shape (3, 3).
         position_tolerance: Accepted displacements along the axes of the pose [m], a
-        number or shape (3,). rotation_tolerance: Accepted components of the rotation
-        vector in these axes [rad], a number or shape (3,).
-            About an axis with pi or more, any rotation is accepted.
+            number or shape (3,).
+        rotation_tolerance: Accepted components of the rotation vector in these axes
+            [rad], a number or shape (3,). About an axis with pi or more, any rotation
+            is accepted.
     """
 
     frame: str
@@ -78,13 +81,18 @@ class GoalPose:
 class SceneProblem:
     """One planning problem in a scene: obstacles, a start at rest, and a goal at rest.
 
-    Attributes: name: Name of the scene, unique in its file. obstacles: Obstacles with
-        poses in the frame of the robot's base, which is the world frame. start_q: Joint
-        positions at the start [rad], shape (n,); empty if the file has none. goal_q:
-        Goal states [rad], any of which is a goal, shape (G, n); G may be 0 with a goal
-        pose. goal_pose: Goal pose, or None. joint_names: Names of the n joints; empty
-        for the planned joints of the problem in their order. source: File of the scene,
-        for messages.
+    Attributes:
+        name: Name of the scene, unique in its file.
+        obstacles: Obstacles with poses in the frame of the robot's base, which is the
+            world frame.
+        start_q: Joint positions at the start [rad], shape (n,); empty if the file has
+            none.
+        goal_q: Goal states [rad], any of which is a goal, shape (G, n); G may be 0 with
+            a goal pose.
+        goal_pose: Goal pose, or None.
+        joint_names: Names of the n joints; empty for the planned joints of the problem
+            in their order.
+        source: File of the scene, for messages.
     """
 
     name: str

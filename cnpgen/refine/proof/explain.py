@@ -90,8 +90,10 @@ def explain_plans(
 ) -> dict[int, Explanation]:
     """Explain why no valid plans of some problems were found.
 
-    Args: plans: The plans. indices: Indices of the plans to explain; by default all
-        whose status is not valid.
+    Args:
+        plans: The plans.
+        indices: Indices of the plans to explain; by default all whose status is not
+            valid.
 
     Returns:
         Index -> explanation.

@@ -44,10 +44,13 @@ DRY_FRACTION, VISCOUS_FRACTION = (
 class Plant:
     """A simulated robot.
 
-    Attributes: name: Its name. title: Deviations from the nominal model, in one line.
-        mass: Factor of masses and inertias. delay: Delay of torques in ticks of the
-        controller, 1 ms each. environment: Folder of an external environment; empty for
-        cnpgen's own simulation.
+    Attributes:
+        name: Its name.
+        title: Deviations from the nominal model, in one line.
+        mass: Factor of masses and inertias.
+        delay: Delay of torques in ticks of the controller, 1 ms each.
+        environment: Folder of an external environment; empty for cnpgen's own
+            simulation.
     """
 
     name: str

@@ -79,8 +79,10 @@ _APPLY: dict[str, Callable[..., Any]] = {
 class TensorTape:
     """A tape that runs on tensors.
 
-    Args: tape: The program, without a loop. results: Indices of the results to compute;
-        operations that they do not need are omitted.
+    Args:
+        tape: The program, without a loop.
+        results: Indices of the results to compute; operations that they do not need are
+            omitted.
     """
 
     def __init__(self, tape: Tape, results: Sequence[int] | None = None) -> None:
@@ -129,8 +131,9 @@ class TensorTape:
     def __call__(self, *arguments: torch.Tensor) -> list[torch.Tensor]:
         """Evaluate the tape.
 
-        Args: arguments: One tensor per input of the tape, shape (width, ...); their
-            further axes are broadcast.
+        Args:
+            arguments: One tensor per input of the tape, shape (width, ...); their
+                further axes are broadcast.
 
         Returns:
             One tensor of shape (width, ...) per selected result.
