@@ -10,6 +10,7 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.errors import RecipeError
+from cnpgen.judges.plans.plan_plot import shares_of_limits
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.pipelines.stages.torque import torque_ratio
 from cnpgen.problems.constraints.joint import JointTorque, judged_torque
@@ -17,6 +18,7 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import open_problem, record_problem
+from cnpgen.problems.robot_model import RobotModel
 from cnpgen.robots.drive import NO_DRIVE, Drive, DriveSpec
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import PerJoint
@@ -41,6 +43,12 @@ geometry = "paper-capsules"
 [[constraint]]
 use = "joint-position"
 tolerance = 1e-3
+[[constraint]]
+use = "joint-velocity"
+tolerance = 2e-3
+[[constraint]]
+use = "joint-acceleration"
+tolerance = 5e-3
 [[constraint]]
 use = "joint-torque"
 tolerance = 5e-3
@@ -378,3 +386,38 @@ def test_specs_without_terms_are_no_drives(tmp_path: Path) -> None:
         arm(tmp_path, urdf="soft-limits"), drive=DriveSpec(limits="motor")
     )
     assert load_robot(problem).drive is None
+
+
+def test_the_robot_model_computes_the_same_torques() -> None:
+    problem, robot = heavy()
+    model, world = RobotModel(problem, backend="numpy"), World(robot)
+    q, dq, ddq = states(robot, 10, seed=9)
+    low, high = model.motor_torque(q, dq, ddq)
+    for k, moving in enumerate(zip(q, dq, ddq, strict=True)):
+        world.set_state(*moving, np.empty(0))
+        np.testing.assert_allclose(
+            np.array([low[k], high[k]]), world.motor_torque, atol=1e-9
+        )
+    rigid = RobotModel("heavy-object", backend="numpy")
+    for each in rigid.motor_torque(q, dq, ddq):
+        np.testing.assert_array_equal(each, rigid.inverse_dynamics(q, dq, ddq))
+
+
+def test_plots_show_torques_of_both_sides() -> None:
+    for limits, names in (
+        ("both", {"torque", "motor torque"}),
+        ("motor", {"motor torque"}),
+        ("joint", {"torque"}),
+    ):
+        _, robot = heavy(limits=limits)
+        path = PathWorld(robot)
+        q, dq, ddq = states(robot, 5)
+        path.set_path(q.T, dq.T, ddq.T, np.empty(0))
+        shares = shares_of_limits(path)
+        assert {name for name in shares if "torque" in name} == names
+        if limits == "motor":
+            low, high = path.motor_torque
+            largest = np.maximum(np.abs(low), np.abs(high))
+            assert robot.drive is not None
+            expected = largest / robot.drive.torque_limit[:, None]
+            np.testing.assert_allclose(np.abs(shares["motor torque"]), expected)
