@@ -15,7 +15,8 @@ alternation, with compiled kernels.
 import argparse
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -144,8 +145,6 @@ def judge(plans: Plans, drive: Drive, robot: Robot) -> dict[str, Any]:
 
 def without_drive(problems: Plans) -> Plans:
     """Return the same boundary problems of the rigid robot."""
-    from dataclasses import replace
-
     record = problems.problem
     content = {key: value for key, value in record.content.items() if key != "drive"}
     rigid = ProblemRecord(json.dumps(content, ensure_ascii=False), record.urdf)
@@ -163,7 +162,7 @@ def measure(name: str, options: argparse.Namespace) -> dict[str, Any]:
     cpu: dict[str, list[float]] = {key: [] for key in sets}
     for _ in range(options.repeat):
         for key, each in sets.items():
-            cpu[key].append(cpu_of(lambda each=each: solve_plans(each, workers=1)))
+            cpu[key].append(cpu_of(partial(solve_plans, each, workers=1)))
     valid = {
         key: cnpgen.evaluate_plans(each, workers=1).valid
         for key, each in solved.items()

@@ -2,8 +2,8 @@
 
 All values are seen at the joint, through the gear. With the rigid torque tau of the
 inverse dynamics, the motor delivers ``tau + J ddq + b dq + c F(dq)``, where F is the
-sign of the velocity and, at rest, any value of [-1, 1]. 'docs/concepts/drives.md' has
-the model.
+sign of the velocity and, at rest, any value of [-1, 1]. 'cnpgen docs drives' has the
+model.
 """
 
 from collections.abc import Iterator

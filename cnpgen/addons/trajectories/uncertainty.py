@@ -110,8 +110,8 @@ def _friction_changes(
 ) -> Array | float:
     """Bound the changes of the friction of drives in every block, shape (m, B); 0 for other conditions.
 
-    Friction changes within a few samples about a reversal, which the middle of a block
-    may miss. It rises with the velocity, so both ends of the velocities bound it.
+    Friction changes within a few samples about a reversal, which the midpoint of a
+    block may miss. It rises with the velocity, so both ends of the velocities bound it.
     """
     drive, is_torque = world.robot.drive, isinstance(condition.constraint, JointTorque)
     parts = condition.condition.parts

@@ -20,7 +20,7 @@ def quintic(rate: float, distance: float = 2.0, *, back: bool = False) -> Trajec
     t = np.linspace(0, DURATION_S, int(DURATION_S * rate) + 1)
     s = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
     x = t / DURATION_S
-    if back:  # a reversal in the middle
+    if back:  # a reversal at the midpoint
         s = np.polynomial.Polynomial([0, 0, 0, 64, -192, 192, -64])
     q = np.tile(START, (len(t), 1))
     dq, ddq = np.zeros_like(q), np.zeros_like(q)
