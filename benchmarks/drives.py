@@ -24,7 +24,9 @@ from common import arguments, cpu_of, median, progress, report, table
 from scipy.spatial.transform import Rotation
 
 import cnpgen
+from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
+from cnpgen.planner.time_parametrization import make_time_parametrization
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
 from cnpgen.refine.refine_plans import solve_plans
@@ -36,6 +38,7 @@ PHASES = 2001  # of every plan
 TOLERANCE = 1.005  # of a limit
 STRIBECK_RATIO, STRIBECK_SPEED = 1.5, 0.1  # breakaway / dry friction; rad/s
 PARAMETER_ERROR = 1.3  # factor of rotors and friction of the other plant
+MOTIONS, CALLS, SLOWER = 512, 9, 0.8  # of the time parametrization; factor of rates
 MOVING = 1e-9  # rad/s, above which dry friction has a direction
 
 
@@ -151,6 +154,29 @@ def without_drive(problems: Plans) -> Plans:
     return replace(problems, problem=rigid)
 
 
+def parametrization_us(solved: dict[str, Plans]) -> dict[str, float] | None:
+    """Return the CPU time of the time parametrization of one motion [us]; None if the problem bounds the jerk."""
+    problems = {key: open_problem(plans.problem) for key, plans in solved.items()}
+    if any(problem.uses_jerk for problem, _ in problems.values()):
+        return None
+    backend = choose_backend(None)
+    parametrizations = {
+        key: make_time_parametrization(
+            problem, robot, problem_kernels(problem, robot, *backend), at_rest=True
+        )
+        for key, (problem, robot) in problems.items()
+    }
+    plans = solved["drives"]
+    motion = plans.motion[np.resize(np.arange(len(plans)), MOTIONS)]
+    motion = replace(motion, rate=SLOWER * motion.rate)
+    poses = np.resize(plans.scene.poses, (MOTIONS, plans.scene.poses.shape[1]))
+    times: dict[str, list[float]] = {key: [] for key in solved}
+    for _ in range(CALLS):
+        for key, each in parametrizations.items():
+            times[key].append(cpu_of(partial(each.parametrize, motion, poses)))
+    return {key: 1e6 * median(values) / MOTIONS for key, values in times.items()}
+
+
 def measure(name: str, options: argparse.Namespace) -> dict[str, Any]:
     """Solve the problems of a pipeline with and without drives, and judge both."""
     progress(f"{name}: {options.problems} problems")
@@ -182,6 +208,7 @@ def measure(name: str, options: argparse.Namespace) -> dict[str, Any]:
         },
         "CPU ratio": median(cpu["drives"]) / median(cpu["rigid"]),
         "CPU [s]": cpu,
+        "time parametrization [us]": parametrization_us(solved),
         **{
             key: judge(each[np.flatnonzero(valid[key])], robot.drive, robot)
             for key, each in solved.items()
@@ -210,6 +237,7 @@ def tables(results: dict[str, dict[str, Any]]) -> list[str]:
                 for c in ("mean", "median", "largest")
             ),
             f"{found['CPU ratio']:.2f}",
+            _fitting(found["time parametrization [us]"]),
             f"{found['drives']['difference of judges [N m]']:.1e}",
         ]
         for name, found in results.items()
@@ -223,12 +251,8 @@ def tables(results: dict[str, dict[str, Any]]) -> list[str]:
     ]
     title = "plans above 1.005 of a limit (largest torque / limit)"
     ratio = [
-        "problem",
-        "duration: mean",
-        "median",
-        "largest",
-        "CPU",
-        "judges differ [N m]",
+        *("problem", "duration: mean", "median", "largest", "CPU of solving"),
+        *("time parametrization [us]", "judges differ [N m]"),
     ]
     return [
         table(title, head, rows, left=2),
@@ -240,6 +264,11 @@ def tables(results: dict[str, dict[str, Any]]) -> list[str]:
             left=2,
         ),
     ]
+
+
+def _fitting(times: dict[str, float] | None) -> str:
+    """Format the times of the time parametrization."""
+    return "-" if times is None else f"{times['drives']:.0f} / {times['rigid']:.0f}"
 
 
 def main() -> None:
