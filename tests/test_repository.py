@@ -36,7 +36,9 @@ def test_workflows_run_parts_of_the_script_of_checks() -> None:
     named = {
         part
         for workflow in WORKFLOWS
-        for words in re.findall(r"run: bash \.ci/run ([\w ]+)", workflow.read_text("utf-8"))
+        for words in re.findall(
+            r"run: bash \.ci/run ([\w ]+)", workflow.read_text("utf-8")
+        )
         for part in words.split()
     }
     assert named

@@ -6,6 +6,7 @@ are on the site and in the repository only.
 
 import argparse
 import re
+import sys
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -24,7 +25,7 @@ def add_options(parser: Parser) -> None:
     what.add_argument(
         "--search",
         metavar="TEXT",
-        help="list the lines with TEXT on all pages, in any case",
+        help="list the lines with all words of TEXT on all pages, in any case",
     )
     parser.add_argument(
         "--url", action="store_true", help="print the address of PAGE on the site"
@@ -158,18 +159,24 @@ def _list(pages: dict[str, Path], *, as_json: bool) -> None:
 
 
 def _search(text: str, pages: dict[str, Path], *, as_json: bool) -> int:
-    """Print the lines that contain a text; return 1 if there are none."""
+    """Print the lines that contain all words of a text, in any order.
+
+    Return 1 if there are none.
+    """
+    words = text.casefold().split()
     rows = [
         {"page": name, "line": number, "text": line.strip()}
         for name, file in pages.items()
         for number, line in enumerate(_text(file).splitlines(), 1)
-        if text.casefold() in line.casefold()
+        if all(word in line.casefold() for word in words)
     ]
     if as_json:
         _print_json(rows)
     else:
         for row in rows:
             print(f"{row['page']}:{row['line']}: {row['text']}")
+    if not rows:
+        print(f"cnpgen: no line of the documentation has {text!r}", file=sys.stderr)
     return 0 if rows else 1
 
 

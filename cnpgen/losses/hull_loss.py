@@ -20,13 +20,10 @@ from cnpgen.robots.scene import Scene
 
 Array = NDArray[Any]
 
-NODE_STRIDE, SHIFTS = (
-    4,
-    16,
-)  # every fourth node; which ones depends on 16ths of the shift
-TRAINING_DISTANCE_M = (
-    0.02  # in addition to the required one, so that plans keep it after training
-)
+# Every fourth node; which ones depends on 16ths of the shift.
+NODE_STRIDE, SHIFTS = 4, 16
+# In addition to the required one, so that plans keep it after training.
+TRAINING_DISTANCE_M = 0.02
 
 
 class HullLoss:

@@ -146,11 +146,12 @@ class Inputs:
     ]  # p, p' and p'' [rad], n each, and p''' if the jerk is constrained
     rate: Any  # r and r' [1/s], and r'' if the jerk is constrained
     obstacle_poses: Any  # poses and sizes of the obstacles
-    relaxation: (
-        Any  # relaxation of the conditions with time-varying bounds, in their units
-    )
+    # Relaxation of the conditions with time-varying bounds, in their units.
+    relaxation: Any
     node: Any  # quadrature weight
-    tightening: Any  # factors of the limits of all constraints, then insets of the other bounds of all constraints
+    # Factors of the limits of all constraints, then insets of the other bounds of all
+    # constraints.
+    tightening: Any
     weights: Any  # weight of every constraint (the paper's e^alpha)
 
     @property

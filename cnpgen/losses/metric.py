@@ -25,10 +25,10 @@ Array = NDArray[np.float64]
 Kind = Literal["fixed", "ramped", "learned"]
 Average = Literal["mean", "median", "trimmed"]
 
-WEIGHT_FACTOR = 100.0  # of the weight in the problem file, for constraint classes without ``training_weight``
-TRIMMED_FRACTION = (
-    0.1  # of the plans, those with the largest losses, excluded from a trimmed mean
-)
+# Of the weight in the problem file, for constraint classes without ``training_weight``.
+WEIGHT_FACTOR = 100.0
+# Of the plans, those with the largest losses, excluded from a trimmed mean.
+TRIMMED_FRACTION = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -116,7 +116,9 @@ class Problem:
     )
     objective: Objective = field("objective of the optimization", default=Objective())
     path: Path = Path()
-    is_stored: bool = False  # in a dataset, a plan or a model: implausible sizes and limits were accepted before
+    # In a dataset, a plan or a model: implausible sizes and limits were accepted
+    # before.
+    is_stored: bool = False
 
     @checked_arguments
     def first(self, kind: type[Kind]) -> Kind | None:

@@ -97,8 +97,17 @@ def test_a_search_prints_lines_and_reports_if_there_are_none(capsys):
     lines = capsys.readouterr().out.splitlines()
     assert any(line.startswith("verdict:") for line in lines)
     assert all("bernstein" in line.casefold() for line in lines)
-    assert main(["docs", "--search", "no such words anywhere"]) == 1
-    assert capsys.readouterr().out == ""
+    assert main(["docs", "--search", "certificate Zanzibar"]) == 1
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert "no line of the documentation has" in printed.err
+
+
+def test_a_search_finds_words_in_any_order(capsys):
+    assert main(["docs", "--search", "samples grid"]) == 0
+    lines = capsys.readouterr().out
+    assert main(["docs", "--search", "GRID samples"]) == 0
+    assert capsys.readouterr().out == lines
 
 
 def test_a_search_and_a_page_exclude_each_other(capsys):

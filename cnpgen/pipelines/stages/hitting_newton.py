@@ -41,14 +41,12 @@ from cnpgen.kernels.symbolic.linalg import (
 from cnpgen.robots.robot import Robot
 
 MAX_NEWTON_STEP_RAD = 0.6  # Euclidean norm of one Newton step
-MIN_PIVOT = (
-    1e-3  # minimum |pivot| of the reduced Hessian: every step is an ascent direction
-)
+# Minimum |pivot| of the reduced Hessian: every step is an ascent direction.
+MIN_PIVOT = 1e-3
 NEWTON_TOLERANCE_RAD = 1e-6  # length of the last step; convergence is quadratic
 MAX_NEWTON_STEPS = 40
-CONSTRAINT_WEIGHT = (
-    1e3  # weight of J_F^T J_F relative to -H: both are in m^2/rad^2, and of order 1
-)
+# Weight of J_F^T J_F relative to -H: both are in m^2/rad^2, and of order 1.
+CONSTRAINT_WEIGHT = 1e3
 
 
 def objective(robot: Robot) -> Any:
