@@ -4,7 +4,9 @@ The path stays. So do the two control points of the rate at either end that dete
 velocities and accelerations there; at rest they have no effect, and move. On a fixed
 path a bounded value is ``g = constant + square r^2 + mixed r r'`` with coefficients
 that depend on the phase alone: squares of velocities, accelerations and torques, as in
-time-optimal path parametrization (Bobrow, Dubowsky and Gibson, 1985). So it is a
+time-optimal path parametrization (Bobrow, Dubowsky and Gibson, 1985). The viscous
+friction of drives adds ``linear r``, and dry friction a constant, since its direction
+along a path is that of p'. So it is a
 quadratic of each control point of the rate, or of a factor of them all, and the largest
 step up to the first bound follows in closed form. Every second control point takes a
 fraction of its step, one after the other, then those between them a larger fraction;
@@ -62,6 +64,7 @@ class _TimeParametrization(ctypes.Structure):
 
     _fields_ = (
         *((name, c_long) for name in ("joints", "pose_width", "path_points", "points")),
+        ("linear", c_long),
         *((name, c_long) for name in ("phases", "rows", "first", "last", "moves")),
         *(
             (name, c_void_p)
@@ -212,6 +215,7 @@ class TimeParametrization(PhaseGrid):
             self.coefficients.tape.inputs[0] - 3 * self.joints - 2,
             path_points,
             points,
+            len(self.coefficients.tape.outputs) - 3,
         )
         moves = phases, len(lower), self.fixed, points - self.fixed, len(order)
         addresses = (
@@ -233,7 +237,9 @@ class TimeParametrization(PhaseGrid):
     ) -> None:
         assert self.library is not None
         rows, phases = (
-            self.coefficients.tape.inputs[0] + 3 * len(self.lower) + 3,
+            self.coefficients.tape.inputs[0]
+            + len(self.coefficients.tape.outputs) * len(self.lower)
+            + 3,
             self.path.shape[1],
         )
         memory = np.empty(
@@ -337,12 +343,14 @@ def advance(
 ) -> Array:
     """Return the largest steps of N rates within the bounds, or the required steps back if one is violated.
 
-    Coefficients (constant, square, mixed) have shape (m, N, K) each, bounds (m,) each,
-    r with r' and their directions (2, N, K).
+    Coefficients (constant, square, mixed and, with viscous friction, linear) have shape
+    (m, N, K) each, bounds (m,) each, r with r' and their directions (2, N, K).
     """
-    (constant, square, mixed), (r, r1), (b, b1) = coefficients, rates, along
+    (constant, square, mixed, *linear), (r, r1), (b, b1) = coefficients, rates, along
     value = constant + (square * r + mixed * r1) * r
     first = (2 * square * r + mixed * r1) * b + mixed * r * b1
+    if linear:
+        value, first = value + linear[0] * r, first + linear[0] * b
     second = (square * b + mixed * b1) * b
     low, high = (bound[:, None, None] for bound in bounds)
     margin = np.stack([high - value, value - low])

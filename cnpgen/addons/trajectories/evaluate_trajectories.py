@@ -20,6 +20,7 @@ from cnpgen.addons.trajectories.trajectory_verdict import Decision, TrajectoryVe
 from cnpgen.errors import UsageError, counted
 from cnpgen.judges.plans.judge import check_step
 from cnpgen.plans.evaluate import MAX_VERDICT_STEP_S, judged_in_parts
+from cnpgen.problems.constraints.joint import judged_torque
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
 from cnpgen.schema.argument_types import checked_arguments
@@ -67,6 +68,12 @@ class TrajectoryEvaluation:
         """Whether each trajectory is proven to be valid, shape (N,)."""
         return np.array([verdict.valid for verdict in self.verdicts], bool)
 
+    @property
+    def judged_torque(self) -> str:
+        """Torque that was judged, in words; empty if the problem limits none."""
+        problem, robot = open_problem(self.problem)
+        return judged_torque(problem.constraint, robot)
+
     def summary(self) -> dict[str, Any]:
         """Return the summary of all trajectories for JSON ('cnpgen docs trajectories')."""
         conditions: dict[str, dict[str, Any]] = {}
@@ -81,6 +88,7 @@ class TrajectoryEvaluation:
             "format_version": TRAJECTORY_EVALUATION_VERSION,
             "problem": self.problem.name,
             "problem_sha256": self.problem.comparable_sha256,
+            **({"torque": self.judged_torque} if self.judged_torque else {}),
             "step_s": self.step,
             "trajectories": len(self.verdicts),
             **self.counts,

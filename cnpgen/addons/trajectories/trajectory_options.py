@@ -136,7 +136,9 @@ def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
     counts = ", ".join(
         f"{count:,} {decision}" for decision, count in found.counts.items()
     )
-    lines = [f"{file}: trajectories of {found.problem.name}: {counts}", ""]
+    lines = [f"{file}: trajectories of {found.problem.name}: {counts}"]
+    lines += [f"torque: {found.judged_torque}"] if found.judged_torque else []
+    lines.append("")
     decided: list[tuple[str, ...]] = [
         (
             "condition",
