@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -25,6 +27,17 @@ class KeptStops:
         self._lock = threading.Lock()
         self._motion: SampledMotion | None = None
         self._stops: list[tuple[float, SampledMotion]] = []
+        self._may_compute = threading.Event()
+        self._may_compute.set()
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Leave the processor to the block."""
+        self._may_compute.clear()
+        try:
+            yield
+        finally:
+            self._may_compute.set()
 
     def follow(self, motion: SampledMotion | None) -> None:
         """Compute the stops of another motion from its start on, and drop those of the last one; None ends it."""
@@ -48,6 +61,7 @@ class KeptStops:
         for begin in np.arange(
             motion.start, motion.end_time, KEPT_STOP_STEP_S
         ).tolist():
+            self._may_compute.wait()
             stop = earliest_stop(self._checker, motion, begin, measured=self._measured)
             with self._lock:
                 if self._motion is not motion:

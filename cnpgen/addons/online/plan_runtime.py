@@ -247,7 +247,8 @@ class PlanRuntime:
         """Compute a stop and follow it, or a kept one if it comes too late."""
         for _ in range(MAX_LATE_STOPS):
             motion = self._timeline.part_at(begin)
-            stop = earliest_stop(self._checker, motion, begin, measured=self._judge)
+            with self._kept_stops.paused():
+                stop = earliest_stop(self._checker, motion, begin, measured=self._judge)
             with self._lock:
                 now = self._timeline.now
                 if now > begin:

@@ -9,7 +9,8 @@ from scipy.interpolate import BSpline
 
 from cnpgen.addons.benchmark.simulator.reference import TICK_S, Reference
 from cnpgen.addons.online.plan_hits import plan_hits
-from cnpgen.addons.online.plan_runtime import PlanRuntime, SwitchOutcome
+from cnpgen.addons.online.plan_runtime import PlanRuntime
+from cnpgen.addons.online.switches import SwitchOutcome
 from cnpgen.errors import UsageError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.planner import Planner
