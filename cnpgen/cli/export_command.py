@@ -75,7 +75,12 @@ def run(arguments: argparse.Namespace) -> int:
     plans = _plans(arguments)
     chosen, out = _chosen(plans, arguments), _place(arguments, exporter)
     exported = export_plans(
-        plans, out, to=arguments.to, rate=arguments.rate, only=chosen
+        plans,
+        out,
+        to=arguments.to,
+        rate=arguments.rate,
+        only=chosen,
+        force=arguments.force,
     )
     for why in exported.refused.values():
         print(f"cnpgen: left out: {why}", file=sys.stderr)

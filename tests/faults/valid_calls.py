@@ -673,6 +673,15 @@ def _of_runtime() -> list[ValidCall]:
     base = planner.robot.home
     runtime = results.PlanRuntime(planner, base)
     plan = planner.plan(base, base)
+
+    def resume(measured_q: Any, at: Any = None) -> None:
+        stopped = results.PlanRuntime(planner, base)
+        stopped.stop(0.0)
+        stopped.resume(measured_q, at=at)
+
+    def close(timeout: Any) -> bool:
+        return results.PlanRuntime(planner, base).close(timeout=timeout)
+
     return [
         ValidCall("PlanRuntime", results.PlanRuntime, {"planner": planner, "q": base}),
         ValidCall("PlanRuntime.state_at", runtime.state_at, {"time": 0.0}),
@@ -688,5 +697,6 @@ def _of_runtime() -> list[ValidCall]:
             runtime.replan,
             {"make_plan": lambda *_: plan, "at": 0.0},
         ),
-        ValidCall("PlanRuntime.close", runtime.close),
+        ValidCall("PlanRuntime.resume", resume, {"measured_q": base, "at": 1.0}),
+        ValidCall("PlanRuntime.close", close, {"timeout": 1.0}),
     ]

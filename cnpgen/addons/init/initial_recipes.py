@@ -261,7 +261,7 @@ def _stages(arm: Arm, problem: Problem) -> tuple[Stage, ...]:
         GoalIK(),
         *holding["goal"],
         AtRest(end="start"),
-        AtRest(end="goal"),
+        AtRest(end="goal", acceleration="zero"),
     )
 
 
