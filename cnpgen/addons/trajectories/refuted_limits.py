@@ -119,10 +119,11 @@ def _bounds(
         f"a {name} limit is exceeded" if errors.t else ""
         for name in ("velocity", "velocity or acceleration")
     ]
+    # A position is reached at some time, whatever the jitter.
+    yield from _each(0, POSITIONS, "", value_intervals(t, q, errors.q))
     if np.isfinite(moved[0]):
-        e, condition = errors.q + moved[0], conditions[0]
-        yield from _each(0, POSITIONS, condition, value_intervals(t, q, e))
-        yield from _each(3, POSITIONS, condition, third_derivatives(t, q, e))
+        jerks = third_derivatives(t, q, errors.q + moved[0])
+        yield from _each(3, POSITIONS, conditions[0], jerks)
     yield from _each(1, POSITIONS, "", first_derivatives(t, q, errors.q, errors.t))
     yield from _each(2, POSITIONS, "", second_derivatives(t, q, errors.q, errors.t))
     if dq is None:
