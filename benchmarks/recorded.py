@@ -15,13 +15,13 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import arguments, machine_line, median
+from common import arguments, machine_line
 
 from cnpgen.addons.trajectories.judge_family import FamilyJudge
 from cnpgen.addons.trajectories.judge_samples import judge_samples, refute
@@ -44,19 +44,20 @@ KINDS = {  # name -> decimals, noise of positions [rad], jitter [s]
     "jitter 2 ms": (None, 1e-4, 2e-3),
 }
 EPISODE_S = 10.0
-# Judges episodes in another process, which may have another version of the package.
+# Judges the episodes of a problem in one call, in a process that may have another version.
 TIMER = """
 import json, sys, time
 import numpy as np, cnpgen
 from cnpgen.trajectories import Trajectory
 found = []
-for problem, path, noise in json.load(open(sys.argv[1])):
-    data = np.load(path)
-    trajectory = Trajectory(data["t"], data["q"])
-    cnpgen.evaluate_trajectories(problem, [trajectory], noise=noise, workers=1)
+for problem, paths, noise in json.load(open(sys.argv[1])):
+    data = [np.load(path) for path in paths]
+    episodes = [Trajectory(each["t"], each["q"]) for each in data]
+    cnpgen.evaluate_trajectories(problem, episodes[:1], noise=noise, workers=1)
     start = time.process_time()
-    verdict = cnpgen.evaluate_trajectories(problem, [trajectory], noise=noise, workers=1)
-    found.append((time.process_time() - start, str(verdict.verdicts[0].decision)))
+    verdicts = cnpgen.evaluate_trajectories(problem, episodes, noise=noise, workers=1).verdicts
+    spent = (time.process_time() - start) / len(episodes)
+    found.append((spent, [str(verdict.decision) for verdict in verdicts]))
 print(json.dumps(found))
 """
 
@@ -289,32 +290,31 @@ def _is_undecided(conditions: Any, name: str) -> bool:
     return name in conditions and conditions[name].decision == Decision.UNDECIDED
 
 
-def long_episodes(plans: Plans, folder: Path) -> Iterator[tuple[str, str, Path]]:
-    """Write plans slowed to 10 s at 30 Hz, valid and with a sample 0.2 rad aside: kind, problem, file."""
-    random = np.random.default_rng(3)
-    name = plans.problem.name  # a recipe, or a folder of 'cnpgen init'
-    problem = Path(name) / "problem.toml" if Path(name).is_dir() else name
-    for index in range(min(5, len(plans))):
+def long_episodes(plans: Plans, folder: Path) -> dict[str, list[Path]]:
+    """Write plans slowed to 10 s at 30 Hz, valid and with a sample 0.2 rad aside: kind -> files."""
+    random, found = np.random.default_rng(3), dict[str, list[Path]]()
+    for index in range(len(plans)):
         slow = EPISODE_S / float(plans.motion[[index]].duration()[0])
         good = Sampling(slow, 30, noise=5e-5).sample(plans, index, random)
         bad = good.q.copy()
         bad[100, 0] += 0.2
         for kind, q in (("valid", good.q), ("faulty", bad)):
-            path = folder / f"{plans.problem.name}-{index}-{kind}.npz"
+            path = folder / f"{index}-{kind}.npz"
             np.savez(path, t=good.t, q=q)
-            yield kind, str(problem), path
+            found.setdefault(kind, []).append(path)
+    return found
 
 
 def cpu_times(
-    python: str, episodes: list[tuple[str, str, Path]]
-) -> list[tuple[float, str]]:
-    """Return CPU times [s] and decisions of the second verdict on each episode by a Python."""
-    with tempfile.TemporaryDirectory() as folder:
-        listing = Path(folder) / "episodes.json"
-        listing.write_text(json.dumps([(p, str(f), 5e-5) for _, p, f in episodes]))
-        command = [python, "-c", TIMER, str(listing)]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-    return [(float(time), str(decision)) for time, decision in json.loads(done.stdout)]
+    python: str, problem: str, episodes: dict[str, list[Path]], folder: Path
+) -> list[tuple[float, list[str]]]:
+    """Return the CPU time [s] of an episode and the decisions by a Python, for each kind of episode."""
+    listing = folder / "episodes.json"
+    tasks = [(problem, list(map(str, paths)), 5e-5) for paths in episodes.values()]
+    listing.write_text(json.dumps(tasks))
+    command = [python, "-c", TIMER, str(listing)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return [tuple(each) for each in json.loads(done.stdout)]
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
@@ -355,18 +355,20 @@ def main() -> None:
 
 
 def compared_times(plans: Plans, folder: Path, python: str) -> dict[str, Any]:
-    """Return medians of CPU times [ms] of both versions, and their ratio, by kind of episode."""
-    episodes, found = list(long_episodes(plans, folder)), {}
-    own, other = (cpu_times(each, episodes) for each in (sys.executable, python))
-    for kind in ("valid", "faulty"):
-        rows = [k for k, (name, *_) in enumerate(episodes) if name == kind]
-        times = [median(1e3 * each[k][0] for k in rows) for each in (own, other)]
+    """Return CPU times [ms] of an episode by both versions, and their ratio, by kind of episode."""
+    name = plans.problem.name  # a recipe, or a folder of 'cnpgen init'
+    problem = str(Path(name) / "problem.toml") if Path(name).is_dir() else name
+    episodes, found = long_episodes(plans, folder), {}
+    both = [
+        cpu_times(each, problem, episodes, folder) for each in (sys.executable, python)
+    ]
+    for kind, (own, decisions), (other, others) in zip(episodes, *both, strict=True):
         found[kind] = {
-            "ms": times[0],
-            "ms_other": times[1],
-            "ratio": times[1] / times[0],
-            "decisions": dict(Counter(own[k][1] for k in rows)),
-            "decisions_other": dict(Counter(other[k][1] for k in rows)),
+            "ms": 1e3 * own,
+            "ms_other": 1e3 * other,
+            "ratio": other / own,
+            "decisions": dict(Counter(decisions)),
+            "decisions_other": dict(Counter(others)),
         }
     return found
 

@@ -40,8 +40,8 @@ class ArmLimit:
 
 
 @dataclass(frozen=True, eq=False)
-class Arm:
-    """An arm of the registry.
+class RecordedArm:
+    """Arm of the registry.
 
     Attributes: name: Its name. joints: Names of its joints. limits: Quantity -> limits;
         a limit without a source is absent. noise: Largest error of its positions [rad],
@@ -59,7 +59,7 @@ class Arm:
     is_normalized: bool
 
 
-def find_arm(name: str) -> Arm:
+def find_arm(name: str) -> RecordedArm:
     """Return the arm of a name or a type of robot; raise UsageError for an unknown one."""
     arm = known_arm(name)
     if arm is None:
@@ -69,7 +69,7 @@ def find_arm(name: str) -> Arm:
     return arm
 
 
-def known_arm(name: str) -> Arm | None:
+def known_arm(name: str) -> RecordedArm | None:
     """Return the arm of a name or a type of robot, or None."""
     found = name.lower().replace("-", "_")
     return next(
@@ -88,7 +88,7 @@ def _registry() -> dict[str, dict[str, Any]]:
     return tomllib.loads(text)
 
 
-def _arm(name: str, data: Mapping[str, Any]) -> Arm:
+def _arm(name: str, data: Mapping[str, Any]) -> RecordedArm:
     limits = {}
     for quantity in QUANTITIES:
         if quantity in data:
@@ -97,7 +97,7 @@ def _arm(name: str, data: Mapping[str, Any]) -> Arm:
             lower = np.array(entry.get("lower", -upper), float)
             limits[quantity] = ArmLimit(lower, upper, entry["basis"], entry["source"])
     noise = data.get("noise", {})
-    return Arm(
+    return RecordedArm(
         name,
         tuple(data["joints"]),
         limits,

@@ -17,7 +17,7 @@ from cnpgen.cli.parser import Parser
 from cnpgen.errors import UsageError, listed
 
 if TYPE_CHECKING:
-    from cnpgen.addons.trajectories.arm_registry import Arm
+    from cnpgen.addons.trajectories.arm_registry import RecordedArm
     from cnpgen.addons.trajectories.episode_checks import EpisodeReport, Scale
     from cnpgen.addons.trajectories.episode_files import Episode, Recording
 
@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
     return int(any(report.level == Level.EXCLUDE for report in reports))
 
 
-def _arm(arguments: argparse.Namespace, recording: "Recording") -> "Arm | None":
+def _arm(arguments: argparse.Namespace, recording: "Recording") -> "RecordedArm | None":
     """Return the stated arm, or that of the data; report on stderr if it is unknown."""
     from cnpgen.addons.trajectories.arm_registry import find_arm, known_arm
 
@@ -109,7 +109,7 @@ def _numbers(texts: tuple[str, ...] | None) -> list[int] | None:
 
 
 def _scale(
-    arguments: argparse.Namespace, arm: "Arm", episode: "Episode"
+    arguments: argparse.Namespace, arm: "RecordedArm", episode: "Episode"
 ) -> "Scale | None":
     """Return the conversion of an episode's joints to radians, or None if their unit is unknown."""
     import numpy as np
@@ -127,7 +127,7 @@ def _scale(
 
 
 def _columns(
-    names: tuple[str, ...] | None, arm: "Arm", episode: "Episode"
+    names: tuple[str, ...] | None, arm: "RecordedArm", episode: "Episode"
 ) -> tuple[int, ...]:
     """Return the column of each joint of an arm."""
     wanted = arm.joints if names is None else names
@@ -155,7 +155,7 @@ def _columns(
     return tuple(found)
 
 
-def _calibrated(path: Path, arm: "Arm") -> list[float]:
+def _calibrated(path: Path, arm: "RecordedArm") -> list[float]:
     """Return the radians per unit of values of -100 to 100 of the ranges of a calibration."""
     import math
 
@@ -190,7 +190,7 @@ def _kept(reports: "list[EpisodeReport]") -> list[str]:
 def _lines(
     path: str,
     recording: "Recording",
-    arm: "Arm | None",
+    arm: "RecordedArm | None",
     reports: "list[EpisodeReport]",
 ) -> list[str]:
     """Return one line for each episode, the summary, and what to do next."""
@@ -226,7 +226,9 @@ def _lines(
     return lines
 
 
-def _write_json(path: str, arm: "Arm | None", reports: "list[EpisodeReport]") -> None:
+def _write_json(
+    path: str, arm: "RecordedArm | None", reports: "list[EpisodeReport]"
+) -> None:
     """Write the reports as JSON."""
     from cnpgen.addons.trajectories.episode_checks import Level
 

@@ -16,7 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.addons.trajectories.arm_registry import QUANTITIES, VENDOR, Arm, ArmLimit
+from cnpgen.addons.trajectories.arm_registry import (
+    QUANTITIES,
+    VENDOR,
+    RecordedArm,
+    ArmLimit,
+)
 from cnpgen.addons.trajectories.episode_files import Episode
 from cnpgen.addons.trajectories.lower_bounds import (
     MeanDerivatives,
@@ -47,8 +52,8 @@ class Level(StrEnum):
 
 
 @dataclass(frozen=True)
-class Finding:
-    """A finding about one episode.
+class EpisodeFinding:
+    """Finding about one episode.
 
     Attributes: level: Its consequence. check: Name of the check. joint: Name of the
         value; empty for all. time: Time [s], or None. statement: What is proven. basis:
@@ -73,7 +78,7 @@ class EpisodeReport:
     """Findings about one episode, the most serious first, and checks that could not run with their reasons."""
 
     name: str
-    findings: tuple[Finding, ...]
+    findings: tuple[EpisodeFinding, ...]
     not_run: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -111,7 +116,7 @@ class Scale:
 
 def check_episode(
     episode: Episode,
-    arm: Arm | None,
+    arm: RecordedArm | None,
     scale: Scale | None,
     *,
     noise: float | None = None,
@@ -144,7 +149,7 @@ def check_episode(
     )
 
 
-def _file_findings(episode: Episode) -> Iterator[Finding]:
+def _file_findings(episode: Episode) -> Iterator[EpisodeFinding]:
     """Yield what the file alone proves, without units."""
     tables = {"state": episode.state, "time": episode.t[:, None]}
     if episode.action is not None:
@@ -155,25 +160,27 @@ def _file_findings(episode: Episode) -> Iterator[Finding]:
             frame, column = bad[0].tolist()
             joint = episode.names[column] if name == "state" else name
             text = f"{len(bad)} values are no numbers, the first in frame {frame}"
-            yield Finding(Level.EXCLUDE, "numbers", joint, None, text)
+            yield EpisodeFinding(Level.EXCLUDE, "numbers", joint, None, text)
             return
     steps = np.diff(episode.t)
     if len(steps) and steps.min() <= 0:
         k = int(steps.argmin())
         text = f"the time does not increase after frame {k}"
-        yield Finding(Level.EXCLUDE, "times", "", float(episode.t[k]), text)
+        yield EpisodeFinding(Level.EXCLUDE, "times", "", float(episode.t[k]), text)
     gaps = np.flatnonzero(np.diff(episode.frame) != 1)
     if len(gaps):
         first, after = episode.frame[gaps[0] : gaps[0] + 2].tolist()
         text = f"frames are missing: {after} follows {first}"
-        yield Finding(Level.REVIEW, "frames", "", float(episode.t[gaps[0]]), text)
+        yield EpisodeFinding(
+            Level.REVIEW, "frames", "", float(episode.t[gaps[0]]), text
+        )
     if episode.length is not None and episode.length != len(episode.t):
         text = f"{len(episode.t)} frames, the description states {episode.length}"
-        yield Finding(Level.REVIEW, "frames", "", None, text)
+        yield EpisodeFinding(Level.REVIEW, "frames", "", None, text)
     yield from _still_findings(episode)
 
 
-def _still_findings(episode: Episode) -> Iterator[Finding]:
+def _still_findings(episode: Episode) -> Iterator[EpisodeFinding]:
     """Yield a time in which all states are equal while the actions change."""
     if episode.action is None or len(episode.t) < 3:
         return
@@ -184,17 +191,19 @@ def _still_findings(episode: Episode) -> Iterator[Finding]:
         length = float(episode.t[end] - episode.t[start])
         if length >= STILL_S and moved.any():
             text = f"all states are equal for {length:.2g} s while the actions change"
-            yield Finding(Level.REVIEW, "frozen", "", float(episode.t[start]), text)
+            yield EpisodeFinding(
+                Level.REVIEW, "frozen", "", float(episode.t[start]), text
+            )
             return
 
 
 def _limit_findings(
     episode: Episode,
-    arm: Arm,
+    arm: RecordedArm,
     scale: Scale,
     errors: tuple[float | None, float | None],
     not_run: dict[str, str],
-) -> Iterator[Finding]:
+) -> Iterator[EpisodeFinding]:
     """Yield the limits that no curve through the states meets."""
     q = episode.state[:, scale.columns] * scale.factor
     noise, jitter = errors
@@ -225,7 +234,7 @@ def _limit_findings(
         proven = known and limit.basis == VENDOR and quantity != "acceleration"
         word = "at least" if value >= bound else "at most"
         unit = QUANTITIES[quantity]
-        yield Finding(
+        yield EpisodeFinding(
             Level.EXCLUDE if proven else Level.REVIEW,
             quantity,
             arm.joints[joint],
@@ -235,7 +244,7 @@ def _limit_findings(
         )
 
 
-def _noise(q: Array, arm: Arm, noise: float | None) -> tuple[float, bool, str]:
+def _noise(q: Array, arm: RecordedArm, noise: float | None) -> tuple[float, bool, str]:
     """Return the error of positions [rad], whether it is known, and its text."""
     half = rounding(q)[1]
     if noise is not None:

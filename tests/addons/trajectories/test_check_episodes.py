@@ -331,8 +331,8 @@ def recorded_arm(seed: int, seconds: float) -> tuple[np.ndarray, np.ndarray]:
             target = random.uniform(-1.5, 1.5, 5)
         data.ctrl[:] = target
         mujoco.mj_step(model, data)
-        slack = np.radians(0.5)  # of the gears, on either side of the encoder
-        play = np.clip(play, data.qpos - slack, data.qpos + slack)
+        half_gap = np.radians(0.5)  # of the gears, on either side of the encoder
+        play = np.clip(play, data.qpos - half_gap, data.qpos + half_gap)
         if data.time >= due:
             states.append(np.round(play / STEP) * STEP)
             actions.append(target.copy())
