@@ -43,11 +43,14 @@ class ArmLimit:
 class RecordedArm:
     """Arm of the registry.
 
-    Attributes: name: Its name. joints: Names of its joints. limits: Quantity -> limits;
-        a limit without a source is absent. noise: Largest error of its positions [rad],
-        or None if no source states it. noise_source: Document that states the noise.
-        steps_per_turn: Steps of an encoder per turn, or None. is_normalized: Whether
-        its recordings usually hold shares of a calibrated range.
+    Attributes:
+        name: Its name.
+        joints: Names of its joints.
+        limits: Quantity -> limits; a limit without a source is absent.
+        noise: Largest error of its positions [rad], or None if no source states it.
+        noise_source: Document that states the noise.
+        steps_per_turn: Steps of an encoder per turn, or None.
+        is_normalized: Whether its recordings usually hold shares of a calibrated range.
     """
 
     name: str

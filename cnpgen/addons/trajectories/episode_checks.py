@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from cnpgen.addons.trajectories.arm_registry import (
     QUANTITIES,
     VENDOR,
-    RecordedArm,
     ArmLimit,
+    RecordedArm,
 )
 from cnpgen.addons.trajectories.episode_files import Episode
 from cnpgen.addons.trajectories.lower_bounds import (
@@ -55,9 +55,13 @@ class Level(StrEnum):
 class EpisodeFinding:
     """Finding about one episode.
 
-    Attributes: level: Its consequence. check: Name of the check. joint: Name of the
-        value; empty for all. time: Time [s], or None. statement: What is proven. basis:
-        Facts that it rests on.
+    Attributes:
+        level: Its consequence.
+        check: Name of the check.
+        joint: Name of the value; empty for all.
+        time: Time [s], or None.
+        statement: What is proven.
+        basis: Facts that it rests on.
     """
 
     level: Level

@@ -66,8 +66,9 @@ class Episode:
 class Recording:
     """Episodes of a path, and what its description states.
 
-    Attributes: episodes: The episodes. robot: Type of the robot; empty if not stated.
-        kind: "lerobot", "hdf5" or "csv".
+    Attributes:
+        episodes: The episodes.
+        robot: Type of the robot; empty if not stated. kind: "lerobot", "hdf5" or "csv".
     """
 
     episodes: tuple[Episode, ...]

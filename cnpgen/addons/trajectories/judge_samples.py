@@ -53,13 +53,12 @@ from cnpgen.judges.plans.judge import MAX_STEP_S
 
 Array = NDArray[np.float64]
 
-MAX_LINEAR_SPAN_S = (
-    0.0101  # between exact positions that a controller connects by lines
-)
+# Between exact positions that a controller connects by lines.
+
+MAX_LINEAR_SPAN_S = 0.0101
 SMOOTH_NEIGHBORS = 8  # positions that determine velocities between two of them
-TOLERANCE_SHARE = (
-    0.9  # of the tolerance of accelerations and jerks that the smooth curve uses
-)
+# Of the tolerance of accelerations and jerks that the smooth curve uses.
+TOLERANCE_SHARE = 0.9
 LINES = "the positions are connected by lines"
 NO_JITTER_BOUND = "a jitter of the times needs limits of velocities and accelerations"
 RESOLUTION = "errors between the samples are as estimated from their resolution"

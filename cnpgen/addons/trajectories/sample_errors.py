@@ -26,8 +26,12 @@ NEGLIGIBLE_SHARE = 0.02  # of an acceleration limit, that rounding may change
 class SampleErrors:
     """Largest errors of the samples of a trajectory.
 
-    Attributes: q: Of positions [rad]. dq: Of velocities [rad/s]. ddq: Of accelerations
-        [rad/s^2]. t: Of times [s]. source: How the errors are known, for the output.
+    Attributes:
+        q: Of positions [rad].
+        dq: Of velocities [rad/s].
+        ddq: Of accelerations [rad/s^2].
+        t: Of times [s].
+        source: How the errors are known, for the output.
     """
 
     q: float

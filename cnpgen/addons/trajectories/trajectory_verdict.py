@@ -15,9 +15,8 @@ from typing import Any
 
 from cnpgen.judges.plans.verdict import Margin
 
-DECIDING_ERROR = (
-    1e3  # an error this large, in SI units, is that of a missing derivative
-)
+# An error this large, in SI units, is that of a missing derivative.
+DECIDING_ERROR = 1e3
 
 
 class Decision(StrEnum):
@@ -45,14 +44,19 @@ class Statement(StrEnum):
 class ConditionDecision:
     """Decision on one condition of a problem.
 
-    Attributes: decision: The decision. reason: Reason of a decision that is not valid;
-        empty for a valid one. margin: Smallest margin, or largest violation, of any
-        curve that the samples allow. uncertainty: Largest difference of the value from
-        that of the nominal curve, there [unit of the margin]. violated_share: Share of
-        the time in which every curve violates the condition, at the checked times; None
-        if it was not measured. undecided_share: Share of the time in which some curves
-        may violate it and others not, or None. detail: The proof of a decision, such as
-        a lower bound with joint and time; empty without one.
+    Attributes:
+        decision: The decision.
+        reason: Reason of a decision that is not valid; empty for a valid one.
+        margin: Smallest margin, or largest violation, of any curve that the samples
+            allow.
+        uncertainty: Largest difference of the value from that of the nominal curve,
+            there [unit of the margin].
+        violated_share: Share of the time in which every curve violates the condition,
+            at the checked times; None if it was not measured.
+        undecided_share: Share of the time in which some curves may violate it and
+            others not, or None.
+        detail: The proof of a decision, such as a lower bound with joint and time; empty
+            without one.
     """
 
     decision: Decision
@@ -88,14 +92,17 @@ class ConditionDecision:
 class TrajectoryVerdict:
     """Verdict on one sampled trajectory.
 
-    Attributes: decision: Invalid if a condition is, valid if all are, else undecided.
+    Attributes:
+        decision: Invalid if a condition is, valid if all are, else undecided.
         reason: Reason of a decision that is not valid: of the deciding condition; empty
-        for a valid one. conditions: Condition -> decision; empty if the trajectory
-        could not be evaluated. Lower bounds that decide leave the others out: they were
-        not evaluated. duration: Duration [s]. samples: Number of times that were
-        checked. detail: The proof of the decision with joint and time; may be empty.
-        assumption: What all curves that were judged meet; empty if no assumption was
-        needed.
+            for a valid one.
+        conditions: Condition -> decision; empty if the trajectory could not be
+            evaluated. Lower bounds that decide leave the others out: they were not
+            evaluated.
+        duration: Duration [s].
+        samples: Number of times that were checked.
+        detail: The proof of the decision with joint and time; may be empty.
+        assumption: What all curves that were judged meet; empty if none was needed.
     """
 
     decision: Decision
