@@ -71,7 +71,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--calls", type=int, default=20_000, help="calls in C")
     parser.add_argument("--repeat", type=int, default=5, help="repetitions")
     text = "options of the compiler (default: -O2 -fno-math-errno -fno-trapping-math)"
-    parser.add_argument("--options", default="-O2 -fno-math-errno -fno-trapping-math", help=text)
+    parser.add_argument(
+        "--options", default="-O2 -fno-math-errno -fno-trapping-math", help=text
+    )
 
 
 def build(model: str, folder: Path, boundary: Boundary, options: str) -> Path:

@@ -33,6 +33,8 @@ EXCLUDED = {  # public callables without a valid call, and the reason
     "plan_scenes": "needs a model for scenes; its arguments are those of scene_plans",
     "solve_scenes": "compiles kernels for minutes; its arguments are those of scene_plans and solve_plans",
     "ConditionDecision": "made by evaluate_trajectories",
+    "SampleErrors": "made by evaluate_trajectories",
+    "Statement": "an enum",
     "Decision": "an enum",
     "TrajectoryEvaluation": "made by evaluate_trajectories",
     "TrajectoryVerdict": "made by evaluate_trajectories",
