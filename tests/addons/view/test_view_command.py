@@ -302,7 +302,7 @@ def test_what_cannot_be_meant_is_refused(words, said, capsys):
 @needs_meshcat
 def test_a_plan_is_shown_with_meshes_where_its_problem_is_named(tmp_path, capsys):
     file = _with_visual(tmp_path, "package://crane/meshes/wedge.stl")
-    base, still = load_robot(load_problem(file)).base[None], np.zeros((1, 4))
+    base, still = load_robot(load_problem(file)).home[None], np.zeros((1, 4))
     boundary = cnpgen.Boundary(base, still, still, base, still)
     points, rate = np.tile(base, (1, 15, 1)), np.ones((1, 20))
     plans = cnpgen.make_plans(
