@@ -28,7 +28,7 @@ from cnpgen.problems.scenes.scene_problem import MAX_SCENE_OBSTACLES, SceneError
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import Array
 from cnpgen.schema.units import PLAUSIBLE_MAX
-from cnpgen.store.files.accounted import is_default, mark_read
+from cnpgen.store.files.accounted import mark_read
 from cnpgen.store.files.yaml_document import part, scalar, vector
 
 ROUNDING = 1e-9  # by which voxels are smaller than cells, so that each has one center
@@ -47,7 +47,7 @@ def read_octomap(
     """
     message = part(world, "octomap", dict, place)
     tree = part(message, "octomap", dict, place)
-    if is_default(tree.get("data")):
+    if not part(tree, "data", list, place):
         mark_read(message)
         return
     where = f"{place}: octomap"

@@ -89,7 +89,9 @@ class Account:
                 else:
                     names = known | self.fates.known()
                     key = _plain(path).rpartition(".")[2]
-                    unknown.append((key, f"{path}{nearest(key, sorted(names))}"))
+                    is_entry = path.endswith("]")  # of a list, which has no name
+                    hint = "" if is_entry else nearest(key, sorted(names))
+                    unknown.append((key, f"{path}{hint}"))
         if unknown:
             count = counted(len(unknown), "unknown element")
             texts = listed([text for _, text in unknown], MAX_REPORTED)

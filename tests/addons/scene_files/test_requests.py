@@ -11,6 +11,7 @@ import pinocchio as pin
 import pytest
 
 import cnpgen
+from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
 from cnpgen.plans.scene_plans import goal_states, scene_plans, start_state
 from cnpgen.problems.load_robot import load_robot
@@ -468,3 +469,41 @@ def stick_distances(
             coal.distance(body, here, other, there, coal.DistanceRequest(), result)
         )
     return found
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (
+            [],
+            "world.collison_objects (did you mean 'collision_objects'?); --allow-unused collison_objects",
+        ),
+        (["--payload", "-1"], "expected a mass above 0"),
+        (["--allow-unused", "collison_objects"], "has no joint 'panda_joint7'"),
+    ],
+)
+def test_the_command_line_names_the_option_for_unknown_keys(
+    tmp_path, capsys, options, text
+):
+    content = request(world={"collison_objects": []})
+    if "--allow-unused" in options:  # stops before the plan, after the scenes were read
+        state = content["start_state"]["joint_state"]
+        content["start_state"] = {
+            "joint_state": {key: value[:-1] for key, value in state.items()}
+        }
+        del content["goal_constraints"][0]["joint_constraints"][-1]
+    file = tmp_path / "case.yaml"
+    file.write_text(json.dumps(content))
+    out = str(tmp_path / "plans.h5")
+    assert main(["solve", str(file), "--robot", "panda", "-o", out, *options]) == 2
+    assert text in capsys.readouterr().err
+
+
+def test_plans_record_the_elements_that_were_accepted_as_unused(tmp_path):
+    content = request(max_cartesian_speed=0.3)
+    scene = scene_of(tmp_path, content, allow_unused=["max_cartesian_speed"])
+    plans = scene_plans(robot_problem(), [scene])
+    assert (
+        plans.source
+        == f"scenes of {tmp_path / 'case.yaml'}, without max_cartesian_speed"
+    )
