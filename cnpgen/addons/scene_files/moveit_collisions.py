@@ -35,7 +35,10 @@ def check_allowed_collisions(
         raise SceneError(f"{place}: {ACM} needs one entry for each name")
     known, allowed = {*objects, "<octomap>"}, list[str]()
     for first, row in zip(names, rows, strict=True):
-        enabled = part(row, "enabled", list, place)
+        # robowflex writes the rows as plain lists
+        enabled = (
+            list(row) if isinstance(row, list) else part(row, "enabled", list, place)
+        )
         if len(enabled) != len(names):
             raise SceneError(f"{place}: {ACM} needs one value for each pair")
         allowed += [

@@ -59,8 +59,9 @@ def composed(outer: Pose, inner: Pose) -> Pose:
 
 
 def frame_id(entry: Any, where: str) -> str:
-    """Return the frame of a header; empty for the planning frame."""
-    return str(part(part(entry, "header", dict, where), "frame_id", str, where))
+    """Return the frame of a header, without the slash of tf before it; empty for the planning frame."""
+    header = part(entry, "header", dict, where)
+    return str(part(header, "frame_id", str, where)).removeprefix("/")
 
 
 def pose_of(pose: Any, where: str) -> Pose:

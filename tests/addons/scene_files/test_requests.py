@@ -407,6 +407,39 @@ def test_a_robot_of_another_name_and_other_joints_are_warnings(tmp_path, robot, 
     )
 
 
+def test_files_as_robowflex_and_tf_write_them_are_read(tmp_path):
+    """Rows of the matrix are plain lists, frames begin with a slash, corners are lists, and factors are 0."""
+    content = request(
+        allowed_collision_matrix={
+            "entry_names": ["panda_link0", "panda_link1"],
+            "entry_values": [[False, True], [True, False]],
+        },
+        fixed_frame_transforms=[
+            {
+                "header": {"frame_id": "panda_link0"},
+                "child_frame_id": "panda_link0",
+                "transform": {"translation": [0, 0, 0], "rotation": UPRIGHT},
+            }
+        ],
+        workspace_parameters={"min_corner": [-1, -1, -1], "max_corner": [1, 1, 1]},
+        max_velocity_scaling_factor=0,
+        max_acceleration_scaling_factor=0,
+    )
+    content["world"]["collision_objects"][0]["header"]["frame_id"] = "/panda_link0"
+    scene = scene_of(tmp_path, content)
+    assert scene.request.obstacle_frames == ("panda_link0",)
+    assert not scene.request.changes_problem
+    mesh = {
+        "id": "m",
+        "meshes": [{"resource": "package://a/b.dae"}],
+        "mesh_poses": [{}],
+    }
+    with pytest.raises(
+        SceneError, match=r"mesh resource 'package://a/b\.dae': mesh files"
+    ):
+        scene_of(tmp_path, request(world={"collision_objects": [mesh]}))
+
+
 @pytest.mark.slow
 @needs_compiler
 def test_the_velocity_scaling_of_a_request_holds(tmp_path, robot):
