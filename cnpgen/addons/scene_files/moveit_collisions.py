@@ -6,8 +6,8 @@ from collections.abc import Collection
 from typing import Any
 
 from cnpgen.problems.scenes.scene_problem import SceneError
+from cnpgen.problems.scenes.yaml_document import part, scalar
 from cnpgen.store.files.accounted import AccountedMapping, mark_read
-from cnpgen.store.files.yaml_document import part, scalar
 
 ACM = "allowed_collision_matrix"
 

@@ -9,9 +9,9 @@ import numpy as np
 from cnpgen.problems.scenes.quaternions import quaternion_error, rotation_matrix
 from cnpgen.problems.scenes.scene_problem import SceneError
 from cnpgen.problems.scenes.scene_request import BASE_FRAMES
+from cnpgen.problems.scenes.yaml_document import part, vector
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, Array
 from cnpgen.store.files.accounted import is_default, mark_read
-from cnpgen.store.files.yaml_document import part, vector
 
 Pose = tuple[Array, Array]  # position [m] and rotation matrix
 BASE = "base of the robot"  # where the planning frame is elsewhere

@@ -16,8 +16,8 @@ from cnpgen.addons.scene_files.moveit_frames import (
 )
 from cnpgen.addons.scene_files.moveit_shapes import primitive_kind, primitive_sizes
 from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError
+from cnpgen.problems.scenes.yaml_document import part, scalar, vector
 from cnpgen.robots.shape.hull import Array
-from cnpgen.store.files.yaml_document import part, scalar, vector
 
 REGIONS = ("box", "sphere", "cylinder")
 EULER, ROTATION_VECTOR = "0", "1"  # codes of the parameterization

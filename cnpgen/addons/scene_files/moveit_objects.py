@@ -23,7 +23,7 @@ from cnpgen.addons.scene_files.moveit_shapes import (
 )
 from cnpgen.problems.scenes.scene_problem import SceneError, check_count
 from cnpgen.problems.scenes.scene_request import AttachedObject
-from cnpgen.store.files.yaml_document import part, scalar
+from cnpgen.problems.scenes.yaml_document import part, scalar
 
 OPERATIONS = ("ADD", "REMOVE", "APPEND", "MOVE")  # in the order of their codes
 

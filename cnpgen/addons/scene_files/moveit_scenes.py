@@ -46,6 +46,7 @@ from cnpgen.problems.scenes.scene_problem import (
     SceneProblem,
 )
 from cnpgen.problems.scenes.scene_request import SceneRequest
+from cnpgen.problems.scenes.yaml_document import part, scalar
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.store.files.accounted import (
     Account,
@@ -54,7 +55,6 @@ from cnpgen.store.files.accounted import (
     is_default,
     mark_read,
 )
-from cnpgen.store.files.yaml_document import part, scalar
 
 _KEYS = {"collision_objects", "goal_constraints", "start_state", "world"}
 

@@ -39,7 +39,9 @@ FATES = Fates(
     harmless={},
     unused=dict.fromkeys(_TRAJECTORIES, "trajectories beside starts and goals"),
 )
-_SHAPES = {  # kind -> datasets of its sizes, their number of columns, the word in the names of the others
+# Kind -> datasets of its sizes, their number of columns, the word in the names of the
+# others.
+_SHAPES = {
     "box": (("cuboid_dims",), (3,), "cuboid"),
     "cylinder": (("cylinder_radii", "cylinder_heights"), (1, 1), "cylinder"),
     "sphere": (("sphere_radii",), (1,), "sphere"),

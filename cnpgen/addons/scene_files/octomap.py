@@ -25,11 +25,11 @@ from cnpgen.problems.scenes.point_cloud import (
     obstacles_of_points,
 )
 from cnpgen.problems.scenes.scene_problem import MAX_SCENE_OBSTACLES, SceneError
+from cnpgen.problems.scenes.yaml_document import part, scalar, vector
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import Array
 from cnpgen.schema.units import PLAUSIBLE_MAX
 from cnpgen.store.files.accounted import mark_read
-from cnpgen.store.files.yaml_document import part, scalar, vector
 
 ROUNDING = 1e-9  # by which voxels are smaller than cells, so that each has one center
 DEPTH = 16  # levels of an octree below its root

@@ -24,9 +24,9 @@ from cnpgen.problems.scenes.scene_problem import (
     make_obstacle,
 )
 from cnpgen.problems.scenes.scene_request import BASE_FRAMES, SceneRequest
+from cnpgen.problems.scenes.yaml_document import part, scalar, vector
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.store.files.accounted import Account, Fates, accounted
-from cnpgen.store.files.yaml_document import part, scalar, vector
 
 FATES = Fates(
     harmless={"collision_buffer_ik": "distance at which the goal states were drawn"}

@@ -38,7 +38,8 @@ KIND_NAMES = {
 }
 MAX_RATE_DEVIATION = 0.01  # of a stated rate from that of the file's times, relative
 MIN_DOUBTFUL_STEP_S = 0.5  # of times without a unit
-MAX_DOUBTFUL_SPEED = 2e-3  # relative to the velocity limits; twice the limit if the times are milliseconds
+# Relative to the velocity limits; twice the limit if the times are milliseconds.
+MAX_DOUBTFUL_SPEED = 2e-3
 UNUSED_KINDS = ("jerk", "effort", "efforts")  # not reported as ignored
 _UNIT = re.compile(r"\s*\[([^\]]*)\]\s*$")
 _SEPARATORS = (" ", "_", ".", "/", ":", "")
@@ -74,11 +75,11 @@ def load_trajectories(
 ) -> LoadedTrajectories:
     """Load sampled trajectories from a file or a folder; 'cnpgen docs trajectories' lists formats and columns.
 
-    Args: path: CSV, JSON, YAML, NPZ, HDF5 or Parquet file, or a folder of them.
+    Args:
+        path: CSV, JSON, YAML, NPZ, HDF5 or Parquet file, or a folder of them.
         problem: Problem, record, or name or path of a problem, pipeline or dataset.
         joints: Names of the problem's joints in the file, in the problem's order; by
-        default the same names. For arrays
-            without names: indices.
+            default the same names. For arrays without names: indices.
         unit: Unit of revolute joints in columns without a unit in their name.
         rate: Samples per second [Hz] of a file without times.
         separate_by: Column whose value differs from trajectory to trajectory.
@@ -87,10 +88,12 @@ def load_trajectories(
         parameters: Values of the problem's parameters that the file does not have, by
             name, in SI units.
 
-    Raises: UsageError: A column is missing, a value is not finite, times do not
-        increase, or the file is damaged. UnitError: Positions without a unit are
-        probably in degrees or millimetres, or times in milliseconds. MissingExtraError:
-        The format needs a package that is not installed.
+    Raises:
+        UsageError: A column is missing, a value is not finite, times do not increase,
+            or the file is damaged.
+        UnitError: Positions without a unit are probably in degrees or millimetres, or
+            times in milliseconds.
+        MissingExtraError: The format needs a package that is not installed.
     """
     record = as_record(problem)
     names = record.joint_names if joints is None else tuple(joints)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import CnpgenError, DatasetError, UsageError, either, requires_extra
 from cnpgen.plans.format import JOINT_NAMES_KEY, PHASE_COLUMN, PLAN_COLUMN
+from cnpgen.problems.scenes.yaml_document import read_yaml
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.store.files.atomic import machine_error, read_file
 from cnpgen.store.files.csv_table import read_csv_table
@@ -20,7 +21,6 @@ from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.hdf5 import open_hdf5
 from cnpgen.store.files.kind import HDF5_SUFFIXES, is_hdf5, kind_of_content
 from cnpgen.store.files.size_limits import MAX_TABLE_BYTES
-from cnpgen.store.files.yaml_document import read_yaml
 from cnpgen.store.layout import SPECIFICATION
 from cnpgen.store.paths import require_path
 
@@ -37,22 +37,21 @@ _PART_OF_ARCHIVE = re.compile(
 )
 MESSAGE_TIME = "t [s]"  # of formats that define the unit
 _POINT_FIELDS = {"positions": "q", "velocities": "dq", "accelerations": "ddq"}
-_NESTING = (
-    "joint_trajectory",
-    "trajectory",
-    "trajectories",
-    "solution",
-)  # keys of messages that hold messages
+# Keys of messages that hold messages.
+_NESTING = "joint_trajectory", "trajectory", "trajectories", "solution"
 
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryTable:
     """One trajectory, or several of equal columns, as a file has them.
 
-    Attributes: place: The file and the part of it, for messages. columns: Name ->
-        values, shape (K,), (K, w) or (N, K, w); texts are kept as texts. joint_names:
-        Names of the joints of columns with one value per joint; empty if the file does
-        not name them. lines: Numbers of the lines of a text file, for messages.
+    Attributes:
+        place: The file and the part of it, for messages.
+        columns: Name -> values, shape (K,), (K, w) or (N, K, w); texts are kept as
+            texts.
+        joint_names: Names of the joints of columns with one value per joint; empty if
+            the file does not name them.
+        lines: Numbers of the lines of a text file, for messages.
     """
 
     place: str
@@ -64,9 +63,11 @@ class TrajectoryTable:
 def read_trajectory_tables(path: Path) -> list[TrajectoryTable]:
     """Read all trajectories of a file, or of all files of a folder in the order of their names.
 
-    Raises: UsageError: The file does not exist, is damaged or of an unknown format; the
-        message names the place. MissingExtraError: The format needs a package that is
-        not installed. MachineError: The file cannot be read.
+    Raises:
+        UsageError: The file does not exist, is damaged or of an unknown format; the
+            message names the place.
+        MissingExtraError: The format needs a package that is not installed.
+        MachineError: The file cannot be read.
     """
     if (path / LEROBOT_INFO).is_file():
         return list(_read_lerobot(path))

@@ -34,9 +34,11 @@ class SceneReader(ABC):
         Every element of a file is used, refused by name, or cannot change the answer.
         ``allow_unused`` has the keys of elements that are accepted without effect.
 
-        Raises: UsageError: There are no scenes, or one is invalid; the message names
-            file, scene and element. DatasetError: A file is damaged. MissingExtraError:
-            A package for the format is missing.
+        Raises:
+            UsageError: There are no scenes, or one is invalid; the message names file,
+                scene and element.
+            DatasetError: A file is damaged.
+            MissingExtraError: A package for the format is missing.
         """
 
 
