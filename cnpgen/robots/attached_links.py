@@ -40,12 +40,16 @@ def with_attached_link(
 ) -> str:
     """Return a URDF with an attached object as a link that is fixed to another one.
 
-    Args: urdf: Text of the URDF, whose meshes are inline. name: Name of the object.
-        link: Link that carries it. shapes: Its shapes, with poses in the frame of that
-        link. mass: Its mass [kg], which all shapes share by volume; 0 for none.
+    Args:
+        urdf: Text of the URDF, whose meshes are inline.
+        name: Name of the object.
+        link: Link that carries it.
+        shapes: Its shapes, with poses in the frame of that link.
+        mass: Its mass [kg], which all shapes share by volume; 0 for none.
         touch_links: Links that may touch it, beside ``link``.
 
-    Raises: RecipeError: The URDF has a link or a joint of that name.
+    Raises:
+        RecipeError: The URDF has a link or a joint of that name.
     """
     robot, body = urdf_tree(urdf), attached_link_name(name)
     if any(part.get("name") == body for part in robot if part.tag in {"link", "joint"}):

@@ -24,8 +24,8 @@ MAX_TILT = (
 class FrameTable:
     """Frames that a document places: fixed transforms, objects with their subframes, and the base of the robot.
 
-    Attributes: used: Frames of the table that were resolved, and whether each is the
-        base.
+    Attributes:
+        used: Frames of the table that were resolved, and whether each is the base.
     """
 
     def __init__(self, place: str) -> None:

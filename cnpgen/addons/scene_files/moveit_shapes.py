@@ -33,8 +33,10 @@ REMEDIES = {
 class ObjectShape:
     """Shape of an object.
 
-    Attributes: kind: Kind of the shape. sizes: Sizes [m] of a primitive, or the points
-        of a mesh, shape (V, 3). pose: Pose in the frame of the object.
+    Attributes:
+        kind: Kind of the shape.
+        sizes: Sizes [m] of a primitive, or the points of a mesh, shape (V, 3).
+        pose: Pose in the frame of the object.
     """
 
     kind: str

@@ -30,11 +30,16 @@ _LOG = logging.getLogger(__name__)
 def placed_scene(scene: SceneProblem, robot: Robot, start: Array) -> SceneProblem:
     """Return a scene with all poses in the frame of the robot's base, and those of attached objects in their links.
 
-    Args: scene: The scene. robot: The robot. start: Joint positions at the start in the
-        order of the planned joints [rad], shape (n,), which place the frames of links.
+    A robot of another name is a warning.
 
-    Raises: SceneError: A frame or a link is unknown. A robot of another name is a
-        warning.
+    Args:
+        scene: The scene.
+        robot: The robot.
+        start: Joint positions at the start in the order of the planned joints [rad],
+            shape (n,), which place the frames of links.
+
+    Raises:
+        SceneError: A frame or a link is unknown.
     """
     request = scene.request
     _warn_of_another_robot(scene, robot)

@@ -37,11 +37,16 @@ def requested_problem(
     Scaling factors multiply the limits of velocities and accelerations. Attached
     objects become links with their geometry and mass.
 
-    Args: problem: The robot's problem. robot: Its robot. scenes: Placed scenes.
+    Args:
+        problem: The robot's problem.
+        robot: Its robot.
+        scenes: Placed scenes.
         payload: Mass of attached objects of unknown weight [kg].
 
-    Raises: SceneError: The scenes ask for different problems, or an attached object has
-        no mass or no place in the problem. UsageError: ``payload`` is out of range.
+    Raises:
+        SceneError: The scenes need different problems, or an attached object has no
+            mass or no place in the problem.
+        UsageError: ``payload`` is out of range.
     """
     if payload is not None:
         mass = number("payload", payload)

@@ -18,10 +18,14 @@ MIN_SCALE = 1e-3  # of the limits, as in a problem file
 class AttachedObject:
     """Object that a link of the robot carries.
 
-    Attributes: name: Name of the object. link: Link that carries it. shapes: Its
-        shapes. frames: Frame of the pose of each shape, a link of the robot at the
-        start state; empty for the robot's base. touch_links: Links that may touch it,
-        beside ``link``. mass: Its mass [kg], 0 if it is unknown.
+    Attributes:
+        name: Name of the object.
+        link: Link that carries it.
+        shapes: Its shapes.
+        frames: Frame of the pose of each shape, a link of the robot at the start state;
+            empty for the robot's base.
+        touch_links: Links that may touch it, beside ``link``.
+        mass: Its mass [kg], 0 if it is unknown.
     """
 
     name: str
@@ -42,17 +46,22 @@ class AttachedObject:
 class SceneRequest:
     """Demands of a motion plan request beside obstacles, start and goal states.
 
-    Attributes: robot_name: Name of the robot; empty if it is not given. start_dq: Joint
-        velocities at the start [rad/s], shape (n,), or None for rest. velocity_scale:
-        Fraction of the velocity limits that the motion may use. acceleration_scale:
-        Fraction of the acceleration limits. goal_below: Tolerances of the goal states
-        below them [rad], shape (G, n), or None. goal_above: Tolerances above them.
-        goal_frame: Frame of the goal pose. obstacle_frames: Frame of the pose of each
-        obstacle; empty for obstacles in the frame of the robot's base. Other frames are
-        links of the robot at the start state. fixed_frames: Frames that the file
-        places, and whether each is the base; only the root link of the robot may be one
-        of them. attached: Objects that the robot carries. accepted: Elements of the file whose loss the caller
-        accepted.
+    Attributes:
+        robot_name: Name of the robot; empty if it is not given.
+        start_dq: Joint velocities at the start [rad/s], shape (n,), or None for rest.
+        velocity_scale: Fraction of the velocity limits that the motion may use.
+        acceleration_scale: Fraction of the acceleration limits.
+        goal_below: Tolerances of the goal states below them [rad], shape (G, n), or
+            None.
+        goal_above: Tolerances above them.
+        goal_frame: Frame of the goal pose.
+        obstacle_frames: Frame of the pose of each obstacle; empty for obstacles in the
+            frame of the robot's base. Other frames are links of the robot at the start
+            state.
+        fixed_frames: Frames that the file places, and whether each is the base; only
+            the root link of the robot may be one of them.
+        attached: Objects that the robot carries.
+        accepted: Elements of the file whose loss the caller accepted.
     """
 
     robot_name: str = ""

@@ -43,12 +43,15 @@ class Fates:
 class Account:
     """Record of the elements of one document that were used, accepted as unused, or refused.
 
-    Args: place: File, and part of it, for messages. fates: Elements that cannot change
-        the answer. allow_unused: Keys or ends of paths whose loss the caller accepts.
+    Args:
+        place: File, and part of it, for messages.
+        fates: Elements that cannot change the answer.
+        allow_unused: Keys or ends of paths whose loss the caller accepts.
         error: Class of the errors.
 
-    Attributes: unused: Elements for other software that the document has. accepted:
-        Elements whose loss the caller accepted.
+    Attributes:
+        unused: Elements for other software that the document has.
+        accepted: Elements whose loss the caller accepted.
     """
 
     def __init__(
