@@ -9,6 +9,7 @@ import numpy as np
 
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import Array
+from cnpgen.schema.argument_types import check_fields
 
 BASE_FRAMES = ("", "world")  # names of the frame of the robot's base
 MIN_SCALE = 1e-3  # of the limits, as in a problem file
@@ -34,6 +35,9 @@ class AttachedObject:
     frames: tuple[str, ...]
     touch_links: tuple[str, ...] = ()
     mass: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     @property
     def digest(self) -> tuple[object, ...]:
@@ -75,6 +79,9 @@ class SceneRequest:
     fixed_frames: tuple[tuple[str, bool], ...] = ()
     attached: tuple[AttachedObject, ...] = ()
     accepted: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     @property
     def places(self) -> bool:
