@@ -79,11 +79,11 @@ def uniform_inertia(shapes: Sequence[Obstacle], mass: float) -> pin.Inertia:
     volumes = np.array([body.computeVolume() for body in bodies])
     density, total = mass / volumes.sum(), pin.Inertia.Zero()
     for shape, body, volume in zip(shapes, bodies, volumes, strict=True):
-        # Coal returns the second moment of volume, about the center of mass
-        moment = density * np.array(body.computeMomentofInertiaRelatedToCOM())
+        # Coal returns the inertia at unit density, about the center of mass
+        inertia = density * np.array(body.computeMomentofInertiaRelatedToCOM())
         center = np.array(body.computeCOM())
         placement = pin.SE3(turned(*shape.rotation), np.array(shape.position))
-        total += placement.act(pin.Inertia(density * volume, center, moment))
+        total += placement.act(pin.Inertia(density * volume, center, inertia))
     return total
 
 
@@ -113,12 +113,12 @@ def _geometry(shape: Obstacle) -> Element:
 
 
 def _inertial(inertia: pin.Inertia) -> Element:
-    """Return the element of an inertia: mass, center of mass, and moments about it along the axes of the link."""
+    """Return the element of an inertia: mass, center of mass, and inertias about it along the axes of the link."""
     element = Element("inertial")
     SubElement(element, "origin", xyz=numbers_text(inertia.lever), rpy="0 0 0")
     SubElement(element, "mass", value=numbers_text([inertia.mass]))
-    moments = {
+    inertias = {
         key: numbers_text([inertia.inertia[index]]) for key, index in _INERTIA.items()
     }
-    SubElement(element, "inertia", moments)
+    SubElement(element, "inertia", inertias)
     return element

@@ -8,13 +8,13 @@ from cnpgen.errors import UsageError
 from cnpgen.store.files.accounted import (
     Account,
     AccountedMapping,
-    Fates,
+    UnusedElements,
     accounted,
     is_default,
     mark_read,
 )
 
-FATES = Fates({".title": "a title", "header.stamp": "a time"}, {"planner": "another's"})
+UNUSED_ELEMENTS = UnusedElements({".title": "a title", "header.stamp": "a time"}, {"planner": "another's"})
 CONTENT = {
     "title": "x",
     "header": {"stamp": 3, "frame": "a"},
@@ -24,7 +24,7 @@ CONTENT = {
 
 
 def document(**changes: object) -> tuple[AccountedMapping, Account]:
-    account = Account("file.yaml", FATES, allow_unused=changes.pop("allowed", ()))
+    account = Account("file.yaml", UNUSED_ELEMENTS, allow_unused=changes.pop("allowed", ()))
     return accounted(CONTENT | changes, account), account
 
 

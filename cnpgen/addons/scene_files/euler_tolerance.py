@@ -18,10 +18,10 @@ def rotation_vector_tolerance(angles: Array) -> Array:
     For R = Rx(a) Ry(b) Rz(c) = exp([w]), the angles differ from w by products of two of
     its components to second order: |a - wx| <= |wy wz| / 2, and so on. An angle of pi
     is free. If c is free, a and b are the tilt of the z axis, which is at most |(wx,
-    wy)|; if a is free, likewise the x axis.
+    wy)|; if a is free, b and c are that of the x axis.
 
     Raises:
-        ValueError: The middle angle or two of them are free.
+        ValueError: The second angle, or two of them, are free.
     """
     free = angles >= np.pi
     if free.all():

@@ -16,7 +16,7 @@ from cnpgen.store.files.accounted import is_default, mark_read
 Pose = tuple[Array, Array]  # position [m] and rotation matrix
 BASE = "base of the robot"  # where the planning frame is elsewhere
 IDENTITY: Pose = (np.zeros(3), np.eye(3))
-MAX_TILT = (
+MAX_BASE_TILT = (
     1e-9  # of the base against the vertical; gravity would have another direction
 )
 
@@ -96,7 +96,7 @@ def transform_of(transform: Any, where: str) -> Pose:
         raise SceneError(
             f"{where}: translation must be finite and at most {MAX_COORDINATE_M:g}, got {shift.tolist()}"
         )
-    same = not shift.any() and np.abs(turn - np.eye(3)).max() <= MAX_TILT
+    same = not shift.any() and np.abs(turn - np.eye(3)).max() <= MAX_BASE_TILT
     return IDENTITY if same else (shift, turn)
 
 
@@ -145,7 +145,7 @@ def add_base(table: FrameTable, state: Any, where: str) -> None:
     if not moved:
         return
     shift, turn = moved[0]
-    if abs(turn[2, 2] - 1) > MAX_TILT:
+    if abs(turn[2, 2] - 1) > MAX_BASE_TILT:
         raise SceneError(f"{where} tilts the base: gravity is along z of the base")
     for name in BASE_FRAMES:
         table.add(name, BASE, (-turn.T @ shift, turn.T))

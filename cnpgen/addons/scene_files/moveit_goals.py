@@ -161,7 +161,7 @@ def _region(constraint: Any, where: str) -> tuple[Array, float]:
         raise SceneError(
             f"{where}: dimensions of the goal region must be positive, got {sizes.tolist()!r:.60}"
         )
-    # the ball in a box has half of its shortest edge, that in a cylinder also at most its radius
+    # the ball in a box has half of its minimum edge, that in a cylinder also at most its radius
     radius = sizes[0] if kind == "sphere" else sizes.min() / 2
     return pose_of(poses[0], where)[0], float(radius)
 

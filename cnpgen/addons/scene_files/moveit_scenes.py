@@ -3,7 +3,7 @@
 Positions are (x, y, z) in m and orientations quaternions (x, y, z, w), as lists or
 mappings. Dimensions follow ``shape_msgs/SolidPrimitive``. Poses are in the planning
 frame, which is that of the robot's base, or in the frame of a link, an object or a
-fixed transform. Every element is read, refused by name, or one of ``moveit_fates``.
+fixed transform. Every element is read, refused by name, or one of ``moveit_unused``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from cnpgen.addons.scene_files.moveit_collisions import (
     check_padding,
     is_true,
 )
-from cnpgen.addons.scene_files.moveit_fates import FATES
 from cnpgen.addons.scene_files.moveit_frames import (
     FrameTable,
     add_base,
@@ -39,6 +38,7 @@ from cnpgen.addons.scene_files.moveit_objects import (
     read_world,
 )
 from cnpgen.addons.scene_files.moveit_shapes import built
+from cnpgen.addons.scene_files.moveit_unused import UNUSED_ELEMENTS
 from cnpgen.addons.scene_files.octomap import read_octomap
 from cnpgen.problems.scenes.scene_problem import (
     MAX_SCENE_OBSTACLES,
@@ -87,7 +87,10 @@ def read_moveit(
                 f"{path}: there is no scene {scene_path.name} beside the request"
             )
         account = Account(
-            f"{scene_path}", FATES, allow_unused=allow_unused, error=SceneError
+            f"{scene_path}",
+            UNUSED_ELEMENTS,
+            allow_unused=allow_unused,
+            error=SceneError,
         )
         scene = accounted(documents[scene_path], account)
         own = accounted(document, account) if scene_path != path else scene

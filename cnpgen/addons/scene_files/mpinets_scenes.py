@@ -30,12 +30,12 @@ from cnpgen.problems.scenes.scene_request import SceneRequest
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.shape.hull import Array
-from cnpgen.store.files.accounted import Account, Fates, accounted
+from cnpgen.store.files.accounted import Account, UnusedElements, accounted
 from cnpgen.store.files.hdf5 import Hdf5, create_hdf5, open_hdf5
 
 _ENDS = (("start_q", "goal_q"), ("start_configs", "target_configs"))
 _TRAJECTORIES = ("global_solutions", "hybrid_solutions", "solutions")  # shape (N, T, n)
-FATES = Fates(
+UNUSED_ELEMENTS = UnusedElements(
     harmless={},
     unused=dict.fromkeys(_TRAJECTORIES, "trajectories beside starts and goals"),
 )
@@ -62,7 +62,9 @@ def read_mpinets(
 
     DatasetError if it is damaged, SceneError if a dataset or obstacle is invalid.
     """
-    account = Account(str(path), FATES, allow_unused=allow_unused, error=SceneError)
+    account = Account(
+        str(path), UNUSED_ELEMENTS, allow_unused=allow_unused, error=SceneError
+    )
     with open_hdf5(path) as file:
         _check_names(file, account)
         start, goal = _ends(file, rows)

@@ -31,7 +31,9 @@ from cnpgen.robots.shape.hull import Array
 from cnpgen.schema.units import PLAUSIBLE_MAX
 from cnpgen.store.files.accounted import mark_read
 
-ROUNDING = 1e-9  # by which voxels are smaller than cells, so that each has one center
+VOXEL_ROUNDING = (
+    1e-9  # by which voxels are smaller than cells, so that each has one center
+)
 DEPTH = 16  # levels of an octree below its root
 MIN_RESOLUTION_M, MAX_RESOLUTION_M = 1e-3, 1.0
 FREE, OCCUPIED, INNER = 1, 2, 3  # two bits of a child in a binary tree
@@ -171,7 +173,7 @@ def _boxes(
         return obstacles_of_points(
             centers,
             radius=size / 2,
-            resolution=max(size * (1 - ROUNDING), MIN_VOXEL_M),
+            resolution=max(size * (1 - VOXEL_ROUNDING), MIN_VOXEL_M),
             max_obstacles=free,
             name="octomap",
         )

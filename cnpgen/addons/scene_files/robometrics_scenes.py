@@ -26,9 +26,9 @@ from cnpgen.problems.scenes.scene_problem import (
 from cnpgen.problems.scenes.scene_request import BASE_FRAMES, SceneRequest
 from cnpgen.problems.scenes.yaml_document import part, scalar, vector
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.store.files.accounted import Account, Fates, accounted
+from cnpgen.store.files.accounted import Account, UnusedElements, accounted
 
-FATES = Fates(
+UNUSED_ELEMENTS = UnusedElements(
     harmless={"collision_buffer_ik": "distance at which the goal states were drawn"}
 )
 _KINDS = ("cuboid", "cylinder", "sphere")
@@ -57,7 +57,9 @@ def read_robometrics(
             place = f"{path}: scene {name!r}"
             if not isinstance(entry, dict):
                 raise SceneError(f"{place} must be a mapping, got {entry!r:.60}")
-            account = Account(place, FATES, allow_unused=allow_unused, error=SceneError)
+            account = Account(
+                place, UNUSED_ELEMENTS, allow_unused=allow_unused, error=SceneError
+            )
             counted = accounted(entry, account)
             problem = _problem(path, name, counted, place)
             account.finish(counted)

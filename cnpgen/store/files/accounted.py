@@ -1,6 +1,6 @@
 """Accounted documents: mappings and lists of a file that record which elements a reader used.
 
-Every element of an input has one of three fates. It is used; it is refused by name; or
+Every element of an input is treated in one of three ways. It is used; it is refused by name; or
 it cannot change the answer and is listed as unused. A reader wraps its document once by
 ``accounted`` and reads it as plain mappings and lists. ``Account.finish`` then raises an
 error for every other element, with its path and the nearest known name.
@@ -21,7 +21,7 @@ MAX_REPORTED = 10  # elements that one error names
 
 
 @dataclass(frozen=True)
-class Fates:
+class UnusedElements:
     """Elements of a format that its reader does not use, because they cannot change the answer.
 
     The keys are ends of paths, such as ``header.stamp``, or whole paths that begin with
@@ -45,7 +45,7 @@ class Account:
 
     Args:
         place: File, and part of it, for messages.
-        fates: Elements that cannot change the answer.
+        known: Elements that cannot change the answer.
         allow_unused: Keys or ends of paths whose loss the caller accepts.
         error: Class of the errors.
 
@@ -57,12 +57,12 @@ class Account:
     def __init__(
         self,
         place: str,
-        fates: Fates,
+        known: UnusedElements,
         *,
         allow_unused: Sequence[str] = (),
         error: type[UsageError] = UsageError,
     ) -> None:
-        self.place, self.fates, self.error = place, fates, error
+        self.place, self.known, self.error = place, known, error
         self._allowed = tuple(allow_unused)
         self.unused: list[str] = []
         self.accepted: list[str] = []
@@ -74,7 +74,7 @@ class Account:
             return
         key = _plain(path).rpartition(".")[2]
         raise self.error(
-            f"{self.place}: {path} is {_brief(value)}: {text}; {{{ALLOW_UNUSED}}} leaves it unused",
+            f"{self.place}: {path} is {_summary(value)}: {text}; {{{ALLOW_UNUSED}}} leaves it unused",
             remedies={ALLOW_UNUSED: key},
         )
 
@@ -83,14 +83,14 @@ class Account:
         unknown = []
         for document in documents:
             for path, known in document.unread():
-                if _matches(path, self.fates.harmless):
+                if _matches(path, self.known.harmless):
                     continue
-                if _matches(path, self.fates.unused):
+                if _matches(path, self.known.unused):
                     self.unused.append(_plain(path))
                 elif _matches(path, self._allowed):
                     self.accepted.append(_plain(path))
                 else:
-                    names = known | self.fates.known()
+                    names = known | self.known.known()
                     key = _plain(path).rpartition(".")[2]
                     is_entry = path.endswith("]")  # of a list, which has no name
                     hint = "" if is_entry else nearest(key, sorted(names))
@@ -243,7 +243,7 @@ def _matches(
     return any(keys[-len(end) :] == end for end in (each.split(".") for each in ends))
 
 
-def _brief(value: object) -> str:
+def _summary(value: object) -> str:
     if isinstance(value, list):
         return f"a list of {len(value)}"
     if isinstance(value, Mapping):

@@ -58,12 +58,12 @@ def full(node: Tree) -> bytes:
 
 def random_tree(seed: int) -> tuple[set[tuple[int, int, int]], Tree]:
     random = np.random.default_rng(seed)
-    middle = 1 << DEPTH - 1
+    center = 1 << DEPTH - 1
     cells = {
-        tuple(cell) for cell in (middle + random.integers(6, 14, (40, 3))).tolist()
+        tuple(cell) for cell in (center + random.integers(6, 14, (40, 3))).tolist()
     }
     others = {
-        tuple(cell) for cell in (middle + random.integers(-4, 6, (30, 3))).tolist()
+        tuple(cell) for cell in (center + random.integers(-4, 6, (30, 3))).tolist()
     }
     return cells, tree_of(cells, others - cells)
 

@@ -297,7 +297,7 @@ def test_attached_objects_have_geometry_mass_and_touch_links(tmp_path, robot):
     content = request(start_state=stick())
     problem, carrying, _ = changed_problem(tmp_path, content, robot)
     assert "attached stick" in record_problem(problem).urdf
-    # mass and first moment against a box that Pinocchio adds to the hand
+    # mass and center of mass against a box that Pinocchio adds to the hand
     model = robot.model.copy()
     hand = model.frames[model.getFrameId("panda_hand")]
     inertia = pin.Inertia.FromBox(2.0, 0.04, 0.04, 0.3)

@@ -75,7 +75,7 @@ def with_value(place: tuple[Any, ...], value: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("place", places(PROBLEM), ids=".".join)
-def test_every_element_of_robometrics_files_has_a_fate(
+def test_every_element_of_robometrics_files_is_used_refused_or_listed(
     tmp_path: Path, place: tuple[Any, ...]
 ) -> None:
     usual = digest(load(tmp_path, PROBLEM))

@@ -1,6 +1,6 @@
 """Elements of MoveIt's messages that cannot change the answer: harmless ones, and those for other software."""
 
-from cnpgen.store.files.accounted import Fates
+from cnpgen.store.files.accounted import UnusedElements
 
 HARMLESS = {
     ".name": "name of the scene",
@@ -42,4 +42,4 @@ UNUSED = {
     "multi_dof_joint_state.wrench": "torques follow from the motion",
     "attached_collision_objects.detach_posture": "nothing is detached",
 }
-FATES = Fates(HARMLESS, UNUSED)
+UNUSED_ELEMENTS = UnusedElements(HARMLESS, UNUSED)

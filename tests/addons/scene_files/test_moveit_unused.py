@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cnpgen.addons.scene_files.moveit_fates import FATES, HARMLESS, UNUSED
 from cnpgen.addons.scene_files.moveit_scenes import read_moveit
+from cnpgen.addons.scene_files.moveit_unused import HARMLESS, UNUSED, UNUSED_ELEMENTS
 from cnpgen.errors import UsageError
 from cnpgen.problems.scenes.scene_problem import SceneProblem, checked_scene
 from cnpgen.robots.obstacle import Obstacle
@@ -103,8 +103,8 @@ def is_listed(place: Place) -> bool:
     )
 
 
-def fate(content: dict[str, Any], place: Place, value: Any, usual: Any) -> str:
-    """Return the fate of a value: refused, used, listed, without effect, or lost."""
+def outcome(content: dict[str, Any], place: Place, value: Any, usual: Any) -> str:
+    """Return the outcome of a value: refused, used, listed, without effect, or lost."""
     before = value_at(content, place)
     try:
         scene, _ = read(changed(content, place, value))
@@ -150,14 +150,14 @@ def test_the_document_of_the_tests_is_read() -> None:
 @pytest.mark.parametrize(
     "root", ["plain", pytest.param("rich", marks=pytest.mark.slow)]
 )
-def test_every_element_of_the_messages_has_one_of_the_fates(root: str) -> None:
+def test_every_element_of_the_messages_is_used_refused_or_listed(root: str) -> None:
     content = document() if root == "rich" else minimal()
     usual = digest(read(content)[0])
     counts: dict[str, int] = {}
     lost = []
     for place, kind in ALL_FIELDS:
         for value in VALUES.get(kind, [{}]):
-            result = fate(content, place, value, usual)
+            result = outcome(content, place, value, usual)
             counts[result] = counts.get(result, 0) + 1
             if result == "lost" and not plain(place).startswith(
                 tuple(EQUIVALENT[root])
@@ -366,7 +366,7 @@ def test_accepted_and_unused_elements_are_reported(
 
 
 def test_unread_elements_are_found_in_lists_and_mappings() -> None:
-    account = Account("file", FATES)
+    account = Account("file", UNUSED_ELEMENTS)
     wrapped = accounted({"a": [{"b": "1", "c": "2"}, {"d": "3"}], "e": {}}, account)
     assert wrapped["a"][0]["b"] == "1"
     with pytest.raises(
