@@ -17,6 +17,8 @@ from cnpgen.problems.scenes.scene_problem import GoalPose as GoalPose
 from cnpgen.problems.scenes.scene_problem import SceneError as SceneError
 from cnpgen.problems.scenes.scene_problem import SceneProblem as SceneProblem
 from cnpgen.problems.scenes.scene_problem import make_mesh as make_mesh
+from cnpgen.problems.scenes.scene_request import AttachedObject as AttachedObject
+from cnpgen.problems.scenes.scene_request import SceneRequest as SceneRequest
 from cnpgen.robots.observation.camera import Camera as Camera
 from cnpgen.robots.observation.observations import BasisPoints as BasisPoints
 from cnpgen.robots.observation.observations import CameraCloud as CameraCloud

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import ENGINE, Parser, add_engine, add_json, options_of, refuse
 from cnpgen.cli.refine_command import (
+    ALLOW_UNUSED,
     LARGE_ANGLES,
     REFINING,
     WORKERS,
@@ -66,6 +67,7 @@ def add_options(parser: Parser) -> None:
         help="accept samples of another pipeline than the training data",
     )
     option("--allow-large-angles", action="store_true", help=LARGE_ANGLES)
+    option("--allow-unused", metavar="KEY", action="append", help=ALLOW_UNUSED)
     option(
         "--no-time-scaling", action="store_true", help="keep the rates of the network"
     )
@@ -179,8 +181,8 @@ def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
         )
     refuse(
         arguments,
-        ["split", "first", "n"],
-        "--split, --first and --n need the folder of a dataset, got a file",
+        ["split", "first", "n", "allow_unused"],
+        "--split, --first and --n need the folder of a dataset, --allow-unused needs scenes, got a file",
     )
     return read_file(
         problems,
@@ -202,7 +204,10 @@ def _scenes(arguments: argparse.Namespace, model: "Model") -> "Requests":
     return scene_requests(
         model,
         read_scenes(
-            Path(arguments.problems), start=arguments.first or 0, n=arguments.n
+            Path(arguments.problems),
+            start=arguments.first or 0,
+            n=arguments.n,
+            allow_unused=arguments.allow_unused or (),
         ),
     )
 

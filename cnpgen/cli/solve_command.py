@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, refuse
 from cnpgen.cli.refine_command import (
+    ALLOW_UNUSED,
     LARGE_ANGLES,
     add_refine_options,
     check_place,
@@ -61,6 +62,9 @@ def add_options(parser: Parser) -> None:
     option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     text = "solve scenes with this problem of a robot, such as panda"
     option("--robot", metavar="NAME|FILE", type=recipe_names.problem, help=text)
+    option("--allow-unused", metavar="KEY", action="append", help=ALLOW_UNUSED)
+    text = "mass of objects that scenes attach with weight 0, such as 2kg"
+    option("--payload", metavar="KG", type=values.kilograms, help=text)
     option(
         "-o",
         "--out",
@@ -103,12 +107,15 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
         "--robot is for scenes, which have --first and --n",
     )
     scenes = read_scenes(
-        Path(arguments.what), start=arguments.first or 0, n=arguments.n
+        Path(arguments.what),
+        start=arguments.first or 0,
+        n=arguments.n,
+        allow_unused=arguments.allow_unused or (),
     )
     problem = as_problem(arguments.robot)
 
     def solve(_: "Plans", **options: Any) -> "SolvedScenes":
-        return solve_scenes(problem, scenes, **options)
+        return solve_scenes(problem, scenes, payload=arguments.payload, **options)
 
     return refine_and_save(
         arguments, None, out, title=f"solving {arguments.what}", make=solve
@@ -120,6 +127,11 @@ def _problems(arguments: argparse.Namespace) -> "Plans":
     from cnpgen.problems.scenes.scene_reader import holds_scenes
     from cnpgen.store.paths import file_kind
 
+    refuse(
+        arguments,
+        ["allow_unused", "payload"],
+        "--allow-unused and --payload are for scenes, which need --robot",
+    )
     what = Path(arguments.what)
     kind = file_kind(what)
     if what.exists() and holds_scenes(what):

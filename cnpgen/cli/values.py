@@ -147,6 +147,7 @@ def _quantity(unit: str, expected: str, text: str) -> float:
 
 seconds = partial(_quantity, "s", "a time above 0, such as 0.001 or 1ms")
 meters = partial(_quantity, "m", "a length above 0, such as 0.02 or 20mm")
+kilograms = partial(_quantity, "kg", "a mass above 0, such as 1.5 or 1.5kg")
 hertz = partial(_quantity, "1/s", "a rate above 0, such as 1000 or 1000Hz")
 
 

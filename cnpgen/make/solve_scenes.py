@@ -26,14 +26,17 @@ from cnpgen.plans.plans import Plans
 from cnpgen.plans.scene_plans import (
     capacity_of,
     goal_states,
-    joint_order,
+    goal_tolerances,
     scene_plans,
+    start_state,
     with_wider_capacity,
 )
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.obstacles import Capacity
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem, open_problem
+from cnpgen.problems.scenes.placement import placed_scene
+from cnpgen.problems.scenes.requested_problem import requested_problem
 from cnpgen.problems.scenes.scene_problem import (
     GoalPose,
     SceneError,
@@ -56,6 +59,7 @@ from cnpgen.world.pose_ik import PoseKinematics
 
 Array = NDArray[np.float64]
 
+TOLERANCE_SEEDS = 256  # random states within the tolerances of a goal in collision
 POSE_EXPLANATION = f"{POSE_SEEDS} searches from random joint positions found none with the goal pose within the limits"
 
 
@@ -136,10 +140,11 @@ def solve_scenes(
     address: str | None = None,
     journal: str | Path | None = None,
     discard: bool = False,
+    payload: float | None = None,
     begin: Callable[[int, int], None] | None = None,
     progress: Progress | None = None,
 ) -> SolvedScenes:
-    """Plan the problems of scenes, from rest to rest, with the limits and constraints of a robot's problem.
+    """Plan the problems of scenes, which end at rest, with the limits and constraints of a robot's problem.
 
     Scenes with equal numbers of obstacles of each kind, rounded up to multiples of
     four, share compiled kernels. Of several goal states, the ``MAX_GOAL_STATES``
@@ -149,7 +154,9 @@ def solve_scenes(
     "no inverse kinematics of the goal".
 
     ``problem`` is the robot's problem, such as "panda"; obstacles of the scenes are
-    added to its own. The other arguments are those of ``refine_plans``. The names of
+    added to its own. Requests change it: scaling factors multiply its limits, and
+    attached objects become links. ``payload`` is the mass of attached objects of
+    unknown weight [kg]. The other arguments are those of ``refine_plans``. The names of
     the journals are that of ``journal`` with a number.
 
     Raises:
@@ -161,6 +168,8 @@ def solve_scenes(
     check_scenes(scenes)
     loaded, scenes = as_problem(problem), [checked_scene(scene) for scene in scenes]
     robot = load_robot(loaded)
+    placed = [placed_scene(scene, robot, start_state(scene, robot)) for scene in scenes]
+    loaded, robot, scenes = requested_problem(loaded, robot, placed, payload=payload)
     goals = [_goals(loaded, robot, scene, index) for index, scene in enumerate(scenes)]
     if begin is not None:
         begin(len(scenes), 0)
@@ -250,18 +259,28 @@ def _goals(problem: Problem, robot: Robot, scene: SceneProblem, index: int) -> A
     if not len(scene.goal_q):
         return _states_of_pose(problem, robot, scene, index)
     states = goal_states(scene, robot)
-    if len(states) == 1 or robot.shape is None:
+    below, above = goal_tolerances(scene, robot)
+    widths = below + above
+    if robot.shape is None or (len(states) == 1 and not widths.any()):
         return states[:MAX_GOAL_STATES]
-    valid = states[
-        RestingStates(problem, robot, scene.obstacles).are_ends(states.T.copy())
-    ]
-    return (
-        nearest_states(valid, _start(scene, robot), robot) if len(valid) else states[:1]
-    )
+    resting = RestingStates(problem, robot, scene.obstacles)
+    valid = states[resting.are_ends(states.T.copy())]
+    if not len(valid) and widths.any():
+        near = _states_within(states, below, above, robot=robot, index=index)
+        valid = near[resting.are_ends(near.T.copy())]
+    start = start_state(scene, robot)
+    return nearest_states(valid, start, robot) if len(valid) else states[:1]
 
 
-def _start(scene: SceneProblem, robot: Robot) -> Array:
-    return np.asarray(joint_order(scene, robot, scene.start_q[None], "start")[0])
+def _states_within(
+    states: Array, below: Array, above: Array, *, robot: Robot, index: int
+) -> Array:
+    """Return random states within the tolerances of goal states and the joint limits, shape (K, n)."""
+    random = np.random.default_rng([index, TOLERANCE_SEEDS])
+    count = TOLERANCE_SEEDS // len(states) + 1
+    shares = random.uniform(size=(count, *states.shape))
+    near = (states - below + shares * (below + above)).reshape(-1, robot.n)
+    return np.clip(near, robot.position_lower, robot.position_upper)
 
 
 def _states_of_pose(
@@ -275,7 +294,7 @@ def _states_of_pose(
     states = RestingStates(problem, robot, scene.obstacles)
     conditions = EndConditions(problem, robot, scene.obstacles)
     random = np.random.default_rng([index, POSE_SEEDS])
-    start = _start(scene, robot)
+    start = start_state(scene, robot)
     goals, found = states_of_pose(
         kinematics, states, conditions, pose, start=start, random=random
     )

@@ -14,6 +14,8 @@ from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.obstacles import Capacity, with_capacity
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import open_problem, record_problem
+from cnpgen.problems.scenes.placement import placed_scene
+from cnpgen.problems.scenes.requested_problem import refuse_changes
 from cnpgen.problems.scenes.scene_problem import SceneError, SceneProblem, check_scenes
 from cnpgen.robots.observation.primitives import KINDS, primitives_of
 from cnpgen.robots.obstacle import Obstacle
@@ -68,7 +70,7 @@ def scene_plans(
     capacity: Capacity | None = None,
     sample_id: Sequence[int] | None = None,
 ) -> Plans:
-    """Return the boundary problems of scenes, from rest to rest, as plans without motions.
+    """Return the boundary problems of scenes, which end at rest, as plans without motions.
 
     Args:
         problem: The robot's problem. Obstacles of the scenes are added to its own.
@@ -83,13 +85,16 @@ def scene_plans(
             outside its limits.
     """
     check_scenes(scenes)
+    refuse_changes(scenes, "solve_scenes changes the problem for them")
     problem.urdf_text  # noqa: B018 - read once for all capacities
     full = with_capacity(problem, capacity_of(scenes) if capacity is None else capacity)
     record = record_problem(full)
     robot = open_problem(record)[1]
-    start = np.array(
-        [joint_order(scene, robot, scene.start_q[None], "start")[0] for scene in scenes]
-    )
+    start = np.array([start_state(scene, robot) for scene in scenes])
+    scenes = [
+        placed_scene(scene, robot, q) for scene, q in zip(scenes, start, strict=True)
+    ]
+    start_dq = np.array([start_velocity(scene, robot) for scene in scenes])
     if goals is None:
         goals = [goal_states(scene, robot)[0] for scene in scenes]
     goal_q = numbers("goals", goals)
@@ -105,15 +110,46 @@ def scene_plans(
     others = f" and {len(files) - 1} other files" if len(files) > 1 else ""
     return make_plans(
         record,
-        Boundary(start, zero, zero, goal_q, zero, None),
+        Boundary(start, start_dq, zero, goal_q, zero, None),
         path_control_points=np.full((count, spec.path_control_points, robot.n), np.nan),
         rate_control_points=np.full((count, spec.rate_control_points), np.nan),
         columns={OBSTACLE_POSES: poses},
         sample_id=np.arange(count)
         if sample_id is None
         else numbers("sample_id", sample_id, "int64"),
-        source=f"scenes of {files[0]}{others}" if files else "",
+        source=f"scenes of {files[0]}{others}{_accepted(scenes)}" if files else "",
     )
+
+
+def _accepted(scenes: Sequence[SceneProblem]) -> str:
+    """Return a note of the elements of the files whose loss the caller accepted, for the source of plans."""
+    names = sorted({name for scene in scenes for name in scene.request.accepted})
+    return f", without {', '.join(names)}" if names else ""
+
+
+def start_state(scene: SceneProblem, robot: Robot) -> Array:
+    """Return the start state of a scene in the order of the planned joints [rad], shape (n,)."""
+    return np.asarray(joint_order(scene, robot, scene.start_q[None], "start")[0])
+
+
+def start_velocity(scene: SceneProblem, robot: Robot) -> Array:
+    """Return the start velocity of a scene in the order of the planned joints [rad/s], shape (n,).
+
+    Raise SceneError if a joint that is not planned moves.
+    """
+    velocity = scene.request.start_velocity(len(scene.start_q))
+    if not scene.joint_names:
+        return velocity
+    moving = [
+        name
+        for name, rate in zip(scene.joint_names, velocity, strict=True)
+        if rate and name not in robot.joint_names
+    ]
+    if moving:
+        raise SceneError(
+            f"{scene.place}: the joint {moving[0]!r} moves at the start and is not planned"
+        )
+    return velocity[[scene.joint_names.index(name) for name in robot.joint_names]]
 
 
 def goal_states(scene: SceneProblem, robot: Robot) -> Array:
@@ -123,7 +159,58 @@ def goal_states(scene: SceneProblem, robot: Robot) -> Array:
     """
     if not len(scene.goal_q):
         raise SceneError(f"{scene.place} has no goal state")
-    return joint_order(scene, robot, scene.goal_q, "goal")
+    _check_still_joints(scene, robot)
+    return joint_order(scene, robot, _within_limits(scene, robot), "goal")
+
+
+def goal_tolerances(scene: SceneProblem, robot: Robot) -> tuple[Array, Array]:
+    """Return the tolerances of the goal states below and above them [rad], shape (G, n), for the planned joints."""
+    columns = _columns(scene, robot)
+    zero = np.zeros_like(scene.goal_q)
+    below, above = (
+        np.asarray(zero if each is None else each)[:, columns]
+        for each in (scene.request.goal_below, scene.request.goal_above)
+    )
+    return below, above
+
+
+def _columns(scene: SceneProblem, robot: Robot) -> list[int]:
+    """Return the columns of the planned joints in the states of a scene; those of missing joints are left out."""
+    if not scene.joint_names:
+        return list(range(len(scene.start_q)))
+    names = [name for name in robot.joint_names if name in scene.joint_names]
+    return [scene.joint_names.index(name) for name in names]
+
+
+def _within_limits(scene: SceneProblem, robot: Robot) -> Array:
+    """Return the goal states of a scene, moved into the joint limits as far as their tolerances allow."""
+    request, columns = scene.request, _columns(scene, robot)
+    states = np.array(scene.goal_q, float)
+    if request.goal_below is None or len(columns) != robot.n:
+        return states
+    below, above = goal_tolerances(scene, robot)
+    goals = states[:, columns]
+    clipped = np.clip(goals, robot.position_lower, robot.position_upper)
+    states[:, columns] = np.clip(clipped, goals - below, goals + above)
+    return states
+
+
+def _check_still_joints(scene: SceneProblem, robot: Robot) -> None:
+    """Raise SceneError if a joint that is not planned would have to move to a goal."""
+    below, above = (
+        np.zeros_like(scene.goal_q) if each is None else each
+        for each in (scene.request.goal_below, scene.request.goal_above)
+    )
+    shift = scene.start_q - scene.goal_q
+    violation = np.maximum(shift - above, -shift - below)
+    for index, name in enumerate(scene.joint_names):
+        if name in robot.joint_names or not len(scene.goal_q):
+            continue
+        if violation[:, index].min() > JOINT_TOLERANCE_RAD:
+            raise SceneError(
+                f"{scene.place}: the goal moves the joint {name!r} from {scene.start_q[index]:g}"
+                f" to {scene.goal_q[0, index]:g}, and the robot's problem does not plan it"
+            )
 
 
 def joint_order(scene: SceneProblem, robot: Robot, states: Array, end: str) -> Array:

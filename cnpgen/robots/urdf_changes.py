@@ -1,5 +1,6 @@
 """Changes of the text of a URDF: locked joints, disabled pairs of links, and the payload as a link."""
 
+import logging
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from xml.etree import ElementTree
@@ -7,7 +8,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from cnpgen.errors import RecipeError, nearest
+from cnpgen.errors import RecipeError, counted, listed, nearest
 from cnpgen.robots.robot_spec import Payload, RobotSpec
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.urdf import number_in, numbers_in, numbers_text, read_urdf, urdf_tree
@@ -16,8 +17,10 @@ from cnpgen.robots.urdf_parameters import placement_of
 _TURNING, _SLIDING = ("revolute", "continuous"), ("prismatic",)
 # Elements of a joint that moves.
 _MOTION = "axis", "limit", "mimic", "calibration", "dynamics", "safety_controller"
-_TAG = "disable_collisions"
+_TAG, _PAIR = "disable_collisions", ("link1", "link2")
 PAYLOAD = "carried payload"  # name of the link and of its joint
+
+_LOG = logging.getLogger(__name__)
 
 
 def with_locked_joints(
@@ -126,7 +129,8 @@ def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
 def with_disabled_pairs(urdf: str, srdf: Path) -> str:
     """Return a URDF with the disabled link pairs of an SRDF file.
 
-    URDF parsers ignore unknown elements.
+    URDF parsers ignore unknown elements. Pairs with links that the URDF lacks, such as
+    those of another gripper, are left out with a warning that lists the links.
     """
     try:
         tree = urdf_tree(read_urdf(srdf))
@@ -136,9 +140,20 @@ def with_disabled_pairs(urdf: str, srdf: Path) -> str:
         raise RecipeError(
             [f"{srdf}: is a URDF, expected an SRDF with <{_TAG}> elements"]
         )
-    return _with_entries(
-        urdf, [dict(entry.attrib) for entry in tree.iter(_TAG)], str(srdf)
-    )
+    entries = [dict(entry.attrib) for entry in tree.iter(_TAG)]
+    links = {link.get("name", "") for link in urdf_tree(urdf).iter("link")}
+    named = {entry[key] for entry in entries for key in _PAIR if key in entry}
+    if unknown := sorted(named - links):
+        count = counted(len(unknown), "link")
+        _LOG.warning(
+            "%s names %s that the URDF lacks: %s", srdf, count, listed(unknown)
+        )
+    known = [
+        entry
+        for entry in entries
+        if not {entry.get(key, "") for key in _PAIR} & set(unknown)
+    ]
+    return _with_entries(urdf, known, str(srdf))
 
 
 def with_ignored_pairs(urdf: str, pairs: Iterable[tuple[str, str]]) -> str:
@@ -153,9 +168,9 @@ def _with_entries(urdf: str, entries: list[dict[str, str]], source: str) -> str:
     robot = urdf_tree(urdf)
     links = {link.get("name", "") for link in robot.iter("link")}
     for entry in entries:
-        if missing := [key for key in ("link1", "link2") if key not in entry]:
+        if missing := [key for key in _PAIR if key not in entry]:
             raise RecipeError([f"{source}: {entry} lacks {', '.join(missing)}"])
-    named = {entry[key] for entry in entries for key in ("link1", "link2")}
+    named = {entry[key] for entry in entries for key in _PAIR}
     if unknown := sorted(named - links):
         raise RecipeError([f"{source}: the URDF has no link {', '.join(unknown)}"])
     known = [

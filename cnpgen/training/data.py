@@ -20,7 +20,7 @@ from cnpgen.plans.format import BOUNDARY, CONDITIONS
 from cnpgen.plans.scene_plans import scene_plans
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
-from cnpgen.problems.scenes.scene_problem import SceneProblem
+from cnpgen.problems.scenes.scene_problem import SceneError, SceneProblem
 from cnpgen.problems.scenes.scene_reader import holds_scenes, read_scenes
 from cnpgen.schema.arguments import concerning
 from cnpgen.store.dataset_spec import StoredProblem
@@ -201,6 +201,11 @@ def make_scene_rows(
             f"{place} has {len(scenes)} problems, expected at least {MIN_SCENE_ROWS} to train and validate",
             concerns="folder",
         )
+    for scene in scenes:
+        if scene.request.start_dq is not None and np.any(scene.request.start_dq):
+            raise SceneError(
+                f"{scene.place} has a start velocity, expected problems from rest to rest for training"
+            )
     plans = scene_plans(problem, scenes)
     n_validation = min(round(VALIDATION_SHARE * len(plans)), MAX_VALIDATION_ROWS)
     return SceneRows(

@@ -22,7 +22,11 @@ from cnpgen.robots.shape.hull import coal_hull, enclosing_hull, hull_corners
 from cnpgen.robots.shape.inline import corners_of, inline_mesh, with_inline_meshes
 from cnpgen.robots.shape.mesh_files import find_named_file
 from cnpgen.robots.shape.shape import Shape, load_shape
-from cnpgen.robots.urdf_changes import disabled_pairs, with_disabled_pairs
+from cnpgen.robots.urdf_changes import (
+    disabled_pairs,
+    with_disabled_pairs,
+    with_ignored_pairs,
+)
 from tests.examples.shaped_robot import (
     CLAW,
     LINKS,
@@ -472,9 +476,20 @@ def test_an_srdf_decides_which_pairs_are_left_out(tmp_path, cache_folder, shape)
         p.colliding for p in shape.pairs if (p.first, p.second) == ("base", "hand")
     )
     assert disabled_pairs(urdf()) is None
-    srdf.write_text('<robot><disable_collisions link1="hand" link2="foot"/></robot>')
+
+
+def test_links_of_an_srdf_that_the_urdf_lacks_are_a_warning(tmp_path, caplog):
+    srdf = tmp_path / "crane.srdf"
+    pairs = ("hand", "foot"), ("hand", "base"), ("toe", "foot")
+    entries = "".join(
+        f'<disable_collisions link1="{a}" link2="{b}"/>' for a, b in pairs
+    )
+    srdf.write_text(f"<robot>{entries}</robot>")
+    text = with_disabled_pairs(urdf(), srdf)
+    assert disabled_pairs(text) == {frozenset(("base", "hand"))}
+    assert "names 2 links that the URDF lacks: foot, toe" in caplog.text
     with pytest.raises(RecipeError, match="the URDF has no link foot"):
-        with_disabled_pairs(text, srdf)
+        with_ignored_pairs(text, [("hand", "foot")])
 
 
 def test_a_robot_without_collision_geometry_has_no_shape(tmp_path):

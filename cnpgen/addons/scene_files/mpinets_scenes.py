@@ -26,13 +26,19 @@ from cnpgen.problems.scenes.scene_problem import (
     check_count,
     make_obstacle,
 )
+from cnpgen.problems.scenes.scene_request import SceneRequest
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.shape.hull import Array
+from cnpgen.store.files.accounted import Account, UnusedElements, accounted
 from cnpgen.store.files.hdf5 import Hdf5, create_hdf5, open_hdf5
 
 _ENDS = (("start_q", "goal_q"), ("start_configs", "target_configs"))
 _TRAJECTORIES = ("global_solutions", "hybrid_solutions", "solutions")  # shape (N, T, n)
+UNUSED_ELEMENTS = UnusedElements(
+    harmless={},
+    unused=dict.fromkeys(_TRAJECTORIES, "trajectories beside starts and goals"),
+)
 # Kind -> datasets of its sizes, their number of columns, the word in the names of the
 # others.
 _SHAPES = {
@@ -49,12 +55,18 @@ def is_mpinets(path: Path) -> bool:
         return "cuboid_dims" in file or "cylinder_radii" in file
 
 
-def read_mpinets(path: Path, rows: slice) -> Iterator[SceneProblem]:
-    """Yield the problems of a file.
+def read_mpinets(
+    path: Path, rows: slice, *, allow_unused: Sequence[str] = ()
+) -> Iterator[tuple[SceneProblem, Account]]:
+    """Yield the problems of a file with the account of its datasets.
 
     DatasetError if it is damaged, SceneError if a dataset or obstacle is invalid.
     """
+    account = Account(
+        str(path), UNUSED_ELEMENTS, allow_unused=allow_unused, error=SceneError
+    )
     with open_hdf5(path) as file:
+        _check_names(file, account)
         start, goal = _ends(file, rows)
         count = len(start)
         shapes = {kind: _entries(file, kind, rows, count) for kind in _SHAPES}
@@ -68,13 +80,31 @@ def read_mpinets(path: Path, rows: slice) -> Iterator[SceneProblem]:
             ),
             place,
         )
-        yield SceneProblem(
+        scene = SceneProblem(
             name=name,
             obstacles=tuple(_obstacles(numbers, place)),
             start_q=start[row],
             goal_q=goal[row][None],
             source=str(path),
+            request=SceneRequest(accepted=tuple(account.accepted)),
         )
+        yield scene, account
+
+
+def _check_names(file: Hdf5, account: Account) -> None:
+    """Refuse datasets and attributes that are not read; trajectories are unused if there are starts and goals."""
+    entries = accounted(dict.fromkeys((*file.names(), *file.attributes)), account)
+    ends = next((both for both in _ENDS if all(name in file for name in both)), ())
+    trajectory = next((name for name in _TRAJECTORIES if name in file), "")
+    used = [*ends, SCENE_NAMES] if ends else [trajectory, SCENE_NAMES]
+    for sizes, _, word in _SHAPES.values():
+        quaternions = (
+            f"{word}_quats" if f"{word}_quats" in file else f"{word}_quaternions"
+        )
+        used += [*sizes, f"{word}_centers", quaternions]
+    for name in used:
+        entries.get(name)
+    account.finish(entries)
 
 
 def _ends(file: Hdf5, rows: slice) -> tuple[Array, Array]:

@@ -8,7 +8,8 @@ with a ``pose`` (x, y, z, qw, qx, qy, qz) relative to the robot's base.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,14 @@ from cnpgen.problems.scenes.scene_problem import (
     check_count,
     make_obstacle,
 )
+from cnpgen.problems.scenes.scene_request import BASE_FRAMES, SceneRequest
 from cnpgen.problems.scenes.yaml_document import part, scalar, vector
 from cnpgen.robots.obstacle import Obstacle
+from cnpgen.store.files.accounted import Account, UnusedElements, accounted
 
+UNUSED_ELEMENTS = UnusedElements(
+    harmless={"collision_buffer_ik": "distance at which the goal states were drawn"}
+)
 _KINDS = ("cuboid", "cylinder", "sphere")
 
 
@@ -41,12 +47,24 @@ def is_robometrics(document: Any) -> bool:
     )
 
 
-def read_robometrics(path: Path, document: Any) -> Iterator[SceneProblem]:
-    """Yield the problems of a document."""
+def read_robometrics(
+    path: Path, document: Any, *, allow_unused: Sequence[str] = ()
+) -> Iterator[tuple[SceneProblem, Account]]:
+    """Yield the problems of a document with their accounts."""
     for family in document:
         for index, entry in enumerate(part(document, family, list, str(path))):
             name = f"{family} {index}"
-            yield _problem(path, name, entry, f"{path}: scene {name!r}")
+            place = f"{path}: scene {name!r}"
+            if not isinstance(entry, dict):
+                raise SceneError(f"{place} must be a mapping, got {entry!r:.60}")
+            account = Account(
+                place, UNUSED_ELEMENTS, allow_unused=allow_unused, error=SceneError
+            )
+            counted = accounted(entry, account)
+            problem = _problem(path, name, counted, place)
+            account.finish(counted)
+            request = replace(problem.request, accepted=tuple(account.accepted))
+            yield replace(problem, request=request), account
 
 
 def _problem(path: Path, name: str, entry: Any, place: str) -> SceneProblem:
@@ -62,13 +80,19 @@ def _problem(path: Path, name: str, entry: Any, place: str) -> SceneProblem:
     pose = _goal_pose(part(entry, "goal_pose", dict, place), place)
     if not goals and pose is None:
         raise SceneError(f"{place} has neither goal_ik nor goal_pose")
+    frame = part(entry, "world_frame", str, place)
+    frame = "" if frame in BASE_FRAMES else frame
+    obstacles = tuple(_obstacles(part(entry, "obstacles", dict, place), place))
     return SceneProblem(
         name=name,
-        obstacles=tuple(_obstacles(part(entry, "obstacles", dict, place), place)),
+        obstacles=obstacles,
         start_q=start,
         goal_q=np.array(goals).reshape(len(goals), len(start)),
         goal_pose=pose,
         source=str(path),
+        request=SceneRequest(
+            goal_frame=frame, obstacle_frames=(frame,) * len(obstacles)
+        ),
     )
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import itertools
+import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from cnpgen.addons.scene_files.moveit_scenes import is_moveit, moveit_texts, read_moveit
+from cnpgen.addons.scene_files.moveit_scenes import is_moveit, read_moveit
+from cnpgen.addons.scene_files.moveit_writer import check_plain, moveit_texts
 from cnpgen.addons.scene_files.mpinets_scenes import (
     is_mpinets,
     mpinets_bytes,
@@ -17,7 +19,7 @@ from cnpgen.addons.scene_files.robometrics_scenes import (
     is_robometrics,
     read_robometrics,
 )
-from cnpgen.errors import UsageError
+from cnpgen.errors import UsageError, listed
 from cnpgen.problems.scenes.scene_problem import (
     MAX_SCENES,
     SceneError,
@@ -28,6 +30,7 @@ from cnpgen.problems.scenes.scene_problem import (
 from cnpgen.problems.scenes.yaml_document import read_yaml
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
+from cnpgen.store.files.accounted import Account
 from cnpgen.store.files.atomic import write_file
 from cnpgen.store.files.kind import HDF5_SUFFIXES, is_hdf5
 
@@ -35,21 +38,31 @@ YAML_SUFFIXES = (".yaml", ".yml")
 SCENE_SUFFIXES = (*YAML_SUFFIXES, *HDF5_SUFFIXES)
 MAX_SCENE_FILES = 20_000  # of a folder
 
+_LOG = logging.getLogger(__name__)
+
 
 @checked_arguments
 def load_scenes(
-    path: str | Path, *, start: int = 0, n: int | None = None
+    path: str | Path,
+    *,
+    start: int = 0,
+    n: int | None = None,
+    allow_unused: Sequence[str] = (),
 ) -> list[SceneProblem]:
     """Read the planning problems of scene files.
 
     The format follows from the content: MoveIt planning scenes and requests, or
     robometrics, in YAML; MPiNets or Avoid Everything in HDF5. Files of a folder are
-    read in the order of their names, without subfolders.
+    read in the order of their names, without subfolders. Every element of a file is
+    used, refused by name, or cannot change the answer; those of other software are
+    listed by the logger ``cnpgen``.
 
     Args:
         path: A file, or a folder of files.
         start: First scene.
         n: Number of scenes; by default all that follow.
+        allow_unused: Keys, or ends of paths such as ``start_state.is_diff``, of
+            elements that are accepted without effect.
 
     Raises:
         UsageError: There are no scenes.
@@ -60,24 +73,35 @@ def load_scenes(
     """
     path, start = Path(path), integer("start", start, least=0)
     stop = None if n is None else start + integer("n", n, least=1)
-    files = _files(path)
+    files, allowed = _files(path), tuple(allow_unused)
     if len(files) == 1 and _is_hdf5(files[0]):
-        scenes = list(read_mpinets(files[0], slice(start, stop)))
+        found = list(read_mpinets(files[0], slice(start, stop), allow_unused=allowed))
     else:
-        scenes = list(
-            itertools.islice(
-                _scenes(files),
-                start,
-                stop if stop is not None else start + MAX_SCENES + 1,
-            )
-        )
+        last = stop if stop is not None else start + MAX_SCENES + 1
+        found = list(itertools.islice(_scenes(files, allowed), start, last))
+    scenes = [scene for scene, _ in found]
     if len(scenes) > MAX_SCENES:
         raise SceneError(
             f"{path} has more than {MAX_SCENES:,} scenes: choose some by start and n"
         )
     if not scenes:
         raise UsageError(f"{path} has no scene from number {start} on", concerns="path")
+    _report(path, [account for _, account in found])
     return [checked_scene(scene) for scene in scenes]
+
+
+def _report(path: Path, accounts: Sequence[Account]) -> None:
+    """List the elements of files that were not used, in one line for each reason."""
+    unused = sorted({name for account in accounts for name in account.unused})
+    accepted = sorted({name for account in accounts for name in account.accepted})
+    if unused:
+        _LOG.info(
+            "%s: not used: %s (the reasons are in 'cnpgen docs scene-files')",
+            path,
+            listed(unused),
+        )
+    if accepted:
+        _LOG.warning("%s: accepted as unused: %s", path, listed(accepted))
 
 
 def holds_scenes(path: Path) -> bool:
@@ -123,15 +147,17 @@ def _files(path: Path) -> list[Path]:
     return known
 
 
-def _scenes(files: Sequence[Path]) -> Iterator[SceneProblem]:
-    """Yield the scenes of several files.
+def _scenes(
+    files: Sequence[Path], allowed: Sequence[str]
+) -> Iterator[tuple[SceneProblem, Account]]:
+    """Yield the scenes of several files with their accounts.
 
     Requests of MoveIt belong to scenes in other files.
     """
     moveit: dict[Path, Any] = {}
     for file in files:
         if _is_hdf5(file):
-            yield from read_mpinets(file, slice(0, None))
+            yield from read_mpinets(file, slice(0, None), allow_unused=allowed)
             continue
         for document in (
             read_yaml(file) if len(files) > 1 else _with_partner(file, moveit)
@@ -139,12 +165,12 @@ def _scenes(files: Sequence[Path]) -> Iterator[SceneProblem]:
             if is_moveit(document):
                 moveit[file] = {**moveit.get(file, {}), **document}
             elif is_robometrics(document):
-                yield from read_robometrics(file, document)
+                yield from read_robometrics(file, document, allow_unused=allowed)
             elif len(files) == 1:
                 raise SceneError(
                     f"{file} is neither a planning scene or request of MoveIt nor a robometrics file"
                 )
-    yield from read_moveit(moveit)
+    yield from read_moveit(moveit, allow_unused=allowed)
 
 
 def _with_partner(file: Path, moveit: dict[Path, Any]) -> list[Any]:
@@ -178,6 +204,8 @@ def save_scenes(
     """
     path = Path(path)
     check_scenes(scenes)
+    for scene in scenes:
+        check_plain(scene)
     if _is_hdf5(path):
         write_file(path, mpinets_bytes(scenes))
         return

@@ -1,5 +1,6 @@
 """The reader of scene files by its name."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +17,13 @@ class SceneFiles(SceneReader):
         """Return whether suffix and content are those of scenes."""
         return holds_scenes(path)
 
-    def load(self, path: Path, *, start: int, n: int | None) -> list[SceneProblem]:
+    def load(
+        self,
+        path: Path,
+        *,
+        start: int,
+        n: int | None,
+        allow_unused: Sequence[str] = (),
+    ) -> list[SceneProblem]:
         """Read scenes by ``load_scenes``."""
-        return load_scenes(path, start=start, n=n)
+        return load_scenes(path, start=start, n=n, allow_unused=allow_unused)

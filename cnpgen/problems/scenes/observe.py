@@ -68,8 +68,11 @@ def scene_bodies(scenes: Scenes) -> Primitives:
     Args:
         scenes: See ``observe``.
 
+    Obstacles that are all in the frame of one link stay in that frame.
+
     Raises:
-        UsageError: An obstacle is a mesh file, or there are no scenes.
+        UsageError: An obstacle is a mesh file, there are no scenes, or the obstacles of
+            a scene are in several frames.
     """
     if isinstance(scenes, Primitives):
         return scenes
@@ -83,6 +86,15 @@ def scene_bodies(scenes: Scenes) -> Primitives:
         raise UsageError("there are no scenes", concerns="scenes")
     if isinstance(scenes, Scene):
         return scene_primitives(scenes)
+    for scene in scenes:
+        if (
+            isinstance(scene, SceneProblem)
+            and len(set(scene.request.obstacle_frames)) > 1
+        ):
+            raise UsageError(
+                f"{scene.place} has obstacles in several frames, which need the robot: see placed_scene",
+                concerns="scenes",
+            )
     bodies = [
         scene.obstacles if isinstance(scene, SceneProblem) else scene
         for scene in scenes

@@ -15,6 +15,7 @@ from cnpgen.problems.scenes.quaternions import (
     roll_pitch_yaw,
     rotation_matrix,
 )
+from cnpgen.problems.scenes.scene_request import NO_REQUEST, SceneRequest
 from cnpgen.robots.observation.primitives import KINDS, primitives_of, signed_distances
 from cnpgen.robots.obstacle import Obstacle, invalid_obstacle
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, Array, check_solid, hull_corners
@@ -78,7 +79,7 @@ class GoalPose:
 
 @dataclass(frozen=True, eq=False)
 class SceneProblem:
-    """One planning problem in a scene: obstacles, a start at rest, and a goal at rest.
+    """One planning problem in a scene: obstacles, a start, and a goal at rest.
 
     Attributes:
         name: Name of the scene, unique in its file.
@@ -92,6 +93,7 @@ class SceneProblem:
         joint_names: Names of the n joints; empty for the planned joints of the problem
             in their order.
         source: File of the scene, for messages.
+        request: Further demands, such as a start velocity.
     """
 
     name: str
@@ -101,6 +103,7 @@ class SceneProblem:
     goal_pose: GoalPose | None = None
     joint_names: tuple[str, ...] = ()
     source: str = ""
+    request: SceneRequest = NO_REQUEST
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -330,8 +333,16 @@ def checked_scene(scene: SceneProblem) -> SceneProblem:
             raise SceneError(
                 f"{scene.place}: obstacle {obstacle.name!r} is a mesh file, expected corners: see make_mesh"
             )
+    counts = len(scene.start_q), len(scene.goal_q), len(scene.obstacles)
+    if error := next(scene.request.errors(*counts), ""):
+        raise SceneError(f"{scene.place}: {error}")
     scene = replace(scene, obstacles=_uniquely_named(scene.obstacles))
-    depths = np.array([_depth_of_base(obstacle) for obstacle in scene.obstacles])
+    depths = np.array(
+        [
+            -np.inf if scene.request.frame_of(index) else _depth_of_base(obstacle)
+            for index, obstacle in enumerate(scene.obstacles)
+        ]
+    )
     if len(depths) and depths.max() > MAX_BASE_DEPTH_M:
         name, depth = scene.obstacles[int(depths.argmax())].name, float(depths.max())
         raise SceneError(

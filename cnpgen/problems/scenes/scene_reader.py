@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from pathlib import Path
 
 from cnpgen.problems.scenes.scene_problem import SceneProblem
@@ -20,8 +21,18 @@ class SceneReader(ABC):
         """Return whether a file or a folder contains scenes that this reader reads."""
 
     @abstractmethod
-    def load(self, path: Path, *, start: int, n: int | None) -> list[SceneProblem]:
+    def load(
+        self,
+        path: Path,
+        *,
+        start: int,
+        n: int | None,
+        allow_unused: Sequence[str] = (),
+    ) -> list[SceneProblem]:
         """Read scenes from the number ``start`` on, at most ``n`` of them, or all that follow.
+
+        Every element of a file is used, refused by name, or cannot change the answer.
+        ``allow_unused`` has the keys of elements that are accepted without effect.
 
         Raises:
             UsageError: There are no scenes, or one is invalid; the message names file,
@@ -37,7 +48,11 @@ def holds_scenes(path: Path) -> bool:
 
 
 def read_scenes(
-    path: Path, *, start: int = 0, n: int | None = None
+    path: Path,
+    *,
+    start: int = 0,
+    n: int | None = None,
+    allow_unused: Sequence[str] = (),
 ) -> list[SceneProblem]:
     """Read the scenes of a path by the reader that accepts it; errors as of ``SceneReader.load``.
 
@@ -48,7 +63,7 @@ def read_scenes(
     if not readers:
         raise addons.missing("scene_files", f"reading scenes from {path}")
     chosen = next((reader for reader in readers if reader.holds(path)), readers[0])
-    return chosen.load(path, start=start, n=n)
+    return chosen.load(path, start=start, n=n, allow_unused=allow_unused)
 
 
 def _readers() -> list[SceneReader]:

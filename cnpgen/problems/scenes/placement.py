@@ -1,0 +1,151 @@
+"""Placement of scenes: obstacles and goal poses in frames of links, moved to the frame of the robot's base."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from cnpgen.errors import listed, nearest
+from cnpgen.problems.scenes.quaternions import roll_pitch_yaw
+from cnpgen.problems.scenes.scene_problem import SceneError, SceneProblem, checked_scene
+from cnpgen.problems.scenes.scene_request import (
+    BASE_FRAMES,
+    AttachedObject,
+    SceneRequest,
+)
+from cnpgen.robots.chain import frame_of
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.robot import Robot
+from cnpgen.robots.shape.convex_part import turned
+from cnpgen.robots.shape.hull import Array
+from cnpgen.robots.urdf import urdf_tree
+
+Pose = tuple[Array, Array]  # position [m] and rotation matrix
+
+_LOG = logging.getLogger(__name__)
+
+
+def placed_scene(scene: SceneProblem, robot: Robot, start: Array) -> SceneProblem:
+    """Return a scene with all poses in the frame of the robot's base, and those of attached objects in their links.
+
+    A robot of another name is a warning.
+
+    Args:
+        scene: The scene.
+        robot: The robot.
+        start: Joint positions at the start in the order of the planned joints [rad],
+            shape (n,), which place the frames of links.
+
+    Raises:
+        SceneError: A frame or a link is unknown.
+    """
+    request = scene.request
+    _warn_of_another_robot(scene, robot)
+    if not (request.places or request.attached):
+        return scene
+    frames = LinkFrames(scene, robot, start)
+    obstacles = []
+    for index, obstacle in enumerate(scene.obstacles):
+        frame = request.frame_of(index)
+        pose = frames.pose(frame, f"obstacle {obstacle.name!r}")
+        obstacles.append(moved_obstacle(obstacle, pose) if frame else obstacle)
+    goal = scene.goal_pose
+    if goal is not None and request.goal_frame:
+        position, rotation = frames.pose(request.goal_frame, "the goal pose")
+        goal = replace(
+            goal,
+            position=position + rotation @ goal.position,
+            rotation=rotation @ goal.rotation,
+        )
+    attached = tuple(_in_link(each, frames) for each in request.attached)
+    plain: SceneRequest = replace(
+        request, obstacle_frames=(), goal_frame="", fixed_frames=(), attached=attached
+    )
+    placed = replace(scene, obstacles=tuple(obstacles), goal_pose=goal, request=plain)
+    return checked_scene(placed)
+
+
+class LinkFrames:
+    """Frames of the links of a robot at the start state of a scene."""
+
+    def __init__(self, scene: SceneProblem, robot: Robot, start: Array) -> None:
+        import pinocchio as pin
+
+        self._scene, self._model = scene, robot.model
+        tree = urdf_tree(robot.urdf_text)
+        self.links = tuple(link.get("name", "") for link in tree.findall("link"))
+        self._data = self._model.createData()
+        pin.framesForwardKinematics(self._model, self._data, start)
+        children = {child.get("link") for child in tree.iter("child")}
+        for frame, is_base in scene.request.fixed_frames:
+            if frame in self.links and (not is_base or frame in children):
+                raise SceneError(
+                    f"{scene.place}: its frame {frame!r} is a link of the robot, which"
+                    " the transforms of the file cannot place"
+                )
+
+    def pose(self, frame: str, what: str) -> Pose:
+        """Return the pose of a frame in the frame of the robot's base."""
+        if frame in self.links:
+            placement = self._data.oMf[frame_of(self._model, frame)]
+            return np.array(placement.translation), np.array(placement.rotation)
+        if frame in BASE_FRAMES:
+            return np.zeros(3), np.eye(3)
+        raise SceneError(
+            f"{self._scene.place}: {what} is in the frame {frame!r}, which the robot"
+            f" lacks{nearest(frame, self.links)}; expected world, a link of the robot,"
+            f" an object or a fixed frame of the file; links: {listed(self.links, 12)}"
+        )
+
+    def check_link(self, link: str, what: str) -> None:
+        """Raise SceneError for an unknown link."""
+        if link not in self.links:
+            raise SceneError(
+                f"{self._scene.place}: {what} names the link {link!r}, which the robot"
+                f" lacks{nearest(link, self.links)}; links: {listed(self.links, 12)}"
+            )
+
+
+def moved_obstacle(obstacle: Obstacle, pose: Pose) -> Obstacle:
+    """Return an obstacle after the motion of its frame by a pose."""
+    position, rotation = pose
+    if not position.any() and np.array_equal(rotation, np.eye(3)):
+        return obstacle  # its numbers stay exact
+    x, y, z = (position + rotation @ np.array(obstacle.position)).tolist()
+    if obstacle.kind == "sphere":
+        return replace(obstacle, position=(x, y, z))
+    turn = roll_pitch_yaw(rotation @ turned(*obstacle.rotation))
+    return replace(obstacle, position=(x, y, z), rotation=turn)
+
+
+def _in_link(item: AttachedObject, frames: LinkFrames) -> AttachedObject:
+    """Return an attached object with the poses of its shapes in the frame of its link."""
+    what = f"the attached object {item.name!r}"
+    for link in (item.link, *item.touch_links):
+        frames.check_link(link, what)
+    # T_link_shape = T_base_link^-1 T_base_frame T_frame_shape
+    position, rotation = frames.pose(item.link, what)
+    shapes = []
+    for shape, frame in zip(item.shapes, item.frames, strict=True):
+        if frame == item.link:
+            shapes.append(shape)
+            continue
+        origin, turn = frames.pose(frame, what)
+        back = rotation.T @ (origin - position), rotation.T @ turn
+        shapes.append(moved_obstacle(shape, back))
+    return replace(item, shapes=tuple(shapes), frames=(item.link,) * len(item.shapes))
+
+
+def _warn_of_another_robot(scene: SceneProblem, robot: Robot) -> None:
+    """Warn if the scene names another robot than the URDF."""
+    expected = scene.request.robot_name
+    actual = urdf_tree(robot.urdf_text).get("name", "") if expected else ""
+    if expected != actual:
+        _LOG.warning(
+            "%s is for the robot %r, the URDF is that of %r: joints and links are matched by name",
+            scene.source or "the scene",
+            expected,
+            actual,
+        )

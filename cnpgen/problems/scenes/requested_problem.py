@@ -1,0 +1,204 @@
+"""Problem of a request: a robot's problem with the scaling factors and the attached objects of its scenes."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+
+from cnpgen.errors import RecipeError, listed
+from cnpgen.problems.constraints.joint import JointTorque
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.problem_record import ProblemRecord, as_problem, record_problem
+from cnpgen.problems.scenes.scene_problem import SceneError, SceneProblem
+from cnpgen.problems.scenes.scene_request import NO_REQUEST, AttachedObject
+from cnpgen.robots.attached_links import attached_link_name, with_attached_link
+from cnpgen.robots.robot import Robot
+from cnpgen.robots.urdf import urdf_tree
+from cnpgen.schema.arguments import check_range, number
+from cnpgen.schema.keys import PerJoint
+
+MAX_HELD_ERROR = 1e-3  # rad or m
+MIN_PAYLOAD_KG, MAX_PAYLOAD_KG = 1e-6, 1e4
+
+_LOG = logging.getLogger(__name__)
+
+
+def requested_problem(
+    problem: Problem,
+    robot: Robot,
+    scenes: Sequence[SceneProblem],
+    *,
+    payload: float | None = None,
+) -> tuple[Problem, Robot, list[SceneProblem]]:
+    """Return the problem that placed scenes ask for, its robot, and the scenes without these changes.
+
+    Scaling factors multiply the limits of velocities and accelerations. Attached
+    objects become links with their geometry and mass.
+
+    Args:
+        problem: The robot's problem.
+        robot: Its robot.
+        scenes: Placed scenes.
+        payload: Mass of attached objects of unknown weight [kg].
+
+    Raises:
+        SceneError: The scenes need different problems, or an attached object has no
+            mass or no place in the problem.
+        UsageError: ``payload`` is out of range.
+    """
+    if payload is not None:
+        mass = number("payload", payload)
+        check_range("payload", mass, MIN_PAYLOAD_KG, MAX_PAYLOAD_KG, "kg")
+    first = scenes[0]
+    _report_held_joints(problem, scenes)
+    for scene in scenes:
+        if scene.request.changes != first.request.changes:
+            raise SceneError(
+                f"{scene.place} has other scaling factors or attached objects than"
+                f" {first.place}, and the plans of one call share a problem: choose the"
+                " scenes of one problem by {first} and {n}",
+                remedies={"first": None, "n": None},
+            )
+    if not first.request.changes_problem:
+        return problem, robot, list(scenes)
+    changed = _with_scales(problem, robot, first)
+    if first.request.attached:
+        objects = [
+            _with_mass(item, problem, first, payload) for item in first.request.attached
+        ]
+        changed = _with_objects(changed, objects, first)
+    actual = load_robot(changed)
+    _check_contacts(actual, first)
+    return changed, actual, [_without_changes(scene) for scene in scenes]
+
+
+def _report_held_joints(problem: Problem, scenes: Sequence[SceneProblem]) -> None:
+    """Warn of joints that the problem holds at other positions than the start states of scenes, and of unknown ones."""
+    spec, tree = problem.robot, urdf_tree(problem.urdf_text)
+    moving = {
+        each.get("name", "")
+        for each in tree.iter("joint")
+        if each.get("type") != "fixed"
+    }
+    held = dict.fromkeys(moving - set(spec.joints), 0.0)
+    held |= zip(spec.locked_joints, spec.locked_positions, strict=True)
+    known = {each.get("name", "") for each in tree.iter("joint")}
+    texts = dict[str, None]()
+    for scene in scenes:
+        for name, position in zip(scene.joint_names, scene.start_q, strict=False):
+            if name not in known:
+                texts[f"{name} (the robot lacks it)"] = None
+            elif abs(position - held.get(name, position)) > MAX_HELD_ERROR:
+                texts[f"{name} ({position:g} in the file, held at {held[name]:g})"] = (
+                    None
+                )
+    if texts:
+        _LOG.warning(
+            "joints of the scenes that the problem %r does not plan: %s",
+            problem.name,
+            listed(list(texts), 10),
+        )
+
+
+def _without_changes(scene: SceneProblem) -> SceneProblem:
+    request = replace(
+        scene.request,
+        velocity_scale=NO_REQUEST.velocity_scale,
+        acceleration_scale=NO_REQUEST.acceleration_scale,
+        attached=(),
+    )
+    return replace(scene, request=request)
+
+
+def _with_scales(problem: Problem, robot: Robot, scene: SceneProblem) -> Problem:
+    """Return the problem with scaled limits of velocities and accelerations; those of jerks and torques stay."""
+    request = scene.request
+    limits = replace(
+        problem.limits,
+        velocity_scale=problem.limits.velocity_scale * request.velocity_scale,
+        acceleration=PerJoint(
+            tuple((request.acceleration_scale * robot.acceleration_limit).tolist())
+        ),
+        jerk=PerJoint(tuple(robot.jerk_limit.tolist())),
+    )
+    scaled = replace(problem, limits=limits)
+    vars(scaled)["urdf_text"] = problem.urdf_text  # cached, expensive to read again
+    return scaled
+
+
+def _with_mass(
+    item: AttachedObject, problem: Problem, scene: SceneProblem, payload: float | None
+) -> AttachedObject:
+    """Return an attached object with a mass; an unknown one is refused for problems with torques."""
+    if item.mass:
+        _LOG.info(
+            "%s: the weight of the attached object %r, %g, is taken as its mass in kg",
+            scene.source or "the scene",
+            item.name,
+            item.mass,
+        )
+        return item
+    if payload is not None:
+        return replace(item, mass=payload)
+    if problem.first(JointTorque) is not None:
+        raise SceneError(
+            f"{scene.place}: the attached object {item.name!r} has the weight 0, which"
+            " means that it is unknown, and the problem limits torques: give its"
+            " weight in kg, or {payload} in kg",
+            remedies={"payload": None},
+        )
+    return item
+
+
+def _with_objects(
+    problem: Problem, objects: Sequence[AttachedObject], scene: SceneProblem
+) -> Problem:
+    """Return the problem with attached objects as links."""
+    if problem.robot.geometry != "urdf":
+        raise SceneError(
+            f"{scene.place} has attached objects, and the problem {problem.name!r} has"
+            ' no link geometry: expected [robot] geometry = "urdf"'
+        )
+    record = record_problem(problem)
+    text = record.urdf
+    try:
+        for item in objects:
+            text = with_attached_link(
+                text,
+                item.name,
+                item.link,
+                shapes=item.shapes,
+                mass=item.mass,
+                touch_links=item.touch_links,
+            )
+    except (RecipeError, ValueError) as error:
+        raise SceneError(f"{scene.place}: {error}") from error
+    return as_problem(ProblemRecord(record.recipe, text))
+
+
+def _check_contacts(robot: Robot, scene: SceneProblem) -> None:
+    """Raise SceneError if an attached object always overlaps a link, which no check of a motion could notice."""
+    names = {
+        attached_link_name(item.name): item.name for item in scene.request.attached
+    }
+    for pair in () if robot.shape is None else robot.shape.pairs:
+        body = next((each for each in (pair.first, pair.second) if each in names), None)
+        if body is None or pair.left_out != "always":
+            continue
+        other = pair.second if body == pair.first else pair.first
+        raise SceneError(
+            f"{scene.place}: the attached object {names[body]!r} overlaps the link"
+            f" {other!r} in every state: name the link in its touch_links",
+            concerns="scenes",
+        )
+
+
+def refuse_changes(scenes: Sequence[SceneProblem], why: str) -> None:
+    """Raise SceneError for scaling factors and attached objects where the problem cannot change."""
+    for scene in scenes:
+        if scene.request.changes_problem:
+            raise SceneError(
+                f"{scene.place} has scaling factors or attached objects: {why}"
+            )

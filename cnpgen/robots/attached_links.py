@@ -1,0 +1,124 @@
+"""Attached objects as links of a URDF: shapes, mass and touch links of a body that a link carries."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
+
+from cnpgen.errors import RecipeError
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.shape.convex_part import turned
+from cnpgen.robots.shape.hull import coal_hull
+from cnpgen.robots.shape.inline import corners_of
+from cnpgen.robots.urdf import numbers_text, urdf_tree
+from cnpgen.robots.urdf_changes import with_ignored_pairs
+
+if TYPE_CHECKING:
+    import pinocchio as pin
+
+_INERTIA = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2)}
+_INERTIA |= {"iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+
+
+def attached_link_name(name: str) -> str:
+    """Return the name of the link, and of its joint, of an attached object."""
+    return f"attached {name}"
+
+
+def with_attached_link(
+    urdf: str,
+    name: str,
+    link: str,
+    *,
+    shapes: Sequence[Obstacle],
+    mass: float,
+    touch_links: Iterable[str],
+) -> str:
+    """Return a URDF with an attached object as a link that is fixed to another one.
+
+    Args:
+        urdf: Text of the URDF, whose meshes are inline.
+        name: Name of the object.
+        link: Link that carries it.
+        shapes: Its shapes, with poses in the frame of that link.
+        mass: Its mass [kg], which all shapes share by volume; 0 for none.
+        touch_links: Links that may touch it, beside ``link``.
+
+    Raises:
+        RecipeError: The URDF has a link or a joint of that name.
+    """
+    robot, body = urdf_tree(urdf), attached_link_name(name)
+    if any(part.get("name") == body for part in robot if part.tag in {"link", "joint"}):
+        raise RecipeError([f"the URDF has a link or joint {body!r} already"])
+    element = SubElement(robot, "link", name=body)
+    if mass:
+        element.append(_inertial(uniform_inertia(shapes, mass)))
+    for kind in ("visual", "collision"):
+        for shape in shapes:
+            part = SubElement(element, kind)
+            xyz, rpy = numbers_text(shape.position or ()), numbers_text(shape.rotation)
+            SubElement(part, "origin", xyz=xyz, rpy=rpy)
+            SubElement(part, "geometry").append(_geometry(shape))
+    joint = SubElement(robot, "joint", name=body, type="fixed")
+    SubElement(joint, "parent", link=link)
+    SubElement(joint, "child", link=body)
+    text = ElementTree.tostring(robot, encoding="unicode")
+    links = dict.fromkeys((link, *touch_links))
+    return with_ignored_pairs(text, [(each, body) for each in links])
+
+
+def uniform_inertia(shapes: Sequence[Obstacle], mass: float) -> pin.Inertia:
+    """Return the inertia of shapes of one density, in the frame of their poses, for a total mass [kg]."""
+    import pinocchio as pin
+
+    bodies = [_coal_shape(shape) for shape in shapes]
+    volumes = np.array([body.computeVolume() for body in bodies])
+    density, total = mass / volumes.sum(), pin.Inertia.Zero()
+    for shape, body, volume in zip(shapes, bodies, volumes, strict=True):
+        # Coal returns the inertia at unit density, about the center of mass
+        inertia = density * np.array(body.computeMomentofInertiaRelatedToCOM())
+        center = np.array(body.computeCOM())
+        placement = pin.SE3(turned(*shape.rotation), np.array(shape.position))
+        total += placement.act(pin.Inertia(density * volume, center, inertia))
+    return total
+
+
+def _coal_shape(shape: Obstacle) -> Any:
+    import coal
+
+    if shape.kind == "box":
+        return coal.Box(*(shape.size or ()))
+    if shape.kind == "sphere":
+        return coal.Sphere(shape.radius)
+    if shape.kind == "cylinder":
+        return coal.Cylinder(shape.radius, shape.length)
+    return coal_hull(corners_of(shape.mesh))
+
+
+def _geometry(shape: Obstacle) -> Element:
+    """Return the geometry of a shape as an element of a URDF."""
+    if shape.kind == "box":
+        return Element("box", size=numbers_text(shape.size or ()))
+    radius = numbers_text([shape.radius or 0.0])
+    if shape.kind == "sphere":
+        return Element("sphere", radius=radius)
+    if shape.kind == "cylinder":
+        length = numbers_text([shape.length or 0.0])
+        return Element("cylinder", radius=radius, length=length)
+    return Element("mesh", filename=shape.mesh)
+
+
+def _inertial(inertia: pin.Inertia) -> Element:
+    """Return the element of an inertia: mass, center of mass, and inertias about it along the axes of the link."""
+    element = Element("inertial")
+    SubElement(element, "origin", xyz=numbers_text(inertia.lever), rpy="0 0 0")
+    SubElement(element, "mass", value=numbers_text([inertia.mass]))
+    inertias = {
+        key: numbers_text([inertia.inertia[index]]) for key, index in _INERTIA.items()
+    }
+    SubElement(element, "inertia", inertias)
+    return element

@@ -1,0 +1,155 @@
+"""Every element of robometrics, MPiNets and Avoid Everything files is used, refused or listed."""
+
+import copy
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from cnpgen.errors import UsageError
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.scenes.placement import placed_scene
+from cnpgen.scenes import SceneError, SceneProblem, load_scenes, observe
+from tests.examples.example_robots import needs_robots
+
+START = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
+POSE = [0.5, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0]
+PROBLEM: dict[str, Any] = {
+    "start": START,
+    "goal_ik": [[0.5, *START[1:]]],
+    "goal_pose": {
+        "frame": "panda_hand",
+        "position_xyz": [0.4, 0, 0.4],
+        "quaternion_wxyz": [0, 1, 0, 0],
+    },
+    "obstacles": {
+        "cuboid": {"box": {"dims": [0.1, 0.1, 0.1], "pose": POSE}},
+        "cylinder": {"can": {"radius": 0.1, "height": 0.2, "pose": POSE}},
+        "sphere": {"ball": {"radius": 0.1, "pose": POSE}},
+    },
+    "world_frame": "panda_link0",
+    "collision_buffer_ik": 0.0,
+}
+
+
+def load(folder: Path, problem: dict[str, Any], **options: Any) -> SceneProblem:
+    (folder / "set.yaml").write_text(json.dumps({"shelf": [problem]}))
+    (scene,) = load_scenes(folder / "set.yaml", **options)
+    return scene
+
+
+def digest(scene: SceneProblem) -> str:
+    goal = scene.goal_pose
+    ends = [scene.start_q.tolist(), scene.goal_q.tolist()]
+    ends += (
+        []
+        if goal is None
+        else [goal.frame, goal.position.tolist(), goal.rotation.tolist()]
+    )
+    return repr([ends, scene.obstacles, scene.request.obstacle_frames])
+
+
+def places(content: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Return the places of all keys of a document."""
+    if isinstance(content, list):
+        return []
+    return [
+        each
+        for key, value in (content.items() if isinstance(content, dict) else ())
+        for each in ((*place, key), *places(value, (*place, key)))
+    ]
+
+
+def with_value(place: tuple[Any, ...], value: Any) -> dict[str, Any]:
+    content = copy.deepcopy(PROBLEM)
+    at: Any = content
+    for key in place[:-1]:
+        at = at[key]
+    at[place[-1]] = value
+    return content
+
+
+@pytest.mark.parametrize("place", places(PROBLEM), ids=".".join)
+def test_every_element_of_robometrics_files_is_used_refused_or_listed(
+    tmp_path: Path, place: tuple[Any, ...]
+) -> None:
+    usual = digest(load(tmp_path, PROBLEM))
+    for value in (0, -1, 0.3, "nan", "", [], {}, "elsewhere"):
+        if place[-1] == "collision_buffer_ik":
+            assert digest(load(tmp_path, with_value(place, value))) == usual
+            continue
+        try:
+            assert digest(load(tmp_path, with_value(place, value))) != usual
+        except SceneError as error:
+            refusal = str(error)
+        else:
+            continue
+        assert "shelf 0" in refusal
+    wrong = with_value((*place[:-1], f"{place[-1]}q"), 1)
+    if place[:-1] in {(), ("goal_pose",)} or len(place) == 4:
+        with pytest.raises(
+            SceneError, match=rf"unknown element, .*{place[-1]}q \(did you mean '"
+        ):
+            load(tmp_path, wrong)
+        key = f"{place[-1]}q"
+        assert load(tmp_path, wrong, allow_unused=[key]).request.accepted
+
+
+@needs_robots
+def test_the_world_frame_of_robometrics_is_a_link_of_the_robot(tmp_path: Path) -> None:
+    robot = load_robot(load_problem("panda"))
+    start = np.array(START)
+    scene = load(tmp_path, PROBLEM)
+    usual = load(tmp_path, with_value(("world_frame",), ""))
+    assert placed_scene(scene, robot, start).obstacles == usual.obstacles
+    other = load(tmp_path, with_value(("world_frame",), "table"))
+    with pytest.raises(SceneError, match="in the frame 'table', which the robot lacks"):
+        placed_scene(other, robot, start)
+
+
+def hdf5(folder: Path, **changes: Any) -> Path:
+    columns: dict[str, Any] = {
+        "cuboid_dims": np.full((2, 1, 3), 0.1),
+        "cuboid_centers": np.full((2, 1, 3), 0.5),
+        "cuboid_quaternions": np.tile([1.0, 0, 0, 0], (2, 1, 1)),
+        "start_q": np.zeros((2, 7)),
+        "goal_q": np.ones((2, 7)),
+    } | changes
+    file = folder / "scenes.h5"
+    with h5py.File(file, "w") as content:
+        for name, values in columns.items():
+            content[name] = values
+    return file
+
+
+def test_unknown_datasets_of_hdf5_files_are_refused(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "cnpgen")
+    usual = [digest(scene) for scene in load_scenes(hdf5(tmp_path))]
+    file = hdf5(tmp_path, cilinder_radii=np.ones((2, 1)))
+    with pytest.raises(
+        SceneError, match=r"cilinder_radii \(did you mean 'cylinder_radii'"
+    ):
+        load_scenes(file)
+    scenes = load_scenes(file, allow_unused=["cilinder_radii"])
+    assert scenes[0].request.accepted == ("cilinder_radii",)
+    for seed in range(2):  # the trajectories beside starts and goals change nothing
+        file = hdf5(
+            tmp_path, global_solutions=np.random.default_rng(seed).random((2, 9, 7))
+        )
+        assert [digest(scene) for scene in load_scenes(file)] == usual
+    assert "not used: global_solutions" in caplog.text
+
+
+def test_observations_need_one_frame(tmp_path: Path) -> None:
+    scene = load(tmp_path, PROBLEM)
+    assert observe([scene], "tokens")["mask"].sum() == 3
+    request = replace(scene.request, obstacle_frames=("a", "b", ""))
+    with pytest.raises(UsageError, match="has obstacles in several frames"):
+        observe([replace(scene, request=request)], "tokens")
