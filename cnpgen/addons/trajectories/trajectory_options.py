@@ -139,8 +139,9 @@ def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
     lines = [f"{file}: trajectories of {found.problem.name}: {counts}"]
     lines += [f"torque: {found.judged_torque}"] if found.judged_torque else []
     for source, count in found.assumed_errors.items():
-        text = f"{source} is assumed for {count:,}, at least that of the numbers"
-        lines.append(f"{text}; --noise and --time-jitter state a sensor's")
+        lines.append(f"assumed for {count:,}, at least that of the numbers: {source}")
+    if found.assumed_errors:
+        lines.append("  a sensor has more: --noise and --time-jitter state it")
     lines.append("")
     decided: list[tuple[str, ...]] = [
         (
