@@ -68,7 +68,7 @@ def test_files_of_every_kind_are_read_unchanged(
     good: Path, tmp_path: Path, kind: str
 ) -> None:
     for index in range(UNCHANGED_PER_KIND):
-        folder, draw = tmp_path / str(index), Random(f"{kind} {index}")  # noqa: S311
+        folder, draw = tmp_path / str(index), Random(f"{kind} {index}")
         folder.mkdir()
         SUBJECTS[kind].change(good, folder, draw)
         read_quietly(SUBJECTS[kind], folder, draw)
