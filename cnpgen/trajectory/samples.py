@@ -10,7 +10,7 @@ from cnpgen.trajectory.boundary import Boundary
 Array = NDArray[np.float64]
 
 MAX_SAMPLE = 1e9  # of times, positions and velocities in SI units; powers of larger ones overflow
-MIN_DURATION_S = 1e-9  # of trajectories; derivatives of shorter ones overflow
+MIN_SAMPLED_DURATION_S = 1e-9  # of trajectories; derivatives of shorter ones overflow
 MIN_DENSE_SAMPLES = (
     400  # fewer samples are resampled from the cubic through positions and velocities
 )
@@ -71,9 +71,11 @@ def checked_samples(
                 f"must be at most {MAX_SAMPLE:g}, got {np.abs(values).max():g}",
                 argument=name,
             )
-    if not (times[-1] - times[0] >= MIN_DURATION_S or np.any(np.diff(times) <= 0)):
+    if not (
+        times[-1] - times[0] >= MIN_SAMPLED_DURATION_S or np.any(np.diff(times) <= 0)
+    ):
         raise UsageError(
-            f"must last at least {MIN_DURATION_S:g} s, got {times[-1] - times[0]:g} s",
+            f"must last at least {MIN_SAMPLED_DURATION_S:g} s, got {times[-1] - times[0]:g} s",
             argument="t",
         )
     if np.any(np.diff(times) <= 0):
