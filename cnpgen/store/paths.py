@@ -85,7 +85,15 @@ def require_file(
 def require_path(path: Path, expected: str, *, argument: str = "path") -> None:
     """Raise UsageError, naming the argument, if a path is missing, and MachineError if it cannot be read."""
     check_readable(path)
-    if not path.exists():
+    try:
+        present = path.exists()
+    except (OSError, ValueError) as error:  # a name that is too long, or with NUL
+        reason = getattr(error, "strerror", None) or str(error)
+        raise UsageError(
+            f"{str(path)!r:.100} cannot be a path: {reason}, expected {expected}",
+            concerns=argument,
+        ) from error
+    if not present:
         raise UsageError(
             f"{path} is not there, expected {expected}{similar_path(path)}",
             concerns=argument,

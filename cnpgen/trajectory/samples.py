@@ -11,6 +11,8 @@ Array = NDArray[np.float64]
 
 # Of times, positions and velocities in SI units; powers of larger ones overflow.
 MAX_SAMPLE = 1e9
+# Of trajectories; derivatives of shorter ones overflow.
+MIN_SAMPLED_DURATION_S = 1e-9
 # Fewer samples are resampled from the cubic through positions and velocities.
 MIN_DENSE_SAMPLES = 400
 WINDOWS = (
@@ -72,6 +74,13 @@ def checked_samples(
                 f"must be at most {MAX_SAMPLE:g}, got {np.abs(values).max():g}",
                 argument=name,
             )
+    if not (
+        times[-1] - times[0] >= MIN_SAMPLED_DURATION_S or np.any(np.diff(times) <= 0)
+    ):
+        raise UsageError(
+            f"must last at least {MIN_SAMPLED_DURATION_S:g} s, got {times[-1] - times[0]:g} s",
+            argument="t",
+        )
     if np.any(np.diff(times) <= 0):
         index = int(np.argmin(np.diff(times) > 0))
         raise UsageError(

@@ -80,6 +80,9 @@ class Motion:
             raise UsageError(
                 f"control points must be arrays: {error}", concerns="path"
             ) from error
+        for name in ("path", "rate"):
+            if np.asarray(getattr(self, name)).dtype.kind not in "fiu":
+                raise UsageError("must be an array of numbers", argument=name)
         if len(path) != 3 or len(rate) != 2 or path[0] != rate[0]:
             raise UsageError(
                 f"control points must have shapes (N, C, n) and (N, R), got {path} and {rate}",

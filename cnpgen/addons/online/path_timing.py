@@ -4,7 +4,7 @@ A motion ``q(t)`` is followed as ``q(sigma(t))`` with the speed ``u = dsigma/dt`
 falls from 1 to 0, and ``w = -du/dt``. Its derivatives are ``dq = q' u`` and
 ``ddq = q'' u^2 - q' w``, so every acceleration and torque (Bobrow et al. 1985) is
 
-    value = rest + square u^2 - slope w.
+    value = rest + square u^2 - brake_factor w.
 
 The motion itself has u = 1 and w = 0. The feasible set of (u^2, w) is convex at each
 state and contains (1, 0) and, since the arm can rest there, (0, 0): braking slowly
@@ -39,8 +39,8 @@ Array = NDArray[np.float64]
 RAMPS = (0.1, 0.25, 0.45, 0.7)  # shares of the braking time in which w rises or falls
 NODE_STEP_S = 2e-3  # of the states at which limits are evaluated
 PHASES_OF_LAW = 41  # at which a time law is compared with the limits
-ROUNDING = 1e-9  # of times [s], and relative of limits
-LIMIT_SHARE = 0.999  # of the limits: states between the phases differ a little
+TIMING_ROUNDING = 1e-9  # of times [s], and relative of limits
+MAX_BRAKING_USE = 0.999  # of the limits: states between the phases differ a little
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class PathLimits:
     times: Array
     rest: Array
     square: Array
-    slope: Array
+    brake_factor: Array
     limit: Array
 
     def feasible(
@@ -90,7 +90,7 @@ class PathLimits:
         u2, w = (speed**2)[..., None], (brake / duration[:, None])[..., None]
         # The value is linear in each of the tables, so the two nodes are compared.
         low, high = (
-            np.abs(self.rest[k] + self.square[k] * u2 - self.slope[k] * w)
+            np.abs(self.rest[k] + self.square[k] * u2 - self.brake_factor[k] * w)
             / self.limit[k]
             for k in (node, node + 1)
         )
@@ -122,13 +122,13 @@ def shape_at(x: Array, rise: float, fall: float) -> tuple[Array, Array, Array]:
     """
     height = 1 / (1 - (rise + fall) / 2)
     brake = height * np.minimum(np.minimum(x / rise, (1 - x) / fall), 1.0)
-    # Integrals of the ramps (x - e)+ that w T consists of: its slope changes at e.
-    edges, slopes = (0.0, rise, 1 - fall), (1 / rise, -1 / rise, -1 / fall)
+    # Integrals of the ramps (x - e)+ that w T consists of: its gradient changes at e.
+    edges, gradients = (0.0, rise, 1 - fall), (1 / rise, -1 / rise, -1 / fall)
     lost, shortened = np.zeros_like(x), np.zeros_like(x)
-    for edge, slope in zip(edges, slopes, strict=True):
+    for edge, gradient in zip(edges, gradients, strict=True):
         after = np.maximum(x - edge, 0.0)
-        lost += height * slope * after**2 / 2
-        shortened += height * slope * after**3 / 6
+        lost += height * gradient * after**2 / 2
+        shortened += height * gradient * after**3 / 6
     return 1 - lost, brake, x - shortened
 
 
@@ -147,15 +147,19 @@ def path_limits(
     terms = []
     for part, mask, _ in passed_parts(motion, times):
         terms.append(_terms(checker, part, SetPoint(*(x[mask] for x in states))))
-    rest, square, slope, limit = (np.concatenate(x) for x in zip(*terms, strict=True))
-    limit = np.maximum(LIMIT_SHARE * limit, np.abs(rest + square) * (1 + ROUNDING))
-    return PathLimits(times, rest, square, slope, limit)
+    rest, square, brake_factor, limit = (
+        np.concatenate(x) for x in zip(*terms, strict=True)
+    )
+    limit = np.maximum(
+        MAX_BRAKING_USE * limit, np.abs(rest + square) * (1 + TIMING_ROUNDING)
+    )
+    return PathLimits(times, rest, square, brake_factor, limit)
 
 
 def _terms(
     checker: MotionChecker, part: Plans, states: SetPoint
 ) -> tuple[Array, Array, Array, Array]:
-    """Return rest, square, slope and limit of the limited quantities at K states, shape (K, m) each."""
+    """Return rest, square, brake_factor and limit of the limited quantities at K states, shape (K, m) each."""
     q, dq, ddq = states
     still, (problem, robot) = np.zeros_like(q), open_problem(part.problem)
     quantities = []
@@ -164,10 +168,10 @@ def _terms(
         quantities.append((still, ddq, dq, np.broadcast_to(limit, q.shape)))
     if problem.first(JointTorque) is not None:
         gravity = checker.torques(part, q, still, still)
-        slope = checker.torques(part, q, still, dq) - gravity
+        brake_factor = checker.torques(part, q, still, dq) - gravity
         square = checker.torques(part, q, dq, ddq) - gravity
         limit = np.broadcast_to(robot.torque_limit, q.shape)
-        quantities.append((gravity, square, slope, limit))
+        quantities.append((gravity, square, brake_factor, limit))
     if not quantities:
         return (np.zeros((len(q), 0)),) * 4
     return tuple(np.hstack(term) for term in zip(*quantities, strict=True))  # type: ignore[return-value]
@@ -194,7 +198,9 @@ def retimed(motion: SampledMotion, law: TimeLaw) -> SampledMotion:
     times = grid(law.duration)
     u, brake, travel = shape_at(times / law.duration, law.rise, law.fall)
     sigma = law.start + law.duration * travel
-    if sigma[-1] >= motion.end_time - ROUNDING:  # a settling part ends with the path
+    if (
+        sigma[-1] >= motion.end_time - TIMING_ROUNDING
+    ):  # a slower end stops with the path
         sigma = np.minimum(sigma, np.nextafter(motion.end_time, -np.inf))
     q, dq, ddq = motion.at(sigma)
     u[-1] = brake[-1] = 0.0  # exactly at rest

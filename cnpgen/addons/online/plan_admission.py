@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from cnpgen.addons.online.motion_check import MotionChecker
 from cnpgen.addons.online.plan_hits import PlannedHits
 from cnpgen.addons.online.set_points import SampledMotion, SetPoint, sample_motion
-from cnpgen.addons.online.stops import settled
+from cnpgen.addons.online.stops import with_smooth_end
 from cnpgen.addons.online.switches import SwitchOutcome
 from cnpgen.errors import UsageError
 from cnpgen.planner.planner import Planner
@@ -61,9 +61,9 @@ class Admission:
             UsageError: There are several plans, or they are of another robot.
         """
         self._check_plan(plan)
-        return self._find_reason(plan) or self._settled(plan, at)
+        return self._find_reason(plan) or self._with_smooth_end(plan, at)
 
-    def _settled(
+    def _with_smooth_end(
         self, plan: Plans | JoinedPlans, at: float
     ) -> tuple[SwitchOutcome | SampledMotion, str]:
         """Return the motion of a plan, slower at its end if it would end with an acceleration, and a text about it."""
@@ -73,7 +73,7 @@ class Admission:
         if share <= MAX_END_ACCELERATION:
             return motion, ""
         text = f"it ends with {share:.3g} of the acceleration limit"
-        slower = settled(self._checker, motion, measured=self._judge)
+        slower = with_smooth_end(self._checker, motion, measured=self._judge)
         if slower is None:
             return SwitchOutcome.ACCELERATING if self._judge else motion, text
         added = slower.end_time - motion.end_time

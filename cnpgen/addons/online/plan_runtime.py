@@ -28,7 +28,7 @@ PlanFunction = Callable[[SetPoint], Executable | None]
 """A function of the state at the switch that returns one plan, sequence or hit from there, or None."""
 
 HISTORY_S = 1.0  # for which ``state_at`` returns the executed motion
-MAX_STEP_S = 0.1  # a joint moves no further from one set point to the next than at its velocity limit in this time
+MAX_SET_POINT_STEP_S = 0.1  # a joint moves no further from one set point to the next than at its velocity limit in this time
 CLOSING_TIME_S = 2.0  # for which ``close`` waits for a planner
 MAX_LATE_STOPS = 3  # of computed stops whose begin has passed meanwhile
 STOP_LEAD_S = 0.02  # of the next one
@@ -76,7 +76,7 @@ class PlanRuntime:
         judge: bool = True,
         parameters: ArrayLike | None = None,
         history: float = HISTORY_S,
-        max_step: float = MAX_STEP_S,
+        max_step: float = MAX_SET_POINT_STEP_S,
     ) -> None:
         self._robot, self._judge, self._checker = planner.robot, judge, MotionChecker()
         self._admission = Admission(
@@ -106,7 +106,7 @@ class PlanRuntime:
         The motion in execution continues to its end.
 
         Args:
-            timeout: Longest time to wait [s].
+            timeout: Maximum time to wait [s].
 
         Returns:
             Whether planning has ended. A planner that hangs is left in a daemon thread.

@@ -26,7 +26,7 @@ DELAYS_S = np.array([0.0, 0.01, 0.02, 0.035, 0.05, 0.075, 0.1, 0.15])  # before 
 BISECTIONS = 9  # of the braking time
 MAX_MEASURED_LAWS = 4  # then the motion continues to its end
 SLOWER_STEP = 1.25  # of braking times after a measurement that found a violation
-SETTLING_TIMES_S = np.array([0.03, 0.05, 0.08, 0.12, 0.18, 0.26, 0.38, 0.55, 0.8])
+SMOOTH_END_TIMES_S = np.array([0.03, 0.05, 0.08, 0.12, 0.18, 0.26, 0.38, 0.55, 0.8])
 
 
 def earliest_stop(
@@ -56,7 +56,7 @@ def earliest_stop(
 def _earliest_law(limits: PathLimits, time: float, horizon: float) -> TimeLaw | None:
     """Return the feasible time law that ends first, None if none ends before the horizon [s] after a time.
 
-    Every combination of a delay and a shape is bisected for its shortest feasible
+    Every combination of a delay and a shape is bisected for its minimum feasible
     duration. Longer ones are feasible, too, except where the path becomes harder.
     """
     count = len(shapes())
@@ -68,10 +68,10 @@ def _earliest_law(limits: PathLimits, time: float, horizon: float) -> TimeLaw | 
     feasible = limits.feasible(time + delay, high, shape)
     low = np.full_like(high, MIN_BRAKING_TIME_S)
     for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        shorter = limits.feasible(time + delay, middle, shape)
+        midpoint = (low + high) / 2
+        shorter = limits.feasible(time + delay, midpoint, shape)
         feasible |= shorter
-        low, high = np.where(shorter, low, middle), np.where(shorter, middle, high)
+        low, high = np.where(shorter, low, midpoint), np.where(shorter, midpoint, high)
     if not feasible.any():
         return None
     best = int(np.argmin(np.where(feasible, delay + high, np.inf)))
@@ -87,7 +87,7 @@ def _slower(law: TimeLaw, end: float) -> Iterator[TimeLaw]:
         yield TimeLaw(law.start, duration, law.rise, law.fall)
 
 
-def settled(
+def with_smooth_end(
     checker: MotionChecker, motion: SampledMotion, *, measured: bool
 ) -> SampledMotion | None:
     """Return a motion whose end is slower, so that its acceleration falls to zero, None if none is feasible.
@@ -98,8 +98,8 @@ def settled(
     length = motion.end_time - motion.start
     limits = path_limits(checker, motion, motion.start, motion.end_time)
     travel = shape_table()[2][:, -1]
-    duration = np.repeat(SETTLING_TIMES_S, len(travel))
-    shape = np.tile(np.arange(len(travel), dtype=np.int64), len(SETTLING_TIMES_S))
+    duration = np.repeat(SMOOTH_END_TIMES_S, len(travel))
+    shape = np.tile(np.arange(len(travel), dtype=np.int64), len(SMOOTH_END_TIMES_S))
     path = duration * travel[shape]  # of the motion that is retimed [s]
     begin = motion.end_time - path
     feasible = (path < length) & limits.feasible(

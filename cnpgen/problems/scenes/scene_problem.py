@@ -219,7 +219,7 @@ def make_mesh(
     if not vertices.size:
         raise SceneError(f"{where} is a mesh without vertices")
     shapes = {
-        "points": (vertices, (len(vertices), 3)),
+        "points": (vertices, (*vertices.shape[:1], 3)),
         "position": (origin, (3,)),
         "rotation": (turn, (3, 3)),
     }

@@ -87,7 +87,7 @@ def test_set_points_are_the_states_of_the_plan(planner, runtime):
     np.testing.assert_allclose(points.dq, dq, atol=1e-6)
     np.testing.assert_allclose(runtime.state_at(9.0).q, planner.robot.home, atol=1e-9)
     assert not runtime.state_at(9.0).dq.any()
-    assert 0 < runtime.end_time - float(sequence.duration[0]) < 0.1  # its end settles
+    assert 0 < runtime.end_time - float(sequence.duration[0]) < 0.1  # its end is slower
 
 
 def test_a_switch_in_flight_is_continuous_in_position_velocity_and_acceleration(

@@ -1,0 +1,49 @@
+"""Arguments that raised exceptions of Python or NumPy: each is a UsageError that names the argument."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+import cnpgen
+from cnpgen.errors import UsageError
+from cnpgen.problems.scenes.scene_problem import make_mesh
+from cnpgen.schema.arguments import check_range, distinct
+from cnpgen.trajectory.fit import fit_motion
+from cnpgen.trajectory.spline_motion import Motion
+from cnpgen.trajectory.trajectory_spec import TrajectorySpec
+
+CALLS: dict[str, tuple[Callable[[], Any], str]] = {
+    "a long name": (lambda: cnpgen.load_dataset("a" * 100_000), "cannot be a path"),
+    "NUL in a name": (lambda: cnpgen.load_dataset("a\0b"), "folder must name a folder"),
+    "short times": (
+        lambda: fit_motion([0, 1e-320, 2e-320], np.zeros((3, 2)), spec=TrajectorySpec()),
+        "t must last at least 1e-09 s, got",
+    ),
+    "texts": (lambda: Motion(np.full((1, 9, 2), "a"), np.ones((1, 9))), "path must be"),
+    "objects": (lambda: Motion(np.ones((1, 9, 2)), np.full((1, 9), {})), "rate must be"),
+    "a number": (lambda: make_mesh("box", points=-1), "points must have shape"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_an_argument_is_refused_by_its_name(name: str) -> None:
+    call, message = CALLS[name]
+    with pytest.raises(UsageError, match=message) as caught:
+        call()
+    assert "\0" not in str(caught.value)
+    assert len(str(caught.value)) < 1000
+
+
+def test_ranges_print_as_numbers_that_differ() -> None:
+    low = -0.05
+    with pytest.raises(UsageError) as caught:
+        check_range("angle", np.nextafter(low, -1), low, 0.1, "rad")
+    assert "must be from -0.05" in str(caught.value)
+    assert "got -0.05000000000000001 rad" in str(caught.value)
+    assert distinct(0.1, 0.1) == ("0.1", "0.1")
+    assert distinct(1 / 3, 0.25) == ("0.333333", "0.25")
+    near = np.nextafter(0.25, 1)
+    assert len(set(distinct(0.25, near, 0.25))) == 2
+    assert distinct(np.nan, 1.0, np.nan) == ("nan", "1", "nan")
