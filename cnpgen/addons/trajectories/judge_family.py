@@ -88,14 +88,18 @@ class FamilyJudge:
         )
 
     def torque_limit(self) -> TorqueLimit | None:
-        """Return the torque limit of the problem, or None."""
+        """Return the limit of torques of the rigid body at the joints, or None."""
         constraint = next(
             (each for each in self._problem.constraint if type(each) is JointTorque),
             None,
         )
         if constraint is None:
             return None
-        (condition,) = constraint.measured(cast(World, self._moved))
+        conditions = constraint.measured(cast(World, self._moved))
+        name = JointTorque.condition_name
+        condition = next((each for each in conditions if each.name == name), None)
+        if condition is None:  # drives whose motors alone are limited
+            return None
         limit, allowed = condition.upper, constraint.allowed(condition)
         return TorqueLimit(condition.name, constraint.reason, limit, allowed)
 

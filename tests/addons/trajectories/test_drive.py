@@ -87,6 +87,13 @@ def test_a_reversal_between_samples_is_part_of_the_uncertainty(tmp_path: Path) -
     assert low[1].violation > low[0].violation
 
 
+def test_torques_of_motors_alone_are_judged(tmp_path: Path) -> None:
+    problem = used(tmp_path, 'limits = "motor"')
+    (verdict,) = evaluate_trajectories(problem, [quintic(500)]).verdicts
+    assert str(verdict.reason) == "joint torque limit"
+    assert "joint torque" not in verdict.conditions
+
+
 def test_the_summary_of_plans_states_the_torque(tmp_path: Path) -> None:
     plans = cnpgen.draw_boundary_problems("heavy-object", 1)
     assert cnpgen.evaluate_plans(plans).summary()["torque"] == "rigid body"
