@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from cnpgen.plans.exporter import Exporter
     from cnpgen.plans.join import JoinedPlans
 
+DEFAULT_RATE_HZ = 1000.0
 MAX_LISTED_PLANS = 10  # invalid plans that are listed by number
 NO_OBSTACLES = "the output lacks the obstacles of the plans: only a problem with these obstacles judges it among them"
 
@@ -43,8 +44,7 @@ def add_options(parser: Parser) -> None:
         "--rate",
         metavar="HZ",
         type=values.hertz,
-        default=1000.0,
-        help="samples per second (default: 1000)",
+        help=f"samples per second (default: {DEFAULT_RATE_HZ:g})",
     )
     text = "file (npz) or folder to write; default: in the current folder, named after FILE and FORMAT"
     option("-o", "--out", metavar="PATH", type=Path, help=text)
@@ -72,13 +72,14 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.problems.problem_record import open_problem
 
     exporter = load_exporter(arguments.to)
+    rate = DEFAULT_RATE_HZ if arguments.rate is None else arguments.rate
     plans = _plans(arguments)
     chosen, out = _chosen(plans, arguments), _place(arguments, exporter)
     exported = export_plans(
         plans,
         out,
         to=arguments.to,
-        rate=arguments.rate,
+        rate=rate,
         only=chosen,
         force=arguments.force,
     )
@@ -94,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
         f" of {exported.count + len(exported.refused):,}" if exported.refused else ""
     )
     print(
-        f"exported {counted(exported.count, 'plan')}{of_all} at {arguments.rate:g} Hz",
+        f"exported {counted(exported.count, 'plan')}{of_all} at {rate:g} Hz",
         file=sys.stderr,
     )
     print(exported.files[0] if exporter.single_file else out)

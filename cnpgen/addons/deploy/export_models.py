@@ -14,7 +14,7 @@ from cnpgen.cli.parser import Options, refuse
 from cnpgen.errors import UsageError
 
 FORMAT = "c"
-_OF_PLANS = ("plan", "sample", "join", "at")
+_OF_PLANS = ("rate", "plan", "sample", "join", "at")
 
 
 def add_options(options: Options) -> None:

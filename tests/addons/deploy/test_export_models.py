@@ -40,6 +40,7 @@ def test_a_model_becomes_a_source_a_header_and_a_readme(tmp_path: Path, capsys):
         (["airhockey-hit", "--to", "npz"], "a model is exported with --to c"),
         (["airhockey-hit", "--to", "c", "--plan", "0"], "--plan is for plans"),
         (["airhockey-hit", "--to", "c", "--at", "1s"], "--at is for plans"),
+        (["airhockey-hit", "--to", "c", "--rate", "1000"], "--rate is for plans"),
         (["airhockey-hit", "--to", "c", "-o", "FILE"], "is a file"),
         (["panda-scenes", "--to", "c"], "its samples place obstacles"),
         (["FILE", "--to", "c"], "needs a model"),
