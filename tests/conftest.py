@@ -23,6 +23,10 @@ import ctypes
 import shutil
 import signal
 import sys
+
+# Without cached byte code, pytest rewrites every assert of the suite in every run.
+sys.dont_write_bytecode = False
+
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import cache

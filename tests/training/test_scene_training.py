@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.interpolate import BSpline
+import scipy
 
 from cnpgen.cli.main import main
 from cnpgen.errors import DatasetError, UsageError
@@ -127,7 +127,9 @@ def test_clearances_along_a_path_are_those_of_the_capsules(problem, tmp_path):
     scene = Scene(items, place_obstacles(items)[None])
     found = features(path[None], scene)[0]
     phases = (np.arange(PATH_PHASES) + 1) / (PATH_PHASES + 1)
-    states = BSpline(clamped_knots(15, spec.degree), path, spec.degree)(phases)
+    states = scipy.interpolate.BSpline(
+        clamped_knots(15, spec.degree), path, spec.degree
+    )(phases)
     rotations, positions = ForwardKinematics(robot.model).poses(states.T)
     bodies = primitives_of(items, scene.poses[0])
     for phase in range(PATH_PHASES):

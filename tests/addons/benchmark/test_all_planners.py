@@ -11,7 +11,7 @@ from cnpgen.addons.benchmark.run_suite import Benchmark, run_benchmark
 from cnpgen.schema import registry
 from tests.conftest import some
 
-pytest.importorskip("mujoco")
+pytestmark = pytest.mark.skipif(not find_spec("mujoco"), reason="needs mujoco")
 MODULES = {"cbirrt": ("ompl",), "rrtconnect": ("ompl", "toppra"), "ruckig": ("ruckig",)}
 MODULES |= {
     "sscbirrt": ("sscbirrt",),

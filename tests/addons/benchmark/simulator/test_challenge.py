@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.plans import Plans, save_plans
 from cnpgen.refine.refine_plans import solve_plans
 
-pytest.importorskip("mujoco")
+pytestmark = pytest.mark.skipif(not find_spec("mujoco"), reason="needs mujoco")
 CLONE = Path(__file__).parents[3] / "examples" / "challenge"
 
 
