@@ -253,19 +253,18 @@ def test_the_version_and_the_address_are_the_same_everywhere() -> None:
     assert holders == ["versions.py"]
 
 
-def bridge(framework: str) -> Callable[[], object]:
-    """Return a function that imports the bridge of a framework as if for the first time."""
+def bridge(framework: str, name: str) -> Callable[[], object]:
+    """Return a function that loads a name of the bridge of a framework as if for the first time."""
 
     def load() -> object:
-        name = f"cnpgen.interop.{framework}"
-        loaded = [
-            module
-            for module in sys.modules
-            if module == name or module.startswith(f"{name}.")
-        ]
-        for module in loaded:
-            del sys.modules[module]
-        return importlib.import_module(name)
+        bridges = (
+            f"cnpgen.addons.frameworks.{framework}",
+            f"cnpgen.interop.{framework}",
+        )
+        for module in list(sys.modules):
+            if module in bridges or module.startswith(f"{bridges[0]}."):
+                del sys.modules[module]
+        return getattr(importlib.import_module(bridges[1]), name)
 
     return load
 
@@ -285,9 +284,9 @@ def trajectories(suffix: str) -> object:
 
 
 OPTIONAL = {  # package that cnpgen imports -> extra that installs it, function that needs it
-    "torch": ("torch", bridge("torch")),
-    "jax": ("jax", bridge("jax")),
-    "tensorflow": ("tensorflow", bridge("tensorflow")),
+    "torch": ("torch", bridge("torch", "to_torch")),
+    "jax": ("jax", bridge("jax", "to_jax")),
+    "tensorflow": ("tensorflow", bridge("tensorflow", "to_tensorflow")),
     "matplotlib": ("plot", lambda: new_figure(1, 1)),
     "mujoco": ("benchmark", load_mujoco),
     "imageio": ("benchmark", rendering._imageio),

@@ -31,6 +31,7 @@ from cnpgen.kernels.interpreted_kernel import (
 from cnpgen.kernels.kernel import GridKernel, Kernel
 from cnpgen.kernels.parallel_compilation import CompilerPool
 from cnpgen.kernels.tape import CODES, Dtype, GridSpec, Loop, Tape, tape_from_function
+from cnpgen.schema import addons, registry
 from cnpgen.schema.registry import package_digest
 from cnpgen.store.files.atomic import write_file
 from cnpgen.store.files.cache_folder import (
@@ -236,15 +237,32 @@ def _versions() -> list[str]:
 def _source_digests(builder: Callable[..., Any]) -> list[str]:
     """Return digests of the sources that a builder may use; kernels are rebuilt when one of them changes.
 
-    In this package these are ``BUILDER_PACKAGES`` and the builder's own subpackage. A
-    plug-in's builder may import anything: the digests cover this package and the
-    plug-in's.
+    In this package these are ``BUILDER_PACKAGES`` and the builder's own subpackage or
+    add-on; losses also use the conditions of published rules. A plug-in's builder may
+    import anything: the digests cover this package and the plug-in's.
     """
-    package, _, module = builder.__module__.partition(".")
-    if package != "cnpgen":
-        return [_digest_of(PACKAGE_FOLDER), package_digest(package)]
+    module = builder.__module__
+    if module.partition(".")[0] != "cnpgen":
+        return [_digest_of(PACKAGE_FOLDER), package_digest(module.partition(".")[0])]
     shared = (PACKAGE_FOLDER / name for name in BUILDER_PACKAGES)
-    return [_digest_of(*shared), _digest_of(PACKAGE_FOLDER / module.partition(".")[0])]
+    own = subpackage_of(module)
+    digests = [_digest_of(*shared), _digest_of(PACKAGE_FOLDER / own)]
+    return digests + _rules_digests() if own == "losses" else digests
+
+
+def subpackage_of(module: str) -> str:
+    """Return the path of the subpackage of a module of this package: "refine", "addons/benchmark"."""
+    if addon := addons.addon_of(module):
+        return f"addons/{addon}"
+    return module.split(".")[1]
+
+
+def _rules_digests() -> list[str]:
+    """Return digests of the sources of all installed published rules."""
+    modules = [entry.module for entry in addons.installed(registry.RULES)]
+    own = [PACKAGE_FOLDER / subpackage_of(m) for m in modules if addons.addon_of(m)]
+    others = {m.partition(".")[0] for m in modules if not addons.addon_of(m)}
+    return [_digest_of(*own), *map(package_digest, sorted(others))]
 
 
 @cache

@@ -97,8 +97,14 @@ class Engine:
     def __post_init__(self) -> None:
         if self.workers is not None:
             integer("workers", self.workers, least=1)
-        if self.name is not None:
-            check_engine_name(self.name)
+        if self.name is not None and not is_engine(self.name):
+            known = engine_names()
+            hint = nearest(str(self.name), known)
+            raise UsageError(
+                f"engine {self.name!r} does not exist: "
+                f"expected one of {', '.join(known)}{hint}",
+                concerns="engine",
+            )
         if self.name is not None and self.is_cluster:
             engine = cluster_engine(self.name)
             if self.address is not None:
@@ -116,16 +122,16 @@ class Engine:
         return self.name not in {None, LOKY}
 
 
-def check_engine_name(name: object) -> None:
-    """Raise UsageError if no package registers an engine of this name.
+def is_engine(name: object) -> bool:
+    """Return whether a package registers an engine of this name; engines of missing add-ons have names, too."""
+    if name == LOKY:
+        return True
+    return isinstance(name, str) and addons.find(registry.ENGINES, name) is not None
 
-    Engines of missing add-ons have names, too.
-    """
-    if isinstance(name, str) and (name == LOKY or addons.find(registry.ENGINES, name)):
-        return
-    known = (LOKY, *registry.names(registry.ENGINES))
-    expected = f"expected one of {', '.join(known)}{nearest(str(name), known)}"
-    raise UsageError(f"engine {name!r} does not exist: {expected}", concerns="engine")
+
+def engine_names() -> tuple[str, ...]:
+    """List the names of the installed engines."""
+    return (LOKY, *registry.names(registry.ENGINES))
 
 
 @dataclass(frozen=True)
