@@ -1,6 +1,5 @@
 """Clearance of a robot that has a shape: capsules ask for more than the pieces of its links, which decide."""
 
-from tests.examples.shipped import PROBLEMS
 from functools import cache
 from pathlib import Path
 from typing import Any
