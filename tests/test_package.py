@@ -20,7 +20,6 @@ import pytest
 import cnpgen
 from cnpgen.addons.benchmark.planners import (
     cbirrt,
-    crocoddyl,
     drake,
     rrtconnect,
     ruckig,
@@ -286,7 +285,6 @@ def trajectories(suffix: str) -> object:
 OPTIONAL = {  # package that cnpgen imports -> extra that installs it, function that needs it
     "torch": ("torch", bridge("torch", "to_torch")),
     "jax": ("jax", bridge("jax", "to_jax")),
-    "tensorflow": ("tensorflow", bridge("tensorflow", "to_tensorflow")),
     "matplotlib": ("plot", lambda: new_figure(1, 1)),
     "mujoco": ("benchmark", load_mujoco),
     "imageio": ("benchmark", rendering._imageio),
@@ -295,7 +293,6 @@ OPTIONAL = {  # package that cnpgen imports -> extra that installs it, function 
     "ruckig": ("benchmark", ruckig.load_ruckig),
     "sscbirrt": ("planners", sscbirrt.load_sscbirrt),
     "pydrake": ("planners", drake.load_drake),
-    "crocoddyl": ("crocoddyl", crocoddyl.load_crocoddyl),
     "meshcat": ("view", page._viewer),
     "distributed": ("dask", lambda: cluster("dask")),
     "ray": ("ray", lambda: cluster("ray")),

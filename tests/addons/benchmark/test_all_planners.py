@@ -13,11 +13,7 @@ from tests.conftest import some
 
 pytestmark = pytest.mark.skipif(not find_spec("mujoco"), reason="needs mujoco")
 MODULES = {"cbirrt": ("ompl",), "rrtconnect": ("ompl", "toppra"), "ruckig": ("ruckig",)}
-MODULES |= {
-    "sscbirrt": ("sscbirrt",),
-    "drake": ("pydrake",),
-    "crocoddyl": ("crocoddyl",),
-}
+MODULES |= {"sscbirrt": ("sscbirrt",), "drake": ("pydrake",)}
 NEEDS_A_FILE = "cnp-b-paper"
 ALL = tuple(
     name
