@@ -43,7 +43,7 @@ def test_every_key_is_documented() -> None:
         "finished",
         "broken",
     ):
-        assert f"`{name}`" in PAGE
+        assert f"`{name}`" in PAGE.read_text(encoding="utf-8")
     assert set(evaluation.summary()["conditions"]["tilt"]) == {
         "violating_plans",
         "worst_plan",
@@ -54,6 +54,6 @@ def test_every_key_is_documented() -> None:
 def test_every_metric_and_reason_is_documented() -> None:
     for label in ("hit", "transport"):
         for name in load(label).judged().metrics.to_dict():
-            assert f"| `{name}` |" in PAGE
+            assert f"| `{name}` |" in PAGE.read_text(encoding="utf-8")
     for reason in Reason:
-        assert f"`{reason}`" in PAGE
+        assert f"`{reason}`" in PAGE.read_text(encoding="utf-8")

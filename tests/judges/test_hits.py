@@ -69,7 +69,7 @@ def test_the_gradient_agrees_with_differences_up_to_rows_of_the_jacobian() -> No
     random = np.random.default_rng(0)
     for _ in range(5):
         q, home = (
-            ROBOTS["airhockey"].base + random.uniform(-0.5, 0.5, ROBOTS["airhockey"].n)
+            ROBOTS["airhockey"].home + random.uniform(-0.5, 0.5, ROBOTS["airhockey"].n)
             for _ in range(2)
         )
         angle, step = random.uniform(-1, 1), 1e-6
@@ -151,7 +151,7 @@ def test_goals_of_another_start_are_reported(rows: tuple[Columns, HitRule]) -> N
 def test_f_may_increase_towards_an_active_joint_limit() -> None:
     """A goal is valid if f increases towards its active limit, and invalid if f increases away from it."""
     random = np.random.default_rng(3)
-    q = ROBOTS["airhockey"].base + random.uniform(-0.2, 0.2, ROBOTS["airhockey"].n)
+    q = ROBOTS["airhockey"].home + random.uniform(-0.2, 0.2, ROBOTS["airhockey"].n)
     (J,), (gradient,) = _gradients(
         ROBOTS["airhockey"], q[None], q[None], direction(0.3)
     )

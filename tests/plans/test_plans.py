@@ -36,7 +36,7 @@ from cnpgen.plans.boundary_problems import load_boundary_problems
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.export import export_plans
 from cnpgen.problems.load_robot import load_robot
-from cnpgen.problems.problem import resolved
+from cnpgen.problems.problem import Problem, resolved
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.refine.refine_plans import refine_plans
 from cnpgen.robots.plausible_values import UnitError
@@ -68,10 +68,11 @@ def draw_plans(
     *,
     n: int = N,
     goal_ddq: bool = False,
-    name: str = "airhockey",
+    problem: Problem | str = "airhockey",
     **others: Any,
 ) -> Plans:
-    problem = PROBLEMS[name]
+    if isinstance(problem, str):
+        problem = PROBLEMS[problem]
     numbers = np.random.default_rng(seed)
     joints, spec = len(problem.robot.joints), problem.trajectory
     parts = numbers.uniform(-1, 1, (6, n, joints))
@@ -835,7 +836,7 @@ def test_selected_plans_joined_again_are_the_same() -> None:
 @pytest.mark.parametrize(
     ("others", "message"),
     [
-        ({"name": "heavy-object"}, "the problem is"),
+        ({"problem": "heavy-object"}, "the problem is"),
         ({"goal_ddq": True}, "goal_ddq is True in part 1, but False in part 0"),
         ({"columns": {"x": np.zeros(N)}}, "the set of columns is"),
     ],

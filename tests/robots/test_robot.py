@@ -195,7 +195,7 @@ def test_base_on_its_limit_is_inside():
     assert (
         load_robot(
             changed(PROBLEMS["heavy-object"], base=tuple(robot.position_upper))
-        ).base[0]
+        ).home[0]
         == robot.position_upper[0]
     )
 
