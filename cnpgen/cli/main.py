@@ -158,7 +158,14 @@ def build_parser(names: Sequence[str] | None = None) -> Parser:
         title="commands", metavar="COMMAND", parser_class=_LinkedParser
     )
     for name in command_names() if names is None else names:
-        add_command(commands, name, load_command(name), load_alternatives(name))
+        try:
+            module = load_command(name)
+        except MachineError as error:
+            if names is not None:
+                raise
+            commands.add_parser(name, help=f"cannot be used: {error}")
+        else:
+            add_command(commands, name, module, load_alternatives(name))
     return parser
 
 

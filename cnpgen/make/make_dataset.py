@@ -16,6 +16,7 @@ from pathlib import Path
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.machine.engine import Engine, assembled
 from cnpgen.make.certify import certified
+from cnpgen.make.dataset_documents import dataset_documents
 from cnpgen.make.make_shards import Job, make_shards
 from cnpgen.make.recipe import DatasetRecipe, as_dataset_recipe, load_notes
 from cnpgen.make.resolve_spec import dataset_folder, resolve
@@ -320,7 +321,7 @@ def finish(
         damaged = list(dict.fromkeys(finding.file for finding in findings))
         if has_checksum:  # without a manifest the dataset was unfinished: a run may have ended just before
             warnings.warn(f"written again: {findings[0]}", RuntimeWarning, stacklevel=3)
-    finalize(folder, spec, notes=notes)
+    finalize(folder, spec, notes=notes, documents=dataset_documents())
     return True, damaged
 
 

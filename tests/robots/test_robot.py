@@ -53,7 +53,7 @@ def test_limits_are_those_of_the_urdf_scaled(name):
     np.testing.assert_allclose(
         robot.torque_limit, 0.8 * np.array(model.effortLimit), rtol=1e-15
     )
-    np.testing.assert_array_equal(robot.home, problem.robot.home)
+    np.testing.assert_array_equal(robot.home, problem.robot.base)
 
 
 def test_acceleration_limit_is_the_rate_times_the_velocity_limit_up_to_the_cap():

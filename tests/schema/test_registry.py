@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import pytest
 
+from cnpgen.cli.main import main
 from cnpgen.errors import RecipeError
 from cnpgen.machine.engine import ClusterEngine
 from cnpgen.pipelines.scene_family import SceneFamily
@@ -195,3 +196,28 @@ def test_every_built_in_kind_can_be_loaded(group):
     assert names(group)
     for name in names(group):
         assert name_of(group, load(group, name)) == name
+
+
+def test_a_package_adds_a_command(register, capsys, monkeypatch, tmp_path):
+    (tmp_path / "greeting_command.py").write_text(
+        '"""Greet.\n\nMore."""\n\n\n'
+        "def add_options(parser):\n    parser.add_argument('name')\n\n\n"
+        "def run(arguments):\n    print('hello', arguments.name)\n    return 1\n",
+        encoding="utf-8",
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    register(registry.COMMANDS, "greet", "greeting_command")
+    assert main(["greet", "you"]) == 1
+    assert capsys.readouterr().out == "hello you\n"
+    assert main(["--help"]) == 0
+    assert "\n    greet         greet\n" in capsys.readouterr().out
+    assert main(["gret"]) == 2
+    assert "did you mean 'greet'?" in capsys.readouterr().err
+
+
+def test_a_command_that_cannot_be_imported_does_not_hide_the_others(register, capsys):
+    register(registry.COMMANDS, "broken", "no_such_module_of_a_package")
+    assert main(["--help"]) == 0
+    assert "    broken        cannot be used: " in capsys.readouterr().out
+    assert main(["broken"]) == 3
+    assert "the command 'broken' cannot be imported" in capsys.readouterr().err

@@ -14,11 +14,11 @@ from cnpgen.judges.rows.hits import highest_speed
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.store.dataset_spec import load_dataset_spec, shards
-from cnpgen.store.manifest import finalize
 from cnpgen.store.shard import read_shard
 from cnpgen.store.shard_record import commit_shard, load_record
 from cnpgen.validate.validate_dataset import validate_dataset
 from tests.conftest import some
+from tests.examples.finalized import finalize
 from tests.examples.shipped import ROBOTS
 
 FRAME = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED

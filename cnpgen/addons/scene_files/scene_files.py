@@ -25,11 +25,11 @@ from cnpgen.problems.scenes.scene_problem import (
     check_scenes,
     checked_scene,
 )
+from cnpgen.problems.scenes.yaml_document import read_yaml
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.store.files.atomic import write_file
 from cnpgen.store.files.kind import HDF5_SUFFIXES, is_hdf5
-from cnpgen.store.files.yaml_document import read_yaml
 
 YAML_SUFFIXES = (".yaml", ".yml")
 SCENE_SUFFIXES = (*YAML_SUFFIXES, *HDF5_SUFFIXES)
