@@ -84,7 +84,6 @@ def scene_plans(
             outside its limits.
     """
     check_scenes(scenes)
-    problem.urdf_text  # noqa: B018 - read once for all capacities
     full = with_capacity(problem, capacity_of(scenes) if capacity is None else capacity)
     record = record_problem(full)
     robot = open_problem(record)[1]

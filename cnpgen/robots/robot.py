@@ -81,6 +81,7 @@ class Robot:
             [m], shape (3,).
         nominal_parameters: Parameters of a sample for which none are given, shape
             (width,).
+        built_model: ``model`` if the same one was built before.
     """
 
     urdf: Path
@@ -102,6 +103,7 @@ class Robot:
     parameters: ParameterRanges = NO_PARAMETERS
     table_origin: Array = field(default_factory=lambda: np.zeros(3))
     nominal_parameters: Array = field(default_factory=lambda: np.empty(0))
+    built_model: "pin.Model | None" = field(default=None, repr=False)
 
     @property
     def n(self) -> int:
@@ -142,6 +144,8 @@ class Robot:
     @cached_property
     def model(self) -> "pin.Model":
         """The Pinocchio model reduced to the planned joints."""
+        if self.built_model is not None:
+            return self.built_model
         return reduced_model(self.urdf, self.urdf_text, self.joint_names, self.attached)
 
     @cached_property

@@ -15,7 +15,7 @@ from tests.examples.models import accelerated
 def boundary(problem: str, count: int, seed: int = 0) -> Boundary:
     """Draw boundary conditions near the base configuration, with moving starts and goals."""
     base, random = (
-        np.array(load_problem(problem).robot.home),
+        np.array(load_problem(problem).robot.base),
         np.random.default_rng(seed),
     )
     draw = lambda scale: scale * random.standard_normal((count, len(base)))  # noqa: E731

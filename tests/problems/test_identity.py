@@ -89,7 +89,7 @@ def test_every_key_of_a_recipe_but_its_labels_changes_the_identity(name: str) ->
         "name",
         "robot.joints",
         "robot.tip",
-        "robot.home",
+        "robot.base",
         "limits.torque_scale",
         "constraint",
     } < keys_seen
@@ -154,9 +154,9 @@ def test_code_and_undeclared_fields_of_a_plug_in_change_it(
     assert replace(problem).identity != problem.identity
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", PROBLEMS)
 def test_a_problem_that_is_read_from_its_record_is_the_same_one(name: str) -> None:
-    problem = example(name)
+    problem = PROBLEMS[name]
     record = record_problem(problem)
     assert open_problem(record)[0].identity == problem.identity
     with loaded_problem(record, "numpy") as given:

@@ -159,7 +159,7 @@ def test_everything_that_takes_a_problem_takes_what_plans_have_of_it(
         PlanLoss(given, backend="numpy"),
         BoundaryLayer(given, projection_steps=0, backend="numpy"),
     )  # for two plans
-    q = np.tile(PROBLEMS["heavy-object"].robot.home, (2, 1))
+    q = np.tile(PROBLEMS["heavy-object"].robot.base, (2, 1))
     zero = np.zeros_like(q)
     tasks = omega.tasks(Boundary(q, zero, zero, q + 0.1, zero))
     phi, log_rate = np.zeros((2, omega.path_outputs)), np.zeros((2, omega.rate_outputs))

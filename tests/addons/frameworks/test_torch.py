@@ -430,7 +430,7 @@ def loss(cache_folder: Path, fastest: Any) -> Callable[..., PlanLoss]:
 def plans(problem: str, count: int, dtype: Any = torch.float64) -> dict[str, Any]:
     """Draw plans, weights and obstacle poses."""
     found, random = load_problem(problem), np.random.default_rng(1)
-    base, spec = np.array(found.robot.home), found.trajectory
+    base, spec = np.array(found.robot.base), found.trajectory
     path = base + 0.3 * random.standard_normal(
         (count, spec.path_control_points, len(base))
     )
