@@ -27,8 +27,10 @@ import pytest
 ROOT = Path(__file__).parents[1]
 LIST = Path(__file__).parent / "data" / "costly.txt"
 RESULT = "CNPGEN_TEST_COSTS"  # environment variable: file of the measured costs
-MAX_MEAN_S = 0.1  # CPU time of a quick test, the mean of the parameters of its function
-MAX_SUM_S = 1.0  # of all parameters of a function
+MAX_MEAN_S = (
+    0.04  # CPU time of a quick test, the mean of the parameters of its function
+)
+MAX_SUM_S = 0.4  # of all parameters of a function
 
 
 def read_costly() -> frozenset[str]:

@@ -192,6 +192,7 @@ def test_what_the_default_run_of_the_tests_leaves_out_is_run_before_a_change_lan
     ]["pytest"]["ini_options"]
     assert settings["addopts"][-2:] == ["-m", "not slow and not extended"]
     assert {text.partition(":")[0] for text in settings["markers"]} == {
+        "quick",
         "slow",
         "extended",
     }

@@ -42,6 +42,7 @@ from cnpgen.training.data import make_scene_rows
 from cnpgen.training.prepare import prepare_run
 from cnpgen.training.settings import TrainingSettings
 from cnpgen.training.train import train_model
+from cnpgen.training.training_options import TrainingOptions
 from cnpgen.trajectory.spline import clamped_knots
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from tests.conftest import needs_compiler
@@ -294,7 +295,7 @@ def test_a_planner_is_trained_on_a_scene_file_and_plans_its_scenes(
         settings=settings,
         check_rows=1,
         workers=1,
-        robot=str(path),
+        options=TrainingOptions(robot=str(path)),
     )
     model = load_model(trained.path)
     assert model.features.blocks[-2:] == ("scene", "line")

@@ -13,7 +13,7 @@ complete, also if planners failed.
 import argparse
 import json
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -162,6 +162,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
+    from cnpgen.addons.benchmark.benchmark_options import BenchmarkOptions
     from cnpgen.addons.benchmark.run_suite import FASTEST, run_benchmark
 
     meter, doing = Meter(noun="problem"), [""]
@@ -177,33 +178,21 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
             meter.begin(what, total, done - 1)
         meter(1)
 
+    plants = (arguments.plant or ("nominal",)) if arguments.simulate else ()
+    others = {entry.name for entry in fields(BenchmarkOptions)}
+    given = options_of(arguments, *others.union(ENGINE, ("n", "force")))
+    options = {name: given.pop(name) for name in others & given.keys()}
     with meter, resumable(folder):
         return run_benchmark(
             arguments.suite,
             folder,
             planners=arguments.planners or FASTEST,
-            repeat=arguments.repeat,
-            reference=arguments.reference,
+            plants=plants,
             parameters=parameters,
             progress=progress,
-            **_options(arguments),
+            options=BenchmarkOptions(**options),
+            **given,
         )
-
-
-def _options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the options of a run."""
-    names = (
-        "n",
-        "environment",
-        "time_limit",
-        "seed",
-        "plane_tolerance",
-        *ENGINE,
-        "replan",
-        "force",
-    )
-    plants = (arguments.plant or ("nominal",)) if arguments.simulate else ()
-    return {"plants": plants, **options_of(arguments, *names)}
 
 
 def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cnpgen.addons.benchmark.benchmark_options import BenchmarkOptions
 from cnpgen.addons.benchmark.benchmark_planner import PLANNERS
 from cnpgen.addons.benchmark.run_suite import Benchmark, run_benchmark
 from cnpgen.schema import registry
@@ -32,9 +33,9 @@ def test_every_planner_has_a_row_in_one_table(suite: str, tmp_path: Path) -> Non
         tmp_path,
         planners=planners,
         n=1,
-        time_limit=1,
         plants=["nominal"],
         workers=1,
+        options=BenchmarkOptions(time_limit=1),
     )
     summary = benchmark.summary("nominal")
     assert list(summary) == planners

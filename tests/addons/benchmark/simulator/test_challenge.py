@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cnpgen.addons.benchmark.benchmark_options import BenchmarkOptions
 from cnpgen.addons.benchmark.benchmark_report import save_benchmark_report
 from cnpgen.addons.benchmark.run_suite import run_benchmark
 from cnpgen.addons.benchmark.simulator.challenge import _ScalarItems, challenge_plant
@@ -79,7 +80,12 @@ def test_violated_constraints_and_penalties_are_counted(plans: Plans) -> None:
 @pytest.mark.slow
 def test_a_benchmark_executes_in_the_challenge(tmp_path: Path) -> None:
     benchmark = run_benchmark(
-        "hits-81", tmp_path, planners=["cnpgen"], n=1, environment=CLONE, workers=1
+        "hits-81",
+        tmp_path,
+        planners=["cnpgen"],
+        n=1,
+        workers=1,
+        options=BenchmarkOptions(environment=CLONE),
     )
     assert benchmark.executions == ("challenge",)
     assert benchmark.results["cnpgen"][0]["executed"]["challenge"]["success"]
@@ -191,7 +197,11 @@ def test_other_problems_than_hits_are_refused(tmp_path: Path) -> None:
         )
     with pytest.raises(UsageError, match="is another problem"):
         run_benchmark(
-            "heavy-100", tmp_path, planners=["cnpgen"], n=1, environment=CLONE
+            "heavy-100",
+            tmp_path,
+            planners=["cnpgen"],
+            n=1,
+            options=BenchmarkOptions(environment=CLONE),
         )
 
 
