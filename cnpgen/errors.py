@@ -5,7 +5,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-MAX_LINE_LENGTH = 4000  # characters of a message; exceptions of libraries may repeat the content of a file
+# Characters of a message; exceptions of libraries may repeat the content of a file.
+MAX_LINE_LENGTH = 4000
 
 Spelling = Callable[[str, object], str]
 """Writes an argument with the value that a message proposes for it, None for any value."""

@@ -210,16 +210,16 @@ def _documentation(value: Any) -> str:
 
 
 def describe_index() -> str:
-    """Return the first page, with the sections of the README that help to decide on cnpgen."""
+    """Return the first page, with the section of the README on its two commands."""
     shared = (FOLDER.parent / "README.md").read_text(encoding="utf-8")
     shared = shared[
-        shared.index("## Two commands") : shared.index("## How it works")
+        shared.index("## Two commands") : shared.index("## Plan, optimize, check")
     ].replace("](docs/", "](")
     page = (FOLDER / "index.md").read_text(encoding="utf-8")
     return (
         page[: page.index("## Two commands")]
         + shared
-        + page[page.index("## Tutorials") :].rstrip("\n")
+        + page[page.index("## When to use it") :].rstrip("\n")
     )
 
 

@@ -14,9 +14,8 @@ from cnpgen.errors import either, nearest
 
 _WHOLE = re.compile(r"[+-]?[0-9]+(?:(?:_[0-9]+)*|(?:\.[0-9]+)?[eE]\+?[0-9]{1,2})")
 MAX_ROWS_ARGUMENT = 10**12  # make.MAX_ROWS
-_MAX_DIGITS = (
-    30  # digits; no number here has more, and very long ones take long to read
-)
+# Digits; no number here has more, and very long ones take long to read.
+_MAX_DIGITS = 30
 MAX_ERROR = 1.0  # rad or m; larger ones are probably in degrees
 MAX_SELECTED = 10**7  # of the numbers in a range
 

@@ -35,7 +35,8 @@ from cnpgen.store.files.cache_folder import (
 
 CALL_SOURCE = Path(__file__).with_name("call.c")
 CACHE_LINE_DOUBLES = 8
-MAX_O2_INSTRUCTIONS = 6000  # GCC's register allocator takes minutes at -O2 for longer tapes, without a gain
+# GCC's register allocator takes minutes at -O2 for longer tapes, without a gain.
+MAX_O2_INSTRUCTIONS = 6000
 _LOG = logging.getLogger(__name__)
 
 

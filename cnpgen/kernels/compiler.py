@@ -26,12 +26,10 @@ COMPILER_FLAGS = (
     "-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-w",
     *_LINKER_FLAGS,
 )  # fmt: skip
-MAX_COMPILE_TIME_S = (
-    3600  # the largest kernels, of some MB of source, take minutes on a busy machine
-)
-MIN_COMPILE_LIMIT_S = (
-    120  # the limit for the smallest kernels, which take less than 1 s
-)
+# The largest kernels, of some MB of source, take minutes on a busy machine.
+MAX_COMPILE_TIME_S = 3600
+# The limit for the smallest kernels, which take less than 1 s.
+MIN_COMPILE_LIMIT_S = 120
 LIMIT_S_PER_BYTE = 3e-3  # of source
 MAX_VERSION_TIME_S = 10
 NOTICE_AFTER_S = 60  # a user hears of a compiler that takes longer

@@ -48,15 +48,10 @@ Backend = Literal["compiled", "numpy", "casadi"]
 BACKENDS: tuple[Backend, ...] = ("compiled", "numpy", "casadi")
 PACKAGE_FOLDER = Path(__file__).parents[1]
 ARRAYS = Path(__file__).with_name("arrays.h")
-BUILDER_PACKAGES = (
-    "robots",
-    "kernels",
-    "problems",
-    "trajectory",
-)  # imported by builders of any package
-NUMPY_SLOWDOWN = (
-    "10 to 20 times slower than compiled code"  # benchmarks/generator.py: 9 to 24
-)
+# Imported by builders of any package.
+BUILDER_PACKAGES = "robots", "kernels", "problems", "trajectory"
+# Benchmarks/generator.py: 9 to 24.
+NUMPY_SLOWDOWN = "10 to 20 times slower than compiled code"
 
 
 @dataclass

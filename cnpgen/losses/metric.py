@@ -25,10 +25,10 @@ Array = NDArray[np.float64]
 Kind = Literal["fixed", "ramped", "learned"]
 Average = Literal["mean", "median", "trimmed"]
 
-WEIGHT_FACTOR = 100.0  # of the weight in the problem file, for constraint classes without ``training_weight``
-TRIMMED_FRACTION = (
-    0.1  # of the plans, those with the largest losses, excluded from a trimmed mean
-)
+# Of the weight in the problem file, for constraint classes without ``training_weight``.
+WEIGHT_FACTOR = 100.0
+# Of the plans, those with the largest losses, excluded from a trimmed mean.
+TRIMMED_FRACTION = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,6 +129,8 @@ def alpha_step(
     weight unchanged.
     """
     before, mean, budget = (np.asarray(x, float) for x in (alpha, losses, budgets))
+    # log(L / C) as a difference of logarithms: 0 where nothing is learned, -inf for a
+    # term without violations, which the bound makes finite.
     learned = (budget > 0) & np.isfinite(mean)
     with np.errstate(divide="ignore"):
         logs = np.log(mean, where=learned, out=np.zeros_like(mean)) - np.log(
@@ -140,6 +142,7 @@ def alpha_step(
 def average_loss(terms: ArrayLike, average: Average) -> Array:
     """Average every term of the losses of N plans, shape (N, m), over valid plans, shape (m,); nan without any."""
     values = np.asarray(terms, float)
+    # Invalid plans have losses of nan and take no part.
     values = values[np.isfinite(values).all(axis=1)]
     if len(values) == 0:
         return np.full(values.shape[1], np.nan)
@@ -239,6 +242,7 @@ class Metric:
             budgets = np.where(
                 np.isfinite(self.alpha), self._budgets, 0.0
             )  # an omitted term learns nothing
+            # Shrinking budgets have the effect of the growing weights of the ramped metric.
             budgets = budgets * settings.budget_factor / settings.grown(progress)
             alpha = alpha_step(
                 self.alpha,

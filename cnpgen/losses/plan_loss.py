@@ -296,6 +296,8 @@ class PlanLoss:
             batch.obstacle_poses[:, : self.problem.for_planning.scene_width],
         )
         lanes = rates.shape[1]
+        # Splines at all nodes by one product: rows are p, p', p'' (orders x nodes), columns
+        # are joints x samples.
         path = (table.path @ batch.lanes(batch.path).reshape(points, -1)).reshape(
             orders, nodes, n, lanes
         )
@@ -314,6 +316,8 @@ class PlanLoss:
             )
         by_path, by_rate = np.empty_like(path), np.empty_like(rate)
         self._gradient(*arguments, out=[terms, *by_path.swapaxes(1, 2), by_rate])
+        # Chain rule through the splines, which are linear in the control points: the
+        # transposed products.
         by_points = table.path.T @ by_path.reshape(orders * nodes, -1)
         return (
             terms,

@@ -10,9 +10,8 @@ from types import FrameType
 from typing import Any
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM)
-MIN_REPEAT_INTERVAL_S = (
-    1.0  # a terminal and a wrapper such as ``uv run`` forward the same Ctrl-C twice
-)
+# A terminal and a wrapper such as ``uv run`` forward the same Ctrl-C twice.
+MIN_REPEAT_INTERVAL_S = 1.0
 
 SignalHandler = Callable[[int], object]
 

@@ -309,7 +309,9 @@ def finish(
         if not findings:
             return True, []
         damaged = list(dict.fromkeys(finding.file for finding in findings))
-        if has_checksum:  # without a manifest the dataset was unfinished: a run may have ended just before
+        # Without a manifest the dataset was unfinished: a run may have ended just
+        # before.
+        if has_checksum:
             warnings.warn(f"written again: {findings[0]}", RuntimeWarning, stacklevel=3)
     finalize(folder, spec, notes=notes, documents=dataset_documents())
     return True, damaged

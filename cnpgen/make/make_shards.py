@@ -34,9 +34,9 @@ from cnpgen.store.shard import storage_dtype
 from cnpgen.store.shard_record import commit_shard
 from cnpgen.store.workspace import require_dataset_spec
 
-MAX_SPOT_CHECK_ROWS = (
-    32  # per shard, recomputed by Pinocchio and Coal before the commit
-)
+# Per shard, recomputed by Pinocchio and Coal before the commit.
+
+MAX_SPOT_CHECK_ROWS = 32
 
 
 @dataclass(frozen=True)

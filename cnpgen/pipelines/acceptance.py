@@ -38,12 +38,11 @@ States = tuple[Array, Array, Array]
 Decide = Callable[[States, Array, Mask, CandidateBatch | None], Mask]
 """Function of the narrow phase, see ``narrow_phase_of``."""
 
-MIN_SCENE_MARGIN_M = (
-    1e-6  # of distances in compiled code, above which Coal does not measure them again
-)
-ZERO_VELOCITY_ROUNDING_M_S = (
-    1e-14  # rounding error of a velocity that is zero in exact arithmetic
-)
+# Of distances in compiled code, above which Coal does not measure them again.
+
+MIN_SCENE_MARGIN_M = 1e-6
+# Rounding error of a velocity that is zero in exact arithmetic.
+ZERO_VELOCITY_ROUNDING_M_S = 1e-14
 
 
 def acceptance(

@@ -22,10 +22,8 @@ from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import table_frame_of
 from cnpgen.store.field import Field
 
-_EXCLUSIVE_COLUMNS = (
-    ("start_q", "start_xyz"),
-    ("goal_q", "goal_xyz"),
-)  # joint positions or a tip position
+# Joint positions or a tip position.
+_EXCLUSIVE_COLUMNS = ("start_q", "start_xyz"), ("goal_q", "goal_xyz")
 
 
 class Completion:

@@ -41,7 +41,8 @@ from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
 
-SLOW_DURATION = 1.8  # in expected times, above which a motion nearer to the straight line may be faster
+# In expected times, above which a motion nearer to the straight line may be faster.
+SLOW_DURATION = 1.8
 OFFSET_FRACTION = 0.5  # of the offsets from the line that such motions keep
 STATIC_INTERVALS = 32  # between phases
 COARSE_PHASES = slice(2, None, 4)  # that most violating motions fail at

@@ -34,10 +34,10 @@ Array = NDArray[np.float64]
 
 GOAL_TOLERANCE = 1e-9  # rad, rad/s and rad/s^2: goals that differ by less are equal
 MIN_REMAINING_TIME_S = 1e-6  # motions that end sooner are not reused
-MAX_DURATION_RATIO = (
-    0.98  # of a new plan's duration to the remaining time; else the old plan is reused
-)
-REST_TOLERANCE = 1e-9  # fraction of a limit: rounding error of a velocity or an acceleration that was zero
+# Of a new plan's duration to the remaining time; else the old plan is reused.
+MAX_DURATION_RATIO = 0.98
+# Fraction of a limit: rounding error of a velocity or an acceleration that was zero.
+REST_TOLERANCE = 1e-9
 
 
 class Planner:

@@ -19,14 +19,10 @@ Array = NDArray[Any]
 
 MIN_EXPECTED_TIME_S = 0.2  # lower bound of ``expected_time``
 MIN_REACH_TIME_S = 0.03  # lower bound of ``reaching_time``
-MIN_TRAVEL_TIME_S = (
-    1e-6  # lower bound without effect on moving joints: avoids a division by zero
-)
-EXPECTED_TIMES = (
-    "distance",
-    "reach",
-    "travel",
-)  # ``expected_time``, ``reaching_time``, ``expected_time`` unbounded
+# Lower bound without effect on moving joints: avoids a division by zero.
+MIN_TRAVEL_TIME_S = 1e-6
+# ``expected_time``, ``reaching_time``, ``expected_time`` unbounded.
+EXPECTED_TIMES = "distance", "reach", "travel"
 
 
 @dataclass(frozen=True)

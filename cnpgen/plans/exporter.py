@@ -18,7 +18,9 @@ from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
 
-MIN_LAST_STEP_FRACTION = 0.01  # minimum length of the last step in steps; a shorter one is merged with the step before
+# Minimum length of the last step in steps; a shorter one is merged with the step
+# before.
+MIN_LAST_STEP_FRACTION = 0.01
 
 
 @dataclass(frozen=True)

@@ -27,12 +27,11 @@ from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
 
-OBSTACLES_PER_STEP = (
-    4  # capacities are multiples of it, so that scenes share compiled kernels
-)
-JOINT_TOLERANCE_RAD = (
-    1e-3  # outside a limit, which rounding of files to float32 may cause
-)
+# Capacities are multiples of it, so that scenes share compiled kernels.
+
+OBSTACLES_PER_STEP = 4
+# Outside a limit, which rounding of files to float32 may cause.
+JOINT_TOLERANCE_RAD = 1e-3
 
 
 def capacity_of(scenes: Sequence[SceneProblem]) -> dict[str, int]:

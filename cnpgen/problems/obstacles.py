@@ -22,11 +22,8 @@ if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
 Capacity = Mapping[str, int]  # kind, or corners of a mesh -> number of obstacles
-_PARKED_ROTATION = (
-    0.1,
-    0.1,
-    0.1,
-)  # any rotation: boxes of scenes have rotation matrices
+# Any rotation: boxes of scenes have rotation matrices.
+_PARKED_ROTATION = 0.1, 0.1, 0.1
 
 
 def scene_of(

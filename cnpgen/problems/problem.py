@@ -112,10 +112,13 @@ class Problem:
     )
     objective: Objective = field("objective of the optimization", default=Objective())
     path: Path = Path()
+    # In a dataset, a plan or a model: implausible sizes and limits were accepted
+    # before.
+    is_stored: bool = False
+    # ``urdf_text`` if it was read before: that of the same problem, or a stored one.
     read_urdf_text: str | None = dataclasses.field(
         default=None, compare=False, repr=False
-    )  # ``urdf_text`` if it was read before: that of the same problem, or a stored one
-    is_stored: bool = False  # in a dataset, a plan or a model: implausible sizes and limits were accepted before
+    )
 
     @checked_arguments
     def first(self, kind: type[Kind]) -> Kind | None:

@@ -61,11 +61,8 @@ _FORM = {
     "constraint": [{"use": TEXT}],
     "trajectory": {ANY_KEY: WHOLE},
 }
-_JUDGED_BY = (
-    "tolerance",
-    "budget",
-    "weight",
-)  # strictness of the verdict, not part of the problem's definition
+# Strictness of the verdict, not part of the problem's definition.
+_JUDGED_BY = "tolerance", "budget", "weight"
 
 
 @dataclass(frozen=True, repr=False)

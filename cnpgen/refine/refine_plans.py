@@ -29,10 +29,12 @@ from cnpgen.refine.task import Attempt
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.scene_table import OBSTACLE_POSES
 
-MAX_SERIAL_PLANS = (
-    60  # up to which the start of a second process takes longer than the plans
-)
-PLANS_PER_TASK = 4  # of one of several processes: the transfer of a task takes a twentieth of a plan's time
+# Up to which the start of a second process takes longer than the plans.
+
+MAX_SERIAL_PLANS = 60
+# Of one of several processes: the transfer of a task takes a twentieth of a plan's
+# time.
+PLANS_PER_TASK = 4
 
 
 @checked_arguments

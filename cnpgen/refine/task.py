@@ -15,7 +15,9 @@ from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline import basis
 
 Array = NDArray[np.float64]
-MAX_JUDGED_VIOLATION = 3.0  # tolerances on the fine grid; attempts with larger ones are judged only without better ones
+# Tolerances on the fine grid; attempts with larger ones are judged only without better
+# ones.
+MAX_JUDGED_VIOLATION = 3.0
 DISTANCE_PHASES = 512  # at which motions are compared with their input path
 
 
@@ -60,12 +62,10 @@ class RefinementTask:
     scene: Scene  # its obstacles, one sample
     start_xyz: Array  # position of the tip at the start [m], shape (3,)
     goal_xyz: Array  # position of the tip at the goal [m], shape (3,)
-    path: Array | None = (
-        None  # path control points of the input plan [rad], shape (C, n), or None
-    )
-    rate: Array | None = (
-        None  # rate control points of the input plan [1/s], shape (R,), or None
-    )
+    # Path control points of the input plan [rad], shape (C, n), or None.
+    path: Array | None = None
+    # Rate control points of the input plan [1/s], shape (R,), or None.
+    rate: Array | None = None
     deadline: Deadline | None = None  # deadline of the solver's iterations, or None
     # Largest difference of every joint from the path of the input plan [rad or m], or
     # None.

@@ -26,11 +26,8 @@ from cnpgen.robots.solid import (
 from cnpgen.schema.arguments import integer
 from cnpgen.store.scene_table import NO_OBSTACLE, OBSTACLE_KINDS, SceneTable
 
-PARKED_POSITION_M = (
-    0.0,
-    0.0,
-    -100.0,
-)  # of obstacles that a sample with fewer obstacles does not have
+# Of obstacles that a sample with fewer obstacles does not have.
+PARKED_POSITION_M = 0.0, 0.0, -100.0
 
 
 class SampleIndexError(UsageError, IndexError):

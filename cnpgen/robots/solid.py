@@ -26,9 +26,9 @@ from cnpgen.robots.shape.hull import CUBE, Array, frame_along
 from cnpgen.robots.shape.inline import corners_of
 from cnpgen.schema.keys import Range
 
-UNBOUNDED_OBSTACLE_HEIGHT_M = (
-    10.0  # height of the box that represents an obstacle without a lower end
-)
+# Height of the box that represents an obstacle without a lower end.
+
+UNBOUNDED_OBSTACLE_HEIGHT_M = 10.0
 _NOTHING = (0.0, 0.0, 0.0)
 
 

@@ -14,14 +14,8 @@ from cnpgen.robots.urdf import number_in, numbers_in, numbers_text, read_urdf, u
 from cnpgen.robots.urdf_parameters import placement_of
 
 _TURNING, _SLIDING = ("revolute", "continuous"), ("prismatic",)
-_MOTION = (
-    "axis",
-    "limit",
-    "mimic",
-    "calibration",
-    "dynamics",
-    "safety_controller",
-)  # elements of a joint that moves
+# Elements of a joint that moves.
+_MOTION = "axis", "limit", "mimic", "calibration", "dynamics", "safety_controller"
 _TAG = "disable_collisions"
 PAYLOAD = "carried payload"  # name of the link and of its joint
 

@@ -30,9 +30,8 @@ ENGINES = "cnpgen.engines"
 DOCUMENTS = "cnpgen.documents"
 RULES = "cnpgen.rules"
 RECIPES = "cnpgen.recipes"  # types of recipe files; they have no common base class
-COMMANDS = (
-    "cnpgen.commands"  # modules with the functions of ``cnpgen.cli.parser.add_command``
-)
+# Modules with the functions of ``cnpgen.cli.parser.add_command``.
+COMMANDS = "cnpgen.commands"
 
 PROJECT = "cnpgen"  # the distribution of core and add-ons
 

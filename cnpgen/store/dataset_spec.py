@@ -50,7 +50,9 @@ from cnpgen.store.layout import (
 from cnpgen.store.scene_table import SCENE_ARRAYS
 
 SPECIFICATION_FORMAT = "cnpgen-specification"
-GENERATOR_REVISION = 2  # raised by every change of the generator after which an equal specification gives other samples
+# Raised by every change of the generator after which an equal specification gives other
+# samples.
+GENERATOR_REVISION = 2
 SPECIFICATION_VERSION = 3
 _FIELD_STRUCTURE = {
     **dict.fromkeys(("name", "unit", "long_name", "role", "frame", "dtype"), TEXT),

@@ -29,11 +29,8 @@ from cnpgen.store.layout import DESCRIPTIONS, MANIFEST, SPECIFICATION, STATS, WO
 
 MANIFEST_FORMAT = "cnpgen-dataset"
 MANIFEST_VERSION = 2
-LISTED = (
-    SPECIFICATION,
-    STATS,
-    *DESCRIPTIONS,
-)  # files with their size and sha256 beside the shards
+# Files with their size and sha256 beside the shards.
+LISTED = SPECIFICATION, STATS, *DESCRIPTIONS
 _FILE_STRUCTURE = {"bytes": WHOLE, "sha256": TEXT}
 _SHARD_STRUCTURE = {
     **dict.fromkeys(("file", "sha256"), TEXT),

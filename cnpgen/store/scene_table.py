@@ -19,7 +19,8 @@ from cnpgen.errors import DatasetError
 from cnpgen.store.field import Field
 
 SCENE_ID = "scene_id"
-OBSTACLE_POSES = "obstacle_poses"  # column of a sample or plan with its obstacles, instead of the problem's
+# Column of a sample or plan with its obstacles, instead of the problem's.
+OBSTACLE_POSES = "obstacle_poses"
 OBSTACLE_KINDS = ("box", "sphere", "cylinder", "capsule")  # index: the code of a kind
 NO_OBSTACLE = -1  # kind of the entries that pad a scene
 _KINDS_TEXT = f"{NO_OBSTACLE} for none; " + ", ".join(

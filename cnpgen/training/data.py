@@ -30,10 +30,8 @@ from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
 
-DEMONSTRATION = (
-    "path_control_points",
-    "rate_control_points",
-)  # columns of a certified dataset
+# Columns of a certified dataset.
+DEMONSTRATION = "path_control_points", "rate_control_points"
 VALIDATION_SHARE = 0.05  # of the problems of scenes, the last ones
 MAX_VALIDATION_ROWS = 200  # verdicts among obstacles take a quarter of a second
 MIN_SCENE_ROWS = 40

@@ -33,12 +33,8 @@ from cnpgen.training.settings import Length, TrainingSettings
 from cnpgen.training.training_options import TrainingOptions
 
 DEFAULT_CPU_TIME_S = 120.0
-CHECKPOINT, LOG, PICTURE, LOCK = (
-    ".checkpoint",
-    ".jsonl",
-    ".png",
-    ".lock",
-)  # in place of .h5
+# In place of .h5.
+CHECKPOINT, LOG, PICTURE, LOCK = ".checkpoint", ".jsonl", ".png", ".lock"
 MAX_SCORED_ROWS = 2000  # validation rows for the final score
 
 

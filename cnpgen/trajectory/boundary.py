@@ -362,9 +362,8 @@ class BoundaryDerivative:
 
     point: int  # index of the path control point, 0 to C - 1
     variable: int  # index of the rate control point, 0 to R - 1
-    derivative: (
-        Array  # d(path control point) / d(rate control point) [rad s], shape (N, n)
-    )
+    # d(path control point) / d(rate control point) [rad s], shape (N, n).
+    derivative: Array
 
 
 def boundary_derivatives(

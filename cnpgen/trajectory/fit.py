@@ -34,10 +34,8 @@ ARC_LENGTH_FRACTIONS = (0.0, 0.3, 0.6, 0.9)  # of the arc length in the phase
 MIN_FIT_ERROR_RAD = 1e-6  # smaller errors count as equal, and the simplest r is chosen
 MAX_RATE_FIT_SAMPLES = 2000  # in the optimization of r
 MAX_LOG_RATE_CHANGE = 4.0  # in the optimization of r
-PATH_SMOOTHNESS, RATE_SMOOTHNESS = (
-    1e-8,
-    3e-5,
-)  # weights of p''' and of second differences of log r; positions: rad
+# Weights of p''' and of second differences of log r; positions: rad.
+PATH_SMOOTHNESS, RATE_SMOOTHNESS = 1e-8, 3e-5
 
 
 @checked_arguments

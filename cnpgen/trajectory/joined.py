@@ -13,7 +13,9 @@ from cnpgen.trajectory.spline_motion import Motion, States, states_at_times
 
 Array = NDArray[np.float64]
 
-MAX_JOINT_GAP = 1e-9  # rad, rad/s and rad/s^2: rounding error between a state and a motion that starts from it
+# Rad, rad/s and rad/s^2: rounding error between a state and a motion that starts from
+# it.
+MAX_JOINT_GAP = 1e-9
 CONTROL_POINT_ROUNDING = (
     4 * np.finfo(float).eps
 )  # relative; dominates in accelerations of motions of milliseconds

@@ -38,12 +38,11 @@ from cnpgen.store.scene_table import SCENE_ID
 from cnpgen.store.shard_record import is_committed
 from cnpgen.validate.validate_rows import DeepCheck, check_rows
 
-MAX_REGENERATION_ERROR = (
-    1e-9  # in SI units; accepted difference of rows made on another machine or backend
-)
-MAX_REGENERATION_ERROR_FLOAT32 = (
-    1e-5  # in SI units; accepted difference of rows stored as float32
-)
+# In SI units; accepted difference of rows made on another machine or backend.
+
+MAX_REGENERATION_ERROR = 1e-9
+# In SI units; accepted difference of rows stored as float32.
+MAX_REGENERATION_ERROR_FLOAT32 = 1e-5
 
 
 @dataclass(frozen=True)

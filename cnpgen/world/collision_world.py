@@ -171,7 +171,8 @@ class CollisionWorld:
                 body, pose, self._mover, self._pose
             )
             return distance
-        self._result.clear()  # otherwise Coal keeps the smallest distance of earlier calls
+        # Otherwise Coal keeps the smallest distance of earlier calls.
+        self._result.clear()
         return float(
             measure(
                 self._transform, self._transforms[obstacle], self._request, self._result

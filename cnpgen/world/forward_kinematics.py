@@ -16,11 +16,10 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_ORIGIN, _SLIDE = (
-    3,
-    7,
-)  # rows of a joint's coefficients: its origin, and its direction if it slides
-MAX_POSE_ERROR = 1e-9  # between our poses and Pinocchio's, relative to 1 + the largest joint position
+# Rows of a joint's coefficients: its origin, and its direction if it slides.
+_ORIGIN, _SLIDE = 3, 7
+# Between our poses and Pinocchio's, relative to 1 + the largest joint position.
+MAX_POSE_ERROR = 1e-9
 
 
 class ForwardKinematics:

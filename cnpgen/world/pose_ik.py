@@ -21,9 +21,8 @@ METERS_PER_RADIAN = 0.3  # weight of an angle against a distance
 POSE_DAMPING = 1e-3  # relative to the squared error
 POSE_POSITION_TOLERANCE_M = 1e-6
 POSE_ROTATION_TOLERANCE_RAD = 1e-6
-TOLERANCE_INSET = (
-    1e-5  # m and rad, from the end of a tolerance, so that solutions are within it
-)
+# M and rad, from the end of a tolerance, so that solutions are within it.
+TOLERANCE_INSET = 1e-5
 
 
 @dataclass(frozen=True, eq=False)

@@ -218,6 +218,7 @@ TRUNCATE = """
 import sys
 from pathlib import Path
 import numpy as np
+from cnpgen import BatchOptions
 from cnpgen.errors import CnpgenError
 import cnpgen.store.checked_shard as checked
 import cnpgen.store.files.hdf5 as hdf5

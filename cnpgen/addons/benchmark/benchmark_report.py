@@ -34,14 +34,11 @@ MAX_FILM_FRAMES = 300  # less than 1 MB
 _STYLE = "body{font-family:sans-serif;max-width:75em;margin:2em auto}td,th{padding:.2em .8em;text-align:right}"
 _STYLE += "td:first-child,th:first-child{text-align:left}table{border-collapse:collapse}tr{border-top:1px solid #ccc}"
 _STYLE += "svg{max-width:100%;height:auto}figure{display:inline-block;width:46%;margin:1%}img,video{width:100%}"
-MIN_LOGARITHMIC_RATIO = 20.0  # of the largest to the smallest positive value, from which axes are logarithmic
+# Of the largest to the smallest positive value, from which axes are logarithmic.
+MIN_LOGARITHMIC_RATIO = 20.0
 PANELS_PER_ROW = 4
-STYLES = (
-    "-",
-    "--",
-    "-.",
-    ":",
-)  # with the ten colors of matplotlib, forty planners differ
+# With the ten colors of matplotlib, forty planners differ.
+STYLES = "-", "--", "-.", ":"
 COLORS = 10
 
 

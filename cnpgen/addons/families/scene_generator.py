@@ -42,9 +42,8 @@ MAX_PAIRS = 24  # of a start and a goal that are tried for one problem
 MAX_FAILED_SCENES = 20  # in a row, without any problem
 END_MARGIN_M = 0.005  # clearance of starts and goals
 STRAIGHT_SHARE = 0.1  # of the problems that may be solvable by a straight line
-NEUTRAL_SPREAD_RAD = (
-    0.1  # standard deviation of neutral starts around the base configuration
-)
+# Standard deviation of neutral starts around the base configuration.
+NEUTRAL_SPREAD_RAD = 0.1
 _STARTS = {"neutral": 0.4, "grasp": 0.4, "random": 0.2}  # kind of start -> probability
 
 

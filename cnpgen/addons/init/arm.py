@@ -13,10 +13,8 @@ from cnpgen.robots.robot import recipe_errors_in
 from cnpgen.robots.urdf import read_urdf, urdf_tree
 from cnpgen.robots.urdf_parameters import LinkInertia, UrdfJoint, urdf_parameters
 
-DEFAULT_RANGE_RAD, DEFAULT_RANGE_M = (
-    math.pi,
-    0.5,
-)  # ranges to either side, where the URDF has none
+# Ranges to either side, where the URDF has none.
+DEFAULT_RANGE_RAD, DEFAULT_RANGE_M = math.pi, 0.5
 MAX_INERTIA_ERROR = 0.01  # relative; published URDFs round their numbers
 MAX_LIMITED_RAD = 1000.0  # largest limit of a revolute joint that is one
 DEFAULT_SPEED = 1.0  # rad/s or m/s, where the URDF has none
@@ -27,7 +25,9 @@ class ArmJoint:
     """A movable joint with the limits of the URDF or placeholders."""
 
     name: str
-    kind: str  # type in the URDF: "revolute", "continuous", "prismatic" or one that cannot be planned
+    # Type in the URDF: "revolute", "continuous", "prismatic" or one that cannot be
+    # planned.
+    kind: str
     lower: float  # limit of the position [rad or m]
     upper: float
     velocity: float  # limit [rad/s or m/s]

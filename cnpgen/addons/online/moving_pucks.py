@@ -42,12 +42,10 @@ HitArguments = tuple[
 
 MAX_MEETING_TIME_S = 60.0
 MAX_PUCK_SPEED_M_S = 20.0
-EARLY_CONTACT_PHASES = (
-    65  # at which early contacts are checked; motion between them is straight
-)
-EARLY_CONTACT_MARGIN_M = (
-    2e-3  # of the mallet's path before the contact, on which it is no early one
-)
+# At which early contacts are checked; motion between them is straight.
+EARLY_CONTACT_PHASES = 65
+# Of the mallet's path before the contact, on which it is no early one.
+EARLY_CONTACT_MARGIN_M = 2e-3
 MAX_EARLY_DEPTH_M = 5e-4
 MAX_MEETING_ITERATIONS = 12
 MAX_MEETING_ERROR_S = 1e-4  # of the time at which mallet and puck meet

@@ -29,9 +29,9 @@ from cnpgen.schema.arguments import concerning, number, numbers
 
 Array = NDArray[np.float64]
 
-CONTACT_DISTANCE_M = (
-    0.07  # from the centre of the paper's puck to that of its mallet at contact
-)
+# From the centre of the paper's puck to that of its mallet at contact.
+
+CONTACT_DISTANCE_M = 0.07
 
 _COMPLETIONS: WeakKeyDictionary[Planner, Completion] = WeakKeyDictionary()
 

@@ -31,11 +31,8 @@ Array = NDArray[np.float64]
 PlanFunction = Callable[[SetPoint], Plans | JoinedPlans | None]
 """A function of the state at the switch that returns one plan or one sequence of plans from there, or None."""
 
-MAX_SWITCH_GAPS = (
-    1e-6,
-    1e-5,
-    1e-3,
-)  # of q [rad]; of dq and ddq as fractions of the limits
+# Of q [rad]; of dq and ddq as fractions of the limits.
+MAX_SWITCH_GAPS = 1e-6, 1e-5, 1e-3
 MAX_END_SPEED = 1e-6  # fraction of the velocity limits: a plan ends at rest
 BRAKING_LOOKAHEADS_S = np.array([0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5])
 

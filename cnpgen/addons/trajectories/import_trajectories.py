@@ -38,24 +38,22 @@ from cnpgen.world.world import World
 Array = NDArray[np.float64]
 State = tuple[Array, Array, Array]
 
-MAX_FIT_ERROR_RAD = 2e-3  # of the positions at the samples, plus the noise, with more control points otherwise
+# Of the positions at the samples, plus the noise, with more control points otherwise.
+MAX_FIT_ERROR_RAD = 2e-3
 GROWTH = (1.0, 1.6, 2.6)  # of the number of control points of the path
 FIT_SAMPLES_PER_POINT = 4  # of the path, at most
-MIN_SAMPLES_PER_POINT = (
-    2  # of the path, from which velocities of the samples are not needed
-)
+# Of the path, from which velocities of the samples are not needed.
+MIN_SAMPLES_PER_POINT = 2
 REST_WINDOW_S = 0.05  # in which noise of the positions looks like a velocity
 MIN_SNAP_RAD = 1e-3  # distance by which positions may always be moved
 SNAP_FACTOR = 3.0  # largest change of positions by snapping, relative to the noise
 MAX_ITERATIONS = 12  # of snapping
 DIFFERENCE = 1e-6  # of central differences, in units of the scaled state
-BOUND_INSET = 1e-6  # distance from a violated bound, relative to its range, at which a state is placed
+# Distance from a violated bound, relative to its range, at which a state is placed.
+BOUND_INSET = 1e-6
 MAX_RESIDUAL = 1e-10  # at which the iteration ends
-SCALES = (
-    1.0,
-    100.0,
-    1e5,
-)  # a change of 1 mrad counts as much as one of 0.1 rad/s, or of 100 rad/s^2
+# A change of 1 mrad counts as much as one of 0.1 rad/s, or of 100 rad/s^2.
+SCALES = 1.0, 100.0, 1e5
 
 
 @dataclass(frozen=True, eq=False)

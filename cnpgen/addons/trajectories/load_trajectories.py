@@ -38,7 +38,8 @@ KIND_NAMES = {
 }
 MAX_RATE_DEVIATION = 0.01  # of a stated rate from that of the file's times, relative
 MIN_DOUBTFUL_STEP_S = 0.5  # of times without a unit
-MAX_DOUBTFUL_SPEED = 2e-3  # relative to the velocity limits; twice the limit if the times are milliseconds
+# Relative to the velocity limits; twice the limit if the times are milliseconds.
+MAX_DOUBTFUL_SPEED = 2e-3
 UNUSED_KINDS = ("jerk", "effort", "efforts")  # not reported as ignored
 _UNIT = re.compile(r"\s*\[([^\]]*)\]\s*$")
 _SEPARATORS = (" ", "_", ".", "/", ":", "")

@@ -18,14 +18,8 @@ if TYPE_CHECKING:
     from cnpgen.addons.trajectories.load_trajectories import LoadedTrajectories
     from cnpgen.problems.problem import Problem
 
-TRAJECTORY_OPTIONS = (
-    "joints",
-    "unit",
-    "rate",
-    "separate_by",
-    "unwrap",
-    "parameters",
-)  # of load_trajectories
+# Of load_trajectories.
+TRAJECTORY_OPTIONS = "joints", "unit", "rate", "separate_by", "unwrap", "parameters"
 MAX_IGNORED = 8  # unused columns that are listed
 
 

@@ -37,12 +37,8 @@ _PART_OF_ARCHIVE = re.compile(
 )
 MESSAGE_TIME = "t [s]"  # of formats that define the unit
 _POINT_FIELDS = {"positions": "q", "velocities": "dq", "accelerations": "ddq"}
-_NESTING = (
-    "joint_trajectory",
-    "trajectory",
-    "trajectories",
-    "solution",
-)  # keys of messages that hold messages
+# Keys of messages that hold messages.
+_NESTING = "joint_trajectory", "trajectory", "trajectories", "solution"
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,10 +16,8 @@ from cnpgen.addons.view.view_scene import View, ViewScene
 from cnpgen.errors import CnpgenError, MachineError, UsageError, requires_extra
 
 HOST = "127.0.0.1"
-_NAMES = (
-    HOST,
-    "localhost",
-)  # accepted Host headers; requests that another site redirected have other ones
+# Accepted Host headers; requests that another site redirected have other ones.
+_NAMES = HOST, "localhost"
 _RETRY_S = 2  # time after which a browser reloads an error page
 
 Page = Callable[[int | None, str], str]

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-ZERO_TOLERANCE = 1e-200  # replaces a tolerance of 0 in relative violations, so that they can be compared
+# Replaces a tolerance of 0 in relative violations, so that they can be compared.
+ZERO_TOLERANCE = 1e-200
 
 
 class Reason(StrEnum):

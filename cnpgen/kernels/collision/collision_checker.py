@@ -37,9 +37,8 @@ _NAMES = (
 )
 SOURCES = [Path(__file__).with_name(name) for name in _NAMES]
 MAX_JOINTS = 56  # of the arrays in collision.c
-MIN_CONTACT_CAPACITY = (
-    1024  # of the first call; a second one follows where it is too small
-)
+# Of the first call; a second one follows where it is too small.
+MIN_CONTACT_CAPACITY = 1024
 CAPSULE = np.dtype(
     [
         ("frame", np.int64),

@@ -37,9 +37,8 @@ PARAMETERS = "parameters"  # only for problems with parameters
 LINE = "line"  # only if the network corrects its own path
 BLOCKS = (*USUAL, ARRIVAL, PARAMETERS, SCENE, LINE)
 FEATURE_SETS = ("full", "no-scene", "states", "paper")
-MIN_DEVIATION = (
-    1e-7  # SI units; features with a smaller standard deviation are constant
-)
+# SI units; features with a smaller standard deviation are constant.
+MIN_DEVIATION = 1e-7
 PATH_PHASES = 12  # states of the path
 STEP_RAD = 0.15  # rad or m: of every joint to both sides of the path
 RANGE_M = 0.12  # clearance below which points count

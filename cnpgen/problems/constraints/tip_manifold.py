@@ -22,10 +22,8 @@ if TYPE_CHECKING:
 
 Vector = tuple[float, float, float]
 Vectors = Sequence[Sequence[float]]  # Python floats, used in scalar products
-BOUND_KINKS = (
-    0.1,
-    0.3,
-)  # phases between which a motion that starts off the manifold must reach it
+# Phases between which a motion that starts off the manifold must reach it.
+BOUND_KINKS = 0.1, 0.3
 
 
 @dataclass(frozen=True)
@@ -72,9 +70,8 @@ class TipManifold(Constraint):
     velocity_name: ClassVar[str]
     acceleration_name: ClassVar[str]
     parts: ClassVar[tuple[tuple[str, ...], tuple[str, ...]]] = ((), ())
-    moves_with_table: ClassVar[bool] = (
-        False  # whether parameters of the problem move it
-    )
+    # Whether parameters of the problem move it.
+    moves_with_table: ClassVar[bool] = False
 
     @property
     @abstractmethod

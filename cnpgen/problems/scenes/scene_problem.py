@@ -26,9 +26,8 @@ from cnpgen.schema.units import PLAUSIBLE_MAX
 
 MAX_SCENE_OBSTACLES = 100  # as many as a problem may have
 MAX_SCENES = 100_000  # of one call
-MAX_BASE_DEPTH_M = (
-    0.01  # of the robot's base in an obstacle, such as the plate that it stands on
-)
+# Of the robot's base in an obstacle, such as the plate that it stands on.
+MAX_BASE_DEPTH_M = 0.01
 MIN_OBSTACLE_SIZE_M = 1e-6
 MAX_ROTATION_ERROR = 1e-6  # of the products of the rows of a rotation matrix
 _SIZES = {

@@ -13,9 +13,9 @@ from cnpgen.robots.shape.hull import CUBE, MAX_COORDINATE_M, Array, check_solid
 from cnpgen.robots.shape.inline import corners_of, is_inline
 from cnpgen.robots.urdf import urdf_tree
 
-PRISM_SIDES = (
-    64  # of the prism that contains a cylinder; its corners exceed the radius by 0.12 %
-)
+# Of the prism that contains a cylinder; its corners exceed the radius by 0.12 %.
+
+PRISM_SIDES = 64
 _ANGLES = np.arange(PRISM_SIDES) * (2 * math.pi / PRISM_SIDES)
 _UNIT_PRISM = np.array(
     [[math.cos(angle), math.sin(angle), z] for z in (-1.0, 1.0) for angle in _ANGLES]

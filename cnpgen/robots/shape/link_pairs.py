@@ -19,8 +19,11 @@ Names = frozenset[str]
 Mask = NDArray[np.bool_]
 
 SAMPLED_STATES = 10_000  # ten times as many gave the same pairs for a Franka Panda
-ALWAYS_FRACTION = 0.95  # links that overlap in a larger fraction of the states are treated as connected
-MAX_CAPSULE_ERROR_FRACTION = 0.05  # maximum fraction of collision-free states in which the capsules of a usable pair overlap
+# Links that overlap in a larger fraction of the states are treated as connected.
+ALWAYS_FRACTION = 0.95
+# Maximum fraction of collision-free states in which the capsules of a usable pair
+# overlap.
+MAX_CAPSULE_ERROR_FRACTION = 0.05
 
 
 @dataclass(frozen=True)

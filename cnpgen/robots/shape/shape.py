@@ -38,7 +38,9 @@ Pairs = tuple[LinkPair, ...]
 Parts = tuple[ConvexPart, ...]
 Size = tuple[float, float, float]
 
-SHAPE_REVISION = 1  # of the computation of capsules and pairs; cached results of another revision are ignored
+# Of the computation of capsules and pairs; cached results of another revision are
+# ignored.
+SHAPE_REVISION = 1
 HELD_OBJECT = "held object"  # takes the place of a link's name
 SAMPLED_HELD_STATES = 2000  # states in which the object and the links are compared
 

@@ -31,14 +31,8 @@ from cnpgen.store.files.size_limits import (
     MIN_EXPANSION_LIMIT_BYTES,
 )
 
-_DAMAGE = (
-    OSError,
-    KeyError,
-    RuntimeError,
-    ValueError,
-    TypeError,
-    AttributeError,
-)  # errors of h5py for damaged files
+# Errors of h5py for damaged files.
+_DAMAGE = OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError
 _SYSTEM_ERRORS = {
     errno.EACCES,
     errno.EPERM,

@@ -16,9 +16,9 @@ from cnpgen.judges.plans.metrics import tilt
 
 Array = NDArray[np.float64]
 
-PLANE_TOLERANCE_M = (
-    0.02  # of the mallet's height, as in the Air Hockey Challenge (2023)
-)
+# Of the mallet's height, as in the Air Hockey Challenge (2023).
+
+PLANE_TOLERANCE_M = 0.02
 MAX_GOAL_DISTANCE_M = 0.01  # of a finished motion, as in the paper
 EARLY_CONTACT_M = (
     hockey.PATH_LEFT_AT_CONTACT_M + 0.01

@@ -34,10 +34,8 @@ IIWA = {
     "joint_6": Friction(0.196149, 0.1),
     "joint_7": Friction(0.299238, 0.1),
 }
-DRY_FRACTION, VISCOUS_FRACTION = (
-    2e-3,
-    1e-3,
-)  # of the rated torque, the second per rad/s; for other joints
+# Of the rated torque, the second per rad/s; for other joints.
+DRY_FRACTION, VISCOUS_FRACTION = 2e-3, 1e-3
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,8 @@ import torch
 from cnpgen.kernels.tape import NAMES, OPERATIONS, Tape
 
 Value = Any  # a tensor, or a constant as a Python number
-MAX_GUARD = 1e-12  # a denominator ``fmax(x, guard)`` with a smaller constant is that of a closest point
+# A denominator ``fmax(x, guard)`` with a smaller constant is that of a closest point.
+MAX_GUARD = 1e-12
 # Below, segment and face or segment are parallel, and their closest points are
 # arbitrary.
 MIN_REGULAR_DENOMINATOR_M2 = 1e-6
