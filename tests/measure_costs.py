@@ -5,12 +5,13 @@
 parameters. A function that is not listed is quick, so a new test needs no entry. With
 paths only the entries of these files change.
 
-A value that several tests share (``functools.cache``, kernels) is paid by the first of
-them. Without that test the next one pays, so the quick tests are measured again until
-no costly one is left.
+A value that several tests share (``functools.cache``, a dataset) is paid by the first of
+them. Without that test the next one pays, so the quick tests are measured once more, and
+those that pay for much are listed, too.
 """
 
 import json
+import math
 import os
 import resource
 import subprocess
@@ -27,10 +28,11 @@ import pytest
 ROOT = Path(__file__).parents[1]
 LIST = Path(__file__).parent / "data" / "costly.txt"
 RESULT = "CNPGEN_TEST_COSTS"  # environment variable: file of the measured costs
-MAX_MEAN_S = (
+MAX_MEAN_S = 0.05(
     0.04  # CPU time of a quick test, the mean of the parameters of its function
 )
-MAX_SUM_S = 0.4  # of all parameters of a function
+MAX_SUM_S = 0.5  # of all parameters of a function
+MAX_SHARED_S = 0.3  # of a quick test that pays for what others share
 
 
 def read_costly() -> frozenset[str]:
@@ -38,12 +40,20 @@ def read_costly() -> frozenset[str]:
     return frozenset(LIST.read_text(encoding="utf-8").split())
 
 
+def write_costly(names: Iterable[str]) -> None:
+    """Write the names of the functions that are not quick."""
+    text = "".join(f"{name}\n" for name in sorted(names))
+    LIST.write_text(text, encoding="utf-8")
+
+
 def function_of(node_id: str) -> str:
     """Return the name of a test without its parameters."""
     return node_id.partition("[")[0]
 
 
-def costly(costs: Mapping[str, float]) -> set[str]:
+def costly(
+    costs: Mapping[str, float], max_mean: float, max_sum: float = math.inf
+) -> set[str]:
     """Return the functions whose tests need too much CPU time, from node ID -> time [s]."""
     times: dict[str, list[float]] = defaultdict(list)
     for node_id, cost in costs.items():
@@ -51,7 +61,7 @@ def costly(costs: Mapping[str, float]) -> set[str]:
     return {
         name
         for name, values in times.items()
-        if sum(values) > min(MAX_SUM_S, MAX_MEAN_S * len(values))
+        if sum(values) > min(max_sum, max_mean * len(values))
     }
 
 
@@ -60,7 +70,7 @@ class CostMeter:
 
     def __init__(self) -> None:
         self.costs: dict[str, float] = {}
-        self._fixtures: dict[str, float] = defaultdict(float)
+        self._fixtures: dict[tuple[str, str], float] = defaultdict(float)
         self._shared = 0.0  # CPU time of shared fixtures within the present test [s]
 
     @pytest.hookimpl(wrapper=True)
@@ -72,7 +82,7 @@ class CostMeter:
         finally:
             own = cpu_time() - before - (self._shared - shared)
             if fixturedef.scope != "function":
-                self._fixtures[fixturedef.argname] += own
+                self._fixtures[_key(fixturedef)] += own
                 self._shared += own
 
     @pytest.hookimpl(wrapper=True)
@@ -81,13 +91,19 @@ class CostMeter:
         before, self._shared = cpu_time(), 0.0
         result = yield
         own = cpu_time() - before - self._shared
-        fixtures = sum(self._fixtures[name] for name in set(item.fixturenames))
+        used = item._fixtureinfo.name2fixturedefs.values()
+        fixtures = sum(self._fixtures[_key(found[-1])] for found in used)
         self.costs[item.nodeid] = own + fixtures
         return result
 
     def pytest_sessionfinish(self) -> None:
         """Write the costs for the process that started this one."""
         Path(os.environ[RESULT]).write_text(json.dumps(self.costs), encoding="utf-8")
+
+
+def _key(fixturedef: Any) -> tuple[str, str]:
+    """Identify a fixture: modules have fixtures of the same name."""
+    return fixturedef.baseid, fixturedef.argname
 
 
 def cpu_time() -> float:
@@ -121,15 +137,12 @@ def main(paths: list[str]) -> None:
     """Write the list."""
     costs = measure("not slow and not extended", paths)
     measured = {function_of(node_id) for node_id in costs}
-    listed = set(read_costly() - measured if paths else ()) | costly(costs)
-    new, quick = costly(costs), costs
-    while new:
-        LIST.write_text("".join(f"{name}\n" for name in sorted(listed)))
-        quick = measure("quick", paths)
-        new = costly(quick)
-        listed |= new
-    share = len(quick) / len(costs)
-    print(f"{share:.0%} of {len(costs)} tests are quick: {sum(quick.values()):.0f} s")
+    listed = set(read_costly() - measured if paths else ())
+    listed |= costly(costs, MAX_MEAN_S, MAX_SUM_S)
+    write_costly(listed)
+    write_costly(listed | costly(measure("quick", paths), MAX_SHARED_S))
+    quick = [node_id for node_id in costs if function_of(node_id) not in read_costly()]
+    print(f"{len(quick) / len(costs):.0%} of {len(costs)} tests are quick")
 
 
 if __name__ == "__main__":

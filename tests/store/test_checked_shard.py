@@ -256,7 +256,10 @@ elif how == "size":
 else:
     before(hdf5, "check_heaps")
 read = {
-    "batches": lambda: [batch.table.sum() for batch in load_dataset(folder, verify=False).batches(50, options=BatchOptions(shuffle=False))],
+    "batches": lambda: [
+        batch.table.sum()
+        for batch in load_dataset(folder, verify=False).batches(50, options=BatchOptions(shuffle=False))
+    ],
     "arrays": lambda: load_dataset(folder, verify=False).arrays("train"),
     "store": lambda: open_dataset(folder).read("train"),
 }[sys.argv[3]]
