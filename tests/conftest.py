@@ -79,6 +79,8 @@ needs_compiler = pytest.mark.skipif(
     find_compiler() is None, reason="no C compiler on this machine"
 )
 
+pytest_plugins = ["pytester"]
+
 Prepare = Callable[..., PreparedPipeline]
 
 

@@ -28,9 +28,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 LIST = Path(__file__).parent / "data" / "costly.txt"
 RESULT = "CNPGEN_TEST_COSTS"  # environment variable: file of the measured costs
-MAX_MEAN_S = 0.05(
-    0.04  # CPU time of a quick test, the mean of the parameters of its function
-)
+# CPU time of a quick test, the mean of the parameters of its function.
+MAX_MEAN_S = 0.05
 MAX_SUM_S = 0.5  # of all parameters of a function
 MAX_SHARED_S = 0.3  # of a quick test that pays for what others share
 
