@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.schema.arguments import distinct
 from cnpgen.schema.keys import Range, field, keys
 
 Array = NDArray[np.float64]
@@ -186,8 +187,9 @@ class ParameterRanges:
             )
             if outside.any():
                 row = int(outside.argmax())
+                low, high, got = distinct(span.low, span.high, rows[row, column])
                 raise UsageError(
-                    f"{name} must be from {span.low:g} to {span.high:g}, got {rows[row, column]:g} in row {row}",
+                    f"{name} must be from {low} to {high}, got {got} in row {row}",
                     argument="parameters",
                 )
         return rows

@@ -9,6 +9,12 @@ import numpy as np
 
 from cnpgen.errors import RecipeError, UsageError, listed
 from cnpgen.problems.checks import frames_of, missing_frame, unread_xacro
+from cnpgen.problems.urdf_dynamics import (
+    JointFriction,
+    friction_in,
+    joint_notes,
+    suggested_use,
+)
 from cnpgen.robots.robot import recipe_errors_in
 from cnpgen.robots.urdf import read_urdf, urdf_tree
 from cnpgen.robots.urdf_parameters import LinkInertia, UrdfJoint, urdf_parameters
@@ -55,6 +61,13 @@ class Arm:
     ]  # links that planned joints move with inertias that no body has
     shaped: tuple[str, ...]  # links that have a ``<collision>`` element
     meshes: tuple[str, ...]  # mesh files that links name
+    friction: tuple[JointFriction, ...]  # friction of planned joints that have any
+    joint_notes: tuple[str, ...]  # about further elements of planned joints
+
+    @property
+    def urdf_dynamics(self) -> str:
+        """The key of [drive]: whether the problem uses the friction of the URDF."""
+        return suggested_use(self.friction, len(self.planned))
 
     @property
     def has_shape(self) -> bool:
@@ -121,6 +134,8 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
             if link.find("collision") is not None
         ),
         meshes=tuple(mesh.get("filename", "") for mesh in tree.iterfind("link//mesh")),
+        friction=tuple(friction_in(moving)),
+        joint_notes=tuple(joint_notes(tree, moving)),
     )
 
 
@@ -141,6 +156,11 @@ def arm_notes(arm: Arm) -> Iterator[str]:
             )
             text = f"the URDF has no {limit} limit of {', '.join(joints)}{reason}"
             yield f"{text}: [limits] has a placeholder, {placeholder}; enter the value of the data sheet"
+    yield from arm.joint_notes
+    if arm.friction:
+        use, shares = arm.urdf_dynamics, ", ".join(map(str, arm.friction))
+        reason = {"use": "", "ignore": ", since the values look like placeholders"}[use]
+        yield f'friction in the URDF: {shares}; [drive] has urdf_dynamics = "{use}"{reason}'
     if light := [
         link for link in arm.moved if link in arm.shaped and not arm.masses.get(link)
     ]:
@@ -209,6 +229,7 @@ def _joint(joint: UrdfJoint) -> ArmJoint:
         "velocity": velocity == 0,
         "torque": effort == 0,
     }
+    lower, upper = max(lower, joint.soft[0]), min(upper, joint.soft[1])
     half = DEFAULT_RANGE_M if joint.kind == "prismatic" else DEFAULT_RANGE_RAD
     return ArmJoint(
         name=joint.name,
