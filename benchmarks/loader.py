@@ -25,6 +25,7 @@ from common import arguments, median, progress, report, table, verdict
 from loader_methods import Method, Reader, Tables
 
 import cnpgen
+from cnpgen.loader.batch_options import BatchOptions
 from cnpgen.loader.dataset import Dataset
 
 SLOW_ROWS = 2 * 1024  # of methods that read row by row
@@ -56,7 +57,7 @@ def methods_of(reader: Reader) -> list[Method]:
         Method(
             f"{STREAMED}, not shuffled",
             "none",
-            lambda: reader.streamed(shuffle=False),
+            lambda: reader.streamed(options=BatchOptions(shuffle=False)),
             rows,
         ),
     ]
@@ -162,7 +163,9 @@ def shuffling(dataset: Dataset) -> dict[str, float]:
     ids = np.concatenate(
         [
             batch["sample_id"]
-            for batch in dataset.batches(1024, fields=["sample_id"], drop_last=False)
+            for batch in dataset.batches(
+                1024, fields=["sample_id"], options=BatchOptions(drop_last=False)
+            )
         ]
     )
     shard_of = np.searchsorted(

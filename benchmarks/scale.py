@@ -11,7 +11,7 @@ import argparse
 import resource
 import tempfile
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from common import arguments, cpu_of, progress, report, table
 
 import cnpgen
 from cnpgen.cli.dry_run import row_bytes
+from cnpgen.make.generation_options import GenerationOptions
 from cnpgen.make.make_dataset import find_damaged, finish
 from cnpgen.store.dataset_spec import default_shard_size, load_dataset_spec, shards
 from cnpgen.store.layout import DOCUMENTS
@@ -70,26 +71,32 @@ class Costs:
         return 2 * self.shards + len(DOCUMENTS)
 
 
-def measure(name: str, rows: int, sample: int, **options: Any) -> Costs:
+def measure(
+    name: str, rows: int, sample: int, *, dtype: str = "float64", **options: Any
+) -> Costs:
     """Make a small dataset and extrapolate to a large one."""
     block = CERTIFIED_BLOCK if options.get("certify") else 4096
     shard_rows = default_shard_size(rows, block)
     with tempfile.TemporaryDirectory(prefix="cnpgen-scale-") as temporary:
         folder = Path(temporary) / "out"
+        generation = GenerationOptions(dtype=dtype)
         settings = {"workers": 1, "shard_size": min(shard_rows, sample), **options}
         cnpgen.make_dataset(
             name,
             Path(temporary) / "first",
             n=block,
             **{**settings, "shard_size": block},
+            options=generation,
         )  # compiles kernels
         start_times: list[float] = []  # times after the preparation, which is done once
         cnpgen.make_dataset(
             name,
             folder,
             n=sample,
-            begin=lambda *_: start_times.append(time.process_time()),
             **settings,
+            options=replace(
+                generation, begin=lambda *_: start_times.append(time.process_time())
+            ),
         )
         make = time.process_time() - start_times[-1]
         deep = cpu_of(lambda: cnpgen.validate_dataset(folder, deep=True, workers=1))

@@ -26,7 +26,8 @@ Functions:
 Classes:
     ``Dataset``, ``Problem``, ``Scene``, ``RobotModel``, ``Boundary``, ``Motion``,
     ``Plans``, ``Planner``, ``Model``, ``BoundaryLayer``, ``PlanLoss``,
-    ``TrainingSettings``, ``RefineOptions``, ``CnpgenError``.
+    ``TrainingSettings``, ``CnpgenError``, and options of functions:
+    ``GenerationOptions``, ``BatchOptions``, ``TrainingOptions``, ``RefineOptions``.
 
 ``help(cnpgen.Plans)`` documents one name, and the command ``cnpgen docs`` prints pages
 of the documentation. Other public names are in these modules:

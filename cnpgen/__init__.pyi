@@ -1,6 +1,7 @@
 from typing import Any
 
 from cnpgen.errors import CnpgenError as CnpgenError
+from cnpgen.loader.batch_options import BatchOptions as BatchOptions
 from cnpgen.loader.dataset import Dataset as Dataset
 from cnpgen.loader.load import load_dataset as load_dataset
 from cnpgen.losses.plan_loss import PlanLoss as PlanLoss
@@ -10,6 +11,7 @@ from cnpgen.make.draw_boundary_problems import (
     draw_boundary_problems as draw_boundary_problems,
 )
 from cnpgen.make.extend import extend_dataset as extend_dataset
+from cnpgen.make.generation_options import GenerationOptions as GenerationOptions
 from cnpgen.make.make_dataset import make_dataset as make_dataset
 from cnpgen.make.merge import merge_datasets as merge_datasets
 from cnpgen.planner.boundary_layer import BoundaryLayer as BoundaryLayer
@@ -38,6 +40,7 @@ from cnpgen.robots.scene import Scene as Scene
 from cnpgen.store.inspection import inspect_dataset as inspect_dataset
 from cnpgen.training.settings import TrainingSettings as TrainingSettings
 from cnpgen.training.train import train_model as train_model
+from cnpgen.training.training_options import TrainingOptions as TrainingOptions
 from cnpgen.trajectory.boundary import Boundary as Boundary
 from cnpgen.trajectory.spline_motion import Motion as Motion
 from cnpgen.validate.machine import check_machine as check_machine

@@ -33,7 +33,6 @@ MODULES = (
 BRIDGES = (
     "torch",
     "jax",
-    "tensorflow",
 )  # their modules are read without an import of the framework
 
 COMMANDS_INTRODUCTION = """\

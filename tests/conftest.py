@@ -23,6 +23,10 @@ import ctypes
 import shutil
 import signal
 import sys
+
+# Without cached byte code, pytest rewrites every assert of the suite in every run.
+sys.dont_write_bytecode = False
+
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import cache
@@ -42,6 +46,7 @@ from cnpgen.pipelines.stages.stage import CandidateBatch
 from cnpgen.robots.robot import Robot
 from cnpgen.store.files.cache_folder import exclusive_lock, make_private_folder
 from cnpgen.store.layout import MANIFEST
+from tests.measure_costs import function_of, read_costly
 
 SHIPPED = ("airhockey-hit", "airhockey-replan", "heavy-object")
 TINY_ROWS = 660  # 600 + 60: three shards of training and one of validation
@@ -74,6 +79,8 @@ needs_compiler = pytest.mark.skipif(
     find_compiler() is None, reason="no C compiler on this machine"
 )
 
+pytest_plugins = ["pytester"]
+
 Prepare = Callable[..., PreparedPipeline]
 
 
@@ -87,6 +94,16 @@ def pytest_configure(config: pytest.Config) -> None:
         config.addinivalue_line(
             "filterwarnings", "ignore:.*running on the NumPy backend:RuntimeWarning"
         )
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark every test as quick that is in no other tier and not in the list of ``tests.measure_costs``."""
+    costly = read_costly()
+    for item in items:
+        in_a_tier = any(item.get_closest_marker(tier) for tier in ("slow", "extended"))
+        if not in_a_tier and function_of(item.nodeid) not in costly:
+            item.add_marker(pytest.mark.quick)
 
 
 @pytest.hookimpl(optionalhook=True)

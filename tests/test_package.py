@@ -20,7 +20,6 @@ import pytest
 import cnpgen
 from cnpgen.addons.benchmark.planners import (
     cbirrt,
-    crocoddyl,
     drake,
     rrtconnect,
     ruckig,
@@ -193,6 +192,7 @@ def test_what_the_default_run_of_the_tests_leaves_out_is_run_before_a_change_lan
     ]["pytest"]["ini_options"]
     assert settings["addopts"][-2:] == ["-m", "not slow and not extended"]
     assert {text.partition(":")[0] for text in settings["markers"]} == {
+        "quick",
         "slow",
         "extended",
     }
@@ -286,7 +286,6 @@ def trajectories(suffix: str) -> object:
 OPTIONAL = {  # package that cnpgen imports -> extra that installs it, function that needs it
     "torch": ("torch", bridge("torch", "to_torch")),
     "jax": ("jax", bridge("jax", "to_jax")),
-    "tensorflow": ("tensorflow", bridge("tensorflow", "to_tensorflow")),
     "matplotlib": ("plot", lambda: new_figure(1, 1)),
     "mujoco": ("benchmark", load_mujoco),
     "imageio": ("benchmark", rendering._imageio),
@@ -295,7 +294,6 @@ OPTIONAL = {  # package that cnpgen imports -> extra that installs it, function 
     "ruckig": ("benchmark", ruckig.load_ruckig),
     "sscbirrt": ("planners", sscbirrt.load_sscbirrt),
     "pydrake": ("planners", drake.load_drake),
-    "crocoddyl": ("crocoddyl", crocoddyl.load_crocoddyl),
     "meshcat": ("view", page._viewer),
     "distributed": ("dask", lambda: cluster("dask")),
     "ray": ("ray", lambda: cluster("ray")),

@@ -22,8 +22,6 @@ from cnpgen.schema.public_names import NAMES
 
 SPECIAL = {"__init__", "__call__", "__getitem__", "__iter__"}
 INNER = {  # classes in public signatures that users neither construct nor annotate
-    "Run": "argument of the hook `begin` of train_model",
-    "State": "argument of the hook `begin` of train_model",
     "Columns": "layout of a Batch, used through the names of its fields",
     "BatchPartition": "constructed by Dataset.batches",
     "RowFormat": "constructed by Dataset.batches",
@@ -117,7 +115,7 @@ MODULES = (
     "scenes",
     "trajectories",
 )
-MAX_NAMES, MAX_HELP_LINES = 40, 400
+MAX_NAMES, MAX_HELP_LINES = 43, 400
 MAX_ANNOTATION_CHARACTERS = (
     80  # of one argument in a signature; NumPy's ArrayLike in full has 300
 )

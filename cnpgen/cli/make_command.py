@@ -16,7 +16,7 @@ SIGTERM (143), kill -9 or a full disk the same command resumes.
 
 import argparse
 import sys
-from functools import partial
+from dataclasses import fields
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
@@ -120,11 +120,21 @@ def run(arguments: argparse.Namespace) -> None:
 
         print(spec_text(recipe, arguments.out, **options_of(arguments, *_SETTINGS)))
         return
-    from cnpgen.make.make_dataset import make_dataset
+    from cnpgen.make.generation_options import Begin, GenerationOptions
+    from cnpgen.make.make_dataset import MadeDataset, Progress, make_dataset
 
-    options = options_of(arguments, *_SETTINGS, *ENGINE, "part")
+    given = options_of(arguments, *_SETTINGS, *ENGINE, "part")
+    names = {entry.name for entry in fields(GenerationOptions)}
+    options = {name: given.pop(name) for name in names & given.keys()}
+
+    def make(begin: Begin, progress: Progress) -> MadeDataset:
+        chosen = GenerationOptions(**options, begin=begin)
+        return make_dataset(
+            recipe, arguments.out, **given, progress=progress, options=chosen
+        )
+
     make_metered(
-        partial(make_dataset, recipe, arguments.out, **options),
+        make,
         quiet=arguments.quiet,
         part=arguments.part,
     )

@@ -173,10 +173,18 @@ def _train(arguments: argparse.Namespace, watch: Watch) -> "Trained":
     from cnpgen.training.presets import PRESETS
     from cnpgen.training.settings import TrainingSettings
     from cnpgen.training.train import train_model
+    from cnpgen.training.training_options import TrainingOptions
 
     preset, length = PRESETS.get(arguments.preset), options_of(arguments, *_LENGTHS)
     if preset is not None and all(value is None for value in length.values()):
-        length = vars(preset.length)
+        length = dict(vars(preset.length))
+    options = TrainingOptions(
+        epochs=length.pop("epochs"),
+        command=_command(arguments),
+        begin=watch.begin,
+        watch=watch,
+        **options_of(arguments, "robot"),
+    )
     return train_model(
         arguments.folder,
         arguments.out,
@@ -185,10 +193,8 @@ def _train(arguments: argparse.Namespace, watch: Watch) -> "Trained":
         ),
         **length,
         check_rows=arguments.check,
-        command=_command(arguments),
-        begin=watch.begin,
-        watch=watch,
-        **options_of(arguments, "start_from", "force", "workers", "robot"),
+        options=options,
+        **options_of(arguments, "start_from", "force", "workers"),
     )
 
 

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from cnpgen.errors import DatasetError, MissingExtraError, UsageError, lacks
 from cnpgen.loader.batch import observer_of
+from cnpgen.loader.batch_options import BatchOptions
 from cnpgen.loader.batches import Batches, BatchPartition, Observe, checked_position
 from cnpgen.loader.gather import Split, gather
 from cnpgen.loader.row_format import (
@@ -37,6 +38,7 @@ from cnpgen.loader.shard_reader import (
 from cnpgen.robots.observation.observations import Observation
 from cnpgen.robots.scene import Scene
 from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.old_keywords import with_old_keywords
 from cnpgen.store.checked_shard import Shard
 from cnpgen.store.dataset_spec import DatasetSpec, StoredProblem
 from cnpgen.store.field import Field
@@ -135,14 +137,12 @@ class Dataset:
         split: str = "train",
         seed: int = 0,
         epoch: int = 0,
-        rank: int = 0,
-        world: int = 1,
         fields: Iterable[str] | None = None,
         normalize: bool | Normalization = True,
         dtype: DTypeLike = "float32",
-        drop_last: bool = True,
-        shuffle: bool = True,
         observe: Observe | Observation | str | None = None,
+        options: BatchOptions | None = None,
+        **old_keywords: Any,
     ) -> Batches:
         """Return the batches of a split, in an order that depends on seed and epoch only.
 
@@ -151,20 +151,16 @@ class Dataset:
             split: Name of the split.
             seed: Seed of the order of all epochs.
             epoch: First epoch.
-            rank: Index of the rank of this process; it reads the rows ``rank::world``
-                of every batch.
-            world: Number of ranks.
             fields: Names of the fields.
             normalize: Whether to normalize every split with the statistics of the
                 training rows.
             dtype: Type of float fields.
-            drop_last: Whether to omit an incomplete last batch of an epoch.
-            shuffle: Whether to shuffle the rows; otherwise they are in their stored
-                order.
             observe: Kind of observation of the scenes of the rows, such as "cloud"
                 (``cnpgen.scenes.observe``), or a function that returns observations of
                 a batch, name -> array with a first axis of length B. They are added to
                 the batch.
+            options: Rank, incomplete batches and the stored order.
+            old_keywords: Fields of the options, as keywords of version 1.0.
 
         Raises:
             UsageError: An argument is invalid, or there are fewer rows than in one
@@ -178,10 +174,14 @@ class Dataset:
                 field.name for field in select_columns(self.spec, fields).fields
             ]
             fields = list(dict.fromkeys([*selected, OBSTACLE_POSES]))
+        chosen = with_old_keywords("batches", options, BatchOptions(), old_keywords)
         partition = BatchPartition(
-            batch_size=batch_size, rank=rank, world=world, drop_last=drop_last
+            batch_size=batch_size,
+            rank=chosen.rank,
+            world=chosen.world,
+            drop_last=chosen.drop_last,
         )
-        position = checked_position(seed=seed, shuffle=shuffle, epoch=epoch)
+        position = checked_position(seed=seed, shuffle=chosen.shuffle, epoch=epoch)
         row_format = self._row_format(fields=fields, normalize=normalize, dtype=dtype)
         return Batches(self._source(split), row_format, partition, position, observe)
 

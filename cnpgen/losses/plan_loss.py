@@ -210,26 +210,24 @@ class PlanLoss:
             np.empty_like(batch.rate[selected]),
         )
 
+        # Hulls, kernel and bounds are built on first use: here, before threads start.
+        hulls, varying = self._hulls, self._varying(batch, gradient=gradient)
+
         def evaluate_block(rows: slice) -> None:
             part = batch[rows]
             with (
                 one_thread(),
                 np.errstate(all="ignore"),
             ):  # an overflow affects its own plan only
-                results = self._integrate(part, checked, table, gradient=gradient)
-                if self._hulls is not None:
-                    self._hulls.add(results, part, checked, table, shift=shift)
+                results = self._integrate(
+                    part, checked, table, varying, gradient=gradient
+                )
+                if hulls is not None:
+                    hulls.add(results, part, checked, table, shift=shift)
                 terms[rows], path_gradient[rows], rate_gradient[rows] = (
                     part.samples(values) for values in results
                 )
 
-        self._hulls  # noqa: B018 - a cached property, loaded before threads start, as are the kernel and the bound
-        kernel = self._gradient if gradient else self._values
-        if (
-            kernel.tape.inputs[relaxation_argument(self.problem)]
-            and batch.start_tip is not None
-        ):
-            self._time_varying  # noqa: B018 - a cached property
         self._run(evaluate_block, n)
         with np.errstate(all="ignore"):
             total = terms[:, 0] + terms[:, 1:] @ checked
@@ -261,10 +259,28 @@ class PlanLoss:
 
         Otherwise the first call does.
         """
-        self._gradient  # noqa: B018 - a cached property
+        self._kernel(gradient=True)
+
+    def _kernel(self, *, gradient: bool) -> GridKernel:
+        return self._gradient if gradient else self._values
+
+    def _varying(
+        self, batch: PlanBatch, *, gradient: bool
+    ) -> list[tuple[Constraint, Condition]]:
+        """Return the time-varying bounds; none if the kernel or the plans do without them."""
+        used = self._kernel(gradient=gradient).tape.inputs[
+            relaxation_argument(self.problem)
+        ]
+        return self._time_varying if used and batch.start_tip is not None else []
 
     def _integrate(
-        self, batch: PlanBatch, weights: Array, table: BasisTable, *, gradient: bool
+        self,
+        batch: PlanBatch,
+        weights: Array,
+        table: BasisTable,
+        varying: list[tuple[Constraint, Condition]],
+        *,
+        gradient: bool,
     ) -> tuple[Array, Array, Array]:
         """Return terms and gradients of a block, samples last.
 
@@ -289,7 +305,7 @@ class PlanLoss:
         terms = np.zeros((len(self.terms), lanes), self.dtype)
         arguments = (
             *path.swapaxes(1, 2), rate, batch.lanes(poses),
-            self._relaxation(batch, table, lanes, gradient=gradient), table.weights, self.tightening, weights,
+            self._relaxation(batch, table, lanes, varying, gradient=gradient), table.weights, self.tightening, weights,
         )  # fmt: skip
         if not gradient:
             self._values(*arguments, out=[terms])
@@ -310,10 +326,16 @@ class PlanLoss:
         )
 
     def _relaxation(
-        self, batch: PlanBatch, table: BasisTable, lanes: int, *, gradient: bool
+        self,
+        batch: PlanBatch,
+        table: BasisTable,
+        lanes: int,
+        varying: list[tuple[Constraint, Condition]],
+        *,
+        gradient: bool,
     ) -> Array:
         """Return the relaxation of the conditions with time-varying bounds, shape (values, K, lanes)."""
-        kernel = self._gradient if gradient else self._values
+        kernel = self._kernel(gradient=gradient)
         out = np.zeros(
             (
                 kernel.tape.inputs[relaxation_argument(self.problem)],
@@ -323,9 +345,7 @@ class PlanLoss:
             self.dtype,
         )
         if batch.start_tip is not None and len(out):
-            out[..., : len(batch)] = relaxation_of(
-                self._time_varying, table.s, batch.start_tip
-            )
+            out[..., : len(batch)] = relaxation_of(varying, table.s, batch.start_tip)
         return out
 
     def check_shapes(self, **shapes: tuple[int, ...]) -> None:

@@ -10,7 +10,8 @@ from cnpgen.errors import DatasetError, UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.machine.engine import Engine
 from cnpgen.make.dataset_documents import dataset_documents
-from cnpgen.make.make_dataset import Begin, MadeDataset, Progress, delete_shards, run
+from cnpgen.make.generation_options import Begin
+from cnpgen.make.make_dataset import MadeDataset, Progress, delete_shards, run
 from cnpgen.make.make_shards import Job, prepare
 from cnpgen.make.recipe import DatasetRecipe, makes_its_rows, restored, split_rows
 from cnpgen.make.resolve_spec import MAX_ROWS

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 import os
 import warnings
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -12,16 +11,19 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.machine.engine import Engine, assembled
 from cnpgen.make.certify import certified
 from cnpgen.make.dataset_documents import dataset_documents
+from cnpgen.make.generation_options import Begin, GenerationOptions
 from cnpgen.make.make_shards import Job, make_shards
 from cnpgen.make.recipe import DatasetRecipe, as_dataset_recipe, load_notes
 from cnpgen.make.resolve_spec import dataset_folder, resolve
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS
 from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.old_keywords import with_old_keywords
 from cnpgen.store.check import check_documents
 from cnpgen.store.checked_shard import Shard, read_rows
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shards
@@ -40,8 +42,6 @@ MAX_BLOCKS_PER_RUN = 8  # blocks of the shards that a worker generates in one ru
 MIN_RUNS_PER_WORKER = 4  # given enough blocks, so that workers finish at similar times
 MAX_THREADS = 8  # that compare shards with their records
 
-# Called with ("checking" or "making", folder, rows, existing rows).
-Begin = Callable[[str, Path, int, int], None]
 # Called with the rows of a shard and, for a generated shard, its sampling statistics.
 Progress = Callable[[int, SamplingStatistics | None], None]
 
@@ -76,17 +76,12 @@ def make_dataset(
     n: int | None = None,
     seed: int | None = None,
     workers: int | None = None,
-    engine: str | None = None,
-    address: str | None = None,
     shard_size: int | None = None,
-    dtype: str = "float64",
-    backend: str | None = None,
     certify: bool = False,
-    model: str | Path | None = None,
     force: bool = False,
-    part: tuple[int, int] | None = None,
-    begin: Begin | None = None,
     progress: Progress | None = None,
+    options: GenerationOptions | None = None,
+    **old_keywords: Any,
 ) -> MadeDataset:
     """Generate a dataset, or finish an interrupted one.
 
@@ -103,30 +98,15 @@ def make_dataset(
         seed: Root seed; default the recipe's.
         workers: Number of processes; default one per available core, or one for few
             missing rows; on a cluster, all its workers.
-        engine: "loky" for processes of this machine; "dask" or "ray" for a cluster
-            whose workers share the folder. By default loky, or the backend of
-            ``joblib.parallel_config``.
-        address: Address of the cluster's scheduler or head; by default a temporary
-            cluster on this machine.
         shard_size: Rows per shard; default between 8192 and 65536, for certified
             datasets between 64 and 1024.
-        dtype: Float type in which rows are stored and validated, "float64" or
-            "float32".
-        backend: "compiled", "numpy" or "casadi"; default the fastest working one.
         certify: Whether to plan every sample and keep those with a valid plan, with the
             plan (about 30 ms a sample).
-        model: Planner for the initial guesses of certification, which takes half the
-            time; by default no initial guess. Plans are judged in the same way; they
-            differ as local optima from different initial guesses differ.
         force: Whether to delete another dataset in the folder.
-        part: ``(k, m)``: generate only the k-th of m parts of the shards, counted from
-            0, for arrays of batch jobs. The call that completes the shards finishes the
-            dataset.
-        begin: Called with ("checking", folder, existing rows, 0) before existing rows
-            are compared, and with ("making", folder, rows of this call, existing rows
-            of them) before rows are generated.
         progress: Called with (rows, sampling statistics) of every generated shard, and
             (rows, None) of every compared one.
+        options: Engine, type of the stored rows, backend, part and others.
+        old_keywords: Fields of the options, as keywords of version 1.0.
 
     Raises:
         RecipeError: The recipe has errors, or its data card cannot be read.
@@ -136,14 +116,17 @@ def make_dataset(
             continue.
         DatasetError: The specification.json in the folder is damaged.
     """
-    where = Engine(engine, address, workers)
-    _check(part, force=force)
+    chosen = with_old_keywords(
+        "make_dataset", options, GenerationOptions(), old_keywords
+    )
+    where = Engine(chosen.engine, chosen.address, workers)
+    _check(chosen.part, force=force)
     loaded = as_dataset_recipe(recipe)
-    if model is not None and not certify:
+    if chosen.model is not None and not certify:
         raise UsageError(
             "needs {certify}", argument="model", remedies={"certify": True}
         )
-    loaded = certified(loaded, model=model) if certify else loaded
+    loaded = certified(loaded, model=chosen.model) if certify else loaded
     notes = load_notes(loaded)
     folder = dataset_folder(loaded, out)
     workspace = find_workspace(folder)
@@ -154,12 +137,19 @@ def make_dataset(
         n=n,
         seed=seed,
         shard_size=shard_size,
-        dtype=dtype,
-        backend=backend,
+        dtype=chosen.dtype,
+        backend=chosen.backend,
         force=force,
     )
     job = replace(job, spec=open_workspace(folder, job.spec, force=force))
-    return run(job, notes, engine=where, part=part, begin=begin, progress=progress)
+    return run(
+        job,
+        notes,
+        engine=where,
+        part=chosen.part,
+        begin=chosen.begin,
+        progress=progress,
+    )
 
 
 def run(
@@ -330,18 +320,7 @@ def finish(
 def _check(part: tuple[int, int] | None, *, force: bool) -> None:
     """Raise UsageError for invalid arguments or environment variables before anything is written."""
     source_date()
-    if part is None:
-        return
-    try:
-        k, m = map(operator.index, part)
-    except (TypeError, ValueError) as error:
-        raise UsageError(
-            f"must be two integers (K, M) with 0 <= K < M, got {part!r}",
-            argument="part",
-        ) from error
-    if not 0 <= k < m:
-        raise UsageError(f"must be K/M with 0 <= K < M, got {k}/{m}", argument="part")
-    if force:
+    if part is not None and force:
         text = "{force} would delete what the other parts have made: remove the folder, then start the parts"
         raise UsageError(text, remedies={"force": True})
 

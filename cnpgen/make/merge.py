@@ -9,7 +9,8 @@ from pathlib import Path
 
 from cnpgen.errors import DatasetError, RecipeError, UsageError, listed
 from cnpgen.make.certify import certified
-from cnpgen.make.make_dataset import Begin, MadeDataset, Progress, finish
+from cnpgen.make.generation_options import Begin
+from cnpgen.make.make_dataset import MadeDataset, Progress, finish
 from cnpgen.make.recipe import load_dataset_recipe, load_notes, recipe_digest
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.catalogue import list_recipes

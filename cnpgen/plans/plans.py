@@ -82,20 +82,8 @@ class Plans:
             raise
         if wrong is not None:
             check_fields(self)
-            text = next(_errors(self, _rows(self)))
-            raise UsageError(text, concerns=self._argument_of(text))
-
-    def _argument_of(self, message: str) -> str:
-        """Return the name of the argument that a message of ``_errors`` begins with, or that holds the array."""
-        name = message.split(maxsplit=1)[0]
-        if name in vars(self.boundary):
-            return "boundary"
-        holder = (
-            "columns"
-            if name in self.columns or message.startswith("a column")
-            else "path_control_points"
-        )
-        return name if name in vars(self) else holder
+            argument, text = next(_errors(self, _rows(self)))
+            raise UsageError(text, concerns=argument)
 
     def __len__(self) -> int:
         return len(self.path_control_points)
@@ -365,8 +353,8 @@ def _checked(which: Any, plans: int) -> slice | NDArray[Any]:
     return np.atleast_1d(found)
 
 
-def _errors(plans: Plans, rows: int | None = None) -> Iterator[str]:
-    """Yield error messages about shapes.
+def _errors(plans: Plans, rows: int | None = None) -> Iterator[tuple[str, str]]:
+    """Yield the argument and the message of every error in shapes.
 
     The default number of plans is that of the paths.
     """
@@ -376,43 +364,73 @@ def _errors(plans: Plans, rows: int | None = None) -> Iterator[str]:
         plans.degree,
     )
     if path.ndim != 3:
-        yield f"path_control_points must have shape (N, C, n), got {path.shape}"
+        yield (
+            "path_control_points",
+            f"path_control_points must have shape (N, C, n), got {path.shape}",
+        )
         return
     _, points, n = path.shape
     rows = len(path) if rows is None else rows
     if len(path) != rows:
-        yield f"path_control_points must have shape ({rows}, C, n) like the other fields, got {path.shape}"
+        yield (
+            "path_control_points",
+            f"path_control_points must have shape ({rows}, C, n) like the other fields, got {path.shape}",
+        )
     joints = len(plans.problem.joint_names)
     if n != joints:
-        yield f"path_control_points has {n} joints, but {plans.problem.name!r} plans {joints}: got shape {path.shape}"
+        yield (
+            "path_control_points",
+            f"path_control_points has {n} joints, but {plans.problem.name!r} plans {joints}: got shape {path.shape}",
+        )
     min_count = plans.boundary.min_control_points(degree)
     if points < min_count:
-        yield f"path_control_points must have at least {min_count} of degree {degree}, got shape {path.shape}"
+        yield (
+            "path_control_points",
+            f"path_control_points must have at least {min_count} of degree {degree}, got shape {path.shape}",
+        )
     most = max(points, rate.shape[-1] if rate.ndim else 0)
     if most > MAX_CONTROL_POINTS:
-        yield f"splines have at most {MAX_CONTROL_POINTS} control points, got {most}"
+        yield (
+            "path_control_points",
+            f"splines have at most {MAX_CONTROL_POINTS} control points, got {most}",
+        )
     if rate.ndim != 2 or len(rate) != rows or rate.shape[1] <= degree:
-        yield f"rate_control_points must have shape ({rows}, R) with R > {degree}, the degree, got {rate.shape}"
+        yield (
+            "rate_control_points",
+            f"rate_control_points must have shape ({rows}, R) with R > {degree}, the degree, got {rate.shape}",
+        )
     for name, values in plans.boundary.conditions().items():
         if values.shape != (rows, n):
-            yield f"{name} must have shape {(rows, n)} (plans, joints), got {values.shape}"
+            yield (
+                "boundary",
+                f"{name} must have shape {(rows, n)} (plans, joints), got {values.shape}",
+            )
     yield from _parameter_errors(plans, rows)
     for name in ("sample_id", "status"):
         if getattr(plans, name).shape != (rows,):
-            yield f"{name} must have shape {(rows,)}, got {getattr(plans, name).shape}"
+            yield (
+                name,
+                f"{name} must have shape {(rows,)}, got {getattr(plans, name).shape}",
+            )
     yield from _column_errors(plans, rows)
     for name in NOTES:
         if not isinstance(getattr(plans, name), str):
-            yield f"{name} must be a text, got {getattr(plans, name)!r:.60}"
+            yield name, f"{name} must be a text, got {getattr(plans, name)!r:.60}"
 
 
-def _parameter_errors(plans: Plans, rows: int) -> Iterator[str]:
+def _parameter_errors(plans: Plans, rows: int) -> Iterator[tuple[str, str]]:
     parameters, width = plans.boundary.parameters, len(plans.problem.parameters)
     if width and parameters is None:
         names = ", ".join(plans.problem.parameters.names)
-        yield f"parameters are missing: plans of {plans.problem.name!r} have {names}"
+        yield (
+            "boundary",
+            f"parameters are missing: plans of {plans.problem.name!r} have {names}",
+        )
     elif parameters is not None and parameters.shape != (rows, width):
-        yield f"parameters must have shape {(rows, width)} (plans, parameters of the problem), got {parameters.shape}"
+        yield (
+            "boundary",
+            f"parameters must have shape {(rows, width)} (plans, parameters of the problem), got {parameters.shape}",
+        )
 
 
 def _rows(plans: Plans) -> int:
@@ -430,15 +448,21 @@ def _rows(plans: Plans) -> int:
     ).most_common(1)[0][0]
 
 
-def _column_errors(plans: Plans, rows: int) -> Iterator[str]:
+def _column_errors(plans: Plans, rows: int) -> Iterator[tuple[str, str]]:
     for name, values in plans.columns.items():
         array: Any = values
         if not isinstance(array, np.ndarray):
-            yield f"columns must hold arrays of NumPy, got {array!r:.60} at {name!r:.60}"
+            yield (
+                "columns",
+                f"columns must hold arrays of NumPy, got {array!r:.60} at {name!r:.60}",
+            )
             return
         if name in _NO_COLUMNS or "/" in name:
-            yield f"a column cannot be called {name!r}"
+            yield "columns", f"a column cannot be called {name!r}"
         if values.ndim not in {1, 2} or len(values) != rows:
-            yield f"{name} must have shape ({rows},) or ({rows}, w), got {values.shape}"
+            yield (
+                "columns",
+                f"{name} must have shape ({rows},) or ({rows}, w), got {values.shape}",
+            )
         elif name in {"start_xyz", "goal_xyz"} and values.shape != (rows, 3):
-            yield f"{name} must have shape {(rows, 3)}, got {values.shape}"
+            yield "columns", f"{name} must have shape {(rows, 3)}, got {values.shape}"

@@ -86,7 +86,6 @@ def scene_plans(
     """
     check_scenes(scenes)
     refuse_changes(scenes, "solve_scenes changes the problem for them")
-    problem.urdf_text  # noqa: B018 - read once for all capacities
     full = with_capacity(problem, capacity_of(scenes) if capacity is None else capacity)
     record = record_problem(full)
     robot = open_problem(record)[1]

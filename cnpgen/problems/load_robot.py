@@ -96,11 +96,12 @@ def load_robot(problem: Problem) -> Robot:
             if spec.geometry == "urdf"
             else None
         )
-        model, robot = (
-            robot.model,
-            replace(robot, shape=shape, held_shape=_held_shape(problem, robot)),
+        robot = replace(
+            robot,
+            shape=shape,
+            held_shape=_held_shape(problem, robot),
+            built_model=robot.model,  # expensive to build again
         )
-    vars(robot)["model"] = model  # a cached property, expensive to build again
     if not problem.is_stored:
         _check_sizes(problem, robot)
     return robot

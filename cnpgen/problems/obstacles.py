@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -128,10 +127,7 @@ def with_capacity(problem: Problem, capacity: Capacity) -> Problem:
         for shape in shapes
         for index in range(1, capacity.get(shape, 0) + 1)
     ]
-    full = replace(problem, obstacle=(*problem.obstacle, *parked))
-    if "urdf_text" in vars(problem):  # a cached property, expensive to read again
-        vars(full)["urdf_text"] = problem.urdf_text
-    return full
+    return problem.replaced(obstacle=(*problem.obstacle, *parked))
 
 
 def _parked(kind: str, index: int) -> Obstacle:

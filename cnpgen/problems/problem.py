@@ -119,6 +119,10 @@ class Problem:
     # In a dataset, a plan or a model: implausible sizes and limits were accepted
     # before.
     is_stored: bool = False
+    # ``urdf_text`` if it was read before: that of the same problem, or a stored one.
+    read_urdf_text: str | None = dataclasses.field(
+        default=None, compare=False, repr=False
+    )
 
     @checked_arguments
     def first(self, kind: type[Kind]) -> Kind | None:
@@ -135,11 +139,11 @@ class Problem:
         """
         if error := invalid_obstacle(obstacles):
             raise UsageError(error, concerns="obstacles")
-        other = dataclasses.replace(self, obstacle=tuple(obstacles))
-        vars(other)["urdf_text"] = (
-            self.urdf_text
-        )  # a cached property, expensive to read again
-        return other
+        return self.replaced(obstacle=tuple(obstacles))
+
+    def replaced(self, **fields: Any) -> "Problem":
+        """Return the problem with other fields; the text of the URDF stays, because it is expensive to read again."""
+        return dataclasses.replace(self, read_urdf_text=self.urdf_text, **fields)
 
     @property
     def has_sample_obstacles(self) -> bool:
@@ -362,6 +366,8 @@ class Problem:
             RecipeError: The URDF, a mesh or the SRDF cannot be read, or is not UTF-8,
                 or a joint cannot be locked.
         """
+        if self.read_urdf_text is not None:
+            return self.read_urdf_text
         spec = self.robot
         positions = dict(zip(spec.locked_joints, spec.locked_positions, strict=True))
         text = with_locked_joints(

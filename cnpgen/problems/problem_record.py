@@ -127,6 +127,10 @@ class ProblemRecord(StoredProblem):
         """
         return self._parsed(TrajectorySpec, "trajectory", self.content["trajectory"])
 
+    def check_trajectory(self) -> None:
+        """Raise a RecipeError if there is no parametrization as suggested."""
+        self._parsed(TrajectorySpec, "trajectory", self.content["trajectory"])
+
     @cached_property
     def parameters(self) -> ParameterRanges:
         """Parameters that differ from motion to motion.
@@ -173,10 +177,8 @@ class ProblemRecord(StoredProblem):
         """
         with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
             problem = restore_problem(self.content, self.urdf, Path(folder))
-            vars(problem)["urdf_text"] = (
-                self.urdf
-            )  # a cached property: the text contains meshes and pairs already
-            yield problem
+            # The stored text contains meshes and pairs already.
+            yield replace(problem, read_urdf_text=self.urdf)
 
     @checked_arguments
     def tip_positions(self, q: Array) -> Array:
@@ -216,7 +218,7 @@ def with_control_points(
         json.dumps(content, ensure_ascii=False, allow_nan=False), record.urdf
     )
     try:
-        found.trajectory  # noqa: B018 - checks the numbers
+        found.check_trajectory()
     except RecipeError as error:
         raise UsageError(
             f"{', '.join(changed)}: {error}", concerns=next(iter(changed))

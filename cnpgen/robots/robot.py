@@ -91,6 +91,7 @@ class Robot:
         nominal_parameters: Parameters of a sample for which none are given, shape
             (width,).
         drive: Drives of the joints; None for torques of the rigid body alone.
+        built_model: ``model`` if the same one was built before.
     """
 
     urdf: Path
@@ -113,6 +114,7 @@ class Robot:
     table_origin: Array = field(default_factory=lambda: np.zeros(3))
     nominal_parameters: Array = field(default_factory=lambda: np.empty(0))
     drive: Drive | None = None
+    built_model: "pin.Model | None" = field(default=None, compare=False, repr=False)
 
     @cached_property
     def holding_limit(self) -> Array:
@@ -162,6 +164,8 @@ class Robot:
     @cached_property
     def model(self) -> "pin.Model":
         """The Pinocchio model reduced to the planned joints."""
+        if self.built_model is not None:
+            return self.built_model
         return reduced_model(self.urdf, self.urdf_text, self.joint_names, self.attached)
 
     @cached_property

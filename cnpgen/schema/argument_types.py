@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import (
     Any,
     Literal,
@@ -22,8 +23,14 @@ from typing import (
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cnpgen.errors import CnpgenError, MachineError, UsageError, either, nearest
-from cnpgen.schema.arguments import flag, integer, number, reject_masked
+from cnpgen.errors import CnpgenError, MachineError, either, nearest
+from cnpgen.schema.arguments import (
+    UnexpectedValueError,
+    flag,
+    integer,
+    number,
+    reject_masked,
+)
 from cnpgen.schema.keys import alternatives
 
 P = ParamSpec("P")
@@ -125,10 +132,10 @@ def _evaluated(function: Callable[..., Any], annotation: Any) -> Any:
     """
     if not isinstance(annotation, str):
         return annotation
+    names = vars(collections.abc) | inspect.unwrap(function).__globals__
+    holder = SimpleNamespace(__annotations__={"value": annotation})
     with suppress(NameError):
-        return eval(  # noqa: S307
-            annotation, vars(collections.abc) | inspect.unwrap(function).__globals__
-        )
+        return get_type_hints(holder, names)["value"]
     return annotation
 
 
@@ -179,16 +186,12 @@ def _check_of(hint: Any, *, strict: bool = False) -> Check | None:
         for check in checks:
             try:
                 return check(name, value)
-            except UsageError as error:
-                errors.append(error.args[0])
-        expected = either(
-            [error.partition(", got ")[0].removeprefix("must be ") for error in errors]
-        )
-        got = errors[0].partition(", got ")[2]
-        raise UsageError(
-            f"must be {expected}, got {got}" if len(errors) > 1 else errors[0],
-            argument=name,
-        )
+            except UnexpectedValueError as error:
+                errors.append(error)
+        if len(errors) == 1:
+            raise errors[0]
+        expected = either([error.expected for error in errors])
+        raise UnexpectedValueError(expected, errors[0].got, argument=name)
 
     return check_options if checks else None
 
@@ -237,9 +240,8 @@ def _check_of_type(hint: Any, *, strict: bool) -> Check | None:
 def _array(name: str, value: Any) -> Any:
     reject_masked(name, value)
     if not isinstance(value, np.ndarray):
-        raise UsageError(
-            f"must be an array of NumPy, got {type(value).__name__}", argument=name
-        )
+        got = type(value).__name__
+        raise UnexpectedValueError("an array of NumPy", got, argument=name)
     return value
 
 
@@ -252,7 +254,7 @@ def _real(name: str, value: Any) -> float:
 
 def _accepted(accepts: Callable[[Any], bool], noun: str, name: str, value: Any) -> Any:
     if not accepts(value):
-        raise UsageError(f"must be {noun}, got {value!r:.100}", argument=name)
+        raise UnexpectedValueError(noun, f"{value!r:.100}", argument=name)
     return value
 
 
@@ -266,17 +268,15 @@ def _path(name: str, value: Any) -> str | Path:
         or not os.fspath(value)
         or "\0" in str(value)
     ):
-        raise UsageError(f"must be a name or a path, got {value!r:.100}", argument=name)
+        raise UnexpectedValueError("a name or a path", f"{value!r:.100}", argument=name)
     return value if isinstance(value, str) else Path(value)
 
 
 def _choice(choices: tuple[Any, ...], name: str, value: Any) -> Any:
     if not isinstance(value, str) or value not in choices:
         hint = nearest(value, choices) if isinstance(value, str) else ""
-        raise UsageError(
-            f"must be one of {', '.join(map(str, choices))}, got {value!r:.100}{hint}",
-            argument=name,
-        )
+        expected = f"one of {', '.join(map(str, choices))}"
+        raise UnexpectedValueError(expected, f"{value!r:.100}{hint}", argument=name)
     return value
 
 
@@ -286,8 +286,6 @@ def _instance(kind: type, name: str, value: Any) -> Any:
 
 def _named(kind: str, name: str, value: Any) -> Any:
     if kind not in {base.__name__ for base in type(value).__mro__}:
-        raise UsageError(
-            f"must be {NOUNS.get(kind, f'of type {kind}')}, got {type(value).__name__}",
-            argument=name,
-        )
+        expected = NOUNS.get(kind, f"of type {kind}")
+        raise UnexpectedValueError(expected, type(value).__name__, argument=name)
     return value

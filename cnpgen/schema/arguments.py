@@ -1,5 +1,6 @@
 """Validation of Python arguments: bounded integers, finite numbers, arrays that fit into memory, and flags."""
 
+import functools
 import math
 import operator
 from collections.abc import Iterator, Mapping
@@ -16,6 +17,25 @@ Array = NDArray[Any]
 
 BYTES_PER_FLOAT = 8
 MIN_CHECKED_SIZE = 10_000_000  # floats from which on the available memory is measured
+
+
+class UnexpectedValueError(UsageError):
+    """An argument of another type or value than expected.
+
+    Args:
+        expected: Noun of the accepted values: "an integer".
+        got: The value, or its type.
+        argument: Name of the argument.
+    """
+
+    def __init__(self, expected: str, got: str, *, argument: str) -> None:
+        super().__init__(f"must be {expected}, got {got}", argument=argument)
+        self.expected, self.got = expected, got
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle for worker processes."""
+        create = functools.partial(type(self), argument=self.argument or "")
+        return create, (self.expected, self.got), vars(self)
 
 
 def integer(
@@ -41,8 +61,8 @@ def integer(
             if most is None
             else f" from {least} to {most}"
         )
-        raise UsageError(
-            f"must be an integer{bounds}, got {value!r:.100}", argument=name
+        raise UnexpectedValueError(
+            f"an integer{bounds}", f"{value!r:.100}", argument=name
         )
     return found
 
@@ -62,7 +82,7 @@ def number(name: str, value: Any) -> float:
     except (TypeError, ValueError):
         found = math.nan
     if not math.isfinite(found):
-        raise UsageError(f"must be a finite number, got {value!r:.100}", argument=name)
+        raise UnexpectedValueError("a finite number", f"{value!r:.100}", argument=name)
     return found
 
 
@@ -171,7 +191,7 @@ def flag(name: str, value: Any) -> bool:
     Accept NumPy's bool, raise UsageError for other types such as 1 and "no".
     """
     if not isinstance(value, bool | np.bool_):
-        raise UsageError(f"must be True or False, got {value!r:.100}", argument=name)
+        raise UnexpectedValueError("True or False", f"{value!r:.100}", argument=name)
     return bool(value)
 
 

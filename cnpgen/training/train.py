@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from cnpgen.problems.problem_record import (
 )
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning, integer
+from cnpgen.schema.old_keywords import with_old_keywords
 from cnpgen.store.files.atomic import check_writable, file_sha256
 from cnpgen.store.files.documents import differences, plain
 from cnpgen.store.files.file_lock import output_lock
@@ -29,7 +30,7 @@ from cnpgen.training.data import open_training_data
 from cnpgen.training.log import TrainingLog, is_log
 from cnpgen.training.prepare import begin_run, identity, prepare_run, validate
 from cnpgen.training.settings import Length, TrainingSettings
-from cnpgen.training.training_run import Run, Watcher
+from cnpgen.training.training_options import TrainingOptions
 
 DEFAULT_CPU_TIME_S = 120.0
 # In place of .h5.
@@ -65,17 +66,14 @@ def train_model(
     out: str | Path,
     *,
     steps: int | None = None,
-    epochs: float | None = None,
     cpu_seconds: float | None = None,
     settings: TrainingSettings | None = None,
     start_from: str | Path | None = None,
     check_rows: int = 200,
-    command: str = "",
     force: bool = False,
     workers: int | None = None,
-    robot: str | Path | None = None,
-    begin: Callable[[State, Run], None] | None = None,
-    watch: Watcher | None = None,
+    options: TrainingOptions | None = None,
+    **old_keywords: Any,
 ) -> Trained:
     """Train a model, or resume an interrupted run; an existing model of the same run is returned.
 
@@ -87,7 +85,6 @@ def train_model(
         folder: The dataset; with ``robot`` a scene file, or a folder of scene files.
         out: The model's file, ``.h5``.
         steps: Length in steps.
-        epochs: Length in epochs.
         cpu_seconds: Length in CPU time of the steps [s]: the time of a step is measured
             first, and the number of steps is then fixed. Compiling, reading rows and
             validation are not included. The default is 120 s.
@@ -96,14 +93,12 @@ def train_model(
             ones; width, depth and output definition in the settings must be the same.
         check_rows: Number of validation rows that models are compared on during the
             run, at most half of them; the best one is scored on up to 2,000 others.
-        command: Command recorded in the model.
         force: Replace an existing model, log and picture; discard another run's
             checkpoint.
         workers: Number of processes of the final validation; training itself uses one
             process.
-        robot: Problem of the robot that moves in the scenes, such as "panda".
-        begin: Called once before the first step.
-        watch: Called with every line of the log.
+        options: Length in epochs, the robot of scene files and others.
+        old_keywords: Fields of the options, as keywords of version 1.0.
 
     Raises:
         UsageError: An argument is invalid, the initial model is missing or does not
@@ -113,8 +108,9 @@ def train_model(
         MachineError: The disk is full, or the loss is not finite any more.
     """
     clock = Stopwatch()
+    chosen = with_old_keywords("train_model", options, TrainingOptions(), old_keywords)
     out, settings = Path(out), settings or TrainingSettings()
-    lengths = {"steps": steps, "epochs": epochs, "cpu_seconds": cpu_seconds}
+    lengths = {"steps": steps, "epochs": chosen.epochs, "cpu_seconds": cpu_seconds}
     passed: dict[str, Any] = {
         name: value for name, value in lengths.items() if value is not None
     }
@@ -122,7 +118,7 @@ def train_model(
     length, check_rows = Length(**passed), integer("check_rows", check_rows, least=1)
     check_out(out)
     remove_temporary_files(out)
-    source = open_training_data(folder, robot)
+    source = open_training_data(folder, chosen.robot)
     initial_model, digest = _read_initial_model(start_from)
     run_identity = {
         "length": plain(passed),
@@ -153,14 +149,14 @@ def train_model(
             settings,
             initial_model=initial_model,
             check_rows=check_rows,
-            command=command,
+            command=chosen.command,
         )
         state = checkpoints.load(discard=force) or begin_run(run, length)
         clock.prepared()
-        if begin is not None:
-            begin(state, run)
+        if chosen.begin is not None:
+            chosen.begin(state, run)
         log = TrainingLog(out.with_suffix(LOG), state.log)
-        run.train(state, checkpoints, log, watch)
+        run.train(state, checkpoints, log, chosen.watch)
         checkpoints.save(state)
         best = run.model(state.best.parameters)
         score = validate(

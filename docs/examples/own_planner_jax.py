@@ -219,9 +219,8 @@ def main():
     )
     options = {
         "split": "validation",
-        "shuffle": False,
         "fields": [*STATES, "sample_id"],
-        "drop_last": False,
+        "options": cnpgen.BatchOptions(shuffle=False, drop_last=False),
     }
     batch = next(iter(dataset.batches(arguments.problems, **options)))
     tasks = layer.tasks(cnpgen.Boundary.from_batch(batch))

@@ -187,9 +187,8 @@ def main():
     )
     options = {
         "split": "validation",
-        "shuffle": False,
         "fields": [*STATES, "sample_id"],
-        "drop_last": False,
+        "options": cnpgen.BatchOptions(shuffle=False, drop_last=False),
     }
     batch = to_torch(next(iter(dataset.batches(arguments.problems, **options))))
     with torch.no_grad():

@@ -71,7 +71,7 @@ def test_the_page_of_names_has_all_public_modules(generator: ModuleType) -> None
     assert set(generator.MODULES) == set(MODULES)
 
 
-@pytest.mark.parametrize("framework", ["torch", "jax", "tensorflow"])
+@pytest.mark.parametrize("framework", ["torch", "jax"])
 def test_the_page_of_names_has_the_bridges_to_frameworks(
     generator: ModuleType, framework: str
 ) -> None:
@@ -81,9 +81,7 @@ def test_the_page_of_names_has_the_bridges_to_frameworks(
         .split("\n## ")[0]
     )
     names = re.findall(r"^\| `(\w+)` \| .*\. \|$", section, re.M)
-    assert {"torch": "TensorLoss", "jax": "plan_loss", "tensorflow": "to_tensorflow"}[
-        framework
-    ] in names
+    assert {"torch": "TensorLoss", "jax": "plan_loss"}[framework] in names
     module = pytest.importorskip(f"cnpgen.interop.{framework}", exc_type=CnpgenError)
     assert names == sorted(getattr(module, "__all__", [f"to_{framework}"]))
 

@@ -9,14 +9,13 @@ from cnpgen.plans.evaluate import evaluate_plans
 from tests.examples.plan_files import plans_of
 from tests.examples.plans import load
 
-PAGE = (
-    Path(__file__).parents[2] / "docs" / "reference" / "verdict-format.md"
-).read_text(encoding="utf-8")
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "verdict-format.md"
 
 
 def documented(after: str) -> set[str]:
     """Return the keys in the first column of the first table after a text."""
-    table = re.search(r"\| key \|.*?\n\n", PAGE[PAGE.index(after) :] + "\n\n", re.S)
+    page = PAGE.read_text(encoding="utf-8")
+    table = re.search(r"\| key \|.*?\n\n", page[page.index(after) :] + "\n\n", re.S)
     assert table
     return {
         key
@@ -44,7 +43,7 @@ def test_every_key_is_documented() -> None:
         "finished",
         "broken",
     ):
-        assert f"`{name}`" in PAGE
+        assert f"`{name}`" in PAGE.read_text(encoding="utf-8")
     assert set(evaluation.summary()["conditions"]["tilt"]) == {
         "violating_plans",
         "worst_plan",
@@ -55,6 +54,6 @@ def test_every_key_is_documented() -> None:
 def test_every_metric_and_reason_is_documented() -> None:
     for label in ("hit", "transport"):
         for name in load(label).judged().metrics.to_dict():
-            assert f"| `{name}` |" in PAGE
+            assert f"| `{name}` |" in PAGE.read_text(encoding="utf-8")
     for reason in Reason:
-        assert f"`{reason}`" in PAGE
+        assert f"`{reason}`" in PAGE.read_text(encoding="utf-8")

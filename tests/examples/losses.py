@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from scipy.interpolate import BSpline
+import scipy
 
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.world.world import World
@@ -79,7 +79,10 @@ class States:
 
 def states(path: np.ndarray, rate: np.ndarray, s: np.ndarray) -> States:
     """Evaluate a plan independently of cnpgen's splines, on purpose."""
-    p, r = BSpline(KNOTS[len(path)], path, 7), BSpline(KNOTS[len(rate)], rate, 7)
+    p, r = (
+        scipy.interpolate.BSpline(KNOTS[len(path)], path, 7),
+        scipy.interpolate.BSpline(KNOTS[len(rate)], rate, 7),
+    )
     r0, r1 = r(s)[:, None], r(s, 1)[:, None]
     return States(p(s), p(s, 1) * r0, p(s, 2) * r0**2 + p(s, 1) * r1 * r0, r0[:, 0])
 

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import least_squares
+import scipy
 
 from cnpgen.problems.constraints.axis import Axis
 from cnpgen.problems.constraints.constraint import Constraint
@@ -15,9 +15,6 @@ from cnpgen.schema.keys import Range
 from cnpgen.world.world import World
 from tests.examples.plans import PROBLEMS, ROBOTS, load
 
-PROBLEM = PROBLEMS["heavy-object"]
-LIMITS = tuple(c for c in PROBLEM.constraint if type(c).__name__.startswith("Joint"))
-ROBOT = ROBOTS["heavy-object"]
 TIPS = np.array([[0.45, -0.3, 0.45], [0.55, 0.3, 0.55]])
 U_RANGE, V_RANGE = Range(-0.2, 0.2), Range(-0.3, 0.3)
 MANIFOLDS = {
@@ -32,16 +29,25 @@ MANIFOLDS = {
 }  # fmt: skip
 
 
+def joint_limits() -> tuple[Constraint, ...]:
+    """Return the joint limits of the arm."""
+    constraints = PROBLEMS["heavy-object"].constraint
+    return tuple(c for c in constraints if type(c).__name__.startswith("Joint"))
+
+
 def problem_on(name: str) -> Problem:
     """Return the problem of the arm with its joint limits on a manifold, without obstacles and object."""
     return replace(
-        PROBLEM, constraint=(*LIMITS, *MANIFOLDS[name]), obstacle=(), object=None
+        PROBLEMS["heavy-object"],
+        constraint=(*joint_limits(), *MANIFOLDS[name]),
+        obstacle=(),
+        object=None,
     )
 
 
 def ends_on(name: str) -> list[np.ndarray]:
     """Return two configurations on a manifold."""
-    world, constraints = World(ROBOT, (), None), MANIFOLDS[name]
+    world, constraints = World(ROBOTS["heavy-object"], (), None), MANIFOLDS[name]
     first = on(world, constraints, TIPS[0], load("transport").boundary.start_q[0])
     return [first, on(world, constraints, TIPS[1], first)]
 
@@ -71,12 +77,13 @@ def on(
             [100 * violation(q), world.tip_position - tip, 0.01 * (q - start)]
         )
 
-    bounds = 0.9 * ROBOT.position_lower, 0.9 * ROBOT.position_upper
-    near = least_squares(
+    robot = ROBOTS["heavy-object"]
+    bounds = 0.9 * robot.position_lower, 0.9 * robot.position_upper
+    near = scipy.optimize.least_squares(
         distance, np.clip(start, *(0.99 * bound for bound in bounds)), bounds=bounds
     ).x
     return np.asarray(
-        least_squares(
+        scipy.optimize.least_squares(
             violation, near, bounds=bounds, xtol=1e-15, ftol=1e-15, gtol=1e-15
         ).x
     )

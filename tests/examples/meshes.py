@@ -6,8 +6,7 @@ from pathlib import Path
 import coal
 import numpy as np
 import pinocchio as pin
-from scipy.interpolate import BSpline
-from scipy.spatial.transform import Rotation
+import scipy
 
 from cnpgen.plans import Plans
 from cnpgen.problems.problem import Problem
@@ -75,7 +74,7 @@ class Meshes:
     def _hold(self, problem: Problem) -> int:
         """Put the held cuboid about the tip, as the problem's keys say; it may touch what holds it."""
         frame = self.model.frames[self.model.getFrameId(problem.robot.tip)]
-        turn = Rotation.from_euler(
+        turn = scipy.spatial.transform.Rotation.from_euler(
             "xyz", problem.robot.tip_rotation
         ).as_matrix()  # about fixed axes
         pose = frame.placement * pin.SE3(turn, np.array(problem.robot.tip_offset))
@@ -124,7 +123,7 @@ def states(plans: Plans, index: int, step: float = 1e-3) -> np.ndarray:
         plans.degree,
     )
     p, r = (
-        BSpline(
+        scipy.interpolate.BSpline(
             np.concatenate(
                 [[0] * degree, np.linspace(0, 1, len(c) - degree + 1), [1] * degree]
             ),

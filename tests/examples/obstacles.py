@@ -4,8 +4,7 @@ from typing import Any
 
 import coal
 import numpy as np
-from scipy.spatial import ConvexHull
-from scipy.spatial.transform import Rotation
+import scipy
 
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import hull_corners
@@ -58,7 +57,9 @@ def coal_obstacle(obstacle: Obstacle) -> tuple[Any, Any]:
         return coal.Box(x.high - x.low, y.high - y.low, height), coal.Transform3s(
             np.eye(3), center
         )
-    turn = Rotation.from_euler("xyz", obstacle.rotation).as_matrix()  # about fixed axes
+    turn = scipy.spatial.transform.Rotation.from_euler(
+        "xyz", obstacle.rotation
+    ).as_matrix()  # about fixed axes
     return _shape(obstacle), coal.Transform3s(turn, np.array(obstacle.position))
 
 
@@ -68,7 +69,7 @@ def _shape(obstacle: Obstacle) -> Any:
         points, faces = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
         for corner in corners:
             points.append(corner)
-        for triangle in ConvexHull(corners).simplices:
+        for triangle in scipy.spatial.ConvexHull(corners).simplices:
             faces.append(coal.Triangle(*map(int, triangle)))
         return coal.Convex(points, faces)
     return {
@@ -89,7 +90,9 @@ def coal_distance(shape: Any, place: Any, obstacle: Obstacle) -> float:
 def segment(first: np.ndarray, second: np.ndarray) -> tuple[Any, Any]:
     """A segment as Coal's capsule without thickness, and its place."""
     along = second - first
-    turn = Rotation.align_vectors([along], [[0, 0, 1]])[0].as_matrix()
+    turn = scipy.spatial.transform.Rotation.align_vectors([along], [[0, 0, 1]])[
+        0
+    ].as_matrix()
     return coal.Capsule(0.0, float(np.linalg.norm(along))), coal.Transform3s(
         turn, (first + second) / 2
     )

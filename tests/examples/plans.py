@@ -2,28 +2,25 @@
 
 import json
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from scipy.integrate import simpson
-from scipy.interpolate import BSpline
+import scipy
 
 from cnpgen.judges.plans import Verdict
 from cnpgen.judges.plans.judge import Judge
-from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion
+from tests.examples.shipped import PROBLEMS, ROBOTS
 
-PROBLEMS = {name: load_problem(name) for name in ("airhockey", "heavy-object")}
-ROBOTS = {name: load_robot(problem) for name, problem in PROBLEMS.items()}
-CONTENT = json.loads((Path(__file__).parents[1] / "data" / "plans.json").read_text())
+STORED_PLANS = Path(__file__).parents[1] / "data" / "plans.json"
 KNOTS = {
     count: np.r_[np.zeros(8), np.arange(1, count - 7) / (count - 7), np.ones(8)]
     for count in (15, 20)
@@ -77,8 +74,14 @@ class Plan:
         return replace(self, problem=replace(self.problem, constraint=constraints))
 
 
+@cache
+def stored_plans() -> dict[str, Any]:
+    """Read the valid plans by label; not to be changed."""
+    return json.loads(STORED_PLANS.read_text())
+
+
 def load(label: str) -> Plan:
-    content = CONTENT[label]
+    content = stored_plans()[label]
     value = {
         name: np.array(values)[None]
         for name, values in content.items()
@@ -169,14 +172,17 @@ class ReferenceTrajectory:
     rotation: np.ndarray
 
     def integral(self, values: np.ndarray) -> float:
-        return float(simpson(values, x=self.t))
+        return float(scipy.integrate.simpson(values, x=self.t))
 
 
 def reference_trajectory(plan: Plan, count: int = 4001) -> ReferenceTrajectory:
     """Evaluate a plan independently of cnpgen's splines, on purpose."""
     s = np.linspace(0, 1, count)
     path, rate = plan.motion.path[0], plan.motion.rate[0]
-    p, r = BSpline(KNOTS[15], path, 7), BSpline(KNOTS[20], rate, 7)
+    p, r = (
+        scipy.interpolate.BSpline(KNOTS[15], path, 7),
+        scipy.interpolate.BSpline(KNOTS[20], rate, 7),
+    )
     q, r0 = p(s), r(s)[:, None]
     dq, ddq = p(s, 1) * r0, p(s, 2) * r0**2 + p(s, 1) * r(s, 1)[:, None] * r0
     jerk = (p(s, 3) * r0**2 + 3 * p(s, 2) * r(s, 1)[:, None] * r0) * r0

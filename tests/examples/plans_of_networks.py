@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import BSpline
+import scipy
 
 from cnpgen.planner.boundary_layer import BoundaryLayer
 from cnpgen.problems.problem_file import load_problem
@@ -15,7 +15,7 @@ from tests.examples.models import accelerated
 def boundary(problem: str, count: int, seed: int = 0) -> Boundary:
     """Draw boundary conditions near the base configuration, with moving starts and goals."""
     base, random = (
-        np.array(load_problem(problem).robot.home),
+        np.array(load_problem(problem).robot.base),
         np.random.default_rng(seed),
     )
     draw = lambda scale: scale * random.standard_normal((count, len(base)))  # noqa: E731
@@ -42,8 +42,10 @@ def outputs(
 def at_ends(path: Any, rate: Any) -> list[np.ndarray]:
     """Return q, dq and ddq at start and goal of motions by SciPy, on purpose independent of cnpgen's splines."""
     path, rate, states = np.asarray(path, float), np.asarray(rate, float), []
-    p = BSpline(clamped_knots(path.shape[1], 7), path.swapaxes(0, 1), 7)
-    r = BSpline(clamped_knots(rate.shape[1], 7), rate.T[..., None], 7)
+    p = scipy.interpolate.BSpline(
+        clamped_knots(path.shape[1], 7), path.swapaxes(0, 1), 7
+    )
+    r = scipy.interpolate.BSpline(clamped_knots(rate.shape[1], 7), rate.T[..., None], 7)
     for s in (0.0, 1.0):
         states += [p(s), p(s, 1) * r(s), p(s, 2) * r(s) ** 2 + p(s, 1) * r(s, 1) * r(s)]
     return states

@@ -1,10 +1,11 @@
 """A small arm whose links have shapes of every kind, written to a folder with its meshes and a problem file."""
 
 import struct
+from functools import cache
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import ConvexHull
+import scipy
 
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
@@ -245,19 +246,22 @@ def box(low: np.ndarray, high: np.ndarray) -> np.ndarray:
         * (high - low)
         + low
     )
-    hull = ConvexHull(corners)
+    hull = scipy.spatial.ConvexHull(corners)
     inwards = np.linalg.det(corners[hull.simplices] - (low + high) / 2) < 0
     sides = np.where(inwards[:, None], hull.simplices[:, ::-1], hull.simplices)
     return corners[sides]
 
 
-CHANNEL = np.concatenate([box(*each) for each in BOXES])
+@cache
+def channel() -> np.ndarray:
+    """Return the triangles of the channel, shape (36, 3, 3)."""
+    return np.concatenate([box(*each) for each in BOXES])
 
 
 def arm_of_channels(folder: Path, robot: str = "") -> Problem:
     """Write the arm without obstacles; its forearm is an open channel, which its hull fills."""
     file = write_problem(folder, robot=robot, obstacles="")
-    corners = (CHANNEL * [1.5, 4, 4] - [0.1, 0, 0.1]).reshape(-1, 3)
+    corners = (channel() * [1.5, 4, 4] - [0.1, 0, 0.1]).reshape(-1, 3)
     sides = [(k, k + 1, k + 2) for k in range(0, len(corners), 3)]
     (folder / "crane" / "channel.stl").write_bytes(stl(corners, sides))
     urdf = folder / "crane" / "crane.urdf"

@@ -3,8 +3,10 @@
 import hashlib
 from pathlib import Path
 
+from cnpgen.make.generation_options import GenerationOptions
 from cnpgen.make.make_dataset import MadeDataset, make_dataset
 from tests.conftest import TINY_SHARD, tiny_recipe
+from tests.examples.grouped import grouped
 
 SHARDS = 4  # of a tiny dataset: 250, 250 and 100 rows of training, 60 of validation
 
@@ -12,9 +14,8 @@ SHARDS = 4  # of a tiny dataset: 250, 250 and 100 rows of training, 60 of valida
 def make_tiny(
     folder: Path, name: str = "airhockey-hit", **options: object
 ) -> MadeDataset:
-    return make_dataset(
-        tiny_recipe(name), folder, **{"shard_size": TINY_SHARD, "workers": 1, **options}
-    )
+    given = {"shard_size": TINY_SHARD, "workers": 1, **options}
+    return grouped(make_dataset, GenerationOptions, tiny_recipe(name), folder, **given)
 
 
 def digests(folder: Path) -> dict[str, str]:

@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from cnpgen.robots.robot import Robot
 
@@ -121,7 +121,7 @@ def _pose(element: Element) -> np.ndarray:
     """Return the <origin> of an element, shape (4, 4)."""
     origin, pose = element.find("origin"), np.eye(4)
     if origin is not None:
-        pose[:3, :3] = Rotation.from_euler(
+        pose[:3, :3] = scipy.spatial.transform.Rotation.from_euler(
             "xyz", _floats(origin.get("rpy", "0 0 0"))
         ).as_matrix()
         pose[:3, 3] = _floats(origin.get("xyz", "0 0 0"))

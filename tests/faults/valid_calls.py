@@ -325,6 +325,10 @@ def _of_plans(folder: Path, plans: Any) -> list[ValidCall]:
             {"problems": plans[:0], "options": options, "workers": 1},
         ),
         ValidCall("RefineOptions", cnpgen.RefineOptions),
+        ValidCall("GenerationOptions", cnpgen.GenerationOptions),
+        ValidCall("BatchOptions", cnpgen.BatchOptions),
+        ValidCall("TrainingOptions", cnpgen.TrainingOptions),
+        ValidCall("BenchmarkOptions", benchmark.BenchmarkOptions),
         ValidCall("RefineOptions.document", options.document),
     ]
 
@@ -532,7 +536,7 @@ def _of_benchmark(folder: Path, problem: Any, plans: Any) -> list[ValidCall]:
                 "n": 1,
                 "workers": 1,
             },
-            frozenset({"n", "repeat"}),  # large ones are valid and run the whole suite
+            frozenset({"n"}),  # large ones are valid and run the whole suite
         ),
         ValidCall("Benchmark.summary", ran.summary),
         ValidCall(

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.interpolate import BPoly
+import scipy
 
 from cnpgen.judges.plans.bernstein import (
     LIMIT_DECISION_TOLERANCE,
@@ -15,7 +15,7 @@ from tests.examples.plans import load, perturbed, reference_trajectory
 
 def value(coefficients: np.ndarray, edges: np.ndarray, s: np.ndarray) -> np.ndarray:
     """Evaluate functions in Bernstein form with SciPy: (d + 1, S, M) at (K,) -> (M, K)."""
-    return np.asarray(BPoly(coefficients, edges)(s).T)
+    return np.asarray(scipy.interpolate.BPoly(coefficients, edges)(s).T)
 
 
 @pytest.mark.parametrize("label", ["hit", "replan", "transport"])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.interpolate import BSpline
+import scipy
 
 from cnpgen.judges.plans.evaluated_trajectory import (
     Phases,
@@ -75,7 +75,7 @@ def test_cached_bases_give_the_same_states(jerk: bool) -> None:
 def test_values_at_both_ends_and_every_knot_are_correct() -> None:
     plan = load("hit")
     s = np.arange(9) / 8
-    spline = BSpline(KNOTS[15], plan.motion.path[0], 7)
+    spline = scipy.interpolate.BSpline(KNOTS[15], plan.motion.path[0], 7)
     np.testing.assert_allclose(
         evaluate_trajectory(plan.motion, s).q, spline(s).T, atol=1e-13
     )

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pinocchio as pin
 import pytest
-from scipy.optimize import linprog, minimize_scalar
+import scipy
 
 from cnpgen.errors import DatasetError, RecipeError
 from cnpgen.judges.rows import verify as rows_module
@@ -19,14 +19,13 @@ from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.obstacles import scene_of
-from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import solids_of
 from cnpgen.world.collision_world import CollisionWorld
 from cnpgen.world.world import World
+from tests.examples.shipped import PROBLEMS
 
 Columns = dict[str, np.ndarray]
-AIRHOCKEY, HEAVY = load_problem("airhockey"), load_problem("heavy-object")
 ROWS = 6
 WORLD_ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
@@ -142,7 +141,9 @@ def is_clear(robot: Robot, q: np.ndarray, row: Columns) -> bool:
         [*(data.oMi[i].translation for i in (2, 4, 6)), tip_pose(robot, q).translation]
     )
     points = np.concatenate([np.linspace(a, b, 500) for a, b in pairwise(corners)])
-    for box, end in zip(HEAVY.obstacle, ("start", "goal"), strict=True):
+    for box, end in zip(
+        PROBLEMS["heavy-object"].obstacle, ("start", "goal"), strict=True
+    ):
         low = np.array([box.x.low, box.y.low, -9.0])
         high = np.array([box.x.high, box.y.high, row[f"{end}_xyz"][2] - 0.15])
         if np.linalg.norm(points - np.clip(points, low, high), axis=1).min() < 0.145:
@@ -167,7 +168,7 @@ class Case:
 @pytest.fixture(scope="module")
 def hits() -> Case:
     """Rows of which the last is at its velocity limit, and the first ends at rest."""
-    robot, random = load_robot(AIRHOCKEY), np.random.default_rng(7)
+    robot, random = load_robot(PROBLEMS["airhockey"]), np.random.default_rng(7)
     made = [
         hit_row(robot, random, share=share) for share in (0.0, 0.2, 0.5, 0.7, 0.9, 1.0)
     ]
@@ -178,7 +179,7 @@ def hits() -> Case:
 
 @pytest.fixture(scope="module")
 def carries() -> Case:
-    robot, random = load_robot(HEAVY), np.random.default_rng(8)
+    robot, random = load_robot(PROBLEMS["heavy-object"]), np.random.default_rng(8)
     made = [carry_row(robot, random) for _ in range(ROWS)]
     return Case(
         robot, {name: np.array([row[name] for row in made]) for name in made[0]}
@@ -190,7 +191,7 @@ def failures(report: RowReport) -> set[str]:
 
 
 def test_valid_hits_pass(hits):
-    report = verify_rows(AIRHOCKEY, hits.robot, hits.columns)
+    report = verify_rows(PROBLEMS["airhockey"], hits.robot, hits.columns)
     assert failures(report) == set()
     assert report.ok
     assert report.rows == ROWS
@@ -212,7 +213,7 @@ def test_valid_hits_pass(hits):
 
 
 def test_valid_transports_pass(carries):
-    report = verify_rows(HEAVY, carries.robot, carries.columns)
+    report = verify_rows(PROBLEMS["heavy-object"], carries.robot, carries.columns)
     assert failures(report) == set()
     assert {"tilt", "upright", "robot clearance", "object contact"} <= {
         check.name for check in report.checks
@@ -238,7 +239,7 @@ def test_the_highest_speed_of_a_hit_agrees_with_highs(hits):
                 np.array([-np.sin(angle), np.cos(angle), 0]),
             )
             equations = np.array([across @ J, J[2]])
-            solved = linprog(
+            solved = scipy.optimize.linprog(
                 -along @ J,
                 A_eq=equations,
                 b_eq=[0, 0],
@@ -253,9 +254,9 @@ def test_a_wrong_highest_speed_is_reported(hits):
     columns["hit_speed_max"] = highest_speed(
         J, columns["hit_angle"], hits.robot.velocity_limit
     )
-    assert verify_rows(AIRHOCKEY, hits.robot, columns).ok
+    assert verify_rows(PROBLEMS["airhockey"], hits.robot, columns).ok
     columns["hit_speed_max"][2] += 1e-7
-    report = verify_rows(AIRHOCKEY, hits.robot, columns)
+    report = verify_rows(PROBLEMS["airhockey"], hits.robot, columns)
     assert [(check.name, check.worst_row) for check in report.failed] == [
         ("highest hit speed", 2)
     ]
@@ -287,7 +288,7 @@ def distance_of_arm(
             return float(np.linalg.norm(point - np.clip(point, low, high)))
 
         return float(
-            minimize_scalar(
+            scipy.optimize.minimize_scalar(
                 distance, bounds=(0, 1), method="bounded", options={"xatol": 1e-10}
             ).fun
         )
@@ -302,7 +303,9 @@ def diagnosed(carries) -> Case:
     """Transports with the diagnostics of their ends, from Pinocchio's gravity term and SciPy."""
     columns, robot = carries.copy(), carries.robot
     radius = next(
-        each.radius for each in HEAVY.constraint if isinstance(each, RobotClearance)
+        each.radius
+        for each in PROBLEMS["heavy-object"].constraint
+        if isinstance(each, RobotClearance)
     )
     for end in ("start", "goal"):
         columns[f"{end}_torque_ratio"], columns[f"{end}_clearance"] = (
@@ -311,7 +314,7 @@ def diagnosed(carries) -> Case:
         )
     for row in range(ROWS):
         poses = scene_of(
-            HEAVY,
+            PROBLEMS["heavy-object"],
             columns["start_xyz"][row : row + 1],
             columns["goal_xyz"][row : row + 1],
         ).poses[0]
@@ -320,7 +323,7 @@ def diagnosed(carries) -> Case:
                 np.array([box.x.low, box.y.low, -9.0]),
                 np.array([box.x.high, box.y.high, top]),
             )
-            for box, top in zip(HEAVY.obstacle, poses, strict=True)
+            for box, top in zip(PROBLEMS["heavy-object"].obstacle, poses, strict=True)
         ]
         for end in ("start", "goal"):
             q = columns[f"{end}_q"][row]
@@ -335,7 +338,7 @@ def diagnosed(carries) -> Case:
 
 
 def test_valid_diagnostics_pass(diagnosed):
-    report = verify_rows(HEAVY, diagnosed.robot, diagnosed.columns)
+    report = verify_rows(PROBLEMS["heavy-object"], diagnosed.robot, diagnosed.columns)
     assert report.ok
     assert {"holding torque ratio", "clearance"} <= {
         check.name for check in report.checks
@@ -353,7 +356,7 @@ def test_a_wrong_diagnostic_is_reported_in_its_row_and_end(
 ):
     columns = diagnosed.copy()
     columns[f"{end}_{field}"][4] += 1e-7
-    report = verify_rows(HEAVY, diagnosed.robot, columns)
+    report = verify_rows(PROBLEMS["heavy-object"], diagnosed.robot, columns)
     (failed,) = report.failed
     assert (failed.name, failed.n_failed, failed.worst_row, failed.worst_end) == (
         check,
@@ -373,11 +376,13 @@ def test_the_diagnostics_of_one_end_alone_are_checked(diagnosed):
         columns["goal_torque_ratio"],
     )
     columns["goal_clearance"][2] = np.nan  # fails as not finite, and is not compared
-    report = verify_rows(HEAVY, diagnosed.robot, columns)
+    report = verify_rows(PROBLEMS["heavy-object"], diagnosed.robot, columns)
     assert failures(report) == {"finite"}
     assert "holding torque ratio" not in {check.name for check in report.checks}
     columns["goal_clearance"][3] += 1.0
-    assert failures(verify_rows(HEAVY, diagnosed.robot, columns)) == {
+    assert failures(
+        verify_rows(PROBLEMS["heavy-object"], diagnosed.robot, columns)
+    ) == {
         "finite",
         "clearance",
     }
@@ -391,8 +396,8 @@ def test_valid_rows_in_single_precision_pass_only_as_float32(hits):
         single["goal_dq"] * (1 - 1e-7),
         single["goal_dq"],
     )
-    assert verify_rows(AIRHOCKEY, hits.robot, single, "float32").ok
-    assert failures(verify_rows(AIRHOCKEY, hits.robot, single)) >= {
+    assert verify_rows(PROBLEMS["airhockey"], hits.robot, single, "float32").ok
+    assert failures(verify_rows(PROBLEMS["airhockey"], hits.robot, single)) >= {
         "tip position",
         "hit direction",
     }
@@ -498,7 +503,7 @@ def test_corruption_of_a_hit_is_reported_under_its_name_in_its_row(
 ):
     columns = hits.copy()
     corrupt(hits, columns, row)
-    report = verify_rows(AIRHOCKEY, hits.robot, columns)
+    report = verify_rows(PROBLEMS["airhockey"], hits.robot, columns)
     assert failures(report) == names
     assert report.failed_rows.tolist() == [row]
     assert all((check.n_failed, check.worst_row) == (1, row) for check in report.failed)
@@ -517,7 +522,7 @@ def test_moved_joints_are_reported_by_the_checks_that_depend_on_them(
 ):
     columns = hits.copy()
     corrupt(hits, columns, 3)
-    report = verify_rows(AIRHOCKEY, hits.robot, columns)
+    report = verify_rows(PROBLEMS["airhockey"], hits.robot, columns)
     assert failures(report) >= names
     assert report.failed_rows.tolist() == [3]
 
@@ -552,7 +557,7 @@ def test_corruption_of_a_transport_is_reported_under_its_name_in_its_row(
 ):
     columns = carries.copy()
     corrupt(carries, columns, 2)
-    report = verify_rows(HEAVY, carries.robot, columns)
+    report = verify_rows(PROBLEMS["heavy-object"], carries.robot, columns)
     assert failures(report) == names
     assert report.failed_rows.tolist() == [2]
 
@@ -560,7 +565,7 @@ def test_corruption_of_a_transport_is_reported_under_its_name_in_its_row(
 def test_an_arm_in_a_pedestal_is_reported(carries):
     columns = carries.copy()
     reach_through_pedestal(carries, columns, 4)
-    report = verify_rows(HEAVY, carries.robot, columns)
+    report = verify_rows(PROBLEMS["heavy-object"], carries.robot, columns)
     assert failures(report) >= {"robot clearance"}
     assert report.failed_rows.tolist() == [4]
     (clearance,) = (check for check in report.checks if check.name == "robot clearance")
@@ -596,7 +601,7 @@ def test_holding_torque_is_checked_at_both_ends_at_rest(carries, end, other):
     joint = int(np.argmax(violation))
     torque = holding_torque(carries, end, joint)
     report = verify_rows(
-        HEAVY,
+        PROBLEMS["heavy-object"],
         with_torque_limit(carries.robot, joint, torque.max() * (1 - 1e-9)),
         carries.columns,
     )
@@ -618,9 +623,9 @@ def test_torque_at_a_moving_goal_is_checked_only_if_its_acceleration_is_stored(h
             for pair in zip(columns["goal_q"], columns["goal_dq"], strict=True)
         ]
     )
-    assert verify_rows(AIRHOCKEY, hits.robot, columns).ok
+    assert verify_rows(PROBLEMS["airhockey"], hits.robot, columns).ok
     columns["goal_ddq"][4] += 1e-6 * lift(hits.robot, columns["goal_q"][4])
-    report = verify_rows(AIRHOCKEY, hits.robot, columns)
+    report = verify_rows(PROBLEMS["airhockey"], hits.robot, columns)
     assert (failures(report), report.failed_rows.tolist()) == (
         {"vertical acceleration"},
         [4],
@@ -634,7 +639,7 @@ def test_torque_at_a_moving_goal_is_checked_only_if_its_acceleration_is_stored(h
     )
     torque = next(
         c
-        for c in verify_rows(AIRHOCKEY, strict, columns).checks
+        for c in verify_rows(PROBLEMS["airhockey"], strict, columns).checks
         if c.name == "joint torque"
     )
     assert torque.n_failed == ROWS
@@ -648,9 +653,9 @@ def test_blocks_do_not_change_the_report(hits, monkeypatch):
     turn_hit(hits, columns, 1)
     rise(hits, columns, 4)
     put_nan(hits, columns, 3)
-    whole = verify_rows(AIRHOCKEY, hits.robot, columns)
+    whole = verify_rows(PROBLEMS["airhockey"], hits.robot, columns)
     monkeypatch.setattr(rows_module, "VERIFICATION_BLOCK_ROWS", 2)
-    blocks = verify_rows(AIRHOCKEY, hits.robot, columns)
+    blocks = verify_rows(PROBLEMS["airhockey"], hits.robot, columns)
     assert whole.to_dict() == blocks.to_dict()
     assert whole.failed_rows.tolist() == [1, 3, 4]
 
@@ -662,20 +667,28 @@ def test_merged_reports_are_the_report_of_all_rows(hits):
         {name: column[part] for name, column in columns.items()}
         for part in (slice(0, 4), slice(4, 6))
     ]
-    merged = merge([verify_rows(AIRHOCKEY, hits.robot, part) for part in parts])
-    assert merged.to_dict() == verify_rows(AIRHOCKEY, hits.robot, columns).to_dict()
+    merged = merge(
+        [verify_rows(PROBLEMS["airhockey"], hits.robot, part) for part in parts]
+    )
+    assert (
+        merged.to_dict()
+        == verify_rows(PROBLEMS["airhockey"], hits.robot, columns).to_dict()
+    )
 
 
 def test_no_rows_give_an_empty_report(hits):
     report = verify_rows(
-        AIRHOCKEY,
+        PROBLEMS["airhockey"],
         hits.robot,
         {name: column[:0] for name, column in hits.columns.items()},
     )
     assert (report.rows, report.ok, failures(report)) == (0, True, set())
     assert merge([]).ok
     assert (
-        merge([report, verify_rows(AIRHOCKEY, hits.robot, hits.columns)]).rows == ROWS
+        merge(
+            [report, verify_rows(PROBLEMS["airhockey"], hits.robot, hits.columns)]
+        ).rows
+        == ROWS
     )
 
 
@@ -696,7 +709,7 @@ def test_the_report_is_valid_json_if_a_value_could_not_be_evaluated():
 def test_finite_values_that_overflow_fail(hits):
     columns = hits.copy()
     columns["start_dq"][2] = 1e300
-    report = verify_rows(AIRHOCKEY, hits.robot, columns)
+    report = verify_rows(PROBLEMS["airhockey"], hits.robot, columns)
     assert {"joint velocity", "joint torque"} <= failures(report)
     assert report.failed_rows.tolist() == [2]
 
@@ -725,7 +738,7 @@ def test_rows_of_a_wrong_shape_raise_an_error(
     columns = hits.copy()
     change(columns)
     with pytest.raises(DatasetError, match=message):
-        verify_rows(AIRHOCKEY, hits.robot, columns)
+        verify_rows(PROBLEMS["airhockey"], hits.robot, columns)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -760,9 +773,9 @@ class HighElbow(Constraint):
 def test_a_constraint_of_a_plug_in_is_checked(hits):
     angles = hits.columns["goal_q"][:, 1]
     problem = replace(
-        AIRHOCKEY,
+        PROBLEMS["airhockey"],
         constraint=(
-            *AIRHOCKEY.constraint,
+            *PROBLEMS["airhockey"].constraint,
             HighElbow(height=float(np.sort(angles)[-2])),
         ),
     )
@@ -776,8 +789,15 @@ def test_a_constraint_of_a_plug_in_is_checked(hits):
 
 
 def test_obstacle_poses_follow_the_object_or_are_fixed():
-    high = replace(HEAVY.obstacle[1], top=0.7, below="")
-    problem = replace(HEAVY, obstacle=(HEAVY.obstacle[0], high, HEAVY.obstacle[1]))
+    high = replace(PROBLEMS["heavy-object"].obstacle[1], top=0.7, below="")
+    problem = replace(
+        PROBLEMS["heavy-object"],
+        obstacle=(
+            PROBLEMS["heavy-object"].obstacle[0],
+            high,
+            PROBLEMS["heavy-object"].obstacle[1],
+        ),
+    )
     poses = scene_of(
         problem,
         np.array([[0.4, -0.4, 0.5], [0.4, -0.4, 0.6]]),
@@ -788,7 +808,7 @@ def test_obstacle_poses_follow_the_object_or_are_fixed():
 
 def test_the_collision_world_measures_segments_in_order_and_exactly():
     scene = CollisionWorld(None)
-    scene.place(solids_of(HEAVY.obstacle, np.array([0.5, 0.4])))
+    scene.place(solids_of(PROBLEMS["heavy-object"].obstacle, np.array([0.5, 0.4])))
     up = (
         (0.4, -0.45, 0.6),
         (0.4, -0.45, 0.9),
@@ -804,7 +824,7 @@ def test_the_collision_world_measures_segments_in_order_and_exactly():
 
 def test_the_collision_world_measures_a_segment_of_length_zero():
     scene = CollisionWorld(None)
-    scene.place(solids_of(HEAVY.obstacle, np.array([0.5, 0.4])))
+    scene.place(solids_of(PROBLEMS["heavy-object"].obstacle, np.array([0.5, 0.4])))
     np.testing.assert_allclose(
         scene.segment_distances([((0.4, 0.0, 0.2),) * 2]), [0.3, 0.3], atol=1e-9
     )
@@ -814,7 +834,7 @@ def test_the_collision_world_measures_a_segment_of_length_zero():
 @pytest.mark.parametrize("depth", [-0.1, -1e-9, 0.0, 1e-9, 1e-3, 0.1])
 def test_the_collision_world_measures_the_penetration_depth_of_an_object(turn, depth):
     scene = CollisionWorld((0.2, 0.2, 0.3))
-    scene.place(solids_of(HEAVY.obstacle, np.array([0.5, -3.0])))
+    scene.place(solids_of(PROBLEMS["heavy-object"].obstacle, np.array([0.5, -3.0])))
     position, rotation = (
         np.array([0.41, -0.44, 0.65 - depth]),
         pin.exp3(np.array([0.0, 0.0, turn])),
@@ -826,13 +846,25 @@ def test_the_collision_world_measures_the_penetration_depth_of_an_object(turn, d
 
 def test_the_distance_of_a_missing_object_raises_an_error(hits):
     with pytest.raises(RecipeError, match="no \\[object\\]"):
-        World(hits.robot, AIRHOCKEY.obstacle, AIRHOCKEY.object_size).object_distances()
+        World(
+            hits.robot,
+            PROBLEMS["airhockey"].obstacle,
+            PROBLEMS["airhockey"].object_size,
+        ).object_distances()
 
 
 def test_setting_a_state_replaces_the_whole_state(carries):
     world, fresh = (
-        World(carries.robot, HEAVY.obstacle, HEAVY.object_size),
-        World(carries.robot, HEAVY.obstacle, HEAVY.object_size),
+        World(
+            carries.robot,
+            PROBLEMS["heavy-object"].obstacle,
+            PROBLEMS["heavy-object"].object_size,
+        ),
+        World(
+            carries.robot,
+            PROBLEMS["heavy-object"].obstacle,
+            PROBLEMS["heavy-object"].object_size,
+        ),
     )
     poses, zero = np.array([0.3, 0.4]), np.zeros(7)
     world.set_state(carries.columns["goal_q"][0], zero + 1, zero + 2, poses + 1)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+import scipy
 
 from tests.conftest import columns_of
 
@@ -39,8 +39,8 @@ def placements(q: Array) -> list[tuple[Array, Array]]:
     ):
         origin = origin + rotation @ np.array(offset, float)
         fixed, moved = (
-            Rotation.from_euler("xyz", angles),
-            Rotation.from_euler("z", turn[:, None]),
+            scipy.spatial.transform.Rotation.from_euler("xyz", angles),
+            scipy.spatial.transform.Rotation.from_euler("z", turn[:, None]),
         )
         rotation = rotation @ fixed.as_matrix() @ moved.as_matrix()
         frames.append((rotation, origin))
@@ -103,7 +103,10 @@ def test_the_object_is_upright_between_literal_positions(carries):
     for end, (low, high) in (("start", (-0.6, -0.3)), ("goal", (0.3, 0.6))):
         rotation, _ = placements(carries[f"{end}_q"])[-1]
         center = tip(carries[f"{end}_q"], 0.07 + 0.1)
-        up = (rotation @ Rotation.from_euler("x", -HALF_PI).as_matrix())[:, :, 2]
+        up = (
+            rotation
+            @ scipy.spatial.transform.Rotation.from_euler("x", -HALF_PI).as_matrix()
+        )[:, :, 2]
         assert np.abs(center - carries[f"{end}_xyz"]).max() < 1e-8
         assert np.abs(up - [0, 0, 1]).max() < 1e-8
         assert np.all(

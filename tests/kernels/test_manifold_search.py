@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
+import scipy
 
 from cnpgen.kernels.collision.tree_search import TreeSettings, find_tree_path
 from cnpgen.problems.load_robot import load_robot
@@ -58,7 +58,7 @@ class Setting:
 
     def level(self, q, height=HEIGHT_M):
         """Project a state onto a height with SciPy."""
-        return least_squares(
+        return scipy.optimize.least_squares(
             lambda x: [1e3 * (self.height(x) - height), *(1e-3 * (x - q))],
             q,
             xtol=1e-15,

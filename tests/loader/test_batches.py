@@ -14,11 +14,13 @@ import pytest
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.loader import windows
 from cnpgen.loader.batch import Batch
+from cnpgen.loader.batch_options import BatchOptions
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
 from cnpgen.loader.shard_reader import ShardReader
 from cnpgen.store.checked_shard import Shard
 from tests.conftest import HANGING
+from tests.examples.grouped import grouped
 from tests.examples.loader import ALL, columns, ids, make, same
 
 SIZES = {  # rows and rows per shard
@@ -87,7 +89,13 @@ def cases(dataset: Dataset, count: int = 12) -> Iterator[tuple[str, dict[str, An
 def test_every_row_is_returned_once_per_epoch(dataset: Dataset) -> None:
     for split, options in cases(dataset):
         everything = dataset.arrays(split, fields=ALL, normalize=True)
-        batches = dataset.batches(split=split, fields=ALL, **options | {"world": 1})
+        batches = grouped(
+            dataset.batches,
+            BatchOptions,
+            split=split,
+            fields=ALL,
+            **options | {"world": 1},
+        )
         found = list(batches)
         rows = np.concatenate([batch["sample_id"] for batch in found])
         dropped = (
@@ -106,7 +114,9 @@ def test_only_the_last_batch_may_be_incomplete(dataset: Dataset) -> None:
     for split, options in cases(dataset):
         sizes = [
             batch.rows
-            for batch in dataset.batches(split=split, **options | {"world": 1})
+            for batch in grouped(
+                dataset.batches, BatchOptions, split=split, **options | {"world": 1}
+            )
         ]
         assert set(sizes[:-1]) <= {options["batch_size"]}
         assert (
@@ -121,9 +131,26 @@ def test_the_batches_of_all_ranks_together_are_those_of_one_rank(
 ) -> None:
     for split, options in cases(dataset):
         world = options["world"]
-        whole = list(dataset.batches(split=split, fields=ALL, **options | {"world": 1}))
+        whole = list(
+            grouped(
+                dataset.batches,
+                BatchOptions,
+                split=split,
+                fields=ALL,
+                **options | {"world": 1},
+            )
+        )
         ranks = [
-            list(dataset.batches(split=split, fields=ALL, rank=r, **options))
+            list(
+                grouped(
+                    dataset.batches,
+                    BatchOptions,
+                    split=split,
+                    fields=ALL,
+                    rank=r,
+                    **options,
+                )
+            )
             for r in range(world)
         ]
         assert {len(rank) for rank in ranks} == {len(whole)}
@@ -136,15 +163,23 @@ def test_the_batches_of_all_ranks_together_are_those_of_one_rank(
 def test_a_resumed_run_equals_the_uninterrupted_run(dataset: Dataset) -> None:
     """Over two epochs, through JSON, in new objects, one of them with another seed and epoch."""
     for split, options in cases(dataset, 6):
-        uncut = dataset.batches(split=split, fields=ALL, **options)
+        uncut = grouped(
+            dataset.batches, BatchOptions, split=split, fields=ALL, **options
+        )
         expected = [batch for _ in range(2) for batch in uncut]
         batches = len(uncut)
         for cut in {0, 1, batches // 2, batches - 1, batches, batches + 1, 2 * batches}:
-            first = dataset.batches(split=split, fields=ALL, **options)
+            first = grouped(
+                dataset.batches, BatchOptions, split=split, fields=ALL, **options
+            )
             head = take(first, cut)
             state = json.loads(json.dumps(first.state()))
-            second = dataset.batches(
-                split=split, fields=ALL, **options | {"seed": 99, "epoch": 7}
+            second = grouped(
+                dataset.batches,
+                BatchOptions,
+                split=split,
+                fields=ALL,
+                **options | {"seed": 99, "epoch": 7},
             )
             second.load_state(state)
             tail = take(second, 2 * batches - cut)
@@ -168,7 +203,10 @@ def take(batches: Any, count: int) -> list[Batch]:
 def test_the_state_is_the_same_on_every_rank_and_may_be_loaded_with_another_world(
     plain: Dataset,
 ) -> None:
-    ranks = [plain.batches(6, rank=rank, world=3, fields=ALL) for rank in range(3)]
+    ranks = [
+        plain.batches(6, fields=ALL, options=BatchOptions(rank=rank, world=3))
+        for rank in range(3)
+    ]
     for rank in ranks:
         take(rank, 4)
     states = [rank.state() for rank in ranks]
@@ -199,8 +237,8 @@ def test_the_state_after_a_number_of_used_batches_is_computed_without_reading_th
 ) -> None:
     for drop_last in (True, False):
         batches, ahead = (
-            plain.batches(8, epoch=1, drop_last=drop_last),
-            plain.batches(8, drop_last=drop_last),
+            plain.batches(8, epoch=1, options=BatchOptions(drop_last=drop_last)),
+            plain.batches(8, options=BatchOptions(drop_last=drop_last)),
         )
         for used in range(len(batches)):
             assert ahead.state(epoch=1, batch=used) == batches.state()
@@ -339,19 +377,22 @@ def test_a_batch_size_above_the_number_of_rows_needs_drop_last_false(
         match=r"batch_size 51 is more than the 50 rows of split 'train'; drop_last=False",
     ):
         plain.batches(51)
-    (batch,) = plain.batches(51, drop_last=False)
+    (batch,) = plain.batches(51, options=BatchOptions(drop_last=False))
     assert batch.rows == 50
 
 
 def test_a_last_batch_without_rows_for_a_rank_is_refused(plain: Dataset) -> None:
     message = "the last batch of 50 rows has 2 for 3 ranks: omit it with drop_last=True"
     with pytest.raises(UsageError, match=message):
-        plain.batches(6, world=3, drop_last=False)
+        plain.batches(6, options=BatchOptions(world=3, drop_last=False))
     assert [
-        batch.rows for batch in plain.batches(48, world=2, rank=1, drop_last=False)
+        batch.rows
+        for batch in plain.batches(
+            48, options=BatchOptions(world=2, rank=1, drop_last=False)
+        )
     ] == [24, 1]
     batches = plain.batches(
-        9, world=3, drop_last=False
+        9, options=BatchOptions(world=3, drop_last=False)
     )  # 50 = 5 x 9 + 5, but 46 = 5 x 9 + 1
     with pytest.raises(UsageError, match="has 1 for 3 ranks"):
         batches.load_state(batches.state() | {"row": 4})
@@ -389,7 +430,7 @@ def test_invalid_arguments_are_refused(
     plain: Dataset, options: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(UsageError, match=message):
-        plain.batches(**{"batch_size": 8} | options)
+        grouped(plain.batches, BatchOptions, **{"batch_size": 8} | options)
 
 
 def test_unknown_splits_and_fields_are_refused_with_the_nearest_name(

@@ -10,6 +10,7 @@ import pytest
 import cnpgen
 from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.loader import shard_reader
+from cnpgen.loader.batch_options import BatchOptions
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.gather import RowError
 from cnpgen.loader.load import load_dataset
@@ -285,7 +286,14 @@ def test_an_unfinished_dataset_is_refused_unless_allowed(tmp_path: Path) -> None
     )  # type: ignore[union-attr]
     with pytest.raises(UsageError, match="more than the 0 rows"):
         dataset.batches(1, split="validation")
-    assert list(dataset.batches(1, split="validation", drop_last=False)) == []
+    assert (
+        list(
+            dataset.batches(
+                1, split="validation", options=BatchOptions(drop_last=False)
+            )
+        )
+        == []
+    )
     assert dataset.arrays("validation")["start_q"].shape == (0, 3)
 
 
@@ -301,11 +309,16 @@ def test_a_dataset_without_training_rows_needs_the_normalization_of_another_one(
     raw = np.concatenate(
         [
             b["start_q"]
-            for b in lonely.batches(3, split="test", normalize=False, shuffle=False)
+            for b in lonely.batches(
+                3, split="test", normalize=False, options=BatchOptions(shuffle=False)
+            )
         ]
     )
     borrowed = lonely.batches(
-        3, split="test", normalize=dataset.normalization, shuffle=False
+        3,
+        split="test",
+        normalize=dataset.normalization,
+        options=BatchOptions(shuffle=False),
     )
     expected = (raw - columns()["start_q"].mean(0)) / columns()["start_q"].std(0)
     assert np.allclose(

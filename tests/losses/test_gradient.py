@@ -11,7 +11,7 @@ from cnpgen.schema.keys import Range
 from tests.conftest import some
 from tests.examples.jerk_limits import jerk_limited
 from tests.examples.losses import PROBLEM_OF, Batch, batch, loss, moved, with_weight
-from tests.examples.manifolds import LIMITS, MANIFOLDS, problem_on
+from tests.examples.manifolds import MANIFOLDS, joint_limits, problem_on
 from tests.examples.plans import PROBLEMS
 
 CASES = [
@@ -99,7 +99,7 @@ def test_the_gradient_of_every_manifold_agrees_with_central_differences(name):
     of = PlanLoss(problem_on(name), dtype="float64", backend="numpy", nodes=16)
     some, random = batch("transport", 3, by=0.5, seed=1), np.random.default_rng(3)
     given = Batch(some.problem, some.path, some.rate, np.zeros((3, 0)))
-    for term in of.terms[1 + len(LIMITS) :]:
+    for term in of.terms[1 + len(joint_limits()) :]:
         value = given.evaluated(of, weights=weights_of(of, term))
         assert (value.terms[:, of.terms.index(term)] > 0).any()
         check_along_random_directions(

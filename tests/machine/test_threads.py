@@ -15,12 +15,10 @@ from cnpgen.planner import control_points
 from cnpgen.planner import inference_pipeline as inference
 from cnpgen.planner.boundary_layer import BoundaryLayer
 from cnpgen.planner.planner import Planner
-from cnpgen.problems.problem_file import load_problem
 from cnpgen.trajectory.boundary import Boundary
 from tests.conftest import HANGING
 from tests.examples.models import untrained_model
-
-AIRHOCKEY = load_problem("airhockey")
+from tests.examples.shipped import PROBLEMS
 
 
 @pytest.fixture(autouse=True)
@@ -85,14 +83,17 @@ def boundary() -> Boundary:
 
 
 def loss_call() -> None:
-    loss = PlanLoss(AIRHOCKEY, nodes=8, backend="numpy")
+    loss = PlanLoss(PROBLEMS["airhockey"], nodes=8, backend="numpy")
     path, rate = np.zeros((2, 15, 6)), np.ones((2, 20))
     loss(path, rate, weights=loss.weights0, obstacle_poses=np.zeros((2, 4)))
 
 
 def omega_call() -> None:
     omega = BoundaryLayer(
-        AIRHOCKEY, line_projection_steps=0, projection_steps=0, backend="numpy"
+        PROBLEMS["airhockey"],
+        line_projection_steps=0,
+        projection_steps=0,
+        backend="numpy",
     )
     tasks = omega.tasks(boundary())
     phi, log_rate = np.zeros((3, omega.path_outputs)), np.zeros((3, omega.rate_outputs))

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from cnpgen.make import make_dataset as making
+from cnpgen.make.generation_options import GenerationOptions
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.store.dataset_spec import load_dataset_spec, shards
 from cnpgen.store.layout import MANIFEST
@@ -238,7 +239,11 @@ def test_shards_are_compared_by_several_threads_and_an_interruption_cancels_the_
 def test_shard_size_and_backend_of_an_unfinished_dataset_are_kept(tmp_path):
     recipe = tiny_recipe("airhockey-hit")
     make_dataset(
-        recipe, tmp_path, shard_size=77, backend="numpy", workers=1, part=(0, 2)
+        recipe,
+        tmp_path,
+        shard_size=77,
+        workers=1,
+        options=GenerationOptions(backend="numpy", part=(0, 2)),
     )
     made = make_dataset(recipe, tmp_path, workers=1)
     assert made.complete

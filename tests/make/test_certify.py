@@ -14,6 +14,7 @@ from cnpgen.cli.main import main
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.judges.rows.verify import PlanCheck, check_plans
 from cnpgen.make.certify import NO_PLAN, CertifiedPlan, certified
+from cnpgen.make.generation_options import GenerationOptions
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.merge import _shipped_notes
 from cnpgen.make.recipe import load_dataset_recipe
@@ -108,7 +109,12 @@ def test_a_round_whose_draws_are_all_rejected_needs_no_plans(
 def test_workers_and_interruptions_change_no_byte(folder: Path, tmp_path: Path) -> None:
     again = tmp_path / "again"
     make_dataset(
-        "airhockey-hit", again, n=ROWS, certify=True, part=(1, 2), shard_size=8
+        "airhockey-hit",
+        again,
+        n=ROWS,
+        certify=True,
+        shard_size=8,
+        options=GenerationOptions(part=(1, 2)),
     )
     make_dataset("airhockey-hit", again, n=ROWS, certify=True, workers=2, shard_size=8)
     shards = sorted(path.relative_to(folder) for path in folder.rglob("*.h5"))
@@ -175,7 +181,11 @@ def test_float32_is_refused_since_plans_would_miss_their_ends(
     )
     with pytest.raises(RecipeError, match="float64"):
         make_dataset(
-            "airhockey-hit", tmp_path / "out", n=4, certify=True, dtype="float32"
+            "airhockey-hit",
+            tmp_path / "out",
+            n=4,
+            certify=True,
+            options=GenerationOptions(dtype="float32"),
         )
 
 
@@ -222,9 +232,9 @@ def from_planner(tmp_path_factory: pytest.TempPathFactory) -> Path:
         out,
         n=ROWS,
         certify=True,
-        model="airhockey-hit",
         workers=1,
         shard_size=8,
+        options=GenerationOptions(model="airhockey-hit"),
     ).folder
 
 
@@ -253,8 +263,8 @@ def test_transports_begin_with_a_planners_plans_too(tmp_path: Path) -> None:
         tmp_path / "out",
         n=3,
         certify=True,
-        model="heavy-object",
         workers=1,
+        options=GenerationOptions(model="heavy-object"),
     )
     assert len(open_dataset(made.folder).read("train")["duration"]) == 3
 
@@ -281,7 +291,12 @@ def test_a_planner_is_for_certifying(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(UsageError, match="certify=True"):
-        make_dataset("airhockey-hit", tmp_path / "out", n=4, model="airhockey-hit")
+        make_dataset(
+            "airhockey-hit",
+            tmp_path / "out",
+            n=4,
+            options=GenerationOptions(model="airhockey-hit"),
+        )
     assert (
         main(
             [

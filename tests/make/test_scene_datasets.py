@@ -13,7 +13,9 @@ import cnpgen
 from cnpgen.addons.hub.publish import write_repository
 from cnpgen.cli.main import main
 from cnpgen.errors import DatasetError, UsageError
+from cnpgen.loader.batch_options import BatchOptions
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
+from cnpgen.make.generation_options import GenerationOptions
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.obstacles import with_capacity
 from cnpgen.problems.problem_record import as_record, open_problem
@@ -138,7 +140,12 @@ def test_an_interrupted_dataset_is_finished_and_parts_are_merged(
     parts = [tmp_path / "part0", tmp_path / "part1"]
     for index, part in enumerate(parts):
         cnpgen.make_dataset(
-            pipeline, part, n=ROWS, shard_size=100, workers=1, part=(index, 2)
+            pipeline,
+            part,
+            n=ROWS,
+            shard_size=100,
+            workers=1,
+            options=GenerationOptions(part=(index, 2)),
         )
     cnpgen.merge_datasets(parts, merged)
     assert shard_bytes(merged) == shard_bytes(dataset)
@@ -271,7 +278,11 @@ def test_training_rows_have_the_obstacles_of_their_scenes(dataset: Path) -> None
 
 def test_batches_observe_the_scenes_of_their_rows(dataset: Path) -> None:
     loaded = cnpgen.load_dataset(dataset)
-    options = {"split": "validation", "fields": ["start_q"], "shuffle": False}
+    options = {
+        "split": "validation",
+        "fields": ["start_q"],
+        "options": BatchOptions(shuffle=False),
+    }
     batch = next(iter(loaded.batches(4, observe="basis", **options)))
     expected = observe(loaded.scenes("validation", np.arange(4)), "basis")["basis"]
     np.testing.assert_allclose(
@@ -292,7 +303,9 @@ def test_a_dataset_without_scenes_has_nothing_to_observe(tiny: Any) -> None:
 @pytest.mark.slow
 def test_float32_datasets_are_valid_as_stored(pipeline: Path, tmp_path: Path) -> None:
     folder = tmp_path / "single"
-    cnpgen.make_dataset(pipeline, folder, n=60, dtype="float32", workers=1)
+    cnpgen.make_dataset(
+        pipeline, folder, n=60, workers=1, options=GenerationOptions(dtype="float32")
+    )
     with h5py.File(folder / "train" / "shard-00000.h5") as file:
         assert file["obstacle_size"].dtype == np.float32
     assert main(["validate", str(folder), "--deep", "--workers", "1"]) == 0
@@ -355,8 +368,8 @@ def test_certified_samples_have_valid_plans_in_their_scenes(
         folder,
         n=12,
         certify=True,
-        model=model if from_planner else None,
         workers=1,
+        options=GenerationOptions(model=model if from_planner else None),
     )
     assert main(["validate", str(folder), "--deep", "--workers", "1"]) == 0
     plans = cnpgen.load_boundary_problems(folder)

@@ -48,7 +48,6 @@ BALL = Obstacle(name="ball", kind="sphere", position=(-0.5, -0.3, 0.5), radius=0
 CORNERS = np.array(
     [[-0.1, -0.1, 0.0], [0.1, -0.1, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.5]]
 )
-WEDGE = make_mesh("wedge", CORNERS, np.array([0.6, 0.0, 0.0]), np.eye(3), place="")
 SCENES = [
     SceneProblem(name="post", obstacles=(POST,), start_q=START, goal_q=GOAL[None]),
     SceneProblem(
@@ -152,7 +151,8 @@ def test_scenes_are_solved_and_judged(crane: Path, tmp_path: Path) -> None:
         goal_q=np.array([inside.goal_q[0], GOAL, START + 0.1]),
     )
     posed = replace(SCENES[0], name="posed", goal_q=np.zeros((0, 4)), goal_pose=pose)
-    meshed = replace(SCENES[1], name="meshed", obstacles=(WEDGE, BALL))
+    wedge = make_mesh("wedge", CORNERS, np.array([0.6, 0.0, 0.0]), np.eye(3), place="")
+    meshed = replace(SCENES[1], name="meshed", obstacles=(wedge, BALL))
     solved = solve_scenes(
         problem, [SCENES[0], inside, several, posed, meshed], workers=1
     )

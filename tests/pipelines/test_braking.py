@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.optimize import linprog
+import scipy
 
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.pipeline import load_pipeline
@@ -79,7 +79,7 @@ def rollout(arm: Arm, robot, table: Table, case: Case) -> float:
             robot.acceleration_limit, (robot.velocity_limit - dq) / BRAKING_STEP_S
         )
         along = case.side * jacobian[case.axis]
-        best = linprog(
+        best = scipy.optimize.linprog(
             along,
             A_eq=jacobian[2:],
             b_eq=[height],

@@ -152,7 +152,7 @@ def test_two_splits_of_the_same_tasks_raise_an_error(recipe, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("positions", "error"),
+    ("positions", "message"),
     [
         ("", "stage 1.goal: either a list of goals or a grid"),
         (
@@ -177,10 +177,10 @@ def test_two_splits_of_the_same_tasks_raise_an_error(recipe, tmp_path):
         ),
     ],
 )
-def test_recipe_errors_in_the_recipe_name_their_keys(recipe, positions, error):
+def test_recipe_errors_in_the_recipe_name_their_keys(recipe, positions, message):
     with pytest.raises(RecipeError) as error:
         load_pipeline(recipe(positions))
-    assert error in str(error.value)
+    assert message in str(error.value)
 
 
 def test_listed_starts_are_solved_by_a_later_stage(tmp_path, prepare):

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize
+import scipy
 
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.stages.hitting_configuration import HittingConfiguration
@@ -48,7 +48,7 @@ class Search:
         return np.array(self.arm.pose(q).translation) - self.position
 
     def slsqp(self, start: Array) -> Array | None:
-        found = minimize(
+        found = scipy.optimize.minimize(
             lambda q: -self.value(q), start, jac=lambda q: -self.gradient(q), method="SLSQP",
             bounds=list(zip(self.robot.position_lower, self.robot.position_upper, strict=True)),
             constraints=[{"type": "eq", "fun": self.miss, "jac": lambda q: self.arm.jacobian(q)[:3]}],

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from scipy.optimize import linprog
+import scipy
 
 from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity, hitting_velocity
 from cnpgen.pipelines.stages.stage import CandidateBatch
@@ -92,7 +92,7 @@ class Program:
     def highs(self) -> float:
         bounds = list(zip(-self.limit, self.limit, strict=True))
         return -float(
-            linprog(
+            scipy.optimize.linprog(
                 -self.a, A_eq=self.b, b_eq=[0, 0], bounds=bounds, method="highs"
             ).fun
         )

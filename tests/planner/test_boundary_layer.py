@@ -10,6 +10,7 @@ import pytest
 
 import cnpgen
 from cnpgen.errors import UsageError
+from cnpgen.loader.batch_options import BatchOptions
 from cnpgen.planner.boundary_layer import BoundaryLayer
 from cnpgen.plans.format import BOUNDARY
 from cnpgen.robots.plausible_values import UnitError
@@ -307,7 +308,11 @@ def test_boundary_conditions_are_read_from_rows_in_their_units(tiny: Any) -> Non
     ):
         Boundary.from_batch(rows)
     plain = next(
-        iter(dataset.batches(8, shuffle=False, normalize=False, dtype="float64"))
+        iter(
+            dataset.batches(
+                8, normalize=False, dtype="float64", options=BatchOptions(shuffle=False)
+            )
+        )
     )
     np.testing.assert_array_equal(
         Boundary.from_batch(plain).start_q, rows["start_q"][:8]

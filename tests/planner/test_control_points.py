@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.interpolate import BSpline
+import scipy
 
 from cnpgen.planner.control_points import control_points, vjp
 from cnpgen.planner.tasks import MIN_EXPECTED_TIME_S, Tasks, expected_time
@@ -44,8 +44,8 @@ def test_boundary_conditions_hold_for_any_output(goal_ddq):
     given = tasks(goal_ddq=goal_ddq)
     points = control_points(given, *outputs(given), scale=0.3, spec=SPEC)
     for i in range(N):
-        p = BSpline(clamped_knots(15, 7), points.path[i], 7)
-        r = BSpline(clamped_knots(20, 7), points.rate[i], 7)
+        p = scipy.interpolate.BSpline(clamped_knots(15, 7), points.path[i], 7)
+        r = scipy.interpolate.BSpline(clamped_knots(20, 7), points.rate[i], 7)
         for end, s in (("start", 0.0), ("goal", 1.0)):
             dq = p(s, 1) * r(s)
             ddq = p(s, 2) * r(s) ** 2 + p(s, 1) * r(s, 1) * r(s)

@@ -10,12 +10,13 @@ from cnpgen.planner.control_points import make_projection
 from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.world import World
-from tests.examples.manifolds import ROBOT, ends_on, problem_on
+from tests.examples.manifolds import ends_on, problem_on
+from tests.examples.shipped import ROBOTS
 
 
 def manifold_distances(problem: Problem, path: np.ndarray) -> np.ndarray:
     """Return the largest violations of equalities by paths in the central half of their phases, shape (N,)."""
-    world, found = World(ROBOT, (), None), []
+    world, found = World(ROBOTS["heavy-object"], (), None), []
     states = Motion(path, np.ones((len(path), 20))).at(np.linspace(0.25, 0.75, 40))
     for motion in states.q:
         worst = 0.0
@@ -51,7 +52,9 @@ def test_projection_moves_paths_near_a_manifold_onto_it(
 ) -> None:
     problem, (start, goal) = problem_on(name), ends_on(name)
     projection = make_projection(
-        problem, problem_kernels(problem, ROBOT, "numpy", tmp_path), steps=1
+        problem,
+        problem_kernels(problem, ROBOTS["heavy-object"], "numpy", tmp_path),
+        steps=1,
     )
     along = np.r_[0, 0, 0, np.linspace(0, 1, 10), 1, 1][:, None]
     path = np.repeat((start + along * (goal - start))[None], 4, axis=0)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from scipy.interpolate import BSpline
+import scipy
 
 from cnpgen.kernels.library import problem_kernels
 from cnpgen.planner.expressions import effective_steps
@@ -43,7 +43,7 @@ def worst_tilt(name: str, path: np.ndarray) -> float:
     """Return the largest angle of the tip's z axis to the world's along one path [rad], by Pinocchio and SciPy."""
     robot = loaded_problem_of(name).robot
     model, data = robot.model, robot.model.createData()
-    spline, worst = BSpline(KNOTS[15], path, 7), 0.0
+    spline, worst = scipy.interpolate.BSpline(KNOTS[15], path, 7), 0.0
     for s in np.linspace(0, 1, 101):
         pin.framesForwardKinematics(model, data, spline(s))
         up = data.oMf[model.getFrameId(robot.tip)].rotation[:, 2]
@@ -90,7 +90,9 @@ def heights(paths: np.ndarray) -> np.ndarray:
     model, data, found = robot.model, robot.model.createData(), []
     for path in paths:
         z = []
-        for q in BSpline(KNOTS[15], path, 7)(np.linspace(0.1, 0.9, 41)):
+        for q in scipy.interpolate.BSpline(KNOTS[15], path, 7)(
+            np.linspace(0.1, 0.9, 41)
+        ):
             pin.framesForwardKinematics(model, data, q)
             z.append(data.oMf[model.getFrameId(robot.tip)].translation[2])
         found.append(np.abs(np.array(z) - 0.16).max())

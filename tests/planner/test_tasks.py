@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.optimize import linprog
+import scipy
 
 from cnpgen.errors import UsageError
 from cnpgen.planner.boundary_layer import BoundaryLayer
@@ -48,7 +48,7 @@ def can_reach(
     bound = np.concatenate(
         [np.full(STEPS, velocity - v0), np.full(STEPS, velocity + v0)]
     )
-    found = linprog(
+    found = scipy.optimize.linprog(
         np.zeros(STEPS),
         A_ub=unequal,
         b_ub=bound,

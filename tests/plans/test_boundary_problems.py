@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,17 @@ from cnpgen.errors import CnpgenError, DatasetError, RecipeError, UsageError
 from cnpgen.plans import PlanStatus, load_plans, save_plans
 from cnpgen.plans.boundary_problems import load_boundary_problems
 from cnpgen.problems.problem_file import load_problem
-from cnpgen.problems.problem_record import record_problem
+from cnpgen.problems.problem_record import ProblemRecord, record_problem
 from cnpgen.refine.refine_plans import solve_plans
 
 Tiny = Callable[[str], Path]
-RECORD = record_problem(load_problem("airhockey"))
+
+
+@cache
+def record() -> ProblemRecord:
+    return record_problem(load_problem("airhockey"))
+
+
 CONDITIONS = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
 
 
@@ -67,27 +74,29 @@ def test_what_is_left_out_is_zero_and_goal_accelerations_are_kept_where_they_are
     write,
 ) -> None:
     still = load_boundary_problems(
-        write(start_dq=None, start_ddq=None, goal_dq=None), problem=RECORD
+        write(start_dq=None, start_ddq=None, goal_dq=None), problem=record()
     )
     assert not np.any(
         [still.boundary.start_dq, still.boundary.start_ddq, still.boundary.goal_dq]
     )
     assert still.boundary.goal_ddq is None
-    fixed = load_boundary_problems(write(goal_ddq=np.full((3, 6), 0.5)), problem=RECORD)
+    fixed = load_boundary_problems(
+        write(goal_ddq=np.full((3, 6), 0.5)), problem=record()
+    )
     np.testing.assert_array_equal(fixed.boundary.goal_ddq, np.full((3, 6), 0.5))
 
 
 def test_a_file_may_say_its_problem_itself(write) -> None:
     assert (
         load_boundary_problems(write(attributes={"problem": "airhockey"})).problem
-        == RECORD
+        == record()
     )
     texts = {
-        "problem_recipe": RECORD.recipe,
-        "problem_urdf": RECORD.urdf,
-        "problem_sha256": RECORD.comparable_sha256,
+        "problem_recipe": record().recipe,
+        "problem_urdf": record().urdf,
+        "problem_sha256": record().comparable_sha256,
     }
-    assert load_boundary_problems(write(attributes=texts)).problem == RECORD
+    assert load_boundary_problems(write(attributes=texts)).problem == record()
 
 
 def test_a_shard_is_of_the_problem_of_its_dataset_and_needs_one_without_it(
@@ -95,7 +104,7 @@ def test_a_shard_is_of_the_problem_of_its_dataset_and_needs_one_without_it(
 ) -> None:
     shard = tiny("airhockey-replan") / "train" / "shard-00000.h5"
     found = load_boundary_problems(shard)
-    assert found.problem.comparable_sha256 == RECORD.comparable_sha256
+    assert found.problem.comparable_sha256 == record().comparable_sha256
     np.testing.assert_array_equal(found.boundary.start_ddq[:3], rows.boundary.start_ddq)
     with pytest.raises(
         DatasetError,

@@ -21,11 +21,11 @@ from cnpgen.problems.problem_file import load_problem
 from cnpgen.schema import registry
 from cnpgen.trajectory.spline_motion import Motion
 from tests.examples.installed import installed_kind
-from tests.plans.test_plans import AIRHOCKEY, draw_plans, garbage
+from tests.plans.test_plans import draw_plans, garbage
 
 FORMATS = ("npz", "csv", "joint-trajectory")
 FIELDS = ("q", "dq", "ddq", "jerk")
-JOINTS = list(AIRHOCKEY.robot.joints)
+JOINTS = [f"joint_{number}" for number in range(1, 7)]  # of the problem airhockey
 
 
 def read(exported: Exported, form: str) -> dict[int, dict[str, np.ndarray]]:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -35,17 +36,23 @@ from cnpgen.plans.boundary_problems import load_boundary_problems
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.export import export_plans
 from cnpgen.problems.load_robot import load_robot
-from cnpgen.problems.problem import resolved
+from cnpgen.problems.problem import Problem, resolved
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.refine.refine_plans import refine_plans
 from cnpgen.robots.plausible_values import UnitError
 from cnpgen.store.files.checksum_file import with_checksum
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
 from tests.examples.plan_files import remove_checksum
+from tests.examples.shipped import PROBLEMS
 
 DOCS = Path(__file__).parents[2] / "docs" / "reference" / "plan-format.md"
-AIRHOCKEY, HEAVY = load_problem("airhockey"), load_problem("heavy-object")
-RECORD = record_problem(AIRHOCKEY)
+
+
+@cache
+def record() -> ProblemRecord:
+    return record_problem(PROBLEMS["airhockey"])
+
+
 N = 7
 ARRAYS = (
     "path_control_points",
@@ -61,9 +68,11 @@ def draw_plans(
     *,
     n: int = N,
     goal_ddq: bool = False,
-    problem: Any = AIRHOCKEY,
+    problem: Problem | str = "airhockey",
     **others: Any,
 ) -> Plans:
+    if isinstance(problem, str):
+        problem = PROBLEMS[problem]
     numbers = np.random.default_rng(seed)
     joints, spec = len(problem.robot.joints), problem.trajectory
     parts = numbers.uniform(-1, 1, (6, n, joints))
@@ -106,12 +115,11 @@ def assert_equal(one: Plans, other: Plans) -> None:
 
 
 @pytest.mark.parametrize("goal_ddq", [False, True])
-@pytest.mark.parametrize(
-    "problem", [AIRHOCKEY, HEAVY], ids=["airhockey", "heavy-object"]
-)
+@pytest.mark.parametrize("name", ["airhockey", "heavy-object"])
 def test_plans_come_back_as_they_were(
-    tmp_path: Path, problem: Any, goal_ddq: bool
+    tmp_path: Path, name: str, goal_ddq: bool
 ) -> None:
+    problem = PROBLEMS[name]
     columns = {
         "hit_angle": np.linspace(-1, 1, N),
         "puck": np.arange(2.0 * N).reshape(N, 2),
@@ -166,7 +174,7 @@ def test_a_file_needs_no_other_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "mine"
-    shutil.copytree(AIRHOCKEY.path.parent, folder)
+    shutil.copytree(PROBLEMS["airhockey"].path.parent, folder)
     text = (
         (folder / "problem.toml")
         .read_text(encoding="utf-8")
@@ -209,13 +217,15 @@ def test_every_dataset_says_what_it_is(tmp_path: Path) -> None:
         assert units["start_ddq"] == "rad/s^2"
         assert units["rate_control_points"] == "1/s"
         assert units["hit_speed"] == "m/s"
-        assert json.loads(file["goal_q"].attrs["names"]) == list(AIRHOCKEY.robot.joints)
+        assert json.loads(file["goal_q"].attrs["names"]) == list(
+            PROBLEMS["airhockey"].robot.joints
+        )
         assert file["goal_xyz"].attrs["frame"] == b"world"
         assert file["duration"].dtype == "<f8"
         assert file["status"].dtype == "u1"
         assert file.attrs["format"] == b"cnpgen-plans"
         assert file.attrs["problem"] == b"airhockey"
-        assert file.attrs["problem_sha256"].decode() == RECORD.comparable_sha256
+        assert file.attrs["problem_sha256"].decode() == record().comparable_sha256
 
 
 # --- files of others --------------------------------------------------------------------------------------------------
@@ -234,7 +244,7 @@ def test_ten_lines_of_any_trainer_write_a_valid_file(tmp_path: Path) -> None:
     assert not plans.status.any()
     assert plans.degree == 7
     assert np.allclose(plans.duration, 1 / np.linspace(0.5, 1, 8))
-    robot = load_robot(AIRHOCKEY)
+    robot = load_robot(PROBLEMS["airhockey"])
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, plans.boundary.goal_q[3])
     tip = data.oMf[robot.model.getFrameId(robot.tip)].translation
@@ -287,7 +297,7 @@ def test_other_float_types_and_sizes_are_welcome(tmp_path: Path) -> None:
 
 
 def test_a_problem_beside_the_file_or_in_the_call(tmp_path: Path) -> None:
-    shutil.copytree(HEAVY.path.parent, tmp_path / "heavy")
+    shutil.copytree(PROBLEMS["heavy-object"].path.parent, tmp_path / "heavy")
     fields = {
         name: np.zeros((3, 7))
         for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
@@ -300,9 +310,11 @@ def test_a_problem_beside_the_file_or_in_the_call(tmp_path: Path) -> None:
     assert load_plans(beside).problem.name == "heavy-object"
     assert (
         load_plans(beside, problem="heavy-object").problem.comparable_sha256
-        == record_problem(HEAVY).comparable_sha256
+        == record_problem(PROBLEMS["heavy-object"]).comparable_sha256
     )
-    assert load_plans(missing, problem=HEAVY).problem == record_problem(HEAVY)
+    assert load_plans(
+        missing, problem=PROBLEMS["heavy-object"]
+    ).problem == record_problem(PROBLEMS["heavy-object"])
     with pytest.raises(
         UsageError,
         match=r"b\.h5 does not name its problem: set its attribute 'problem'",
@@ -315,10 +327,11 @@ def test_tolerances_of_the_call_count_and_do_not_make_another_problem(
 ) -> None:
     save_plans(tmp_path / "plan.h5", draw_plans())
     loose = replace(
-        AIRHOCKEY,
+        PROBLEMS["airhockey"],
         name="loose",
         constraint=tuple(
-            replace(item, tolerance=0.5, budget=1.0) for item in AIRHOCKEY.constraint
+            replace(item, tolerance=0.5, budget=1.0)
+            for item in PROBLEMS["airhockey"].constraint
         ),
     )
     plans = load_plans(tmp_path / "plan.h5", problem=loose)
@@ -348,7 +361,7 @@ def test_another_problem_s_file_is_refused(
         DatasetError,
         match=rf"plan\.h5 has plans of problem 'airhockey'.*they differ in {key}$",
     ):
-        load_plans(tmp_path / "plan.h5", problem=change(AIRHOCKEY))
+        load_plans(tmp_path / "plan.h5", problem=change(PROBLEMS["airhockey"]))
     with pytest.raises(
         DatasetError,
         match=r"of problem 'airhockey', not of 'heavy-object': they differ in robot\.joints",
@@ -357,7 +370,7 @@ def test_another_problem_s_file_is_refused(
 
 
 def test_constraints_of_one_kind_all_count() -> None:
-    once = json.loads(RECORD.recipe)
+    once = json.loads(record().recipe)
     table = next(each for each in once["constraint"] if each["use"] == "table")
     twice, others = (
         once | {"constraint": [*once["constraint"], table | {"x": x}]}
@@ -365,7 +378,7 @@ def test_constraints_of_one_kind_all_count() -> None:
     )
     narrow = once | {"constraint": [table | {"x": [0.9, 1.0]}, *once["constraint"]]}
     records = [
-        ProblemRecord(json.dumps(each), RECORD.urdf)
+        ProblemRecord(json.dumps(each), record().urdf)
         for each in (once, twice, others, narrow)
     ]
     assert len({record.comparable_sha256 for record in records}) == 4
@@ -373,17 +386,17 @@ def test_constraints_of_one_kind_all_count() -> None:
 
 
 def test_another_robot_file_is_another_problem() -> None:
-    other = ProblemRecord(RECORD.recipe, RECORD.urdf.replace("iiwa14", "iiwa15", 1))
-    assert other.urdf != RECORD.urdf
-    assert RECORD.differences(other) == ["robot.urdf"]
-    renamed = json.loads(RECORD.recipe) | {
+    other = ProblemRecord(record().recipe, record().urdf.replace("iiwa14", "iiwa15", 1))
+    assert other.urdf != record().urdf
+    assert record().differences(other) == ["robot.urdf"]
+    renamed = json.loads(record().recipe) | {
         "name": "x",
         "title": "y",
         "trajectory": {"degree": 5},
     }
     assert (
-        ProblemRecord(json.dumps(renamed), RECORD.urdf).comparable_sha256
-        == RECORD.comparable_sha256
+        ProblemRecord(json.dumps(renamed), record().urdf).comparable_sha256
+        == record().comparable_sha256
     )
 
 
@@ -506,7 +519,7 @@ def test_a_damaged_problem_is_said(tmp_path: Path, recipe: Any) -> None:
 def test_a_changed_problem_is_said(tmp_path: Path) -> None:
     save_plans(tmp_path / "plan.h5", draw_plans())
     with h5py.File(remove_checksum(tmp_path / "plan.h5"), "a") as file:
-        file.attrs["problem_recipe"] = RECORD.recipe.replace(
+        file.attrs["problem_recipe"] = record().recipe.replace(
             '"velocity_scale": 0.8', '"velocity_scale": 0.9'
         )
     with pytest.raises(
@@ -616,7 +629,7 @@ def test_cut_off_and_changed_files_never_give_anything_but_plans_or_an_error(
             changed[draws.randrange(len(changed))] = draws.randrange(256)
         path.write_bytes(changed)
         try:
-            outcomes[len(load_plans(path, problem=AIRHOCKEY)) == N] += 1
+            outcomes[len(load_plans(path, problem=PROBLEMS["airhockey"])) == N] += 1
         except DatasetError as error:
             assert "broken.h5" in str(error)  # noqa: PT017
             outcomes[False] += 1
@@ -699,7 +712,10 @@ def garbage() -> Plans:
     rate[8] = 1e-320  # positive, but 1 / r is not a number that can be had
     rate[4, 7] = -1e308  # finite, but its differences are not
     return make_plans(
-        AIRHOCKEY, boundary, path_control_points=path, rate_control_points=rate
+        PROBLEMS["airhockey"],
+        boundary,
+        path_control_points=path,
+        rate_control_points=rate,
     )
 
 
@@ -820,7 +836,7 @@ def test_selected_plans_joined_again_are_the_same() -> None:
 @pytest.mark.parametrize(
     ("others", "message"),
     [
-        ({"problem": HEAVY}, "the problem is"),
+        ({"problem": "heavy-object"}, "the problem is"),
         ({"goal_ddq": True}, "goal_ddq is True in part 1, but False in part 0"),
         ({"columns": {"x": np.zeros(N)}}, "the set of columns is"),
     ],
@@ -1094,7 +1110,7 @@ def test_a_replaced_rate_has_its_own_duration() -> None:
 def test_plans_travel_to_other_processes() -> None:
     plans = draw_plans()
     assert_equal(pickle.loads(pickle.dumps(plans)), plans)
-    assert hash(plans.problem) == hash(record_problem(AIRHOCKEY))
+    assert hash(plans.problem) == hash(record_problem(PROBLEMS["airhockey"]))
 
 
 def test_importing_plans_imports_nothing_heavy() -> None:
@@ -1124,7 +1140,7 @@ def test_plans_are_made_of_tensors_that_carry_gradients() -> None:
         name: Tensor(getattr(plans, name))
         for name in ("path_control_points", "rate_control_points")
     }
-    assert_equal(make_plans(AIRHOCKEY, boundary, **given), plans)
+    assert_equal(make_plans(PROBLEMS["airhockey"], boundary, **given), plans)
 
 
 @pytest.mark.slow
@@ -1134,7 +1150,7 @@ def test_plans_are_made_of_arrays_of_jax_and_tensors_of_torch() -> None:
     path, rate = plans.path_control_points, plans.rate_control_points
     with_gradient = torch.tensor(path, requires_grad=True)
     found = make_plans(
-        AIRHOCKEY,
+        PROBLEMS["airhockey"],
         plans.boundary,
         path_control_points=with_gradient,
         rate_control_points=jnp.asarray(rate),
@@ -1159,10 +1175,12 @@ def test_joint_positions_in_degrees_are_refused_where_they_come_in(
     with pytest.raises(
         UnitError, match=message + r"\? allow_large_angles=True accepts such values"
     ) as caught:
-        make_plans(AIRHOCKEY, boundary, **points)
+        make_plans(PROBLEMS["airhockey"], boundary, **points)
     assert caught.value.argument == "boundary"
     with pytest.warns(UserWarning, match=message):
-        made = make_plans(AIRHOCKEY, boundary, **points, allow_large_angles=True)
+        made = make_plans(
+            PROBLEMS["airhockey"], boundary, **points, allow_large_angles=True
+        )
     save_plans(tmp_path / "degrees.h5", made)
     with pytest.warns(UserWarning, match=message):  # the verdict reports it
         load_plans(tmp_path / "degrees.h5")
@@ -1179,7 +1197,7 @@ def test_joint_positions_that_are_only_outside_are_not_suspicious(value: float) 
         for name in ("path_control_points", "rate_control_points")
     }
     assert (
-        len(make_plans(AIRHOCKEY, boundary, **points)) == N
+        len(make_plans(PROBLEMS["airhockey"], boundary, **points)) == N
     )  # warnings are errors in tests
 
 
@@ -1196,7 +1214,7 @@ def test_joint_positions_that_are_only_outside_are_not_suspicious(value: float) 
 def test_a_problem_in_another_folder_is_not_opened(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, problem: str
 ) -> None:
-    shutil.copytree(HEAVY.path.parent, tmp_path / "heavy")
+    shutil.copytree(PROBLEMS["heavy-object"].path.parent, tmp_path / "heavy")
     (tmp_path / "theirs").mkdir()
     (tmp_path / "theirs" / "link").symlink_to(tmp_path / "heavy")
     fields = {
@@ -1217,4 +1235,6 @@ def test_a_problem_in_another_folder_is_not_opened(
                 match=r"attribute 'problem' names .*, which is not in the folder of the file",
             ):
                 read(path)
-    assert load_plans(path, problem=HEAVY).problem == record_problem(HEAVY)
+    assert load_plans(path, problem=PROBLEMS["heavy-object"]).problem == record_problem(
+        PROBLEMS["heavy-object"]
+    )

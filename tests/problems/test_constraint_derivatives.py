@@ -10,8 +10,8 @@ import pytest
 
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
+from tests.examples.shipped import PROBLEMS
 from tests.problems.test_constraints import (
-    HEAVY,
     KINDS,
     Bench,
     gantry_problem,
@@ -191,7 +191,11 @@ def test_an_edge_that_enters_between_two_corners_is_seen_exactly(
     """The corner of a pedestal in the side of the object: no corner of the object is in the pedestal."""
     here = Bench(gantry_problem(tmp_path))
     function, _ = here.symbolic(KINDS["object-contact"])
-    half = np.array(HEAVY.object.size[:2]) / 2 if HEAVY.object else np.zeros(2)
+    half = (
+        np.array(PROBLEMS["heavy-object"].object.size[:2]) / 2
+        if PROBLEMS["heavy-object"].object
+        else np.zeros(2)
+    )
     corner, depth = np.array([0.2, -0.3]), 0.012  # of pedestal 1
     face = np.array(
         [np.cos(turn), -np.sin(turn)]

@@ -36,7 +36,6 @@ from cnpgen.problems.constraints.puck_contact import PuckContact
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.robot_spec import LimitSpec, RobotSpec
 from cnpgen.robots.solid import pose_width
@@ -44,8 +43,7 @@ from cnpgen.schema.keys import Range
 from cnpgen.schema.registry import CONSTRAINTS, load, names
 from cnpgen.world.world import World
 from tests.examples.constraints import TipSpeed as SpeedOfPlugin
-
-AIRHOCKEY, HEAVY = load_problem("airhockey"), load_problem("heavy-object")
+from tests.examples.shipped import PROBLEMS
 
 # Three sliding axes, a turn about z and a lean about x: what it holds is upright unless it leans.
 GANTRY_JOINTS = [
@@ -87,11 +85,13 @@ def gantry_problem(folder: Path) -> Problem:
         urdf="gantry.urdf", joints=joints, tip="grip_link", base=(0.0,) * 5
     )
     constraints = tuple(
-        item for item in HEAVY.constraint if not isinstance(item, ObjectClearance)
+        item
+        for item in PROBLEMS["heavy-object"].constraint
+        if not isinstance(item, ObjectClearance)
     )
     path = folder / "problem.toml"
     return replace(
-        HEAVY,
+        PROBLEMS["heavy-object"],
         name="gantry",
         robot=spec,
         limits=LimitSpec(),
@@ -159,7 +159,10 @@ class Bench:
 
 @pytest.fixture(scope="module")
 def benches(gantry: Problem) -> dict[str, Bench]:
-    return {problem.name: Bench(problem) for problem in (AIRHOCKEY, HEAVY, gantry)}
+    return {
+        problem.name: Bench(problem)
+        for problem in (PROBLEMS["airhockey"], PROBLEMS["heavy-object"], gantry)
+    }
 
 
 KINDS = {
@@ -235,7 +238,9 @@ def test_every_shipped_kind_is_tested_here():
 def test_symbolic_form_agrees_with_the_measurement(benches, problem, name):
     bench, random = benches[problem], np.random.default_rng(4)
     if name == "robot-clearance" and not bench.problem.obstacle:
-        bench = Bench(replace(bench.problem, obstacle=HEAVY.obstacle))
+        bench = Bench(
+            replace(bench.problem, obstacle=PROBLEMS["heavy-object"].obstacle)
+        )
     function, _ = bench.symbolic(KINDS[name])
     for _ in range(40):
         state = bench.random_state(random)

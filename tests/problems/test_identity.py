@@ -13,7 +13,6 @@ from cnpgen.planner.model import Model, ModelConfig
 from cnpgen.planner.planner import Planner
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import open_problem, record_problem
 from cnpgen.robots.robot_spec import HeldObject, Payload
 from cnpgen.schema import registry
@@ -21,18 +20,22 @@ from cnpgen.schema.keys import Range, keys
 from cnpgen.trajectory.boundary import Boundary
 from tests.examples.constraints import TipSpeed
 from tests.examples.models import untrained_model
+from tests.examples.shipped import PROBLEMS
 
-SHIPPED = {name: load_problem(name) for name in ("airhockey", "heavy-object")}
 # Names, locations of files, how they are read and what was measured: only their content counts.
 LABELS = {"title", "robot.urdf", "robot.srdf", "robot.convex_parts", "robot.hull_gap"}
 
 
-PROBLEMS = {
-    **SHIPPED,
-    "with a plug-in": replace(
-        SHIPPED["airhockey"], constraint=(*SHIPPED["airhockey"].constraint, TipSpeed())
-    ),
-}
+PLUGGED = "with a plug-in"
+NAMES = (*PROBLEMS, PLUGGED)
+
+
+def example(name: str) -> Problem:
+    """Return a shipped problem, or one with a constraint of another package."""
+    if name != PLUGGED:
+        return PROBLEMS[name]
+    shipped = PROBLEMS["airhockey"]
+    return replace(shipped, constraint=(*shipped.constraint, TipSpeed()))
 
 
 def other_values(value: Any) -> Iterator[Any]:
@@ -77,9 +80,9 @@ def changes(obj: Any) -> Iterator[tuple[str, Any]]:
             )
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", NAMES)
 def test_every_key_of_a_recipe_but_its_labels_changes_the_identity(name: str) -> None:
-    problem = PROBLEMS[name]
+    problem = example(name)
     found = [(key, other) for key, other in changes(problem) if key not in LABELS]
     keys_seen = {key for key, _ in found}
     assert {
@@ -102,11 +105,11 @@ def test_every_key_of_a_recipe_but_its_labels_changes_the_identity(name: str) ->
     assert len(identities) == len(found)
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", NAMES)
 def test_what_a_problem_is_called_and_where_it_lies_does_not_change_it(
     name: str, tmp_path: Path
 ) -> None:
-    problem = PROBLEMS[name]
+    problem = example(name)
     (tmp_path / "other.urdf").write_bytes(problem.urdf_path.read_bytes())
     moved = replace(
         problem,
@@ -120,11 +123,11 @@ def test_what_a_problem_is_called_and_where_it_lies_does_not_change_it(
 def test_the_content_of_the_urdf_changes_it_and_robot_and_identity_are_of_one_text(
     tmp_path: Path,
 ) -> None:
-    problem = replace(SHIPPED["airhockey"], path=tmp_path / "problem.toml")
-    text = SHIPPED["airhockey"].urdf_path.read_text(encoding="utf-8")
+    problem = replace(PROBLEMS["airhockey"], path=tmp_path / "problem.toml")
+    text = PROBLEMS["airhockey"].urdf_path.read_text(encoding="utf-8")
     problem.urdf_path.write_text(text, encoding="utf-8")
     before = problem.identity
-    assert before == SHIPPED["airhockey"].identity
+    assert before == PROBLEMS["airhockey"].identity
     problem.urdf_path.write_text(
         text.replace('effort="320"', 'effort="100"'), encoding="utf-8"
     )
@@ -132,7 +135,7 @@ def test_the_content_of_the_urdf_changes_it_and_robot_and_identity_are_of_one_te
     assert edited.identity != before
     assert load_robot(edited).torque_limit[0] != load_robot(problem).torque_limit[0]
     np.testing.assert_array_equal(
-        load_robot(problem).torque_limit, load_robot(SHIPPED["airhockey"]).torque_limit
+        load_robot(problem).torque_limit, load_robot(PROBLEMS["airhockey"]).torque_limit
     )
     problem.urdf_path.unlink()
     assert problem.identity == before
@@ -142,7 +145,7 @@ def test_the_content_of_the_urdf_changes_it_and_robot_and_identity_are_of_one_te
 def test_code_and_undeclared_fields_of_a_plug_in_change_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    problem = PROBLEMS["with a plug-in"]
+    problem = example(PLUGGED)
     faster = replace(
         problem, constraint=(*problem.constraint[:-1], TipSpeed(highest=2.0))
     )
@@ -151,12 +154,13 @@ def test_code_and_undeclared_fields_of_a_plug_in_change_it(
     assert replace(problem).identity != problem.identity
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", PROBLEMS)
 def test_a_problem_that_is_read_from_its_record_is_the_same_one(name: str) -> None:
-    record = record_problem(SHIPPED[name])
-    assert open_problem(record)[0].identity == SHIPPED[name].identity
+    problem = PROBLEMS[name]
+    record = record_problem(problem)
+    assert open_problem(record)[0].identity == problem.identity
     with loaded_problem(record, "numpy") as given:
-        assert given.kernels.identity == SHIPPED[name].identity
+        assert given.kernels.identity == problem.identity
 
 
 def boundary(n: int, speed: float) -> Boundary:
@@ -208,7 +212,7 @@ def test_kernels_of_a_problem_are_not_those_of_one_with_another_trajectory(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("CNPGEN_CACHE", str(tmp_path))
-    shipped, wanted = SHIPPED["airhockey"], boundary(6, 0.3)
+    shipped, wanted = PROBLEMS["airhockey"], boundary(6, 0.3)
     Planner(model, backend="numpy").plan_batch(wanted)
     problem = replace(shipped, trajectory=replace(shipped.trajectory, **change))
     plans = Planner(model_of(problem, model, outputs), backend="numpy").plan_batch(

@@ -6,7 +6,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
-from scipy.interpolate import BSpline
+import scipy
 
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.linalg import symbols
@@ -76,8 +76,8 @@ def test_the_jerk_along_a_path_is_the_third_difference_in_time() -> None:
     random, n, h = np.random.default_rng(2), 3, 2e-3
     knots = [np.r_[np.zeros(8), np.linspace(0, 1, 5)[1:-1], np.ones(8)]] * 2
     p, r = (
-        BSpline(knots[0], random.normal(size=(11, n)), 7),
-        BSpline(knots[1], random.uniform(1, 2, 11), 7),
+        scipy.interpolate.BSpline(knots[0], random.normal(size=(11, n)), 7),
+        scipy.interpolate.BSpline(knots[1], random.uniform(1, 2, 11), 7),
     )
     columns = [ca.SX.sym(f"p{order}", n) for order in (1, 2, 3)], ca.SX.sym("r", 3)
     _, _, formula = time_derivatives(

@@ -1,5 +1,6 @@
 """Parameters of manifolds: the rectangle of the table, the upright direction and its tolerance."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -22,7 +23,6 @@ from cnpgen.problems.constraints.axis import Axis, TipAxis
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import record_problem
 from cnpgen.robots.parameter_ranges import NO_PARAMETERS, ParameterRanges
 from cnpgen.schema.keys import Range
@@ -31,6 +31,7 @@ from cnpgen.trajectory.boundary import assemble
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
 from tests.examples.example_robots import needs_robots
+from tests.examples.shipped import PROBLEMS
 
 TABLE_RANGES = ParameterRanges(
     table_x_low=Range(0.55, 0.62),
@@ -43,12 +44,32 @@ UPRIGHT_RANGES = ParameterRanges(
     upright_pitch=Range(-0.1, 0.15),
     upright_tolerance=Range(0.01, 0.06),
 )
-TABLES, LOADS = load_problem("airhockey-tables"), load_problem("heavy-object-loads")
-RECTANGLES = replace(TABLES, parameters=TABLE_RANGES)
-OBJECTS = replace(
-    LOADS, parameters=UPRIGHT_RANGES, obstacle=(), constraint=LOADS.constraint[:5]
-)
-WIPE = replace(load_problem("ur5-wipe"), parameters=UPRIGHT_RANGES)
+
+
+def rectangles() -> Problem:
+    """Return the table with a rectangle per sample."""
+    return replace(PROBLEMS["airhockey-tables"], parameters=TABLE_RANGES)
+
+
+def objects() -> Problem:
+    """Return the carried object with an upright direction per sample, without obstacles."""
+    loads = PROBLEMS["heavy-object-loads"]
+    return replace(
+        loads,
+        parameters=UPRIGHT_RANGES,
+        obstacle=(),
+        constraint=loads.constraint[:5],
+    )
+
+
+def wipe() -> Problem:
+    """Return the wiping arm with an upright direction per sample."""
+    return replace(PROBLEMS["ur5-wipe"], parameters=UPRIGHT_RANGES)
+
+
+def wipe_in_range() -> Problem:
+    """Return the wiping arm whose axis is free within 0.04 rad."""
+    return in_range(wipe(), 0.04)
 
 
 def in_range(problem: Problem, angle: float) -> Problem:
@@ -114,26 +135,27 @@ def with_values(problem: Problem, values: np.ndarray) -> Problem:
 def solved(name: str) -> Plans:
     """Return refined plans of problems with parameters."""
     dataset, problem = {
-        "rectangle": ("airhockey-tables", RECTANGLES),
-        "vertical": ("heavy-object-loads", OBJECTS),
+        "rectangle": ("airhockey-tables", rectangles()),
+        "vertical": ("heavy-object-loads", objects()),
     }[name]
     problems = draw_boundary_problems(recipe_of(dataset, problem), 6, seed=3)
     return cnpgen.solve_plans(problems).plans
 
 
 @pytest.mark.parametrize(
-    "problem",
+    "make",
     [
-        RECTANGLES,
-        OBJECTS,
-        *(
-            pytest.param(each, marks=needs_robots)
-            for each in (WIPE, in_range(WIPE, 0.04))
-        ),
+        rectangles,
+        objects,
+        pytest.param(wipe, marks=needs_robots),
+        pytest.param(wipe_in_range, marks=needs_robots),
     ],
-    ids=lambda each: each.name,
+    ids=lambda make: make.__name__,
 )
-def test_both_forms_agree_on_motions_and_at_their_ends(problem: Problem) -> None:
+def test_both_forms_agree_on_motions_and_at_their_ends(
+    make: Callable[[], Problem],
+) -> None:
+    problem = make()
     robot, random, n = load_robot(problem), np.random.default_rng(2), 8
     exact = tuple(
         item for item in problem.constraint if isinstance(item, Table | TipAxis)
@@ -240,7 +262,7 @@ def test_losses_are_those_of_the_problem_at_these_values(name: str, form: str) -
 
 @pytest.mark.extended
 def test_a_planner_projects_onto_the_manifold_of_each_sample(tmp_path: Path) -> None:
-    recipe = recipe_of("heavy-object-loads", OBJECTS)
+    recipe = recipe_of("heavy-object-loads", objects())
     cnpgen.make_dataset(recipe, tmp_path / "rows", n=300, workers=1)
     settings = TrainingSettings(hidden=16, line_projection_steps=3, projection_steps=3)
     cnpgen.train_model(
@@ -272,34 +294,39 @@ def test_a_planner_projects_onto_the_manifold_of_each_sample(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("problem", "ranges", "text"),
+    ("name", "ranges", "text"),
     [
-        (LOADS, ParameterRanges(table_x_low=Range(0.5, 0.6)), "constraint 'table'"),
         (
-            TABLES,
+            "heavy-object-loads",
+            ParameterRanges(table_x_low=Range(0.5, 0.6)),
+            "constraint 'table'",
+        ),
+        (
+            "airhockey-tables",
             ParameterRanges(upright_roll=Range(-0.1, 0.1)),
             "upright_roll needs one constraint",
         ),
         (
-            TABLES,
+            "airhockey-tables",
             ParameterRanges(table_x_low=Range(0.5, 2.1)),
             "table_x_low must be below table_x_high in all samples",
         ),
         (
-            TABLES,
+            "airhockey-tables",
             ParameterRanges(table_y_high=Range(0.5, 0.6)),
             "table_y_high must include 0.45",
         ),
         (
-            LOADS,
+            "heavy-object-loads",
             ParameterRanges(upright_tolerance=Range(0.1, 0.2)),
             "upright_tolerance must include 0.0314159",
         ),
     ],
 )
 def test_recipe_errors_in_ranges_are_named(
-    problem: Problem, ranges: ParameterRanges, text: str
+    name: str, ranges: ParameterRanges, text: str
 ) -> None:
+    problem = PROBLEMS[name]
     assert any(
         text in error for _, error in replace(problem, parameters=ranges).validate()
     )
@@ -307,7 +334,7 @@ def test_recipe_errors_in_ranges_are_named(
 
 def test_configurations_of_tasks_are_along_the_direction_of_each_sample() -> None:
     boundary = solved("vertical").boundary
-    robot = load_robot(OBJECTS)
+    robot = load_robot(objects())
     for q, (roll, pitch, _) in zip(boundary.goal_q, boundary.parameters, strict=True):
         data = robot.model.createData()
         pin.forwardKinematics(robot.model, data, q)
@@ -319,7 +346,7 @@ def test_configurations_of_tasks_are_along_the_direction_of_each_sample() -> Non
 
 def test_tasks_are_checked_with_the_rectangle_of_each_sample() -> None:
     backend, folder = choose_backend(None)
-    pipeline = recipe_of("airhockey-tables", RECTANGLES).pipeline
+    pipeline = recipe_of("airhockey-tables", rectangles()).pipeline
     context = PreparedPipeline(
         pipeline, backend=backend, cache_folder=folder, dtype="float64"
     ).context

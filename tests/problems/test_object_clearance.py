@@ -21,26 +21,33 @@ from cnpgen.robots.shape.hull import coal_hull
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
+from tests.examples.shipped import PROBLEMS, ROBOTS
 
-HEAVY = load_problem("heavy-object")
-ROBOT = load_robot(HEAVY)
 CLEARANCE = ObjectClearance(distance=0.01, tolerance=0.0)
 CHECKED_LINKS = [f"link_{number}" for number in range(7)]
 
 
 def random_states(count: int) -> np.ndarray:
     return np.random.default_rng(5).uniform(
-        ROBOT.position_lower, ROBOT.position_upper, (count, ROBOT.n)
+        ROBOTS["heavy-object"].position_lower,
+        ROBOTS["heavy-object"].position_upper,
+        (count, ROBOTS["heavy-object"].n),
     )
 
 
 def distance_of_coal(q: np.ndarray) -> float:
     """The smallest distance of the object from the links' parts, by frames of Pinocchio and shapes of Coal."""
-    model, data = ROBOT.model, ROBOT.model.createData()
+    model, data = (
+        ROBOTS["heavy-object"].model,
+        ROBOTS["heavy-object"].model.createData(),
+    )
     pin.framesForwardKinematics(model, data, q)
-    tip, box = data.oMf[model.getFrameId("object")], coal.Box(*HEAVY.object_size)
+    tip, box = (
+        data.oMf[model.getFrameId("object")],
+        coal.Box(*PROBLEMS["heavy-object"].object_size),
+    )
     distances = []
-    for part in link_convex_parts(ROBOT.urdf_text):
+    for part in link_convex_parts(ROBOTS["heavy-object"].urdf_text):
         if part.link in CHECKED_LINKS:
             pose = data.oMf[model.getFrameId(part.link)]
             request, result = coal.DistanceRequest(), coal.DistanceResult()
@@ -62,15 +69,23 @@ def distance_of_coal(q: np.ndarray) -> float:
 
 def test_measured_distances_are_those_of_coal() -> None:
     world, zero, overlapping = (
-        World(ROBOT, HEAVY.obstacle, HEAVY.object_size),
-        np.zeros(ROBOT.n),
+        World(
+            ROBOTS["heavy-object"],
+            PROBLEMS["heavy-object"].obstacle,
+            PROBLEMS["heavy-object"].object_size,
+        ),
+        np.zeros(ROBOTS["heavy-object"].n),
         0,
     )
     states, path = (
         random_states(300),
-        PathWorld(ROBOT, HEAVY.obstacle, HEAVY.object_size),
+        PathWorld(
+            ROBOTS["heavy-object"],
+            PROBLEMS["heavy-object"].obstacle,
+            PROBLEMS["heavy-object"].object_size,
+        ),
     )
-    poses = place_obstacles(HEAVY.obstacle)
+    poses = place_obstacles(PROBLEMS["heavy-object"].obstacle)
     smallest = []
     for q in states:
         world.set_state(q, zero, zero, poses)
@@ -90,13 +105,19 @@ def test_measured_distances_are_those_of_coal() -> None:
 
 
 def test_capsules_of_solvers_are_conservative_and_close() -> None:
-    columns = [symbols(name, ROBOT.n) for name in ("q", "dq", "ddq")]
+    columns = [symbols(name, ROBOTS["heavy-object"].n) for name in ("q", "dq", "ddq")]
     (q, dq, ddq), obstacle_poses = (
         [scalars for _, scalars in columns],
-        [0.0] * len(HEAVY.obstacle),
+        [0.0] * len(PROBLEMS["heavy-object"].obstacle),
     )
     state = SymbolicState(
-        ROBOT, q, dq, ddq, obstacle_poses, HEAVY.obstacle, HEAVY.object_size
+        ROBOTS["heavy-object"],
+        q,
+        dq,
+        ddq,
+        obstacle_poses,
+        PROBLEMS["heavy-object"].obstacle,
+        PROBLEMS["heavy-object"].object_size,
     )
     (condition,) = CLEARANCE.symbolic(state)
     assert condition.sufficient
@@ -115,13 +136,19 @@ def test_capsules_of_solvers_are_conservative_and_close() -> None:
 
 
 def test_gradients_of_capsules_agree_with_differences() -> None:
-    columns = [symbols(name, ROBOT.n) for name in ("q", "dq", "ddq")]
+    columns = [symbols(name, ROBOTS["heavy-object"].n) for name in ("q", "dq", "ddq")]
     (q, dq, ddq), obstacle_poses = (
         [scalars for _, scalars in columns],
-        [0.0] * len(HEAVY.obstacle),
+        [0.0] * len(PROBLEMS["heavy-object"].obstacle),
     )
     state = SymbolicState(
-        ROBOT, q, dq, ddq, obstacle_poses, HEAVY.obstacle, HEAVY.object_size
+        ROBOTS["heavy-object"],
+        q,
+        dq,
+        ddq,
+        obstacle_poses,
+        PROBLEMS["heavy-object"].obstacle,
+        PROBLEMS["heavy-object"].object_size,
     )
     g = ca.vertcat(*CLEARANCE.symbolic(state)[0].g)
     value = ca.Function("g", [columns[0][0]], [g])
@@ -130,7 +157,7 @@ def test_gradients_of_capsules_agree_with_differences() -> None:
     )
     close = []
     for at in random_states(40):
-        steps = 1e-6 * np.eye(ROBOT.n)
+        steps = 1e-6 * np.eye(ROBOTS["heavy-object"].n)
         differences = np.hstack(
             [np.array(value(at + step) - value(at - step)) / 2e-6 for step in steps]
         )
@@ -143,9 +170,11 @@ def test_gradients_of_capsules_agree_with_differences() -> None:
 
 
 def problem_text(tmp_path: Path, old: str, new: str) -> Path:
-    text = HEAVY.path.read_text()
+    text = PROBLEMS["heavy-object"].path.read_text()
     assert old in text
-    (tmp_path / "iiwa14_object.urdf").write_text(HEAVY.urdf_path.read_text())
+    (tmp_path / "iiwa14_object.urdf").write_text(
+        PROBLEMS["heavy-object"].urdf_path.read_text()
+    )
     (tmp_path / "problem.toml").write_text(text.replace(old, new))
     return tmp_path / "problem.toml"
 
@@ -154,7 +183,7 @@ CONSTRAINT = '[[constraint]]\nuse = "object-clearance"'
 
 
 def test_a_held_object_stays_clear_of_links_by_default(tmp_path: Path) -> None:
-    text = HEAVY.path.read_text()
+    text = PROBLEMS["heavy-object"].path.read_text()
     path = problem_text(tmp_path, text[text.index(CONSTRAINT) :], "")
     assert isinstance(load_problem(path).constraint[-1], ObjectClearance)
     stripped = (tmp_path / "iiwa14_object.urdf").read_text()
@@ -189,7 +218,7 @@ def test_mistakes_name_the_links(
 
 
 def test_the_constraint_needs_an_object(tmp_path: Path) -> None:
-    text = HEAVY.path.read_text()
+    text = PROBLEMS["heavy-object"].path.read_text()
     start, end = text.index("[object]"), text.index("[[obstacle]]")
     path = problem_text(tmp_path, text[start:end], "")
     with pytest.raises(RecipeError, match=r"object-clearance needs \[object\]"):

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from scipy.interpolate import BSpline
+import scipy
 
 import cnpgen
 from cnpgen.cli.main import main
@@ -306,9 +306,9 @@ def _plans(plan, problem) -> Plans:
     )
 
 
-def _spline(points: np.ndarray) -> BSpline:
+def _spline(points: np.ndarray) -> "scipy.interpolate.BSpline":
     count = len(points)
-    return BSpline(
+    return scipy.interpolate.BSpline(
         np.r_[np.zeros(8), np.linspace(0, 1, count - 6)[1:-1], np.ones(8)], points, 7
     )
 

@@ -27,9 +27,9 @@ from cnpgen.trajectory.boundary import assemble
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
 from tests.conftest import some
+from tests.examples.shipped import PROBLEMS
 
 NAMES = "airhockey-tables", "heavy-object-loads"
-LOADS, TABLES = load_problem("heavy-object-loads"), load_problem("airhockey-tables")
 
 
 def drawn(problem: Problem, n: int, seed: int = 0) -> np.ndarray:
@@ -86,21 +86,31 @@ def test_one_kernel_agrees_with_pinocchio_for_all_values(name: str) -> None:
 
 
 def test_the_load_of_a_sample_is_that_of_a_problem_with_this_payload() -> None:
-    (mass,) = drawn(LOADS, 1)[0]
-    payload = replace(LOADS.payload, mass=mass)
+    (mass,) = drawn(PROBLEMS["heavy-object-loads"], 1)[0]
+    payload = replace(PROBLEMS["heavy-object-loads"].payload, mass=mass)
     other = load_robot(
-        replace(LOADS, payload=payload, parameters=type(LOADS.parameters)())
+        replace(
+            PROBLEMS["heavy-object-loads"],
+            payload=payload,
+            parameters=type(PROBLEMS["heavy-object-loads"].parameters)(),
+        )
     )
-    q, dq, ddq = (part.T for part in states(LOADS, 5))
-    world = PathWorld(load_robot(LOADS), LOADS.obstacle, LOADS.object_size)
+    q, dq, ddq = (part.T for part in states(PROBLEMS["heavy-object-loads"], 5))
+    world = PathWorld(
+        load_robot(PROBLEMS["heavy-object-loads"]),
+        PROBLEMS["heavy-object-loads"].obstacle,
+        PROBLEMS["heavy-object-loads"].object_size,
+    )
     for value in (9.0, mass):  # the second value replaces the first
         world.set_path(
             q,
             dq,
             ddq,
-            scene_of(LOADS, *np.zeros((2, 1, 3)), parameters=np.array([[value]])).poses[
-                0
-            ],
+            scene_of(
+                PROBLEMS["heavy-object-loads"],
+                *np.zeros((2, 1, 3)),
+                parameters=np.array([[value]]),
+            ).poses[0],
         )
         torque = world.torque
     data = other.model.createData()
@@ -113,16 +123,21 @@ def test_the_load_of_a_sample_is_that_of_a_problem_with_this_payload() -> None:
 
 
 def test_center_and_inertia_of_the_load_differ_from_sample_to_sample() -> None:
-    nominal = replace(LOADS.payload, centre=(0.01, -0.02, 0.05))
+    nominal = replace(
+        PROBLEMS["heavy-object-loads"].payload, centre=(0.01, -0.02, 0.05)
+    )
     ranges = replace(
-        LOADS.parameters,
+        PROBLEMS["heavy-object-loads"].parameters,
         payload_x=Range(-0.05, 0.05),
         payload_y=Range(-0.05, 0.05),
         payload_z=Range(0.0, 0.1),
         payload_inertia=Range(0.5, 2.0),
     )
     problem = replace(
-        LOADS, payload=nominal, parameters=ranges, constraint=LOADS.constraint[:4]
+        PROBLEMS["heavy-object-loads"],
+        payload=nominal,
+        parameters=ranges,
+        constraint=PROBLEMS["heavy-object-loads"].constraint[:4],
     )
     model = cnpgen.RobotModel(problem, backend="numpy")
     values, state = drawn(problem, 6, seed=8), states(problem, 6, seed=8)
@@ -139,7 +154,11 @@ def test_center_and_inertia_of_the_load_differ_from_sample_to_sample() -> None:
         expected = pin.rnea(
             other.model, other.model.createData(), *(part[row] for part in state)
         )
-        world = PathWorld(load_robot(problem), LOADS.obstacle, LOADS.object_size)
+        world = PathWorld(
+            load_robot(problem),
+            PROBLEMS["heavy-object-loads"].obstacle,
+            PROBLEMS["heavy-object-loads"].object_size,
+        )
         world.set_path(*(part[row][:, None] for part in state), scene.poses[row])
         np.testing.assert_allclose(world.torque[:, 0], expected, rtol=1e-10)
         np.testing.assert_allclose(found[row, -7:], expected, rtol=1e-9)
@@ -155,9 +174,9 @@ def test_the_simulator_holds_the_load_of_each_plan() -> None:
             plans, boundary=replace(plans.boundary, parameters=np.array([[mass]]))
         )
         problem = replace(
-            LOADS,
-            payload=replace(LOADS.payload, mass=mass),
-            parameters=type(LOADS.parameters)(),
+            PROBLEMS["heavy-object-loads"],
+            payload=replace(PROBLEMS["heavy-object-loads"].payload, mass=mass),
+            parameters=type(PROBLEMS["heavy-object-loads"].parameters)(),
         )
         boundary = replace(plans.boundary, parameters=None)
         alone = replace(plans, problem=record_problem(problem), boundary=boundary)
@@ -189,7 +208,7 @@ def test_an_unmoved_table_is_simulated_as_without_parameters() -> None:
     plans = cnpgen.solve_plans(draw_boundary_problems("airhockey-hit", 1, seed=1)).plans
     still = replace(
         plans,
-        problem=record_problem(TABLES),
+        problem=record_problem(PROBLEMS["airhockey-tables"]),
         boundary=replace(plans.boundary, parameters=np.array([[0, 0, 0, 1.0]])),
     )
     assert simulate_plans(still).executed == simulate_plans(plans).executed
@@ -197,29 +216,44 @@ def test_an_unmoved_table_is_simulated_as_without_parameters() -> None:
 
 def test_table_coordinates_are_those_of_pinocchio() -> None:
     values, positions = (
-        drawn(TABLES, 20),
+        drawn(PROBLEMS["airhockey-tables"], 20),
         np.random.default_rng(1).uniform(-1, 1, (20, 3)),
     )
-    frame = table_frame(TABLES.parameters, TABLES.table_origin, values)
+    frame = table_frame(
+        PROBLEMS["airhockey-tables"].parameters,
+        PROBLEMS["airhockey-tables"].table_origin,
+        values,
+    )
     np.testing.assert_allclose(
         frame.to_table(frame.to_world(positions)), positions, atol=1e-14
     )
     for row, (height, roll, pitch, _) in enumerate(values):
         pose = pin.SE3(
             pin.rpy.rpyToMatrix(roll, pitch, 0.0),
-            TABLES.table_origin + np.array([0, 0, height]),
+            PROBLEMS["airhockey-tables"].table_origin + np.array([0, 0, height]),
         )
-        expected = pose.actInv(positions[row]) + TABLES.table_origin
+        expected = (
+            pose.actInv(positions[row]) + PROBLEMS["airhockey-tables"].table_origin
+        )
         np.testing.assert_allclose(frame.to_table(positions)[row], expected, atol=1e-14)
 
 
 def test_a_box_contains_the_boxes_on_all_tables() -> None:
     low, high = np.array([0.6, -0.45, 0.16]), np.array([1.3, 0.45, 0.16])
-    frame = table_frame(TABLES.parameters, TABLES.table_origin, drawn(TABLES, 4000))
+    frame = table_frame(
+        PROBLEMS["airhockey-tables"].parameters,
+        PROBLEMS["airhockey-tables"].table_origin,
+        drawn(PROBLEMS["airhockey-tables"], 4000),
+    )
     corners = frame.to_world(
         np.where(np.random.default_rng(2).random((4000, 3)) < 0.5, low, high)
     )
-    box = moved_box(TABLES.parameters, TABLES.table_origin, low, high)
+    box = moved_box(
+        PROBLEMS["airhockey-tables"].parameters,
+        PROBLEMS["airhockey-tables"].table_origin,
+        low,
+        high,
+    )
     assert (box[0] <= corners).all()
     assert (corners <= box[1]).all()
 
@@ -309,15 +343,15 @@ def test_values_are_checked_against_their_ranges() -> None:
     with pytest.raises(
         UsageError, match=r"payload_mass must be from 4 to 14, got 15 in row 1"
     ):
-        LOADS.parameters.checked(np.array([[5.0], [15.0]]))
+        PROBLEMS["heavy-object-loads"].parameters.checked(np.array([[5.0], [15.0]]))
     with pytest.raises(
         UsageError, match=r"velocity_factor must be from 0\.5 to 1, got nan"
     ):
-        TABLES.parameters.checked(np.array([0, 0, 0, np.nan]))
+        PROBLEMS["airhockey-tables"].parameters.checked(np.array([0, 0, 0, np.nan]))
     with pytest.raises(
         UsageError, match=r"shape \(N, 4\) for table_height, table_roll"
     ):
-        TABLES.parameters.checked(np.zeros((2, 3)))
+        PROBLEMS["airhockey-tables"].parameters.checked(np.zeros((2, 3)))
 
 
 @pytest.mark.parametrize(
@@ -346,9 +380,11 @@ def test_values_are_checked_against_their_ranges() -> None:
 def test_recipe_errors_in_ranges_are_named(
     tmp_path: Path, old: str, new: str, text: str
 ) -> None:
-    content = LOADS.path.read_text()
+    content = PROBLEMS["heavy-object-loads"].path.read_text()
     assert old in content
-    (tmp_path / "iiwa14_gripper.urdf").write_text(LOADS.urdf_text)
+    (tmp_path / "iiwa14_gripper.urdf").write_text(
+        PROBLEMS["heavy-object-loads"].urdf_text
+    )
     (tmp_path / "problem.toml").write_text(content.replace(old, new))
     with pytest.raises(RecipeError, match=text):
         load_problem(tmp_path / "problem.toml")
@@ -357,4 +393,4 @@ def test_recipe_errors_in_ranges_are_named(
 def test_a_problem_without_parameters_keeps_its_identity() -> None:
     assert "parameters" not in resolved(load_problem("airhockey"))
     assert load_problem("airhockey").scene_width == 4
-    assert TABLES.scene_width == 8
+    assert PROBLEMS["airhockey-tables"].scene_width == 8

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -18,37 +19,46 @@ from cnpgen.plans import make_plans, record_problem
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
-from cnpgen.problems.problem_record import as_problem, as_record, open_problem
+from cnpgen.problems.problem_record import (
+    ProblemRecord,
+    as_problem,
+    as_record,
+    open_problem,
+)
 from cnpgen.trajectory.boundary import Boundary
 from tests.conftest import some
 from tests.examples.shaped_robot import write_problem
+from tests.examples.shipped import PROBLEMS
 
 ROOT = Path(__file__).parents[2]
-HEAVY = load_problem("heavy-object")
-RECORD = record_problem(HEAVY)
+
+
+@cache
+def record() -> ProblemRecord:
+    return record_problem(PROBLEMS["heavy-object"])
 
 
 def test_a_record_is_rebuilt_once_and_its_urdf_stays() -> None:
-    problem = as_problem(RECORD)
-    assert problem is as_problem(RECORD)
-    assert problem.urdf_path.read_text() == RECORD.urdf
+    problem = as_problem(record())
+    assert problem is as_problem(record())
+    assert problem.urdf_path.read_text() == record().urdf
     assert (problem.name, problem.constraint, problem.obstacle) == (
-        HEAVY.name,
-        HEAVY.constraint,
-        HEAVY.obstacle,
+        PROBLEMS["heavy-object"].name,
+        PROBLEMS["heavy-object"].constraint,
+        PROBLEMS["heavy-object"].obstacle,
     )
-    assert as_record(problem).comparable_sha256 == RECORD.comparable_sha256
-    assert as_record(RECORD) is RECORD
+    assert as_record(problem).comparable_sha256 == record().comparable_sha256
+    assert as_record(record()) is record()
 
 
 @pytest.mark.parametrize("name", ["", " ", "joint-position 2"])
 def test_the_digest_of_a_record_with_an_unknown_constraint_exists_and_the_record_is_refused(
     name: str,
 ) -> None:
-    content = json.loads(RECORD.recipe)
+    content = json.loads(record().recipe)
     content["constraint"][1]["use"] = name
-    changed = replace(RECORD, recipe=json.dumps(content))
-    assert changed.comparable_sha256 != RECORD.comparable_sha256
+    changed = replace(record(), recipe=json.dumps(content))
+    assert changed.comparable_sha256 != record().comparable_sha256
     with pytest.raises(CnpgenError, match=f"constraint {name!r} is not installed"):
         as_problem(changed)
 
@@ -82,8 +92,8 @@ def test_a_name_or_a_file_leads_to_the_problem(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(ROOT)
-    assert as_problem(name) == HEAVY
-    assert as_problem(Path(name) if "/" in name else name) == HEAVY
+    assert as_problem(name) == PROBLEMS["heavy-object"]
+    assert as_problem(Path(name) if "/" in name else name) == PROBLEMS["heavy-object"]
 
 
 @pytest.mark.parametrize("name", ["airhockey-hit", "airhockey-replan", "airhockey"])
@@ -124,9 +134,11 @@ def test_what_leads_to_no_problem_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [None, 3, b"airhockey", [RECORD] * 50, {"problem": "x" * 5000}]
+    "wrong", [None, 3, b"airhockey", ["record"] * 50, {"problem": "x" * 5000}]
 )
 def test_what_is_no_problem_is_refused_in_few_words(wrong: object) -> None:
+    if isinstance(wrong, list):
+        wrong = [record()] * len(wrong)
     for use in (PlanLoss, BoundaryLayer, as_record):
         with pytest.raises(
             UsageError,
@@ -136,15 +148,18 @@ def test_what_is_no_problem_is_refused_in_few_words(wrong: object) -> None:
         assert len(str(caught.value)) < 200
 
 
-@pytest.mark.parametrize("given", some([RECORD, HEAVY, "heavy-object"], 1, "slow"))
+@pytest.mark.parametrize("form", some(["record", "problem", "name"], 1, "slow"))
 def test_everything_that_takes_a_problem_takes_what_plans_have_of_it(
-    given: Problem,
+    form: str,
 ) -> None:
+    given: ProblemRecord | Problem | str = "heavy-object"
+    if form != "name":
+        given = record() if form == "record" else PROBLEMS["heavy-object"]
     loss, omega = (
         PlanLoss(given, backend="numpy"),
         BoundaryLayer(given, projection_steps=0, backend="numpy"),
     )  # for two plans
-    q = np.tile(HEAVY.robot.home, (2, 1))
+    q = np.tile(PROBLEMS["heavy-object"].robot.base, (2, 1))
     zero = np.zeros_like(q)
     tasks = omega.tasks(Boundary(q, zero, zero, q + 0.1, zero))
     phi, log_rate = np.zeros((2, omega.path_outputs)), np.zeros((2, omega.rate_outputs))
@@ -155,7 +170,7 @@ def test_everything_that_takes_a_problem_takes_what_plans_have_of_it(
     np.testing.assert_array_equal(obstacle_poses, tasks.scene.poses)
     arrays = plans.path_control_points, plans.rate_control_points
     found = loss(*arrays, weights=loss.weights0, obstacle_poses=obstacle_poses)
-    expected = PlanLoss(HEAVY, backend="numpy")(
+    expected = PlanLoss(PROBLEMS["heavy-object"], backend="numpy")(
         *arrays, weights=loss.weights0, obstacle_poses=obstacle_poses
     )
     np.testing.assert_array_equal(found.total, expected.total)
@@ -168,13 +183,16 @@ def test_everything_that_takes_a_problem_takes_what_plans_have_of_it(
     assert (
         again.problem.comparable_sha256
         == plans.problem.comparable_sha256
-        == RECORD.comparable_sha256
+        == record().comparable_sha256
     )
 
 
 def test_a_loss_of_a_record_can_be_sent_to_other_processes() -> None:
-    assert pickle.loads(pickle.dumps(PlanLoss(RECORD))).terms == PlanLoss(HEAVY).terms
+    assert (
+        pickle.loads(pickle.dumps(PlanLoss(record()))).terms
+        == PlanLoss(PROBLEMS["heavy-object"]).terms
+    )
 
 
 def test_a_record_is_written_in_few_words() -> None:
-    assert repr(RECORD) == "<ProblemRecord of 'heavy-object': 7 joints>"
+    assert repr(record()) == "<ProblemRecord of 'heavy-object': 7 joints>"

@@ -1,6 +1,7 @@
 """The constraint between mallet and puck: its forms, the geometry of legal contacts, and tip paths around the puck."""
 
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 
 import casadi as ca
@@ -17,18 +18,21 @@ from cnpgen.problems.constraints.puck_contact import (
     TRAINING_MARGIN_M,
     PuckContact,
 )
-from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.world.measured_parameters import MeasuredParameters
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
+from tests.examples.shipped import PROBLEMS, ROBOTS
 
-AIRHOCKEY = load_problem("airhockey")
-ROBOT = load_robot(AIRHOCKEY)
-CONTACT = AIRHOCKEY.first(PuckContact)
-assert CONTACT is not None
-RADII = CONTACT.contact_range
+
+@cache
+def contact() -> PuckContact:
+    found = PROBLEMS["airhockey"].first(PuckContact)
+    assert found is not None
+    return found
+
+
 HIT = np.array([np.cos(0.3), np.sin(0.3)])  # direction of the hit
 GOAL = np.array([1.0, 0.1])
 SCENE = np.array([*GOAL, *(GOAL + 0.07 * HIT)])
@@ -40,9 +44,9 @@ def violation(points: np.ndarray) -> np.ndarray:
     class Tip:
         tip_position = np.column_stack([points, np.full(len(points), 0.16)]).T
         scene_values = SCENE
-        parameters = MeasuredParameters(ROBOT)
+        parameters = MeasuredParameters(ROBOTS["airhockey"])
 
-    (condition,) = CONTACT.measured(Tip())
+    (condition,) = contact().measured(Tip())
     return condition.lower[0] - condition.g[0]
 
 
@@ -55,31 +59,33 @@ def test_symbolic_and_measured_forms_agree(form):
         [column for column, _ in names],
         [scalars for _, scalars in names],
     )
-    state = SymbolicState(ROBOT, q, dq, ddq, values, (), None)
+    state = SymbolicState(ROBOTS["airhockey"], q, dq, ddq, values, (), None)
     (symbolic,) = (
-        CONTACT.symbolic(state)
+        contact().symbolic(state)
         if form == "motion"
-        else CONTACT.symbolic_at(state, "start")
+        else contact().symbolic_at(state, "start")
     )
-    function, world = ca.Function("g", columns, symbolic.g), World(ROBOT)
+    function, world = ca.Function("g", columns, symbolic.g), World(ROBOTS["airhockey"])
     random, rest = np.random.default_rng(5), np.zeros(6)
     for _ in range(50):
-        q_now = ROBOT.home + random.normal(scale=0.1, size=6)
+        q_now = ROBOTS["airhockey"].home + random.normal(scale=0.1, size=6)
         world.set_state(q_now, rest, rest, np.empty(0))
         goal = world.tip_position[:2] + random.normal(scale=0.02, size=2)
         values_now = np.concatenate([goal, goal + 0.07 * HIT])
         world.set_state(q_now, rest, rest, values_now)
         (measured,) = (
-            CONTACT.solved(world)
+            contact().solved(world)
             if form == "motion"
-            else CONTACT.measured_at(world, "start")
+            else contact().measured_at(world, "start")
         )
         np.testing.assert_allclose(
             float(function(q_now, rest, rest, values_now)), measured.g[0], atol=1e-9
         )
         np.testing.assert_array_equal(symbolic.lower, measured.lower)
     assert (
-        CONTACT.symbolic_at(state, "goal") == CONTACT.measured_at(world, "goal") == ()
+        contact().symbolic_at(state, "goal")
+        == contact().measured_at(world, "goal")
+        == ()
     )
 
 
@@ -87,21 +93,29 @@ def test_the_training_form_grows_linearly_with_a_large_violation():
     names = [symbols(name, 6) for name in ("q", "dq", "ddq")] + [
         symbols("obstacle_poses", 4)
     ]
-    state = SymbolicState(ROBOT, *(scalars for _, scalars in names), (), None)
-    (penalized,) = CONTACT.penalized(state)
+    state = SymbolicState(
+        ROBOTS["airhockey"], *(scalars for _, scalars in names), (), None
+    )
+    (penalized,) = contact().penalized(state)
     function, rest = (
         ca.Function("g", [names[0][0], names[3][0]], penalized.g),
         np.zeros(6),
     )
-    world = World(ROBOT)
-    world.set_state(ROBOT.home, rest, rest, np.empty(0))
+    world = World(ROBOTS["airhockey"])
+    world.set_state(ROBOTS["airhockey"].home, rest, rest, np.empty(0))
     tip = world.tip_position[:2]
     violations = []
     for distance in (0.03, 0.06, 0.2):
         puck = np.add(tip, [0.0, distance])
-        found = float(function(ROBOT.home, np.concatenate([puck - 0.07 * HIT, puck])))
+        found = float(
+            function(
+                ROBOTS["airhockey"].home, np.concatenate([puck - 0.07 * HIT, puck])
+            )
+        )
         violations.append(max(0.0, penalized.lower[0] - found))
-        exact = max(0.0, RADII + ADDED_RADIUS_M + TRAINING_MARGIN_M - distance)
+        exact = max(
+            0.0, contact().contact_range + ADDED_RADIUS_M + TRAINING_MARGIN_M - distance
+        )
         assert violations[-1] == pytest.approx(
             exact / np.sqrt(1 + exact / TRAINING_KNEE_M), abs=3e-4
         )
@@ -122,15 +136,15 @@ def test_legal_contacts_are_near_the_goal_and_behind_the_puck():
     ).reshape(-1, 2)
     points, puck = GOAL + offsets, SCENE[2:]
     legal_contact = (violation(points) <= 0) & (
-        np.linalg.norm(points - puck, axis=1) < RADII
+        np.linalg.norm(points - puck, axis=1) < contact().contact_range
     )
     assert legal_contact.sum() > 100
     from_goal = np.linalg.norm(offsets[legal_contact], axis=1)
-    deep = (violation(points) <= CONTACT.tolerance) & (
-        np.linalg.norm(points - puck, axis=1) < RADII - 5e-5
+    deep = (violation(points) <= contact().tolerance) & (
+        np.linalg.norm(points - puck, axis=1) < contact().contact_range - 5e-5
     )
-    assert np.linalg.norm(offsets[deep], axis=1).max() <= CONTACT.last
-    assert from_goal.max() <= CONTACT.last + 1e-3
+    assert np.linalg.norm(offsets[deep], axis=1).max() <= contact().last
+    assert from_goal.max() <= contact().last + 1e-3
     towards = (puck - points[legal_contact]) / np.linalg.norm(
         puck - points[legal_contact], axis=1
     )[:, None]
@@ -151,7 +165,7 @@ def test_the_puck_follows_from_the_goal_and_is_out_of_reach_without_a_hit():
         np.array([[1.0, 0.1, 0.16]] * 2),
         np.array([[0.6, -0.8, 0.0], [0.0, 0.0, 0.0]]),
     )
-    scene = scene_of(AIRHOCKEY, goal, goal, velocity)
+    scene = scene_of(PROBLEMS["airhockey"], goal, goal, velocity)
     np.testing.assert_allclose(
         scene.poses[0], [1.0, 0.1, 1.0 + 0.07 * 0.6, 0.1 - 0.07 * 0.8]
     )
@@ -159,22 +173,22 @@ def test_the_puck_follows_from_the_goal_and_is_out_of_reach_without_a_hit():
     with pytest.raises(
         UsageError, match="goal_velocity is missing: the problem 'airhockey' needs it"
     ):
-        scene_of(AIRHOCKEY, goal, goal)
+        scene_of(PROBLEMS["airhockey"], goal, goal)
 
 
 def test_goal_velocities_equal_finite_differences():
     random = np.random.default_rng(2)
     q, dq = (
-        ROBOT.home + random.normal(scale=0.2, size=(5, 6)),
+        ROBOTS["airhockey"].home + random.normal(scale=0.2, size=(5, 6)),
         random.normal(size=(5, 6)),
     )
-    world, step = PathWorld(ROBOT), 1e-6
+    world, step = PathWorld(ROBOTS["airhockey"]), 1e-6
     tips = []
     for moved in (q + step * dq, q - step * dq):
         world.set_path(moved.T, moved.T, moved.T, np.empty(0))
         tips.append(world.tip_position.T.copy())
     np.testing.assert_allclose(
-        goal_velocities(AIRHOCKEY, ROBOT, q, dq),
+        goal_velocities(PROBLEMS["airhockey"], ROBOTS["airhockey"], q, dq),
         (tips[0] - tips[1]) / (2 * step),
         atol=1e-7,
     )
@@ -184,7 +198,7 @@ def test_tip_paths_go_around_the_puck_and_end_along_the_hit():
     puck = SCENE[2:]
     for angle in np.linspace(-np.pi, np.pi, 40):
         start = puck + 0.25 * np.array([np.cos(angle), np.sin(angle)])
-        paths = CONTACT.initial_tip_paths(SCENE, np.array([*start, 0.16]))
+        paths = contact().initial_tip_paths(SCENE, np.array([*start, 0.16]))
         behind = np.cos(angle - 0.3) < -0.5  # more than 120 degrees from the hit
         assert len(paths) == 0 if behind else len(paths) in {0, 2}
         for path in paths:
@@ -192,12 +206,15 @@ def test_tip_paths_go_around_the_puck_and_end_along_the_hit():
                 :, :2
             ]
             outside = np.linalg.norm(dense - GOAL, axis=1) > 0.011
-            assert np.linalg.norm(dense[outside] - puck, axis=1).min() > RADII - 1e-4
+            assert (
+                np.linalg.norm(dense[outside] - puck, axis=1).min()
+                > contact().contact_range - 1e-4
+            )
             np.testing.assert_allclose(path[0], [*start, 0.16])
             np.testing.assert_allclose(path[-1, :2], GOAL)
             last = path[-1, :2] - path[-2, :2]
             np.testing.assert_allclose(last / np.linalg.norm(last), HIT, atol=1e-9)
-    both = CONTACT.initial_tip_paths(
+    both = contact().initial_tip_paths(
         SCENE, np.array([*(puck + 0.2 * HIT + 0.01), 0.16])
     )
     lengths = [np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in both]
@@ -210,13 +227,17 @@ def test_tip_paths_go_around_the_puck_and_end_along_the_hit():
     ('contact_distance = "7 cm"', 'contact_distance = "6 cm"', "by less than 'last', 0.01 m"),
 ])  # fmt: skip
 def test_inconsistent_distances_are_refused(tmp_path, old, new, expected):
-    text = AIRHOCKEY.path.read_text(encoding="utf-8").replace(old, new)
+    text = PROBLEMS["airhockey"].path.read_text(encoding="utf-8").replace(old, new)
     (tmp_path / "problem.toml").write_text(text, encoding="utf-8")
-    (tmp_path / "iiwa14_striker.urdf").write_bytes(AIRHOCKEY.urdf_path.read_bytes())
+    (tmp_path / "iiwa14_striker.urdf").write_bytes(
+        PROBLEMS["airhockey"].urdf_path.read_bytes()
+    )
     with pytest.raises(RecipeError, match=expected):
         load_problem(tmp_path / "problem.toml")
 
 
 def test_a_problem_has_at_most_one_constraint_with_values_of_each_motion(tmp_path):
-    twice = replace(AIRHOCKEY, constraint=(*AIRHOCKEY.constraint, CONTACT))
+    twice = replace(
+        PROBLEMS["airhockey"], constraint=(*PROBLEMS["airhockey"].constraint, contact())
+    )
     assert [key for key, _ in twice.validate()] == ["constraint"]

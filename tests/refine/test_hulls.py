@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.optimize import brentq
+import scipy
 
 from cnpgen.kernels.collision.collision_checker import load_collision_library
 from cnpgen.kernels.collision.tree_search import TreeSettings
@@ -266,7 +266,7 @@ def test_an_end_within_the_tolerance_of_a_contact_is_accepted(tmp_path):
         world.set_state(np.array([0.0, lift, 0.9, 0.0]), zero, zero, poses)
         return min(world.object_distances()) + 0.003
 
-    lift = brentq(depth, -0.7, -0.3)
+    lift = scipy.optimize.brentq(depth, -0.7, -0.3)
     task = between(problem, np.array([[-0.8, lift, 0.9, 0.0], [0.8, lift, 0.9, 0.0]]))
     found = refine_task(
         tool, PlanChecker(problem, robot, degree=tool.spec.degree), task

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.interpolate import BSpline
+import scipy
 
 from cnpgen.addons.online.plan_hits import plan_hits
 from cnpgen.planner.planner import Planner
@@ -31,7 +31,10 @@ def depth_of_early_contact(plans: Plans, pucks: np.ndarray) -> np.ndarray:
             np.zeros(8), np.arange(1, len(path) - 7) / (len(path) - 7), np.ones(8)
         ]
         tip = np.array(
-            [arm.pose(q).translation[:2].copy() for q in BSpline(knots, path, 7)(s)]
+            [
+                arm.pose(q).translation[:2].copy()
+                for q in scipy.interpolate.BSpline(knots, path, 7)(s)
+            ]
         )
         left = np.append(
             np.cumsum(np.linalg.norm(np.diff(tip, axis=0), axis=1)[::-1])[::-1], 0.0

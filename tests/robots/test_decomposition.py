@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial import ConvexHull, Delaunay
-from scipy.spatial.transform import Rotation
+import scipy
 
 from cnpgen.errors import RecipeError
 from cnpgen.problems.load_robot import load_robot
@@ -21,7 +20,7 @@ from cnpgen.robots.shape.decomposition import (
     cut_parts,
 )
 from cnpgen.robots.shape.hull import hull_corners
-from tests.examples.shaped_robot import CHANNEL, box, stl, write_problem
+from tests.examples.shaped_robot import box, channel, stl, write_problem
 
 
 def covered(points: np.ndarray, parts: list[np.ndarray]) -> np.ndarray:
@@ -29,11 +28,14 @@ def covered(points: np.ndarray, parts: list[np.ndarray]) -> np.ndarray:
     grown = [
         part.mean(axis=0) + (part - part.mean(axis=0)) * (1 + 1e-6) for part in parts
     ]
-    return np.any([Delaunay(part).find_simplex(points) >= 0 for part in grown], axis=0)
+    return np.any(
+        [scipy.spatial.Delaunay(part).find_simplex(points) >= 0 for part in grown],
+        axis=0,
+    )
 
 
 def volume(parts: list[np.ndarray]) -> float:
-    return sum(ConvexHull(part).volume for part in parts)
+    return sum(scipy.spatial.ConvexHull(part).volume for part in parts)
 
 
 def on_triangles(triangles: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -51,19 +53,25 @@ def as_mesh(triangles: np.ndarray) -> TriangleMesh:
 
 def slanted(angle: float) -> np.ndarray:
     """The triangles of the channel, turned about x and z."""
-    return CHANNEL @ Rotation.from_euler("xz", [angle, angle]).as_matrix().T
+    return (
+        channel()
+        @ scipy.spatial.transform.Rotation.from_euler("xz", [angle, angle])
+        .as_matrix()
+        .T
+    )
 
 
-@pytest.mark.parametrize(
-    "triangles", [CHANNEL, slanted(0.5)], ids=["along the axes", "slanted"]
-)
-def test_every_point_of_a_mesh_is_in_a_part(triangles):
+@pytest.mark.parametrize("angle", [0.0, 0.5], ids=["along the axes", "slanted"])
+def test_every_point_of_a_mesh_is_in_a_part(angle):
+    triangles = slanted(angle)
     parts = [
         hull_corners(part.used_points) for part in cut_parts(as_mesh(triangles), 8)
     ]
     assert 3 <= len(parts) <= 8
     assert covered(on_triangles(triangles, np.random.default_rng(1)), parts).all()
-    assert volume(parts) < 0.75 * ConvexHull(triangles.reshape(-1, 3)).volume
+    assert (
+        volume(parts) < 0.75 * scipy.spatial.ConvexHull(triangles.reshape(-1, 3)).volume
+    )
 
 
 def test_a_cut_keeps_every_triangle_on_its_side():
@@ -92,8 +100,8 @@ def channel_problem(folder: Path, more: str = "") -> Problem:
     file = write_problem(folder)
     (folder / "crane" / "channel.stl").write_bytes(
         stl(
-            CHANNEL.reshape(-1, 3),
-            [(k, k + 1, k + 2) for k in range(0, 3 * len(CHANNEL), 3)],
+            channel().reshape(-1, 3),
+            [(k, k + 1, k + 2) for k in range(0, 3 * len(channel()), 3)],
         )
     )
     urdf = folder / "crane" / "crane.urdf"

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+import scipy
 
 from cnpgen.errors import RecipeError
 from cnpgen.problems.obstacles import scene_of
@@ -128,14 +128,18 @@ def test_kinds_are_where_their_keys_say(tmp_path: Path) -> None:
         problem.obstacle, place_obstacles(problem.obstacle)
     )
     assert pose_width(problem.obstacle) == 15 + 4 + 7 + 7 + 12
-    turn = Rotation.from_euler("xyz", [0, 0, 20], degrees=True).as_matrix()
+    turn = scipy.spatial.transform.Rotation.from_euler(
+        "xyz", [0, 0, 20], degrees=True
+    ).as_matrix()
     corner = np.array([0.5, 0.0, 0.15]) + turn @ [0.05, 0.25, 0.15]
     assert np.linalg.norm(wall.position + wall.corners - corner, axis=1).min() < 1e-12
     assert (ball.corners.tolist(), ball.radius) == ([[0, 0, 0]], 0.08)
     np.testing.assert_allclose([post.low[2], post.high[2]], [0, 0.6], atol=1e-12)
     assert 0.05 <= (post.high - post.position)[0] < 0.05 * 1.002
     np.testing.assert_allclose([pipe.low[1], pipe.high[1]], [-0.54, 0.54], atol=1e-12)
-    turn = Rotation.from_euler("xyz", [0, -60, 30], degrees=True).as_matrix()
+    turn = scipy.spatial.transform.Rotation.from_euler(
+        "xyz", [0, -60, 30], degrees=True
+    ).as_matrix()
     expected = 1e-3 * WEDGE @ turn.T + [0.2, 0.55, 0.1]
     for corner in wedge.position + wedge.corners:
         assert np.linalg.norm(expected - corner, axis=1).min() < 1e-8

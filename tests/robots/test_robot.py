@@ -11,10 +11,7 @@ import pytest
 from cnpgen.errors import RecipeError
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_file import load_problem
-
-HEAVY = load_problem("heavy-object")
-AIRHOCKEY = load_problem("airhockey")
+from tests.examples.shipped import PROBLEMS
 
 
 def changed(problem: Problem, **robot: Any) -> Problem:
@@ -23,10 +20,13 @@ def changed(problem: Problem, **robot: Any) -> Problem:
 
 def with_urdf(folder: Path, old: str, new: str) -> Problem:
     """Heavy object with the first ``old`` of its URDF replaced."""
-    text = HEAVY.urdf_path.read_text()
+    text = PROBLEMS["heavy-object"].urdf_path.read_text()
     assert old in text
     (folder / "changed.urdf").write_text(text.replace(old, new, 1))
-    return changed(replace(HEAVY, path=folder / "problem.toml"), urdf="changed.urdf")
+    return changed(
+        replace(PROBLEMS["heavy-object"], path=folder / "problem.toml"),
+        urdf="changed.urdf",
+    )
 
 
 def mistake_of(problem: Problem) -> str:
@@ -36,10 +36,9 @@ def mistake_of(problem: Problem) -> str:
     return error
 
 
-@pytest.mark.parametrize(
-    "problem", [AIRHOCKEY, HEAVY], ids=lambda problem: problem.name
-)
-def test_limits_are_those_of_the_urdf_scaled(problem):
+@pytest.mark.parametrize("name", ["airhockey", "heavy-object"])
+def test_limits_are_those_of_the_urdf_scaled(name):
+    problem = PROBLEMS[name]
     robot, model = load_robot(problem), load_robot(problem).model
     assert robot.n == len(problem.robot.joints) == model.nq
     np.testing.assert_allclose(
@@ -54,14 +53,18 @@ def test_limits_are_those_of_the_urdf_scaled(problem):
     np.testing.assert_allclose(
         robot.torque_limit, 0.8 * np.array(model.effortLimit), rtol=1e-15
     )
-    np.testing.assert_array_equal(robot.home, problem.robot.home)
+    np.testing.assert_array_equal(robot.home, problem.robot.base)
 
 
 def test_acceleration_limit_is_the_rate_times_the_velocity_limit_up_to_the_cap():
     robot = load_robot(
         replace(
-            HEAVY,
-            limits=replace(HEAVY.limits, acceleration_rate=10.0, acceleration_cap=15.0),
+            PROBLEMS["heavy-object"],
+            limits=replace(
+                PROBLEMS["heavy-object"].limits,
+                acceleration_rate=10.0,
+                acceleration_cap=15.0,
+            ),
         )
     )
     np.testing.assert_allclose(
@@ -82,7 +85,7 @@ def test_position_scale_narrows_limits_about_their_center(tmp_path):
 
 
 def test_capsule_axes_of_the_heavy_object_are_shoulder_elbow_wrist_object():
-    robot = load_robot(HEAVY)
+    robot = load_robot(PROBLEMS["heavy-object"])
     assert robot.capsule_axes == ((1, 3), (3, 5), (5, 7))
     model, data = robot.model, robot.model.createData()
     pin.framesForwardKinematics(model, data, np.linspace(-1, 1, 7))
@@ -95,33 +98,42 @@ def test_capsule_axes_of_the_heavy_object_are_shoulder_elbow_wrist_object():
 
 
 def test_capsule_axes_end_at_the_tip_where_joint_7_is_locked():
-    robot = load_robot(AIRHOCKEY)
+    robot = load_robot(PROBLEMS["airhockey"])
     assert robot.capsule_axes == ((1, 3), (3, 5), (5, 6))
     assert robot.n == 6
 
 
 def test_locked_inner_joints_leave_angled_capsule_axes():
-    joints = tuple(name for name in HEAVY.robot.joints if name != "joint_4")
-    robot = load_robot(changed(HEAVY, joints=joints, base=(0.0,) * 6))
+    joints = tuple(
+        name for name in PROBLEMS["heavy-object"].robot.joints if name != "joint_4"
+    )
+    robot = load_robot(
+        changed(PROBLEMS["heavy-object"], joints=joints, base=(0.0,) * 6)
+    )
     assert robot.joint_names == joints
     assert robot.chain.joints[3].mass > 0
     assert robot.capsule_axes[-1][1] == robot.n
 
 
 def test_unknown_joint_is_named_with_the_nearest_one():
-    error = mistake_of(changed(HEAVY, joints=("joint1", *HEAVY.robot.joints[1:])))
-    assert error.startswith(f"{HEAVY.path}: robot.joints: ")
+    error = mistake_of(
+        changed(
+            PROBLEMS["heavy-object"],
+            joints=("joint1", *PROBLEMS["heavy-object"].robot.joints[1:]),
+        )
+    )
+    assert error.startswith(f"{PROBLEMS['heavy-object'].path}: robot.joints: ")
     assert "'joint1' (did you mean 'joint_1'?)" in error
 
 
 def test_unknown_tip_is_named_with_the_nearest_one():
-    error = mistake_of(changed(HEAVY, tip="objekt"))
-    assert error.startswith(f"{HEAVY.path}: robot.tip: ")
+    error = mistake_of(changed(PROBLEMS["heavy-object"], tip="objekt"))
+    assert error.startswith(f"{PROBLEMS['heavy-object'].path}: robot.tip: ")
     assert "'objekt' (did you mean 'object'?)" in error
 
 
 def test_tip_must_be_behind_the_last_planned_joint():
-    error = mistake_of(changed(HEAVY, tip="link_4"))
+    error = mistake_of(changed(PROBLEMS["heavy-object"], tip="link_4"))
     assert (
         "robot.tip: frame 'link_4' is not moved by the last planned joint 'joint_7'"
         in error
@@ -129,19 +141,25 @@ def test_tip_must_be_behind_the_last_planned_joint():
 
 
 def test_joints_must_be_in_the_order_of_the_urdf():
-    error = mistake_of(changed(HEAVY, joints=HEAVY.robot.joints[::-1]))
+    error = mistake_of(
+        changed(
+            PROBLEMS["heavy-object"], joints=PROBLEMS["heavy-object"].robot.joints[::-1]
+        )
+    )
     assert "robot.joints: must be in the URDF's order ['joint_1', 'joint_2'," in error
     assert "got ['joint_7', 'joint_6'," in error
 
 
 def test_base_needs_one_value_per_joint():
     assert "robot.base: needs 7 values, one per planned joint, got 6" in mistake_of(
-        changed(HEAVY, base=(0.0,) * 6)
+        changed(PROBLEMS["heavy-object"], base=(0.0,) * 6)
     )
 
 
 def test_base_outside_its_limits_names_the_joint_that_is_furthest_out():
-    error = mistake_of(changed(HEAVY, base=(0.0, 2.2, 0.0, -2.5, 0.0, 0.0, 0.0)))
+    error = mistake_of(
+        changed(PROBLEMS["heavy-object"], base=(0.0, 2.2, 0.0, -2.5, 0.0, 0.0, 0.0))
+    )
     assert (
         "robot.base: joint_4 = -2.5 rad is outside its planning limits [-2.0944, 2.0944]"
         in error
@@ -150,28 +168,34 @@ def test_base_outside_its_limits_names_the_joint_that_is_furthest_out():
 
 def test_a_tip_below_the_table_is_a_mistake_with_its_height():
     table = next(
-        each for each in AIRHOCKEY.constraint if type(each).__name__ == "Table"
+        each
+        for each in PROBLEMS["airhockey"].constraint
+        if type(each).__name__ == "Table"
     )
     lifted = tuple(
         replace(each, z=1.0, start_band=0.01) if each is table else each
-        for each in AIRHOCKEY.constraint
+        for each in PROBLEMS["airhockey"].constraint
     )
-    found = mistake_of(replace(AIRHOCKEY, constraint=lifted))
+    found = mistake_of(replace(PROBLEMS["airhockey"], constraint=lifted))
     assert (
         "robot.base: the tip is 0.84 m below the table, at z = 0.16 m, expected 1 m or more"
         in found
     )
     above = tuple(
         replace(each, z=0.165, start_band=0.01) if each is table else each
-        for each in AIRHOCKEY.constraint
+        for each in PROBLEMS["airhockey"].constraint
     )
-    load_robot(replace(AIRHOCKEY, constraint=above))  # as far off as motions may start
+    load_robot(
+        replace(PROBLEMS["airhockey"], constraint=above)
+    )  # as far off as motions may start
 
 
 def test_base_on_its_limit_is_inside():
-    robot = load_robot(HEAVY)
+    robot = load_robot(PROBLEMS["heavy-object"])
     assert (
-        load_robot(changed(HEAVY, base=tuple(robot.position_upper))).home[0]
+        load_robot(
+            changed(PROBLEMS["heavy-object"], base=tuple(robot.position_upper))
+        ).home[0]
         == robot.position_upper[0]
     )
 
@@ -265,7 +289,7 @@ def test_joints_that_mimic_others_and_would_stand_elsewhere_are_refused(
 
 def test_a_joint_that_mimics_another_cannot_be_planned(tmp_path):
     mimic = '<mimic joint="joint_2"/>\n<axis'
-    urdf = HEAVY.urdf_path.read_text()
+    urdf = PROBLEMS["heavy-object"].urdf_path.read_text()
     at = urdf.index("<axis", urdf.index('name="joint_5"'))
     problem = with_urdf(tmp_path, urdf[at - 40 : at + 5], urdf[at - 40 : at] + mimic)
     assert "'joint_5' mimics 'joint_2' and cannot be planned by itself" in mistake_of(
@@ -289,7 +313,13 @@ def test_continuous_joint_that_is_locked_is_no_obstacle(tmp_path):
         tmp_path, 'name="joint_7" type="revolute"', 'name="joint_7" type="continuous"'
     )
     assert (
-        load_robot(changed(problem, joints=HEAVY.robot.joints[:6], base=(0.0,) * 6)).n
+        load_robot(
+            changed(
+                problem,
+                joints=PROBLEMS["heavy-object"].robot.joints[:6],
+                base=(0.0,) * 6,
+            )
+        ).n
         == 6
     )
 
@@ -298,7 +328,8 @@ def test_continuous_joint_that_is_locked_is_no_obstacle(tmp_path):
 def test_file_that_is_no_urdf_is_named(tmp_path, text):
     (tmp_path / "broken.urdf").write_text(text)
     problem = changed(
-        replace(HEAVY, path=tmp_path / "problem.toml"), urdf="broken.urdf"
+        replace(PROBLEMS["heavy-object"], path=tmp_path / "problem.toml"),
+        urdf="broken.urdf",
     )
     assert (
         f"{tmp_path / 'broken.urdf'}: not a URDF that Pinocchio can read"
@@ -307,4 +338,6 @@ def test_file_that_is_no_urdf_is_named(tmp_path, text):
 
 
 def test_missing_urdf_is_named():
-    assert "absent.urdf: no such file" in mistake_of(changed(HEAVY, urdf="absent.urdf"))
+    assert "absent.urdf: no such file" in mistake_of(
+        changed(PROBLEMS["heavy-object"], urdf="absent.urdf")
+    )

@@ -8,7 +8,7 @@ from pathlib import Path
 import coal
 import numpy as np
 import pytest
-from scipy.spatial import ConvexHull, KDTree
+import scipy
 
 from cnpgen.errors import RecipeError
 from cnpgen.problems.load_robot import load_robot
@@ -213,22 +213,27 @@ def test_only_meshes_of_a_bounded_size_are_given_to_their_reader(tmp_path, monke
 def test_a_mesh_too_fine_is_replaced_by_a_body_that_contains_it(tmp_path):
     fine = np.random.default_rng(1).normal(size=(12_000, 3))
     fine *= [[0.05, 0.03, 0.1]] / np.linalg.norm(fine, axis=1, keepdims=True)
-    assert len(ConvexHull(fine).vertices) > 10_000
+    assert len(scipy.spatial.ConvexHull(fine).vertices) > 10_000
     (tmp_path / "fine.stl").write_bytes(
-        stl(fine, [tuple(side) for side in ConvexHull(fine).simplices.tolist()])
+        stl(
+            fine,
+            [tuple(side) for side in scipy.spatial.ConvexHull(fine).simplices.tolist()],
+        )
     )
     with pytest.warns(
         RuntimeWarning,
         match=r"fine.stl: a hull of the mesh has 12,000 corners.* at most 0.\d+ mm",
     ):
         corners = corners_of(inline_mesh(tmp_path / "fine.stl", np.ones(3)))
-    equations = ConvexHull(corners).equations
+    equations = scipy.spatial.ConvexHull(corners).equations
     assert (
         fine @ equations[:, :3].T + equations[:, 3]
     ).max() < 1e-8  # STL has numbers of 32 bits
     assert len(corners) <= 4_000
     body, bound = enclosing_hull(fine)
-    distance = np.linalg.norm(body - fine[KDTree(fine).query(body)[1]], axis=1).max()
+    distance = np.linalg.norm(
+        body - fine[scipy.spatial.KDTree(fine).query(body)[1]], axis=1
+    ).max()
     assert np.linalg.norm(body / [0.05, 0.03, 0.1], axis=1).max() - 1 < 3e-3
     assert 0 < bound < min(distance, 3e-4)
 

@@ -15,15 +15,17 @@ from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import open_problem, record_problem
 from cnpgen.robots.urdf import MAX_DEPTH, MAX_URDF_BYTES, read_urdf, urdf_tree
 from cnpgen.world.world import World
+from tests.examples.shipped import PROBLEMS
 
-SHIPPED = load_problem("heavy-object")
 LIMIT = '<limit lower="-1" upper="1" velocity="1" effort="1"/>'
 
 
 def problem_with(folder: Path, urdf: str | bytes) -> Path:
     """A problem file beside a URDF."""
-    text = SHIPPED.path.read_text(encoding="utf-8").replace(
-        f'"{SHIPPED.robot.urdf}"', '"robot.urdf"'
+    text = (
+        PROBLEMS["heavy-object"]
+        .path.read_text(encoding="utf-8")
+        .replace(f'"{PROBLEMS["heavy-object"].robot.urdf}"', '"robot.urdf"')
     )
     (folder / "problem.toml").write_text(text, encoding="utf-8")
     (folder / "robot.urdf").write_bytes(
@@ -33,7 +35,7 @@ def problem_with(folder: Path, urdf: str | bytes) -> Path:
 
 
 def shipped_with(*changes: tuple[str, str]) -> str:
-    text = SHIPPED.urdf_text
+    text = PROBLEMS["heavy-object"].urdf_text
     for old, new in changes:
         assert old in text
         text = text.replace(old, new)
@@ -78,7 +80,7 @@ def test_what_no_robot_needs_is_a_mistake_in_the_recipe(
 
 
 def test_so_it_is_in_the_record_of_a_problem() -> None:
-    record = record_problem(SHIPPED)
+    record = record_problem(PROBLEMS["heavy-object"])
     long = type(record)(record.recipe, chain(5000))
     with pytest.raises(RecipeError, match="it has 5,001 links"):
         open_problem(long)
@@ -116,7 +118,7 @@ def test_what_is_no_file_is_not_read(tmp_path: Path, what: str) -> None:
 def test_an_offset_with_a_comma_is_no_number(tmp_path: Path) -> None:
     mimic = '<mimic joint="other" offset="0,5"/>'
     finger = f'<link name="f"/><joint name="finger" type="revolute"><parent link="iiwa_link_1"/><child link="f"/>{LIMIT}'
-    link = SHIPPED.urdf_text.split('<link name="')[1].split('"')[0]
+    link = PROBLEMS["heavy-object"].urdf_text.split('<link name="')[1].split('"')[0]
     urdf = shipped_with(
         ("</robot>", f"{finger.replace('iiwa_link_1', link)}{mimic}</joint></robot>")
     )
@@ -129,13 +131,21 @@ def test_an_offset_with_a_comma_is_no_number(tmp_path: Path) -> None:
 
 def test_a_link_may_have_the_name_of_its_joint(tmp_path: Path) -> None:
     """The tip is the frame of the link; the numbers are those of the robot whose names differ."""
-    usual = load_robot(SHIPPED)
-    last, joint = SHIPPED.robot.tip, usual.model.frames[usual.tip_frame].name
+    usual = load_robot(PROBLEMS["heavy-object"])
+    last, joint = (
+        PROBLEMS["heavy-object"].robot.tip,
+        usual.model.frames[usual.tip_frame].name,
+    )
     assert joint == last
     names = [
-        part.split('"')[0] for part in SHIPPED.urdf_text.split('<joint name="')[1:]
+        part.split('"')[0]
+        for part in PROBLEMS["heavy-object"].urdf_text.split('<joint name="')[1:]
     ]
-    fixed = next(name for name in reversed(names) if name not in SHIPPED.robot.joints)
+    fixed = next(
+        name
+        for name in reversed(names)
+        if name not in PROBLEMS["heavy-object"].robot.joints
+    )
     problem = load(
         problem_with(
             tmp_path, shipped_with((f'<joint name="{fixed}"', f'<joint name="{last}"'))
@@ -143,7 +153,12 @@ def test_a_link_may_have_the_name_of_its_joint(tmp_path: Path) -> None:
     )
     robot = load_robot(problem)
     worlds = [
-        World(each, SHIPPED.obstacle, SHIPPED.object_size) for each in (usual, robot)
+        World(
+            each,
+            PROBLEMS["heavy-object"].obstacle,
+            PROBLEMS["heavy-object"].object_size,
+        )
+        for each in (usual, robot)
     ]
     q = np.linspace(-0.5, 0.5, 7)
     for world in worlds:

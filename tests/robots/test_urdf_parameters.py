@@ -16,8 +16,8 @@ from cnpgen.problems.problem_record import ProblemRecord, open_problem, record_p
 from cnpgen.robots.urdf_parameters import urdf_parameters
 from tests.examples.plan_files import plans_of
 from tests.examples.plans import load as stored_plan
+from tests.examples.shipped import PROBLEMS
 
-SHIPPED = load_problem("heavy-object")
 NUMBERS = (
     "1,5",
     "nan",
@@ -34,10 +34,14 @@ NUMBERS = (
 
 
 def changed(
-    path: str, attribute: str, value: str, *, urdf: str = SHIPPED.urdf_text
+    path: str,
+    attribute: str,
+    value: str,
+    *,
+    urdf: str | None = None,
 ) -> str:
     """Change an attribute of the last link with an inertia, or of a joint, in the shipped URDF."""
-    tree = ElementTree.fromstring(urdf)
+    tree = ElementTree.fromstring(urdf or PROBLEMS["heavy-object"].urdf_text)
     kind = "joint" if path.startswith("joint") else "link"
     element = [
         each
@@ -51,7 +55,7 @@ def changed(
 
 
 def record_of(urdf: str) -> ProblemRecord:
-    return ProblemRecord(record_problem(SHIPPED).recipe, urdf)
+    return ProblemRecord(record_problem(PROBLEMS["heavy-object"]).recipe, urdf)
 
 
 @pytest.mark.parametrize("value", NUMBERS)
@@ -98,8 +102,8 @@ def test_a_vector_in_another_notation_is_refused(
 @pytest.mark.parametrize("value", ["+1.5", "1.", ".5", "15e-1", "1.5E0", "0"])
 def test_every_notation_that_pinocchio_reads_is_accepted(value: str) -> None:
     _, robot = open_problem(record_of(changed("link/inertial/mass", "value", value)))
-    _, usual = open_problem(record_problem(SHIPPED))
-    tree = ElementTree.fromstring(SHIPPED.urdf_text)
+    _, usual = open_problem(record_problem(PROBLEMS["heavy-object"]))
+    tree = ElementTree.fromstring(PROBLEMS["heavy-object"].urdf_text)
     mass = float(list(tree.iterfind("link/inertial/mass"))[-1].attrib["value"])
     total, before = (
         sum(inertia.mass for inertia in each.model.inertias) for each in (robot, usual)
@@ -136,7 +140,7 @@ def test_every_notation_that_pinocchio_reads_is_accepted(value: str) -> None:
 def test_an_element_that_pinocchio_ignores_is_refused(
     old: str, new: str, message: str
 ) -> None:
-    text = SHIPPED.urdf_text
+    text = PROBLEMS["heavy-object"].urdf_text
     if old == "<inertial>":
         text = text.replace("</inertial>", "</Inertial>")
     urdf = re.sub(old, new, text)
@@ -152,8 +156,10 @@ def test_all_mistakes_of_a_file_are_listed_with_its_name(tmp_path: Path) -> None
         "1,5",
         urdf=changed("link/inertial/mass", "value", "2,5"),
     )
-    text = SHIPPED.path.read_text(encoding="utf-8").replace(
-        f'"{SHIPPED.robot.urdf}"', '"robot.urdf"'
+    text = (
+        PROBLEMS["heavy-object"]
+        .path.read_text(encoding="utf-8")
+        .replace(f'"{PROBLEMS["heavy-object"].robot.urdf}"', '"robot.urdf"')
     )
     (tmp_path / "problem.toml").write_text(text, encoding="utf-8")
     (tmp_path / "robot.urdf").write_text(urdf, encoding="utf-8")
@@ -178,7 +184,7 @@ def test_plans_with_such_a_urdf_are_not_judged(tmp_path: Path) -> None:
 
 
 def test_joints_and_links_are_read_by_name() -> None:
-    tree = ElementTree.fromstring(SHIPPED.urdf_text)
+    tree = ElementTree.fromstring(PROBLEMS["heavy-object"].urdf_text)
     parameters = urdf_parameters(tree)
     assert set(parameters.inertias) == {
         link.get("name") for link in tree.findall("link")
@@ -196,6 +202,8 @@ def test_a_cycle_that_no_root_moves_is_refused(length: int) -> None:
         f'<joint name="cycle{k}" type="fixed"><parent link="c{k}"/><child link="c{(k + 1) % length}"/></joint>'
         for k in range(length)
     )
-    urdf = SHIPPED.urdf_text.replace("</robot>", f"{links}{joints}</robot>")
+    urdf = PROBLEMS["heavy-object"].urdf_text.replace(
+        "</robot>", f"{links}{joints}</robot>"
+    )
     with pytest.raises(RecipeError, match=r"link 'c\d': its joints form a cycle"):
         open_problem(record_of(urdf))

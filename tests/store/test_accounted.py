@@ -14,7 +14,9 @@ from cnpgen.store.files.accounted import (
     mark_read,
 )
 
-UNUSED_ELEMENTS = UnusedElements({".title": "a title", "header.stamp": "a time"}, {"planner": "another's"})
+UNUSED_ELEMENTS = UnusedElements(
+    {".title": "a title", "header.stamp": "a time"}, {"planner": "another's"}
+)
 CONTENT = {
     "title": "x",
     "header": {"stamp": 3, "frame": "a"},
@@ -24,7 +26,9 @@ CONTENT = {
 
 
 def document(**changes: object) -> tuple[AccountedMapping, Account]:
-    account = Account("file.yaml", UNUSED_ELEMENTS, allow_unused=changes.pop("allowed", ()))
+    account = Account(
+        "file.yaml", UNUSED_ELEMENTS, allow_unused=changes.pop("allowed", ())
+    )
     return accounted(CONTENT | changes, account), account
 
 

@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import CnpgenError, DatasetError
+from cnpgen.loader.batch_options import BatchOptions
 from cnpgen.loader.load import load_dataset
 from cnpgen.make.extend import extend_dataset
+from cnpgen.make.generation_options import GenerationOptions
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.merge import merge_datasets
 from cnpgen.planner.plan_requests import read_rows
@@ -113,7 +115,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
         [
             batch["start_q"]
             for batch in load_dataset(folder).batches(
-                50, shuffle=False, normalize=False, dtype="f8"
+                50, normalize=False, dtype="f8", options=BatchOptions(shuffle=False)
             )
         ]
     )[ROWS],
@@ -172,7 +174,7 @@ def test_merge_refuses_a_modified_shard(tmp_path: Path, change: str) -> None:
             tmp_path / f"part{k}",
             shard_size=250,
             workers=1,
-            part=(k, 2),
+            options=GenerationOptions(part=(k, 2)),
         ).folder
         for k in range(2)
     ]
@@ -216,6 +218,7 @@ TRUNCATE = """
 import sys
 from pathlib import Path
 import numpy as np
+from cnpgen import BatchOptions
 from cnpgen.errors import CnpgenError
 import cnpgen.store.checked_shard as checked
 import cnpgen.store.files.hdf5 as hdf5
@@ -253,7 +256,10 @@ elif how == "size":
 else:
     before(hdf5, "check_heaps")
 read = {
-    "batches": lambda: [batch.table.sum() for batch in load_dataset(folder, verify=False).batches(50, shuffle=False)],
+    "batches": lambda: [
+        batch.table.sum()
+        for batch in load_dataset(folder, verify=False).batches(50, options=BatchOptions(shuffle=False))
+    ],
     "arrays": lambda: load_dataset(folder, verify=False).arrays("train"),
     "store": lambda: open_dataset(folder).read("train"),
 }[sys.argv[3]]

@@ -18,7 +18,9 @@ from cnpgen.training.adam import Clipping
 from cnpgen.training.data import open_training_data
 from cnpgen.training.step import imitation_loss
 from cnpgen.training.train import train_model
+from cnpgen.training.training_options import TrainingOptions
 from tests.conftest import columns_of, tiny_recipe
+from tests.examples.grouped import grouped
 from tests.examples.models import SMALL, boundary_of_columns, learner_of
 
 UNCLIPPED = replace(SMALL, sample_clip=np.inf, batch_clip=np.inf)
@@ -138,7 +140,9 @@ def test_an_interrupted_imitating_run_resumes_exactly(target, tmp_path, monkeypa
             "workers": 1,
             **options,
         }
-        return train_model(target, tmp_path / name, **arguments)
+        return grouped(
+            train_model, TrainingOptions, target, tmp_path / name, **arguments
+        )
 
     whole = train("whole.h5")
     for step in (4, 9, 14):

@@ -21,6 +21,7 @@ from cnpgen.training.prepare import prepare_run
 from cnpgen.training.presets import PAPER
 from cnpgen.training.settings import TrainingSettings
 from cnpgen.training.train import train_model
+from cnpgen.training.training_options import TrainingOptions
 from tests.examples.models import interpreted, loaded_problem_of
 
 EPOCHS, BATCHES = 4, 4  # 600 rows in batches of 128
@@ -35,9 +36,9 @@ def trained(tiny, tmp_path_factory):
         tiny("airhockey-hit"),
         out,
         settings=SMALL,
-        epochs=EPOCHS,
         check_rows=2,
         workers=1,
+        options=TrainingOptions(epochs=EPOCHS),
     )
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.interpolate import BSpline
+import scipy
 
 from cnpgen.cli.main import main
 from cnpgen.errors import DatasetError, UsageError
@@ -42,6 +42,7 @@ from cnpgen.training.data import make_scene_rows
 from cnpgen.training.prepare import prepare_run
 from cnpgen.training.settings import TrainingSettings
 from cnpgen.training.train import train_model
+from cnpgen.training.training_options import TrainingOptions
 from cnpgen.trajectory.spline import clamped_knots
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from tests.conftest import needs_compiler
@@ -127,7 +128,9 @@ def test_clearances_along_a_path_are_those_of_the_capsules(problem, tmp_path):
     scene = Scene(items, place_obstacles(items)[None])
     found = features(path[None], scene)[0]
     phases = (np.arange(PATH_PHASES) + 1) / (PATH_PHASES + 1)
-    states = BSpline(clamped_knots(15, spec.degree), path, spec.degree)(phases)
+    states = scipy.interpolate.BSpline(
+        clamped_knots(15, spec.degree), path, spec.degree
+    )(phases)
     rotations, positions = ForwardKinematics(robot.model).poses(states.T)
     bodies = primitives_of(items, scene.poses[0])
     for phase in range(PATH_PHASES):
@@ -292,7 +295,7 @@ def test_a_planner_is_trained_on_a_scene_file_and_plans_its_scenes(
         settings=settings,
         check_rows=1,
         workers=1,
-        robot=str(path),
+        options=TrainingOptions(robot=str(path)),
     )
     model = load_model(trained.path)
     assert model.features.blocks[-2:] == ("scene", "line")

@@ -23,7 +23,9 @@ from cnpgen.planner.model_file import load_model
 from cnpgen.store.files.leftovers import temporary_name
 from cnpgen.training import checkpoint as checkpoints
 from cnpgen.training.train import Trained, train_model
+from cnpgen.training.training_options import TrainingOptions
 from tests.conftest import some, tiny_recipe
+from tests.examples.grouped import grouped
 from tests.examples.models import SMALL
 
 STEPS, SCORED = 30, 6
@@ -51,7 +53,8 @@ def train(
             "workers": 1,
             **options,
         }
-        return train_model(tiny("airhockey-hit"), tmp_path / out, **arguments)
+        folders = tiny("airhockey-hit"), tmp_path / out
+        return grouped(train_model, TrainingOptions, *folders, **arguments)
 
     return run
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.interpolate import BSpline
+import scipy
 
 from cnpgen.errors import UsageError
 from cnpgen.trajectory.boundary import (
@@ -46,9 +46,9 @@ def end_states(
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Yield q, dq, ddq in time at s = 0 and s = 1 of one motion."""
 
-    def spline(control: np.ndarray) -> BSpline:
+    def spline(control: np.ndarray) -> scipy.interpolate.BSpline:
         inner = np.arange(1, len(control) - degree) / (len(control) - degree)
-        return BSpline(
+        return scipy.interpolate.BSpline(
             np.r_[[0.0] * (degree + 1), inner, [1.0] * (degree + 1)], control, degree
         )
 

@@ -5,7 +5,7 @@ import sys
 
 import numpy as np
 import pytest
-from scipy.interpolate import BSpline
+import scipy
 
 from cnpgen.trajectory.spline import (
     basis,
@@ -39,7 +39,7 @@ def test_the_knots_agree_with_appendix_a() -> None:
 def test_the_basis_agrees_with_scipy(points: int, degree: int, order: int) -> None:
     random = np.random.default_rng([points, degree])
     control, s = random.normal(size=(points, 3)), np.linspace(0, 1, 97)
-    spline = BSpline(clamped_knots(points, degree), control, degree)
+    spline = scipy.interpolate.BSpline(clamped_knots(points, degree), control, degree)
     expected = spline.derivative(order)(s) if order else spline(s)
     found = basis(s, points, degree, order)
     assert found.shape == (97, points)
@@ -53,7 +53,7 @@ def test_eta_and_beta_give_the_end_derivatives_and_the_printed_eta_does_not(
     points: int, degree: int
 ) -> None:
     control = np.random.default_rng([points, degree]).normal(size=points)
-    spline = BSpline(clamped_knots(points, degree), control, degree)
+    spline = scipy.interpolate.BSpline(clamped_knots(points, degree), control, degree)
     ends = end_derivatives(points, degree)
     for c0, c1, c2, s, sign in (
         (*control[:3], 0.0, 1.0),

@@ -4,8 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
-from scipy.interpolate import BSpline
+import scipy
 
 from cnpgen.errors import UsageError
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
@@ -72,9 +71,11 @@ def test_the_duration_is_the_integral_of_one_over_r(spread: float) -> None:
         ]
     )
     for i, found in enumerate(motion.duration()):
-        r = BSpline(clamped_knots(20, 7), motion.rate[i], 7)
+        r = scipy.interpolate.BSpline(clamped_knots(20, 7), motion.rate[i], 7)
         pieces = [
-            quad(lambda s, r=r: 1 / r(s), a, b, epsabs=0, epsrel=1e-12)[0]
+            scipy.integrate.quad(lambda s, r=r: 1 / r(s), a, b, epsabs=0, epsrel=1e-12)[
+                0
+            ]
             for a, b in pairwise(breaks)
         ]
         assert found == pytest.approx(sum(pieces), rel=1e-13 if spread < 0.5 else 1e-8)
@@ -99,10 +100,11 @@ def test_a_slow_start_is_included_in_the_duration() -> None:
     """The first basis function is 0.01 wide: a quadrature on equal cells has errors of some percent."""
     rate = np.full((1, 20), 2.0)
     rate[0, 0] = 1e-3
-    r = BSpline(clamped_knots(20, 7), rate[0], 7)
+    r = scipy.interpolate.BSpline(clamped_knots(20, 7), rate[0], 7)
     breaks = np.r_[0, 0.5 ** np.arange(25, 2, -1), 1]
     expected = sum(
-        quad(lambda s: 1 / r(s), a, b, epsrel=1e-12)[0] for a, b in pairwise(breaks)
+        scipy.integrate.quad(lambda s: 1 / r(s), a, b, epsrel=1e-12)[0]
+        for a, b in pairwise(breaks)
     )
     assert Motion(np.zeros((1, 15, 1)), rate).duration()[0] == pytest.approx(
         expected, rel=1e-9
@@ -271,7 +273,7 @@ def test_the_duration_with_a_rate_close_to_zero_agrees_with_adaptive_quadrature(
     motion = Motion(np.zeros((4, 15, 1)), rate)
     T = motion.duration()
     for row, found in zip(rate, T, strict=True):
-        r = BSpline(clamped_knots(20, 7), row, 7)
+        r = scipy.interpolate.BSpline(clamped_knots(20, 7), row, 7)
         near = extrema(row, 7)[0]
         cuts = [
             near,
@@ -279,7 +281,7 @@ def test_the_duration_with_a_rate_close_to_zero_agrees_with_adaptive_quadrature(
         ]
         edges = np.unique(np.clip(np.concatenate([np.linspace(0, 1, 14), *cuts]), 0, 1))
         pieces = [
-            quad(lambda s, r=r: 1 / r(s), a, b, epsrel=1e-11)[0]
+            scipy.integrate.quad(lambda s, r=r: 1 / r(s), a, b, epsrel=1e-11)[0]
             for a, b in pairwise(edges)
         ]
         assert found == pytest.approx(sum(pieces), rel=2e-9)

@@ -13,16 +13,14 @@ import pytest
 from cnpgen.judges.rows.hits import highest_speed
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.recipe import load_dataset_recipe
-from cnpgen.problems.load_robot import load_robot
-from cnpgen.problems.problem_file import load_problem
 from cnpgen.store.dataset_spec import load_dataset_spec, shards
 from cnpgen.store.shard import read_shard
 from cnpgen.store.shard_record import commit_shard, load_record
 from cnpgen.validate.validate_dataset import validate_dataset
 from tests.conftest import some
 from tests.examples.finalized import finalize
+from tests.examples.shipped import ROBOTS
 
-ROBOT = load_robot(load_problem("airhockey"))
 FRAME = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "dataset-format.md"
 Columns = dict[str, np.ndarray]
@@ -31,14 +29,20 @@ Columns = dict[str, np.ndarray]
 def jacobian(q: np.ndarray) -> np.ndarray:
     return np.array(
         pin.computeFrameJacobian(
-            ROBOT.model, ROBOT.model.createData(), q, ROBOT.tip_frame, FRAME
+            ROBOTS["airhockey"].model,
+            ROBOTS["airhockey"].model.createData(),
+            q,
+            ROBOTS["airhockey"].tip_frame,
+            FRAME,
         )[:3]
     )
 
 
 def tip(q: np.ndarray) -> np.ndarray:
-    pin.framesForwardKinematics(ROBOT.model, data := ROBOT.model.createData(), q)
-    return np.array(data.oMf[ROBOT.tip_frame].translation)
+    pin.framesForwardKinematics(
+        ROBOTS["airhockey"].model, data := ROBOTS["airhockey"].model.createData(), q
+    )
+    return np.array(data.oMf[ROBOTS["airhockey"].tip_frame].translation)
 
 
 def put_at(q: np.ndarray, xyz: np.ndarray) -> np.ndarray:
@@ -73,11 +77,11 @@ def turn_the_arm(columns: Columns) -> None:
         )
         J, angle = jacobian(q), columns["hit_angle"][row]
         highest = highest_speed(
-            J[None], columns["hit_angle"][[row]], ROBOT.velocity_limit
+            J[None], columns["hit_angle"][[row]], ROBOTS["airhockey"].velocity_limit
         )[0]
         direction = np.array([np.cos(angle), np.sin(angle), 0.0])
         velocity = np.linalg.pinv(J) @ direction
-        speed = 0.5 * (ROBOT.velocity_limit / np.abs(velocity)).min()
+        speed = 0.5 * (ROBOTS["airhockey"].velocity_limit / np.abs(velocity)).min()
         columns["goal_q"][row], columns["goal_dq"][row] = q, speed * velocity
         columns["hit_speed"][row], columns["hit_speed_max"][row] = speed, highest
 

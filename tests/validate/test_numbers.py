@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cnpgen.make.generation_options import GenerationOptions
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, load_dataset_spec, shards
 from cnpgen.store.shard import read_shard
@@ -51,7 +52,11 @@ def test_made_datasets_have_no_findings(tiny, tmp_path, name, dtype):
     if dtype == "float32":
         folder = tmp_path / name
         make_dataset(
-            tiny_recipe(name), folder, shard_size=TINY_SHARD, workers=1, dtype=dtype
+            tiny_recipe(name),
+            folder,
+            shard_size=TINY_SHARD,
+            workers=1,
+            options=GenerationOptions(dtype=dtype),
         )
     for index in range(4):
         assert check_numbers(*parts(folder, index)) == []
@@ -77,7 +82,7 @@ def test_float32_values_may_exceed_a_bound_by_one_rounding_error(tmp_path):
         tmp_path,
         shard_size=TINY_SHARD,
         workers=1,
-        dtype="float32",
+        options=GenerationOptions(dtype="float32"),
     )
     shard = parts(tmp_path)
     height = np.float32(0.16)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import MachineError, UsageError
+from cnpgen.make.generation_options import GenerationOptions
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
@@ -55,7 +56,11 @@ def test_made_datasets_are_valid_and_regenerated_blocks_are_identical(
     if dtype == "float32":
         folder = tmp_path / name
         make_dataset(
-            tiny_recipe(name), folder, shard_size=TINY_SHARD, workers=1, dtype=dtype
+            tiny_recipe(name),
+            folder,
+            shard_size=TINY_SHARD,
+            workers=1,
+            options=GenerationOptions(dtype=dtype),
         )
     report = validate_dataset(folder, deep=True, regenerate=4, workers=1)
     assert report.ok, report.summary()
@@ -72,7 +77,13 @@ def test_made_datasets_are_valid_and_regenerated_blocks_are_identical(
 @pytest.mark.extended
 def test_thousands_of_float32_rows_are_valid(tmp_path):
     for name in SHIPPED:
-        make_dataset(name, tmp_path / name, n=4000, workers=1, dtype="float32")
+        make_dataset(
+            name,
+            tmp_path / name,
+            n=4000,
+            workers=1,
+            options=GenerationOptions(dtype="float32"),
+        )
         report = validate_dataset(tmp_path / name, deep=True, workers=2)
         assert report.ok, report.summary()
 
@@ -140,7 +151,7 @@ def test_the_finished_shards_of_an_unfinished_dataset_are_checked(tmp_path):
         tmp_path / "out",
         shard_size=TINY_SHARD,
         workers=1,
-        part=(0, 2),
+        options=GenerationOptions(part=(0, 2)),
     )
     report = validate_dataset(tmp_path / "out", deep=True, regenerate=2, workers=1)
     assert report.rows == 500
@@ -432,7 +443,10 @@ def test_all_rows_of_shards_that_begin_within_a_block_are_regenerated(tmp_path):
 @pytest.mark.slow
 def test_blocks_are_regenerated_with_the_backend_of_the_specification(tmp_path):
     make_dataset(
-        tiny_recipe("airhockey-hit"), tmp_path / "out", workers=1, backend="numpy"
+        tiny_recipe("airhockey-hit"),
+        tmp_path / "out",
+        workers=1,
+        options=GenerationOptions(backend="numpy"),
     )
     report = validate_dataset(tmp_path / "out", regenerate=2)
     assert (report.ok, report.identical) == (True, 2)

@@ -1,26 +1,29 @@
 """Many states at once agree with the one-state world, and no smallest distance is skipped."""
 
 import json
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from scipy.interpolate import BSpline
+import scipy
 
 from cnpgen.errors import RecipeError
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
 from tests.examples.chains import chain
+from tests.examples.shipped import PROBLEMS, ROBOTS
 
-PROBLEMS = {name: load_problem(name) for name in ("airhockey", "heavy-object")}
-ROBOTS = {name: load_robot(problem) for name, problem in PROBLEMS.items()}
-PLANS = json.loads((Path(__file__).parents[1] / "data" / "plans.json").read_text())
+
+@cache
+def stored_plans() -> Any:
+    return json.loads((Path(__file__).parents[1] / "data" / "plans.json").read_text())
 
 
 def wandering(
@@ -29,7 +32,7 @@ def wandering(
     """Draw smooth random joint motions, shape (n, count) each, with derivatives as large as the limits."""
     random, s = np.random.default_rng(seed), np.linspace(0, 1, count)
     control = random.uniform(robot.position_lower, robot.position_upper, (9, robot.n))
-    curve = BSpline(
+    curve = scipy.interpolate.BSpline(
         np.concatenate([[0] * 4, np.linspace(0, 1, 6), [1] * 4]), control[:9], 4
     )
     dq, ddq = (random.uniform(-1, 1, (robot.n, count)) for _ in range(2))
@@ -213,7 +216,7 @@ def test_a_path_that_is_not_exact_measures_only_if_bounds_are_not_sufficient():
 
 
 def test_the_search_agrees_with_brute_force_on_a_plan_that_slides_along_a_pedestal():
-    problem, plan = PROBLEMS["heavy-object"], PLANS["dragging"]
+    problem, plan = PROBLEMS["heavy-object"], stored_plans()["dragging"]
     motion = Motion(np.array([plan["path"]]), np.array([plan["rate"]]))
     states = motion.at(np.linspace(0, 1, 700))
     world, poses = (
@@ -227,7 +230,7 @@ def test_the_search_agrees_with_brute_force_on_a_plan_that_slides_along_a_pedest
 
 
 def test_nearly_all_states_are_not_measured(monkeypatch: pytest.MonkeyPatch):
-    problem, plan = PROBLEMS["heavy-object"], PLANS["transport"]
+    problem, plan = PROBLEMS["heavy-object"], stored_plans()["transport"]
     states = Motion(np.array([plan["path"]]), np.array([plan["rate"]])).at(
         np.linspace(0, 1, 1500)
     )
@@ -269,12 +272,18 @@ def test_a_motion_equals_scipys_spline_of_its_control_points(label):
     """Use explicit knots, and finite differences of q(t) with t from integrating ds/dt = r(s)."""
     from scipy.integrate import solve_ivp
 
-    path, rate = np.array(PLANS[label]["path"]), np.array(PLANS[label]["rate"])
+    path, rate = (
+        np.array(stored_plans()[label]["path"]),
+        np.array(stored_plans()[label]["rate"]),
+    )
     knots = [
         np.r_[np.zeros(8), np.arange(1, c - 7) / (c - 7), np.ones(8)]
         for c in (len(path), len(rate))
     ]
-    p, r = BSpline(knots[0], path, 7), BSpline(knots[1], rate, 7)
+    p, r = (
+        scipy.interpolate.BSpline(knots[0], path, 7),
+        scipy.interpolate.BSpline(knots[1], rate, 7),
+    )
     motion = Motion(path[None], rate[None])
     phase = solve_ivp(
         lambda _, s: r(np.clip(s, 0, 1)),

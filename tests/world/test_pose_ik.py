@@ -3,7 +3,7 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from scipy.spatial.transform import Rotation
+import scipy
 
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
@@ -23,8 +23,8 @@ def robot() -> Robot:
 
 
 def test_rotation_vectors_agree_with_scipy() -> None:
-    rotations = Rotation.random(50, random_state=0)
-    small = Rotation.from_rotvec(1e-12 * np.eye(3))
+    rotations = scipy.spatial.transform.Rotation.random(50, random_state=0)
+    small = scipy.spatial.transform.Rotation.from_rotvec(1e-12 * np.eye(3))
     for each in (rotations, small):
         assert rotation_vectors(each.as_matrix()) == pytest.approx(
             each.as_rotvec(), abs=1e-9
@@ -117,9 +117,11 @@ def test_tolerances_and_free_axes_accept_more_poses(robot: Robot) -> None:
     tolerance = PoseTolerance(*np.repeat(limits[:, None], count, axis=1))
     q, met = solve_pose_ik(kinematics, positions, rotations, seeds, tolerance=tolerance)
     reached, turned, _ = kinematics.evaluate(q)
-    back = Rotation.from_matrix(rotations).inv()
+    back = scipy.spatial.transform.Rotation.from_matrix(rotations).inv()
     shift = np.abs(back.apply(reached - positions))[met]
-    turn = np.abs((back * Rotation.from_matrix(turned)).as_rotvec())[met]
+    turn = np.abs(
+        (back * scipy.spatial.transform.Rotation.from_matrix(turned)).as_rotvec()
+    )[met]
     assert met.sum() > solve_pose_ik(kinematics, positions, rotations, seeds)[1].sum()
     assert (shift <= limits[0] + 1e-6).all()
     assert (turn <= limits[1] + 1e-6).all()

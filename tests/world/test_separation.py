@@ -3,7 +3,7 @@
 import coal
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+import scipy
 
 from cnpgen.robots.shape.hull import coal_hull
 from cnpgen.robots.solid import Box
@@ -30,7 +30,11 @@ def draw(seed: int, count: int = 400) -> tuple[np.ndarray, np.ndarray, Box]:
         if seed % 2
         else random.normal(0, 3, (count, 3))
     )
-    rotation = Rotation.from_rotvec(turn).as_matrix().transpose(1, 2, 0)
+    rotation = (
+        scipy.spatial.transform.Rotation.from_rotvec(turn)
+        .as_matrix()
+        .transpose(1, 2, 0)
+    )
     position = (box.low + box.high)[:, None] / 2 + random.normal(0, 0.4, (3, count))
     return position, rotation, box
 

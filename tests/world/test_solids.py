@@ -5,7 +5,7 @@ from pathlib import Path
 import coal
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+import scipy
 
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
@@ -45,7 +45,9 @@ def test_distances_of_segments_and_objects_agree_with_coal_s_own_shapes(
             first, second = random.normal(0, 0.2, (2, 3))
             position, turn = (
                 random.normal(0, 0.25, 3),
-                Rotation.random(random_state=random).as_matrix(),
+                scipy.spatial.transform.Rotation.random(
+                    random_state=random
+                ).as_matrix(),
             )
             bodies = [
                 (

@@ -13,7 +13,7 @@ complete, also if planners failed.
 import argparse
 import json
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -112,22 +112,6 @@ def add_options(parser: Parser) -> None:
         type=parameter,
         help=text,
     )
-    text = "instead, try random values of fields of one planner, such as drake.control_points=8..25; ranks them"
-    option(
-        "--search",
-        metavar="NAME.KEY=LOW..HIGH",
-        nargs="+",
-        default=[],
-        type=parameter_range,
-        help=text,
-    )
-    option(
-        "--trials",
-        metavar="K",
-        type=values.positive,
-        default=20,
-        help="random trials of --search (default: 20)",
-    )
     option(
         "--replan",
         action="store_true",
@@ -149,23 +133,6 @@ def parameter(text: str) -> tuple[str, str, Any]:
     return name, key, values.toml_value(value)
 
 
-def parameter_range(text: str) -> tuple[str, str, tuple[float, float]]:
-    """Read the range of a field: the name of the planner, the key, and both ends in SI units."""
-    left, _, right = text.partition("=")
-    name, _, key = left.rpartition(".")
-    ends = right.split("..")
-    try:
-        low, high = (
-            int(end) if end.lstrip("-").isdigit() else float(end) for end in ends
-        )
-    except ValueError:
-        name = ""
-    if not (name and key):
-        text = f"expected NAME.KEY=LOW..HIGH in SI units, such as drake.control_points=8..25, got {text!r}"
-        raise argparse.ArgumentTypeError(text)
-    return name, key, (low, high)
-
-
 def run(arguments: argparse.Namespace) -> None:
     from cnpgen.addons.benchmark.benchmark_report import (
         save_benchmark_figures,
@@ -183,9 +150,6 @@ def run(arguments: argparse.Namespace) -> None:
     for name in ("plant", "environment", "video"):
         if getattr(arguments, name) and not arguments.simulate:
             raise UsageError(f"--{name} needs --simulate")
-    if arguments.search:
-        _search(arguments)
-        return
     folder = arguments.out or Path(f"{Path(arguments.suite).stem}-results")
     found = _run(arguments, folder)
     save_benchmark_tables(found, folder)
@@ -197,37 +161,8 @@ def run(arguments: argparse.Namespace) -> None:
     print(f"report: {report}", file=sys.stderr)
 
 
-def _search(arguments: argparse.Namespace) -> None:
-    """Search for parameters of one planner and print the trials, the best one first."""
-    from cnpgen.addons.benchmark.parameter_search import (
-        SEARCH_FILE,
-        csv_of,
-        search_parameters,
-    )
-
-    (planner, *others), ranges = (
-        {name for name, _, _ in arguments.search},
-        {k: ends for _, k, ends in arguments.search},
-    )
-    if (
-        others
-        or arguments.planners not in (None, [planner])
-        or arguments.set
-        or arguments.repeat != 1
-    ):
-        raise UsageError(
-            "--search has fields of one planner, without --planners, --set and --repeat"
-        )
-    folder = arguments.out or Path(f"{Path(arguments.suite).stem}-search")
-    options = {"trials": arguments.trials, **_options(arguments)}
-    with resumable(folder):
-        trials = search_parameters(arguments.suite, folder, planner, ranges, **options)
-    documents = json.dumps([asdict(trial) for trial in trials], indent=2) + "\n"
-    sys.stdout.write(documents if arguments.json else csv_of(trials, list(ranges)))
-    print(f"trials: {folder / SEARCH_FILE}", file=sys.stderr)
-
-
 def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
+    from cnpgen.addons.benchmark.benchmark_options import BenchmarkOptions
     from cnpgen.addons.benchmark.run_suite import FASTEST, run_benchmark
 
     meter, doing = Meter(noun="problem"), [""]
@@ -243,33 +178,21 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
             meter.begin(what, total, done - 1)
         meter(1)
 
+    plants = (arguments.plant or ("nominal",)) if arguments.simulate else ()
+    others = {entry.name for entry in fields(BenchmarkOptions)}
+    given = options_of(arguments, *others.union(ENGINE, ("n", "force")))
+    options = {name: given.pop(name) for name in others & given.keys()}
     with meter, resumable(folder):
         return run_benchmark(
             arguments.suite,
             folder,
             planners=arguments.planners or FASTEST,
-            repeat=arguments.repeat,
-            reference=arguments.reference,
+            plants=plants,
             parameters=parameters,
             progress=progress,
-            **_options(arguments),
+            options=BenchmarkOptions(**options),
+            **given,
         )
-
-
-def _options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the options of a run and of the runs of a search."""
-    names = (
-        "n",
-        "environment",
-        "time_limit",
-        "seed",
-        "plane_tolerance",
-        *ENGINE,
-        "replan",
-        "force",
-    )
-    plants = (arguments.plant or ("nominal",)) if arguments.simulate else ()
-    return {"plants": plants, **options_of(arguments, *names)}
 
 
 def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:

@@ -27,7 +27,6 @@ LIBRARIES = (
     "ruckig",
     "sscbirrt",
     "drake",
-    "crocoddyl",
 )
 _STRUCTURE = {
     "date": TEXT,

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from cnpgen.addons.benchmark.answers import execute_answer, judge_answer
+from cnpgen.addons.benchmark.benchmark_options import BenchmarkOptions
 from cnpgen.addons.benchmark.benchmark_planner import PLANNERS, Setting, load_planner
 from cnpgen.addons.benchmark.hypothesis_tests import summarize_results
 from cnpgen.addons.benchmark.process import PlannerProcess, PlanningOutcome
@@ -41,10 +42,10 @@ from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.arguments import concerning, integer, number
+from cnpgen.schema.arguments import concerning
+from cnpgen.schema.old_keywords import with_old_keywords
 from cnpgen.store.files.documents import plain
 
-MAX_REPETITIONS = 10_000
 PROBLEMS_PER_TASK = 4  # of a worker; starting a planner takes some seconds
 FASTEST = ("cnpgen", "cnpgen+refine", "solve")  # default; the others take longer
 
@@ -129,19 +130,12 @@ def run_benchmark(
     planners: Sequence[str] = FASTEST,
     n: int | None = None,
     plants: Sequence[str | Plant] = (),
-    environment: str | Path | None = None,
-    time_limit: float = 60.0,
-    seed: int = 0,
-    repeat: int = 1,
-    plane_tolerance: float = PLANE_TOLERANCE_M,
-    reference: str | None = None,
     parameters: Mapping[str, Mapping[str, Any]] | None = None,
     workers: int | None = None,
-    engine: str | None = None,
-    address: str | None = None,
-    replan: bool = False,
     force: bool = False,
     progress: Progress | None = None,
+    options: BenchmarkOptions | None = None,
+    **old_keywords: Any,
 ) -> Benchmark:
     """Compare planners; an interrupted run resumes.
 
@@ -157,28 +151,15 @@ def run_benchmark(
         n: Number of problems, the first ones; random suites may have more than the
             recipe.
         plants: Plants that execute plans; none by default.
-        environment: A clone of the Air Hockey Challenge's environment, which also
-            executes plans, as the plant "challenge".
-        time_limit: Planning time per problem [s]; later answers are not counted, and
-            the planner's processes are ended.
-        seed: Seed of random planners. Each problem and repetition has its own random
-            generator.
-        repeat: Number of repetitions of every problem.
-        plane_tolerance: Maximum distance of the mallet of a successful hit from the
-            table plane [m].
-        reference: Planner with which the others are compared; default
-            ``cnpgen+refine``, or the first one without it.
         parameters: Planner -> its field -> value, as in a recipe; the others have the
             values of the suite, or their defaults.
         workers: Processes that execute plans and, with an engine, plan; default one per
             available core.
-        engine: Engine of the workers, see ``make_dataset``; by default planners run on
-            this machine.
-        address: Address of the engine, see ``make_dataset``.
-        replan: Whether to discard the earlier answers of these planners.
         force: Whether to delete results of another suite, version, time limit or
             planner parameters in the folder.
         progress: Called after every problem.
+        options: Time limit, seed, repetitions, engine and others.
+        old_keywords: Fields of the options, as keywords of version 1.0.
 
     Raises:
         UsageError: A planner, plant or environment is unknown or unsuitable, or the
@@ -187,49 +168,44 @@ def run_benchmark(
         MachineError: MuJoCo is missing, the results cannot be written, or a cluster
             cannot be reached.
     """
-    where = Engine(engine, address, workers)
+    chosen = with_old_keywords(
+        "run_benchmark", options, BenchmarkOptions(), old_keywords
+    )
+    where = Engine(chosen.engine, chosen.address, workers)
     with concerning("suite"):
         loaded = suite if isinstance(suite, Suite) else load_suite(suite)
     given = _checked_planners(planners, loaded.planners or {}, parameters or {})
     values = {name: _checked_parameters(name, given[name]) for name in planners}
-    limit, seed, repeat = _checked_numbers(time_limit, plane_tolerance, seed, repeat)
-    robots = _checked_plants(plants, environment)
+    robots = _checked_plants(plants, chosen.environment)
     problems, prefix = loaded.problems(n)
-    if environment is not None:
+    if chosen.environment is not None:
         check_challenge(*open_problem(problems.problem))
+    limit, seed = float(chosen.time_limit), int(chosen.seed)
     setting = Setting(problems.problem, loaded.model, limit, seed)
     place = ResultsFolder(Path(folder), loaded, setting)
-    names = {*place.planners(delete_others=force), *planners}
-    if reference is not None and reference not in names:
-        raise UsageError(
-            f"must be one of {', '.join(sorted(names))}, got {reference!r}",
-            argument="reference",
-        )
+    _check_reference(
+        chosen.reference, {*place.planners(delete_others=force), *planners}
+    )
     runs = (*load_runs(place.path), describe_run(seed, planners))
     save_runs(place.path, runs)
-    report = progress or (lambda *_: None)
     with assembled(where, len(problems)) as pool:
-        for name, repetition in product(planners, range(repeat)):
+        plan = _plan_locally if chosen.engine is None else partial(_plan_in_pool, pool)
+        for name, repetition in product(planners, range(chosen.repeat)):
             results = place.open(
-                name, repetition, values[name], overwrite=force, discard=replan
-            )
-            planned = partial(
-                _plan_locally if engine is None else partial(_plan_in_pool, pool),
                 name,
-                replace(setting, repetition=repetition, parameters=given[name]),
+                repetition,
+                values[name],
+                overwrite=force,
+                discard=chosen.replan,
             )
-            label = name if repeat == 1 else f"{name}, repetition {repetition}"
-            _plan_all(results, problems, planned, partial(report, f"{label} plans"))
+            task = replace(setting, repetition=repetition, parameters=given[name])
+            label = name if chosen.repeat == 1 else f"{name}, repetition {repetition}"
+            report = partial(progress or (lambda *_: None), f"{label} plans")
+            _plan_all(results, problems, partial(plan, name, task), report)
             for plant in robots:
                 activity = f"{label}, {plant.name} plant"
-                _execute_all(
-                    results,
-                    plant,
-                    problems,
-                    prefix,
-                    pool=pool,
-                    report=partial(report, activity),
-                )
+                report = partial(progress or (lambda *_: None), activity)
+                _execute_all(results, plant, problems, prefix, pool=pool, report=report)
     rows = place.rows(planners)
     count = max(
         (row["problem"] + 1 for part in rows.values() for row in part), default=0
@@ -237,29 +213,24 @@ def run_benchmark(
     if count > len(problems):
         problems, prefix = loaded.problems(count)
     return Benchmark(
-        loaded, problems, prefix, rows, robots, runs, reference, plane_tolerance
+        loaded,
+        problems,
+        prefix,
+        rows,
+        robots,
+        runs,
+        chosen.reference,
+        chosen.plane_tolerance,
     )
 
 
-def _checked_numbers(
-    time_limit: float, plane_tolerance: float, seed: int, repeat: int
-) -> tuple[float, int, int]:
-    """Return the time limit, the seed and the number of repetitions after checking all numbers."""
-    limit = number("time_limit", time_limit)
-    if limit <= 0:
+def _check_reference(reference: str | None, names: set[str]) -> None:
+    """Check that the reference is a planner with results."""
+    if reference is not None and reference not in names:
         raise UsageError(
-            f"must be above 0 s, got {time_limit:g} s", argument="time_limit"
+            f"must be one of {', '.join(sorted(names))}, got {reference!r}",
+            argument="reference",
         )
-    if number("plane_tolerance", plane_tolerance) < 0:
-        raise UsageError(
-            f"must not be negative, got {plane_tolerance:g} m",
-            argument="plane_tolerance",
-        )
-    return (
-        limit,
-        integer("seed", seed, least=0),
-        integer("repeat", repeat, least=1, most=MAX_REPETITIONS),
-    )
 
 
 def _checked_plants(

@@ -1,1 +1,1 @@
-"""Bridges to torch, JAX and TensorFlow, each imported only if its framework is installed."""
+"""Bridges to torch and JAX, each imported only if its framework is installed."""

@@ -217,7 +217,7 @@ def make_mesh(
         numbers("rotation", rotation),
     )
     if not vertices.size:
-        raise SceneError(f"{where} is a mesh without vertices")
+        raise SceneError(f"{where} is a mesh without vertices", concerns="points")
     shapes = {
         "points": (vertices, (*vertices.shape[:1], 3)),
         "position": (origin, (3,)),

@@ -8,7 +8,6 @@ at the neighboring points. Some are found by the verdict only, which names their
 """
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,8 +71,7 @@ def without_distances(problem: Problem) -> Problem:
     others = tuple(
         item for item in problem.constraint if not isinstance(item, measured)
     )
-    return _changed(
-        problem,
+    return problem.replaced(
         constraint=others,
         obstacle=problem.obstacle if problem.structure is None else (),
     )
@@ -85,15 +83,7 @@ def without_contacts(problem: Problem) -> Problem:
         replace(each, tolerance=0.0) if isinstance(each, LINK_CONSTRAINTS) else each
         for each in problem.constraint
     )
-    return _changed(problem, constraint=tuple(strict))
-
-
-def _changed(problem: Problem, **changes: Any) -> Problem:
-    changed = replace(problem, **changes)
-    vars(changed)["urdf_text"] = (
-        problem.urdf_text
-    )  # a cached property, expensive to read again
-    return changed
+    return problem.replaced(constraint=tuple(strict))
 
 
 class HullTranscription(Transcription):

@@ -6,18 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cnpgen.addons.benchmark.benchmark_options import BenchmarkOptions
 from cnpgen.addons.benchmark.benchmark_planner import PLANNERS
 from cnpgen.addons.benchmark.run_suite import Benchmark, run_benchmark
 from cnpgen.schema import registry
 from tests.conftest import some
 
-pytest.importorskip("mujoco")
+pytestmark = pytest.mark.skipif(not find_spec("mujoco"), reason="needs mujoco")
 MODULES = {"cbirrt": ("ompl",), "rrtconnect": ("ompl", "toppra"), "ruckig": ("ruckig",)}
-MODULES |= {
-    "sscbirrt": ("sscbirrt",),
-    "drake": ("pydrake",),
-    "crocoddyl": ("crocoddyl",),
-}
+MODULES |= {"sscbirrt": ("sscbirrt",), "drake": ("pydrake",)}
 NEEDS_A_FILE = "cnp-b-paper"
 ALL = tuple(
     name
@@ -36,9 +33,9 @@ def test_every_planner_has_a_row_in_one_table(suite: str, tmp_path: Path) -> Non
         tmp_path,
         planners=planners,
         n=1,
-        time_limit=1,
         plants=["nominal"],
         workers=1,
+        options=BenchmarkOptions(time_limit=1),
     )
     summary = benchmark.summary("nominal")
     assert list(summary) == planners

@@ -6,8 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pinocchio as pin
 import pytest
-from scipy.integrate import quad
-from scipy.optimize import LinearConstraint, minimize
+import scipy
 
 from cnpgen.addons.benchmark.answers import judge_answer
 from cnpgen.addons.benchmark.benchmark_planner import BenchmarkPlanner, Setting
@@ -117,7 +116,7 @@ def test_the_quadratic_program_of_aqp_has_the_optimum_of_slsqp(seed: int) -> Non
     low, high = -0.8 - min_norm, 0.8 - min_norm
     solution = nearest_in_null_space(null, weights, ahead, (low, high))
     H, f = null.T @ (weights[:, None] * null), null.T @ (weights * ahead)
-    expected = minimize(
+    expected = scipy.optimize.minimize(
         lambda a: a @ H @ a / 2 + f @ a,
         np.zeros(3),
         jac=lambda a: H @ a + f,
@@ -128,7 +127,10 @@ def test_the_quadratic_program_of_aqp_has_the_optimum_of_slsqp(seed: int) -> Non
         ],
         options={"ftol": 1e-14},
     )
-    assert LinearConstraint(null, low, high).residual(expected.x)[0].min() > -1e-9
+    assert (
+        scipy.optimize.LinearConstraint(null, low, high).residual(expected.x)[0].min()
+        > -1e-9
+    )
     np.testing.assert_allclose(solution, expected.x, atol=1e-5)
 
 
@@ -146,7 +148,7 @@ def length_of(path: PlanePath) -> float:
     def speed(s: float) -> float:
         return float(np.linalg.norm(path.at(s + 1e-6) - path.at(s - 1e-6))) / 2e-6
 
-    return float(quad(speed, 1e-6, path.length - 1e-6, limit=200)[0])
+    return float(scipy.integrate.quad(speed, 1e-6, path.length - 1e-6, limit=200)[0])
 
 
 @pytest.mark.parametrize("hit", [(1.1, 0.3), (0.9, -0.35), (1.0, 0.0)])

@@ -5,7 +5,7 @@ from math import comb
 
 import numpy as np
 import pytest
-from scipy.stats import binomtest
+import scipy
 
 from cnpgen.addons.benchmark.hypothesis_tests import (
     holm,
@@ -149,7 +149,7 @@ def test_rows_that_do_not_apply_are_not_counted() -> None:
     ("count", "n"), [(0, 81), (41, 81), (80, 81), (81, 81), (1, 1)]
 )
 def test_the_interval_of_a_ratio_equals_that_of_scipy(count: int, n: int) -> None:
-    expected = binomtest(count, n).proportion_ci(0.95, method="wilson")
+    expected = scipy.stats.binomtest(count, n).proportion_ci(0.95, method="wilson")
     np.testing.assert_allclose(
         wilson(count / n, n), (expected.low, expected.high), atol=1e-12
     )

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cnpgen.addons.benchmark.benchmark_options import BenchmarkOptions
 from cnpgen.addons.benchmark.benchmark_planner import Setting
 from cnpgen.addons.benchmark.benchmark_report import (
     benchmark_values,
@@ -44,6 +45,7 @@ from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.schema.catalogue import list_recipes
 from tests.conftest import some
+from tests.examples.grouped import grouped
 from tests.examples.installed import installed_kind
 
 UNRELIABLE = """
@@ -97,7 +99,11 @@ def test_a_failure_of_a_planner_affects_only_its_own_problem(
 ) -> None:
     monkeypatch.setattr("cnpgen.addons.benchmark.process.STOP_MARGIN_S", 0.5)
     benchmark = run_benchmark(
-        "hits-81", tmp_path / "results", planners=[unreliable], n=13, time_limit=0.2
+        "hits-81",
+        tmp_path / "results",
+        planners=[unreliable],
+        n=13,
+        options=BenchmarkOptions(time_limit=0.2),
     )
     rows = benchmark.results[unreliable]
     endings = [row["ending"] for row in rows]
@@ -278,8 +284,8 @@ def test_parallel_planners_return_the_results_of_one(
         tmp_path / "parallel",
         planners=["cnpgen"],
         n=3,
-        engine=engine,
         workers=2,
+        options=BenchmarkOptions(engine=engine),
     ).results.values()
     assert [row["planners_at_once"] for row in parallel] == [2] * 3
     for key in ("problem", "answer", "verdict"):
@@ -379,11 +385,19 @@ def test_mistakes_are_reported_before_any_work(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="unknown plant"):
         run_benchmark("hits-81", tmp_path, planners=["cnpgen"], plants=["lighter"])
     with pytest.raises(UsageError, match="time_limit must be above 0"):
-        run_benchmark("hits-81", tmp_path, planners=["cnpgen"], time_limit=0)
+        run_benchmark(
+            "hits-81",
+            tmp_path,
+            planners=["cnpgen"],
+            options=BenchmarkOptions(time_limit=0),
+        )
     for tolerance in (-1e-3, float("inf"), True):
         with pytest.raises(UsageError, match="plane_tolerance must"):
             run_benchmark(
-                "hits-81", tmp_path, planners=["cnpgen"], plane_tolerance=tolerance
+                "hits-81",
+                tmp_path,
+                planners=["cnpgen"],
+                options=BenchmarkOptions(plane_tolerance=tolerance),
             )
     assert list(tmp_path.iterdir()) == []
 
@@ -452,7 +466,9 @@ class Random(BenchmarkPlanner):
 def drawn(
     folder: Path, name: str, indices: slice = slice(None), **options: Any
 ) -> list[Any]:
-    rows = run_benchmark("hits-81", folder, planners=[name], **options).results[name]
+    options["planners"] = [name]
+    rows = grouped(run_benchmark, BenchmarkOptions, "hits-81", folder, **options)
+    rows = rows.results[name]
     return [row["answer"]["q"] for row in rows[indices]]
 
 
@@ -472,7 +488,13 @@ def test_every_problem_has_its_own_random_numbers(random: str, tmp_path: Path) -
     assert repeated[:3] == whole
     assert len({str(answer) for answer in repeated}) == 6
     with pytest.raises(UsageError, match="seed"):
-        run_benchmark("hits-81", tmp_path / "whole", planners=[random], n=1, seed=1)
+        run_benchmark(
+            "hits-81",
+            tmp_path / "whole",
+            planners=[random],
+            n=1,
+            options=BenchmarkOptions(seed=1),
+        )
 
 
 def test_earlier_answers_are_discarded_on_request(random: str, tmp_path: Path) -> None:
@@ -486,7 +508,11 @@ def test_earlier_answers_are_discarded_on_request(random: str, tmp_path: Path) -
     ).results[random]
     assert [row["planning_s"] == 77.0 for row in kept] == [True, False, False]
     again = run_benchmark(
-        "hits-81", tmp_path / "results", planners=[random], n=1, replan=True
+        "hits-81",
+        tmp_path / "results",
+        planners=[random],
+        n=1,
+        options=BenchmarkOptions(replan=True),
     ).results[random]
     assert len(again) == 1
     assert again[0]["planning_s"] < 77.0
@@ -562,7 +588,11 @@ def test_children_of_a_planner_end_with_its_time_limit(
     monkeypatch.setattr("cnpgen.addons.benchmark.process.STOP_MARGIN_S", 0.2)
     start = time.monotonic()
     (row,) = run_benchmark(
-        "hits-81", tmp_path / "results", planners=[random], n=1, time_limit=0.5
+        "hits-81",
+        tmp_path / "results",
+        planners=[random],
+        n=1,
+        options=BenchmarkOptions(time_limit=0.5),
     ).results[random]
     assert row["ending"] == "out of time"
     assert time.monotonic() - start < 60
@@ -605,7 +635,11 @@ def test_a_report_covers_the_folder_and_nothing_else(
     folder = tmp_path / "results"
     run_benchmark("hits-81", folder, planners=["cnpgen"], n=3)
     benchmark = run_benchmark(
-        "hits-81", folder, planners=[random], n=2, reference="cnpgen"
+        "hits-81",
+        folder,
+        planners=[random],
+        n=2,
+        options=BenchmarkOptions(reference="cnpgen"),
     )
     assert {name: len(rows) for name, rows in benchmark.results.items()} == {
         random: 2,
@@ -639,7 +673,13 @@ def test_a_report_covers_the_folder_and_nothing_else(
     with pytest.raises(
         UsageError, match="reference must be one of cnpgen, random, got 'solve'"
     ):
-        run_benchmark("hits-81", folder, planners=[random], n=1, reference="solve")
+        run_benchmark(
+            "hits-81",
+            folder,
+            planners=[random],
+            n=1,
+            options=BenchmarkOptions(reference="solve"),
+        )
     (folder / "other.jsonl").write_text(
         '{"format": "cnpgen-benchmark", "suite": "heavy-100"}\n'
     )

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from cnpgen.cli.main import main
 from cnpgen.plans import make_plans, save_plans
 from tests.examples.plans import load
 
-pytest.importorskip("mujoco")
+pytestmark = pytest.mark.skipif(not find_spec("mujoco"), reason="needs mujoco")
 
 
 @pytest.fixture(scope="module")

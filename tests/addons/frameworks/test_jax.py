@@ -104,7 +104,7 @@ def make_loss(problem: str, dtype: Any, cache_folder: Path, backend: Any) -> Pla
 def plans(problem: str, count: int) -> dict[str, np.ndarray]:
     """Draw plans, weights and obstacle poses."""
     found, random = load_problem(problem), np.random.default_rng(1)
-    base, spec = np.array(found.robot.home), found.trajectory
+    base, spec = np.array(found.robot.base), found.trajectory
     arrays = {
         "path": base
         + 0.3 * random.standard_normal((count, spec.path_control_points, len(base))),

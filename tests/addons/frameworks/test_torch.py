@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cnpgen.loader.batch_options import BatchOptions
 from tests.examples.loader import ALL, columns, ids, make
 from tests.examples.plans_of_networks import at_ends, boundary_for_layer, outputs
 
@@ -137,9 +138,13 @@ def test_gradients_pass_through_denormalization(dataset: Dataset) -> None:
 def test_a_data_loader_yields_the_same_batches_with_any_number_of_workers(
     dataset: Dataset, workers: int, drop_last: bool
 ) -> None:
-    wanted = BatchDataset(dataset.batches(7, fields=ALL, drop_last=drop_last))
+    wanted = BatchDataset(
+        dataset.batches(7, fields=ALL, options=BatchOptions(drop_last=drop_last))
+    )
     loader = DataLoader(wanted, batch_size=None, num_workers=workers)
-    expected = list(dataset.batches(7, fields=ALL, drop_last=drop_last))
+    expected = list(
+        dataset.batches(7, fields=ALL, options=BatchOptions(drop_last=drop_last))
+    )
     assert len(loader) == len(expected)
     for found, batch in zip(loader, expected, strict=True):
         assert list(found) == list(batch)
@@ -430,7 +435,7 @@ def loss(cache_folder: Path, fastest: Any) -> Callable[..., PlanLoss]:
 def plans(problem: str, count: int, dtype: Any = torch.float64) -> dict[str, Any]:
     """Draw plans, weights and obstacle poses."""
     found, random = load_problem(problem), np.random.default_rng(1)
-    base, spec = np.array(found.robot.home), found.trajectory
+    base, spec = np.array(found.robot.base), found.trajectory
     path = base + 0.3 * random.standard_normal(
         (count, spec.path_control_points, len(base))
     )

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.interpolate import BSpline
+import scipy
 
 torch = pytest.importorskip("torch")
 
@@ -275,7 +275,7 @@ def test_states_of_motions_are_those_of_scipy_and_differentiable_in_the_phase() 
     path, control_rate = tensor(plans.path), tensor(plans.rate)
     q, dq, ddq = joint_states(path, control_rate, tensor(s), spec)
     p, r = (
-        BSpline(
+        scipy.interpolate.BSpline(
             clamped_knots(x.shape[1], spec.degree), np.moveaxis(x, 0, 1), spec.degree
         )
         for x in (plans.path, plans.rate)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+import scipy
 
 from cnpgen.addons.online.moving_pucks import NO_MEETING, TOO_LATE, PuckModel
 from cnpgen.addons.online.plan_hits import plan_hits
@@ -53,7 +53,7 @@ def integrate(model: PuckModel, position, velocity, time: float) -> np.ndarray:
     bands.terminal, bands.direction = True, -1
     state, begin = np.array([*position, *velocity]), 0.0
     while begin < time:
-        solution = solve_ivp(
+        solution = scipy.integrate.solve_ivp(
             lambda _, s: [s[2], s[3], -model.drag * s[2], -model.drag * s[3]],
             (begin, time),
             state,

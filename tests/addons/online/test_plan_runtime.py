@@ -4,8 +4,7 @@ import threading
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
-from scipy.interpolate import BSpline
+import scipy
 
 from cnpgen.addons.benchmark.simulator.reference import TICK_S, Reference
 from cnpgen.addons.online.plan_hits import plan_hits
@@ -56,13 +55,13 @@ def states_of_scipy(plan, times):
 
     def spline(control):
         knots = np.r_[np.zeros(7), np.linspace(0, 1, len(control) - 6), np.ones(7)]
-        return BSpline(knots, control, 7)
+        return scipy.interpolate.BSpline(knots, control, 7)
 
     path, rate = (
         spline(plan.path_control_points[0]),
         spline(plan.rate_control_points[0]),
     )
-    solution = solve_ivp(
+    solution = scipy.integrate.solve_ivp(
         lambda _, s: rate(np.clip(s, 0, 1)),
         (0, times[-1]),
         [0.0],

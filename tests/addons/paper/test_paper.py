@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+import scipy
 
 from cnpgen.robots.obstacle import Obstacle
 from tests.examples.plans import load, reference_trajectory
@@ -34,7 +34,11 @@ def test_metrics_agree_with_an_independent_integration(label):
         assert metrics.hit_speed == pytest.approx(speed, rel=1e-3)
         assert np.isnan(metrics.vertical_error)
     else:
-        roll, pitch, _ = Rotation.from_matrix(seen.rotation).as_euler("xyz").T
+        roll, pitch, _ = (
+            scipy.spatial.transform.Rotation.from_matrix(seen.rotation)
+            .as_euler("xyz")
+            .T
+        )
         assert metrics.vertical_error == pytest.approx(
             seen.integral(np.abs(roll) + np.abs(pitch)), rel=1e-4
         )

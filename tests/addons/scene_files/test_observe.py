@@ -6,6 +6,7 @@ import pytest
 from cnpgen.errors import UsageError
 from cnpgen.kernels.observation.compiled_observations import observation_backend
 from cnpgen.loader.batch import Batch
+from cnpgen.loader.batch_options import BatchOptions
 from cnpgen.loader.load import load_dataset
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem_record import as_problem
@@ -329,8 +330,7 @@ def test_batches_of_a_dataset_have_the_observations_of_their_scenes(tiny) -> Non
     options = {
         "fields": fields,
         "normalize": False,
-        "drop_last": False,
-        "shuffle": False,
+        "options": BatchOptions(drop_last=False, shuffle=False),
     }
     batches = list(dataset.batches(16, observe=observer, **options))
     for batch, plain in zip(batches, dataset.batches(16, **options), strict=True):

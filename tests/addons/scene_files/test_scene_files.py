@@ -6,8 +6,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import scipy
 import yaml
-from scipy.spatial.transform import Rotation
 
 from cnpgen.errors import CnpgenError, DatasetError, UsageError
 from cnpgen.problems.scenes.quaternions import (
@@ -65,8 +65,8 @@ def example(name: str = "shelf") -> SceneProblem:
 
 
 def test_quaternions_agree_with_scipy() -> None:
-    random = Rotation.random(200, random_state=1)
-    edges = Rotation.from_euler(
+    random = scipy.spatial.transform.Rotation.random(200, random_state=1)
+    edges = scipy.spatial.transform.Rotation.from_euler(
         "xyz",
         [[0, 90, 0], [30, 90, 0], [30, -90, 20], [180, 0, 0], [0, 0, 180]],
         degrees=True,
@@ -91,7 +91,10 @@ def test_moveit_scenes_and_requests_are_read_with_composed_poses(
         0.14,
         (0.9, 0.0, 1.08),
     )
-    outer, inner = (Rotation.from_euler("z", angle, degrees=True) for angle in (90, 45))
+    outer, inner = (
+        scipy.spatial.transform.Rotation.from_euler("z", angle, degrees=True)
+        for angle in (90, 45)
+    )
     assert shelf.size == (1.2, 1.0, 0.04)
     assert shelf.position == pytest.approx(
         np.array([0.5, 0, 0.25]) + outer.apply([0.25, 0, 0])
@@ -128,12 +131,12 @@ def test_robometrics_files_have_several_goal_states_and_a_pose(tmp_path: Path) -
     cube, cylinder = scene.obstacles
     xyzw = [0.0, 0.0, -0.5233762232815127, 0.8521017127688338]
     assert turned(*cube.rotation) == pytest.approx(
-        Rotation.from_quat(xyzw).as_matrix(), abs=1e-12
+        scipy.spatial.transform.Rotation.from_quat(xyzw).as_matrix(), abs=1e-12
     )
     assert (cylinder.radius, cylinder.length) == (0.01, 0.14)
     assert scene.goal_pose is not None
     assert scene.goal_pose.rotation == pytest.approx(
-        Rotation.from_quat([0.5] * 4).as_matrix()
+        scipy.spatial.transform.Rotation.from_quat([0.5] * 4).as_matrix()
     )
 
 

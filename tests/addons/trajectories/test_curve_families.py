@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.interpolate import BPoly, CubicHermiteSpline
+import scipy
 
 from cnpgen.addons.trajectories.curve_family import ORDERS, UNDEFINED, CurveFamily
 from cnpgen.addons.trajectories.interpolate import bounded_jerk, interpolated
@@ -41,7 +41,7 @@ def test_the_interpolation_is_that_of_scipy(orders: int, degree: int) -> None:
     assert len(family.coefficients) == degree + 1
     s = np.sort(np.random.default_rng(1).uniform(0, 1, 300))
     data = np.stack([smooth(times, order) for order in range(orders + 1)], axis=1)
-    reference = BPoly.from_derivatives(times, data)
+    reference = scipy.interpolate.BPoly.from_derivatives(times, data)
     states = family.evaluate(s, jerk=False)
     for order, name in enumerate(ORDERS[: min(degree, 2) + 1]):
         assert np.allclose(
@@ -143,7 +143,7 @@ def test_curves_whose_jerks_switch_between_the_bounds_are_in_the_family(
                 ),
             ]
         )
-        curve = CubicHermiteSpline(
+        curve = scipy.interpolate.CubicHermiteSpline(
             edges, _positions(edges, acceleration, velocity, signs), velocity
         )
         times = np.arange(12) * h

@@ -12,8 +12,8 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+import scipy
 import yaml
-from scipy.interpolate import BSpline
 
 import cnpgen
 from cnpgen.errors import UsageError
@@ -64,7 +64,9 @@ def test_path_splines_are_those_of_scipy(plans: Plans, tmp_path: Path) -> None:
         assert file["task_id"][:].tolist() == [4, 7, 9]
         for k in range(3):
             knots, control = file["bspline_params_tt"][k], file["bspline_params_cc"][k]
-            spline = BSpline(knots, control.T, int(file["bspline_params_k"][k]))
+            spline = scipy.interpolate.BSpline(
+                knots, control.T, int(file["bspline_params_k"][k])
+            )
             s = np.linspace(0, 1, 50)
             assert np.allclose(spline(s), plans.motion[[k]].at(s[None]).q[0], atol=1e-9)
             assert np.allclose(

@@ -124,7 +124,7 @@ def test_samples_far_from_the_manifold_keep_their_ends() -> None:
 
 def test_the_number_of_control_points_grows_with_the_detail_of_the_samples() -> None:
     t = np.linspace(0, 4, 400)
-    base = np.array(PROBLEMS["airhockey"].robot.home)
+    base = np.array(PROBLEMS["airhockey"].robot.base)
     smooth = Trajectory(t, base + 0.1 * (1 - np.cos(np.pi * t / 4))[:, None])
     detailed = Trajectory(t, base + 0.1 * (1 - np.cos(5 * np.pi * t / 2))[:, None])
     points = [

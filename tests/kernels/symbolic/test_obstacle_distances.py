@@ -4,7 +4,7 @@ import casadi as ca
 import coal
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+import scipy
 
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.obstacle_distances import _solid
@@ -103,7 +103,7 @@ def test_distances_of_cuboids_are_lower_bounds(kind: str) -> None:
         function = ca.Function("cuboid", [place_sx, turn_sx, numbers_sx], [found])
         for _ in range(40):
             position = random.normal(0, 0.25, 3)
-            rotation = Rotation.from_rotvec(
+            rotation = scipy.spatial.transform.Rotation.from_rotvec(
                 random.normal(0, 2, 3) * [tilted, tilted, 1]
             ).as_matrix()
             at = coal.Transform3s(rotation, position)

@@ -6,11 +6,13 @@ import re
 import shutil
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from cnpgen.addons.benchmark.benchmark_options import BenchmarkOptions
 from cnpgen.addons.benchmark.benchmark_report import save_benchmark_report
 from cnpgen.addons.benchmark.run_suite import run_benchmark
 from cnpgen.addons.benchmark.simulator.challenge import _ScalarItems, challenge_plant
@@ -20,7 +22,7 @@ from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.plans import Plans, save_plans
 from cnpgen.refine.refine_plans import solve_plans
 
-pytest.importorskip("mujoco")
+pytestmark = pytest.mark.skipif(not find_spec("mujoco"), reason="needs mujoco")
 CLONE = Path(__file__).parents[3] / "examples" / "challenge"
 
 
@@ -78,7 +80,12 @@ def test_violated_constraints_and_penalties_are_counted(plans: Plans) -> None:
 @pytest.mark.slow
 def test_a_benchmark_executes_in_the_challenge(tmp_path: Path) -> None:
     benchmark = run_benchmark(
-        "hits-81", tmp_path, planners=["cnpgen"], n=1, environment=CLONE, workers=1
+        "hits-81",
+        tmp_path,
+        planners=["cnpgen"],
+        n=1,
+        workers=1,
+        options=BenchmarkOptions(environment=CLONE),
     )
     assert benchmark.executions == ("challenge",)
     assert benchmark.results["cnpgen"][0]["executed"]["challenge"]["success"]
@@ -190,7 +197,11 @@ def test_other_problems_than_hits_are_refused(tmp_path: Path) -> None:
         )
     with pytest.raises(UsageError, match="is another problem"):
         run_benchmark(
-            "heavy-100", tmp_path, planners=["cnpgen"], n=1, environment=CLONE
+            "heavy-100",
+            tmp_path,
+            planners=["cnpgen"],
+            n=1,
+            options=BenchmarkOptions(environment=CLONE),
         )
 
 

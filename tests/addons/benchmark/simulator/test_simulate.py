@@ -1,6 +1,7 @@
 """Hits that score or miss the goal or the puck; transports with and without collision."""
 
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ from cnpgen.refine.refine_plans import solve_plans
 from cnpgen.schema.catalogue import list_recipes
 from tests.examples.plans import ROBOTS, load
 
-pytest.importorskip("mujoco")
+pytestmark = pytest.mark.skipif(not find_spec("mujoco"), reason="needs mujoco")
 
 
 def hit_towards(folder: Path, target: str) -> Plans:

@@ -1,9 +1,20 @@
-"""Differential dynamic programming of Crocoddyl (Mastalli et al., 2020): BoxFDDP with penalties.
+"""A planner package: differential dynamic programming of Crocoddyl (Mastalli et al., 2020), with penalties.
 
-BoxFDDP bounds the torques. Quadratic barriers penalize joint positions, velocities and
-accelerations outside their limits, and quadratic costs the manifold, the obstacles and
-the goal. The duration is fixed in such a program, so the planner tries increasing
-durations until the violations are small.
+BoxFDDP bounds the torques. Quadratic barriers penalize joint positions, velocities and accelerations outside their limits,
+and quadratic costs the manifold, the obstacles and the goal. The duration is fixed in such a program, so the planner tries
+increasing durations until the violations are small.
+
+The package that holds this module registers the planner in its pyproject.toml:
+
+    [project]
+    name = "cnpgen-crocoddyl"
+    version = "1.0"
+    dependencies = ["cnpgen", "crocoddyl>=3.2.1,<3.3", "pin==4.0.*"]
+
+    [project.entry-points."cnpgen.planners"]
+    crocoddyl = "crocoddyl_planner:Crocoddyl"
+
+The wheels of Crocoddyl 3.2 need Pinocchio 4.0, so it belongs into an environment of its own.
 """
 
 from __future__ import annotations
@@ -28,10 +39,9 @@ from cnpgen.addons.benchmark.planners.obstacle_boxes import (
     boxes_of,
     require_table_or_transport,
 )
-from cnpgen.addons.benchmark.planners.trajopt import MIN_CENTER_DISTANCE_M
 from cnpgen.addons.benchmark.simulator.tip import Tip
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.errors import MachineError, requires_extra
+from cnpgen.errors import MachineError
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
@@ -43,6 +53,7 @@ from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
 
+MIN_CENTER_DISTANCE_M = 0.15  # of the object from the obstacles
 MIN_DURATION_S, MAX_DURATION_S = 0.05, 10.0
 MAX_LIMIT_USE = 1.01  # of velocities and accelerations
 # The answer ends at the goal exactly.
@@ -154,24 +165,24 @@ def load_crocoddyl() -> Any:
     """
     import pinocchio
 
-    with requires_extra("crocoddyl", "Crocoddyl"):
+    try:
         number = importlib.metadata.version("crocoddyl")
-        needed = PINOCCHIO.get(".".join(number.split(".")[:2]))
-        if needed is None:
-            known = ", ".join(
-                f"{version}.* with Pinocchio {other}.*"
-                for version, other in PINOCCHIO.items()
-            )
-            raise MachineError(
-                f"Crocoddyl must be {known}, installed is {number}:"
-                " pip install 'cnpgen[crocoddyl]' in another environment"
-            )
-        if not pinocchio.__version__.startswith(f"{needed}."):
-            raise MachineError(
-                f"Crocoddyl {number} needs Pinocchio {needed}, installed is {pinocchio.__version__}:"
-                " pip install 'cnpgen[crocoddyl]' in another environment"
-            )
-        import crocoddyl
+    except importlib.metadata.PackageNotFoundError as error:
+        raise MachineError("Crocoddyl is missing: pip install crocoddyl") from error
+    needed = PINOCCHIO.get(".".join(number.split(".")[:2]))
+    if needed is None:
+        known = ", ".join(
+            f"{version}.* with Pinocchio {other}.*"
+            for version, other in PINOCCHIO.items()
+        )
+        raise MachineError(f"Crocoddyl must be {known}, installed is {number}")
+    if not pinocchio.__version__.startswith(f"{needed}."):
+        raise MachineError(
+            f"Crocoddyl {number} needs Pinocchio {needed},"
+            f" installed is {pinocchio.__version__}"
+        )
+    import crocoddyl
+
     return crocoddyl
 
 
@@ -385,14 +396,14 @@ def _residual_model(package: Any, state: Any, violation: ObjectViolation) -> Any
     """Wrap violations for Crocoddyl."""
     n = state.nq
 
-    class Violation(package.ResidualModelAbstract):  # type: ignore[misc]
+    class Violation(package.ResidualModelAbstract):
         def __init__(self) -> None:
             super().__init__(state, violation.size, n, True, False, False)
 
         def calc(self, data: Any, x: Any, _u: Any = None) -> None:
             data.r[:] = violation.values(np.array(x[:n]))
 
-        def calcDiff(self, data: Any, x: Any, _u: Any = None) -> None:  # noqa: N802 - a method of Crocoddyl
+        def calcDiff(self, data: Any, x: Any, _u: Any = None) -> None:
             data.Rx[:, :n] = violation.derivatives(np.array(x[:n]))
 
     return Violation()
