@@ -403,6 +403,10 @@ def _parameter_errors(plans: Plans, rows: int) -> Iterator[str]:
         yield f"parameters are missing: plans of {plans.problem.name!r} have {names}"
     elif parameters is not None and parameters.shape != (rows, width):
         yield f"parameters must have shape {(rows, width)} (plans, parameters of the problem), got {parameters.shape}"
+    elif parameters is not None and (
+        text := plans.problem.parameters.out_of_range(parameters)
+    ):
+        yield f"parameters: {text}"
 
 
 def _rows(plans: Plans) -> int:

@@ -174,21 +174,27 @@ class ParameterRanges:
                 argument="parameters",
             )
         rows = values.reshape(-1, len(self))
+        if (text := self.out_of_range(rows)) or not np.isfinite(rows).all():
+            text = text or f"must be finite, got {rows[~np.isfinite(rows)][0]}"
+            raise UsageError(text, argument="parameters")
+        return rows
+
+    def out_of_range(self, rows: Array) -> str:
+        """Return an error text if a value of shape (N, width) is outside of its range, otherwise "".
+
+        Values that are not numbers pass: the verdict reports them.
+        """
         for column, (name, span) in enumerate(
             zip(self.names, self.ranges, strict=True)
         ):
             rounding = RANGE_ROUNDING * max(abs(span.low), abs(span.high))
-            outside = ~(
-                (rows[:, column] >= span.low - rounding)
-                & (rows[:, column] <= span.high + rounding)
+            outside = (rows[:, column] < span.low - rounding) | (
+                rows[:, column] > span.high + rounding
             )
             if outside.any():
                 row = int(outside.argmax())
-                raise UsageError(
-                    f"{name} must be from {span.low:g} to {span.high:g}, got {rows[row, column]:g} in row {row}",
-                    argument="parameters",
-                )
-        return rows
+                return f"{name} must be from {span.low:g} to {span.high:g}, got {rows[row, column]:g} in row {row}"
+        return ""
 
     def describe(self) -> Iterator[str]:
         """Yield a text of every parameter with its range in SI units."""
