@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> None:
     problem = problem_of(arguments)
     loaded = load_file(arguments, problem)
     imported = import_trajectories(
-        problem,
+        loaded.problem,
         loaded.trajectories,
         noise=arguments.noise or 0.0,
         at_rest=arguments.at_rest,

@@ -18,16 +18,19 @@ from cnpgen.addons.trajectories.evaluate_trajectories import (
     non_negative,
 )
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.addons.trajectories.trajectory_scenes import problem_of_samples
+from cnpgen.errors import UsageError
 from cnpgen.judges.plans.continuous_collision import is_contact
 from cnpgen.machine.threads import one_thread
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.constraints.constraint import End
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_record import as_record, open_problem
+from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.dataset_spec import StoredProblem
+from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.trajectory.boundary import Boundary, join_boundaries
 from cnpgen.trajectory.fit import fit_motion, largest_error
 from cnpgen.trajectory.samples import sampled_boundary
@@ -103,7 +106,7 @@ def import_trajectories(
     Raises: UsageError: An argument is invalid, or a trajectory has another number of
         joints.
     """
-    record = as_record(problem)
+    record = problem_of_samples(problem)
     check_trajectories(trajectories, record)
     errors = non_negative("noise", noise, 3)
     snapper = StateSnapper(*open_problem(record))
@@ -121,9 +124,14 @@ def import_trajectories(
         record.trajectory,
         MAX_FIT_ERROR_RAD + float(errors[0]),
     )
+    poses = [trajectory.obstacle_poses for trajectory in trajectories]
+    placed = [row for row in poses if row is not None]
+    if 0 < len(placed) < len(poses):
+        raise UsageError("some have scenes and others not", argument="trajectories")
     plans = make_plans(
         record,
         join_boundaries(boundaries),
+        columns={OBSTACLE_POSES: np.array(placed)} if placed else {},
         path_control_points=np.concatenate([motion.path for motion in motions]),
         rate_control_points=np.concatenate([motion.rate for motion in motions]),
         source=source,

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.addons.trajectories.trajectory_scenes import problem_of_samples, with_scenes
 from cnpgen.addons.trajectories.trajectory_tables import (
     TrajectoryTable,
     read_trajectory_tables,
@@ -19,7 +20,8 @@ from cnpgen.addons.trajectories.trajectory_tables import (
 from cnpgen.errors import UsageError, either, nearest
 from cnpgen.plans.format import PHASE_COLUMN
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
+from cnpgen.problems.problem_record import ProblemRecord, open_problem
+from cnpgen.problems.scenes.scene_problem import SceneProblem
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.robots.plausible_values import UnitError, find_implausible_value
 from cnpgen.robots.robot import Robot
@@ -27,6 +29,7 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import number
 from cnpgen.schema.units import UNITS as KNOWN_UNITS
 from cnpgen.store.dataset_spec import StoredProblem
+from cnpgen.store.scene_table import OBSTACLE_POSES
 
 Array = NDArray[np.float64]
 
@@ -50,11 +53,13 @@ class LoadedTrajectories:
     """Trajectories of a file, in the order of the problem's joints and in SI units.
 
     Attributes:
+        problem: The problem, with further obstacles if scenes were given.
         trajectories: The trajectories.
         labels: Places in the file, such as ``"plans/plan_00000.csv"``.
         ignored: Names of columns that are not used, such as those of a gripper.
     """
 
+    problem: ProblemRecord
     trajectories: tuple[Trajectory, ...]
     labels: tuple[str, ...]
     ignored: tuple[str, ...]
@@ -71,6 +76,7 @@ def load_trajectories(
     separate_by: str | None = None,
     unwrap: bool = False,
     parameters: Mapping[str, float] | None = None,
+    scenes: str | Path | Sequence[SceneProblem] | None = None,
 ) -> LoadedTrajectories:
     """Load sampled trajectories from a file or a folder; 'cnpgen docs trajectories' lists formats and columns.
 
@@ -86,13 +92,15 @@ def load_trajectories(
             the end of the range of angles.
         parameters: Values of the problem's parameters that the file does not have, by
             name, in SI units.
+        scenes: Obstacles around the trajectories: a file of scenes or of plans, or
+            loaded scenes; one for each trajectory in order, or one for all.
 
     Raises: UsageError: A column is missing, a value is not finite, times do not
         increase, or the file is damaged. UnitError: Positions without a unit are
         probably in degrees or millimetres, or times in milliseconds. MissingExtraError:
         The format needs a package that is not installed.
     """
-    record = as_record(problem)
+    record = problem_of_samples(problem)
     names = record.joint_names if joints is None else tuple(joints)
     if len(names) != len(record.joint_names) or not all(
         isinstance(name, str) for name in names
@@ -134,8 +142,10 @@ def load_trajectories(
     if unit == "rad":
         _check_unit(path, robot, [trajectory.q for trajectory in trajectories])
     ignored = dict.fromkeys(name for reader in readers for name in reader.unused())
+    if scenes is not None:
+        record, trajectories = with_scenes(record, trajectories, scenes)
     return LoadedTrajectories(
-        trajectories, tuple(table.place for table in tables), tuple(ignored)
+        record, trajectories, tuple(table.place for table in tables), tuple(ignored)
     )
 
 
@@ -256,6 +266,7 @@ class _Reader:
             turning = [not sliding for sliding in self.record.prismatic_joints]
             q[:, turning] = np.unwrap(q[:, turning], axis=0)
         parameters = self._parameters()
+        poses = self._obstacle_poses()
         phase = (
             self._numbers(PHASE_COLUMN, ndim=1)
             if PHASE_COLUMN in self.table.columns
@@ -265,7 +276,7 @@ class _Reader:
             if parameters is not None:
                 self.record.parameters.checked(parameters)
             trajectory = Trajectory(
-                t - t[0], q, columns["dq"], columns["ddq"], parameters, phase
+                t - t[0], q, columns["dq"], columns["ddq"], parameters, phase, poses
             )
         except UsageError as error:
             raise self._error(str(error)) from error
@@ -303,6 +314,17 @@ class _Reader:
         if not ranges or found.keys() != set(ranges.names):
             return None
         return np.array([found[name] for name in ranges.names])
+
+    def _obstacle_poses(self) -> Array | None:
+        """Return the poses and sizes of obstacles in the rows of a file, shape (width,), or None without any."""
+        if OBSTACLE_POSES not in self.table.columns:
+            return None
+        rows = self._numbers(OBSTACLE_POSES, ndim=2)
+        if (rows != rows[0]).any():
+            raise self._error(
+                f"{OBSTACLE_POSES} must be the same in every row: obstacles do not move"
+            )
+        return rows[0]
 
     def _times(self, count: int) -> Array:
         """Return the times of the samples [s]."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.cli import values
+from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Options, options_of
 from cnpgen.cli.terminal import table
 from cnpgen.cli.verdict_text import margin_cells, margin_head
@@ -25,6 +25,7 @@ TRAJECTORY_OPTIONS = (
     "separate_by",
     "unwrap",
     "parameters",
+    "scenes",
 )  # of load_trajectories
 MAX_IGNORED = 8  # unused columns that are listed
 
@@ -63,6 +64,8 @@ def add_trajectory_options(option: Options) -> None:
 
     text = "values of the problem's parameters that the file does not have, such as payload_mass=6kg"
     add("--parameters", metavar="NAME=V,...", type=values.parameters, help=text)
+    text = "obstacles around the trajectories: a file of scenes or of plans; one for each trajectory, or one for all"
+    add("--scenes", metavar="FILE", type=recipe_names.present, help=text)
     text = "body at the tip, in place of the problem's: mass [kg], or mass and centre of mass in the tip frame [m]"
     add("--payload", metavar="M[,X,Y,Z]", type=values.payload, help=text)
 
@@ -82,6 +85,7 @@ def refuse_trajectory_options(
 
 def problem_of(arguments: argparse.Namespace) -> "str | Problem":
     """Return the problem of a command, with the payload of its options."""
+    from cnpgen.addons.trajectories.trajectory_scenes import problem_of_samples
     from cnpgen.problems.problem_record import as_problem
     from cnpgen.robots.robot_spec import Payload
 
@@ -98,7 +102,7 @@ def problem_of(arguments: argparse.Namespace) -> "str | Problem":
         if not centre
         else Payload(mass=mass, centre=(centre[0], centre[1], centre[2]))
     )
-    return replace(as_problem(name), payload=body)
+    return replace(as_problem(problem_of_samples(name)), payload=body)
 
 
 def load_file(

@@ -23,6 +23,7 @@ from cnpgen.store.files.size_limits import MAX_TABLE_BYTES
 from cnpgen.store.files.yaml_document import read_yaml
 from cnpgen.store.layout import SPECIFICATION
 from cnpgen.store.paths import require_path
+from cnpgen.store.scene_table import OBSTACLE_POSES
 
 Values = NDArray[Any]
 
@@ -35,6 +36,7 @@ LEROBOT_ENVIRONMENT = "observation.environment_state"
 _PART_OF_ARCHIVE = re.compile(
     rf"(.+?)_(t|{PHASE_COLUMN}|q|dq|ddq|jerk|{'|'.join(PARAMETER_UNITS)})"
 )
+_POSE_NAME = re.compile(rf"{OBSTACLE_POSES}(_[0-9]+)?")  # a value of LeRobot
 MESSAGE_TIME = "t [s]"  # of formats that define the unit
 _POINT_FIELDS = {"positions": "q", "velocities": "dq", "accelerations": "ddq"}
 _NESTING = (
@@ -288,20 +290,22 @@ def _read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
     parameters = {
         name: k for k, name in enumerate(described) if name in PARAMETER_UNITS
     }
+    scene = [k for k, name in enumerate(described) if _POSE_NAME.fullmatch(name)]
+    environment_key = [LEROBOT_ENVIRONMENT] if parameters or scene else []
     for path in sorted(folder.glob("data/*/*.parquet")):
         table = read_parquet(path)
         needed = (
             "timestamp",
             "episode_index",
             key,
-            *([LEROBOT_ENVIRONMENT] if parameters else []),
+            *environment_key,
         )
         missing = [name for name in needed if name not in table.column_names]
         if missing:
             raise UsageError(
                 f"{path}: there is no column {missing[0]!r}, only {', '.join(table.column_names)}"
             )
-        widths = 1, 1, len(names), *([len(described)] if parameters else [])
+        widths = 1, 1, len(names), *([len(described)] if environment_key else [])
         columns_of = zip(needed, widths, strict=True)
         times, episodes, values, *environment = (
             _number_column(table, name, path, width) for name, width in columns_of
@@ -311,6 +315,8 @@ def _read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
             columns: dict[str, Values] = {MESSAGE_TIME: times[rows, 0]}
             columns |= {name: values[rows, k] for k, name in enumerate(names)}
             columns |= {name: environment[0][rows, k] for name, k in parameters.items()}
+            if scene:
+                columns[OBSTACLE_POSES] = environment[0][rows][:, scene]
             yield TrajectoryTable(f"{folder}: episode {episode:g}", columns)
 
 

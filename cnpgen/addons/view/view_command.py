@@ -183,6 +183,7 @@ def _scene_of_trajectories(
     loaded = load_file(
         argparse.Namespace(**vars(arguments) | {"file": Path(arguments.what)}), problem
     )
+    problem = problem.with_obstacles(as_problem(loaded.problem).obstacle)
     count = len(loaded.trajectories)
     if (row := max(rows)) >= count:
         raise UsageError(
