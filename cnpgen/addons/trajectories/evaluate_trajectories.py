@@ -196,7 +196,9 @@ def _check_scene(index: int, trajectory: Trajectory, problem: Problem) -> None:
     elif problem.has_sample_obstacles:
         text = f"trajectory {index} has no scene: samples of {problem.name!r} place its obstacles, which"
         raise UsageError(
-            f"{text} {{scenes}} gives", concerns="trajectories", remedies={"scenes": None}
+            f"{text} {{scenes}} gives",
+            concerns="trajectories",
+            remedies={"scenes": None},
         )
 
 

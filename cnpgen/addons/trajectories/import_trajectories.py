@@ -128,9 +128,7 @@ def import_trajectories(
         np.array([change for _, change in ends]),
     )
     max_error = MAX_FIT_ERROR_RAD + float(errors[0])
-    motions, deviation = _fitted(
-        trajectories, boundaries, record.trajectory, max_error
-    )
+    motions, deviation = _fitted(trajectories, boundaries, record.trajectory, max_error)
     poses = [trajectory.obstacle_poses for trajectory in trajectories]
     placed = [row for row in poses if row is not None]
     if 0 < len(placed) < len(poses):

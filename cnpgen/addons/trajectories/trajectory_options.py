@@ -11,7 +11,7 @@ from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Options, options_of
 from cnpgen.cli.terminal import table
 from cnpgen.cli.verdict_text import margin_cells, margin_head
-from cnpgen.errors import UsageError, listed
+from cnpgen.errors import UsageError, counted, listed
 
 if TYPE_CHECKING:
     from cnpgen.addons.trajectories.evaluate_trajectories import TrajectoryEvaluation
@@ -20,14 +20,19 @@ if TYPE_CHECKING:
 
 TRAJECTORY_OPTIONS = (
     "joints",
+    "velocities",
+    "time",
     "unit",
     "rate",
+    "separator",
     "separate_by",
     "unwrap",
+    "drop_repeats",
     "parameters",
     "scenes",
 )  # of load_trajectories
 MAX_IGNORED = 8  # unused columns that are listed
+MAX_NOTES = 5  # that are printed
 
 
 def add_trajectory_options(option: Options) -> None:
@@ -40,6 +45,14 @@ def add_trajectory_options(option: Options) -> None:
         help="names of the problem's joints in the file, in order",
     )
     add(
+        "--velocities",
+        metavar="A,B,...",
+        type=values.names,
+        help="columns with the velocities of these joints, if they have other names",
+    )
+    text = "column of the times, with its unit if it has another than s: 'stamp [ms]'"
+    add("--time", metavar="COLUMN", help=text)
+    add(
         "--unit",
         choices=("rad", "deg"),
         help="unit of columns without a unit in their name (default: rad)",
@@ -50,16 +63,21 @@ def add_trajectory_options(option: Options) -> None:
         type=values.hertz,
         help="samples per second of a file without times",
     )
-    add(
-        "--separate-by",
-        metavar="COLUMN",
-        help="column whose value differs from trajectory to trajectory",
-    )
+    text = "separator of columns in text files (default: the comma, semicolon, tab or spaces of the first line)"
+    add("--separator", metavar="TEXT", help=text)
+    text = "column whose value differs from trajectory to trajectory"
+    add("--separate-by", metavar="COLUMN", help=text)
     add(
         "--unwrap",
         action="store_true",
         default=None,
         help="continue angles that jump by more than half a turn",
+    )
+    add(
+        "--drop-repeats",
+        action="store_true",
+        default=None,
+        help="drop rows that repeat the time and the positions of the row before",
     )
 
     text = "values of the problem's parameters that the file does not have, such as payload_mass=6kg"
@@ -119,6 +137,10 @@ def load_file(
             f"columns that are not used: {listed(loaded.ignored, MAX_IGNORED)}",
             file=sys.stderr,
         )
+    for note in loaded.notes[:MAX_NOTES]:
+        print(f"note: {note}", file=sys.stderr)
+    if (more := len(loaded.notes) - MAX_NOTES) > 0:
+        print(f"note: {counted(more, 'further note')}", file=sys.stderr)
     return loaded
 
 

@@ -17,6 +17,7 @@ planned tip is then within d of the disc, and the tip itself within 2 d.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,7 +100,7 @@ class TrackingTube:
             if isinstance(condition.constraint, PuckContact):
                 self._move(context, s)
                 distances = condition.constraint.distances_from_contact_region(
-                    self._world
+                    cast(World, self._world)
                 )
                 change = np.minimum(change, distances)
             return replace(condition, uncertainty=change)
