@@ -174,15 +174,15 @@ class ParameterRanges:
                 argument="parameters",
             )
         rows = values.reshape(-1, len(self))
-        if (text := self.out_of_range(rows)) or not np.isfinite(rows).all():
-            text = text or f"must be finite, got {rows[~np.isfinite(rows)][0]}"
+        if text := self.out_of_range(np.nan_to_num(rows, nan=np.inf), shown=rows):
             raise UsageError(text, argument="parameters")
         return rows
 
-    def out_of_range(self, rows: Array) -> str:
+    def out_of_range(self, rows: Array, *, shown: Array | None = None) -> str:
         """Return an error text if a value of shape (N, width) is outside of its range, otherwise "".
 
-        Values that are not numbers pass: the verdict reports them.
+        Values that are not numbers pass: the verdict reports them. The text shows
+        values of ``shown``, by default the same.
         """
         for column, (name, span) in enumerate(
             zip(self.names, self.ranges, strict=True)
@@ -193,7 +193,8 @@ class ParameterRanges:
             )
             if outside.any():
                 row = int(outside.argmax())
-                return f"{name} must be from {span.low:g} to {span.high:g}, got {rows[row, column]:g} in row {row}"
+                value = (rows if shown is None else shown)[row, column]
+                return f"{name} must be from {span.low:g} to {span.high:g}, got {value:g} in row {row}"
         return ""
 
     def describe(self) -> Iterator[str]:
