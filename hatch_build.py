@@ -15,11 +15,12 @@ class SiteAddresses(MetadataHookInterface):  # type: ignore[misc]
         text = (Path(self.root) / "cnpgen" / "machine" / "versions.py").read_text(
             encoding="utf-8"
         )
-        found = re.search(r'^DOCUMENTATION_URL = "([^"]+)"', text, re.MULTILINE)
+        found = re.search(r'^DOCUMENTATION_URL = "([^"]*)"', text, re.MULTILINE)
         assert found is not None
         site = found[1]
-        metadata["urls"] = {
-            "Homepage": site,
-            "Documentation": f"{site}docs/index.html",
-            "Changelog": f"{site}CHANGELOG.html",
+        pages = {
+            "Homepage": "",
+            "Documentation": "docs/index.html",
+            "Changelog": "CHANGELOG.html",
         }
+        metadata["urls"] = {name: site + page for name, page in pages.items() if site}

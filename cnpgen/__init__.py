@@ -12,15 +12,19 @@ Example:
     >>> cnpgen.evaluate_plans(refined).valid  # judge with Pinocchio and Coal
     >>> cnpgen.save_plans("plans.h5", refined)
 
-Functions: Datasets: ``make_dataset``, ``extend_dataset``, ``merge_datasets``,
-    ``load_dataset``, ``inspect_dataset``, ``validate_dataset``. Problems:
-    ``load_problem``, ``load_boundary_problems``, ``draw_boundary_problems``,
-    ``complete``. Plans: ``make_plans``, ``load_plans``, ``save_plans``, ``join_plans``,
+Functions:
+    Datasets: ``make_dataset``, ``extend_dataset``, ``merge_datasets``,
+    ``load_dataset``, ``inspect_dataset``, ``validate_dataset``.
+    Problems: ``load_problem``, ``load_boundary_problems``, ``draw_boundary_problems``,
+        ``complete``.
+    Plans: ``make_plans``, ``load_plans``, ``save_plans``, ``join_plans``,
     ``solve_plans``, ``refine_plans``, ``explain_plans``, ``evaluate_plans``,
-    ``evaluate_trajectories``, ``export_plans``. Models: ``train_model``,
-    ``load_model``, ``save_model``, ``plan_hits``. Machine: ``check_machine``.
+    ``evaluate_trajectories``, ``export_plans``.
+    Models: ``train_model``, ``load_model``, ``save_model``, ``plan_hits``.
+    Machine: ``check_machine``.
 
-Classes: ``Dataset``, ``Problem``, ``Scene``, ``RobotModel``, ``Boundary``, ``Motion``,
+Classes:
+    ``Dataset``, ``Problem``, ``Scene``, ``RobotModel``, ``Boundary``, ``Motion``,
     ``Plans``, ``Planner``, ``Model``, ``BoundaryLayer``, ``PlanLoss``,
     ``TrainingSettings``, ``RefineOptions``, ``CnpgenError``.
 
@@ -34,7 +38,7 @@ of the documentation. Other public names are in these modules:
 * ``cnpgen.scenes``: planning problems in scene files, families of scenes, and plans for them.
 * ``cnpgen.errors``: the exceptions.
 * ``cnpgen.plugins``: contracts of stages, constraints, objectives and exporters.
-* ``cnpgen.addons.benchmark``: comparison of planners, and simulation of plans.
+* ``cnpgen.benchmark``: comparison of planners, and simulation of plans.
 
 Names load on first use, so that importing the package is cheap. ``__init__.pyi`` lists
 them for type checkers (SPEC 1).

@@ -5,7 +5,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-MAX_LINE_LENGTH = 4000  # characters of a message; exceptions of libraries may repeat the content of a file
+# Characters of a message; exceptions of libraries may repeat the content of a file.
+MAX_LINE_LENGTH = 4000
 
 Spelling = Callable[[str, object], str]
 """Writes an argument with the value that a message proposes for it, None for any value."""
@@ -27,9 +28,9 @@ def _limited(text: str) -> str:
 class CnpgenError(Exception):
     """Base class of all exceptions that cnpgen raises intentionally.
 
-    Args: message: The error. With ``argument`` it is a predicate: "must be positive,
-        got 0". ``{name}`` stands for an
-            argument of ``remedies``.
+    Args:
+        message: The error. With ``argument`` it is a predicate: "must be positive, got
+            0". ``{name}`` stands for an argument of ``remedies``.
         argument: Name of the invalid argument, which begins the text.
         concerns: Name of the invalid argument if the message is a whole sentence; by
             default the first of ``remedies``.

@@ -51,7 +51,7 @@ autodoc_typehints_format = "short"
 autodoc_mock_imports = list(BRIDGES)  # the pages of the bridges need no framework
 napoleon_use_ivar = True  # attributes in docstrings describe those that autodoc lists
 linkcheck_ignore = [
-    re.escape(DOCUMENTATION_URL),
+    *([re.escape(DOCUMENTATION_URL)] if DOCUMENTATION_URL else []),
     r"https?://(localhost|[\w.]*\bexample\.(org|com))\b",
 ]  # not published
 linkcheck_timeout = 20  # [s]

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import cnpgen
-import cnpgen.interop
-from cnpgen.cli.describe_keys import FILES, describe_keys
+import cnpgen.addons.frameworks
+from cnpgen.cli.describe_keys import describe_keys, recipe_types
 from cnpgen.cli.main import build_parser
 
 FOLDER = Path(__file__).parent
@@ -72,7 +72,7 @@ def public_objects() -> dict[str, Any]:
 
 def bridge_names() -> dict[str, tuple[str, str]]:
     """Return the public names of the bridges to frameworks: name -> (class or function, docstring)."""
-    folder = Path(cnpgen.interop.__path__[0])
+    folder = Path(cnpgen.addons.frameworks.__path__[0])
     names = {}
     for framework in BRIDGES:
         single = folder / f"{framework}.py"
@@ -211,16 +211,16 @@ def _documentation(value: Any) -> str:
 
 
 def describe_index() -> str:
-    """Return the first page, with the sections of the README that help to decide on cnpgen."""
+    """Return the first page, with the section of the README on its two commands."""
     shared = (FOLDER.parent / "README.md").read_text(encoding="utf-8")
     shared = shared[
-        shared.index("## Two commands") : shared.index("## How it works")
+        shared.index("## Two commands") : shared.index("## Plan, optimize, check")
     ].replace("](docs/", "](")
     page = (FOLDER / "index.md").read_text(encoding="utf-8")
     return (
         page[: page.index("## Two commands")]
         + shared
-        + page[page.index("## Tutorials") :].rstrip("\n")
+        + page[page.index("## When to use it") :].rstrip("\n")
     )
 
 
@@ -239,7 +239,7 @@ def _escaped(text: str | None) -> str:
 
 
 PAGES = {
-    "reference/keys.md": lambda: describe_keys(tuple(FILES)),
+    "reference/keys.md": lambda: describe_keys(tuple(recipe_types())),
     "reference/cli.md": describe_commands,
     "reference/api.md": describe_names,
     "index.md": describe_index,

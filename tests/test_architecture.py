@@ -1,9 +1,11 @@
 """Import rules: packages import lower layers only, judges are independent, heavy libraries are imported on use."""
 
 import ast
+import importlib.metadata
 import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Collection
 from functools import cache
 from graphlib import TopologicalSorter
@@ -11,6 +13,8 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+
+from cnpgen.schema.entry_points import entry_points
 
 PACKAGE = Path(__file__).parents[1] / "cnpgen"
 
@@ -24,15 +28,30 @@ LAYERS = (
     ("pipelines", "judges", "losses", "loader"),
     ("plans",),
     ("refine", "planner"),
-    ("make", "training", "interop"),
-    ("validate", "benchmark"),
-    ("cli", "plugins", "recipes", "results", "scenes", "trajectories", "__init__"),
+    ("make", "training"),
+    ("validate",),
+    (
+        "cli",
+        "plugins",
+        "recipes",
+        "results",
+        "scenes",
+        "trajectories",
+        "benchmark",
+        "interop",
+        "__init__",
+    ),
+    ("addons",),
     ("__main__",),
 )
-MAX_PACKAGES = 26
+MAX_PACKAGES = 20  # of the core
 # Packages of lower layers that must not be imported: the judge shares no code with the solvers that it checks.
 SOLVERS = ("kernels", "pipelines", "losses", "refine", "planner")
-INDEPENDENT = {"judges": SOLVERS, "world": SOLVERS, "benchmark.simulator": SOLVERS}
+INDEPENDENT = {
+    "judges": SOLVERS,
+    "world": SOLVERS,
+    "addons.benchmark.simulator": SOLVERS,
+}
 HEAVY = (
     "casadi",
     "pinocchio",
@@ -47,10 +66,6 @@ HEAVY = (
     "ompl",
 )
 FRAMEWORKS = ("torch", "jax", "tensorflow")
-BRIDGES = (
-    "interop.jax",
-    "interop.tensorflow",
-)  # bridges of one file; users import them
 MODULES = sorted(
     path.relative_to(PACKAGE).with_suffix("")
     for path in PACKAGE.rglob("*.py")
@@ -117,7 +132,9 @@ def modules_of(imported: Collection[str]) -> set[str]:
 def test_a_module_imports_its_own_package_and_lower_layers_only() -> None:
     for own, module in NAMES.items():
         for target in modules_of(imports(module)):
-            assert package(target) == package(own) or layer(target) < layer(own), (
+            inside = package(target) == package(own) != "addons"
+            addons = package(own) == package(target) == "addons"
+            assert inside or addons or layer(target) < layer(own), (
                 f"cnpgen.{own} imports cnpgen.{target}, which is not in a lower layer"
             )
 
@@ -133,10 +150,13 @@ def test_the_docs_list_every_package_in_its_layer() -> None:
         if line.strip()
     )
     assert layers == LAYERS
-    assert (
-        len([name for row in layers for name in row if (PACKAGE / name).is_dir()])
-        <= MAX_PACKAGES
-    )
+    folders = {
+        name
+        for row in layers
+        for name in row
+        if (PACKAGE / name / "__init__.py").is_file()
+    }
+    assert len(folders - {"addons"}) <= MAX_PACKAGES
     assert {name for row in LAYERS for name in row} == {
         package(module) for module in NAMES
     }
@@ -215,17 +235,134 @@ def test_every_trace_of_the_docs_needs_at_most_nine_files_and_never_returns_to_o
 
 
 def test_the_simulator_does_not_import_the_rest_of_the_benchmark() -> None:
+    benchmark = "addons.benchmark"
     for own, module in NAMES.items():
-        if own.startswith("benchmark.simulator"):
+        if own.startswith(f"{benchmark}.simulator"):
             around = {
                 target
                 for target in modules_of(imports(module))
-                if package(target) == "benchmark"
+                if target.startswith(f"{benchmark}.")
             }
             assert all(
-                target.startswith("benchmark.simulator")
-                for target in around - {"benchmark"}
+                target.startswith(f"{benchmark}.simulator") for target in around
             ), (own, around)
+
+
+ADDONS = sorted(path.parent.name for path in (PACKAGE / "addons").glob("*/__init__.py"))
+
+
+def addon(module: str) -> str:
+    """Return the name of the add-on of a module without "cnpgen."; empty for the core."""
+    parts = module.split(".")
+    return parts[1] if parts[0] == "addons" and len(parts) > 1 else ""
+
+
+def needs(name: str) -> set[str]:
+    """Return ``NEEDS`` of the package of an add-on."""
+    tree = source(Path("addons") / name / "__init__")
+    values = [
+        node.value
+        for node in tree.body
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "NEEDS"
+    ]
+    return set(ast.literal_eval(values[0])) if values else set()
+
+
+def test_an_addon_imports_the_core_and_the_addons_that_it_names() -> None:
+    used: dict[str, set[str]] = {name: set() for name in ADDONS}
+    for own, module in NAMES.items():
+        if addon(own):
+            others = {addon(target) for target in modules_of(imports(module))}
+            used[addon(own)] |= others - {"", addon(own)}
+    assert {name: needs(name) for name in ADDONS} == used
+
+
+def test_the_core_names_no_addon() -> None:
+    """Neither imports, nor stubs, nor strings of the core contain the path of a module of an add-on."""
+    path = re.compile(r"cnpgen[./]addons[./]\w+")
+    for file in [*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.pyi")]:
+        place = file.relative_to(PACKAGE)
+        if place.parts[0] in {"addons", "_recipes"}:
+            continue
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        documented = {id(node) for node in docstrings(tree)}
+        texts = [
+            node.value
+            for node in ast.walk(tree)
+            if isinstance(node, ast.Constant)
+            and isinstance(node.value, str)
+            and id(node) not in documented
+        ]
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Import):
+                texts += [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                texts += [f"{node.module}.{alias.name}" for alias in node.names]
+        assert [text for text in texts if path.search(text)] == [], place
+
+
+def docstrings(tree: ast.Module) -> list[ast.AST]:
+    """Return the constants that are docstrings."""
+    holders = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    first = [
+        node.body[0]
+        for node in ast.walk(tree)
+        if isinstance(node, holders)
+        if node.body
+    ]
+    return [node.value for node in first if isinstance(node, ast.Expr)]
+
+
+def test_every_entry_point_names_an_object_of_an_addon() -> None:
+    declared = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text("utf-8"))
+    groups = declared["project"]["entry-points"]
+    assert len(groups) > 8
+    for group, entries in groups.items():
+        for name, value in entries.items():
+            module, _, attribute = value.partition(":")
+            own = module.removeprefix("cnpgen.")
+            assert addon(own) in ADDONS, (group, name)
+            assert own in NAMES, (group, name, value)
+            assert not attribute or defines(NAMES[own], attribute), (group, name, value)
+    installed = {
+        (group, entry.name, entry.value)
+        for group, entries in entry_points().items()
+        for entry in entries
+        if entry.distribution == "cnpgen"
+    }
+    assert installed == {
+        (group, name, value)
+        for group, entries in groups.items()
+        for name, value in entries.items()
+    }, "the entry points of this environment are old: pip install -e ."
+
+
+def defines(module: Path, attribute: str) -> bool:
+    """Return whether a module defines or imports a name."""
+    return any(
+        getattr(node, "name", None) == attribute
+        or (
+            isinstance(node, ast.Import | ast.ImportFrom)
+            and attribute in {alias.asname or alias.name for alias in node.names}
+        )
+        for node in ast.walk(source(module))
+    )
+
+
+def test_entry_points_are_those_that_the_standard_library_finds() -> None:
+    found = importlib.metadata.entry_points()
+    expected = {
+        (entry.group, entry.name, entry.value)
+        for group in found.groups
+        if group.startswith("cnpgen.")
+        for entry in found.select(group=group)
+    }
+    assert len(expected) > 50
+    assert expected == {
+        (entry.group, entry.name, entry.value)
+        for entries in entry_points().values()
+        for entry in entries
+    }
 
 
 def test_problems_import_kernels_and_world_on_use_only() -> None:
@@ -238,27 +375,35 @@ def test_problems_import_kernels_and_world_on_use_only() -> None:
 
 
 def test_every_module_is_imported_or_registered() -> None:
-    """Registered kinds are loaded by name; plug-in contracts, facades and bridges are for users."""
-    used = {
-        target for module in MODULES for target in modules_of(imports(module))
-    } | modules_of(public_modules())
-    by_name = {
-        value.partition(":")[0].removeprefix("cnpgen.") for value in kinds_by_name()
-    }
+    """Registered kinds and commands are loaded by name; facades are for users."""
+    from cnpgen.cli.commands import _CORE
+    from cnpgen.schema import registry
+
+    used = {target for module in MODULES for target in modules_of(imports(module))}
+    registered = [
+        spec for kinds in registry.BUILT_IN.values() for spec in kinds.values()
+    ]
+    registered += [entry.value for group in entry_points().values() for entry in group]
+    by_name = {spec.partition(":")[0].removeprefix("cnpgen.") for spec in registered}
+    by_name |= {f"cli.{module}" for module in _CORE.values()}
     unused = {
         own
         for own, module in NAMES.items()
-        if own not in used | by_name and module.name != "__init__"
+        if own not in used | by_name | modules_of(public_modules())
+        and module.name != "__init__"
     }
     assert unused <= {
         "__main__",
+        "benchmark",
+        "interop.jax",
+        "interop.tensorflow",
+        "interop.torch",
         "plugins",
         "recipes",
         "results",
         "scenes",
         "trajectories",
         "training.select_via_points",
-        *BRIDGES,
     }
 
 
@@ -275,12 +420,6 @@ def public_modules() -> set[str]:
     }
 
 
-def kinds_by_name() -> set[str]:
-    from cnpgen.schema import registry
-
-    return {spec for group in registry.BUILT_IN.values() for spec in group.values()}
-
-
 def test_no_module_imports_a_heavy_library_at_module_level() -> None:
     for own, module in NAMES.items():
         heavy = {
@@ -294,11 +433,8 @@ def test_only_the_bridge_of_a_framework_imports_it() -> None:
         frameworks = {imported.split(".")[0] for imported in imports(module)} & set(
             FRAMEWORKS
         )
-        own = (
-            set(name(module).split(".")[1:2])
-            if package(name(module)) == "interop"
-            else set()
-        )
+        parts = name(module).split(".")
+        own = set(parts[2:3]) if parts[:2] == ["addons", "frameworks"] else set()
         assert frameworks <= own, f"{name(module)} imports {frameworks}"
 
 
@@ -322,6 +458,7 @@ def test_imports_and_help_texts_load_no_heavy_library() -> None:
     """One process runs all steps and reports the first step that loads a heavy library."""
     code = f"""
 import sys
+import tomllib
 from contextlib import suppress
 loaded = {{}}
 def check(step):
@@ -347,6 +484,7 @@ def test_the_verifier_loads_no_solver_module() -> None:
     """Verify rows in a process and check that it has loaded no kernel and no stage."""
     code = """
 import sys
+import tomllib
 import numpy as np
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.load_robot import load_robot

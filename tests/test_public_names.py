@@ -17,6 +17,8 @@ import pytest
 
 import cnpgen
 import cnpgen.plugins
+from cnpgen.schema.entry_points import entry_points
+from cnpgen.schema.public_names import NAMES
 
 SPECIAL = {"__init__", "__call__", "__getitem__", "__iter__"}
 INNER = {  # classes in public signatures that users neither construct nor annotate
@@ -175,8 +177,20 @@ STUBS = ["cnpgen", *(f"cnpgen.{name}" for name in MODULES if name != "errors")]
 def test_a_stub_lists_every_name_once_and_nothing_else(package: str) -> None:
     module = importlib.import_module(package)
     stub = Path(str(module.__file__)).with_suffix(".pyi").read_text(encoding="utf-8")
-    names = [line.split(" as ")[1] for line in stub.splitlines()]
-    assert sorted(names) == sorted(set(names)) == sorted(module.__all__) == dir(module)
+    imported = [
+        node
+        for node in ast.parse(stub).body
+        if isinstance(node, ast.ImportFrom) and node.module != "typing"
+    ]
+    own = [alias.asname for node in imported for alias in node.names]
+    added = [
+        entry.name.removeprefix(f"{package}.")
+        for entry in entry_points()[NAMES]
+        if entry.name.rpartition(".")[0] == package
+    ]
+    assert ("def __getattr__(" in stub) == bool(added)
+    names = sorted([*own, *added])
+    assert names == sorted(set(names)) == sorted(module.__all__) == dir(module)
 
 
 def test_the_package_has_few_names_and_help_is_short() -> None:
@@ -230,4 +244,8 @@ def test_importing_the_package_loads_none_of_its_packages() -> None:
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
-    assert done.stdout.split() == ["cnpgen"]
+    assert done.stdout.split() == [
+        "cnpgen",
+        "cnpgen.schema",
+        "cnpgen.schema.public_names",
+    ]

@@ -9,6 +9,7 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
+from cnpgen.errors import CnpgenError, MachineError
 from cnpgen.schema import addons
 from cnpgen.schema.registry import COMMANDS
 
@@ -54,14 +55,23 @@ def is_command(name: str) -> bool:
 def load_command(name: str) -> ModuleType:
     """Import the module of a command.
 
-    Raises: MissingAddonError: The command belongs to an add-on that this installation
-        lacks.
+    Raises:
+        MissingAddonError: The command belongs to an add-on that this installation
+            lacks.
+        MachineError: The module of another package cannot be imported.
     """
     if name in _CORE:
         return import_module(f"cnpgen.cli.{_CORE[name]}")
     entry = addons.find(COMMANDS, name)
     assert entry is not None, name
-    module: ModuleType = addons.load_entry(entry, f"the command {name!r}")
+    try:
+        module: ModuleType = addons.load_entry(entry, f"the command {name!r}")
+    except CnpgenError:
+        raise
+    except Exception as error:  # modules of packages may raise any exception
+        text = f"{type(error).__name__}: {error}"
+        message = f"the command {name!r} cannot be imported: {text}"
+        raise MachineError(message) from error
     return module
 
 

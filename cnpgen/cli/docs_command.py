@@ -6,6 +6,7 @@ are on the site and in the repository only.
 
 import argparse
 import re
+import sys
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -24,7 +25,7 @@ def add_options(parser: Parser) -> None:
     what.add_argument(
         "--search",
         metavar="TEXT",
-        help="list the lines with TEXT on all pages, in any case",
+        help="list the lines with all words of TEXT on all pages, in any case",
     )
     parser.add_argument(
         "--url", action="store_true", help="print the address of PAGE on the site"
@@ -38,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.search is not None:
         return _search(arguments.search, pages, as_json=arguments.json)
     if arguments.url:
-        print(page_url(pages[name] if name else pages["index"]))
+        _print_url(pages[name] if name else pages["index"])
     elif name is None:
         _list(pages, as_json=arguments.json)
     elif arguments.json:
@@ -48,6 +49,14 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         print(_text(pages[name]), end="")
     return 0
+
+
+def _print_url(page: Path) -> None:
+    url = page_url(page)
+    if url is None:
+        text = "the documentation has no address yet: 'cnpgen docs PAGE' prints a page"
+        raise UsageError(text)
+    print(url)
 
 
 def docs_folder() -> Path:
@@ -95,22 +104,26 @@ def page_name(text: str, pages: dict[str, Path]) -> str:
     return name
 
 
-def page_url(page: Path) -> str:
-    """Return the address of a page on the site."""
-    from cnpgen.machine.versions import DOCUMENTATION_URL
+def page_url(page: Path) -> str | None:
+    """Return the address of a page on the site; None if the site has no address."""
+    from cnpgen.machine import versions
 
-    return f"{DOCUMENTATION_URL}docs/{page.relative_to(docs_folder()).with_suffix('.html').as_posix()}"
+    if not versions.DOCUMENTATION_URL:
+        return None
+    path = page.relative_to(docs_folder()).with_suffix(".html").as_posix()
+    return f"{versions.DOCUMENTATION_URL}docs/{path}"
 
 
 def mentioned_addresses(text: str) -> list[str]:
     """Return the addresses of the pages that a text names as ``'cnpgen docs PAGE'``.
 
-    None without installed pages.
+    None without installed pages or an address of the site.
     """
     names = re.findall(r"'cnpgen docs ([\w/-]+)'", " ".join(text.split()))
     with suppress(CnpgenError):
         pages = list_pages() if names else {}
-        return [page_url(pages[name]) for name in dict.fromkeys(names) if name in pages]
+        named = [pages[name] for name in dict.fromkeys(names) if name in pages]
+        return list(filter(None, map(page_url, named)))
     return []
 
 
@@ -146,18 +159,24 @@ def _list(pages: dict[str, Path], *, as_json: bool) -> None:
 
 
 def _search(text: str, pages: dict[str, Path], *, as_json: bool) -> int:
-    """Print the lines that contain a text; return 1 if there are none."""
+    """Print the lines that contain all words of a text, in any order.
+
+    Return 1 if there are none.
+    """
+    words = text.casefold().split()
     rows = [
         {"page": name, "line": number, "text": line.strip()}
         for name, file in pages.items()
         for number, line in enumerate(_text(file).splitlines(), 1)
-        if text.casefold() in line.casefold()
+        if all(word in line.casefold() for word in words)
     ]
     if as_json:
         _print_json(rows)
     else:
         for row in rows:
             print(f"{row['page']}:{row['line']}: {row['text']}")
+    if not rows:
+        print(f"cnpgen: no line of the documentation has {text!r}", file=sys.stderr)
     return 0 if rows else 1
 
 

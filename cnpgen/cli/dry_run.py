@@ -18,9 +18,9 @@ from cnpgen.store.workspace import (
     started_spec,
 )
 
-SHARD_OVERHEAD = (
-    41_000  # bytes: what the HDF5 file and the sidecar of a shard take beside the rows
-)
+# Bytes: what the HDF5 file and the sidecar of a shard take beside the rows.
+
+SHARD_OVERHEAD = 41_000
 DOCUMENTS = 90_000  # bytes: specification.json, manifest, card and statistics
 
 

@@ -9,10 +9,8 @@ from pathlib import Path
 
 from cnpgen.machine.signals import signals_handled
 
-INTERRUPTED, TERMINATED = (
-    130,
-    143,
-)  # exit codes: 128 + SIGINT, 128 + SIGTERM, as shells have it
+# Exit codes: 128 + SIGINT, 128 + SIGTERM, as shells have it.
+INTERRUPTED, TERMINATED = 130, 143
 
 _interruptions: list[int] = []  # the signal that came first, if any
 
@@ -63,5 +61,6 @@ def interruptible() -> Iterator[None]:
         try:
             yield
         except Exception:
-            raise_if_interrupted()  # what the same Ctrl-C did to a compiler is not the news
+            # What the same Ctrl-C did to a compiler is not the news.
+            raise_if_interrupted()
             raise

@@ -1,4 +1,4 @@
-"""List datasets, models, pipelines, problems, stages, constraints, objectives and exporters."""
+"""List recipes, models and the kinds that recipes and options name."""
 
 import argparse
 from pathlib import Path
@@ -18,6 +18,9 @@ _HOW = {
     "constraints": "cnpgen show --constraint NAME",
     "objectives": "cnpgen train DIR -o MODEL --objective NAME=WEIGHT",
     "exporters": "cnpgen export PLANS --to NAME",
+    "families": "cnpgen make-scenes NAME --robot ROBOT",
+    "planners": "cnpgen benchmark SUITE --planners NAME",
+    "suites": "cnpgen benchmark NAME",
 }
 WHAT = tuple(_HOW)
 
@@ -51,7 +54,7 @@ def list_all(what: str) -> list[dict[str, Any]]:
     from cnpgen.schema import registry
 
     group = f"cnpgen.{what}"
-    if group in registry.CONTRACTS:
+    if registry.names(group):
         return [
             {"name": name, "title": _summary(group, name)}
             for name in registry.names(group)
@@ -64,11 +67,15 @@ def list_all(what: str) -> list[dict[str, Any]]:
         "models": _model,
         "pipelines": _pipeline,
         "problems": _problem,
-    }[what]
+        "suites": _suite,
+    }.get(what)
+    if describe is None:  # the add-on that has all kinds of the group is missing
+        return []
     kinds: dict[str, Kind] = {
         "datasets": "dataset",
         "pipelines": "pipeline",
         "problems": "problem",
+        "suites": "suite",
     }
     files = list_recipes(kinds[what]) if what in kinds else shipped_models()
     return [
@@ -125,13 +132,22 @@ def _problem(name: str, _: Path) -> dict[str, Any]:
     return {"title": recipe.title, "size": size, **count}
 
 
+def _suite(_: str, file: Path) -> dict[str, Any]:
+    """Describe a suite by its title; its problems are built when a benchmark needs them."""
+    import tomllib
+
+    title = tomllib.loads(file.read_text(encoding="utf-8")).get("title", "")
+    return {"title": str(title)}
+
+
 def _summary(group: str, name: str) -> str:
     """Return one line about a kind; a broken plug-in must not hide the others."""
     from cnpgen.cli.describe_keys import kind_summary
     from cnpgen.schema import registry
 
     try:
-        return kind_summary(registry.load(group, name))
+        base = None if group in registry.CONTRACTS else object
+        return kind_summary(registry.load(group, name, base))
     except RecipeError as error:
         return f"(broken: {error})"
 

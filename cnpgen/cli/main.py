@@ -29,12 +29,12 @@ from cnpgen.errors import (
     Spelling,
     python_spelling,
 )
+from cnpgen.machine import versions
 from cnpgen.machine.threads import prefer_one_thread
-from cnpgen.machine.versions import DOCUMENTATION_URL, installed_version
 
 _DESCRIPTION = "Generate and verify datasets for kinodynamic motion planning, train planners and optimize plans."
 
-_EPILOG = f"""\
+_EPILOG = """\
 examples:
   cnpgen list                                        list recipes
   cnpgen init my-arm --urdf arm.urdf                 recipes for your own arm
@@ -56,7 +56,7 @@ examples:
   cnpgen export plans.h5 --to joint-trajectory       export plans for robots and simulators
   cnpgen docs hit-a-puck                             read a page of the documentation
 
-documentation: {DOCUMENTATION_URL}, or 'cnpgen docs' without a network
+documentation: 'cnpgen docs' lists the pages, 'cnpgen docs PAGE' prints one
 
 stdout is data, stderr everything else. Exit codes:
   0    done
@@ -94,7 +94,7 @@ class _Version(argparse.Action):
     """Print the version; looking it up takes milliseconds, so it is done on demand."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
-        print(f"cnpgen {installed_version('cnpgen') or '(not installed)'}")
+        print(f"cnpgen {versions.installed_version('cnpgen') or '(not installed)'}")
         parser.exit()
 
 
@@ -147,8 +147,9 @@ def _run(words: list[str], given: argparse.Namespace) -> int:
 def build_parser(names: Sequence[str] | None = None) -> Parser:
     """Build the parser of some commands, by default of all; importing the modules of all commands takes time.
 
-    Raises: MissingAddonError: A named command belongs to an add-on that this
-        installation lacks.
+    Raises:
+        MissingAddonError: A named command belongs to an add-on that this installation
+            lacks.
     """
     parser = _LinkedParser(prog="cnpgen", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version")
@@ -157,7 +158,14 @@ def build_parser(names: Sequence[str] | None = None) -> Parser:
         title="commands", metavar="COMMAND", parser_class=_LinkedParser
     )
     for name in command_names() if names is None else names:
-        add_command(commands, name, load_command(name), load_alternatives(name))
+        try:
+            module = load_command(name)
+        except MachineError as error:
+            if names is not None:
+                raise
+            commands.add_parser(name, help=f"cannot be used: {error}")
+        else:
+            add_command(commands, name, module, load_alternatives(name))
     return parser
 
 

@@ -10,13 +10,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cnpgen.errors import either
+from cnpgen.errors import either, nearest
 
 _WHOLE = re.compile(r"[+-]?[0-9]+(?:(?:_[0-9]+)*|(?:\.[0-9]+)?[eE]\+?[0-9]{1,2})")
 MAX_ROWS_ARGUMENT = 10**12  # make.MAX_ROWS
-_MAX_DIGITS = (
-    30  # digits; no number here has more, and very long ones take long to read
-)
+# Digits; no number here has more, and very long ones take long to read.
+_MAX_DIGITS = 30
 MAX_ERROR = 1.0  # rad or m; larger ones are probably in degrees
 MAX_SELECTED = 10**7  # of the numbers in a range
 
@@ -81,10 +80,13 @@ def part(text: str) -> tuple[int, int]:
 
 def engine(text: str) -> str:
     """Read the name of an engine of workers: "loky", or one that an installed package registers."""
-    from cnpgen.machine.engine import check_engine_name
+    from cnpgen.machine.engine import engine_names, is_engine
 
-    check_engine_name(text)
-    return text
+    if is_engine(text):
+        return text
+    known = engine_names()
+    hint = nearest(text, known)
+    raise ArgumentTypeError(f"expected one of {', '.join(known)}, got {text!r}{hint}")
 
 
 def toml_value(text: str) -> Any:

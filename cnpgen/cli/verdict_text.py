@@ -25,7 +25,8 @@ METRICS = {  # metric -> what it is called, in a summary and in a list, and its 
     "effort_s": ("effort [s]", "effort [s]", "{:.3f}"),
     "jerk": ("largest jerk [x limit]", "jerk", "{:.2f}"),
 }
-LONG = 1e6  # of any unit: control points that are garbage make metrics of hundreds of digits
+# Of any unit: control points that are garbage make metrics of hundreds of digits.
+LONG = 1e6
 _TALLIES = {
     "valid": "valid",
     "paper_valid": "valid by the paper's rules",

@@ -35,7 +35,8 @@ from cnpgen.store.files.cache_folder import (
 
 CALL_SOURCE = Path(__file__).with_name("call.c")
 CACHE_LINE_DOUBLES = 8
-MAX_O2_INSTRUCTIONS = 6000  # GCC's register allocator takes minutes at -O2 for longer tapes, without a gain
+# GCC's register allocator takes minutes at -O2 for longer tapes, without a gain.
+MAX_O2_INSTRUCTIONS = 6000
 _LOG = logging.getLogger(__name__)
 
 
@@ -218,8 +219,9 @@ def _content_digest(path: Path) -> str:
 def find_compiled(tape: Tape, cache_folder: Path) -> Path | None:
     """Return the library of a tape if it is in the cache.
 
-    Raises: MachineError: There is no working compiler, or the cache folder is
-        unreadable or writable for other users.
+    Raises:
+        MachineError: There is no working compiler, or the cache folder is unreadable or
+            writable for other users.
     """
     return _find(library_file_stem(tape, require_compiler()), cache_folder)
 
@@ -238,8 +240,9 @@ def _find(stem: str, cache_folder: Path) -> Path | None:
 def compile_tape(tape: Tape, cache_folder: Path) -> Path:
     """Return the library of a tape; compile it if the cache lacks it or its copy is damaged.
 
-    Raises: MachineError: There is no working compiler, or the cache folder is not
-        writable or writable for other users.
+    Raises:
+        MachineError: There is no working compiler, or the cache folder is not writable
+            or writable for other users.
     """
     stem = library_file_stem(tape, require_compiler())
     return _compile(stem, lambda: emit(tape), optimization_level(tape), cache_folder)

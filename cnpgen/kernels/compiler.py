@@ -26,12 +26,10 @@ COMPILER_FLAGS = (
     "-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-w",
     *_LINKER_FLAGS,
 )  # fmt: skip
-MAX_COMPILE_TIME_S = (
-    3600  # the largest kernels, of some MB of source, take minutes on a busy machine
-)
-MIN_COMPILE_LIMIT_S = (
-    120  # the limit for the smallest kernels, which take less than 1 s
-)
+# The largest kernels, of some MB of source, take minutes on a busy machine.
+MAX_COMPILE_TIME_S = 3600
+# The limit for the smallest kernels, which take less than 1 s.
+MIN_COMPILE_LIMIT_S = 120
 LIMIT_S_PER_BYTE = 3e-3  # of source
 MAX_VERSION_TIME_S = 10
 NOTICE_AFTER_S = 60  # a user hears of a compiler that takes longer
@@ -44,7 +42,7 @@ def find_compiler() -> str | None:
     """Return the command of the C compiler: ``$CC``, else cc, gcc, clang or that of ziglang; None if there is none.
 
     It is quoted for a shell: CC may be a path with spaces, or a program with options
-    ("ccache gcc").
+        ("ccache gcc").
     """
     if configured := os.environ.get("CC"):
         return _command([configured]) or _command(_words(configured))

@@ -19,7 +19,9 @@ from cnpgen.kernels.kernel import (
 )
 from cnpgen.kernels.tape import NAMES, OPERATIONS, Axes, GridSpec, Tape
 
-POINTS_PER_BLOCK = 8192  # lanes or points; smaller blocks cost more interpreter time, larger ones exceed the cache
+# Lanes or points; smaller blocks cost more interpreter time, larger ones exceed the
+# cache.
+POINTS_PER_BLOCK = 8192
 
 
 def _if_else_zero(condition: Any, value: Any, out: Array) -> None:

@@ -34,12 +34,13 @@ class Kernel(ABC):
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate every lane.
 
-        Args: arguments: One float64 array of shape (width, N) per input of the tape,
-            rows contiguous.
+        Args:
+            arguments: One float64 array of shape (width, N) per input of the tape, rows
+                contiguous.
 
-        Returns: One new array of shape (width, N) per output. For a tape with a loop:
-            the final state and the error of the state before the last step, shape (1,
-            N).
+        Returns:
+            One new array of shape (width, N) per output. For a tape with a loop: the
+            final state and the error of the state before the last step, shape (1, N).
 
         Raises:
             ValueError: A shape or type does not match the tape.
@@ -108,10 +109,10 @@ class GridKernel(ABC):
     def __call__(self, *arguments: NDArray[Any], out: Sequence[NDArray[Any]]) -> None:
         """Evaluate the grid and write into ``out``.
 
-        Args: arguments: One array of the tape's type per input: (width, K, N) for axes
-            "point", (width, N) for "lane",
-                (width, K) for "node", (width,) for "fixed". Rows of lanes are
-                contiguous.
+        Args:
+            arguments: One array of the tape's type per input: (width, K, N) for axes
+                "point", (width, N) for "lane", (width, K) for "node", (width,) for
+                "fixed". Rows of lanes are contiguous.
             out: One array per output: (width, K, N), or (width, N), to which the sum
                 over the nodes is added.
 

@@ -31,6 +31,7 @@ from cnpgen.kernels.interpreted_kernel import (
 from cnpgen.kernels.kernel import GridKernel, Kernel
 from cnpgen.kernels.parallel_compilation import CompilerPool
 from cnpgen.kernels.tape import CODES, Dtype, GridSpec, Loop, Tape, tape_from_function
+from cnpgen.schema import addons, registry
 from cnpgen.schema.registry import package_digest
 from cnpgen.store.files.atomic import write_file
 from cnpgen.store.files.cache_folder import (
@@ -47,28 +48,26 @@ Backend = Literal["compiled", "numpy", "casadi"]
 BACKENDS: tuple[Backend, ...] = ("compiled", "numpy", "casadi")
 PACKAGE_FOLDER = Path(__file__).parents[1]
 ARRAYS = Path(__file__).with_name("arrays.h")
-BUILDER_PACKAGES = (
-    "robots",
-    "kernels",
-    "problems",
-    "trajectory",
-)  # imported by builders of any package
-NUMPY_SLOWDOWN = (
-    "10 to 20 times slower than compiled code"  # benchmarks/generator.py: 9 to 24
-)
+# Imported by builders of any package.
+BUILDER_PACKAGES = "robots", "kernels", "problems", "trajectory"
+# Benchmarks/generator.py: 9 to 24.
+NUMPY_SLOWDOWN = "10 to 20 times slower than compiled code"
 
 
 @dataclass
 class KernelLibrary:
     """Loader of kernels for one robot and problem, which builds those that are not cached.
 
-    Attributes: backend: "compiled", "numpy" (interpreted tape) or "casadi" (CasADi's
-        map; slow, for reference). cache_folder: Folder of cached tapes and libraries.
-        identity: Digest of all ``arguments``. arguments: Objects passed to builders
-        that have a parameter of that name (robot, problem). structure: Digest of the
-        arguments without the poses and sizes of obstacles, or None; see
-        ``load_by_structure``. compiler_pool: Pool that compiles kernels, inside
-        ``compile_in_parallel``.
+    Attributes:
+        backend: "compiled", "numpy" (interpreted tape) or "casadi" (CasADi's map; slow,
+            for reference).
+        cache_folder: Folder of cached tapes and libraries.
+        identity: Digest of all ``arguments``.
+        arguments: Objects passed to builders that have a parameter of that name (robot,
+            problem).
+        structure: Digest of the arguments without the poses and sizes of obstacles, or
+            None; see ``load_by_structure``.
+        compiler_pool: Pool that compiles kernels, inside ``compile_in_parallel``.
     """
 
     backend: Backend
@@ -94,9 +93,9 @@ class KernelLibrary:
     ) -> Kernel:
         """Return the kernel of an SX function.
 
-        Args: builder: A module-level function that returns a ``casadi.Function``.
-            Parameters named like entries of
-                ``arguments`` are filled from there.
+        Args:
+            builder: A module-level function that returns a ``casadi.Function``.
+                Parameters named like entries of ``arguments`` are filled from there.
             loop: The iteration of the function, or None.
             parameters: Further JSON-able keyword arguments of the builder; part of the
                 cache key.
@@ -233,15 +232,32 @@ def _versions() -> list[str]:
 def _source_digests(builder: Callable[..., Any]) -> list[str]:
     """Return digests of the sources that a builder may use; kernels are rebuilt when one of them changes.
 
-    In this package these are ``BUILDER_PACKAGES`` and the builder's own subpackage. A
-    plug-in's builder may import
-    anything: the digests cover this package and the plug-in's.
+    In this package these are ``BUILDER_PACKAGES`` and the builder's own subpackage or
+    add-on; losses also use the conditions of published rules. A plug-in's builder may
+    import anything: the digests cover this package and the plug-in's.
     """
-    package, _, module = builder.__module__.partition(".")
-    if package != "cnpgen":
-        return [_digest_of(PACKAGE_FOLDER), package_digest(package)]
+    module = builder.__module__
+    if module.partition(".")[0] != "cnpgen":
+        return [_digest_of(PACKAGE_FOLDER), package_digest(module.partition(".")[0])]
     shared = (PACKAGE_FOLDER / name for name in BUILDER_PACKAGES)
-    return [_digest_of(*shared), _digest_of(PACKAGE_FOLDER / module.partition(".")[0])]
+    own = subpackage_of(module)
+    digests = [_digest_of(*shared), _digest_of(PACKAGE_FOLDER / own)]
+    return digests + _rules_digests() if own == "losses" else digests
+
+
+def subpackage_of(module: str) -> str:
+    """Return the path of the subpackage of a module of this package: "refine", "addons/benchmark"."""
+    if addon := addons.addon_of(module):
+        return f"addons/{addon}"
+    return module.split(".")[1]
+
+
+def _rules_digests() -> list[str]:
+    """Return digests of the sources of all installed published rules."""
+    modules = [entry.module for entry in addons.installed(registry.RULES)]
+    own = [PACKAGE_FOLDER / subpackage_of(m) for m in modules if addons.addon_of(m)]
+    others = {m.partition(".")[0] for m in modules if not addons.addon_of(m)}
+    return [_digest_of(*own), *map(package_digest, sorted(others))]
 
 
 @cache

@@ -13,9 +13,9 @@ from cnpgen.kernels.tape import Tape
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
-_KILL_INTERVAL_S = (
-    0.05  # a thread may start its compiler just after the others were killed
-)
+# A thread may start its compiler just after the others were killed.
+
+_KILL_INTERVAL_S = 0.05
 MAX_COMPILERS = 8  # compilers at the same time: each takes some 100 MB
 
 

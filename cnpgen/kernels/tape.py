@@ -52,9 +52,10 @@ STORED_TYPES = {
 class GridSpec:
     """Evaluation of the tape at K nodes of every lane, with results per point or summed over the nodes of a lane.
 
-    Attributes: arguments: Axes of each argument: "point" (nodes and lanes), "lane",
-        "node" or "fixed" (neither). Arguments
-            without a lane axis ("node", "fixed") must not be nan.
+    Attributes:
+        arguments: Axes of each argument: "point" (nodes and lanes), "lane", "node" or
+            "fixed" (neither). Arguments without a lane axis ("node", "fixed") must not
+            be nan.
         results: Axes of each result: "point" or "lane"; "lane" is the sum over the
             nodes.
     """
@@ -150,8 +151,9 @@ def tape_from_function(
 ) -> Tape:
     """Flatten a CasADi SX function, whose arguments and results are columns.
 
-    Raises: ValueError: The function uses an unsupported operation, or the grid does not
-        match it.
+    Raises:
+        ValueError: The function uses an unsupported operation, or the grid does not
+            match it.
     """
     import casadi as ca
 

@@ -31,11 +31,14 @@ class Batch(Mapping[str, NDArray[Any]]):
     are views of ``table``. ``dict(batch)`` is a plain dict of all fields and
     observations.
 
-    Attributes: table: Float fields side by side, C-contiguous, shape (B, D). layout:
-        Fields and their columns in the table. integers: Integer fields, int64, shape
-        (B, width) or (B,). normalization: Normalization of the float fields; None if
-        they are in their units. observations: Results of ``observe`` of
-        :meth:`Dataset.batches`, with a first axis of length B.
+    Attributes:
+        table: Float fields side by side, C-contiguous, shape (B, D).
+        layout: Fields and their columns in the table.
+        integers: Integer fields, int64, shape (B, width) or (B,).
+        normalization: Normalization of the float fields; None if they are in their
+            units.
+        observations: Results of ``observe`` of :meth:`Dataset.batches`, with a first
+            axis of length B.
     """
 
     table: NDArray[Any]
@@ -76,9 +79,11 @@ class Batch(Mapping[str, NDArray[Any]]):
 class BatchObserver:
     """Observer of the scenes of batches, for ``dataset.batches(256, observe=...)``.
 
-    Attributes: kind: See ``cnpgen.scenes.observe``. scenes: Function that returns the
-        scenes of the rows of a batch, as ``observe`` takes them. seed: Seed of the
-        points of clouds, which also depend on the rows of the batch.
+    Attributes:
+        kind: See ``cnpgen.scenes.observe``.
+        scenes: Function that returns the scenes of the rows of a batch, as ``observe``
+            takes them.
+        seed: Seed of the points of clouds, which also depend on the rows of the batch.
     """
 
     kind: str | Observation

@@ -147,13 +147,15 @@ class Batches:
         position: Initial position.
         observe: Function that returns observations of a batch, which are added to it.
 
-    Attributes: times_set: Number of times that ``epoch`` or ``load_state`` set the
-        position. worker_positions: Shared memory in which workers of other processes
-        store their positions, shape (workers, 2):
-            the next epoch and ``times_set``; None without workers.
+    Attributes:
+        times_set: Number of times that ``epoch`` or ``load_state`` set the position.
+        worker_positions: Shared memory in which workers of other processes store their
+            positions, shape (workers, 2): the next epoch and ``times_set``; None
+            without workers.
 
-    Raises: UsageError: There are fewer rows than in one batch, or fewer in the last
-        batch than ranks.
+    Raises:
+        UsageError: There are fewer rows than in one batch, or fewer in the last batch
+            than ranks.
     """
 
     def __init__(
@@ -277,8 +279,9 @@ class Batches:
             epoch: The epoch; the current one by default.
             batch: Number of batches of that epoch that were used.
 
-        Raises: UsageError: The epoch has fewer batches; or workers read batches and
-            ``batch`` is missing.
+        Raises:
+            UsageError: The epoch has fewer batches; or workers read batches and
+                ``batch`` is missing.
         """
         position = self._position
         if epoch is not None or batch is not None:
@@ -313,9 +316,10 @@ class Batches:
         those of this object: a state counts rows, so the batch size and the number of
         ranks may differ.
 
-        Raises: UsageError: The argument is not the state of a loader, or the last batch
-            would have fewer rows than ranks. DatasetError: The state is of another
-            dataset, split or format version.
+        Raises:
+            UsageError: The argument is not the state of a loader, or the last batch
+                would have fewer rows than ranks.
+            DatasetError: The state is of another dataset, split or format version.
         """
         position = self._forward(position_from_json(state, self._source))
         self._partition.check_ranks(self._source.rows, first=position.row)

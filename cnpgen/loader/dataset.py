@@ -56,11 +56,15 @@ class Dataset:
     dataset. ``dtype`` is the type of float fields, "float32" or "float64". Integer
     fields are int64; they and those of scenes are never normalized.
 
-    Attributes: folder: Folder of the dataset. spec: Specification of the dataset:
-        recipe, seed, robot, versions. fingerprint: Fingerprint of the existing rows;
-        equal rows have equal fingerprints. shards: Split -> existing shards.
+    Attributes:
+        folder: Folder of the dataset.
+        spec: Specification of the dataset: recipe, seed, robot, versions.
+        fingerprint: Fingerprint of the existing rows; equal rows have equal
+            fingerprints.
+        shards: Split -> existing shards.
         statistics: Split -> field -> statistics of its columns, in the unit of the
-        field. reader: Reader of the shards.
+            field.
+        reader: Reader of the shards.
     """
 
     folder: Path
@@ -142,21 +146,29 @@ class Dataset:
     ) -> Batches:
         """Return the batches of a split, in an order that depends on seed and epoch only.
 
-        Args: batch_size: Rows of a batch over all ranks; a multiple of ``world``.
-            split: Name of the split. seed: Seed of the order of all epochs. epoch:
-            First epoch. rank: Index of the rank of this process; it reads the rows
-            ``rank::world`` of every batch. world: Number of ranks. fields: Names of the
-            fields. normalize: Whether to normalize every split with the statistics of
-            the training rows. dtype: Type of float fields. drop_last: Whether to omit
-            an incomplete last batch of an epoch. shuffle: Whether to shuffle the rows;
-            otherwise they are in their stored order. observe: Kind of observation of
-            the scenes of the rows, such as "cloud" (``cnpgen.scenes.observe``), or a
-                function that returns observations of a batch, name -> array with a
-                first axis of length B. They are added to the batch.
+        Args:
+            batch_size: Rows of a batch over all ranks; a multiple of ``world``.
+            split: Name of the split.
+            seed: Seed of the order of all epochs.
+            epoch: First epoch.
+            rank: Index of the rank of this process; it reads the rows ``rank::world``
+                of every batch.
+            world: Number of ranks.
+            fields: Names of the fields.
+            normalize: Whether to normalize every split with the statistics of the
+                training rows.
+            dtype: Type of float fields.
+            drop_last: Whether to omit an incomplete last batch of an epoch.
+            shuffle: Whether to shuffle the rows; otherwise they are in their stored
+                order.
+            observe: Kind of observation of the scenes of the rows, such as "cloud"
+                (``cnpgen.scenes.observe``), or a function that returns observations of
+                a batch, name -> array with a first axis of length B. They are added to
+                the batch.
 
-        Raises: UsageError: An argument is invalid, or there are fewer rows than in one
-            batch, or fewer in the last batch
-                than ranks.
+        Raises:
+            UsageError: An argument is invalid, or there are fewer rows than in one
+                batch, or fewer in the last batch than ranks.
             DatasetError: There is no such split or field, there are no training rows
                 for the normalization, or no scenes to observe.
         """
@@ -185,10 +197,13 @@ class Dataset:
     ) -> Rows:
         """Read rows by index; of an unfinished dataset, indices count the existing rows.
 
-        Args: split: Name of the split. indices: Indices of rows, shape (k,); negative
-            ones count from the end. fields: Names of the fields. normalize: Whether to
-            normalize; by default values are in the units of the fields. dtype: Type of
-            float fields; the stored type by default.
+        Args:
+            split: Name of the split.
+            indices: Indices of rows, shape (k,); negative ones count from the end.
+            fields: Names of the fields.
+            normalize: Whether to normalize; by default values are in the units of the
+                fields.
+            dtype: Type of float fields; the stored type by default.
 
         Returns:
             Field name -> values, C-contiguous, shape (k, width) or (k,).
@@ -232,9 +247,10 @@ class Dataset:
             split: Name of the split.
             indices: Indices of rows, shape (k,); see :meth:`rows`.
 
-        Raises: RowError: There is no such row; this is also an IndexError.
+        Raises:
+            RowError: There is no such row; this is also an IndexError.
             DatasetError: The dataset has no scenes, there is no such split, or a shard
-            is damaged.
+                is damaged.
         """
         if not self.spec.scene_obstacles:
             raise DatasetError(
@@ -253,10 +269,14 @@ class Dataset:
     ) -> Any:
         """Read all rows of a split as a table of polars or pandas, one column per joint or axis: ``start_q.joint_1``.
 
-        Args: split: Name of the split. fields: Names of the fields. library: "polars"
-            or "pandas"; by default the installed one, polars if both are.
+        Args:
+            split: Name of the split.
+            fields: Names of the fields.
+            library: "polars" or "pandas"; by default the installed one, polars if both
+                are.
 
-        Returns: A ``DataFrame``, in the units of the fields. With pandas,
+        Returns:
+            A ``DataFrame``, in the units of the fields. With pandas,
             ``frame.attrs["units"]`` maps columns to units.
 
         Raises:

@@ -32,13 +32,18 @@ def load_dataset(
     Existence and sizes of all shards are checked now, header and sha256 of each when it
     is read for the first time.
 
-    Args: folder: Folder of the dataset. allow_incomplete: Whether to open the existing
-        shards of a dataset that is unfinished or has missing shards. verify: Whether to
-        verify the sha256 of every shard when it is read for the first time.
+    Args:
+        folder: Folder of the dataset.
+        allow_incomplete: Whether to open the existing shards of a dataset that is
+            unfinished or has missing shards.
+        verify: Whether to verify the sha256 of every shard when it is read for the
+            first time.
 
-    Raises: UsageError: The folder does not exist or contains no dataset, or an option
-        is not a bool. DatasetError: The dataset is unfinished, or a part is missing or
-        damaged. MachineError: A file cannot be read.
+    Raises:
+        UsageError: The folder does not exist or contains no dataset, or an option is
+            not a bool.
+        DatasetError: The dataset is unfinished, or a part is missing or damaged.
+        MachineError: A file cannot be read.
     """
     verify = flag("verify", verify)
     stored = open_dataset(

@@ -25,10 +25,11 @@ DTYPES = ("float32", "float64")
 class Normalization:
     """Means and standard deviations of the columns of fields.
 
-    Attributes: mean: Field name -> mean of its c columns, in the unit of the field,
-        shape (c,); c is 1 for a scalar field. std: Field name -> standard deviation of
-        its c columns, in the unit of the field, shape (c,). It is 0 for a
-            constant column, which is normalized to 0.
+    Attributes:
+        mean: Field name -> mean of its c columns, in the unit of the field, shape (c,);
+            c is 1 for a scalar field.
+        std: Field name -> standard deviation of its c columns, in the unit of the
+            field, shape (c,). It is 0 for a constant column, which is normalized to 0.
     """
 
     mean: Mapping[str, Floats]
@@ -48,10 +49,10 @@ class Normalization:
     def normalize(self, rows: Mapping[str, Any]) -> dict[str, Any]:
         """Return (x - mean) / std of the fields with statistics; other fields are unchanged.
 
-        Args: rows: Field name -> values in the unit of the field, shape (..., width),
-            or (...) for a scalar field. They
-                may be arrays of NumPy or JAX or tensors of torch; gradients are
-                propagated.
+        Args:
+            rows: Field name -> values in the unit of the field, shape (..., width), or
+                (...) for a scalar field. They may be arrays of NumPy or JAX or tensors
+                of torch; gradients are propagated.
         """
         return {
             name: self._scaled(name, values) if name in self.mean else values

@@ -34,7 +34,8 @@ from cnpgen.store.scene_table import OBSTACLE_POSES, SCENE_ID, SceneTable
 from cnpgen.store.shard import StoredField, storage_dtype
 
 Rows = dict[str, NDArray[Any]]
-MAX_MEMORY_MAPS = 32  # kept open; each needs a file descriptor, and its pages can be reclaimed by the system
+# Kept open; each needs a file descriptor, and its pages can be reclaimed by the system.
+MAX_MEMORY_MAPS = 32
 
 
 def problem_obstacles(spec: DatasetSpec) -> tuple[Obstacle, ...]:
@@ -105,9 +106,8 @@ class ShardReader:
 
     def __init__(self, *, verify: bool, obstacles: Sequence[Obstacle] = ()) -> None:
         self._verify, self._obstacles = verify, tuple(obstacles)
-        self._scenes: tuple[Path, SceneTable] | None = (
-            None  # of the last shard whose scenes were read
-        )
+        # Of the last shard whose scenes were read.
+        self._scenes: tuple[Path, SceneTable] | None = None
         self._placements: dict[
             Path, dict[str, StoredField]
         ] = {}  # of the checked shards

@@ -20,13 +20,10 @@ from cnpgen.robots.scene import Scene
 
 Array = NDArray[Any]
 
-NODE_STRIDE, SHIFTS = (
-    4,
-    16,
-)  # every fourth node; which ones depends on 16ths of the shift
-TRAINING_DISTANCE_M = (
-    0.02  # in addition to the required one, so that plans keep it after training
-)
+# Every fourth node; which ones depends on 16ths of the shift.
+NODE_STRIDE, SHIFTS = 4, 16
+# In addition to the required one, so that plans keep it after training.
+TRAINING_DISTANCE_M = 0.02
 
 
 class HullLoss:
@@ -34,8 +31,9 @@ class HullLoss:
 
     ``tightening`` has the factors, then the insets of all constraints, shape (2 m,).
 
-    Raises: UsageError: The problem has no constraint ``robot-clearance``, or its robot
-        no link geometry.
+    Raises:
+        UsageError: The problem has no constraint ``robot-clearance``, or its robot no
+            link geometry.
     """
 
     def __init__(
@@ -73,12 +71,14 @@ class HullLoss:
         chosen = slice(
             int(shift * SHIFTS) % stride, nodes, stride
         )  # distances take most of the time of a step
+        # Plans with invalid control points get nan, which affects no other plan.
         path = np.where(batch.valid[:, None, None], batch.path, np.nan)
         values, rates = (
             table.path[:nodes][chosen].astype(float),
             table.rate[:nodes][chosen].astype(float),
         )
         node_weights = table.weights[0, chosen].astype(float)
+        # The chosen nodes stand for all: their weights sum to 1 again.
         node_weights /= node_weights.sum()
         q = np.moveaxis(values @ path, 0, -1)
         r = rates @ batch.rate.T
@@ -86,10 +86,12 @@ class HullLoss:
             Scene(self._problem.obstacle, batch.obstacle_poses.astype(float))
         )
         losses, gradients = self._losses(q, bodies, self._required)
+        # integral of loss dt = sum of node weight / r loss
         step, weight = node_weights[:, None] / r, float(weights[self._term - 1])
         terms[self._term, :count] += (step * losses).sum(axis=0)
         if by_path.size:
             by_path[..., :count] += weight * np.einsum(
                 "kc,kjs->cjs", values, step[:, None] * gradients
             )
+            # d(1 / r)/dR_j = -B_j / r^2
             by_rate[..., :count] -= weight * (rates.T @ (step / r * losses))

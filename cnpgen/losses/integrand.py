@@ -57,6 +57,8 @@ def task_term(state: SymbolicState, objective: Sequence[ObjectiveTerm]) -> Term:
             if term.training_smoothing is None
             else term.training_smoothing
         )
+        # Smoothed norm sqrt(|e|^2 + s^2) - s, whose derivative by itself is the weight; a
+        # square without smoothing, whose derivative by e is 2 weight e.
         if smoothing > 0:
             size = ca.sqrt(squares + smoothing**2) - smoothing
             parts.append((size, term.weight))
@@ -82,11 +84,13 @@ def constraint_term(
     for (g, lower, upper), width in zip(
         _bounded(conditions, factor, inset), relaxation, strict=True
     ):
+        # e = g - nearest, the violation; 0 inside the bounds
         nearest = g
         if lower is not None:
             nearest = ca.fmax(nearest, lower if width is None else lower - width)
         if upper is not None:
             nearest = ca.fmin(nearest, upper if width is None else upper + width)
+        # Huber(e) = h e - h^2 / 2 with h = clip(e, -1, 1): e^2 / 2, or |e| - 1/2 beyond 1
         derivative = ca.fmin(ca.fmax(g - nearest, -1), 1)
         value += derivative * (g - nearest - 0.5 * derivative)
         parts.append((g, derivative))
@@ -110,6 +114,7 @@ def _bounded(
                     high - inset if np.isfinite(high) else None,
                 )
             elif np.isfinite(low) and np.isfinite(high):
+                # Two-sided limits shrink toward their center: |g - c| <= factor h.
                 center, half = (low + high) / 2, (high - low) / 2
                 yield g, center - half * factor, center + half * factor
             else:
@@ -146,11 +151,12 @@ class Inputs:
     ]  # p, p' and p'' [rad], n each, and p''' if the jerk is constrained
     rate: Any  # r and r' [1/s], and r'' if the jerk is constrained
     obstacle_poses: Any  # poses and sizes of the obstacles
-    relaxation: (
-        Any  # relaxation of the conditions with time-varying bounds, in their units
-    )
+    # Relaxation of the conditions with time-varying bounds, in their units.
+    relaxation: Any
     node: Any  # quadrature weight
-    tightening: Any  # factors of the limits of all constraints, then insets of the other bounds of all constraints
+    # Factors of the limits of all constraints, then insets of the other bounds of all
+    # constraints.
+    tightening: Any
     weights: Any  # weight of every constraint (the paper's e^alpha)
 
     @property
@@ -183,6 +189,8 @@ def loss_gradient(robot: Robot, problem: Problem, *, form: str) -> Any:
         [1.0, *ca.vertsplit(inputs.weights)],
     )
     g = [part for term in terms for part, _ in term.parts]
+    # Reverse mode: seeds are d(sum of weighted terms)/d(part), so that one product with
+    # the transposed Jacobian of all parts gives the gradient in (p, p', ..., r, r', ...).
     seeds = [
         step * weight * partial
         for weight, term in zip(weights, terms, strict=True)
@@ -193,7 +201,8 @@ def loss_gradient(robot: Robot, problem: Problem, *, form: str) -> Any:
     total = sum(
         weight * term.value for weight, term in zip(weights, terms, strict=True)
     )
-    gradient[width] -= step / inputs.rate[0] * total  # the factor 1 / r
+    # The factor dt/ds = 1 / r is no part: d(1 / r)/dr = -1 / r^2 times all terms.
+    gradient[width] -= step / inputs.rate[0] * total
     parts = [gradient[first : first + n] for first in range(0, width, n)]
     results = state.unfrozen([_stacked(inputs, terms), *parts, gradient[width:]])
     return ca.Function("loss_gradient", inputs.columns, ca.cse(results))
@@ -244,8 +253,9 @@ def relaxation_of(
     It is that of motions that may start outside a constraint: at phases s, shape (K,),
     with positions of the tip at the start [m], shape (N, 3).
 
-    Raises: UsageError: ``bound_relaxation`` of a constraint returns another shape than
-        its contract states.
+    Raises:
+        UsageError: ``bound_relaxation`` of a constraint returns another shape than its
+            contract states.
     """
     rows = []
     for constraint, condition in time_varying:

@@ -22,9 +22,10 @@ class Margins:
     percent. With limits that are a few tenths of a percent smaller, plans meet the true
     limits.
 
-    Attributes: factors: Term -> factor of its limits (of joints), in (0, 1]. insets:
-        Term -> distance by which its other bounds are moved inwards, in SI units, e.g.
-        the table's edges [m].
+    Attributes:
+        factors: Term -> factor of its limits (of joints), in (0, 1].
+        insets: Term -> distance by which its other bounds are moved inwards, in SI
+            units, e.g. the table's edges [m].
     """
 
     factors: Mapping[str, float] = field(default_factory=dict)
@@ -48,8 +49,9 @@ class Margins:
         Args:
             terms: Names of the m constraint terms.
 
-        Raises: UsageError: A name is not a term, a factor is not in (0, 1] or an inset
-            is not a number.
+        Raises:
+            UsageError: A name is not a term, a factor is not in (0, 1] or an inset is
+                not a number.
         """
         if not all(isinstance(term, str) for term in terms):
             raise UsageError(

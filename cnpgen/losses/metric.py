@@ -25,27 +25,33 @@ Array = NDArray[np.float64]
 Kind = Literal["fixed", "ramped", "learned"]
 Average = Literal["mean", "median", "trimmed"]
 
-WEIGHT_FACTOR = 100.0  # of the weight in the problem file, for constraint classes without ``training_weight``
-TRIMMED_FRACTION = (
-    0.1  # of the plans, those with the largest losses, excluded from a trimmed mean
-)
+# Of the weight in the problem file, for constraint classes without ``training_weight``.
+WEIGHT_FACTOR = 100.0
+# Of the plans, those with the largest losses, excluded from a trimmed mean.
+TRIMMED_FRACTION = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
 class MetricSettings:
     """The dependence of weights on the progress of a run (0 at its start, 1 at its end) and on the losses of plans.
 
-    Attributes: kind: "fixed": the first weights; "ramped": growing weights; "learned":
-        the published rule. growth: Factor by which ramped weights grow, and budgets of
-        the learned metric shrink, during the ramp. ramp: Progress at the start and the
-        end of the ramp, which is geometric. gamma: Step size of the learned metric.
-        every: Interval of its steps: "epoch", as published, or "batch". largest_log:
-        Bound on ``|log(mean L_i / C_i)|`` in a step, from the authors' implementation.
+    Attributes:
+        kind: "fixed": the first weights; "ramped": growing weights; "learned": the
+            published rule.
+        growth: Factor by which ramped weights grow, and budgets of the learned metric
+            shrink, during the ramp.
+        ramp: Progress at the start and the end of the ramp, which is geometric.
+        gamma: Step size of the learned metric.
+        every: Interval of its steps: "epoch", as published, or "batch".
+        largest_log: Bound on ``|log(mean L_i / C_i)|`` in a step, from the authors'
+            implementation.
         lowest: Lower bound of a learned weight; without it the weight of a term without
-        violations decreases forever. highest: Upper bound of a learned weight.
-        budget_factor: Factor of all budgets of the learned metric. average: Average
-        over the plans of a batch: "mean" as published, "median" or "trimmed". frozen:
-        Progress after which a learned metric is constant.
+            violations decreases forever.
+        highest: Upper bound of a learned weight.
+        budget_factor: Factor of all budgets of the learned metric.
+        average: Average over the plans of a batch: "mean" as published, "median" or
+            "trimmed".
+        frozen: Progress after which a learned metric is constant.
     """
 
     kind: Kind = "ramped"
@@ -123,6 +129,8 @@ def alpha_step(
     weight unchanged.
     """
     before, mean, budget = (np.asarray(x, float) for x in (alpha, losses, budgets))
+    # log(L / C) as a difference of logarithms: 0 where nothing is learned, -inf for a
+    # term without violations, which the bound makes finite.
     learned = (budget > 0) & np.isfinite(mean)
     with np.errstate(divide="ignore"):
         logs = np.log(mean, where=learned, out=np.zeros_like(mean)) - np.log(
@@ -134,6 +142,7 @@ def alpha_step(
 def average_loss(terms: ArrayLike, average: Average) -> Array:
     """Average every term of the losses of N plans, shape (N, m), over valid plans, shape (m,); nan without any."""
     values = np.asarray(terms, float)
+    # Invalid plans have losses of nan and take no part.
     values = values[np.isfinite(values).all(axis=1)]
     if len(values) == 0:
         return np.full(values.shape[1], np.nan)
@@ -149,9 +158,12 @@ def average_loss(terms: ArrayLike, average: Average) -> Array:
 class Metric:
     """The weights of one training run.
 
-    Args: weights: First weights (e^alpha), shape (m,); a term of weight 0 is omitted
-        and keeps this weight. budgets: Acceptable value of every term (the paper's
-        C-bar^2), shape (m,); 0 where there is none. settings: Settings of the metric.
+    Args:
+        weights: First weights (e^alpha), shape (m,); a term of weight 0 is omitted and
+            keeps this weight.
+        budgets: Acceptable value of every term (the paper's C-bar^2), shape (m,); 0
+            where there is none.
+        settings: Settings of the metric.
 
     Attributes:
         alpha: Logarithms of the present weights, shape (m,).
@@ -230,6 +242,7 @@ class Metric:
             budgets = np.where(
                 np.isfinite(self.alpha), self._budgets, 0.0
             )  # an omitted term learns nothing
+            # Shrinking budgets have the effect of the growing weights of the ramped metric.
             budgets = budgets * settings.budget_factor / settings.grown(progress)
             alpha = alpha_step(
                 self.alpha,

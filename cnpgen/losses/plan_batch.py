@@ -51,6 +51,8 @@ class PlanBatch:
             values.dtype,
         )
         out[..., :n] = np.moveaxis(values, 0, -1)
+        # Ones are harmless in every operation of the kernels: no division by 0, no root of
+        # a negative number that would slow the whole vector down.
         out[..., n:] = 1
         if not self.valid.all():
             out[..., :n][..., ~self.valid] = 1
@@ -75,8 +77,9 @@ def check_batch(
 ) -> PlanBatch:
     """Check the caller's arguments and make a batch of them.
 
-    Raises: UsageError: A shape is wrong, the obstacle poses are missing, or a value is
-        not a real number.
+    Raises:
+        UsageError: A shape is wrong, the obstacle poses are missing, or a value is not
+            a real number.
     """
     arguments = {
         "path": (path, dtype),

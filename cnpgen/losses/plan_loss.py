@@ -57,11 +57,13 @@ class LossValue:
     positive. Positive rate control points are sufficient, but not necessary, for r(s) >
     0.
 
-    Attributes: total: Task loss plus the weighted constraint terms, shape (N,). terms:
-        The integrals without weights, the task loss first, shape (N, 1 + m).
+    Attributes:
+        total: Task loss plus the weighted constraint terms, shape (N,).
+        terms: The integrals without weights, the task loss first, shape (N, 1 + m).
         path_gradient: Gradient of every plan's total with respect to its path control
-        points, shape (N, C, n). rate_gradient: Gradient of every plan's total with
-        respect to its rate control points, shape (N, R).
+            points, shape (N, C, n).
+        rate_gradient: Gradient of every plan's total with respect to its rate control
+            points, shape (N, R).
     """
 
     total: Array
@@ -79,9 +81,9 @@ class PlanLoss:
     If samples place the obstacles, their distances are those of the links' hulls, at
     every fourth node (``HullLoss``).
 
-    Args: problem: The problem, its record (``plans.problem``, ``dataset.problem``), or
-        the name or the file of a problem,
-            a pipeline or a dataset.
+    Args:
+        problem: The problem, its record (``plans.problem``, ``dataset.problem``), or
+            the name or the file of a problem, a pipeline or a dataset.
         dtype: Precision of the arithmetic: "float32" or "float64".
         nodes: Number of quadrature nodes.
         rule: Quadrature rule: "cosine" or "gauss".
@@ -93,12 +95,14 @@ class PlanLoss:
         cache_folder: Cache of kernels; by default that of the user.
         threads: Number of threads that share the plans of a call.
 
-    Attributes: terms: Names of the columns of ``LossValue.terms``: "time", then the
-        kinds of the constraints. budgets: Acceptable violations from the problem file
-        (the paper's C-bar^2), shape (m,); 0 for none. weights0: First weights from the
-        problem file (the paper's e^alpha), shape (m,). tightening: Factors of the
-        limits of all terms, then insets of their other bounds (``Margins``), shape (2
-        m,).
+    Attributes:
+        terms: Names of the columns of ``LossValue.terms``: "time", then the kinds of
+            the constraints.
+        budgets: Acceptable violations from the problem file (the paper's C-bar^2),
+            shape (m,); 0 for none.
+        weights0: First weights from the problem file (the paper's e^alpha), shape (m,).
+        tightening: Factors of the limits of all terms, then insets of their other
+            bounds (``Margins``), shape (2 m,).
 
     Raises:
         UsageError: An argument has an unsupported value.
@@ -167,10 +171,11 @@ class PlanLoss:
     ) -> LossValue:
         """Evaluate N plans.
 
-        Args: path: Path control points [rad], shape (N, C, n). rate: Rate control
-            points [1/s], shape (N, R), positive. weights: Weight of every constraint
-            term (e^alpha), shape (m,); or term -> weight, with ``weights0`` for
-                missing terms.
+        Args:
+            path: Path control points [rad], shape (N, C, n).
+            rate: Rate control points [1/s], shape (N, R), positive.
+            weights: Weight of every constraint term (e^alpha), shape (m,); or term ->
+                weight, with ``weights0`` for missing terms.
             obstacle_poses: Poses and sizes of the obstacles, shape (N, width); required
                 if the problem has obstacles.
             start_tip: Positions of the tip at the start [m], shape (N, 3), for the
@@ -180,9 +185,9 @@ class PlanLoss:
             gradient: Whether to compute gradients; without, they have shape (0, C, n)
                 and (0, R).
 
-        Raises: UsageError: A shape is wrong, a value is not a real number, or a weight
-            is negative, infinite or of an
-                unknown term.
+        Raises:
+            UsageError: A shape is wrong, a value is not a real number, or a weight is
+                negative, infinite or of an unknown term.
         """
         gradient, shift = flag("gradient", gradient), number("shift", shift)
         batch = check_batch(
@@ -275,6 +280,8 @@ class PlanLoss:
             batch.obstacle_poses[:, : self.problem.for_planning.scene_width],
         )
         lanes = rates.shape[1]
+        # Splines at all nodes by one product: rows are p, p', p'' (orders x nodes), columns
+        # are joints x samples.
         path = (table.path @ batch.lanes(batch.path).reshape(points, -1)).reshape(
             orders, nodes, n, lanes
         )
@@ -293,6 +300,8 @@ class PlanLoss:
             )
         by_path, by_rate = np.empty_like(path), np.empty_like(rate)
         self._gradient(*arguments, out=[terms, *by_path.swapaxes(1, 2), by_rate])
+        # Chain rule through the splines, which are linear in the control points: the
+        # transposed products.
         by_points = table.path.T @ by_path.reshape(orders * nodes, -1)
         return (
             terms,
@@ -322,8 +331,9 @@ class PlanLoss:
     def check_shapes(self, **shapes: tuple[int, ...]) -> None:
         """Check the shapes of arguments, for traced functions whose values are unknown.
 
-        Args: shapes: Shapes of ``path``, ``rate``, ``weights`` and, if present,
-            ``obstacle_poses`` and ``start_tip``.
+        Args:
+            shapes: Shapes of ``path``, ``rate``, ``weights`` and, if present,
+                ``obstacle_poses`` and ``start_tip``.
 
         Raises:
             UsageError: A shape is wrong, or the obstacle poses are missing.
@@ -366,8 +376,9 @@ class PlanLoss:
     def checked_weights(self, weights: ArrayLike | Mapping[str, float]) -> Array:
         """Return weights in the order of the terms and in the loss's precision.
 
-        Raises: UsageError: The shape is wrong, a weight is negative or not finite, or
-            there is no such term.
+        Raises:
+            UsageError: The shape is wrong, a weight is negative or not finite, or there
+                is no such term.
         """
         ordered = numbers("weights", self.ordered_weights(weights), differentiable=True)
         self._check_count(ordered.shape)

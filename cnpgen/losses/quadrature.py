@@ -30,13 +30,16 @@ def quadrature(rule: str, nodes: int, shift: float = 0.0) -> tuple[Array, Array]
     nodes of the cosine rule are offset by a fraction of their spacing in theta, in [0,
     1). The average over shifts covers the intervals between nodes.
 
-    Raises: UsageError: The rule does not exist, the number of nodes is no positive
-        integer, or the shift is not in [0, 1).
+    Raises:
+        UsageError: The rule does not exist, the number of nodes is no positive integer,
+            or the shift is not in [0, 1).
     """
     check_quadrature(rule, nodes, shift)
     if rule == "gauss":
         x, weights = np.polynomial.legendre.leggauss(nodes)
         return (1 + x) / 2, weights / 2
+    # s = (1 - cos theta) / 2, ds = sin(theta) / 2 dtheta: midpoints in theta, weights
+    # proportional to sin theta, normalized so that constants are integrated exactly
     theta = np.pi * (np.arange(nodes) + (0.5 + shift) % 1) / nodes
     weights = np.sin(theta)
     return (1 - np.cos(theta)) / 2, weights / weights.sum()
@@ -73,6 +76,7 @@ def rotating_shift(step: int, count: int = 8) -> float:
         count: Number of shifts; 1 for constant nodes.
     """
     integer("count", count, least=1)
+    # Half a spacing off zero, so that no node falls on s = 0 or 1, where nothing changes.
     return ((step % count + 0.5) / count + 0.5) % 1
 
 

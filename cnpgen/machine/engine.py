@@ -77,15 +77,17 @@ def cluster_engine(name: str) -> ClusterEngine:
 class Engine:
     """User's choice of the engine.
 
-    Attributes: name: "loky" for processes of this machine, which end with this one, or
-        a cluster engine, such as "dask" or
-            "ray". None for loky, or the backend of ``joblib.parallel_config``.
+    Attributes:
+        name: "loky" for processes of this machine, which end with this one, or a
+            cluster engine, such as "dask" or "ray". None for loky, or the backend of
+            ``joblib.parallel_config``.
         address: Address of dask's scheduler ("tcp://host:8786") or ray's head
             ("host:6379", "auto"). None for a temporary cluster on this machine.
         workers: Number of tasks that run at once; None for one per available core.
 
-    Raises: UsageError: The engine does not exist or has no address, or there is less
-        than one worker.
+    Raises:
+        UsageError: The engine does not exist or has no address, or there is less than
+            one worker.
     """
 
     name: str | None = None
@@ -95,8 +97,14 @@ class Engine:
     def __post_init__(self) -> None:
         if self.workers is not None:
             integer("workers", self.workers, least=1)
-        if self.name is not None:
-            check_engine_name(self.name)
+        if self.name is not None and not is_engine(self.name):
+            known = engine_names()
+            hint = nearest(str(self.name), known)
+            raise UsageError(
+                f"engine {self.name!r} does not exist: "
+                f"expected one of {', '.join(known)}{hint}",
+                concerns="engine",
+            )
         if self.name is not None and self.is_cluster:
             engine = cluster_engine(self.name)
             if self.address is not None:
@@ -114,24 +122,26 @@ class Engine:
         return self.name not in {None, LOKY}
 
 
-def check_engine_name(name: object) -> None:
-    """Raise UsageError if no package registers an engine of this name.
+def is_engine(name: object) -> bool:
+    """Return whether a package registers an engine of this name; engines of missing add-ons have names, too."""
+    if name == LOKY:
+        return True
+    return isinstance(name, str) and addons.find(registry.ENGINES, name) is not None
 
-    Engines of missing add-ons have names, too.
-    """
-    if isinstance(name, str) and (name == LOKY or addons.find(registry.ENGINES, name)):
-        return
-    known = (LOKY, *registry.names(registry.ENGINES))
-    expected = f"expected one of {', '.join(known)}{nearest(str(name), known)}"
-    raise UsageError(f"engine {name!r} does not exist: {expected}", concerns="engine")
+
+def engine_names() -> tuple[str, ...]:
+    """List the names of the installed engines."""
+    return (LOKY, *registry.names(registry.ENGINES))
 
 
 @dataclass(frozen=True)
 class LocalPool:
     """Processes of this machine, or a backend of joblib.
 
-    Attributes: size: Number of tasks that run at once. is_remote: Whether workers may
-        be on other machines, with other working directories and caches.
+    Attributes:
+        size: Number of tasks that run at once.
+        is_remote: Whether workers may be on other machines, with other working
+            directories and caches.
     """
 
     size: int
@@ -158,10 +168,11 @@ def assembled(
 ) -> Iterator[WorkerPool]:
     """Provide a worker pool for the block: start processes or connect to a cluster.
 
-    Args: engine: Choice of the engine. tasks: Number of tasks, the maximum number of
-        local workers. quick: Whether one process finishes before a second one has
-        started; ignored if the user chose a number of
-            workers or a cluster.
+    Args:
+        engine: Choice of the engine.
+        tasks: Number of tasks, the maximum number of local workers.
+        quick: Whether one process finishes before a second one has started; ignored if
+            the user chose a number of workers or a cluster.
 
     Raises:
         UsageError: The engine's package is not installed.

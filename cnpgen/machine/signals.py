@@ -10,9 +10,8 @@ from types import FrameType
 from typing import Any
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM)
-MIN_REPEAT_INTERVAL_S = (
-    1.0  # a terminal and a wrapper such as ``uv run`` forward the same Ctrl-C twice
-)
+# A terminal and a wrapper such as ``uv run`` forward the same Ctrl-C twice.
+MIN_REPEAT_INTERVAL_S = 1.0
 
 SignalHandler = Callable[[int], object]
 
@@ -44,10 +43,11 @@ def signals_handled(
     Ignored signals stay ignored. Outside the main thread, which alone may set handlers,
     nothing changes.
 
-    Args: first: Called with the number of the first signal. again: Called with the
-        number of a later signal. stay: Whether the handlers stay after the block once a
-        signal was received; otherwise the previous ones are
-            restored.
+    Args:
+        first: Called with the number of the first signal.
+        again: Called with the number of a later signal.
+        stay: Whether the handlers stay after the block once a signal was received;
+            otherwise the previous ones are restored.
     """
     received, before = Received(), _handlers()
 

@@ -10,9 +10,11 @@ from dataclasses import asdict, dataclass, field
 class Times:
     """Elapsed time of a run, in parts [s].
 
-    Attributes: preparing: Time of the preparation, mainly of kernels that are not
-        cached. computing: CPU time after the preparation, per process. waiting:
-        Remaining time: waiting for the processor, the disk or the last process.
+    Attributes:
+        preparing: Time of the preparation, mainly of kernels that are not cached.
+        computing: CPU time after the preparation, per process.
+        waiting: Remaining time: waiting for the processor, the disk or the last
+            process.
     """
 
     preparing: float = 0.0
@@ -49,9 +51,11 @@ NO_TIME = Times()
 class Stopwatch:
     """Stopwatch of a run, started at construction.
 
-    Attributes: begun: Start time [s]. preparing: Duration of the preparation [s].
+    Attributes:
+        begun: Start time [s].
+        preparing: Duration of the preparation [s].
         computing: CPU time per process after the preparation [s]; callers add the time
-        of other processes.
+            of other processes.
     """
 
     begun: float = field(default_factory=time.perf_counter)

@@ -5,7 +5,11 @@ from pathlib import Path
 
 __version__ = "1.0.0"
 
-DOCUMENTATION_URL = "https://cnpgen.example.org/"  # the only place of the address, which the publisher replaces
+DOCUMENTATION_URL = ""
+"""Address of the documentation site, with a slash at its end; empty until it is published.
+
+This is the only place of the address. Help, errors and metadata name it only if it is set.
+"""
 
 
 @cache

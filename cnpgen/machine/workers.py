@@ -24,13 +24,12 @@ from cnpgen.machine.signals import NUMBERS, signals_deferred
 from cnpgen.schema.arguments import integer
 from cnpgen.store.files.atomic import machine_errors
 
-_IGNORED_WARNING = (
-    "ignore:resource_tracker:UserWarning"  # in the format of the option -W
-)
+# In the format of the option -W.
+
+_IGNORED_WARNING = "ignore:resource_tracker:UserWarning"
 DIED = "a worker died (killed, or out of memory)"
-MAX_PIPE_BYTES = (
-    2048  # plus the overhead of joblib; writes of up to 4096 bytes to a pipe are atomic
-)
+# Plus the overhead of joblib; writes of up to 4096 bytes to a pipe are atomic.
+MAX_PIPE_BYTES = 2048
 TASKS_PER_WORKER = 4  # per batch, for backends that accept only lists of tasks
 PARENT_POLL_INTERVAL_S = 0.5  # of the check of a worker for its parent process
 

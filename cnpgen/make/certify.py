@@ -36,9 +36,9 @@ from cnpgen.trajectory.spline_motion import Motion
 
 Counts = tuple[int, ...]  # obstacles of each kind
 
-PLACES_PER_STEP = (
-    2  # numbers of places are multiples of it, so that scenes share solvers
-)
+# Numbers of places are multiples of it, so that scenes share solvers.
+
+PLACES_PER_STEP = 2
 
 NO_PLAN = "no plan found"
 

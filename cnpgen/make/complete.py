@@ -40,11 +40,12 @@ Array = NDArray[np.float64]
 class Completed:
     """Result of the completion of N tasks.
 
-    Attributes: plans: Boundary problems of the solved tasks, as plans without motions;
-        ``plans.sample_id`` is the index of the
-            task. ``solve_plans`` and ``refine_plans`` compute the motions; a planner
-            plans for ``plans.boundary``. A task with a goal pose has one row for each
-            of its goal states, with the column ``goal_option``.
+    Attributes:
+        plans: Boundary problems of the solved tasks, as plans without motions;
+            ``plans.sample_id`` is the index of the task. ``solve_plans`` and
+            ``refine_plans`` compute the motions; a planner plans for
+            ``plans.boundary``. A task with a goal pose has one row for each of its goal
+            states, with the column ``goal_option``.
         reasons: Rejection reason of each task; empty for solved tasks.
     """
 
@@ -88,16 +89,20 @@ def complete(
     axes of the pose; pi frees an axis. Each task then has several rows, one for each
     goal state, and ``solve_plans`` returns the best valid motion to any of them.
 
-    Args: recipe: Name of a shipped pipeline, dataset or problem, path of a recipe file,
-        or a loaded recipe. table: Path of a table of tasks, CSV or HDF5, in place of
-        the columns; see 'cnpgen docs tasks'. columns: Name of a dataset column ->
-        values in SI units, shape (w,) for one task or (N, w); scalars have shape
-            () or (N,). The value of one task applies to all.
+    Args:
+        recipe: Name of a shipped pipeline, dataset or problem, path of a recipe file,
+            or a loaded recipe.
+        table: Path of a table of tasks, CSV or HDF5, in place of the columns; see
+            'cnpgen docs tasks'.
+        columns: Name of a dataset column -> values in SI units, shape (w,) for one task
+            or (N, w); scalars have shape () or (N,). The value of one task applies to
+            all.
 
-    Raises: UnitError: A value is so far outside of its range that it is probably in
-        degrees or millimetres. UsageError: A column is unknown, has the wrong shape or
-        is not finite, a goal is missing, there is no such
-            table, or table and columns are both given.
+    Raises:
+        UnitError: A value is so far outside of its range that it is probably in degrees
+            or millimetres.
+        UsageError: A column is unknown, has the wrong shape or is not finite, a goal is
+            missing, there is no such table, or table and columns are both given.
         DatasetError: The table is damaged, lacks a goal, or has unknown or
             contradictory columns.
         RecipeError: The recipe has errors.

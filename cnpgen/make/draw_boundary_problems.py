@@ -21,13 +21,16 @@ def draw_boundary_problems(
 ) -> Plans:
     """Draw fresh boundary problems of a recipe, as plans without motions for ``solve_plans``.
 
-    Args: recipe: Name of a shipped dataset or pipeline, path of a recipe file, or a
-        loaded recipe. n: Number of boundary problems. seed: Root seed; by default the
-        recipe's. Equal seeds give equal problems.
+    Args:
+        recipe: Name of a shipped dataset or pipeline, path of a recipe file, or a
+            loaded recipe.
+        n: Number of boundary problems.
+        seed: Root seed; by default the recipe's. Equal seeds give equal problems.
 
-    Raises: RecipeError: The recipe has errors. UsageError: ``n`` is not a positive
-        integer, ``seed`` is not an integer from 0 to 2^63 - 1, or ``recipe`` is
-            not a recipe.
+    Raises:
+        RecipeError: The recipe has errors.
+        UsageError: ``n`` is not a positive integer, ``seed`` is not an integer from 0
+            to 2^63 - 1, or ``recipe`` is not a recipe.
         MachineError: No backend works.
     """
     from cnpgen.make.make_shards import stored_columns

@@ -9,6 +9,7 @@ from pathlib import Path
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.machine.engine import Engine
+from cnpgen.make.dataset_documents import dataset_documents
 from cnpgen.make.make_dataset import Begin, MadeDataset, Progress, delete_shards, run
 from cnpgen.make.make_shards import Job, prepare
 from cnpgen.make.recipe import DatasetRecipe, makes_its_rows, restored, split_rows
@@ -16,7 +17,6 @@ from cnpgen.make.resolve_spec import MAX_ROWS
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.schema.texts import read_own, utf8_text
-from cnpgen.store.dataset_document import dataset_documents
 from cnpgen.store.dataset_spec import DatasetSpec, write_dataset_spec
 from cnpgen.store.files.atomic import check_writable
 from cnpgen.store.files.leftovers import remove_leftovers
@@ -45,15 +45,20 @@ def extend_dataset(
     and statistics cover all rows afterwards. Until then the dataset is unfinished and
     has no manifest.
 
-    Args: folder: Folder of the dataset. n: Final number of rows over all splits.
+    Args:
+        folder: Folder of the dataset.
+        n: Final number of rows over all splits.
         workers: Number of processes; this and the following arguments as for
-        ``make_dataset``. engine: Engine that runs the workers. address: Address of a
-        cluster. begin: Callback before rows are compared and before they are generated.
+            ``make_dataset``.
+        engine: Engine that runs the workers.
+        address: Address of a cluster.
+        begin: Callback before rows are compared and before they are generated.
         progress: Callback with the rows of every shard.
 
-    Raises: UsageError: The folder does not exist or contains no dataset, the dataset
-        has more rows or is unfinished, or
-            this version of cnpgen or of its plug-ins generates other rows.
+    Raises:
+        UsageError: The folder does not exist or contains no dataset, the dataset has
+            more rows or is unfinished, or this version of cnpgen or of its plug-ins
+            generates other rows.
         DatasetError: The specification.json of the dataset is damaged.
         RecipeError: This version of cnpgen does not support the recipe in the
             specification.

@@ -37,9 +37,8 @@ Array = NDArray[np.float64]
 MAX_GOAL_STATES = 5  # of one task that are tried, the nearest first
 POSE_REASON = "no inverse kinematics of the goal"
 POSE_SEEDS = 128  # of the inverse kinematics of a goal pose
-MIN_DIFFERENCE_RAD = (
-    0.3  # rad or m, of two goal states with one pose in their farthest joint
-)
+# Rad or m, of two goal states with one pose in their farthest joint.
+MIN_DIFFERENCE_RAD = 0.3
 START_REASON = "start in collision, outside its limits or off a constraint"
 GOAL_REASON = "all goal states in collision or off a constraint"
 

@@ -34,21 +34,25 @@ from cnpgen.store.shard import storage_dtype
 from cnpgen.store.shard_record import commit_shard
 from cnpgen.store.workspace import require_dataset_spec
 
-MAX_SPOT_CHECK_ROWS = (
-    32  # per shard, recomputed by Pinocchio and Coal before the commit
-)
+# Per shard, recomputed by Pinocchio and Coal before the commit.
+
+MAX_SPOT_CHECK_ROWS = 32
 
 
 @dataclass(frozen=True)
 class Job:
     """Picklable input of a worker.
 
-    Attributes: folder: Folder of the dataset. spec: Specification of the dataset.
+    Attributes:
+        folder: Folder of the dataset.
+        spec: Specification of the dataset.
         pipeline: Pipeline of the dataset; None to rebuild it from the specification,
-        for workers without its files. backend: Backend of the kernels. cache_folder:
-        Folder of compiled kernels; None for the default folder of the worker's machine.
+            for workers without its files.
+        backend: Backend of the kernels.
+        cache_folder: Folder of compiled kernels; None for the default folder of the
+            worker's machine.
         date: Date of all records, from SOURCE_DATE_EPOCH; None for the current time and
-        durations.
+            durations.
     """
 
     folder: Path

@@ -45,13 +45,16 @@ def merge_datasets(
     The rows are therefore identical to those of a dataset generated at once. The parts
     stay unchanged.
 
-    Args: parts: Folders of the parts. out: Folder of the dataset; it may be one of the
-        parts. begin: Called with ("merging", folder, rows, existing rows) before shards
-        are copied. progress: Called with (rows, None) of every copied shard.
+    Args:
+        parts: Folders of the parts.
+        out: Folder of the dataset; it may be one of the parts.
+        begin: Called with ("merging", folder, rows, existing rows) before shards are
+            copied.
+        progress: Called with (rows, None) of every copied shard.
 
-    Raises: UsageError: A folder does not exist, a part belongs to another dataset, two
-        parts have the same shard, or
-            ``out`` holds other content.
+    Raises:
+        UsageError: A folder does not exist, a part belongs to another dataset, two
+            parts have the same shard, or ``out`` holds other content.
         DatasetError: A folder holds no dataset, or a shard is damaged or missing.
         MachineError: The disk is full or a file operation failed.
     """

@@ -82,8 +82,9 @@ def split_rows(recipe: DatasetRecipe, n: int) -> dict[str, int]:
         recipe: Recipe to scale.
         n: Number of rows over all splits, at least 1.
 
-    Returns: Split name -> rows, in the recipe's order, without empty splits; the
-        recipe's own rows if ``n`` is their sum.
+    Returns:
+        Split name -> rows, in the recipe's order, without empty splits; the recipe's
+        own rows if ``n`` is their sum.
 
     Raises:
         UsageError: ``n`` is less than 1.

@@ -63,9 +63,12 @@ POSE_EXPLANATION = f"{POSE_SEEDS} searches from random joint positions found non
 class SolvedScenes:
     """Plans for the problems of N scenes.
 
-    Attributes: scenes: The scenes. plans: The plans in the same order, all of one
-        problem; ``obstacle_poses`` has the obstacles of each. results: Best attempt at
-        every plan with its verdict. times: Times of the run.
+    Attributes:
+        scenes: The scenes.
+        plans: The plans in the same order, all of one problem; ``obstacle_poses`` has
+            the obstacles of each.
+        results: Best attempt at every plan with its verdict.
+        times: Times of the run.
     """
 
     scenes: tuple[SceneProblem, ...]
@@ -149,9 +152,11 @@ def solve_scenes(
     added to its own. The other arguments are those of ``refine_plans``. The names of
     the journals are that of ``journal`` with a number.
 
-    Raises: SceneError: A scene does not fit the robot. UsageError: There are no scenes,
-        or the problem has no constraint ``robot-clearance``. MachineError: See
-        ``refine_plans``.
+    Raises:
+        SceneError: A scene does not fit the robot.
+        UsageError: There are no scenes, or the problem has no constraint
+            ``robot-clearance``.
+        MachineError: See ``refine_plans``.
     """
     check_scenes(scenes)
     loaded, scenes = as_problem(problem), [checked_scene(scene) for scene in scenes]

@@ -2,9 +2,8 @@
 
 The check is independent of the stages: it makes no assumption about their convergence,
 order or tolerances. States that conservative conditions do not accept go to a narrow
-phase: exact checks with Pinocchio and Coal. A capsule contains its
-link: if the capsule has clearance, so has the link. Otherwise the convex parts of the
-    link are checked.
+phase: exact checks with Pinocchio and Coal. A capsule contains its link: if the capsule
+has clearance, so has the link. Otherwise the convex parts of the link are checked.
 """
 
 from collections.abc import Callable, Collection
@@ -39,12 +38,11 @@ States = tuple[Array, Array, Array]
 Decide = Callable[[States, Array, Mask, CandidateBatch | None], Mask]
 """Function of the narrow phase, see ``narrow_phase_of``."""
 
-MIN_SCENE_MARGIN_M = (
-    1e-6  # of distances in compiled code, above which Coal does not measure them again
-)
-ZERO_VELOCITY_ROUNDING_M_S = (
-    1e-14  # rounding error of a velocity that is zero in exact arithmetic
-)
+# Of distances in compiled code, above which Coal does not measure them again.
+
+MIN_SCENE_MARGIN_M = 1e-6
+# Rounding error of a velocity that is zero in exact arithmetic.
+ZERO_VELOCITY_ROUNDING_M_S = 1e-14
 
 
 def acceptance(
@@ -194,9 +192,10 @@ def narrow_phase_of(context: Context, end: End, *, exact: bool = True) -> Decide
     The tolerances of boundary states apply if it is ``exact``, otherwise those of
     motions.
 
-    Returns: A function of states ``(q, dq, ddq)``, shape (n, N) each, obstacle poses,
-        shape (width, N), a mask of the states to check, shape (N,), and the candidates.
-        It returns a mask of the violated constraints, shape (constraints, N).
+    Returns:
+        A function of states ``(q, dq, ddq)``, shape (n, N) each, obstacle poses, shape
+        (width, N), a mask of the states to check, shape (N,), and the candidates. It
+        returns a mask of the violated constraints, shape (constraints, N).
     """
     problem, robot = context.problem, context.robot
     if (

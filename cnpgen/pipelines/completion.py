@@ -22,10 +22,8 @@ from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import table_frame_of
 from cnpgen.store.field import Field
 
-_EXCLUSIVE_COLUMNS = (
-    ("start_q", "start_xyz"),
-    ("goal_q", "goal_xyz"),
-)  # joint positions or a tip position
+# Joint positions or a tip position.
+_EXCLUSIVE_COLUMNS = ("start_q", "start_xyz"), ("goal_q", "goal_xyz")
 
 
 class Completion:
@@ -34,9 +32,11 @@ class Completion:
     A task without start columns starts at rest at the base configuration. Tip positions
     follow from given joint positions.
 
-    Attributes: context: Problem, robot and kernels. given: Columns of the tasks: name
-        -> field. height: Tip height on the problem's table [m], the default z of
-        positions; None without a table.
+    Attributes:
+        context: Problem, robot and kernels.
+        given: Columns of the tasks: name -> field.
+        height: Tip height on the problem's table [m], the default z of positions; None
+            without a table.
     """
 
     def __init__(

@@ -88,8 +88,9 @@ def load_pipeline(
         name_or_path: Name of a shipped pipeline, or path of a pipeline file.
         relative_to: Base folder of a relative path; by default the working directory.
 
-    Raises: RecipeError: The pipeline or problem file has errors; the error lists all of
-        them.
+    Raises:
+        RecipeError: The pipeline or problem file has errors; the error lists all of
+            them.
     """
     return load_recipe(("pipeline",), name_or_path, relative_to, read_pipeline)
 

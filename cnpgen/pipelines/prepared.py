@@ -29,9 +29,8 @@ from cnpgen.store.sampling_statistics import DensityMap, SamplingStatistics
 from cnpgen.store.scene_table import SCENE_ID, SceneTable, concatenate_scenes
 
 MIN_ACCEPTANCE = 1e-4  # accepted fraction below which a pipeline raises an error
-MIN_CANDIDATES_BEFORE_ERROR = (
-    100_000  # candidates before the accepted fraction is checked
-)
+# Candidates before the accepted fraction is checked.
+MIN_CANDIDATES_BEFORE_ERROR = 100_000
 DENSITY_CELLS = 24  # along each side of a density map
 BOOKKEEPING = (SCENE_ID, "attempts", "sample_id")  # fields that no stage writes
 
@@ -40,10 +39,11 @@ BOOKKEEPING = (SCENE_ID, "attempts", "sample_id")  # fields that no stage writes
 class Block:
     """Accepted rows in sampling order, and the statistics of all candidates up to the last row.
 
-    Attributes: columns: Field name -> values, shape (width, rows); (1, rows) for
-        scalars. sampling: Counts of candidates and rejections, and density maps.
+    Attributes:
+        columns: Field name -> values, shape (width, rows); (1, rows) for scalars.
+        sampling: Counts of candidates and rejections, and density maps.
         scenes: Scenes of the rows, whose IDs are those of the column ``scene_id``; None
-        without scenes.
+            without scenes.
     """
 
     columns: dict[str, NDArray[Any]]
@@ -209,10 +209,8 @@ class BlockChunk:
         self._fields = [field for field in fields if field.name not in BOOKKEEPING]
         self._parts: list[dict[str, NDArray[Any]]] = []
         self._scenes: list[SceneTable] = []
-        self._tried, self._waiting = (
-            0,
-            0,
-        )  # candidates, and those since the last accepted one
+        # Candidates, and those since the last accepted one.
+        self._tried, self._waiting = 0, 0
         self._rejections: dict[str, int] = {}
         self._stages: dict[str, str] = {}
         self._maps = [field for field in fields if field.name.endswith("_xyz")]

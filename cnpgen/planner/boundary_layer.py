@@ -48,9 +48,9 @@ class BoundaryLayer:
     expected time. The boundary control points follow (paper, Appendix A). If a problem
     has equalities, line and path are projected onto them; the paper uses zero steps.
 
-    Args: problem: The problem, its record (``plans.problem``, ``dataset.problem``), or
-        the name or the file of a problem,
-            a pipeline or a dataset.
+    Args:
+        problem: The problem, its record (``plans.problem``, ``dataset.problem``), or
+            the name or the file of a problem, a pipeline or a dataset.
         path_scale: Factor of phi [rad]; pi in the paper.
         line_projection_steps: Number of Gauss-Newton steps that project the line.
         projection_steps: Number of Gauss-Newton steps that project the path.
@@ -164,17 +164,19 @@ class BoundaryLayer:
     ) -> Tasks:
         """Prepare N tasks: compute everything that the network needs from boundary conditions.
 
-        Args: boundary: Boundary conditions, shape (N, n) each: arrays, or tensors on
-            the CPU. obstacle_poses: Poses and sizes of obstacles that samples place,
-            shape (N, width), as
-                ``dataset.scenes(split, rows).poses`` has them; needed if the problem
-                has such obstacles.
+        Args:
+            boundary: Boundary conditions, shape (N, n) each: arrays, or tensors on the
+                CPU.
+            obstacle_poses: Poses and sizes of obstacles that samples place, shape (N,
+                width), as ``dataset.scenes(split, rows).poses`` has them; needed if the
+                problem has such obstacles.
             allow_large_angles: Whether to accept values that are probably in degrees or
                 millimetres, with a warning.
 
-        Raises: UsageError: A shape is wrong, a value is no real number, poses are
-            missing, or the presence of goal
-                accelerations does not match ``goal_acceleration``.
+        Raises:
+            UsageError: A shape is wrong, a value is no real number, poses are missing,
+                or the presence of goal accelerations does not match
+                ``goal_acceleration``.
             UnitError: A value is probably in degrees or millimetres.
         """
         if boundary.fixed_at_goal > self._fixed_at_goal:
@@ -223,9 +225,11 @@ class BoundaryLayer:
     ) -> ControlPoints:
         """Compute control points, in float64.
 
-        Args: tasks: N tasks. phi: Output of the configuration head, shape (N,
-            path_outputs); shipped networks end in tanh. log_rate: Output of the time
-            head, shape (N, rate_outputs).
+        Args:
+            tasks: N tasks.
+            phi: Output of the configuration head, shape (N, path_outputs); shipped
+                networks end in tanh.
+            log_rate: Output of the time head, shape (N, rate_outputs).
 
         Raises:
             UsageError: A shape is wrong, or a value is no real number.
@@ -257,11 +261,14 @@ class BoundaryLayer:
         If control points overflowed, the gradient of that plan is 0; other plans are
         not affected.
 
-        Args: tasks: N tasks. phi: Output of the configuration head, shape (N,
-            path_outputs). log_rate: Output of the time head, shape (N, rate_outputs).
+        Args:
+            tasks: N tasks.
+            phi: Output of the configuration head, shape (N, path_outputs).
+            log_rate: Output of the time head, shape (N, rate_outputs).
             path_gradient: Gradient with respect to the path control points, shape (N,
-            C, n). rate_gradient: Gradient with respect to the rate control points,
-            shape (N, R).
+                C, n).
+            rate_gradient: Gradient with respect to the rate control points, shape (N,
+                R).
 
         Returns:
             Gradients with respect to phi and log_rate.
@@ -307,11 +314,12 @@ class BoundaryLayer:
     ) -> Plans:
         """Make plans from network outputs, to be evaluated, refined or saved.
 
-        Args: tasks: N tasks. phi: Output of the configuration head, shape (N,
-            path_outputs). log_rate: Output of the time head, shape (N, rate_outputs).
+        Args:
+            tasks: N tasks.
+            phi: Output of the configuration head, shape (N, path_outputs).
+            log_rate: Output of the time head, shape (N, rate_outputs).
             sample_id: Dataset rows of the tasks, shape (N,), such as
-            ``batch["sample_id"]``, also after shuffling;
-                0, 1, ... by default.
+                ``batch["sample_id"]``, also after shuffling; 0, 1, ... by default.
 
         Raises:
             UsageError: A shape is wrong, or a value is no real number.

@@ -41,7 +41,8 @@ from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
 
-SLOW_DURATION = 1.8  # in expected times, above which a motion nearer to the straight line may be faster
+# In expected times, above which a motion nearer to the straight line may be faster.
+SLOW_DURATION = 1.8
 OFFSET_FRACTION = 0.5  # of the offsets from the line that such motions keep
 STATIC_INTERVALS = 32  # between phases
 COARSE_PHASES = slice(2, None, 4)  # that most violating motions fail at
@@ -53,8 +54,10 @@ MAX_LINES = 4  # that motions are planned along
 class ViaPoints:
     """Via points of one problem's model, and the check of static conditions; made by ``make_via_points``.
 
-    Attributes: via_points: Configurations [rad], shape (M, n). static_violation: Kernel
-        of ``expressions.static_violation`` at phases of motions, in single precision.
+    Attributes:
+        via_points: Configurations [rad], shape (M, n).
+        static_violation: Kernel of ``expressions.static_violation`` at phases of
+            motions, in single precision.
         path: Basis of p at K phases, shape (K, C), float32.
     """
 
@@ -155,8 +158,9 @@ def loaded_problem(
 ) -> Iterator[LoadedProblem]:
     """Load a problem from its record, with its URDF file until the context is left, and the fastest backend by default.
 
-    Raises: CnpgenError: The record does not fit this version of cnpgen, or a dependency
-        is missing.
+    Raises:
+        CnpgenError: The record does not fit this version of cnpgen, or a dependency is
+            missing.
     """
     chosen, folder = choose_backend(backend)
     with record.restored() as problem:

@@ -25,14 +25,15 @@ MAX_NETWORK_ITERATIONS = 20
 class ModelConfig:
     """Definition of the network's outputs.
 
-    Attributes: path_scale: Factor of the configuration head's output [rad]; pi in the
-        paper. line_projection_steps: Gauss-Newton steps that project the line onto the
-        equalities; 0 in the paper. projection_steps: Gauss-Newton steps that project
-        the path onto the equalities. expected_time: Unit of durations: "distance", the
-        time of the distance at the velocity limits, at least 0.2 s;
-            "travel", the same without a lower bound, as in the authors' implementation;
-            or "reach", the minimum time in which every joint could reach its goal
-            state.
+    Attributes:
+        path_scale: Factor of the configuration head's output [rad]; pi in the paper.
+        line_projection_steps: Gauss-Newton steps that project the line onto the
+            equalities; 0 in the paper.
+        projection_steps: Gauss-Newton steps that project the path onto the equalities.
+        expected_time: Unit of durations: "distance", the time of the distance at the
+            velocity limits, at least 0.2 s; "travel", the same without a lower bound,
+            as in the authors' implementation; or "reach", the minimum time in which
+            every joint could reach its goal state.
         within_limits: Whether control points are clipped to the joint limits after each
             of these steps, and without any of them once.
         time_parametrized: Whether rates are fitted to the limits after the network
@@ -57,8 +58,10 @@ class ModelConfig:
 class Outputs:
     """Network outputs of N tasks.
 
-    Attributes: offsets: Offsets of interior path control points from the line [rad],
-        shape (N, interior points x n). rate: Rate control points [1/s], shape (N, R).
+    Attributes:
+        offsets: Offsets of interior path control points from the line [rad], shape (N,
+            interior points x n).
+        rate: Rate control points [1/s], shape (N, R).
     """
 
     offsets: NDArray[np.float64]
@@ -69,13 +72,17 @@ class Outputs:
 class Model:
     """A trained model.
 
-    Attributes: problem: The problem that it plans for, with its URDF. architecture: The
-        network's architecture. parameters: All parameters, float32, shape
-        (architecture.n_parameters,). features: Definition of its inputs. config:
-        Definition of its outputs. zero_conditions: Names of the boundary conditions
-        that were zero in all training rows. training: Training metadata: command, seed,
-        dataset, steps, seconds, score; JSON-able. log: Its training log, one JSON
-        object per line.
+    Attributes:
+        problem: The problem that it plans for, with its URDF.
+        architecture: The network's architecture.
+        parameters: All parameters, float32, shape (architecture.n_parameters,).
+        features: Definition of its inputs.
+        config: Definition of its outputs.
+        zero_conditions: Names of the boundary conditions that were zero in all training
+            rows.
+        training: Training metadata: command, seed, dataset, steps, seconds, score;
+            JSON-able.
+        log: Its training log, one JSON object per line.
     """
 
     problem: ProblemRecord

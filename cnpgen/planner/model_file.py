@@ -89,9 +89,11 @@ def load_model(name_or_path: str | Path) -> Model:
     Args:
         name_or_path: Name of a shipped model, or path of a model file.
 
-    Raises: UsageError: There is no such file, it is of another kind, or there is no
-        shipped model of this name. DatasetError: The file is damaged or of another
-        format version. MachineError: The operating system denies reading it.
+    Raises:
+        UsageError: There is no such file, it is of another kind, or there is no shipped
+            model of this name.
+        DatasetError: The file is damaged or of another format version.
+        MachineError: The operating system denies reading it.
     """
     path = find_model(name_or_path)
     return model_from_content(
@@ -133,9 +135,10 @@ def shipped_models() -> dict[str, Path]:
 def find_model(name_or_path: str | Path) -> Path:
     """Return the file of a model: a path if it ends in ``.h5``, has a separator or is a file; else a shipped model.
 
-    Raises: UsageError: There is no such file, it is of another kind, or there is no
-        shipped model of this name. MachineError: The operating system denies reading
-        it.
+    Raises:
+        UsageError: There is no such file, it is of another kind, or there is no shipped
+            model of this name.
+        MachineError: The operating system denies reading it.
     """
     if not isinstance(name_or_path, str | Path):
         raise UsageError(

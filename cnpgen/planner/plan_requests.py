@@ -62,8 +62,10 @@ def read_rows(
     Rows drawn by another recipe than the training rows are accepted if ``other`` is
     set.
 
-    Raises: DatasetError: The dataset is damaged, of another problem, or drawn by
-        another recipe. UsageError: There are no such rows.
+    Raises:
+        DatasetError: The dataset is damaged, of another problem, or drawn by another
+            recipe.
+        UsageError: There are no such rows.
     """
     dataset = open_dataset(folder)
     check_stages(
@@ -90,11 +92,11 @@ def read_file(
     Rows of a shard drawn by another recipe than the training rows are accepted if
     ``other`` is set.
 
-    Raises: UnitError: Boundary conditions are probably in degrees or millimetres.
+    Raises:
+        UnitError: Boundary conditions are probably in degrees or millimetres.
         UsageError: There is no such file, or ``other`` is set and the file is no shard.
         DatasetError: The file is damaged, incomplete, of another problem, of a shard of
-        other rows, or prescribes goal
-            accelerations that the model leaves free.
+            other rows, or prescribes goal accelerations that the model leaves free.
     """
     file = read_boundary_file(path)
     if file.is_shard:
@@ -123,18 +125,19 @@ def plan_scenes(
 ) -> Plans:
     """Plan the problems of scenes, from rest to rest.
 
-    Args: planner: Planner of a model that was trained on scenes. scenes: The scenes.
+    Args:
+        planner: Planner of a model that was trained on scenes.
+        scenes: The scenes.
         goals: Joint positions at the goals in the order of the planned joints [rad],
-        shape (n,) each; by default the
-            first goal state of each scene.
+            shape (n,) each; by default the first goal state of each scene.
 
     Returns:
         A plan per scene, not checked yet (status UNKNOWN).
 
-    Raises: SceneError: A scene does not fit the robot. UsageError: The model is for
-        other problems, there are no scenes, or a scene has more obstacles of a kind
-        than
-            the model's problem.
+    Raises:
+        SceneError: A scene does not fit the robot.
+        UsageError: The model is for other problems, there are no scenes, or a scene has
+            more obstacles of a kind than the model's problem.
     """
     requests = scene_requests(planner.model, scenes, goals=goals)
     return planner.plan_batch(

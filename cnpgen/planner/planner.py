@@ -34,18 +34,19 @@ Array = NDArray[np.float64]
 
 GOAL_TOLERANCE = 1e-9  # rad, rad/s and rad/s^2: goals that differ by less are equal
 MIN_REMAINING_TIME_S = 1e-6  # motions that end sooner are not reused
-MAX_DURATION_RATIO = (
-    0.98  # of a new plan's duration to the remaining time; else the old plan is reused
-)
-REST_TOLERANCE = 1e-9  # fraction of a limit: rounding error of a velocity or an acceleration that was zero
+# Of a new plan's duration to the remaining time; else the old plan is reused.
+MAX_DURATION_RATIO = 0.98
+# Fraction of a limit: rounding error of a velocity or an acceleration that was zero.
+REST_TOLERANCE = 1e-9
 
 
 class Planner:
     """Plan motions with a trained model.
 
-    Args: model: A model, the path of a model file, the name of a shipped model, or a
-        problem (``plans.problem``,
-            ``dataset.problem``) with exactly one shipped model.
+    Args:
+        model: A model, the path of a model file, the name of a shipped model, or a
+            problem (``plans.problem``, ``dataset.problem``) with exactly one shipped
+            model.
         scale_time: Whether motions from rest to rest are scaled uniformly in time to
             meet the limits. This is exact, and done only for models whose training rows
             all begin and end at rest. False also disables the time parametrization of
@@ -57,9 +58,10 @@ class Planner:
         robot: The robot of its problem.
         backend: Backend of the kernels, as passed.
 
-    Raises: UsageError: ``model`` is invalid, there is no such file or shipped model, or
-        several are for the problem. CnpgenError: The model cannot be read, or a
-        dependency is missing.
+    Raises:
+        UsageError: ``model`` is invalid, there is no such file or shipped model, or
+            several are for the problem.
+        CnpgenError: The model cannot be read, or a dependency is missing.
     """
 
     @checked_arguments
@@ -135,14 +137,16 @@ class Planner:
         Boundary conditions are not checked against the limits. A plan from or to an
         invalid state is returned, and ``evaluate_plans`` reports that it is not valid.
 
-        Args: start_q: Start positions [rad], shape (n,) for one motion or (N, n).
-            goal_q: Goal positions [rad], shape (n,) or (N, n). start_dq: Start
-            velocities [rad/s], shape (n,) or (N, n); zero by default. start_ddq: Start
-            accelerations [rad/s^2], shape (n,) or (N, n); zero by default. goal_dq:
-            Goal velocities [rad/s], shape (n,) or (N, n); zero by default. goal_ddq:
-            Goal accelerations [rad/s^2], shape (n,) or (N, n), for models trained on
-            rows with goal
-                accelerations; zero by default. Other models leave them free.
+        Args:
+            start_q: Start positions [rad], shape (n,) for one motion or (N, n).
+            goal_q: Goal positions [rad], shape (n,) or (N, n).
+            start_dq: Start velocities [rad/s], shape (n,) or (N, n); zero by default.
+            start_ddq: Start accelerations [rad/s^2], shape (n,) or (N, n); zero by
+                default.
+            goal_dq: Goal velocities [rad/s], shape (n,) or (N, n); zero by default.
+            goal_ddq: Goal accelerations [rad/s^2], shape (n,) or (N, n), for models
+                trained on rows with goal accelerations; zero by default. Other models
+                leave them free.
             parameters: Parameters of the problem, shape (width,) or (N, width), if it
                 has any.
             allow_large_angles: Whether to accept values that are probably in degrees or
@@ -151,9 +155,10 @@ class Planner:
         Returns:
             One plan or N, not checked yet (status UNKNOWN).
 
-        Raises: UsageError: A shape is wrong, a value is not finite, a condition is not
-            zero that was zero in all training
-                rows, or goal accelerations are given that the model leaves free.
+        Raises:
+            UsageError: A shape is wrong, a value is not finite, a condition is not zero
+                that was zero in all training rows, or goal accelerations are given that
+                the model leaves free.
             UnitError: A condition is probably in degrees or millimetres.
         """
         states = start_q, start_dq, start_ddq, goal_q, goal_dq, goal_ddq
@@ -175,11 +180,12 @@ class Planner:
     ) -> Plans:
         """Plan N motions.
 
-        Args: boundary: Boundary conditions, shape (N, n) each, float64 and finite.
+        Args:
+            boundary: Boundary conditions, shape (N, n) each, float64 and finite.
             sample_id: Dataset samples of the tasks, shape (N,); 0, 1, ... by default.
             columns: Further columns of the tasks, as ``Plans.columns``;
-            ``obstacle_poses`` places the obstacles of a
-                model for scenes (``cnpgen.scenes.scene_plans``).
+                ``obstacle_poses`` places the obstacles of a model for scenes
+                (``cnpgen.scenes.scene_plans``).
             allow_large_angles: See ``plan``.
 
         Raises:
@@ -213,19 +219,21 @@ class Planner:
         differ by more than 0.1 % of the limits, all returned plans have two or three
         spans for each original one.
 
-        Args: plans: One plan or N, by any planner of the same robot; one plan may be
-            replanned to several goals. time: Time at which the new plans take over,
-            since the start of the old ones [s], one number or shape (N,).
-                Planning itself takes time: choose a time in the future.
+        Args:
+            plans: One plan or N, by any planner of the same robot; one plan may be
+                replanned to several goals.
+            time: Time at which the new plans take over, since the start of the old ones
+                [s], one number or shape (N,). Planning itself takes time: choose a time
+                in the future.
             goal_q: New goal positions [rad], shape (n,) or (N, n).
             goal_dq: New goal velocities [rad/s], shape (n,) or (N, n); zero by default.
             goal_ddq: New goal accelerations [rad/s^2], as for ``plan``.
             parameters: Parameters of the problem, as for ``plan``; those of the plans
                 by default.
 
-        Raises: UsageError: The number of times differs from that of plans, a time is
-            outside its plan, the plans are of
-                another robot, or see ``plan``.
+        Raises:
+            UsageError: The number of times differs from that of plans, a time is
+                outside its plan, the plans are of another robot, or see ``plan``.
         """
         if plans.problem.joint_names != self.model.problem.joint_names:
             raise UsageError(

@@ -39,16 +39,20 @@ Array = NDArray[np.float64]
 class TaskPreprocessor:
     """Preprocessor of one problem's tasks; made by ``make_task_preprocessor``.
 
-    Attributes: problem: The problem, ``Problem.for_planning``. velocity_limit: Planning
-        limits [rad/s], shape (n,). tips: Kernel of
-        ``control_point_functions.tips_at_ends``. line: Kernel of
-        ``control_point_functions.line_change``; None if the line is not projected.
+    Attributes:
+        problem: The problem, ``Problem.for_planning``.
+        velocity_limit: Planning limits [rad/s], shape (n,).
+        tips: Kernel of ``control_point_functions.tips_at_ends``.
+        line: Kernel of ``control_point_functions.line_change``; None if the line is not
+            projected.
         reaching_time: Kernel of ``tasks.reaching_time``; None if the expected time is
-        that of the distance. via_line: The same kernel with offsets; None if there are
-        no via points, or no projection. least_time: Lower bound of the expected time of
-        the distance [s]. placed: Obstacles that samples place. scene_features: Features
-        of these obstacles; None if the model has none. iterated: Whether the network
-        corrects its own path.
+            that of the distance.
+        via_line: The same kernel with offsets; None if there are no via points, or no
+            projection.
+        least_time: Lower bound of the expected time of the distance [s].
+        placed: Obstacles that samples place.
+        scene_features: Features of these obstacles; None if the model has none.
+        iterated: Whether the network corrects its own path.
     """
 
     problem: Problem
@@ -75,8 +79,9 @@ class TaskPreprocessor:
         ``ends`` is the result of ``ends_of``, if already computed. Poses are those of
         obstacles that samples place.
 
-        Raises: UsageError: Obstacle poses are missing, have a wrong shape or are not
-            finite, or the problem places them.
+        Raises:
+            UsageError: Obstacle poses are missing, have a wrong shape or are not
+                finite, or the problem places them.
         """
         ends = ends_of(boundary) if ends is None else ends
         start_xyz, goal_xyz, *velocity = (tip.T for tip in self.tips(ends))

@@ -19,27 +19,27 @@ Array = NDArray[Any]
 
 MIN_EXPECTED_TIME_S = 0.2  # lower bound of ``expected_time``
 MIN_REACH_TIME_S = 0.03  # lower bound of ``reaching_time``
-MIN_TRAVEL_TIME_S = (
-    1e-6  # lower bound without effect on moving joints: avoids a division by zero
-)
-EXPECTED_TIMES = (
-    "distance",
-    "reach",
-    "travel",
-)  # ``expected_time``, ``reaching_time``, ``expected_time`` unbounded
+# Lower bound without effect on moving joints: avoids a division by zero.
+MIN_TRAVEL_TIME_S = 1e-6
+# ``expected_time``, ``reaching_time``, ``expected_time`` unbounded.
+EXPECTED_TIMES = "distance", "reach", "travel"
 
 
 @dataclass(frozen=True)
 class Tasks:
     """N planning tasks of one problem with n joints.
 
-    Attributes: boundary: Boundary conditions, shape (N, n) each. start_xyz: Tip
-        positions at the start, world frame [m], shape (N, 3). goal_xyz: Tip positions
-        at the goal, world frame [m], shape (N, 3). expected_time: Unit of durations
-        [s], shape (N,): network outputs are rates times this. scene: Obstacles of the
-        tasks. correction: Offsets of the projected line from the straight one [rad],
-        shape (N, m, n); None if it is straight. placed: Obstacles of a problem whose
-        samples place them; ``scene`` has none then. None for other problems.
+    Attributes:
+        boundary: Boundary conditions, shape (N, n) each.
+        start_xyz: Tip positions at the start, world frame [m], shape (N, 3).
+        goal_xyz: Tip positions at the goal, world frame [m], shape (N, 3).
+        expected_time: Unit of durations [s], shape (N,): network outputs are rates
+            times this.
+        scene: Obstacles of the tasks.
+        correction: Offsets of the projected line from the straight one [rad], shape (N,
+            m, n); None if it is straight.
+        placed: Obstacles of a problem whose samples place them; ``scene`` has none
+            then. None for other problems.
         observation: Features of the placed obstacles, shape (N, F), or None.
     """
 

@@ -40,26 +40,20 @@ from cnpgen.trajectory.spline_motion import Motion
 Array = NDArray[np.float64]
 
 SOURCE = Path(__file__).with_name("time_parametrization.c")
-PARAMETRIZATION_INTERVALS = (
-    79  # between phases; the 80 phases fill vectors of any width
-)
-INTERVALS_AT_REST = (
-    63  # from rest to rest, where RATE_MARGIN covers excesses between the phases
-)
+# Between phases; the 80 phases fill vectors of any width.
+PARAMETRIZATION_INTERVALS = 79
+# From rest to rest, where RATE_MARGIN covers excesses between the phases.
+INTERVALS_AT_REST = 63
 FIXED_RATE_POINTS = 2  # at either end of motions that are not at rest there
-RATE_MARGIN = 3e-3  # relative decrease of the rates from rest to rest, for excesses between the phases
-STEP_FRACTIONS = (
-    0.65,
-    0.9,
-)  # of the step to the first bound: of every second control point, then of those between
-MAX_RATE_INCREASE, MAX_RATE_DECREASE = (
-    1.0,
-    -0.3,
-)  # of a control point in one step, relative
+# Relative decrease of the rates from rest to rest, for excesses between the phases.
+RATE_MARGIN = 3e-3
+# Of the step to the first bound: of every second control point, then of those between.
+STEP_FRACTIONS = 0.65, 0.9
+# Of a control point in one step, relative.
+MAX_RATE_INCREASE, MAX_RATE_DECREASE = 1.0, -0.3
 BOUND_ROUNDING = 1e-9  # fraction of a limit by which boundary conditions may exceed it
-MIN_INCREASE_TO_REPEAT = (
-    0.4  # of a control point in a sweep from rest to rest, after which all move again
-)
+# Of a control point in a sweep from rest to rest, after which all move again.
+MIN_INCREASE_TO_REPEAT = 0.4
 MAX_VECTOR_WIDTH = 8  # float64 values
 
 
@@ -94,13 +88,17 @@ class _TimeParametrization(ctypes.Structure):
 class TimeParametrization(PhaseGrid):
     """Time parametrization of one problem's motions; made by ``make_time_parametrization``.
 
-    Attributes: coefficients: Kernel of ``expressions.speed_coefficients``. lower: Lower
-        bounds of its rows, shape (m,). upper: Upper bounds of its rows, shape (m,).
-        joints: Number of joints. fixed: Number of control points of the rate at either
-        end that stay; 0 from rest to rest. margin: Relative decrease of the rates after
-        the last step. min_increase: Largest increase of a control point in a sweep
-        above which all control points move again. library: Library of
-        time_parametrization.c; None if kernels are not compiled.
+    Attributes:
+        coefficients: Kernel of ``expressions.speed_coefficients``.
+        lower: Lower bounds of its rows, shape (m,).
+        upper: Upper bounds of its rows, shape (m,).
+        joints: Number of joints.
+        fixed: Number of control points of the rate at either end that stay; 0 from rest
+            to rest.
+        margin: Relative decrease of the rates after the last step.
+        min_increase: Largest increase of a control point in a sweep above which all
+            control points move again.
+        library: Library of time_parametrization.c; None if kernels are not compiled.
     """
 
     coefficients: Kernel
@@ -122,8 +120,8 @@ class TimeParametrization(PhaseGrid):
         necessary.
 
         The mask of motions that meet the limits, shape (N,), is False also for motions
-        whose control points moved
-        twice: they exceed the limits more between the phases.
+        whose control points moved twice: they exceed the limits more between the
+        phases.
         """
         rate, violation = (
             np.array(motion.rate, np.float64, order="C"),

@@ -29,9 +29,8 @@ Array = NDArray[np.float64]
 
 MAX_TIME_SCALE = 3.0  # motions that need more are not usable plans
 SCALING_INTERVALS = 128  # between phases
-TIME_SCALE_MARGIN = (
-    2e-4  # relative; limits may be exceeded by about this between two phases
-)
+# Relative; limits may be exceeded by about this between two phases.
+TIME_SCALE_MARGIN = 2e-4
 MOTIONS_PER_BLOCK = 64  # small enough for arrays to stay in the CPU cache
 
 

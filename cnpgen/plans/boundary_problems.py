@@ -240,11 +240,11 @@ def load_boundary_problems(
     Rows of a certified dataset have the stored plans. From a file, only the boundary
     conditions are read; ``load_plans`` reads its plans.
 
-    Args: path: Folder of a dataset, or an HDF5 file of boundary conditions: a shard, a
-        file of plans, or any other
-            with ``start_q`` and ``goal_q`` of shape (N, joints), and ``start_dq``,
-            ``start_ddq`` and ``goal_dq`` unless they are zero, and ``goal_ddq`` unless
-            goal accelerations are free.
+    Args:
+        path: Folder of a dataset, or an HDF5 file of boundary conditions: a shard, a
+            file of plans, or any other with ``start_q`` and ``goal_q`` of shape (N,
+            joints), and ``start_dq``, ``start_ddq`` and ``goal_dq`` unless they are
+            zero, and ``goal_ddq`` unless goal accelerations are free.
         split: Split of the dataset; "train" by default.
         start: First row of the split; 0 by default.
         n: Number of rows; by default all that follow.
@@ -253,10 +253,13 @@ def load_boundary_problems(
         problem: Required problem of a file: name, path, problem or record. Its
             tolerances replace those in the file.
 
-    Raises: DatasetError: The dataset or the file cannot be read, is incomplete or is of
-        another problem. UsageError: The folder, file, split or rows do not exist, or
-        rows of a file are requested. UnitError: Boundary conditions of a file are
-        probably in degrees or millimetres. RecipeError: ``problem`` has errors.
+    Raises:
+        DatasetError: The dataset or the file cannot be read, is incomplete or is of
+            another problem.
+        UsageError: The folder, file, split or rows do not exist, or rows of a file are
+            requested.
+        UnitError: Boundary conditions of a file are probably in degrees or millimetres.
+        RecipeError: ``problem`` has errors.
     """
     path = Path(path)
     if path.is_file() or (path.suffix == ".h5" and not path.is_dir()):

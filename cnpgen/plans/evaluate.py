@@ -41,10 +41,12 @@ _STATUS: dict[str, PlanStatus] = {
 class Evaluation:
     """Verdicts of N plans.
 
-    Attributes: plans: Plans, with tip positions consistent with the joints. verdicts:
-        Verdicts, in the same order. step: Maximum distance of checked times [s].
+    Attributes:
+        plans: Plans, with tip positions consistent with the joints.
+        verdicts: Verdicts, in the same order.
+        step: Maximum distance of checked times [s].
         tracking_error: Largest tracking error of every joint [rad], or one for all;
-        empty for exact tracking.
+            empty for exact tracking.
     """
 
     plans: Plans
@@ -114,17 +116,19 @@ def evaluate_plans(
     ``goal_xyz`` differ from the tip positions of the joints, the joints are used, after
     a warning.
 
-    Args: plans: Plans to judge. step: Maximum distance of checked times [s].
+    Args:
+        plans: Plans to judge.
+        step: Maximum distance of checked times [s].
         tracking_error: Largest tracking error of the joints [rad], one number or one
-        per joint. Limits of positions,
-            clearances and the manifold must then hold for every state within it.
+            per joint. Limits of positions, clearances and the manifold must then hold
+            for every state within it.
         workers: Number of processes; default one per available core, or one for few
             plans.
         progress: Called with the number of plans that were judged since the last call.
 
-    Raises: UsageError: There are no plans, the step is not positive, there is less than
-        one worker, or a tracking error is
-            negative.
+    Raises:
+        UsageError: There are no plans, the step is not positive, there is less than one
+            worker, or a tracking error is negative.
         RecipeError: A required plug-in is not installed.
         MachineError: A worker died.
     """

@@ -28,12 +28,13 @@ MAX_RATE_HZ = 1e6  # steps of 1 us; ROS stamps resolve 1 ns
 class Exported:
     """Result of ``export_plans``.
 
-    Attributes: files: Written files, in the order of the plans. count: Number of
-        exported plans. refused: Index of each plan that could not be exported ->
-        message. invalid: Indices of exported plans with a status other than valid or
-        unknown. held_joints: File with the positions of unplanned movable joints, for
-        formats with one file per plan, if the
-            robot has such joints.
+    Attributes:
+        files: Written files, in the order of the plans.
+        count: Number of exported plans.
+        refused: Index of each plan that could not be exported -> message.
+        invalid: Indices of exported plans with a status other than valid or unknown.
+        held_joints: File with the positions of unplanned movable joints, for formats
+            with one file per plan, if the robot has such joints.
     """
 
     files: tuple[Path, ...]
@@ -78,9 +79,10 @@ def export_plans(
     ones, ``held_joints.yaml`` contains their positions. Plans that cannot be sampled
     are omitted and reported.
 
-    Args: plans: Plans, or joined plans of ``join_plans``. out: File for formats with a
-        single file (in an existing folder: ``plans.npz``), otherwise a folder, which is
-            created.
+    Args:
+        plans: Plans, or joined plans of ``join_plans``.
+        out: File for formats with a single file (in an existing folder: ``plans.npz``),
+            otherwise a folder, which is created.
         to: Name of the format.
         rate: Samples per second [Hz]; the last instant of a plan is always one of its
             samples.

@@ -18,7 +18,9 @@ from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
 
-MIN_LAST_STEP_FRACTION = 0.01  # minimum length of the last step in steps; a shorter one is merged with the step before
+# Minimum length of the last step in steps; a shorter one is merged with the step
+# before.
+MIN_LAST_STEP_FRACTION = 0.01
 
 
 @dataclass(frozen=True)
@@ -50,14 +52,18 @@ class SampledPlan:
 class ExportedSet:
     """Data of all N exported plans.
 
-    Attributes: index: Index of each plan in its set, shape (N,). sample_id: Sample ID
-        of each plan, shape (N,). joint_names: Names of the n planned joints. prismatic:
-        Whether each planned joint is prismatic; its values are in m instead of rad.
+    Attributes:
+        index: Index of each plan in its set, shape (N,).
+        sample_id: Sample ID of each plan, shape (N,).
+        joint_names: Names of the n planned joints.
+        prismatic: Whether each planned joint is prismatic; its values are in m instead
+            of rad.
         held_joints: Positions of the movable joints that are not planned: name -> rad
-        or m. rate: Samples per second [Hz]. problem: Name of the problem. environment:
-        Goals, columns of the tasks and scenes: name -> values in SI units, shape (N,
-        w); empty for
-            formats that do not use them.
+            or m.
+        rate: Samples per second [Hz].
+        problem: Name of the problem.
+        environment: Goals, columns of the tasks and scenes: name -> values in SI units,
+            shape (N, w); empty for formats that do not use them.
         motion: The N motions as splines; None for joined plans.
         parameters: Names of the problem's parameters.
     """
@@ -81,9 +87,11 @@ class Exporter(ABC):
     Packages register formats under the entry point ``cnpgen.exporters``; ``cnpgen
     export --to NAME`` then writes them.
 
-    Attributes: suffix: Suffix of the files, with the dot. single_file: Whether one file
-        has all plans; otherwise each plan has its own file, and ``held_joints.yaml``
-            beside the files has the positions of the joints that are not planned.
+    Attributes:
+        suffix: Suffix of the files, with the dot.
+        single_file: Whether one file has all plans; otherwise each plan has its own
+            file, and ``held_joints.yaml`` beside the files has the positions of the
+            joints that are not planned.
         is_folder: Whether the output with all plans is a folder.
         uses_environment: Whether the format has goals, columns of the tasks and scenes.
     """
@@ -99,9 +107,11 @@ class Exporter(ABC):
     ) -> None:
         """Write a file; an existing file is replaced, atomically.
 
-        Args: path: Path of the file. plans: All plans for a single file, which are
-            sampled one by one; otherwise one plan. exported: Data of all exported
-            plans.
+        Args:
+            path: Path of the file.
+            plans: All plans for a single file, which are sampled one by one; otherwise
+                one plan.
+            exported: Data of all exported plans.
 
         Raises:
             MachineError: The disk is full or read-only, or a file operation failed.

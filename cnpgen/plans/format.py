@@ -14,11 +14,8 @@ FORMAT = "cnpgen-plans"
 PLAN_FILE_VERSION = 1
 
 BOUNDARY = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
-CONDITIONS = (
-    *BOUNDARY,
-    "goal_ddq",
-    "parameters",
-)  # only for given goal accelerations, and problems with parameters
+# Only for given goal accelerations, and problems with parameters.
+CONDITIONS = *BOUNDARY, "goal_ddq", "parameters"
 REQUIRED = (*BOUNDARY, "path_control_points", "rate_control_points")
 
 FLOATS = (*REQUIRED, "goal_ddq", "parameters", "duration")
@@ -34,13 +31,15 @@ ATTRIBUTES = (
     "problem_sha256",
 )
 
-JOINT_NAMES_KEY = (
-    b"cnpgen_joint_names"  # of the metadata of exported Parquet tables, as JSON
-)
+# Of the metadata of exported Parquet tables, as JSON.
+
+JOINT_NAMES_KEY = b"cnpgen_joint_names"
 PLAN_COLUMN = "plan"  # of exported tables with several plans: the index of the plan
 PHASE_COLUMN = "path_phase"  # of exported tables: the phase of each sample
 
-GOAL_OPTION = "goal_option"  # column with the number of a goal state among those of one sample_id, the nearest first
+# Column with the number of a goal state among those of one sample_id, the nearest
+# first.
+GOAL_OPTION = "goal_option"
 
 UNITS = {
     "q": "rad",
@@ -48,7 +47,8 @@ UNITS = {
     "ddq": "rad/s^2",
     "jerk": "rad/s^3",
 }  # for revolute joints
-MIN_SIMILARITY = 0.8  # similarity ratio of names from which one is treated as a misspelling of the other
+# Similarity ratio of names from which one is treated as a misspelling of the other.
+MIN_SIMILARITY = 0.8
 _DESCRIPTIONS = {
     "q": "joint positions",
     "dq": "joint velocities",

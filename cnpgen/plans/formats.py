@@ -174,7 +174,7 @@ class JointTrajectory(Exporter):
     """A folder with one message of ROS 2 per plan, ``trajectory_msgs/JointTrajectory`` as JSON, one point per line.
 
     Positions, velocities and accelerations are included, efforts are not. The header
-    time is 0: start immediately.
+        time is 0: start immediately.
     """
 
     suffix = ".json"

@@ -26,8 +26,10 @@ Array = NDArray[np.float64]
 class JoinedPlans:
     """N sequences of plans in the order of execution; ``export_plans`` accepts them.
 
-    Attributes: parts: Plans, N each, in the order of execution. begins: Start time of
-        each part, since the start of the first [s], shape (parts, N).
+    Attributes:
+        parts: Plans, N each, in the order of execution.
+        begins: Start time of each part, since the start of the first [s], shape (parts,
+            N).
     """
 
     parts: tuple[Plans, ...]
@@ -84,13 +86,15 @@ def join_plans(
     ``refine_plans``). The tolerance includes rounding errors of control points for
     plans of a few milliseconds.
 
-    Args: first: N plans, or joined plans. following: N plans, each starting at the cut
-        of a plan. at: Times of the cuts, since the start of the first [s], one number
-        or shape (N,); by default at the end.
+    Args:
+        first: N plans, or joined plans.
+        following: N plans, each starting at the cut of a plan.
+        at: Times of the cuts, since the start of the first [s], one number or shape
+            (N,); by default at the end.
 
-    Raises: UsageError: The numbers of plans or times or the problems differ, a time is
-        outside its plan, a plan has no
-            motion, or there is a discontinuity.
+    Raises:
+        UsageError: The numbers of plans or times or the problems differ, a time is
+            outside its plan, a plan has no motion, or there is a discontinuity.
     """
     if isinstance(first, JoinedPlans):
         joined = first

@@ -60,9 +60,10 @@ def load_plans(
     every plan later. The checksum of files of cnpgen is verified; other files have
     none, and ``has_checksum`` of the plans is False.
 
-    Args: path: Path of the file. problem: Required problem: a problem, a record, or the
-        name or path of a problem, pipeline or dataset. Its
-            tolerances replace those in the file.
+    Args:
+        path: Path of the file.
+        problem: Required problem: a problem, a record, or the name or path of a
+            problem, pipeline or dataset. Its tolerances replace those in the file.
 
     Raises:
         UsageError: The file does not exist or is of another kind.
@@ -209,8 +210,9 @@ def stored_problem(
     A problem in another folder, which is not opened, is an error if it is required,
     otherwise ignored.
 
-    Raises: DatasetError: The named problem is damaged, cannot be found or is in another
-        folder than the file.
+    Raises:
+        DatasetError: The named problem is damaged, cannot be found or is in another
+            folder than the file.
     """
     if "problem_recipe" in attributes:
         return _stored_record(path, attributes)
@@ -336,8 +338,10 @@ def _statuses(
 def save_plans(path: str | Path, plans: Plans) -> None:
     """Write plans to a file with a checksum, atomically; equal plans give equal bytes.
 
-    Args: path: Path of the file. An existing plan file is replaced, and missing folders
-        are created (unlike by commands). plans: Plans to write.
+    Args:
+        path: Path of the file. An existing plan file is replaced, and missing folders
+            are created (unlike by commands).
+        plans: Plans to write.
 
     Raises:
         UsageError: The path holds another file, or ``plans`` has another type.

@@ -36,15 +36,18 @@ _NO_COLUMNS = {*FLOATS, *INTEGERS, "", "."}  # invalid names of columns
 class Plans:
     """N plans of one problem with n planned joints. Values may be invalid (nan, negative rates); shapes are valid.
 
-    Attributes: problem: Record of the problem. boundary: Boundary conditions, shape (N,
-        n) each. path_control_points: Control points of p(s) [rad], shape (N, C, n).
-        rate_control_points: Control points of r(s) = ds/dt [1/s], shape (N, R). degree:
-        Degree of both splines. columns: Further columns of the tasks: name -> values in
-        SI units, shape (N,) or (N, w). ``start_xyz`` and
-            ``goal_xyz``, the tip's positions in the world frame [m], shape (N, 3), are
-            always there after ``make_plans`` and ``load_plans``. ``obstacle_poses``,
-            shape (N, width), replaces the poses and sizes of the problem's obstacles
-            (``cnpgen.robots.solid``), so that every plan has its own scene.
+    Attributes:
+        problem: Record of the problem.
+        boundary: Boundary conditions, shape (N, n) each.
+        path_control_points: Control points of p(s) [rad], shape (N, C, n).
+        rate_control_points: Control points of r(s) = ds/dt [1/s], shape (N, R).
+        degree: Degree of both splines.
+        columns: Further columns of the tasks: name -> values in SI units, shape (N,) or
+            (N, w). ``start_xyz`` and ``goal_xyz``, the tip's positions in the world
+            frame [m], shape (N, 3), are always there after ``make_plans`` and
+            ``load_plans``. ``obstacle_poses``, shape (N, width), replaces the poses and
+            sizes of the problem's obstacles (``cnpgen.robots.solid``), so that every
+            plan has its own scene.
         sample_id: Sample ID of every plan in a dataset, shape (N,).
         status: Status of every plan, values of ``PlanStatus``, shape (N,).
         source: Source of the plans, a line of text, or empty.
@@ -139,11 +142,13 @@ class Plans:
         Args:
             time: Time since the start of each plan [s], one number or shape (N,).
 
-        Returns: Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape
-            (N, n) each.
+        Returns:
+            Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (N,
+            n) each.
 
-        Raises: UsageError: The number of times differs from that of plans, or a time is
-            outside its plan.
+        Raises:
+            UsageError: The number of times differs from that of plans, or a time is
+                outside its plan.
         """
         try:
             times = np.broadcast_to(numbers("time", time), (len(self),))
@@ -165,11 +170,13 @@ class Plans:
     def __getitem__(self, which: int | slice | Sequence[int] | NDArray[Any]) -> Plans:
         """Return a selection of the plans, as Plans also for a single plan.
 
-        Args: which: An index, several indices in any order, a mask of shape (N,), or a
-            slice.
+        Args:
+            which: An index, several indices in any order, a mask of shape (N,), or a
+                slice.
 
-        Raises: PlanIndexError: The mask has another length, or an index is out of
-            range; a subclass of IndexError.
+        Raises:
+            PlanIndexError: The mask has another length, or an index is out of range; a
+                subclass of IndexError.
         """
         which = _checked(which, len(self))
         if isinstance(which, np.ndarray):
@@ -212,13 +219,15 @@ def make_plans(
     Values may be arrays of NumPy or JAX, or tensors of torch on the CPU, which are
     detached.
 
-    Args: problem: Problem, record, or name or path of a problem, pipeline or dataset.
-        boundary: Boundary conditions, shape (N, n) each. path_control_points: Control
-        points of p(s) [rad], shape (N, C, n). rate_control_points: Control points of
-        r(s) [1/s], shape (N, R). degree: Degree of both splines; the problem's by
-        default. columns: Name -> values, shape (N,) or (N, w); ``start_xyz`` and
-        ``goal_xyz`` [m] by forward kinematics by
-            default; given values must be consistent with it.
+    Args:
+        problem: Problem, record, or name or path of a problem, pipeline or dataset.
+        boundary: Boundary conditions, shape (N, n) each.
+        path_control_points: Control points of p(s) [rad], shape (N, C, n).
+        rate_control_points: Control points of r(s) [1/s], shape (N, R).
+        degree: Degree of both splines; the problem's by default.
+        columns: Name -> values, shape (N,) or (N, w); ``start_xyz`` and ``goal_xyz``
+            [m] by forward kinematics by default; given values must be consistent with
+            it.
         sample_id: Sample IDs, shape (N,); 0, 1, ... by default.
         status: Values of ``PlanStatus``, shape (N,); unknown by default.
         source: Source of the plans, a line of text.
@@ -282,8 +291,9 @@ def check_made(plans: Plans) -> None:
 def screen(plans: Plans) -> NDArray[np.uint8]:
     """Find the plans that cannot be evaluated.
 
-    Returns: Status, shape (N,): NOT_FINITE, NOT_FORWARD, or UNKNOWN for plans that can
-        be evaluated.
+    Returns:
+        Status, shape (N,): NOT_FINITE, NOT_FORWARD, or UNKNOWN for plans that can be
+            evaluated.
     """
     parts = [*plans.boundary.arrays().values(), plans.rate_control_points]
     finite = np.isfinite(plans.path_control_points).all(axis=(1, 2))

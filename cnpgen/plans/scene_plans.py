@@ -27,12 +27,11 @@ from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
 
-OBSTACLES_PER_STEP = (
-    4  # capacities are multiples of it, so that scenes share compiled kernels
-)
-JOINT_TOLERANCE_RAD = (
-    1e-3  # outside a limit, which rounding of files to float32 may cause
-)
+# Capacities are multiples of it, so that scenes share compiled kernels.
+
+OBSTACLES_PER_STEP = 4
+# Outside a limit, which rounding of files to float32 may cause.
+JOINT_TOLERANCE_RAD = 1e-3
 
 
 def capacity_of(scenes: Sequence[SceneProblem]) -> dict[str, int]:
@@ -71,15 +70,17 @@ def scene_plans(
 ) -> Plans:
     """Return the boundary problems of scenes, from rest to rest, as plans without motions.
 
-    Args: problem: The robot's problem. Obstacles of the scenes are added to its own.
-        scenes: The scenes. goals: Joint positions at the goals in the order of the
-        planned joints, shape (n,) each; by default the first
-            goal state of each scene.
+    Args:
+        problem: The robot's problem. Obstacles of the scenes are added to its own.
+        scenes: The scenes.
+        goals: Joint positions at the goals in the order of the planned joints, shape
+            (n,) each; by default the first goal state of each scene.
         capacity: Numbers of obstacles, see ``capacity_of``.
         sample_id: Sample IDs; by default the indices of the scenes.
 
-    Raises: SceneError: A scene lacks a planned joint or a goal state, or a position is
-        outside its limits.
+    Raises:
+        SceneError: A scene lacks a planned joint or a goal state, or a position is
+            outside its limits.
     """
     check_scenes(scenes)
     problem.urdf_text  # noqa: B018 - read once for all capacities

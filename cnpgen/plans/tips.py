@@ -8,7 +8,8 @@ import numpy as np
 from cnpgen.errors import counted
 from cnpgen.plans.plans import Plans
 
-TIP_TOLERANCE_M = 1e-5  # maximum deviation of a tip position from forward kinematics, float32 included
+# Maximum deviation of a tip position from forward kinematics, float32 included.
+TIP_TOLERANCE_M = 1e-5
 
 
 def correct_tips(plans: Plans, *, where: str = "") -> Plans:

@@ -26,16 +26,14 @@ from cnpgen.store.joint_units import unit_of
 
 JERK_RATE = 5.0  # 1/s: jerk limit / acceleration limit in the authors' code
 MIN_REACH_M, MAX_REACH_M = 0.01, 100.0  # of an arm, along its joints
-MAX_LINK_RATIO = (
-    20.0  # size of a link / reach; pedestals and mobile bases may be larger than arms
-)
+# Size of a link / reach; pedestals and mobile bases may be larger than arms.
+MAX_LINK_RATIO = 20.0
 MIN_LINK_RATIO = 0.02  # size of the largest moving link / reach
 MIN_MESH_M = 1e-3  # size of a link with a mesh
 MIN_MASS_KG = 0.01  # of bodies whose inertia is checked; lighter ones have placeholders
 MIN_ARM_KG = 0.1  # that a payload is compared with
-MAX_CENTER_RATIO = (
-    3.0  # distance of a center of mass from its joint, and radius of gyration / reach
-)
+# Distance of a center of mass from its joint, and radius of gyration / reach.
+MAX_CENTER_RATIO = 3.0
 MAX_PAYLOAD_RATIO = 10.0  # mass of a payload / mass of the arm
 MAX_OBSTACLE_RATIO = 10.0  # distance of an obstacle / reach
 
@@ -43,9 +41,10 @@ MAX_OBSTACLE_RATIO = 10.0  # distance of an obstacle / reach
 def load_robot(problem: Problem) -> Robot:
     """Load the robot of a problem.
 
-    Raises: RecipeError: The URDF cannot be read, or is inconsistent with the joints,
-        tip, base configuration or limits. PluginError: The URDF belongs to a package
-        that is not installed.
+    Raises:
+        RecipeError: The URDF cannot be read, or is inconsistent with the joints, tip,
+            base configuration or limits.
+        PluginError: The URDF belongs to a package that is not installed.
     """
     spec, limits = problem.robot, problem.limits
     with recipe_errors_in(problem.path):

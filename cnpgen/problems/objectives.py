@@ -37,9 +37,12 @@ class ObjectiveTerm(ABC):
     norm, ``sqrt(sum + s^2) - s``, which is quadratic below s, so that its gradient is
     continuous.
 
-    Attributes: unit: Unit of the integral. smoothing: Smoothing of the norm in the unit
-        of the residuals; 0 for the sum of squares. training_smoothing: The same in
-        training; None for ``smoothing``. uses_jerk: Whether the residuals use the jerk.
+    Attributes:
+        unit: Unit of the integral.
+        smoothing: Smoothing of the norm in the unit of the residuals; 0 for the sum of
+            squares.
+        training_smoothing: The same in training; None for ``smoothing``.
+        uses_jerk: Whether the residuals use the jerk.
         weight: Weight relative to the time.
     """
 
@@ -184,9 +187,10 @@ class TipReference(ObjectiveTerm):
 def read_objective(text: str) -> tuple[ObjectiveTerm, ...] | None:
     """Read an objective such as ``"effort"``, ``"effort=0.5"`` or ``"time=2, effort=1, jerk=0.1"``.
 
-    Args: text: ``OWN_OBJECTIVE`` or empty for the objective of the problem, or names of
-        terms with weights, 1 by default.
-            The weight of the duration, ``time``, divides the others.
+    Args:
+        text: ``OWN_OBJECTIVE`` or empty for the objective of the problem, or names of
+            terms with weights, 1 by default. The weight of the duration, ``time``,
+            divides the others.
 
     Returns:
         The terms in addition to the duration; None for those of the problem.

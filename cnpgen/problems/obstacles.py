@@ -23,11 +23,8 @@ if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
 Capacity = Mapping[str, int]  # kind, or corners of a mesh -> number of obstacles
-_PARKED_ROTATION = (
-    0.1,
-    0.1,
-    0.1,
-)  # any rotation: boxes of scenes have rotation matrices
+# Any rotation: boxes of scenes have rotation matrices.
+_PARKED_ROTATION = 0.1, 0.1, 0.1
 
 
 def scene_of(
@@ -44,13 +41,16 @@ def scene_of(
     An obstacle with ``below`` ends at the bottom of the object (at the tip without an
     object) at that end.
 
-    Args: problem: The problem. start_xyz: Tip positions at the start [m], shape (N, 3).
-        goal_xyz: Tip positions at the goal [m], shape (N, 3). goal_velocity: Tip
-        velocities at the goal [m/s], shape (N, 3), for problems with a
-        ``scene_constraint``. parameters: Parameters of the samples, shape (N, width),
-        for problems with parameters; nominal by default. obstacle_poses: Poses and
-        sizes of the obstacles of each sample, shape (N, width), in place of the
-        problem's.
+    Args:
+        problem: The problem.
+        start_xyz: Tip positions at the start [m], shape (N, 3).
+        goal_xyz: Tip positions at the goal [m], shape (N, 3).
+        goal_velocity: Tip velocities at the goal [m/s], shape (N, 3), for problems with
+            a ``scene_constraint``.
+        parameters: Parameters of the samples, shape (N, width), for problems with
+            parameters; nominal by default.
+        obstacle_poses: Poses and sizes of the obstacles of each sample, shape (N,
+            width), in place of the problem's.
     """
     half = 0.0 if problem.object is None else problem.object.size[2] / 2
     parts, constraint = [], problem.scene_constraint

@@ -114,7 +114,9 @@ class Problem:
     )
     objective: Objective = field("objective of the optimization", default=Objective())
     path: Path = Path()
-    is_stored: bool = False  # in a dataset, a plan or a model: implausible sizes and limits were accepted before
+    # In a dataset, a plan or a model: implausible sizes and limits were accepted
+    # before.
+    is_stored: bool = False
 
     @checked_arguments
     def first(self, kind: type[Kind]) -> Kind | None:
@@ -125,8 +127,9 @@ class Problem:
     def with_obstacles(self, obstacles: Sequence[Obstacle]) -> "Problem":
         """Return the problem among other obstacles; robot, limits and constraints stay the same.
 
-        Raises: UsageError: A size or a pose of an obstacle is not finite, too large or
-            not positive.
+        Raises:
+            UsageError: A size or a pose of an obstacle is not finite, too large or not
+                positive.
         """
         if error := invalid_obstacle(obstacles):
             raise UsageError(error, concerns="obstacles")
@@ -353,8 +356,9 @@ class Problem:
         includes the hulls of meshes, the pairs of an SRDF and the box of a payload that
         is a body.
 
-        Raises: RecipeError: The URDF, a mesh or the SRDF cannot be read, or is not
-            UTF-8, or a joint cannot be locked.
+        Raises:
+            RecipeError: The URDF, a mesh or the SRDF cannot be read, or is not UTF-8,
+                or a joint cannot be locked.
         """
         spec = self.robot
         positions = dict(zip(spec.locked_joints, spec.locked_positions, strict=True))

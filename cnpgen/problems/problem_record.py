@@ -61,11 +61,8 @@ _FORM = {
     "constraint": [{"use": TEXT}],
     "trajectory": {ANY_KEY: WHOLE},
 }
-_JUDGED_BY = (
-    "tolerance",
-    "budget",
-    "weight",
-)  # strictness of the verdict, not part of the problem's definition
+# Strictness of the verdict, not part of the problem's definition.
+_JUDGED_BY = "tolerance", "budget", "weight"
 
 
 @dataclass(frozen=True, repr=False)
@@ -170,8 +167,9 @@ class ProblemRecord(StoredProblem):
     def restored(self) -> Iterator[Problem]:
         """Rebuild the problem; its URDF is in a temporary folder, which is deleted at the end of the block.
 
-        Raises: RecipeError: The problem needs another version of cnpgen, or a plug-in
-            that is not installed.
+        Raises:
+            RecipeError: The problem needs another version of cnpgen, or a plug-in that
+                is not installed.
         """
         with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
             problem = restore_problem(self.content, self.urdf, Path(folder))
@@ -288,8 +286,9 @@ def _rebuilt(record: ProblemRecord) -> Problem:
 def open_problem(record: ProblemRecord) -> tuple[Problem, Robot]:
     """Rebuild a problem and its robot, which both contain the URDF; the files are deleted afterwards.
 
-    Raises: RecipeError: The problem needs another version of cnpgen, or a plug-in that
-        is not installed.
+    Raises:
+        RecipeError: The problem needs another version of cnpgen, or a plug-in that is
+            not installed.
     """
     from cnpgen.problems.load_robot import load_robot
 

@@ -39,7 +39,8 @@ class PublishedRules(ABC):
             obstacle_poses: Poses of the obstacles, shape (width,).
             goal_xyz: Position of the tip at the goal [m], shape (3,).
 
-        Returns: Whether the motion ends at the goal, and the reasons of the violated
+        Returns:
+            Whether the motion ends at the goal, and the reasons of the violated
             constraints.
         """
 

@@ -36,16 +36,18 @@ class ConstraintValues:
     belong to the symbolic form, with closest points of distances treated as constant
     (envelope theorem).
 
-    Attributes: names: Name of the constraint of each value, length m. g: Values in SI
-        units, shape (N, m). lower: Lower bounds, shape (m,); -inf without a bound.
-        upper: Upper bounds, shape (m,); inf without a bound. tolerance: Accepted
-        violation of each value, shape (m,). jacobian_q: Derivatives with respect to
-        joint positions, shape (N, m, n). jacobian_dq: Derivatives with respect to joint
-        velocities, shape (N, m, n). jacobian_ddq: Derivatives with respect to joint
-        accelerations, shape (N, m, n). drift: ``(dJ_q / dt) dq``, shape (N, m), 0 for
-        conditions that depend on dq or ddq. The second time derivative
-            of a condition of positions is ``jacobian_q @ ddq + drift``, as controllers
-            on the manifold use it.
+    Attributes:
+        names: Name of the constraint of each value, length m.
+        g: Values in SI units, shape (N, m).
+        lower: Lower bounds, shape (m,); -inf without a bound.
+        upper: Upper bounds, shape (m,); inf without a bound.
+        tolerance: Accepted violation of each value, shape (m,).
+        jacobian_q: Derivatives with respect to joint positions, shape (N, m, n).
+        jacobian_dq: Derivatives with respect to joint velocities, shape (N, m, n).
+        jacobian_ddq: Derivatives with respect to joint accelerations, shape (N, m, n).
+        drift: ``(dJ_q / dt) dq``, shape (N, m), 0 for conditions that depend on dq or
+            ddq. The second time derivative of a condition of positions is ``jacobian_q
+            @ ddq + drift``, as controllers on the manifold use it.
     """
 
     names: tuple[str, ...]
@@ -77,17 +79,22 @@ class RobotModel:
     world frame. Kernels are compiled on first use. Distances are measured by Coal; all
     other results use the kernels of the solvers. Use an object in one thread only.
 
-    Args: problem: The problem, its record, or the name or file of a problem, a pipeline
-        or a dataset. backend: "compiled", "numpy" or "casadi"; by default the fastest
-        available.
+    Args:
+        problem: The problem, its record, or the name or file of a problem, a pipeline
+            or a dataset.
+        backend: "compiled", "numpy" or "casadi"; by default the fastest available.
 
-    Attributes: problem: The problem. joint_names: Names of the n planned joints. tip:
-        Name of the tip frame. home: Home configuration [rad], the key `base` of files,
-        shape (n,). position_lower: Planning limits of joint positions [rad], shape
-        (n,). position_upper: Planning limits of joint positions [rad], shape (n,).
+    Attributes:
+        problem: The problem.
+        joint_names: Names of the n planned joints.
+        tip: Name of the tip frame.
+        home: Home configuration [rad], the key `base` of files, shape (n,).
+        position_lower: Planning limits of joint positions [rad], shape (n,).
+        position_upper: Planning limits of joint positions [rad], shape (n,).
         velocity_limit: Planning limits of joint velocities [rad/s], shape (n,).
         acceleration_limit: Planning limits of joint accelerations [rad/s^2], shape
-        (n,). jerk_limit: Planning limits of joint jerks [rad/s^3], shape (n,).
+            (n,).
+        jerk_limit: Planning limits of joint jerks [rad/s^3], shape (n,).
         torque_limit: Planning limits of joint torques [N m], shape (n,).
 
     Raises:
@@ -181,11 +188,11 @@ class RobotModel:
     ) -> Scene:
         """Place the obstacles of N samples; some stand below the object at the start or at the goal.
 
-        Args: start_xyz: Tip positions at the start [m], shape (N, 3) or (3,). goal_xyz:
-            Tip positions at the goal [m], shape (N, 3) or (3,). goal_velocity: Tip
-            velocities at the goal [m/s], shape (N, 3) or (3,), from which the pucks of
-            hits follow;
-                zero by default.
+        Args:
+            start_xyz: Tip positions at the start [m], shape (N, 3) or (3,).
+            goal_xyz: Tip positions at the goal [m], shape (N, 3) or (3,).
+            goal_velocity: Tip velocities at the goal [m/s], shape (N, 3) or (3,), from
+                which the pucks of hits follow; zero by default.
             parameters: Parameters of the problem, shape (N, width) or (width,); nominal
                 by default.
         """
@@ -227,10 +234,12 @@ class RobotModel:
     ) -> ConstraintValues:
         """Evaluate every condition of the problem with its derivatives; conditions of jerks are left out.
 
-        Args: q: Joint positions [rad], shape (N, n) or (n,). dq: Joint velocities
-            [rad/s]; zero by default. ddq: Joint accelerations [rad/s^2]; zero by
-            default. scene: Obstacles of N samples, or of one for all states; by default
-            where the problem places them.
+        Args:
+            q: Joint positions [rad], shape (N, n) or (n,).
+            dq: Joint velocities [rad/s]; zero by default.
+            ddq: Joint accelerations [rad/s^2]; zero by default.
+            scene: Obstacles of N samples, or of one for all states; by default where
+                the problem places them.
         """
         states = self._motion(q, dq, ddq)
         lanes = self._lanes(scene, states[0].shape[1])
@@ -256,10 +265,13 @@ class RobotModel:
     def min_distance(self, q: ArrayLike, *, scene: Scene | None = None) -> Array:
         """Measure the smallest distance with Coal: links and held object from obstacles, and links from each other.
 
-        Args: q: Joint positions [rad], shape (N, n) or (n,). scene: Obstacles of N
-            samples, or of one for all states; by default where the problem places them.
+        Args:
+            q: Joint positions [rad], shape (N, n) or (n,).
+            scene: Obstacles of N samples, or of one for all states; by default where
+                the problem places them.
 
-        Returns: Signed distances [m], negative for penetration, shape (N,); inf without
+        Returns:
+            Signed distances [m], negative for penetration, shape (N,); inf without
             collision pairs. With the paper's capsule model, the distance of the capsule
             axes less the radius of ``robot-clearance``.
         """

@@ -5,8 +5,8 @@
 3. Other initial guesses, and the best attempt so far after uniform time scaling.
 4. Step 2 again, from a straight line at constant rate, then from the best attempt so far.
 5. Without a deadline: levels on hulls in place of capsules, and joint-space paths of RRT-Connect. If compiled trees can
-   search these paths, they come right after step 2, whose finer levels run only for nearly valid attempts. Without a
-   path there are no further attempts.
+   search these paths, they come right after step 2, whose finer levels run only for
+   nearly valid attempts. Without a path there are no further attempts.
 """
 
 from collections.abc import Generator, Iterator
@@ -26,14 +26,12 @@ from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
 
-NEARLY_VALID = (
-    30.0  # tolerances; attempts with larger violations are left for joint-space paths
-)
+# Tolerances; attempts with larger violations are left for joint-space paths.
+NEARLY_VALID = 30.0
 MAX_PENETRATION_M = 0.02  # of links in a plan that hull levels continue from
 MIN_END_PENETRATION_M = 1e-5  # of an end: smaller ones may be rounding errors
-MAX_LINE_PENETRATION_M = (
-    0.05  # of the initial line, above which joint-space paths come first
-)
+# Of the initial line, above which joint-space paths come first.
+MAX_LINE_PENETRATION_M = 0.05
 
 
 def make_attempts(
@@ -67,16 +65,17 @@ def _all_attempts(
         if x is not None and task.at_rest
         else None
     )
+    # Compiled trees find a path in milliseconds; without them, paths are the last resort.
     searches_trees = refiner.measures_hulls and task.deadline is None
+    # From a line deep inside an obstacle the coarse level cannot find a way around it.
     if searches_trees and x is None and _is_deep(refiner, task):
         best = refiner.measured(task, refiner.line_guess(task), Outcome.NOT_CONVERGED)
         yield best
     else:
         limit = NEARLY_VALID if searches_trees else np.inf
         best = yield from run_levels(refiner, task, x, adjusted, max_violation=limit)
-    if task.stay_within is not None or refiner.check.ends_are_invalid(
-        task
-    ):  # the other guesses are other paths
+    # Other guesses are other paths, and no path helps an end that is invalid itself.
+    if task.stay_within is not None or refiner.check.ends_are_invalid(task):
         return
     if searches_trees:
         if ends_penetrate(refiner, task):

@@ -21,21 +21,22 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 FINE_POINTS = 600
 PENETRATION_SCALE_M = 1e-4  # of violated distances without a tolerance of their own
-MAX_SCALINGS = (
-    6  # of one motion, each by the factor that its largest violation requires
-)
+# Of one motion, each by the factor that its largest violation requires.
+MAX_SCALINGS = 6
 MIN_RESIDUAL_TOLERANCE = 1e-12  # of scaled residuals: below rounding errors
-MIN_END_VIOLATION = (
-    1.5  # tolerances: the bounds near an end differ slightly from those at it
-)
-MAX_SCALING = 1.25  # a motion that must be slower by more is left to the solver, which finds a better one
+# Tolerances: the bounds near an end differ slightly from those at it.
+MIN_END_VIOLATION = 1.5
+# A motion that must be slower by more is left to the solver, which finds a better one.
+MAX_SCALING = 1.25
 
 
 @dataclass(frozen=True)
 class GridViolation:
     """Largest violation of the bounds on the fine grid."""
 
-    worst: float  # largest violation as a multiple of its tolerance; inf where a residual is not finite
+    # Largest violation as a multiple of its tolerance; inf where a residual is not
+    # finite.
+    worst: float
     position: bool  # whether a condition on q alone violates its tolerance
     # Factor of the duration, at least 1, that removes the worst violations of velocity,
     # acceleration, torque and jerk. These scale with the rate, its square and its cube.

@@ -48,11 +48,8 @@ def refine_goal_options(
     _check_tasks(plans)
     tasks = list(dict.fromkeys(plans.sample_id.tolist()))
     rounds, results = list[Refinement](), list[Attempt]()  # of all rounds
-    chosen, lowest, files = (
-        dict[int, int](),
-        dict[int, float](),
-        list[Path](),
-    )  # by task: index of a result, its cost
+    # By task: index of a result, its cost.
+    chosen, lowest, files = dict[int, int](), dict[int, float](), list[Path]()
     if begin is not None:
         begin(len(tasks), 0)
     for round_number, rows in enumerate(_rounds(plans, min_durations(plans), lowest)):

@@ -6,28 +6,19 @@ from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.bounds import Tightening
 from cnpgen.refine.solver.sqp import Settings
 
-EARLY_EDGE, LATE_EDGE = (
-    0.012,
-    0.05,
-)  # phases of full tightening; contacts at the ends need the later one
+# Phases of full tightening; contacts at the ends need the later one.
+EARLY_EDGE, LATE_EDGE = 0.012, 0.05
 WARM_RADIUS = 0.1  # initial trust radius from a nearly valid plan
-WARM_VIOLATION_BOUND = 1.0  # from a nearly valid plan; it saves steps there, but some other guesses fail with it
-WARM_SELECTION_DISTANCES = (
-    (0.09, 1.0),
-    (0.04, 0.3),
-    (-1.0, 0.1),
-)  # the first steps from a plan speed it up as a whole
-PATH_VIOLATION_BOUND, PATH_PENALTY = (
-    0.03,
-    1000.0,
-)  # from a motion along a valid joint-space path
-MAX_INITIAL_VIOLATION = (
-    100.0  # in scaled units; with larger ones a straight line is a better initial guess
-)
-COLD_COST_TOLERANCE, CLUTTERED_COST_TOLERANCE = (
-    0.1,
-    0.05,
-)  # factors without a plan, where small steps still lead far
+# From a nearly valid plan; it saves steps there, but some other guesses fail with it.
+WARM_VIOLATION_BOUND = 1.0
+# The first steps from a plan speed it up as a whole.
+WARM_SELECTION_DISTANCES = (0.09, 1.0), (0.04, 0.3), (-1.0, 0.1)
+# From a motion along a valid joint-space path.
+PATH_VIOLATION_BOUND, PATH_PENALTY = 0.03, 1000.0
+# In scaled units; with larger ones a straight line is a better initial guess.
+MAX_INITIAL_VIOLATION = 100.0
+# Factors without a plan, where small steps still lead far.
+COLD_COST_TOLERANCE, CLUTTERED_COST_TOLERANCE = 0.1, 0.05
 
 
 @dataclass(frozen=True)
@@ -46,11 +37,12 @@ class GridLevels:
     warm: GridLevel  # coarse level from an input plan
     coarse: GridLevel  # coarse level from a straight line
     fine: GridLevel  # finer grid, from the result of a coarse level
-    strict: (
-        GridLevel  # finer grid with tighter bounds, for plans that the verdict rejects
-    )
+    # Finer grid with tighter bounds, for plans that the verdict rejects.
+    strict: GridLevel
     restart: GridLevel  # level for other initial guesses
-    path: GridLevel  # level for motions along a valid joint-space path: violations weigh more than any duration
+    # Level for motions along a valid joint-space path: violations weigh more than any
+    # duration.
+    path: GridLevel
 
 
 def default_grid_levels(problem: Problem, settings: Settings) -> GridLevels:

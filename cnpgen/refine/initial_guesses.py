@@ -10,21 +10,15 @@ from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
-RISING_FRACTION, RISING_PHASE = (
-    0.3,
-    0.3,
-)  # first value of a rising rate; fraction of its rising control points
+# First value of a rising rate; fraction of its rising control points.
+RISING_FRACTION, RISING_PHASE = 0.3, 0.3
 MIN_GUESS_DURATION_S = 0.3  # of motions between close configurations
-PATH_DURATION_FACTOR = (
-    2.0  # of the duration at the velocity limits, for motions along joint-space paths
-)
-TIP_PATH_STATES, TIP_PATH_STEPS = (
-    24,
-    4,
-)  # states along a tip path; Gauss-Newton steps for each
-TIP_PATH_CONDITION = (
-    1e-3  # singular values below this fraction of the largest are ignored
-)
+# Of the duration at the velocity limits, for motions along joint-space paths.
+PATH_DURATION_FACTOR = 2.0
+# States along a tip path; Gauss-Newton steps for each.
+TIP_PATH_STATES, TIP_PATH_STEPS = 24, 4
+# Singular values below this fraction of the largest are ignored.
+TIP_PATH_CONDITION = 1e-3
 SAMPLES_PER_CONTROL_POINT = 20  # of the fit to a joint-space path
 
 
@@ -111,10 +105,8 @@ def fit_to_path(
         spec.rate_control_points, 1.0 / (PATH_DURATION_FACTOR * min_duration + 0.1)
     )
     s = np.linspace(0, 1, SAMPLES_PER_CONTROL_POINT * spec.path_control_points)
-    lengths, eased = (
-        _arc_lengths(states),
-        s**3 * (10 - 15 * s + 6 * s**2),
-    )  # starts and ends without velocity
+    # Starts and ends without velocity.
+    lengths, eased = _arc_lengths(states), s**3 * (10 - 15 * s + 6 * s**2)
     q = np.stack(
         [np.interp(eased * lengths[-1], lengths, joint) for joint in states.T], axis=1
     )

@@ -29,11 +29,14 @@ def objective_values(plans: Plans, objective: str = "time") -> dict[str, Array]:
     The integrals use the nodes of the refiner; their error is up to a few tenths of a
     percent.
 
-    Args: plans: N plans. objective: See ``cnpgen.problems.objectives.read_objective``;
-        "time" for the objective of the problem.
+    Args:
+        plans: N plans.
+        objective: See ``cnpgen.problems.objectives.read_objective``; "time" for the
+            objective of the problem.
 
-    Returns: ``time`` [s], and for every term its integral without the weight, shape
-        (N,) each, in the unit of the term.
+    Returns:
+        ``time`` [s], and for every term its integral without the weight, shape (N,)
+        each, in the unit of the term.
 
     Raises:
         UsageError: The objective is invalid.

@@ -16,9 +16,9 @@ MAX_STAY_WITHIN = 1.0  # rad or m
 class RefineOptions:
     """Options of ``refine_plans`` and ``solve_plans``.
 
-    Attributes: objective: "time": the problem's own objective; or the time with other
-        terms, such as "effort",
-            "effort=0.5" or "effort=1, jerk=0.1"
+    Attributes:
+        objective: "time": the problem's own objective; or the time with other terms,
+            such as "effort", "effort=0.5" or "effort=1, jerk=0.1"
             (``cnpgen.problems.objectives.read_objective``).
         weight: Weight of these terms, or of the problem's centrifugal acceleration; by
             default as they are defined.

@@ -64,7 +64,8 @@ def tasks_of(plans: Plans) -> list[RefinementTask]:
 def load_solver(problem: Problem, robot: Robot, kernels: KernelLibrary) -> Solver:
     """Load a function that plans rows of a dataset with the problem's own objective, in one thread.
 
-    Returns: A function of the columns of N rows, shape (N, width) each, among them
+    Returns:
+        A function of the columns of N rows, shape (N, width) each, among them
         ``obstacle_poses`` of scenes, and of N motions as initial guesses, or None. It
         returns N motions and the mask of those that the verdict accepts, (N,).
     """

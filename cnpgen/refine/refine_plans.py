@@ -29,10 +29,12 @@ from cnpgen.refine.task import Attempt
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.scene_table import OBSTACLE_POSES
 
-MAX_SERIAL_PLANS = (
-    60  # up to which the start of a second process takes longer than the plans
-)
-PLANS_PER_TASK = 4  # of one of several processes: the transfer of a task takes a twentieth of a plan's time
+# Up to which the start of a second process takes longer than the plans.
+
+MAX_SERIAL_PLANS = 60
+# Of one of several processes: the transfer of a task takes a twentieth of a plan's
+# time.
+PLANS_PER_TASK = 4
 
 
 @checked_arguments
@@ -96,11 +98,13 @@ def refine_plans(
     never worse than the input: it replaces the input only if the independent verdict
     finds a smaller violation, or none and a lower cost.
 
-    Args: plans: The plans. options: Options of the refiner. workers: Number of
-        processes; default one per available core, or one for few plans. engine: "loky":
-        processes of this machine; "dask" or "ray": a cluster. By default loky, or the
-        backend that
-            ``joblib.parallel_config`` names.
+    Args:
+        plans: The plans.
+        options: Options of the refiner.
+        workers: Number of processes; default one per available core, or one for few
+            plans.
+        engine: "loky": processes of this machine; "dask" or "ray": a cluster. By
+            default loky, or the backend that ``joblib.parallel_config`` names.
         address: Address of the cluster's scheduler or head; by default a cluster on
             this machine, for this call.
         journal: File for finished plans, from which an interrupted run resumes.
@@ -110,9 +114,11 @@ def refine_plans(
         progress: Function that is called with the numbers of plans finished and valid
             since the last call.
 
-    Raises: UsageError: An option is invalid, there is less than one worker, or the
-        journal is another run's. RecipeError: The problem needs a plug-in that is not
-        installed. MachineError: A worker died, or the journal cannot be written.
+    Raises:
+        UsageError: An option is invalid, there is less than one worker, or the journal
+            is another run's.
+        RecipeError: The problem needs a plug-in that is not installed.
+        MachineError: A worker died, or the journal cannot be written.
     """
     watch, where = Stopwatch(), Engine(engine, address, workers)
     plans = correct_tips(plans)

@@ -24,10 +24,12 @@ REFINEMENT_VERSION = 1
 class Refinement:
     """Result of refining N plans.
 
-    Attributes: input_plans: Input plans, with the tip positions of their boundary
-        conditions. plans: Refined plans, in the same order. results: Best attempt at
-        every plan with its verdict, outcome, iterations and cost. times: Times of the
-        run; plans from a journal took none.
+    Attributes:
+        input_plans: Input plans, with the tip positions of their boundary conditions.
+        plans: Refined plans, in the same order.
+        results: Best attempt at every plan with its verdict, outcome, iterations and
+            cost.
+        times: Times of the run; plans from a journal took none.
     """
 
     input_plans: Plans

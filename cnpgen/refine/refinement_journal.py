@@ -55,7 +55,7 @@ def open_journal(path: Path, identity: str, *, discard: bool = False) -> Journal
     """Open the journal of a run with the results of earlier runs of the same identity; create it if it is missing.
 
     The identity is a JSON text: plans, options, version. Finished plans of another run
-    are lost only if ``discard``.
+        are lost only if ``discard``.
 
     Raises:
         UsageError: The file is no journal, holds another run's plans, or is in use.

@@ -58,14 +58,16 @@ from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
-MAX_INPUT_DURATION_S = 60.0  # of an input plan that is used as initial guess; slower ones hardly change in a step
+# Of an input plan that is used as initial guess; slower ones hardly change in a step.
+MAX_INPUT_DURATION_S = 60.0
 MIN_RATE_FRACTION = 1e-3  # of a plan's largest rate control point
-MAX_END_VIOLATION = (
-    10.0  # of boundary states, in scaled units; DAQP may take hours for larger ones
-)
+# Of boundary states, in scaled units; DAQP may take hours for larger ones.
+MAX_END_VIOLATION = 10.0
 MAX_CONTINUATIONS = 4  # of a motion that was scaled in time; most need one
 MAX_FEEDBACKS = 5  # of collisions between grid points to the solver
-SLOWNESS = 1.6  # times slower than the bounds of speeds require: the solver changes such guesses more easily
+# Times slower than the bounds of speeds require: the solver changes such guesses more
+# easily.
+SLOWNESS = 1.6
 
 
 class Refiner:

@@ -47,27 +47,18 @@ MAX_PROJECTION_STEP = 0.5  # rad or m, of any joint
 RELATIVE_DAMPING = 1e-6  # of these steps, in scaled units
 PROJECTED_FRACTION = 0.05  # of its tolerance, at which an equality is met
 
-TREE_MARGINS_M = (
-    6e-3,
-    3e-3,
-    1e-3,
-    0.0,
-)  # of small trees in turn, added to the required distances
+# Of small trees in turn, added to the required distances.
+TREE_MARGINS_M = 6e-3, 3e-3, 1e-3, 0.0
 SMALL_TREES, SMALL_TREE_EXTENSIONS = 12, 4_000  # four, if these find too few paths
 MIN_TREE_PATHS, MAX_TREE_PATHS = 3, 8
 LARGE_TREE_EXTENSIONS = 128_000  # without margin, in narrow passages
-LARGE_TREES, MAX_UNCONNECTED_TREES = (
-    12,
-    3,
-)  # with edges of either length; three if no tree connects
-TREE_EXTENSION_RAD, SHORT_TREE_EXTENSION_RAD = (
-    1.0,
-    0.5,
-)  # length of an edge [rad or m]; shorter ones after the others
+# With edges of either length; three if no tree connects.
+LARGE_TREES, MAX_UNCONNECTED_TREES = 12, 3
+# Length of an edge [rad or m]; shorter ones after the others.
+TREE_EXTENSION_RAD, SHORT_TREE_EXTENSION_RAD = 1.0, 0.5
 TREE_SHORTCUTS = 400  # attempted on a path
-MANIFOLD_SPACING_RAD = (
-    0.04  # of projected states, which are all nodes, so that trees have more of them
-)
+# Of projected states, which are all nodes, so that trees have more of them.
+MANIFOLD_SPACING_RAD = 0.04
 MANIFOLD_NODES, MANIFOLD_LARGE_TREE_NODES = 6_000, 24_000
 
 

@@ -43,8 +43,12 @@ from cnpgen.trajectory.spline_motion import Motion
 Array = NDArray[np.float64]
 
 MAX_VERDICT_FEEDBACKS = 3  # of collisions of one attempt from the verdict to the solver
-MAX_CONTACTS = 6  # valid attempts whose links touch something within the tolerance, before the search ends with one
-FEEDBACK_GROWTH = 3.0  # of the added distance, from one of them to the next: an edge may pass between grid points
+# Valid attempts whose links touch something within the tolerance, before the search
+# ends with one.
+MAX_CONTACTS = 6
+# Of the added distance, from one of them to the next: an edge may pass between grid
+# points.
+FEEDBACK_GROWTH = 3.0
 MAX_ROUNDING_ERROR = 1e-12  # rad and 1/s: smaller differences are rounding errors
 LINK_REASONS = {RobotClearance.reason, SelfClearance.reason}
 COLLISION_REASONS = LINK_REASONS | {ObjectContact.reason, ObjectClearance.reason}
@@ -248,9 +252,8 @@ class RefinementSearch:
         default_factory=list
     )  # with violations above ``MAX_JUDGED_VIOLATION``
     verdict: Verdict | None = None  # the last one
-    found_no_path: bool = (
-        False  # whether trees searched paths among the obstacles in vain
-    )
+    # Whether trees searched paths among the obstacles in vain.
+    found_no_path: bool = False
     contacts: int = 0  # valid plans whose links touch something within the tolerance
 
     def add(self, attempt: Attempt) -> bool:

@@ -15,7 +15,9 @@ from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline import basis
 
 Array = NDArray[np.float64]
-MAX_JUDGED_VIOLATION = 3.0  # tolerances on the fine grid; attempts with larger ones are judged only without better ones
+# Tolerances on the fine grid; attempts with larger ones are judged only without better
+# ones.
+MAX_JUDGED_VIOLATION = 3.0
 DISTANCE_PHASES = 512  # at which motions are compared with their input path
 
 
@@ -60,12 +62,10 @@ class RefinementTask:
     scene: Scene  # its obstacles, one sample
     start_xyz: Array  # position of the tip at the start [m], shape (3,)
     goal_xyz: Array  # position of the tip at the goal [m], shape (3,)
-    path: Array | None = (
-        None  # path control points of the input plan [rad], shape (C, n), or None
-    )
-    rate: Array | None = (
-        None  # rate control points of the input plan [1/s], shape (R,), or None
-    )
+    # Path control points of the input plan [rad], shape (C, n), or None.
+    path: Array | None = None
+    # Rate control points of the input plan [1/s], shape (R,), or None.
+    rate: Array | None = None
     deadline: Deadline | None = None  # deadline of the solver's iterations, or None
     # Largest difference of every joint from the path of the input plan [rad or m], or
     # None.
@@ -133,12 +133,15 @@ class Attempt:
     ``violation``, ``severity``, ``is_precise``, ``touches`` and ``x`` are used by the
     search, not part of its result.
 
-    Attributes: path: Path control points [rad], shape (C, n). rate: Rate control points
-        [1/s], shape (R,). cost: Objective [s]. outcome: Outcome of the refinement if
-        this attempt is its result. iterations: Iterations of the solver. reason: Reason
-        of the independent verdict: "ok", or why the plan is not valid; None before it
-        is judged. For
-            ends that violate a constraint, the reason of that constraint.
+    Attributes:
+        path: Path control points [rad], shape (C, n).
+        rate: Rate control points [1/s], shape (R,).
+        cost: Objective [s].
+        outcome: Outcome of the refinement if this attempt is its result.
+        iterations: Iterations of the solver.
+        reason: Reason of the independent verdict: "ok", or why the plan is not valid;
+            None before it is judged. For ends that violate a constraint, the reason of
+            that constraint.
         violation: Largest violation on the 600-point grid, as a multiple of its
             tolerance; at most 1 is accepted. It is 0 where it was not evaluated because
             the solver converged within its bounds.

@@ -27,11 +27,14 @@ _KINDS = {  # Pinocchio's name of a joint type -> URDF's name
 class Joint:
     """Planned joint and the rigid body that it moves.
 
-    Attributes: rotation: Rotation of the joint frame in the previous joint frame at q =
-        0, shape (3, 3). translation: Origin of the joint frame in the previous one [m],
-        shape (3,). axis: Unit axis in the joint frame, shape (3,). prismatic: Whether q
-        is a displacement [m] and not an angle [rad]. mass: Mass of the body with all
-        fixed parts [kg]. com: Center of mass in the joint frame [m], shape (3,).
+    Attributes:
+        rotation: Rotation of the joint frame in the previous joint frame at q = 0,
+            shape (3, 3).
+        translation: Origin of the joint frame in the previous one [m], shape (3,).
+        axis: Unit axis in the joint frame, shape (3,).
+        prismatic: Whether q is a displacement [m] and not an angle [rad].
+        mass: Mass of the body with all fixed parts [kg].
+        com: Center of mass in the joint frame [m], shape (3,).
         inertia: Inertia about the center of mass, joint axes [kg m^2], shape (3, 3).
     """
 
@@ -48,10 +51,12 @@ class Joint:
 class Chain:
     """Serial chain from the world to a tip frame.
 
-    Attributes: joints: The planned joints, from the base outwards. tip_rotation:
-        Rotation of the tip frame in the last joint frame, shape (3, 3).
+    Attributes:
+        joints: The planned joints, from the base outwards.
+        tip_rotation: Rotation of the tip frame in the last joint frame, shape (3, 3).
         tip_translation: Origin of the tip frame in the last joint frame [m], shape
-        (3,). gravity: Gravity in the world frame [m/s^2], shape (3,).
+            (3,).
+        gravity: Gravity in the world frame [m/s^2], shape (3,).
     """
 
     joints: tuple[Joint, ...]

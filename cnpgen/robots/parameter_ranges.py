@@ -148,8 +148,10 @@ class ParameterRanges:
     ) -> tuple[Any, dict[str, Any]]:
         """Split the values of a scene after its obstacles: those for a constraint, and the parameters by name.
 
-        Args: values: The values; empty for an undefined sample, whose parameters are
-            nominal. nominal: Result of ``nominal``.
+        Args:
+            values: The values; empty for an undefined sample, whose parameters are
+                nominal.
+            nominal: Result of ``nominal``.
         """
         if not len(self):
             return values, {}

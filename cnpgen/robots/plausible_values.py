@@ -13,7 +13,9 @@ from cnpgen.schema.units import suggested_unit
 from cnpgen.store.joint_units import unit_of
 
 MAX_RANGE_RATIO = 2.0  # distance from the center of a joint's range, in half ranges
-MAX_LIMIT_RATIO = 10.0  # of velocities, accelerations and positions of the tip; deg/s is 57 times rad/s, mm 1,000 times m
+# Of velocities, accelerations and positions of the tip; deg/s is 57 times rad/s, mm
+# 1,000 times m.
+MAX_LIMIT_RATIO = 10.0
 MAX_ANGLE_RAD = 2 * np.pi  # of directions
 
 

@@ -54,25 +54,33 @@ class Attached:
 class Robot:
     """Robot of a problem, used by stages, kernels and checks.
 
-    Attributes: urdf: Path of the URDF file, for messages only; the file may be deleted.
-        urdf_text: Text of the URDF. joint_names: The n planned joints; every other
-        joint of the URDF stays at zero. tip: Name of the tip frame in the model.
-        attached: Attachments of the problem. position_lower: Lower planning limits of
-        joint positions [rad], shape (n,). position_upper: Upper planning limits of
-        joint positions [rad], shape (n,). velocity_limit: Symmetric planning limit of
-        joint velocities [rad/s], shape (n,). acceleration_limit: Symmetric planning
-        limit of joint accelerations [rad/s^2], shape (n,). jerk_limit: Symmetric
-        planning limit of joint jerks [rad/s^3], shape (n,); only ``joint-jerk``
-        constrains them. torque_limit: Symmetric planning limit of joint torques [N m],
-        shape (n,). rated_velocity: The URDF's own velocity limit [rad/s], shape (n,).
-        home: Home configuration [rad], the key `base` of files, shape (n,). chain:
-        Parameters of the kinematic chain from the world to the tip. shape: Collision
-        geometry; None for the paper's, a line through the joint origins. held_shape:
-        Link geometry and the held object, for collisions between the two; None if these
-        are not checked. parameters: Parameters that differ from sample to sample.
+    Attributes:
+        urdf: Path of the URDF file, for messages only; the file may be deleted.
+        urdf_text: Text of the URDF.
+        joint_names: The n planned joints; every other joint of the URDF stays at zero.
+        tip: Name of the tip frame in the model.
+        attached: Attachments of the problem.
+        position_lower: Lower planning limits of joint positions [rad], shape (n,).
+        position_upper: Upper planning limits of joint positions [rad], shape (n,).
+        velocity_limit: Symmetric planning limit of joint velocities [rad/s], shape
+            (n,).
+        acceleration_limit: Symmetric planning limit of joint accelerations [rad/s^2],
+            shape (n,).
+        jerk_limit: Symmetric planning limit of joint jerks [rad/s^3], shape (n,); only
+            ``joint-jerk`` constrains them.
+        torque_limit: Symmetric planning limit of joint torques [N m], shape (n,).
+        rated_velocity: The URDF's own velocity limit [rad/s], shape (n,).
+        home: Home configuration [rad], the key `base` of files, shape (n,).
+        chain: Parameters of the kinematic chain from the world to the tip.
+        shape: Collision geometry; None for the paper's, a line through the joint
+            origins.
+        held_shape: Link geometry and the held object, for collisions between the two;
+            None if these are not checked.
+        parameters: Parameters that differ from sample to sample.
         table_origin: Point about which the table turns, the center of its rectangle
-        [m], shape (3,). nominal_parameters: Parameters of a sample for which none are
-        given, shape (width,).
+            [m], shape (3,).
+        nominal_parameters: Parameters of a sample for which none are given, shape
+            (width,).
     """
 
     urdf: Path

@@ -26,11 +26,8 @@ from cnpgen.robots.solid import (
 from cnpgen.schema.arguments import integer
 from cnpgen.store.scene_table import NO_OBSTACLE, OBSTACLE_KINDS, SceneTable
 
-PARKED_POSITION_M = (
-    0.0,
-    0.0,
-    -100.0,
-)  # of obstacles that a sample with fewer obstacles does not have
+# Of obstacles that a sample with fewer obstacles does not have.
+PARKED_POSITION_M = 0.0, 0.0, -100.0
 
 
 class SampleIndexError(UsageError, IndexError):
@@ -41,9 +38,10 @@ class SampleIndexError(UsageError, IndexError):
 class Scene:
     """The obstacles of N samples, created where samples enter and passed along.
 
-    Attributes: obstacles: The obstacles, the same for all samples. poses: Poses and
-        sizes of the obstacles of each sample (``cnpgen.robots.solid``), shape (N,
-        width).
+    Attributes:
+        obstacles: The obstacles, the same for all samples.
+        poses: Poses and sizes of the obstacles of each sample
+            (``cnpgen.robots.solid``), shape (N, width).
     """
 
     obstacles: tuple[Obstacle, ...]
@@ -84,11 +82,13 @@ class Scene:
     def with_poses(self, poses: Array) -> Scene:
         """Return the scene with other poses and sizes of the obstacles; values for a constraint are kept.
 
-        Args: poses: Poses and sizes of the obstacles of each sample, shape (N,
-            ``pose_width(obstacles)``).
+        Args:
+            poses: Poses and sizes of the obstacles of each sample, shape (N,
+                ``pose_width(obstacles)``).
 
-        Raises: UsageError: The shape is wrong, or a number is not finite or larger than
-            ``MAX_COORDINATE_M``.
+        Raises:
+            UsageError: The shape is wrong, or a number is not finite or larger than
+                ``MAX_COORDINATE_M``.
         """
         expected = len(self), pose_width(self.obstacles)
         if poses.shape != expected:

@@ -6,10 +6,9 @@ obstacle are, all in m,
 * of an upright box given by ``x`` and ``y``: the height of its upper face;
 * of any other: its position, then
   box: half its edge lengths, and the rows of its rotation matrix if it is rotated;
-  sphere: its radius;
-  capsule, cylinder: the vector from its centre to the end of its axis, and its radius (of a cylinder that of the
-  corners of the prism round it);
-  mesh: the rows of its rotation matrix.
+  sphere: its radius; capsule, cylinder: the vector from its centre to the end of its
+  axis, and its radius (of a cylinder that of the corners of the prism round it); mesh:
+  the rows of its rotation matrix.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ from cnpgen.robots.shape.hull import CUBE, Array, frame_along
 from cnpgen.robots.shape.inline import corners_of
 from cnpgen.schema.keys import Range
 
-UNBOUNDED_OBSTACLE_HEIGHT_M = (
-    10.0  # height of the box that represents an obstacle without a lower end
-)
+# Height of the box that represents an obstacle without a lower end.
+
+UNBOUNDED_OBSTACLE_HEIGHT_M = 10.0
 _NOTHING = (0.0, 0.0, 0.0)
 
 
@@ -37,10 +36,13 @@ _NOTHING = (0.0, 0.0, 0.0)
 class Solid:
     """Convex body in the world: all points within ``radius`` of the hull of ``corners``, translated by ``position``.
 
-    Attributes: position: Position [m], shape (3,). corners: Corners of the hull
-        relative to the position, in world axes [m], shape (V, 3). low: Lower corner of
-        the bounding box [m], shape (3,). high: Upper corner of the bounding box [m],
-        shape (3,). radius: Radius around the hull [m].
+    Attributes:
+        position: Position [m], shape (3,).
+        corners: Corners of the hull relative to the position, in world axes [m], shape
+            (V, 3).
+        low: Lower corner of the bounding box [m], shape (3,).
+        high: Upper corner of the bounding box [m], shape (3,).
+        radius: Radius around the hull [m].
     """
 
     position: Array

@@ -15,8 +15,10 @@ from cnpgen.robots.shape.hull import Array
 class TableFrame:
     """Frame of the table of N samples; without a turn and a height its coordinates are those of the world.
 
-    Attributes: axes: Axes of the table in the world, columns x, y and the normal, shape
-        (N, 3, 3). pivot: Point about which the unmoved table turns [m], shape (3,).
+    Attributes:
+        axes: Axes of the table in the world, columns x, y and the normal, shape (N, 3,
+            3).
+        pivot: Point about which the unmoved table turns [m], shape (3,).
         height: Height of the pivot above the unmoved one [m], shape (N,).
     """
 

@@ -12,9 +12,8 @@ from cnpgen.errors import RecipeError
 from cnpgen.schema.texts import read_at_most, utf8_text
 
 MAX_URDF_BYTES = 1 << 23
-MAX_URDF_ELEMENTS = (
-    1_000  # links or joints: Pinocchio recurses along a chain and crashes at 5,000
-)
+# Links or joints: Pinocchio recurses along a chain and crashes at 5,000.
+MAX_URDF_ELEMENTS = 1_000
 MAX_DEPTH = 64  # of nested elements
 _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _CONTROL = re.compile(

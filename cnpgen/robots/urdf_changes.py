@@ -14,14 +14,8 @@ from cnpgen.robots.urdf import number_in, numbers_in, numbers_text, read_urdf, u
 from cnpgen.robots.urdf_parameters import placement_of
 
 _TURNING, _SLIDING = ("revolute", "continuous"), ("prismatic",)
-_MOTION = (
-    "axis",
-    "limit",
-    "mimic",
-    "calibration",
-    "dynamics",
-    "safety_controller",
-)  # elements of a joint that moves
+# Elements of a joint that moves.
+_MOTION = "axis", "limit", "mimic", "calibration", "dynamics", "safety_controller"
 _TAG = "disable_collisions"
 PAYLOAD = "carried payload"  # name of the link and of its joint
 
@@ -145,10 +139,13 @@ def with_collision_geometry(
 ) -> str:
     """Return a URDF with other collision elements.
 
-    Args: urdf: Text of the URDF. visual: Links without a <collision> element that get
-        one for each <visual>. skipped: Links whose collision meshes are removed.
+    Args:
+        urdf: Text of the URDF.
+        visual: Links without a <collision> element that get one for each <visual>.
+        skipped: Links whose collision meshes are removed.
 
-    Raises: RecipeError: There is no such link, or it has no such elements.
+    Raises:
+        RecipeError: There is no such link.
     """
     visual, skipped = tuple(visual), tuple(skipped)
     if not visual and not skipped:

@@ -60,9 +60,11 @@ class LinkInertia:
 class UrdfJoint:
     """Joint of a URDF, which moves the link ``child`` on the link ``parent``.
 
-    Attributes: origin: LinkFrame of the child at position zero in the parent. axis:
-        Unit axis, shape (3,). limits: Limit -> value [rad, rad/s, N m, or with m and
-        N]: "lower", "upper", "velocity" and "effort".
+    Attributes:
+        origin: LinkFrame of the child at position zero in the parent.
+        axis: Unit axis, shape (3,).
+        limits: Limit -> value [rad, rad/s, N m, or with m and N]: "lower", "upper",
+            "velocity" and "effort".
     """
 
     name: str

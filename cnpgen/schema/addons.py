@@ -2,29 +2,13 @@
 
 import functools
 import importlib
-import importlib.metadata
 import importlib.util
-from collections.abc import Mapping
-from importlib.metadata import EntryPoint
 from typing import Any
 
 from cnpgen.errors import MissingAddonError
+from cnpgen.schema.entry_points import EntryPoint, entry_points
 
 ADDONS = "cnpgen.addons"
-
-
-@functools.cache
-def entry_points() -> Mapping[str, tuple[EntryPoint, ...]]:
-    """Return the entry points of cnpgen's groups, group -> entries.
-
-    Cached, since reading metadata takes long.
-    """
-    entries = importlib.metadata.entry_points()
-    return {
-        group: tuple(entries.select(group=group))
-        for group in entries.groups
-        if group.startswith("cnpgen.")
-    }
 
 
 def installed(group: str) -> tuple[EntryPoint, ...]:

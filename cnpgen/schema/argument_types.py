@@ -31,7 +31,9 @@ R = TypeVar("R")
 Check = Callable[[str, Any], Any]
 """Returns a checked argument, by its name and value; raises UsageError."""
 
-NOUNS = {  # class name -> description for messages; arguments of these classes are checked before the call
+# Class name -> description for messages; arguments of these classes are checked before
+# the call.
+NOUNS = {
     "Plans": "Plans, as load_plans and make_plans return them",
     "Boundary": "a Boundary, such as plans.boundary",
     "Planner": "a Planner",

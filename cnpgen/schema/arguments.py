@@ -77,8 +77,9 @@ def numbers(
 
     Tensors with gradients are detached or, with ``differentiable``, raise an error.
 
-    Raises: UsageError: The values are texts, dates or complex numbers, have uneven
-        rows, or are not in CPU memory.
+    Raises:
+        UsageError: The values are texts, dates or complex numbers, have uneven rows, or
+            are not in CPU memory.
     """
     if type(values) is np.ndarray and values.dtype == dtype:  # the usual case
         return _fitting(name, values)

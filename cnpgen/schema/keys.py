@@ -51,12 +51,15 @@ def field(
 ) -> Any:
     """Declare a key of a recipe table.
 
-    Args: doc: Short description of the key. unit: SI unit of the stored value;
-        quantities in other units of the same dimension are converted. default: Value of
-        an absent key; without a default the key is required. low: Minimum value. high:
-        Maximum value. plausible: Largest plausible absolute value: larger ones in a
-        user's file are probably in another unit. By
-            default that of the unit, ``PLAUSIBLE_MAX``.
+    Args:
+        doc: Short description of the key.
+        unit: SI unit of the stored value; quantities in other units of the same
+            dimension are converted.
+        default: Value of an absent key; without a default the key is required.
+        low: Minimum value.
+        high: Maximum value.
+        plausible: Largest plausible absolute value: larger ones in a user's file are
+            probably in another unit. By default that of the unit, ``PLAUSIBLE_MAX``.
         choices: Allowed strings.
         pattern: Regular expression that a string, or the names in a table of integers,
             must match.

@@ -18,6 +18,7 @@ from typing import Any
 
 from cnpgen.errors import MissingAddonError, RecipeError, nearest
 from cnpgen.schema import addons
+from cnpgen.schema.entry_points import entry_points
 
 STAGES = "cnpgen.stages"
 CONSTRAINTS = "cnpgen.constraints"
@@ -29,9 +30,8 @@ ENGINES = "cnpgen.engines"
 DOCUMENTS = "cnpgen.documents"
 RULES = "cnpgen.rules"
 RECIPES = "cnpgen.recipes"  # types of recipe files; they have no common base class
-COMMANDS = (
-    "cnpgen.commands"  # modules with the functions of ``cnpgen.cli.parser.add_command``
-)
+# Modules with the functions of ``cnpgen.cli.parser.add_command``.
+COMMANDS = "cnpgen.commands"
 
 PROJECT = "cnpgen"  # the distribution of core and add-ons
 
@@ -240,11 +240,13 @@ def package_of(group: str, kind: type) -> str:
     Empty for built-in and unregistered ones.
     """
     name = name_of(group, kind)
-    distributions = (
-        entry.dist for entry in addons.installed(group) if entry.name == name
-    )
     return next(
-        (dist.name for dist in distributions if dist and dist.name != PROJECT), ""
+        (
+            entry.distribution
+            for entry in addons.installed(group)
+            if entry.name == name and entry.distribution != PROJECT
+        ),
+        "",
     )
 
 
@@ -254,8 +256,8 @@ def package_in(error: BaseException) -> str:
     Empty if there is none.
     """
     packages = {
-        entry.module.partition(".")[0]: entry.dist.name if entry.dist else entry.module
-        for entries in addons.entry_points().values()
+        entry.module.partition(".")[0]: entry.distribution
+        for entries in entry_points().values()
         for entry in entries
     }
     packages.pop(PROJECT, None)
@@ -293,7 +295,7 @@ def _sources(group: str, name: str) -> dict[str, Callable[[], Any]]:
         found[PROJECT] = functools.partial(pkgutil.resolve_name, BUILT_IN[group][name])
     for entry in addons.installed(group):
         if entry.name == name:
-            package = entry.dist.name if entry.dist else "an installed package"
+            package = entry.distribution or "an installed package"
             own = f"the add-on {addons.addon_of(entry.module)!r}"
             source = own if package == PROJECT else f"{package} ({entry.value})"
             found[source] = functools.partial(

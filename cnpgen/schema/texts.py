@@ -36,8 +36,9 @@ def read_own(path: Path, owner: Path, what: str) -> bytes:
 def utf8_text(content: bytes, encoding: str = "utf-8-sig", *, hint: str = "") -> str:
     """Decode a text, by default without a byte order mark; "utf-8" keeps it.
 
-    Raises: ValueError: The content is not UTF-8; the message names line and byte, and
-        ends with the hint.
+    Raises:
+        ValueError: The content is not UTF-8; the message names line and byte, and ends
+            with the hint.
     """
     try:
         return content.decode(encoding)

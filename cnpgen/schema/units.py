@@ -119,8 +119,9 @@ def show(value: object) -> str:
 def parse_number(value: Any, unit: str) -> float:
     """Read a number in ``unit``, or a text such as ``"50 ms"`` or ``"0.05"``; return the value [unit], an SI unit.
 
-    Raises: ValueError: The value is not a finite number, or its unit is unknown or of
-        another dimension.
+    Raises:
+        ValueError: The value is not a finite number, or its unit is unknown or of
+            another dimension.
     """
     match = _QUANTITY.fullmatch(value) if isinstance(value, str) else None
     if match:
@@ -138,8 +139,9 @@ def parse_numbers(
 ) -> tuple[float, ...]:
     """Read a list of values for ``parse_number``, or a text such as ``"[0.6, 1.3] m"``; return the values [unit].
 
-    Raises: ValueError: The value is not a list, has an invalid entry, or not ``count``
-        entries (None for one or more).
+    Raises:
+        ValueError: The value is not a list, has an invalid entry, or not ``count``
+            entries (None for one or more).
     """
     match = _LIST.fullmatch(value) if isinstance(value, str) else None
     if match:

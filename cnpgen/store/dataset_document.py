@@ -3,7 +3,6 @@
 from abc import ABC, abstractmethod
 from typing import ClassVar
 
-from cnpgen.schema import registry
 from cnpgen.store.dataset_summary import DatasetSummary
 
 
@@ -34,11 +33,3 @@ class DatasetDocument(ABC):
     def notes(self, text: str) -> str:  # noqa: ARG002 - used by documents that contain notes
         """Return the notes in the text of a document; empty if it has none."""
         return ""
-
-
-def dataset_documents() -> list[DatasetDocument]:
-    """Return the documents that the installed add-ons write."""
-    return [
-        registry.load(registry.DOCUMENTS, name)()
-        for name in registry.names(registry.DOCUMENTS)
-    ]

@@ -21,9 +21,8 @@ if TYPE_CHECKING:
 
 MAX_DRAWN_ROWS = 300  # in the top view
 MIN_CANDIDATES_PER_CELL = 25  # acceptance rates of fewer candidates are noise
-ARROW_DURATION_S = (
-    0.05  # an arrow is the distance covered at the goal velocity in this time
-)
+# An arrow is the distance covered at the goal velocity in this time.
+ARROW_DURATION_S = 0.05
 
 _COLORS = {"start": "tab:blue", "goal": "tab:red"}
 

@@ -50,7 +50,9 @@ from cnpgen.store.layout import (
 from cnpgen.store.scene_table import SCENE_ARRAYS
 
 SPECIFICATION_FORMAT = "cnpgen-specification"
-GENERATOR_REVISION = 2  # raised by every change of the generator after which an equal specification gives other samples
+# Raised by every change of the generator after which an equal specification gives other
+# samples.
+GENERATOR_REVISION = 2
 SPECIFICATION_VERSION = 3
 _FIELD_STRUCTURE = {
     **dict.fromkeys(("name", "unit", "long_name", "role", "frame", "dtype"), TEXT),
@@ -134,19 +136,26 @@ class StoredProblem:
 class DatasetSpec:
     """The specification of a dataset.
 
-    Attributes: name: Name of the dataset. version: Its version, MAJOR.MINOR.PATCH.
-        title: Description in one line. license: License of the samples, an SPDX
-        identifier. recipe_sha256: sha256 of the resolved recipe. recipe: The resolved
-        recipe as nested tables. seed: Root seed. splits: Split name -> number of rows.
+    Attributes:
+        name: Name of the dataset.
+        version: Its version, MAJOR.MINOR.PATCH.
+        title: Description in one line.
+        license: License of the samples, an SPDX identifier.
+        recipe_sha256: sha256 of the resolved recipe.
+        recipe: The resolved recipe as nested tables.
+        seed: Root seed.
+        splits: Split name -> number of rows.
         shard_size: Rows per shard. The last shard of a split may be shorter.
-        block_rows: Rows per block. dtype: Float type of the stored numbers, "float64"
-        or "float32". backend: Backend of the kernels: "compiled", "numpy", ...
-        generator: Random number generator. revision: Revision of the code of the
-        generator. Rows of different revisions must not be mixed. fields: Fields of the
-        dataset, in order. robot: Name, URDF with its sha256, joint names and limits of
-        the robot. versions: Versions of cnpgen, Python and libraries that wrote the
-        specification. They are not part of its
-            identity.
+        block_rows: Rows per block.
+        dtype: Float type of the stored numbers, "float64" or "float32".
+        backend: Backend of the kernels: "compiled", "numpy", ...
+        generator: Random number generator.
+        revision: Revision of the code of the generator. Rows of different revisions
+            must not be mixed.
+        fields: Fields of the dataset, in order.
+        robot: Name, URDF with its sha256, joint names and limits of the robot.
+        versions: Versions of cnpgen, Python and libraries that wrote the specification.
+            They are not part of its identity.
         previous_splits: The splits before each extension, the oldest first. An
             extension does not change existing shards, so shards also end where a
             previous split ended.

@@ -11,8 +11,8 @@ class Field:
 
     Attributes:
         name: HDF5 dataset name at the root of the shard.
-        unit: SI unit as text: "rad", "rad/s", "rad/s^2", "m", "m/s", "N m", "1"; or
-            one per joint, separated by commas, if some joints are prismatic and others
+        unit: SI unit as text: "rad", "rad/s", "rad/s^2", "m", "m/s", "N m", "1"; or one
+            per joint, separated by commas, if some joints are prismatic and others
             revolute.
         long_name: Description in a few words.
         width: Number of columns; 0 for a scalar per row.

@@ -25,10 +25,13 @@ from cnpgen.store.statistics import FieldStatistics, merge_statistics
 class Inspection:
     """Description of a dataset, which may be unfinished.
 
-    Attributes: folder: Folder of the dataset. summary: The specification and the
-        records of the finished shards. is_finalized: Whether the manifest exists.
-        bytes: Size of all files [bytes]. damage: Problems of the documents of a
-        finalized dataset, one per line; shards are not read.
+    Attributes:
+        folder: Folder of the dataset.
+        summary: The specification and the records of the finished shards.
+        is_finalized: Whether the manifest exists.
+        bytes: Size of all files [bytes].
+        damage: Problems of the documents of a finalized dataset, one per line; shards
+            are not read.
     """
 
     folder: Path

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.store.dataset_document import dataset_documents
+from cnpgen.store.dataset_document import DatasetDocument
 from cnpgen.store.dataset_spec import DatasetSpec, shards
 from cnpgen.store.dataset_summary import (
     DatasetSummary,
@@ -29,11 +29,8 @@ from cnpgen.store.layout import DESCRIPTIONS, MANIFEST, SPECIFICATION, STATS, WO
 
 MANIFEST_FORMAT = "cnpgen-dataset"
 MANIFEST_VERSION = 2
-LISTED = (
-    SPECIFICATION,
-    STATS,
-    *DESCRIPTIONS,
-)  # files with their size and sha256 beside the shards
+# Files with their size and sha256 beside the shards.
+LISTED = SPECIFICATION, STATS, *DESCRIPTIONS
 _FILE_STRUCTURE = {"bytes": WHOLE, "sha256": TEXT}
 _SHARD_STRUCTURE = {
     **dict.fromkeys(("file", "sha256"), TEXT),
@@ -48,18 +45,24 @@ MANIFEST_STRUCTURE = {
 }
 
 
-def finalize(folder: Path, spec: DatasetSpec, *, notes: str = "") -> dict[str, Any]:
+def finalize(
+    folder: Path,
+    spec: DatasetSpec,
+    *,
+    notes: str = "",
+    documents: Iterable[DatasetDocument] = (),
+) -> dict[str, Any]:
     """Summarize the shards of a dataset: write statistics, descriptions and, last, the manifest.
 
     The same shards give the same files, so several processes may do it at the same
-    time. ``notes`` is Markdown for the descriptions. Errors are those of
-    ``summarize_dataset`` and ``source_date``.
+    time. ``notes`` is Markdown for the ``documents`` that describe the dataset. Errors
+    are those of ``summarize_dataset`` and ``source_date``.
     """
     summary = summarize_dataset(folder, spec)
     created = _created(summary)
     (folder / MANIFEST).unlink(missing_ok=True)
     save_document(folder / STATS, stats_document(summary))
-    for document in dataset_documents():
+    for document in documents:
         text = document.render(
             summary, created=created, folder=_name(folder), notes=notes
         )
@@ -114,7 +117,7 @@ def lists_shards_of(manifest: dict[str, Any], spec: DatasetSpec) -> bool:
     """Return whether a manifest lists exactly the shards of a specification, in order.
 
     Only these file names are opened: no path in a manifest can lead outside the folder
-    of the dataset.
+        of the dataset.
     """
     if manifest["splits"].keys() != spec.splits.keys():
         return False

@@ -11,10 +11,8 @@ from cnpgen.store.files.kind import PLANS, is_hdf5, kind_of_content, own_kind
 from cnpgen.store.layout import SPECIFICATION
 from cnpgen.store.workspace import is_dataset
 
-MAX_SIMILAR_PATHS, MIN_SIMILARITY = (
-    1000,
-    0.65,
-)  # names of a folder that are compared, and their share of equal letters
+# Names of a folder that are compared, and their share of equal letters.
+MAX_SIMILAR_PATHS, MIN_SIMILARITY = 1000, 0.65
 ANY_HDF5 = "an HDF5 file"  # of other software
 _KIND_OF_FORMAT = {"cnpgen-plans": PLANS, "cnpgen-shard": "a shard of a dataset"}
 HDF5_KINDS = (ANY_HDF5, *_KIND_OF_FORMAT.values())

@@ -56,11 +56,14 @@ class DensityMap:
 class SamplingStatistics:
     """Numbers of accepted and rejected candidates: ``tried == accepted + sum(rejections)``.
 
-    Attributes: tried: Number of candidates. accepted: Number of candidates that passed
-        every stage. rejections: Reason -> number of rejected candidates, in pipeline
-        order. stages: Reason -> stage of the pipeline that rejects for this reason.
-        densities: Name -> density map. verification: Constraint -> worst violation
-        among the verified rows, in the unit of the constraint.
+    Attributes:
+        tried: Number of candidates.
+        accepted: Number of candidates that passed every stage.
+        rejections: Reason -> number of rejected candidates, in pipeline order.
+        stages: Reason -> stage of the pipeline that rejects for this reason.
+        densities: Name -> density map.
+        verification: Constraint -> worst violation among the verified rows, in the unit
+            of the constraint.
     """
 
     tried: int

@@ -19,7 +19,8 @@ from cnpgen.errors import DatasetError
 from cnpgen.store.field import Field
 
 SCENE_ID = "scene_id"
-OBSTACLE_POSES = "obstacle_poses"  # column of a sample or plan with its obstacles, instead of the problem's
+# Column of a sample or plan with its obstacles, instead of the problem's.
+OBSTACLE_POSES = "obstacle_poses"
 OBSTACLE_KINDS = ("box", "sphere", "cylinder", "capsule")  # index: the code of a kind
 NO_OBSTACLE = -1  # kind of the entries that pad a scene
 _KINDS_TEXT = f"{NO_OBSTACLE} for none; " + ", ".join(
@@ -102,12 +103,15 @@ SCENE_ARRAYS = (
 class SceneTable:
     """S scenes with up to O obstacles each; the names of the attributes are those of ``SCENE_ARRAYS``.
 
-    Attributes: scene_ids: IDs, ascending, shape (S,). scene_family: Indices of their
-        families, shape (S,). obstacle_count: Numbers of obstacles, shape (S,).
+    Attributes:
+        scene_ids: IDs, ascending, shape (S,).
+        scene_family: Indices of their families, shape (S,).
+        obstacle_count: Numbers of obstacles, shape (S,).
         obstacle_kind: Codes of the kinds, index in ``OBSTACLE_KINDS`` or
-        ``NO_OBSTACLE``, shape (S, O). obstacle_size: Sizes [m], shape (S, O, 3): edge
-        lengths of a box; radius, length and 0 of a cylinder or of a
-            capsule without its round ends; radius and zeros of a sphere.
+            ``NO_OBSTACLE``, shape (S, O).
+        obstacle_size: Sizes [m], shape (S, O, 3): edge lengths of a box; radius, length
+            and 0 of a cylinder or of a capsule without its round ends; radius and zeros
+            of a sphere.
         obstacle_position: Centers in the frame of the robot's base [m], shape (S, O,
             3).
         obstacle_quaternion: Quaternions (w, x, y, z) of length 1, shape (S, O, 4).

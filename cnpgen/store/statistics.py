@@ -24,14 +24,18 @@ class FieldStatistics:
     Counts, extrema and histograms do not depend on the shard size; mean and m2 depend
     on it by rounding errors only.
 
-    Attributes: count: Number of rows. mean: Mean, shape (c,). m2: Sum of squared
-        deviations from the mean, shape (c,). minimum: Smallest value, shape (c,).
-        maximum: Largest value, shape (c,). low: Lower bounds of the histograms, the
-        ``valid_min`` of the field, shape (c,); None without histograms. high: Upper
-        bounds of the histograms, the ``valid_max`` of the field, shape (c,). histogram:
-        Rows per bin, 64 equal bins from ``low`` to ``high``, shape (c, 64). Values
-        outside, by rounding
-            errors, are counted in the first or last bin.
+    Attributes:
+        count: Number of rows.
+        mean: Mean, shape (c,).
+        m2: Sum of squared deviations from the mean, shape (c,).
+        minimum: Smallest value, shape (c,).
+        maximum: Largest value, shape (c,).
+        low: Lower bounds of the histograms, the ``valid_min`` of the field, shape (c,);
+            None without histograms.
+        high: Upper bounds of the histograms, the ``valid_max`` of the field, shape
+            (c,).
+        histogram: Rows per bin, 64 equal bins from ``low`` to ``high``, shape (c, 64).
+            Values outside, by rounding errors, are counted in the first or last bin.
     """
 
     count: int

@@ -47,9 +47,8 @@ class Workspace:
         "nothing", "a dataset", "a file", "something else"
     ]  # a file is in place of the folder
     has_shards: bool = False  # whether there are shards or sidecars
-    spec: DatasetSpec | None = (
-        None  # the specification in it; None where there is none that can be read
-    )
+    # The specification in it; None where there is none that can be read.
+    spec: DatasetSpec | None = None
     damage: str = ""  # reason why the specification cannot be read; empty if it can
 
 

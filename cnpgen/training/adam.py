@@ -19,9 +19,8 @@ PARAMETERS_PER_BLOCK = (
     1 << 17
 )  # small enough for the five arrays of a block to stay in the CPU cache
 SAMPLE_MEMORY, BATCH_MEMORY = 0.98, 0.99
-MAX_NORM_RATIO = (
-    3.0  # of a batch's norm to the running norm, in the update of the latter
-)
+# Of a batch's norm to the running norm, in the update of the latter.
+MAX_NORM_RATIO = 3.0
 
 
 @dataclass

@@ -150,8 +150,9 @@ _FORM = {
 def from_content(content: Content) -> State:
     """Make a state from arrays and texts.
 
-    Raises: KeyError, TypeError, ValueError: A key is missing, unknown to this version,
-        or has an invalid value.
+    Raises:
+        KeyError, TypeError, ValueError: A key is missing, unknown to this version, or
+            has an invalid value.
     """
     numbers, arrays = parse_json(content.texts["numbers"]), content.arrays
     check_structure(numbers, _FORM)

@@ -30,10 +30,8 @@ from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
 
-DEMONSTRATION = (
-    "path_control_points",
-    "rate_control_points",
-)  # columns of a certified dataset
+# Columns of a certified dataset.
+DEMONSTRATION = "path_control_points", "rate_control_points"
 VALIDATION_SHARE = 0.05  # of the problems of scenes, the last ones
 MAX_VALIDATION_ROWS = 200  # verdicts among obstacles take a quarter of a second
 MIN_SCENE_ROWS = 40
@@ -220,9 +218,11 @@ def open_training_data(
 ) -> TrainingData:
     """Open a dataset for training or, with the problem of a robot, a scene file or a folder of scene files.
 
-    Raises: DatasetError: It is missing, unfinished or damaged, or has no rows for
-        training or validation. UsageError: There is no such robot or file. SceneError:
-        A scene does not fit the robot.
+    Raises:
+        DatasetError: It is missing, unfinished or damaged, or has no rows for training
+            or validation.
+        UsageError: There is no such robot or file.
+        SceneError: A scene does not fit the robot.
     """
     if robot is not None:
         with concerning("robot"):

@@ -67,8 +67,9 @@ def prepare_run(
     rows. Models are compared on ``check_rows`` validation rows. The command is recorded
     in the model.
 
-    Raises: UsageError: The dataset has no plans to imitate, or the initial model does
-        not fit.
+    Raises:
+        UsageError: The dataset has no plans to imitate, or the initial model does not
+            fit.
     """
     problems = source.training()
     boundary = problems.boundary
@@ -333,10 +334,11 @@ def validate(
 ) -> dict[str, Any]:
     """Plan for N validation rows and judge the plans in some processes.
 
-    Returns: JSON-able: number of ``plans``; fractions ``valid`` and, if the paper's
-        rules are installed, ``paper_valid``; means of some metrics; ``broken``,
-        condition -> number of violating plans; ``score``, which compares models: 1 % of
-        the plans counts as much as 1 % of the motion time.
+    Returns:
+        JSON-able: number of ``plans``; fractions ``valid`` and, if the paper's rules
+        are installed, ``paper_valid``; means of some metrics; ``broken``, condition ->
+        number of violating plans; ``score``, which compares models: 1 % of the plans
+        counts as much as 1 % of the motion time.
     """
     poses = problems.obstacle_poses
     columns = None if poses is None else {OBSTACLE_POSES: poses}

@@ -34,14 +34,16 @@ def with_via_points(
     the model's own plans. They are selected greedily by the number of plans that they
     repair, as measured by ``ViaPoints``.
 
-    Args: model: A model without via points. boundary: Boundary problems to select by,
-        some thousands, not those that the model is scored on; shape (N, n)
-            each.
+    Args:
+        model: A model without via points.
+        boundary: Boundary problems to select by, some thousands, not those that the
+            model is scored on; shape (N, n) each.
         count: Largest number of via points; fewer if no other one repairs a plan.
         seed: Seed of the random configurations.
 
-    Raises: UsageError: ``count`` is no positive integer, the model already has via
-        points, or samples place obstacles.
+    Raises:
+        UsageError: ``count`` is no positive integer, the model already has via points,
+            or samples place obstacles.
     """
     count = integer("count", count, least=1)
     if model.config.via_points:

@@ -46,20 +46,24 @@ CHOICES: dict[str, tuple[str, ...]] = {
 class TrainingSettings:
     """Settings that, together with rows, problem and number of steps, determine a trained model to the bit.
 
-    Attributes: hidden: Width of the network's layers. layers: Depth of its trunk.
-        batch_size: Rows per step; all of them if there are fewer. learning_rate: Peak
-        learning rate. final_rate: Last learning rate, as a fraction of the peak.
-        warm_up: Number of steps until the peak. seed: Seed of the initial parameters
-        and of the order of rows. path_scale: Factor of the configuration head's output
-        [rad]. head_scale: Factor of the heads' initial weights. rate_bias: Logarithm of
-        the initial guess of expected time over duration. line_projection_steps:
-        Gauss-Newton steps that project the line onto the equalities. projection_steps:
-        Gauss-Newton steps that project the path onto the equalities. within_limits:
-        Whether both clip control points to the joint limits. iterations: Number of
-        evaluations of the network; see ``ModelConfig``. time_parametrized: Whether the
-        planner fits rates to the limits after the network; training steps do not
-        include
-            it, validations do.
+    Attributes:
+        hidden: Width of the network's layers.
+        layers: Depth of its trunk.
+        batch_size: Rows per step; all of them if there are fewer.
+        learning_rate: Peak learning rate.
+        final_rate: Last learning rate, as a fraction of the peak.
+        warm_up: Number of steps until the peak.
+        seed: Seed of the initial parameters and of the order of rows.
+        path_scale: Factor of the configuration head's output [rad].
+        head_scale: Factor of the heads' initial weights.
+        rate_bias: Logarithm of the initial guess of expected time over duration.
+        line_projection_steps: Gauss-Newton steps that project the line onto the
+            equalities.
+        projection_steps: Gauss-Newton steps that project the path onto the equalities.
+        within_limits: Whether both clip control points to the joint limits.
+        iterations: Number of evaluations of the network; see ``ModelConfig``.
+        time_parametrized: Whether the planner fits rates to the limits after the
+            network; training steps do not include it, validations do.
         nodes: Number of quadrature nodes of the loss.
         shifts: Number of shifted sets of nodes, used in turn to cover the phases
             between nodes.

@@ -32,12 +32,8 @@ from cnpgen.training.settings import Length, TrainingSettings
 from cnpgen.training.training_run import Run, Watcher
 
 DEFAULT_CPU_TIME_S = 120.0
-CHECKPOINT, LOG, PICTURE, LOCK = (
-    ".checkpoint",
-    ".jsonl",
-    ".png",
-    ".lock",
-)  # in place of .h5
+# In place of .h5.
+CHECKPOINT, LOG, PICTURE, LOCK = ".checkpoint", ".jsonl", ".png", ".lock"
 MAX_SCORED_ROWS = 2000  # validation rows for the final score
 
 
@@ -45,11 +41,15 @@ MAX_SCORED_ROWS = 2000  # validation rows for the final score
 class Trained:
     """Result of a run.
 
-    Attributes: model: The best model. path: Its file. score: Result of ``validate`` on
-        up to 2,000 validation rows that were not used to select it. made: Whether it
-        was made now; False if it existed. times: Times of this run including the final
-        validation; of a resumed run, since it was resumed. The model's
-            ``training`` has the CPU time of all steps and validations.
+    Attributes:
+        model: The best model.
+        path: Its file.
+        score: Result of ``validate`` on up to 2,000 validation rows that were not used
+            to select it.
+        made: Whether it was made now; False if it existed.
+        times: Times of this run including the final validation; of a resumed run, since
+            it was resumed. The model's ``training`` has the CPU time of all steps and
+            validations.
     """
 
     model: Model
@@ -83,12 +83,14 @@ def train_model(
     ``.checkpoint``, beside the model. An interrupted and resumed run gives the same
     parameters to the bit as an uninterrupted one.
 
-    Args: folder: The dataset; with ``robot`` a scene file, or a folder of scene files.
-        out: The model's file, ``.h5``. steps: Length in steps. epochs: Length in
-        epochs. cpu_seconds: Length in CPU time of the steps [s]: the time of a step is
-        measured first, and the number of steps
-            is then fixed. Compiling, reading rows and validation are not included. The
-            default is 120 s.
+    Args:
+        folder: The dataset; with ``robot`` a scene file, or a folder of scene files.
+        out: The model's file, ``.h5``.
+        steps: Length in steps.
+        epochs: Length in epochs.
+        cpu_seconds: Length in CPU time of the steps [s]: the time of a step is measured
+            first, and the number of steps is then fixed. Compiling, reading rows and
+            validation are not included. The default is 120 s.
         settings: Training settings.
         start_from: Model, by name or path, whose parameters and features replace random
             ones; width, depth and output definition in the settings must be the same.
@@ -103,10 +105,10 @@ def train_model(
         begin: Called once before the first step.
         watch: Called with every line of the log.
 
-    Raises: UsageError: An argument is invalid, the initial model is missing or does not
-        fit, there is another model,
-            another run's checkpoint, or a log or picture of another origin, or another
-            process writes the same model.
+    Raises:
+        UsageError: An argument is invalid, the initial model is missing or does not
+            fit, there is another model, another run's checkpoint, or a log or picture
+            of another origin, or another process writes the same model.
         DatasetError: The dataset or the checkpoint is damaged.
         MachineError: The disk is full, or the loss is not finite any more.
     """

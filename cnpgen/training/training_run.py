@@ -23,9 +23,8 @@ Array = NDArray[Any]
 Watcher = Callable[[Mapping[str, Any]], None]
 
 LOG_LINES = 100  # per run
-SHIFT_STRIDE = (
-    7  # between the shifts of successive steps; coprime to the number of shifts
-)
+# Between the shifts of successive steps; coprime to the number of shifts.
+SHIFT_STRIDE = 7
 
 
 @dataclass

@@ -52,11 +52,15 @@ class MotionIndexError(UsageError, IndexError):
 class Boundary:
     """Boundary conditions of N motions of n joints.
 
-    Attributes: start_q: Start positions [rad], shape (N, n). start_dq: Start velocities
-        [rad/s]. start_ddq: Start accelerations [rad/s^2]. goal_q: Goal positions [rad].
-        goal_dq: Goal velocities [rad/s]. goal_ddq: Goal accelerations [rad/s^2], or
-        None where they are free. parameters: Parameters of the problem that differ from
-        motion to motion, shape (N, width), or None.
+    Attributes:
+        start_q: Start positions [rad], shape (N, n).
+        start_dq: Start velocities [rad/s].
+        start_ddq: Start accelerations [rad/s^2].
+        goal_q: Goal positions [rad].
+        goal_dq: Goal velocities [rad/s].
+        goal_ddq: Goal accelerations [rad/s^2], or None where they are free.
+        parameters: Parameters of the problem that differ from motion to motion, shape
+            (N, width), or None.
     """
 
     start_q: Array
@@ -73,13 +77,16 @@ class Boundary:
     ) -> Boundary:
         """Read the boundary conditions from a batch of rows, in SI units; ignore its other fields.
 
-        Args: batch: Field name -> values, shape (N, n): a batch or another mapping of
-            arrays or tensors. normalization: Normalization of the rows, or None for
-            rows in SI units. It may be omitted for batches of a
-                dataset, which hold it; other mappings need it.
+        Args:
+            batch: Field name -> values, shape (N, n): a batch or another mapping of
+                arrays or tensors.
+            normalization: Normalization of the rows, or None for rows in SI units. It
+                may be omitted for batches of a dataset, which hold it; other mappings
+                need it.
 
-        Raises: UsageError: A boundary condition is missing in the fields, or the
-            normalization is unknown.
+        Raises:
+            UsageError: A boundary condition is missing in the fields, or the
+                normalization is unknown.
         """
         scaling = (
             getattr(batch, "normalization", MISSING)
@@ -355,9 +362,8 @@ class BoundaryDerivative:
 
     point: int  # index of the path control point, 0 to C - 1
     variable: int  # index of the rate control point, 0 to R - 1
-    derivative: (
-        Array  # d(path control point) / d(rate control point) [rad s], shape (N, n)
-    )
+    # d(path control point) / d(rate control point) [rad s], shape (N, n).
+    derivative: Array
 
 
 def boundary_derivatives(

@@ -34,10 +34,8 @@ ARC_LENGTH_FRACTIONS = (0.0, 0.3, 0.6, 0.9)  # of the arc length in the phase
 MIN_FIT_ERROR_RAD = 1e-6  # smaller errors count as equal, and the simplest r is chosen
 MAX_RATE_FIT_SAMPLES = 2000  # in the optimization of r
 MAX_LOG_RATE_CHANGE = 4.0  # in the optimization of r
-PATH_SMOOTHNESS, RATE_SMOOTHNESS = (
-    1e-8,
-    3e-5,
-)  # weights of p''' and of second differences of log r; positions: rad
+# Weights of p''' and of second differences of log r; positions: rad.
+PATH_SMOOTHNESS, RATE_SMOOTHNESS = 1e-8, 3e-5
 
 
 @checked_arguments
@@ -51,17 +49,22 @@ def fit_motion(
 ) -> Motion:
     """Fit a motion to samples of one trajectory; ``largest_error`` returns the error of the fit.
 
-    Args: t: Times of the samples [s], shape (K,), increasing; the motion starts at the
-        first one. q: Joint positions [rad], shape (K, n). dq: Joint velocities [rad/s],
-        shape (K, n): with them, samples are connected by cubics. spec: Degree and
-        numbers of control points. boundary: Boundary conditions of the motion, met
-        exactly; ``sampled_boundary`` by default.
+    Args:
+        t: Times of the samples [s], shape (K,), increasing; the motion starts at the
+            first one.
+        q: Joint positions [rad], shape (K, n).
+        dq: Joint velocities [rad/s], shape (K, n): with them, samples are connected by
+            cubics.
+        spec: Degree and numbers of control points.
+        boundary: Boundary conditions of the motion, met exactly; ``sampled_boundary``
+            by default.
 
     Returns:
         One motion of duration ``t[-1] - t[0]``.
 
-    Raises: UsageError: A shape is wrong, the times do not increase, or a value is not
-        finite.
+    Raises:
+        UsageError: A shape is wrong, the times do not increase, or a value is not
+            finite.
     """
     times, positions, velocities = checked_samples(t, q, dq)
     if boundary is None:

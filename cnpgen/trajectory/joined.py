@@ -13,7 +13,9 @@ from cnpgen.trajectory.spline_motion import Motion, States, states_at_times
 
 Array = NDArray[np.float64]
 
-MAX_JOINT_GAP = 1e-9  # rad, rad/s and rad/s^2: rounding error between a state and a motion that starts from it
+# Rad, rad/s and rad/s^2: rounding error between a state and a motion that starts from
+# it.
+MAX_JOINT_GAP = 1e-9
 CONTROL_POINT_ROUNDING = (
     4 * np.finfo(float).eps
 )  # relative; dominates in accelerations of motions of milliseconds
@@ -27,8 +29,9 @@ class JoinedMotion:
         parts: Parts, N motions each, of the same joints.
         start_times: Start time of each part [s], shape (P, N), ascending from 0.
 
-    Raises: UsageError: A part does not start in the state at which the previous part is
-        cut.
+    Raises:
+        UsageError: A part does not start in the state at which the previous part is
+            cut.
     """
 
     parts: tuple[Motion, ...]

@@ -18,12 +18,11 @@ from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Array = NDArray[np.float64]
 
-MAX_ACCELERATION_ERROR = (
-    1e-3  # relative to the limits; smaller than the tolerances of problems
-)
-MAX_SPAN_DIVISIONS = (
-    3  # then accelerations of motions at their limits differ by at most 0.5 %
-)
+# Relative to the limits; smaller than the tolerances of problems.
+
+MAX_ACCELERATION_ERROR = 1e-3
+# Then accelerations of motions at their limits differ by at most 0.5 %.
+MAX_SPAN_DIVISIONS = 3
 COMPARISON_SAMPLES = 64  # times at which accelerations are compared
 
 

@@ -9,10 +9,10 @@ from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
 
-MAX_SAMPLE = 1e9  # of times, positions and velocities in SI units; powers of larger ones overflow
-MIN_DENSE_SAMPLES = (
-    400  # fewer samples are resampled from the cubic through positions and velocities
-)
+# Of times, positions and velocities in SI units; powers of larger ones overflow.
+MAX_SAMPLE = 1e9
+# Fewer samples are resampled from the cubic through positions and velocities.
+MIN_DENSE_SAMPLES = 400
 WINDOWS = (
     5,
     8,
@@ -25,7 +25,8 @@ WINDOWS = (
     135,
     200,
 )  # samples at each end for estimating velocity and acceleration
-MAX_REST_SPEED_RATIO = 2e-3  # of the mean speed: smaller velocities are 0; accelerations: ten times, per duration
+# Of the mean speed: smaller velocities are 0; accelerations: ten times, per duration.
+MAX_REST_SPEED_RATIO = 2e-3
 
 
 def checked_samples(
@@ -33,8 +34,9 @@ def checked_samples(
 ) -> tuple[Array, Array, Array | None]:
     """Return times (K,) [s], positions and velocities (K, n) of one trajectory as arrays of float64.
 
-    Raises: UsageError: A shape is wrong, the times do not increase, or a value is not
-        finite.
+    Raises:
+        UsageError: A shape is wrong, the times do not increase, or a value is not
+            finite.
     """
     times, positions = numbers("t", t), numbers("q", q)
     velocities = None if dq is None else numbers("dq", dq)
@@ -107,8 +109,9 @@ def sampled_boundary(
     Returns:
         Boundary conditions of one motion with a free goal acceleration.
 
-    Raises: UsageError: A shape is wrong, the times do not increase, or a value is not
-        finite.
+    Raises:
+        UsageError: A shape is wrong, the times do not increase, or a value is not
+            finite.
     """
     times, positions, velocities = checked_samples(t, q, dq)
     times, path = resampled(times - times[0], positions, velocities)

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-MAX_UNSCALED = (
-    1e150  # larger control points are scaled, because products of them would overflow
-)
+# Larger control points are scaled, because products of them would overflow.
+
+MAX_UNSCALED = 1e150
 ORDERS = 3  # of ``derivatives_of_each``: value, first and second derivative
 
 

@@ -241,11 +241,13 @@ class Motion:
     def phase_at(self, t: Array) -> Array:
         """Compute the phase at times t: the inverse of ``time_at``, by Newton's method in the cells of its quadrature.
 
-        Args: t: Times in [0, T] [s], shape (K,), the same for all motions, or (N, K);
-            clipped to the motion.
+        Args:
+            t: Times in [0, T] [s], shape (K,), the same for all motions, or (N, K);
+                clipped to the motion.
 
-        Returns: Phases, shape (N, K), exactly 0 and 1 at the ends; undefined where r is
-            not positive.
+        Returns:
+            Phases, shape (N, K), exactly 0 and 1 at the ends; undefined where r is not
+            positive.
 
         Raises:
             UsageError: t has another shape.
@@ -304,10 +306,11 @@ class Motion:
         """Scale time uniformly: keep the path and divide the rate by a factor.
 
         Exact for motions from rest to rest: their boundary velocities and accelerations
-        stay zero.
+            stay zero.
 
-        Args: factor: Scale of the durations, at least 1: one per motion, shape (N,), or
-            one for all.
+        Args:
+            factor: Scale of the durations, at least 1: one per motion, shape (N,), or
+                one for all.
         """
         factors = numbers("factor", factor).reshape(-1, 1)
         if len(factors) not in {1, len(self)} or not (factors > 0).all():
@@ -332,7 +335,7 @@ class Motion:
         """Yield groups of motions, the edges of the quadrature cells of ``t(s)`` for them, and ``_nodes`` of the edges.
 
         All motions share the edges, except those whose r has control points that are
-        not positive: it may nearly be 0.
+            not positive: it may nearly be 0.
         """
         points, degree = self.rate.shape[1], self.degree
         shared = _shared_cells(points, degree)

@@ -5,10 +5,8 @@ from dataclasses import dataclass
 
 from cnpgen.schema.keys import field
 
-MAX_DEGREE, MAX_CONTROL_POINTS = (
-    20,
-    500,
-)  # tables of splines grow with degree x points^2: these take 0.15 GB
+# Tables of splines grow with degree x points^2: these take 0.15 GB.
+MAX_DEGREE, MAX_CONTROL_POINTS = 20, 500
 
 
 @dataclass(frozen=True, kw_only=True)

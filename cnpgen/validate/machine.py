@@ -56,20 +56,30 @@ class _Findings:
 class MachineReport:
     """Properties and problems of a machine.
 
-    Attributes: cnpgen: Version of cnpgen. python: Version of Python. executable: Path
-        of the Python interpreter. platform: Operating system and processor. cores:
-        Number of cores that this process may use. cores_present: Number of cores of the
-        machine. vector: Widest vector instructions: "avx512", "avx2", "avx", "neon",
-        "sse2" or "unknown". libraries: Project -> version, "missing" or "broken". hdf5:
-        Version of the HDF5 library. environment: Relevant environment variables set by
-        the user. compiler: C compiler and its version; empty if there is none. backend:
-        Backend of the kernels; empty if none works. backend_reason: Reason for the
-        choice of the backend. cache_folder: Folder of cached kernels. cache_writable:
-        Whether kernels can be cached. cache_used: Whether cached kernels are loaded;
-        they are not if other users may change them. recipes: Number and folder of the
-        recipes. free_bytes: Free disk space in the working directory [bytes]; 0 if it
-        does not exist. problems: Problems that prevent cnpgen from working, each with a
-        remedy. notes: Remarks, for example on a lower speed.
+    Attributes:
+        cnpgen: Version of cnpgen.
+        python: Version of Python.
+        executable: Path of the Python interpreter.
+        platform: Operating system and processor.
+        cores: Number of cores that this process may use.
+        cores_present: Number of cores of the machine.
+        vector: Widest vector instructions: "avx512", "avx2", "avx", "neon", "sse2" or
+            "unknown".
+        libraries: Project -> version, "missing" or "broken".
+        hdf5: Version of the HDF5 library.
+        environment: Relevant environment variables set by the user.
+        compiler: C compiler and its version; empty if there is none.
+        backend: Backend of the kernels; empty if none works.
+        backend_reason: Reason for the choice of the backend.
+        cache_folder: Folder of cached kernels.
+        cache_writable: Whether kernels can be cached.
+        cache_used: Whether cached kernels are loaded; they are not if other users may
+            change them.
+        recipes: Number and folder of the recipes.
+        free_bytes: Free disk space in the working directory [bytes]; 0 if it does not
+            exist.
+        problems: Problems that prevent cnpgen from working, each with a remedy.
+        notes: Remarks, for example on a lower speed.
     """
 
     cnpgen: str

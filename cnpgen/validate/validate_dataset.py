@@ -38,12 +38,11 @@ from cnpgen.store.scene_table import SCENE_ID
 from cnpgen.store.shard_record import is_committed
 from cnpgen.validate.validate_rows import DeepCheck, check_rows
 
-MAX_REGENERATION_ERROR = (
-    1e-9  # in SI units; accepted difference of rows made on another machine or backend
-)
-MAX_REGENERATION_ERROR_FLOAT32 = (
-    1e-5  # in SI units; accepted difference of rows stored as float32
-)
+# In SI units; accepted difference of rows made on another machine or backend.
+
+MAX_REGENERATION_ERROR = 1e-9
+# In SI units; accepted difference of rows stored as float32.
+MAX_REGENERATION_ERROR_FLOAT32 = 1e-5
 
 
 @dataclass(frozen=True)
@@ -151,13 +150,18 @@ def _explanation(spec: DatasetSpec, recipe: DatasetRecipe) -> str:
 class ValidationReport:
     """Result of a validation.
 
-    Attributes: folder: Folder of the dataset. rows: Number of rows of the existing
-        shards. findings: Problems and notes, by file. deep: Report of the recomputation
-        of every row with Pinocchio and Coal; None without a deep check. plans: Numbers
-        of judged and of valid plans; None without a deep check or without plans.
-        wanted: Number of blocks that were requested to be regenerated. blocks: Number
-        of blocks of the dataset. regenerated: Number of regenerated blocks. identical:
-        Number of regenerated blocks that are bitwise identical.
+    Attributes:
+        folder: Folder of the dataset.
+        rows: Number of rows of the existing shards.
+        findings: Problems and notes, by file.
+        deep: Report of the recomputation of every row with Pinocchio and Coal; None
+            without a deep check.
+        plans: Numbers of judged and of valid plans; None without a deep check or
+            without plans.
+        wanted: Number of blocks that were requested to be regenerated.
+        blocks: Number of blocks of the dataset.
+        regenerated: Number of regenerated blocks.
+        identical: Number of regenerated blocks that are bitwise identical.
     """
 
     folder: Path
@@ -244,9 +248,10 @@ def validate_dataset(
     Checksums, counts, schema and provenance are always checked; every row and some
     regenerated blocks optionally.
 
-    Args: folder: Folder of the dataset. deep: Whether to recompute kinematics, limits,
-        torques, manifold and collisions of every row with Pinocchio and
-            Coal.
+    Args:
+        folder: Folder of the dataset.
+        deep: Whether to recompute kinematics, limits, torques, manifold and collisions
+            of every row with Pinocchio and Coal.
         regenerate: Number of random blocks to regenerate and compare.
         workers: Number of processes for the deep check; by default one per available
             core.
@@ -254,12 +259,14 @@ def validate_dataset(
         address: Address of the engine, as in ``make_dataset``.
         progress: Called with the number of rows of every recomputed shard.
 
-    Raises: UsageError: The folder does not exist or contains no dataset, or an argument
-        is invalid. RecipeError: The recipe in the specification does not fit this
-        version of cnpgen. PluginError: The recipe needs packages that are not
-        installed. MachineError: A file cannot be read, or blocks are to be regenerated
-        and the backend of the dataset does not
-            work on this machine.
+    Raises:
+        UsageError: The folder does not exist or contains no dataset, or an argument is
+            invalid.
+        RecipeError: The recipe in the specification does not fit this version of
+            cnpgen.
+        PluginError: The recipe needs packages that are not installed.
+        MachineError: A file cannot be read, or blocks are to be regenerated and the
+            backend of the dataset does not work on this machine.
     """
     regenerate, machine_engine = (
         integer("regenerate", regenerate, least=0),

@@ -27,7 +27,8 @@ from cnpgen.store.scene_table import OBSTACLE_POSES, SCENE_ID
 from cnpgen.store.shard_record import ShardRecord, load_record
 from cnpgen.store.statistics import FieldStatistics, field_statistics
 
-MAX_RELATIVE_SUM_ERROR = 1e-9  # accepted relative difference of sums of the same numbers between versions of NumPy
+# Accepted relative difference of sums of the same numbers between versions of NumPy.
+MAX_RELATIVE_SUM_ERROR = 1e-9
 _ODD_MULTIPLIERS = np.random.default_rng(0).integers(
     0, 2**63, 64, dtype=np.uint64
 ) * np.uint64(2) + np.uint64(1)

@@ -31,9 +31,11 @@ MAX_CERTIFICATE_GAP_M = 1e-6  # between a measured distance and its certificate
 class ConvexBody:
     """A convex body: the hull of its corners, extended by a radius.
 
-    Attributes: corners: Corners of the hull [m], shape (V, 3). radius: Radius that is
-        added to the hull [m]. equivalent: Coal shape that is measured in place of the
-        hull; None for the hull itself.
+    Attributes:
+        corners: Corners of the hull [m], shape (V, 3).
+        radius: Radius that is added to the hull [m].
+        equivalent: Coal shape that is measured in place of the hull; None for the hull
+            itself.
     """
 
     corners: Array
@@ -99,9 +101,10 @@ class CertifiedDistance:
     ) -> tuple[float, Array]:
         """Measure a signed distance [m]: minus the penetration depth if the bodies overlap.
 
-        Returns: The distance, and the unit vector of shape (3,) from a to b along which
-            the bodies have this distance; minus infinity and a vector of nan if Coal
-            finds no direction.
+        Returns:
+            The distance, and the unit vector of shape (3,) from a to b along which the
+            bodies have this distance; minus infinity and a vector of nan if Coal finds
+            no direction.
         """
         import coal
 

@@ -109,7 +109,8 @@ class CollisionWorld:
     ) -> tuple[float, Array]:
         """Measure the signed distance of the segment from a to b [m] from one obstacle.
 
-        Returns: The distance [m], minus the penetration depth if they overlap, and the
+        Returns:
+            The distance [m], minus the penetration depth if they overlap, and the
             separating unit vector from the obstacle to the segment, shape (3,).
         """
         self._place_segment(a, b)
@@ -170,7 +171,8 @@ class CollisionWorld:
                 body, pose, self._mover, self._pose
             )
             return distance
-        self._result.clear()  # otherwise Coal keeps the smallest distance of earlier calls
+        # Otherwise Coal keeps the smallest distance of earlier calls.
+        self._result.clear()
         return float(
             measure(
                 self._transform, self._transforms[obstacle], self._request, self._result

@@ -16,11 +16,10 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_ORIGIN, _SLIDE = (
-    3,
-    7,
-)  # rows of a joint's coefficients: its origin, and its direction if it slides
-MAX_POSE_ERROR = 1e-9  # between our poses and Pinocchio's, relative to 1 + the largest joint position
+# Rows of a joint's coefficients: its origin, and its direction if it slides.
+_ORIGIN, _SLIDE = 3, 7
+# Between our poses and Pinocchio's, relative to 1 + the largest joint position.
+MAX_POSE_ERROR = 1e-9
 
 
 class ForwardKinematics:
@@ -42,9 +41,10 @@ class ForwardKinematics:
     def poses(self, q: Array) -> tuple[Array, Array]:
         """Compute the poses of all joints at K > 0 states q [rad], shape (n, K).
 
-        Returns: ``(rotations, positions)``: rotation matrices in the world frame, that
-            of the base first, shape (n + 1, 3, 3, K), and positions [m], shape (n + 1,
-            3, K).
+        Returns:
+            ``(rotations, positions)``: rotation matrices in the world frame, that of
+            the base first, shape (n + 1, 3, 3, K), and positions [m], shape (n + 1, 3,
+            K).
 
         Raises:
             MachineError: The poses differ from Pinocchio's.

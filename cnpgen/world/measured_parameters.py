@@ -23,10 +23,12 @@ Array = NDArray[np.float64]
 class MeasuredParameters:
     """Parameters of the sample of a world; ``set`` replaces them.
 
-    Attributes: model: Pinocchio's model with the load of the sample, a copy of the
-        robot's if loads differ. values: Parameters of the sample, by name.
+    Attributes:
+        model: Pinocchio's model with the load of the sample, a copy of the robot's if
+            loads differ.
+        values: Parameters of the sample, by name.
         scene_values: Values for a constraint (``Constraint.scene_values``); empty if
-        none were given.
+            none were given.
     """
 
     def __init__(self, robot: Robot) -> None:

@@ -24,10 +24,12 @@ RESOLUTION = 1e-9  # m: tolerance of the smallest distance
 class ClosestPoints:
     """Smallest signed distance between bodies at K states.
 
-    Attributes: distance: Smallest distance of all pairs [m], minus the penetration
-        depth if they overlap, shape (K,). pair: Index of the pair with this distance,
-        shape (K,). points: Points of the two bodies at this distance, in the world
-        frame [m], shape (K, 2, 3).
+    Attributes:
+        distance: Smallest distance of all pairs [m], minus the penetration depth if
+            they overlap, shape (K,).
+        pair: Index of the pair with this distance, shape (K,).
+        points: Points of the two bodies at this distance, in the world frame [m], shape
+            (K, 2, 3).
     """
 
     distance: Array
@@ -39,11 +41,11 @@ class ClosestPoints:
 class PairDistances:
     """Signed distances of M pairs of convex bodies at K states.
 
-    Attributes: bounds: Lower bounds of the distances [m], shape (M, K). measure:
-        Returns the signed distance of a pair at a state [m] and the unit vector, shape
-        (3,), along which the
-            bodies have this distance, or a vector of nan. Distances are never below
-            their bounds.
+    Attributes:
+        bounds: Lower bounds of the distances [m], shape (M, K).
+        measure: Returns the signed distance of a pair at a state [m] and the unit
+            vector, shape (3,), along which the bodies have this distance, or a vector
+            of nan. Distances are never below their bounds.
         separation: Returns lower bounds of the distances of a pair [m] along a unit
             vector at J states, shape (J,).
         bodies: Returns both bodies of a pair at a state with their poses, that of the
@@ -74,10 +76,11 @@ class PairDistances:
         search ends when no bound is below the smallest measured distance, so no state
         is missed.
 
-        Returns: Distances [m], one array of shape (K,) per pair. The smallest one is
-            exact up to ``RESOLUTION`` and stands where it was measured; values that
-            were not measured are lower bounds above it. A state that cannot be measured
-            is nan and ends the search.
+        Returns:
+            Distances [m], one array of shape (K,) per pair. The smallest one is exact
+            up to ``RESOLUTION`` and stands where it was measured; values that were not
+            measured are lower bounds above it. A state that cannot be measured is nan
+            and ends the search.
         """
         distances, best = self.bounds[pairs], np.inf
         measured: dict[tuple[int, int], float] = {}
@@ -172,10 +175,12 @@ class PairDistances:
         are therefore separated between them, up to that deviation. Bounds are only
         tightened until they reach 0.
 
-        Args: min_distances: Required distance of every pair [m], shape (M,).
+        Args:
+            min_distances: Required distance of every pair [m], shape (M,).
             displacements: Maximum displacement of a point of one body in the frame of
-            the other [m], shape (K - 1,). deviations: Maximum deviation of its path
-            from the chord [m], shape (K - 1,).
+                the other [m], shape (K - 1,).
+            deviations: Maximum deviation of its path from the chord [m], shape (K -
+                1,).
         """
         margins = self.bounds - min_distances[:, None]
         intervals = (margins[:, 1:] + margins[:, :-1] - displacements) / 2 - deviations

@@ -68,11 +68,14 @@ class PathWorld(RobotWorld[Array]):
     ) -> None:
         """Move to K states.
 
-        Args: q: Joint positions [rad], shape (n, K), K > 0; the other arrays of joints
-            have the same shape. dq: Joint velocities [rad/s]. ddq: Joint accelerations
-            [rad/s^2]. obstacle_poses: Poses and sizes of the obstacles
-            (``cnpgen.robots.solid``), then values for a constraint,
-                then the parameters of the problem, shape (width,).
+        Args:
+            q: Joint positions [rad], shape (n, K), K > 0; the other arrays of joints
+                have the same shape.
+            dq: Joint velocities [rad/s].
+            ddq: Joint accelerations [rad/s^2].
+            obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``),
+                then values for a constraint, then the parameters of the problem, shape
+                (width,).
             jerk: Joint jerks [rad/s^3], or None if no constraint needs them.
             exact: Whether the smallest distance must be exact even if bounds prove that
                 all distances are sufficient.
@@ -164,13 +167,14 @@ class PathWorld(RobotWorld[Array]):
     def pairs(self, bodies: str) -> PairDistances:
         """Return the signed distances of all pairs of some bodies.
 
-        Args: bodies: "robot": links, or segments without link geometry, and obstacles,
-            body by body; "self": links of the
-                robot; "object": the held object and obstacles; "held object": the held
-                object and links.
+        Args:
+            bodies: "robot": links, or segments without link geometry, and obstacles,
+                body by body; "self": links of the robot; "object": the held object and
+                obstacles; "held object": the held object and links.
 
-        Raises: RecipeError: The robot has no link geometry, or the problem has no held
-            object, as required.
+        Raises:
+            RecipeError: The robot has no link geometry, or the problem has no held
+                object, as required.
         """
         if bodies == "robot":
             bodies = "segments" if self.robot.shape is None else "links"

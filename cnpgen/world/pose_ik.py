@@ -21,19 +21,18 @@ METERS_PER_RADIAN = 0.3  # weight of an angle against a distance
 POSE_DAMPING = 1e-3  # relative to the squared error
 POSE_POSITION_TOLERANCE_M = 1e-6
 POSE_ROTATION_TOLERANCE_RAD = 1e-6
-TOLERANCE_INSET = (
-    1e-5  # m and rad, from the end of a tolerance, so that solutions are within it
-)
+# M and rad, from the end of a tolerance, so that solutions are within it.
+TOLERANCE_INSET = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class PoseTolerance:
     """Tolerances of K poses along and about the axes of the wanted poses.
 
-    Attributes: position: Accepted displacements along the axes [m], shape (K, 3).
+    Attributes:
+        position: Accepted displacements along the axes [m], shape (K, 3).
         rotation: Accepted components of the rotation vector [rad], shape (K, 3); about
-        an axis with pi or more any
-            rotation is accepted.
+            an axis with pi or more any rotation is accepted.
     """
 
     position: Array
@@ -49,8 +48,9 @@ class PoseTolerance:
             rotations: Wanted rotation matrices, shape (K, 3, 3).
             at: Present positions and rotation matrices.
 
-        Returns: Positions; rotation matrices; and the mask of the three displacements
-            and three rotations that are within their tolerances, shape (K, 6).
+        Returns:
+            Positions; rotation matrices; and the mask of the three displacements and
+            three rotations that are within their tolerances, shape (K, 6).
         """
         back = rotations.swapaxes(1, 2)
         shift = (back @ (at[0] - positions)[..., None])[..., 0]
@@ -92,7 +92,8 @@ class PoseKinematics:
     def evaluate(self, q: Array) -> tuple[Array, Array, Array]:
         """Compute poses and Jacobians at joint positions q [rad], shape (n, K).
 
-        Returns: Positions [m], shape (K, 3); rotation matrices, shape (K, 3, 3); and
+        Returns:
+            Positions [m], shape (K, 3); rotation matrices, shape (K, 3, 3); and
             Jacobians of linear and angular velocity in world axes, shape (K, 6, n).
         """
         rotations, origins = self._kinematics.poses(q)
@@ -125,8 +126,9 @@ def solve_pose_ik(
     positions at which the iteration starts [rad], (n, K). By default no differences
     from the poses are accepted.
 
-    Returns: Joint positions within their limits [rad], shape (n, K), and the mask of
-        those that have their pose, shape (K,).
+    Returns:
+        Joint positions within their limits [rad], shape (n, K), and the mask of those
+        that have their pose, shape (K,).
     """
     robot = kinematics.robot
     low, high = robot.position_lower[:, None], robot.position_upper[:, None]

@@ -35,9 +35,10 @@ class RigidBodies:
         n_obstacles: Number of obstacles.
         n_joints: Number of the robot's planned joints.
 
-    Attributes: obstacle_pairs: Pairs (obstacle, moving part), part by part, shape (M,
-        2). link_pairs: Pairs of parts of links that must not touch, the one nearer to
-        the base first, shape (M, 2).
+    Attributes:
+        obstacle_pairs: Pairs (obstacle, moving part), part by part, shape (M, 2).
+        link_pairs: Pairs of parts of links that must not touch, the one nearer to the
+            base first, shape (M, 2).
     """
 
     def __init__(self, shape: Shape, n_obstacles: int, n_joints: int) -> None:

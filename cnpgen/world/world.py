@@ -84,8 +84,9 @@ class RobotWorld(ABC, Generic[Value]):
         A path that is not exact returns lower bounds without measuring if these are
         sufficient.
 
-        Returns: Exact distances at one state. At K states, arrays of shape (K,), of
-            which the smallest value is exact.
+        Returns:
+            Exact distances at one state. At K states, arrays of shape (K,), of which
+            the smallest value is exact.
         """
         return self._smallest("segments", sufficient)
 
@@ -193,10 +194,15 @@ class World(RobotWorld[float]):
         obstacles: The obstacles.
         object_size: Edge lengths of the held object [m], or None.
 
-    Attributes: robot: The robot. obstacles: The obstacles. parameters: Parameters of
-        the sample. q: Joint positions [rad], shape (n,). dq: Joint velocities [rad/s],
-        shape (n,). ddq: Joint accelerations [rad/s^2], shape (n,). jerk: Joint jerks
-        [rad/s^3], shape (n,); None at a boundary state or if no constraint needs them.
+    Attributes:
+        robot: The robot.
+        obstacles: The obstacles.
+        parameters: Parameters of the sample.
+        q: Joint positions [rad], shape (n,).
+        dq: Joint velocities [rad/s], shape (n,).
+        ddq: Joint accelerations [rad/s^2], shape (n,).
+        jerk: Joint jerks [rad/s^3], shape (n,); None at a boundary state or if no
+            constraint needs them.
     """
 
     def _start(self) -> None:
@@ -220,11 +226,13 @@ class World(RobotWorld[float]):
     ) -> None:
         """Move to a state.
 
-        Args: q: Joint positions [rad], shape (n,). dq: Joint velocities [rad/s], shape
-            (n,). ddq: Joint accelerations [rad/s^2], shape (n,). obstacle_poses: Poses
-            and sizes of the obstacles (``cnpgen.robots.solid``), then values for a
-            constraint,
-                then the parameters of the problem, shape (width,).
+        Args:
+            q: Joint positions [rad], shape (n,).
+            dq: Joint velocities [rad/s], shape (n,).
+            ddq: Joint accelerations [rad/s^2], shape (n,).
+            obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``),
+                then values for a constraint, then the parameters of the problem, shape
+                (width,).
             jerk: Joint jerks [rad/s^3], shape (n,), if the state has any.
         """
         import pinocchio as pin

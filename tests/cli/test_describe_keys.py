@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from cnpgen.cli.describe_keys import (
-    FILES,
     describe_keys,
     describe_kind,
     keys_to_dict,
     kind_summary,
     kind_to_dict,
+    recipe_types,
 )
 from cnpgen.cli.main import main
 from cnpgen.cli.terminal import LINE_WIDTH
@@ -70,8 +70,11 @@ def test_the_page_of_all_keys_is_what_the_command_prints(capsys):
 
 
 def test_every_key_of_every_table_is_on_the_page_with_a_sentence():
-    page = describe_keys(tuple(FILES))
-    named = [*FILES.values(), *(registry.load(group, name) for group, name in KINDS)]
+    page = describe_keys(tuple(recipe_types()))
+    named = [
+        *recipe_types().values(),
+        *(registry.load(group, name) for group, name in KINDS),
+    ]
     tables = {
         spec.type
         for kind in named
@@ -96,7 +99,7 @@ def test_every_key_of_every_table_is_on_the_page_with_a_sentence():
 
 
 def test_no_default_is_a_python_object():
-    page = describe_keys(tuple(FILES))
+    page = describe_keys(tuple(recipe_types()))
     assert "| `parameters` | a table | those of its keys |" in page
     assert not re.search(r"\w\(\w+=", page)
 
@@ -104,7 +107,7 @@ def test_no_default_is_a_python_object():
 def test_every_row_of_every_table_has_four_cells():
     rows = [
         line
-        for line in describe_keys(tuple(FILES)).splitlines()
+        for line in describe_keys(tuple(recipe_types())).splitlines()
         if line.startswith("|")
     ]
     assert len(rows) > 150
@@ -118,7 +121,7 @@ def test_a_key_is_described_with_unit_bounds_and_default():
     assert "| `urdf` | a string | required |" in page
 
 
-@pytest.mark.parametrize("kind", list(FILES))
+@pytest.mark.parametrize("kind", list(recipe_types()))
 def test_the_keys_of_one_kind_of_file_are_a_part_of_all(kind, capsys):
     assert main(["show", "--keys", kind]) == 0
     part = capsys.readouterr().out
@@ -127,7 +130,7 @@ def test_the_keys_of_one_kind_of_file_are_a_part_of_all(kind, capsys):
 
 
 def test_the_keys_have_a_json_form_with_tables_and_kinds():
-    content = json.loads(json.dumps(plain(keys_to_dict(tuple(FILES)))))
+    content = json.loads(json.dumps(plain(keys_to_dict(tuple(recipe_types())))))
     problem = {key["name"]: key for key in content["problem"]["keys"]}
     assert [key["name"] for key in problem["robot"]["table"]["keys"]][:3] == [
         "urdf",
@@ -144,7 +147,7 @@ def test_the_keys_have_a_json_form_with_tables_and_kinds():
 
 
 def test_there_are_keys_of_every_kind_of_file():
-    assert set(FILES) == set(MARKS)
+    assert set(recipe_types()) == set(MARKS)
 
 
 def test_the_keys_of_what_is_no_file_are_refused(capsys):

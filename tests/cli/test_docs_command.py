@@ -7,7 +7,7 @@ import pytest
 
 from cnpgen.cli import docs_command
 from cnpgen.cli.main import main
-from cnpgen.machine.versions import DOCUMENTATION_URL
+from cnpgen.machine import versions
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -63,11 +63,33 @@ def test_an_unknown_page_is_refused_with_the_nearest_one(capsys):
     assert "has no page 'verdct' (did you mean 'verdict'?)" in capsys.readouterr().err
 
 
-def test_the_address_of_a_page_begins_with_that_of_the_site(capsys):
+SITE = "https://docs.example.org/"
+
+
+@pytest.fixture
+def site(monkeypatch):
+    """Give the documentation an address."""
+    monkeypatch.setattr(versions, "DOCUMENTATION_URL", SITE)
+
+
+def test_the_address_of_a_page_begins_with_that_of_the_site(site, capsys):
     assert main(["docs", "verdict", "--url"]) == 0
-    assert capsys.readouterr().out == f"{DOCUMENTATION_URL}docs/concepts/verdict.html\n"
+    assert capsys.readouterr().out == f"{SITE}docs/concepts/verdict.html\n"
     assert main(["docs", "--url"]) == 0
-    assert capsys.readouterr().out == f"{DOCUMENTATION_URL}docs/index.html\n"
+    assert capsys.readouterr().out == f"{SITE}docs/index.html\n"
+
+
+def test_nothing_names_an_address_that_is_not_published(monkeypatch, capsys):
+    monkeypatch.setattr(versions, "DOCUMENTATION_URL", "")
+    assert main(["docs", "verdict", "--url"]) == 2
+    assert "has no address yet" in capsys.readouterr().err
+    assert main(["docs", "verdict", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["url"] is None
+    assert main(["train", "--help"]) == 0
+    printed = capsys.readouterr().out
+    assert "'cnpgen docs training'" in " ".join(printed.split())
+    assert "http" not in printed
+    assert "on the site:" not in printed
 
 
 def test_a_search_prints_lines_and_reports_if_there_are_none(capsys):
@@ -75,8 +97,17 @@ def test_a_search_prints_lines_and_reports_if_there_are_none(capsys):
     lines = capsys.readouterr().out.splitlines()
     assert any(line.startswith("verdict:") for line in lines)
     assert all("bernstein" in line.casefold() for line in lines)
-    assert main(["docs", "--search", "no such words anywhere"]) == 1
-    assert capsys.readouterr().out == ""
+    assert main(["docs", "--search", "certificate Zanzibar"]) == 1
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert "no line of the documentation has" in printed.err
+
+
+def test_a_search_finds_words_in_any_order(capsys):
+    assert main(["docs", "--search", "samples grid"]) == 0
+    lines = capsys.readouterr().out
+    assert main(["docs", "--search", "GRID samples"]) == 0
+    assert capsys.readouterr().out == lines
 
 
 def test_a_search_and_a_page_exclude_each_other(capsys):
@@ -92,34 +123,28 @@ def test_an_installation_without_pages_is_an_error_of_the_machine(
     assert "reinstall cnpgen" in capsys.readouterr().err
 
 
-def test_help_has_the_addresses_of_the_site_and_of_the_pages_that_it_names(capsys):
+def test_help_has_the_addresses_of_the_pages_that_it_names(site, capsys):
     assert main(["--help"]) == 0
-    assert (
-        f"documentation: {DOCUMENTATION_URL}, or 'cnpgen docs' without a network"
-        in capsys.readouterr().out
-    )
+    assert "documentation: 'cnpgen docs' lists the pages" in capsys.readouterr().out
     assert main(["train", "--help"]) == 0
     printed = capsys.readouterr().out
     assert "'cnpgen docs training'" in " ".join(printed.split())
-    assert printed.endswith(
-        f"on the site:\n  {DOCUMENTATION_URL}docs/how-to/training.html\n"
-    )
+    assert printed.endswith(f"on the site:\n  {SITE}docs/how-to/training.html\n")
 
 
-def test_an_error_that_names_a_page_has_its_address(monkeypatch, capsys):
+def test_an_error_that_names_a_page_has_its_address(site, monkeypatch, capsys):
     def broken(_):
         raise ImportError("libcoal.so: cannot open shared object file")
 
     monkeypatch.setattr("cnpgen.cli.doctor_command.run", broken)
     assert main(["doctor"]) == 3
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.endswith(f"({DOCUMENTATION_URL}docs/how-to/troubleshooting.html)")
+    assert line.endswith(f"({SITE}docs/how-to/troubleshooting.html)")
 
 
-def test_texts_without_installed_pages_have_no_addresses(monkeypatch, tmp_path):
+def test_texts_without_installed_pages_have_no_addresses(site, monkeypatch, tmp_path):
     text = "'cnpgen docs scale' or 'cnpgen docs\n  no-such-page'"
-    assert docs_command.mentioned_addresses(text) == [
-        f"{DOCUMENTATION_URL}docs/how-to/scale.html"
-    ]
+    addresses = [f"{SITE}docs/how-to/scale.html"]
+    assert docs_command.mentioned_addresses(text) == addresses
     monkeypatch.setattr(docs_command, "docs_folder", lambda: tmp_path)
     assert docs_command.mentioned_addresses(text) == []

@@ -595,6 +595,9 @@ def test_list_can_be_narrowed_and_read_by_programs(run):
         "constraints",
         "objectives",
         "exporters",
+        "families",
+        "planners",
+        "suites",
     ]
     assert found["datasets"][0]["rows"] == 19_800
     assert Path(found["problems"][0]["file"]).is_file()
@@ -605,10 +608,10 @@ def test_a_broken_plug_in_does_not_hide_the_others(run, monkeypatch):
 
     load = cnpgen.schema.registry.load
 
-    def fail(group, name):
+    def fail(group, name, base=None):
         if name == "goal-ik":
             raise RecipeError(["stage 'goal-ik' cannot be imported"])
-        return load(group, name)
+        return load(group, name, base)
 
     monkeypatch.setattr(cnpgen.schema.registry, "load", fail)
     code, out, _ = run("list", "stages")
@@ -921,3 +924,14 @@ def test_suggestions_do_not_depend_on_the_process():
         for seed in "123"
     }
     assert len(orders) == 1
+
+
+def test_the_list_has_planners_families_and_suites_of_addons(run):
+    out = run("list", "planners")[1]
+    assert "trajopt" in out
+    assert "tabletop" in run("list", "families")[1]
+    names = [
+        entry["name"]
+        for entry in json.loads(run("list", "suites", "--json")[1])["suites"]
+    ]
+    assert "hits-81" in names

@@ -11,10 +11,10 @@ import numpy as np
 from cnpgen.errors import CnpgenError
 from cnpgen.store.dataset_spec import ShardTask, load_dataset_spec, shards
 from cnpgen.store.files.atomic import file_sha256
-from cnpgen.store.manifest import finalize
 from cnpgen.store.shard import read_shard
 from cnpgen.store.shard_record import load_record, save_record
 from cnpgen.store.statistics import column_statistics
+from tests.examples.finalized import finalize
 
 
 def task_of(folder: Path, file: str) -> ShardTask:

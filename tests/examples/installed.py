@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from cnpgen.addons.benchmark.benchmark_planner import PLANNERS
-from cnpgen.schema import addons
+from cnpgen.schema.entry_points import entry_points
 
 
 @contextmanager
@@ -29,8 +29,8 @@ def installed_kind(
         f"[{group}]\n{name} = {target}\n", encoding="utf-8"
     )
     monkeypatch.syspath_prepend(str(folder))
-    addons.entry_points.cache_clear()
+    entry_points.cache_clear()
     try:
         yield
     finally:
-        addons.entry_points.cache_clear()
+        entry_points.cache_clear()

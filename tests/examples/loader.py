@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cnpgen.loader.batch import Batch
 from cnpgen.store.dataset_spec import shards, write_dataset_spec
-from cnpgen.store.manifest import finalize
+from tests.examples.finalized import finalize
 from tests.examples.store import SPEC, make_columns, make_shard
 
 ALL = ("start_q", "goal_p", "clearance", "sample_id")

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shards, write_dataset_spec
 from cnpgen.store.field import Field
-from cnpgen.store.manifest import finalize
 from cnpgen.store.sampling_statistics import DensityMap, SamplingStatistics
 from cnpgen.store.shard_record import ShardRecord, commit_shard
+from tests.examples.finalized import finalize
 
 FIELDS = (
     Field(

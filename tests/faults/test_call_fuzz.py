@@ -75,7 +75,12 @@ def test_every_public_callable_has_a_valid_call(valid: list[ValidCall]) -> None:
 def _is_table(value: Any) -> bool:
     """Return whether a class is a table of recipes: its fields are checked when a file is read, not when it is made."""
     return inspect.isclass(value) and value.__module__.startswith(
-        ("cnpgen.robots", "cnpgen.trajectory", "cnpgen.problems")
+        (
+            "cnpgen.robots",
+            "cnpgen.trajectory",
+            "cnpgen.problems",
+            "cnpgen.addons.trajectories.sampled_trajectory",
+        )
     )
 
 

@@ -9,7 +9,12 @@ import casadi as ca
 import pytest
 
 from cnpgen.kernels import library as library_module
-from cnpgen.kernels.library import BUILDER_PACKAGES, PACKAGE_FOLDER, KernelLibrary
+from cnpgen.kernels.library import (
+    BUILDER_PACKAGES,
+    PACKAGE_FOLDER,
+    KernelLibrary,
+    subpackage_of,
+)
 from cnpgen.pipelines.stages.reach import tip_state
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
@@ -80,24 +85,21 @@ BUILDERS = sorted(filter(makes_functions, MODULES))
 
 
 def test_the_builders_of_every_package_are_found() -> None:
-    assert {name.split(".")[1] for name in BUILDERS} == {
-        *(
-            "benchmark",
-            "losses",
-            "pipelines",
-            "planner",
-            "refine",
-            "kernels",
-            "problems",
-        ),
+    assert {subpackage_of(name) for name in BUILDERS} == {
+        "addons/benchmark",
+        "losses",
+        "pipelines",
+        "planner",
+        "refine",
+        "kernels",
+        "problems",
     }
 
 
 @pytest.mark.parametrize("module", BUILDERS)
 def test_all_imports_of_a_builder_are_in_the_key_of_its_tapes(module: str) -> None:
-    hashed = tuple(
-        f"cnpgen.{package}" for package in (*BUILDER_PACKAGES, module.split(".")[1])
-    )
+    own = subpackage_of(module).replace("/", ".")
+    hashed = tuple(f"cnpgen.{package}" for package in (*BUILDER_PACKAGES, own))
     covered = tuple(f"{package}." for package in (*hashed, *WITHOUT_EFFECT))
     missing = sorted(
         name for name in closure(module) if not f"{name}.".startswith(covered)
@@ -161,3 +163,14 @@ def test_the_key_of_a_plug_in_s_tape_covers_the_whole_package(copy: Path) -> Non
     library_module._digest_of.cache_clear()
     (copy / "cli" / "main.py").write_text("")
     assert library_module._source_digests(of_a_plug_in)[0] != before[0]
+
+
+def test_losses_depend_on_the_sources_of_published_rules(copy: Path) -> None:
+    from cnpgen.losses.integrand import loss_values
+
+    library_module._digest_of.cache_clear()
+    before = library_module._source_digests(loss_values)
+    with (copy / "addons" / "paper" / "published_conditions.py").open("a") as file:
+        file.write("# changed\n")
+    library_module._digest_of.cache_clear()
+    assert library_module._source_digests(loss_values) != before

@@ -1,5 +1,6 @@
 """Engines: what is chosen, what a cluster is asked for, and real clusters of processes on this machine."""
 
+import importlib.util
 import logging
 import os
 import pickle
@@ -252,7 +253,8 @@ def test_an_address_of_another_form_is_refused_at_once(engine, address):
 def test_an_address_where_nobody_listens_is_one_sentence_within_seconds(
     engine, monkeypatch
 ):
-    monkeypatch.setattr(clusters.importlib, "import_module", lambda _name: None)
+    nothing = SimpleNamespace(import_module=lambda _name: None, util=importlib.util)
+    monkeypatch.setattr(clusters, "importlib", nothing)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"

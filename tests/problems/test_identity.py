@@ -86,7 +86,7 @@ def test_every_key_of_a_recipe_but_its_labels_changes_the_identity(name: str) ->
         "name",
         "robot.joints",
         "robot.tip",
-        "robot.home",
+        "robot.base",
         "limits.torque_scale",
         "constraint",
     } < keys_seen

@@ -282,7 +282,7 @@ def test_a_mistake_does_not_hide_another_one_that_has_nothing_to_do_with_it(file
     keys = [error.split(":")[0] for error in errors_of(load_problem, files["problem"])]
     assert keys == [
         "robot.joints",
-        "robot.home",
+        "robot.base",
         "limits.velocity_scale",
         "obstacle 1.x",
         "obstacle 1.top",

@@ -1,10 +1,10 @@
 """The registry of stages and constraints."""
 
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, EntryPoints
 
 import pytest
 
+from cnpgen.cli.main import main
 from cnpgen.errors import RecipeError
 from cnpgen.machine.engine import ClusterEngine
 from cnpgen.pipelines.scene_family import SceneFamily
@@ -15,6 +15,7 @@ from cnpgen.problems.objectives import ObjectiveTerm
 from cnpgen.problems.published_rules import PublishedRules
 from cnpgen.problems.scenes.scene_reader import SceneReader
 from cnpgen.schema import addons, registry
+from cnpgen.schema.entry_points import EntryPoint
 from cnpgen.schema.keys import field
 from cnpgen.schema.registry import CONSTRAINTS, STAGES, load, name_of, names
 from cnpgen.store.dataset_document import DatasetDocument
@@ -52,22 +53,19 @@ THE_STRING = "not a class"
 @pytest.fixture
 def register(monkeypatch):
     """Return a function that installs entry points (group, name, value)."""
-    entries: list[EntryPoint] = []
-
-    def fake():
-        return EntryPoints(entries)
+    entries: dict[str, tuple[EntryPoint, ...]] = {}
 
     def add(group, name, value):
-        entries.append(EntryPoint(name=name, value=value, group=group))
-        addons.entry_points.cache_clear()
+        entries[group] = (*entries.get(group, ()), EntryPoint(group, name, value))
 
-    monkeypatch.setattr("importlib.metadata.entry_points", fake)
+    monkeypatch.setattr(addons, "entry_points", lambda: entries)
+    monkeypatch.setattr(registry, "entry_points", lambda: entries)
     monkeypatch.setattr(
-        registry, "BUILT_IN", {STAGES: {"roll": f"{__name__}:Roll"}, CONSTRAINTS: {}}
+        registry,
+        "BUILT_IN",
+        {STAGES: {"roll": f"{__name__}:Roll"}, CONSTRAINTS: {}},
     )
-    addons.entry_points.cache_clear()
-    yield add
-    addons.entry_points.cache_clear()
+    return add
 
 
 def test_a_built_in_kind_is_imported_by_name(register):
@@ -198,3 +196,28 @@ def test_every_built_in_kind_can_be_loaded(group):
     assert names(group)
     for name in names(group):
         assert name_of(group, load(group, name)) == name
+
+
+def test_a_package_adds_a_command(register, capsys, monkeypatch, tmp_path):
+    (tmp_path / "greeting_command.py").write_text(
+        '"""Greet.\n\nMore."""\n\n\n'
+        "def add_options(parser):\n    parser.add_argument('name')\n\n\n"
+        "def run(arguments):\n    print('hello', arguments.name)\n    return 1\n",
+        encoding="utf-8",
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    register(registry.COMMANDS, "greet", "greeting_command")
+    assert main(["greet", "you"]) == 1
+    assert capsys.readouterr().out == "hello you\n"
+    assert main(["--help"]) == 0
+    assert "\n    greet         greet\n" in capsys.readouterr().out
+    assert main(["gret"]) == 2
+    assert "did you mean 'greet'?" in capsys.readouterr().err
+
+
+def test_a_command_that_cannot_be_imported_does_not_hide_the_others(register, capsys):
+    register(registry.COMMANDS, "broken", "no_such_module_of_a_package")
+    assert main(["--help"]) == 0
+    assert "    broken        cannot be used: " in capsys.readouterr().out
+    assert main(["broken"]) == 3
+    assert "the command 'broken' cannot be imported" in capsys.readouterr().err

@@ -21,8 +21,9 @@ from cnpgen.store.dataset_spec import shards, write_dataset_spec
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.files.documents import save_document
 from cnpgen.store.intact import RERUN_HINT
-from cnpgen.store.manifest import finalize, load_manifest
+from cnpgen.store.manifest import load_manifest
 from tests.conftest import some
+from tests.examples.finalized import finalize
 from tests.examples.store import SPEC, dataset, make_shard, make_shards
 
 __all__ = ["dataset"]

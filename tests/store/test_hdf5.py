@@ -298,7 +298,7 @@ def test_nothing_else_in_the_package_opens_hdf5() -> None:
         "store/files/checksum_file.py",
         "store/shard.py",
         "plans/plan_file.py",
-        "problems/scenes/mpinets_scenes.py",
+        "addons/scene_files/mpinets_scenes.py",
         "plans/formats.py",
     }
     assert {name for name, _ in opened} == makers | {"store/files/hdf5.py"}

@@ -17,8 +17,9 @@ from cnpgen.store import manifest as manifest_module
 from cnpgen.store.check import check_dataset
 from cnpgen.store.dataset_spec import shards, write_dataset_spec
 from cnpgen.store.files.atomic import file_sha256
-from cnpgen.store.manifest import finalize, load_manifest
+from cnpgen.store.manifest import load_manifest
 from cnpgen.store.shard_record import commit_shard
+from tests.examples.finalized import finalize
 from tests.examples.store import (
     FIELDS,
     SPEC,

@@ -15,7 +15,6 @@ from cnpgen.errors import DatasetError, MachineError
 from cnpgen.store.check import check_dataset
 from cnpgen.store.dataset_spec import shards, write_dataset_spec
 from cnpgen.store.files.atomic import file_sha256
-from cnpgen.store.manifest import finalize
 from cnpgen.store.sampling_statistics import (
     DensityMap,
     SamplingStatistics,
@@ -31,6 +30,7 @@ from cnpgen.store.shard_record import (
     record_to_json,
     save_record,
 )
+from tests.examples.finalized import finalize
 from tests.examples.store import (
     SPEC,
     make_columns,

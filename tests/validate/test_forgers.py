@@ -16,11 +16,11 @@ from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.store.dataset_spec import load_dataset_spec, shards
-from cnpgen.store.manifest import finalize
 from cnpgen.store.shard import read_shard
 from cnpgen.store.shard_record import commit_shard, load_record
 from cnpgen.validate.validate_dataset import validate_dataset
 from tests.conftest import some
+from tests.examples.finalized import finalize
 
 ROBOT = load_robot(load_problem("airhockey"))
 FRAME = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED

@@ -9,12 +9,12 @@ from cnpgen.store.dataset_spec import load_dataset_spec
 from cnpgen.store.dataset_summary import STATS_FORMAT, STATS_VERSION
 from cnpgen.store.files.documents import load_document, save_document
 from cnpgen.store.layout import STATS
-from cnpgen.store.manifest import finalize
 from cnpgen.validate.validate_dataset import (
     check_recipe,
     check_statistics,
     validate_dataset,
 )
+from tests.examples.finalized import finalize
 
 
 def test_the_recipe_in_a_specification_must_have_the_recorded_digest(damaged):

@@ -31,11 +31,15 @@ Plan = Callable[[Plans], Answer]
 class Setting:
     """Information for a planner before the first problem.
 
-    Attributes: problem: Record of the problem. model: Name of the shipped model for
-        problems of this kind, or empty. time_limit: Planning time per problem [s]; a
-        planner that takes longer has no plan and is stopped. seed: Seed of random
-        planners. repetition: Number of the repetition, from 0. parameters: Values of
-        the planner's fields, as in a recipe; the others have their defaults.
+    Attributes:
+        problem: Record of the problem.
+        model: Name of the shipped model for problems of this kind, or empty.
+        time_limit: Planning time per problem [s]; a planner that takes longer has no
+            plan and is stopped.
+        seed: Seed of random planners.
+        repetition: Number of the repetition, from 0.
+        parameters: Values of the planner's fields, as in a recipe; the others have
+            their defaults.
     """
 
     problem: ProblemRecord

@@ -34,14 +34,11 @@ MAX_FILM_FRAMES = 300  # less than 1 MB
 _STYLE = "body{font-family:sans-serif;max-width:75em;margin:2em auto}td,th{padding:.2em .8em;text-align:right}"
 _STYLE += "td:first-child,th:first-child{text-align:left}table{border-collapse:collapse}tr{border-top:1px solid #ccc}"
 _STYLE += "svg{max-width:100%;height:auto}figure{display:inline-block;width:46%;margin:1%}img,video{width:100%}"
-MIN_LOGARITHMIC_RATIO = 20.0  # of the largest to the smallest positive value, from which axes are logarithmic
+# Of the largest to the smallest positive value, from which axes are logarithmic.
+MIN_LOGARITHMIC_RATIO = 20.0
 PANELS_PER_ROW = 4
-STYLES = (
-    "-",
-    "--",
-    "-.",
-    ":",
-)  # with the ten colors of matplotlib, forty planners differ
+# With the ten colors of matplotlib, forty planners differ.
+STYLES = "-", "--", "-.", ":"
 COLORS = 10
 
 
@@ -163,9 +160,11 @@ def save_benchmark_report(
 ) -> Path:
     """Write the report of a benchmark as one self-contained file; an existing file is replaced.
 
-    Args: benchmark: Result of ``run_benchmark``. path: Output file, ``.html``. video:
-        Whether to film the first plan of every planner, instead of an image; takes some
-        seconds each.
+    Args:
+        benchmark: Result of ``run_benchmark``.
+        path: Output file, ``.html``.
+        video: Whether to film the first plan of every planner, instead of an image;
+            takes some seconds each.
 
     Raises:
         MachineError: matplotlib is missing, or the file cannot be written.

@@ -118,11 +118,12 @@ def summarize_results(
 ) -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
     """Summarize the rows of all planners on a plant, or of their plans only if it is empty.
 
-    Returns: Planner -> ``{"ratios": ..., "figures": ...}``, both empty if the planner
-        does not apply. A ratio has ``count``, ``of``, ``share`` and its 95 % interval
-        by Wilson, ``low`` and ``high``. A figure has ``median``, ``q1``, ``q3``, the
-        tails ``p99``, ``p999`` and ``max``, and ``of``, its number of values. A tail is
-        the next larger value, so p99 of fewer than 100 values is the maximum. Both have
+    Returns:
+        Planner -> ``{"ratios": ..., "figures": ...}``, both empty if the planner does
+        not apply. A ratio has ``count``, ``of``, ``share`` and its 95 % interval by
+        Wilson, ``low`` and ``high``. A figure has ``median``, ``q1``, ``q3``, the tails
+        ``p99``, ``p999`` and ``max``, and ``of``, its number of values. A tail is the
+        next larger value, so p99 of fewer than 100 values is the maximum. Both have
         ``p``, the p-value of the difference from the reference planner, and ``p_holm``,
         corrected by Holm for all comparisons of this table.
     """

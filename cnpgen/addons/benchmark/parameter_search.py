@@ -59,7 +59,7 @@ def search_parameters(
     ``search.csv``.
 
     Return the trials, the best one first: by solved problems, then by motion time, then
-    by planning time.
+        by planning time.
     """
     trials, seed = (
         integer("trials", trials, least=1, most=MAX_TRIALS),

@@ -20,7 +20,8 @@ from cnpgen.errors import CnpgenError, MachineError, UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.plans.plans import Plans
 
-STOP_MARGIN_S = 1.0  # after its time limit a planner is stopped; an answer in between is not counted
+# After its time limit a planner is stopped; an answer in between is not counted.
+STOP_MARGIN_S = 1.0
 MAX_PREPARATION_TIME_S = 300.0  # including the compilation of kernels
 STDERR = 2  # the file descriptor
 
@@ -113,7 +114,9 @@ class PlannerProcess:
         """Start the process; return the outcome of all problems if the planner cannot be prepared."""
         start = time.perf_counter()
         self._pipe, child_end = multiprocessing.Pipe()
-        with child_end:  # multiprocessing.Process would run the caller's script and is forbidden in dask workers
+        # multiprocessing.Process would run the caller's script and is forbidden in dask
+        # workers.
+        with child_end:
             program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; "
             program += f"serve({child_end.fileno()})"
             command = [sys.executable, "-c", program]

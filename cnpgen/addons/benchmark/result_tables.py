@@ -37,12 +37,8 @@ PRINTED: dict[
         "aqp": {"scored": "52.7 % (real robot)"},
     },
 }
-PYTHON_LOOPS = (
-    "aqp",
-    "cbirrt",
-    "rrtconnect",
-    "sscbirrt",
-)  # planners whose authors' inner loops are in C++
+# Planners whose authors' inner loops are in C++.
+PYTHON_LOOPS = "aqp", "cbirrt", "rrtconnect", "sscbirrt"
 TAIL_FIGURES = ("planning_ms", "planning_cpu_ms")  # printed with their tails
 MAX_PRINTED_P = 0.05
 TABLE_FILES = ("results.csv", "tables.md", "tables.tex")

@@ -17,7 +17,7 @@ from cnpgen.addons.benchmark.hypothesis_tests import FIGURES
 from cnpgen.addons.benchmark.suite import Suite
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.machine.versions import __version__
+from cnpgen.machine.versions import __version__, installed_version
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.problem import resolved
 from cnpgen.schema import addons
@@ -326,13 +326,15 @@ class ResultsFolder:
     ) -> Results:
         """Open the results of a planner and a repetition; see ``open_results``."""
         packages = [
-            entry.dist for entry in addons.installed(PLANNERS) if entry.name == planner
+            entry.distribution
+            for entry in addons.installed(PLANNERS)
+            if entry.name == planner
         ]
         identity = {
             **self._shared,
             "planner": planner,
             "planner_version": next(
-                (package.version for package in packages if package is not None),
+                filter(None, map(installed_version, packages)),
                 __version__,
             ),
             "parameters": parameters,

@@ -62,10 +62,13 @@ Rows = Generator[dict[str, Any], None, None]
 class Benchmark:
     """Results of planners on the problems of a suite.
 
-    Attributes: suite: The suite. problems: Its problems. prefix: Of replanning
-        scenarios, the prefixes of the first motions. results: Planner -> its rows,
-        ordered by repetition and problem ('cnpgen docs benchmark'). They cover all
-            results in the folder, also those of earlier runs.
+    Attributes:
+        suite: The suite.
+        problems: Its problems.
+        prefix: Of replanning scenarios, the prefixes of the first motions.
+        results: Planner -> its rows, ordered by repetition and problem ('cnpgen docs
+            benchmark'). They cover all results in the folder, also those of earlier
+            runs.
         plants: Plants that executed plans in this run.
         runs: Date, machine, versions and seed of the runs that wrote into the folder;
             the last one is this run.
@@ -147,13 +150,15 @@ def run_benchmark(
     engine, its workers also plan, each for other problems; planning times are then
     those of a shared machine.
 
-    Args: suite: A suite, or the name or file of a suite or dataset. folder: Folder for
-        results, one file per planner; created if missing. planners: Names of planners.
+    Args:
+        suite: A suite, or the name or file of a suite or dataset.
+        folder: Folder for results, one file per planner; created if missing.
+        planners: Names of planners.
         n: Number of problems, the first ones; random suites may have more than the
-        recipe. plants: Plants that execute plans; none by default. environment: A clone
-        of the Air Hockey Challenge's environment, which also executes plans, as the
-        plant
-            "challenge".
+            recipe.
+        plants: Plants that execute plans; none by default.
+        environment: A clone of the Air Hockey Challenge's environment, which also
+            executes plans, as the plant "challenge".
         time_limit: Planning time per problem [s]; later answers are not counted, and
             the planner's processes are ended.
         seed: Seed of random planners. Each problem and repetition has its own random
@@ -175,9 +180,9 @@ def run_benchmark(
             planner parameters in the folder.
         progress: Called after every problem.
 
-    Raises: UsageError: A planner, plant or environment is unknown or unsuitable, or the
-        folder has results of another
-            run.
+    Raises:
+        UsageError: A planner, plant or environment is unknown or unsuitable, or the
+            folder has results of another run.
         RecipeError: The suite has errors.
         MachineError: MuJoCo is missing, the results cannot be written, or a cluster
             cannot be reached.

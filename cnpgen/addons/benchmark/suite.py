@@ -104,10 +104,12 @@ class Suite:
     def problems(self, n: int | None = None) -> tuple[Plans, ExecutedPrefix | None]:
         """Return the boundary problems, as plans without motions.
 
-        Args: n: Number of problems, the first ones; random suites may have more than
-            the recipe.
+        Args:
+            n: Number of problems, the first ones; random suites may have more than the
+                recipe.
 
-        Returns: The problems and, of replanning scenarios, the prefixes of the first
+        Returns:
+            The problems and, of replanning scenarios, the prefixes of the first
             motions.
 
         Raises:
@@ -134,8 +136,9 @@ class Suite:
 def load_suite(name_or_path: str | Path) -> Suite:
     """Load a suite; a dataset or a pipeline becomes a suite of its samples.
 
-    Args: name_or_path: Name of a shipped suite, dataset or pipeline, or path of such a
-        file.
+    Args:
+        name_or_path: Name of a shipped suite, dataset or pipeline, or path of such a
+            file.
 
     Raises:
         RecipeError: With every error in the file.

@@ -35,7 +35,8 @@ _ADDRESSES = {  # name -> pattern of addresses, examples
     ),
     "ray": (r"auto|(ray://)?[^\s/:]+:\d{1,5}", "host:6379 or auto"),
 }
-FIRST_WARNING_S = 10.0  # time without workers before the first warning; doubled for each further warning
+# Time without workers before the first warning; doubled for each further warning.
+FIRST_WARNING_S = 10.0
 _LOG = logging.getLogger(__name__)
 
 T = TypeVar("T")
@@ -68,8 +69,9 @@ class Cluster(ABC):
     ) -> Generator[R, None, None]:
         """Run a function on every task and yield the results.
 
-        Raises: MachineError: A task has crashed several workers, or the connection to
-            the cluster is lost.
+        Raises:
+            MachineError: A task has crashed several workers, or the connection to the
+                cluster is lost.
         """
         submit, left = self.prepared(function), enumerate(tasks)
         under_way: dict[Any, int] = {}

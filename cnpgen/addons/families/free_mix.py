@@ -19,9 +19,9 @@ from cnpgen.pipelines.scene_family import (
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.schema.keys import Range, field
 
-MIN_BASE_DISTANCE_M = (
-    0.3  # of an obstacle's center from the axis of the base, plus its radius
-)
+# Of an obstacle's center from the axis of the base, plus its radius.
+
+MIN_BASE_DISTANCE_M = 0.3
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ from typing import Any
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, add_json
 from cnpgen.cli.terminal import Meter
-from cnpgen.errors import UsageError, counted
+from cnpgen.errors import RecipeError, UsageError, counted
 
 
 def _family(text: str) -> str:
@@ -138,11 +138,16 @@ def _check_place(out: Path, *, force: bool) -> None:
 
 def _listing(*, as_json: bool) -> str:
     """Return the families with their parameters."""
-    from cnpgen.addons.families.scene_generator import shipped_families
+    from cnpgen.schema import registry
     from cnpgen.schema.keys import keys
 
     table: dict[str, Any] = {}
-    for name, family in shipped_families().items():
+    for name in registry.names(registry.FAMILIES):
+        try:
+            family = registry.load(registry.FAMILIES, name)
+        except RecipeError as error:  # of another package
+            table[name] = {"description": f"cannot be used: {error}", "parameters": {}}
+            continue
         parameters = {
             key.name: {
                 "description": key.doc,

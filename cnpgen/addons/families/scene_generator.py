@@ -42,9 +42,8 @@ MAX_PAIRS = 24  # of a start and a goal that are tried for one problem
 MAX_FAILED_SCENES = 20  # in a row, without any problem
 END_MARGIN_M = 0.005  # clearance of starts and goals
 STRAIGHT_SHARE = 0.1  # of the problems that may be solvable by a straight line
-NEUTRAL_SPREAD_RAD = (
-    0.1  # standard deviation of neutral starts around the base configuration
-)
+# Standard deviation of neutral starts around the base configuration.
+NEUTRAL_SPREAD_RAD = 0.1
 _STARTS = {"neutral": 0.4, "grasp": 0.4, "random": 0.2}  # kind of start -> probability
 
 
@@ -65,9 +64,10 @@ def shipped_families() -> dict[str, type[SceneFamily]]:
 def load_family(name: str, parameters: Mapping[str, Any] | None = None) -> SceneFamily:
     """Return a family by its name.
 
-    Args: name: Its name among ``shipped_families``, or that of an installed package.
+    Args:
+        name: Its name among ``shipped_families``, or that of an installed package.
         parameters: Values of its fields, as in recipes: ``{"tables": [1, 2], "height":
-        "[0, 30] cm"}``.
+            "[0, 30] cm"}``.
 
     Raises:
         UsageError: The family or a parameter is unknown, or a value is invalid.
@@ -117,9 +117,9 @@ def make_scenes(
         parameters: Values of the fields of a named family.
         progress: Called with the number of problems since the last call.
 
-    Raises: UsageError: An argument is invalid, the problem has an equality constraint,
-        or no problems are found for this
-            robot.
+    Raises:
+        UsageError: An argument is invalid, the problem has an equality constraint, or
+            no problems are found for this robot.
     """
     n, seed = integer("n", n, least=1, most=MAX_SCENES), integer("seed", seed, least=0)
     per_scene = integer("per_scene", per_scene, least=1)

@@ -25,14 +25,18 @@ def evaluate(
     would stay nan when a mask multiplies it by 0, and would reach every weight of the
     network.
 
-    Args: loss: The loss. path: Path control points [rad], shape (N, C, n). rate: Rate
-        control points [1/s], shape (N, R). weights: Weight of every constraint term,
-        shape (m,). gradient: Whether to compute the gradients in path and rate;
-        otherwise they are empty. options: ``obstacle_poses``, ``start_tip`` and
-        ``shift`` of the loss.
+    Args:
+        loss: The loss.
+        path: Path control points [rad], shape (N, C, n).
+        rate: Rate control points [1/s], shape (N, R).
+        weights: Weight of every constraint term, shape (m,).
+        gradient: Whether to compute the gradients in path and rate; otherwise they are
+            empty.
+        options: ``obstacle_poses``, ``start_tip`` and ``shift`` of the loss.
 
-    Returns: Totals, terms, and the gradients of the totals in path, rate and weights,
-        the last of shape (N, m).
+    Returns:
+        Totals, terms, and the gradients of the totals in path, rate and weights, the
+        last of shape (N, m).
     """
     value = loss(path, rate, weights=weights, gradient=gradient, **options)
     gradients = value.path_gradient, value.rate_gradient, value.terms[:, 1:].copy()

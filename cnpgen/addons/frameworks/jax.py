@@ -41,8 +41,10 @@ _MAX_INT32 = np.iinfo(np.int32).max
 def to_jax(batch: Batch, *, device: Any = None) -> dict[str, jax.Array]:
     """Return a batch as JAX arrays; ``jax.device_put(batch.table)`` transfers its packed table at once.
 
-    Args: batch: The batch, which must not be written to afterwards, because JAX may use
-        its memory. device: Device or sharding of the arrays; JAX's default if None.
+    Args:
+        batch: The batch, which must not be written to afterwards, because JAX may use
+            its memory.
+        device: Device or sharding of the arrays; JAX's default if None.
 
     Returns:
         Field name -> values, shape (B, width) or (B,).
@@ -64,13 +66,16 @@ def control_points(
     The computation runs on the host in float64. ``layer.plans`` returns plans of the
     same outputs in float64.
 
-    Args: layer: The boundary layer of the problem. tasks: N tasks from ``layer.tasks``;
-        constants, but they may be an argument under ``jit``. phi: Network outputs of
-        the path, shape (N, ``layer.path_outputs``). log_rate: Network outputs of the
-        rate, shape (N, ``layer.rate_outputs``).
+    Args:
+        layer: The boundary layer of the problem.
+        tasks: N tasks from ``layer.tasks``; constants, but they may be an argument
+            under ``jit``.
+        phi: Network outputs of the path, shape (N, ``layer.path_outputs``).
+        log_rate: Network outputs of the rate, shape (N, ``layer.rate_outputs``).
 
-    Returns: Path [rad] and rate [1/s] control points, shape (N, C, n) and (N, R), in
-        the type of phi, at least float32.
+    Returns:
+        Path [rad] and rate [1/s] control points, shape (N, C, n) and (N, R), in the
+        type of phi, at least float32.
 
     Raises:
         UsageError: A shape is wrong.
@@ -98,23 +103,26 @@ def plan_loss(
     other plans. This holds for ``jnp.where(jnp.isfinite(total), total, 0)`` and for
     ``total.mean()``, which is nan itself.
 
-    Args: loss: The loss; its ``dtype`` is the precision of values and gradients. path:
-        Path control points [rad], shape (N, C, n), of any type. rate: Rate control
-        points [1/s], shape (N, R), positive. weights: Weight of every constraint term
-        (e^alpha), shape (m,); or term -> weight, see ``PlanLoss``. obstacle_poses:
-        Poses and sizes of the obstacles, shape (N, width). A constant like the
-        following arguments, but
-            under ``jit`` it may be an argument.
+    Args:
+        loss: The loss; its ``dtype`` is the precision of values and gradients.
+        path: Path control points [rad], shape (N, C, n), of any type.
+        rate: Rate control points [1/s], shape (N, R), positive.
+        weights: Weight of every constraint term (e^alpha), shape (m,); or term ->
+            weight, see ``PlanLoss``.
+        obstacle_poses: Poses and sizes of the obstacles, shape (N, width). A constant
+            like the following arguments, but under ``jit`` it may be an argument.
         start_tip: Positions of the tip at the start [m], shape (N, 3).
         shift: Shift of the quadrature nodes, in [0, 1); of a traced value only the
             fractional part is used.
 
-    Returns: The totals, shape (N,), and the integrals without weights, shape (N, 1 +
-        m), which have no gradient.
+    Returns:
+        The totals, shape (N,), and the integrals without weights, shape (N, 1 + m),
+        which have no gradient.
 
-    Raises: UsageError: A shape or a value known at tracing time is wrong, or the loss
-        is in float64 and JAX is not. Wrong
-            traced weights raise it inside JAX's own error.
+    Raises:
+        UsageError: A shape or a value known at tracing time is wrong, or the loss is in
+            float64 and JAX is not. Wrong traced weights raise it inside JAX's own
+            error.
     """
     if loss.dtype == "float64" and not jax.config.jax_enable_x64:
         raise UsageError(

@@ -14,7 +14,7 @@ def to_tensorflow(batches: Batches) -> Any:
     """Return batches as a ``tf.data.Dataset`` of dicts; every pass yields the remaining batches of an epoch.
 
     TensorFlow may prefetch batches: the position is ``batches.state(epoch=...,
-    batch=...)``.
+        batch=...)``.
 
     Args:
         batches: Batches from ``dataset.batches(...)``; observations are left out.

@@ -64,10 +64,12 @@ def publish_dataset(
     Returns:
         Address of the repository; empty if it was not uploaded.
 
-    Raises: UsageError: The repository has no valid name or is inside the dataset, or
-        the dataset has no license. DatasetError: The dataset is unfinished or damaged.
-        MissingExtraError: pyarrow or huggingface_hub is not installed. MachineError:
-        The folder cannot be written, or the upload failed.
+    Raises:
+        UsageError: The repository has no valid name or is inside the dataset, or the
+            dataset has no license.
+        DatasetError: The dataset is unfinished or damaged.
+        MissingExtraError: pyarrow or huggingface_hub is not installed.
+        MachineError: The folder cannot be written, or the upload failed.
     """
     if not REPOSITORY.fullmatch(to):
         raise UsageError(

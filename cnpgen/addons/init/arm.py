@@ -18,10 +18,8 @@ from cnpgen.robots.robot import recipe_errors_in
 from cnpgen.robots.urdf import number_in, read_urdf, urdf_tree
 from cnpgen.robots.urdf_parameters import LinkInertia, UrdfJoint, urdf_parameters
 
-DEFAULT_RANGE_RAD, DEFAULT_RANGE_M = (
-    math.pi,
-    0.5,
-)  # ranges to either side, where the URDF has none
+# Ranges to either side, where the URDF has none.
+DEFAULT_RANGE_RAD, DEFAULT_RANGE_M = math.pi, 0.5
 MAX_INERTIA_ERROR = 0.01  # relative; published URDFs round their numbers
 MAX_LIMITED_RAD = 1000.0  # largest limit of a revolute joint that is one
 _FINGER = re.compile(r"finger|knuckle|thumb|jaw|claw")  # in names of links
@@ -33,7 +31,9 @@ class ArmJoint:
     """A movable joint with the limits of the URDF or placeholders."""
 
     name: str
-    kind: str  # type in the URDF: "revolute", "continuous", "prismatic" or one that cannot be planned
+    # Type in the URDF: "revolute", "continuous", "prismatic" or one that cannot be
+    # planned.
+    kind: str
     lower: float  # limit of the position [rad or m]
     upper: float
     velocity: float  # limit [rad/s or m/s]
@@ -81,9 +81,10 @@ class Arm:
 def read_arm(urdf: Path, tip: str | None) -> Arm:
     """Read an arm, whose tip frame is a link or a joint, by default the only link without a child.
 
-    Raises: RecipeError: The file cannot be read, needs xacro, or has no joint that
-        moves the tip. UsageError: The frame does not exist, or several links have no
-        child.
+    Raises:
+        RecipeError: The file cannot be read, needs xacro, or has no joint that moves
+            the tip.
+        UsageError: The frame does not exist, or several links have no child.
     """
     try:
         tree = urdf_tree(read_urdf(urdf))

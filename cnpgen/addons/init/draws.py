@@ -24,18 +24,11 @@ Array = NDArray[np.float64]
 BASE_CANDIDATES = 4000  # random states; the base configuration is one of them
 LIMIT_SHARE = 0.1  # share of a joint's range at either end that is left out
 MAX_LOAD = 0.7  # share of the torque limits that the base configuration may use at rest
-MIN_LINK_CLEARANCE_M = (
-    5e-3  # between links at the base configuration, if a state has it
-)
+# Between links at the base configuration, if a state has it.
+MIN_LINK_CLEARANCE_M = 5e-3
 MAX_CLEARANCE_CHECKS = 500  # free states whose clearance is measured
-BOX_SIZES = (
-    0.3,
-    0.22,
-    0.16,
-    0.11,
-    0.08,
-    0.05,
-)  # edge of the boxes / reach, the largest first
+# Edge of the boxes / reach, the largest first.
+BOX_SIZES = 0.3, 0.22, 0.16, 0.11, 0.08, 0.05
 MIN_BOX_DISTANCE = 0.15  # distance of the boxes / reach, so that no task is trivial
 GOOD_YIELD = 0.5  # share of accepted candidates at which the search for a box ends
 MIN_YIELD = 0.02  # share below which no box is usable
@@ -54,7 +47,8 @@ def comfortable_base(
     the distance from the nearest limit. If no state is free of collisions and within
     the torque limits, the best of the others is returned.
 
-    Returns: Joint positions [rad], rounded, and notes about conditions that it does not
+    Returns:
+        Joint positions [rad], rounded, and notes about conditions that it does not
         meet.
     """
     world, states = World(robot), _states(robot)

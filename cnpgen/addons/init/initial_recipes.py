@@ -39,17 +39,17 @@ from cnpgen.schema.keys import PerJoint, Range
 
 Array = NDArray[np.float64]
 
-GUESS_RANGE_RAD, GUESS_RANGE_M = (
-    0.5,
-    0.1,
-)  # range of inverse kinematics guesses around the base configuration
-INITIAL_JERK_RATE = 100.0  # jerk limits per acceleration limit [1/s]; Franka Research 3: 500 ('cnpgen docs references')
+# Range of inverse kinematics guesses around the base configuration.
+GUESS_RANGE_RAD, GUESS_RANGE_M = 0.5, 0.1
+# Jerk limits per acceleration limit [1/s]; Franka Research 3: 500 ('cnpgen docs
+# references').
+INITIAL_JERK_RATE = 100.0
 MAX_OVERLOAD = 10.0  # torque that gravity needs / torque limit of the URDF
 TORQUE_SCALE = 0.8  # planning limit / URDF limit of joint torques
-MIN_HOLDING_FRACTION = 0.25  # of the random states in which a joint's torque limit must suffice to hold the arm
-TORQUE_STATES = (
-    1000  # random states that determine placeholders of missing torque limits
-)
+# Of the random states in which a joint's torque limit must suffice to hold the arm.
+MIN_HOLDING_FRACTION = 0.25
+# Random states that determine placeholders of missing torque limits.
+TORQUE_STATES = 1000
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Any
 
 from cnpgen.addons.init.arm import Arm, ArmJoint
 from cnpgen.errors import UsageError, nearest
-from cnpgen.store.files.yaml_document import read_yaml
+from cnpgen.problems.scenes.yaml_document import read_yaml
 
 _LIMITS = {  # flag -> the keys that it switches on
     "has_position_limits": ("min_position", "max_position"),
@@ -38,9 +38,10 @@ class JointLimits:
 def read_joint_limits(path: Path, joints: tuple[str, ...]) -> JointLimits:
     """Read a joint_limits.yaml for the joints of a robot.
 
-    Raises: UsageError: The file has other keys, a flag without its values or values
-        without their flag, a joint that the robot lacks, or a value that is not a
-        number. MissingExtraError: PyYAML is missing.
+    Raises:
+        UsageError: The file has other keys, a flag without its values, a joint that the
+            robot lacks, or a value that is not a number.
+        MissingExtraError: PyYAML is missing.
     """
     documents = [each for each in read_yaml(path, numbers=True) if each is not None]
     content = documents[0] if len(documents) == 1 else None

@@ -14,21 +14,18 @@ from cnpgen.robots.shape.link_pairs import LinkPair
 from cnpgen.robots.urdf import read_urdf
 from cnpgen.robots.urdf_changes import with_collision_geometry
 
-MAX_GAP = 0.01  # fraction of the free states that convex parts may reject without further decomposition
+# Fraction of the free states that convex parts may reject without further
+# decomposition.
+MAX_GAP = 0.01
 MAX_PAIR_GAP = 1e-3  # of a pair whose links are not decomposed further
 LARGE_PAIR_GAP = 0.02  # of a pair that a note names
-PART_COUNTS = (
-    4,
-    8,
-    16,
-)  # maximum numbers of convex parts of a mesh, in the order in which they are tried
-MIN_FREE_FRACTION = (
-    0.01  # of the sampled states, below which pairs in contact are ignored
-)
+# Maximum numbers of convex parts of a mesh, in the order in which they are tried.
+PART_COUNTS = 4, 8, 16
+# Of the sampled states, below which pairs in contact are ignored.
+MIN_FREE_FRACTION = 0.01
 MAX_IGNORED_PAIRS = 20
-LARGE_COLLIDING_FRACTION = (
-    0.1  # of the random states, from which on a note names a pair
-)
+# Of the random states, from which on a note names a pair.
+LARGE_COLLIDING_FRACTION = 0.1
 MAX_LISTED_PAIRS = 6  # of a note
 
 

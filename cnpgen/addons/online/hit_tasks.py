@@ -45,9 +45,10 @@ State = tuple[ArrayLike, ArrayLike, ArrayLike]
 def load_completion(model: Model, backend: str | None) -> Completion:
     """Load the pipeline stages that completed the model's training rows, with the columns of hits as input.
 
-    Raises: UsageError: The model does not record its stages, or they do not complete
-        hits. CnpgenError: The stages do not fit this version of cnpgen, or a backend is
-        missing.
+    Raises:
+        UsageError: The model does not record its stages, or they do not complete hits.
+        CnpgenError: The stages do not fit this version of cnpgen, or a backend is
+            missing.
     """
     stages = model.training.get("stages")
     if stages is None:

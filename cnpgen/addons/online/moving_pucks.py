@@ -42,12 +42,10 @@ HitArguments = tuple[
 
 MAX_MEETING_TIME_S = 60.0
 MAX_PUCK_SPEED_M_S = 20.0
-EARLY_CONTACT_PHASES = (
-    65  # at which early contacts are checked; motion between them is straight
-)
-EARLY_CONTACT_MARGIN_M = (
-    2e-3  # of the mallet's path before the contact, on which it is no early one
-)
+# At which early contacts are checked; motion between them is straight.
+EARLY_CONTACT_PHASES = 65
+# Of the mallet's path before the contact, on which it is no early one.
+EARLY_CONTACT_MARGIN_M = 2e-3
 MAX_EARLY_DEPTH_M = 5e-4
 MAX_MEETING_ITERATIONS = 12
 MAX_MEETING_ERROR_S = 1e-4  # of the time at which mallet and puck meet
@@ -65,13 +63,15 @@ ANGLE_ITERATIONS = 8
 class PuckModel:
     """Motion and contacts of a puck; the defaults are those of the simulator's plants.
 
-    Attributes: drag: Deceleration over velocity on the table [1/s]. restitution: Speed
-        of separation over speed of approach, for mallet and puck. friction: Coefficient
-        of friction of mallet and puck. band_restitution: The restitution of bands and
-        puck. band_loss: Fraction of the velocity along a band that a bounce takes.
+    Attributes:
+        drag: Deceleration over velocity on the table [1/s].
+        restitution: Speed of separation over speed of approach, for mallet and puck.
+        friction: Coefficient of friction of mallet and puck.
+        band_restitution: The restitution of bands and puck.
+        band_loss: Fraction of the velocity along a band that a bounce takes.
         half_width: Distance of the puck's centre from the table's centre line at a side
-        band [m]. home_edge: Coordinate x of the puck's centre at the band of the arm's
-        side [m].
+            band [m].
+        home_edge: Coordinate x of the puck's centre at the band of the arm's side [m].
 
     Raises:
         UsageError: A parameter is negative or not finite.
@@ -166,9 +166,11 @@ class PuckModel:
 
         The mallet moves along the line to the puck's centre.
 
-        Args: velocity: Velocities of the pucks before the contact [m/s], shape (N, 2).
-            speed: Speeds of the mallet [m/s], shape (N,). direction: Directions of the
-            pucks after the contact, shape (N, 2), of any length.
+        Args:
+            velocity: Velocities of the pucks before the contact [m/s], shape (N, 2).
+            speed: Speeds of the mallet [m/s], shape (N,).
+            direction: Directions of the pucks after the contact, shape (N, 2), of any
+                length.
         """
         wanted = np.arctan2(direction[:, 1], direction[:, 0])
         angle = wanted.copy()

@@ -29,9 +29,9 @@ from cnpgen.schema.arguments import concerning, number, numbers
 
 Array = NDArray[np.float64]
 
-CONTACT_DISTANCE_M = (
-    0.07  # from the centre of the paper's puck to that of its mallet at contact
-)
+# From the centre of the paper's puck to that of its mallet at contact.
+
+CONTACT_DISTANCE_M = 0.07
 
 _COMPLETIONS: WeakKeyDictionary[Planner, Completion] = WeakKeyDictionary()
 
@@ -40,13 +40,15 @@ _COMPLETIONS: WeakKeyDictionary[Planner, Completion] = WeakKeyDictionary()
 class PlannedHits:
     """Plans of N hits.
 
-    Attributes: plans: Plans of the hits that have an answer, not checked yet;
-        ``plans.sample_id`` is the index of each hit. reasons: Reason why a hit has no
-        answer; empty if it has one. One entry per hit. delay: Time to wait before each
-        plan starts [s], shape (M,) for M plans; zero without a meeting time. overlap:
-        Path of the mallet from the contact to the goal [m]. return_plans: The ways
-        back, M plans from the ends of the hits to the home configuration; None without
-        one.
+    Attributes:
+        plans: Plans of the hits that have an answer, not checked yet;
+            ``plans.sample_id`` is the index of each hit.
+        reasons: Reason why a hit has no answer; empty if it has one. One entry per hit.
+        delay: Time to wait before each plan starts [s], shape (M,) for M plans; zero
+            without a meeting time.
+        overlap: Path of the mallet from the contact to the goal [m].
+        return_plans: The ways back, M plans from the ends of the hits to the home
+            configuration; None without one.
     """
 
     plans: Plans
@@ -106,11 +108,11 @@ def plan_hits(
     puck, and the direction of the hit accounts for the puck's velocity. With a meeting
     time, an arm at rest waits before the plan starts.
 
-    Args: planner: A planner whose model was trained on hits. state: Positions [rad],
-        velocities [rad/s] and accelerations [rad/s^2] of the arm, shape (n,) or (N, n)
-        each,
-            as returned by ``Plans.states_at``; the distance to the table must be within
-            the tolerance of plans.
+    Args:
+        planner: A planner whose model was trained on hits.
+        state: Positions [rad], velocities [rad/s] and accelerations [rad/s^2] of the
+            arm, shape (n,) or (N, n) each, as returned by ``Plans.states_at``; the
+            distance to the table must be within the tolerance of plans.
         puck: Position of the puck's centre, x and y [m], shape (2,) or (N, 2); x, y and
             z for problems without table.
         target: Position to hit the puck towards, x and y [m], shape (2,) or (N, 2).
@@ -131,13 +133,14 @@ def plan_hits(
         parameters: Parameters of the problem, shape (width,) or (N, width); nominal by
             default. Positions are those on a table that they move.
 
-    Returns: Plans of the hits that have an answer, not checked yet, and the reasons why
-        the others have none.
+    Returns:
+        Plans of the hits that have an answer, not checked yet, and the reasons why the
+        others have none.
 
-    Raises: UsageError: A shape is wrong, a value is not finite, the contact distance
-        differs from that of the problem, the
-            model was not trained on hits, or ``home`` is given for a model without
-            moving starts.
+    Raises:
+        UsageError: A shape is wrong, a value is not finite, the contact distance
+            differs from that of the problem, the model was not trained on hits, or
+            ``home`` is given for a model without moving starts.
     """
     completion = _COMPLETIONS.get(planner)
     if completion is None:

@@ -31,11 +31,8 @@ Array = NDArray[np.float64]
 PlanFunction = Callable[[SetPoint], Plans | JoinedPlans | None]
 """A function of the state at the switch that returns one plan or one sequence of plans from there, or None."""
 
-MAX_SWITCH_GAPS = (
-    1e-6,
-    1e-5,
-    1e-3,
-)  # of q [rad]; of dq and ddq as fractions of the limits
+# Of q [rad]; of dq and ddq as fractions of the limits.
+MAX_SWITCH_GAPS = 1e-6, 1e-5, 1e-3
 MAX_END_SPEED = 1e-6  # fraction of the velocity limits: a plan ends at rest
 BRAKING_LOOKAHEADS_S = np.array([0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5])
 
@@ -82,15 +79,18 @@ class PlanRuntime:
 
     ``set_point`` costs microseconds and may run in another thread than planning.
 
-    Args: planner: Plans stops (``stop``); its problem defines the limits. q: Joint
-        positions of the arm, which is at rest [rad], shape (n,). time: Start time [s].
+    Args:
+        planner: Plans stops (``stop``); its problem defines the limits.
+        q: Joint positions of the arm, which is at rest [rad], shape (n,).
+        time: Start time [s].
         judge: Whether to check every plan by the independent verdict, which takes a few
-        milliseconds. parameters: Parameters of the problem, such as the mass of the
-        load, which all plans have, shape (width,);
-            nominal by default.
+            milliseconds.
+        parameters: Parameters of the problem, such as the mass of the load, which all
+            plans have, shape (width,); nominal by default.
 
-    Raises: UsageError: The positions have another shape or are not finite, or a
-        parameter is outside its range.
+    Raises:
+        UsageError: The positions have another shape or are not finite, or a parameter
+            is outside its range.
     """
 
     @checked_arguments
@@ -163,8 +163,10 @@ class PlanRuntime:
     def switch(self, plan: Plans | JoinedPlans | None, at: float) -> Switch:
         """Switch to a plan at a time, if it is valid, ends at rest and arrives in time.
 
-        Args: plan: One plan or one sequence, from ``state_at(at)`` to rest; None is
-            refused. at: Switch time [s], not before the last time of ``set_point``.
+        Args:
+            plan: One plan or one sequence, from ``state_at(at)`` to rest; None is
+                refused.
+            at: Switch time [s], not before the last time of ``set_point``.
 
         Raises:
             UsageError: There are several plans, or they are of another robot.

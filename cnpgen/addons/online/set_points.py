@@ -44,9 +44,11 @@ class SampledMotion:
     The interpolation is twice continuously differentiable. Its error is below 1e-9 rad,
     1e-6 rad/s and 1e-3 rad/s^2 for motions within the limits of the shipped problems.
 
-    Attributes: edges: Edges of the cells [s], ascending, shape (cells + 1,).
+    Attributes:
+        edges: Edges of the cells [s], ascending, shape (cells + 1,).
         coefficients: Polynomials of the cells, in units of the cell width, shape
-        (cells, 6, n). end: Positions at the end [rad], shape (n,).
+            (cells, 6, n).
+        end: Positions at the end [rad], shape (n,).
     """
 
     edges: Array

@@ -27,11 +27,11 @@ from cnpgen.problems.scenes.scene_problem import (
     make_mesh,
     make_obstacle,
 )
+from cnpgen.problems.scenes.yaml_document import part, scalar, vector
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.shape.hull import Array, outward_triangles
 from cnpgen.robots.shape.inline import corners_of
-from cnpgen.store.files.yaml_document import part, scalar, vector
 
 Pose = tuple[Array, Array]  # position [m] and rotation matrix
 

@@ -33,7 +33,9 @@ from cnpgen.store.files.hdf5 import Hdf5, create_hdf5, open_hdf5
 
 _ENDS = (("start_q", "goal_q"), ("start_configs", "target_configs"))
 _TRAJECTORIES = ("global_solutions", "hybrid_solutions", "solutions")  # shape (N, T, n)
-_SHAPES = {  # kind -> datasets of its sizes, their number of columns, the word in the names of the others
+# Kind -> datasets of its sizes, their number of columns, the word in the names of the
+# others.
+_SHAPES = {
     "box": (("cuboid_dims",), (3,), "cuboid"),
     "cylinder": (("cylinder_radii", "cylinder_heights"), (1, 1), "cylinder"),
     "sphere": (("sphere_radii",), (1,), "sphere"),

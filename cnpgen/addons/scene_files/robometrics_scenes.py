@@ -22,8 +22,8 @@ from cnpgen.problems.scenes.scene_problem import (
     check_count,
     make_obstacle,
 )
+from cnpgen.problems.scenes.yaml_document import part, scalar, vector
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.store.files.yaml_document import part, scalar, vector
 
 _KINDS = ("cuboid", "cylinder", "sphere")
 

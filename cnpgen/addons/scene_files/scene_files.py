@@ -25,11 +25,11 @@ from cnpgen.problems.scenes.scene_problem import (
     check_scenes,
     checked_scene,
 )
+from cnpgen.problems.scenes.yaml_document import read_yaml
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.store.files.atomic import write_file
 from cnpgen.store.files.kind import HDF5_SUFFIXES, is_hdf5
-from cnpgen.store.files.yaml_document import read_yaml
 
 YAML_SUFFIXES = (".yaml", ".yml")
 SCENE_SUFFIXES = (*YAML_SUFFIXES, *HDF5_SUFFIXES)
@@ -51,9 +51,12 @@ def load_scenes(
         start: First scene.
         n: Number of scenes; by default all that follow.
 
-    Raises: UsageError: There are no scenes. SceneError: A scene is invalid; the message
-        names file, scene and obstacle. A subclass of UsageError. DatasetError: An HDF5
-        file is damaged. MissingExtraError: PyYAML is missing.
+    Raises:
+        UsageError: There are no scenes.
+        SceneError: A scene is invalid; the message names file, scene and obstacle. A
+            subclass of UsageError.
+        DatasetError: An HDF5 file is damaged.
+        MissingExtraError: PyYAML is missing.
     """
     path, start = Path(path), integer("start", start, least=0)
     stop = None if n is None else start + integer("n", n, least=1)

@@ -18,7 +18,9 @@ from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
 Array = NDArray[np.float64]
 
 ORDERS = ("q", "dq", "ddq", "jerk")
-UNDEFINED = 1e6  # bound of a derivative that the curve does not have, in SI units; no real robot comes close
+# Bound of a derivative that the curve does not have, in SI units; no real robot comes
+# close.
+UNDEFINED = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +31,13 @@ class CurveFamily:
     """
 
     t: Array  # times of the knots [s], from 0 to the duration, shape (S + 1,)
-    coefficients: Array  # Bernstein coefficients of the nominal positions [rad], shape (d + 1, S, n)
+    # Bernstein coefficients of the nominal positions [rad], shape (d + 1, S, n).
+    coefficients: Array
     bounds: tuple[
         Array, Array, Array, Array
     ]  # largest differences of q, dq, ddq and jerk, shape (S, n) each
-    has_jerk: bool = True  # whether the nominal jerks are those of the polynomials; otherwise they are 0
+    # Whether the nominal jerks are those of the polynomials; otherwise they are 0.
+    has_jerk: bool = True
 
     @property
     def duration(self) -> float:

@@ -117,20 +117,22 @@ def evaluate_trajectories(
     condition, and otherwise undecided. Obstacles that depend on the ends of a motion
     are placed at its first and last sample.
 
-    Args: problem: Problem, record, or name or path of a problem, pipeline or dataset.
+    Args:
+        problem: Problem, record, or name or path of a problem, pipeline or dataset.
         trajectories: The trajectories, with the problem's joints in their order.
         interpolation: "hold", "linear", "cubic" or "quintic"; not with ``max_jerk``.
         noise: Largest error of the samples in SI units: one number for positions,
-        velocities and accelerations, or
-            three.
+            velocities and accelerations, or three.
         max_jerk: Bound of the jerks [rad/s^3], one number or shape (n,).
         step: Maximum distance of checked times [s].
         workers: Number of processes.
         progress: Called with the number of trajectories that were judged since the last
             call.
 
-    Raises: UsageError: An argument is invalid, or a trajectory has another number of
-        joints or of parameters. RecipeError: A required plug-in is not installed.
+    Raises:
+        UsageError: An argument is invalid, or a trajectory has another number of joints
+            or of parameters.
+        RecipeError: A required plug-in is not installed.
     """
     check_step(step := number("step", step))
     record = problem_of_samples(problem)

@@ -41,37 +41,37 @@ from cnpgen.world.world import World
 Array = NDArray[np.float64]
 State = tuple[Array, Array, Array]
 
-MAX_FIT_ERROR_RAD = 2e-3  # of the positions at the samples, plus the noise, with more control points otherwise
+# Of the positions at the samples, plus the noise, with more control points otherwise.
+MAX_FIT_ERROR_RAD = 2e-3
 GROWTH = 1.6  # of the number of control points of the path, per attempt
 FIT_SAMPLES_PER_POINT = 4  # of the path, at most
-MIN_SAMPLES_PER_POINT = (
-    2  # of the path, from which velocities of the samples are not needed
-)
+# Of the path, from which velocities of the samples are not needed.
+MIN_SAMPLES_PER_POINT = 2
 REST_WINDOW_S = 0.05  # in which noise of the positions looks like a velocity
 MIN_SNAP_RAD = 1e-3  # distance by which positions may always be moved
 SNAP_FACTOR = 3.0  # largest change of positions by snapping, relative to the noise
 MAX_ITERATIONS = 12  # of snapping
 DIFFERENCE = 1e-6  # of central differences, in units of the scaled state
-BOUND_INSET = 1e-6  # distance from a violated bound, relative to its range, at which a state is placed
+# Distance from a violated bound, relative to its range, at which a state is placed.
+BOUND_INSET = 1e-6
 MAX_RESIDUAL = 1e-10  # at which the iteration ends
-SCALES = (
-    1.0,
-    100.0,
-    1e5,
-)  # a change of 1 mrad counts as much as one of 0.1 rad/s, or of 100 rad/s^2
+# A change of 1 mrad counts as much as one of 0.1 rad/s, or of 100 rad/s^2.
+SCALES = 1.0, 100.0, 1e5
 
 
 @dataclass(frozen=True, eq=False)
 class ImportedTrajectories:
     """Plans of N sampled trajectories.
 
-    Attributes: plans: The plans, with one number of control points for all. deviation:
-        Largest distance of a plan from its samples over all joints [rad], shape (N,).
+    Attributes:
+        plans: The plans, with one number of control points for all.
+        deviation: Largest distance of a plan from its samples over all joints [rad],
+            shape (N,).
         max_deviation: Largest distance that the fit may have [rad]; plans are farther
-        from their samples only if no path of ``MAX_CONTROL_POINTS`` meets it.
+            from their samples only if no path of ``MAX_CONTROL_POINTS`` meets it.
         snapped: Largest change of a boundary position [rad], shape (N,); nan where the
-        constraints cannot be met by a
-            small change, so that the boundary conditions are those of the samples.
+            constraints cannot be met by a small change, so that the boundary conditions
+            are those of the samples.
     """
 
     plans: Plans
@@ -103,17 +103,18 @@ def import_trajectories(
     noise or 1 mrad. The path has as many control points as the samples require for an
     error of 2 mrad plus the noise, at most ``MAX_CONTROL_POINTS``.
 
-    Args: problem: Problem, record, or name or path of a problem, pipeline or dataset.
-        trajectories: The trajectories, with the problem's joints in their order. noise:
-        Largest error of the samples in SI units: one number for positions, velocities
-        and accelerations, or
-            three.
+    Args:
+        problem: Problem, record, or name or path of a problem, pipeline or dataset.
+        trajectories: The trajectories, with the problem's joints in their order.
+        noise: Largest error of the samples in SI units: one number for positions,
+            velocities and accelerations, or three.
         at_rest: Ends at which all motions are at rest: "start", "goal", or True for
             both.
         source: Source of the plans, a line of text.
 
-    Raises: UsageError: An argument is invalid, or a trajectory has another number of
-        joints.
+    Raises:
+        UsageError: An argument is invalid, or a trajectory has another number of
+            joints.
     """
     record = problem_of_samples(problem)
     check_trajectories(trajectories, record)

@@ -57,9 +57,8 @@ from cnpgen.world.path import PathWorld
 Array = NDArray[np.float64]
 
 MIN_SPAN_PARTS = 2  # between two knots
-DECIDING_ERROR = (
-    1e3  # an error this large, in SI units, is that of a missing derivative
-)
+# An error this large, in SI units, is that of a missing derivative.
+DECIDING_ERROR = 1e3
 
 
 class FamilyJudge:

@@ -27,13 +27,12 @@ from cnpgen.judges.plans.joint_limits import ProvenJointLimits, quantity_of
 
 Array = NDArray[np.float64]
 
-MAX_LINEAR_SPAN_S = (
-    0.0101  # between exact positions that a controller connects by lines
-)
+# Between exact positions that a controller connects by lines.
+
+MAX_LINEAR_SPAN_S = 0.0101
 SMOOTH_NEIGHBORS = 8  # positions that determine velocities between two of them
-TOLERANCE_SHARE = (
-    0.9  # of the tolerance of accelerations and jerks that the smooth curve uses
-)
+# Of the tolerance of accelerations and jerks that the smooth curve uses.
+TOLERANCE_SHARE = 0.9
 
 
 def judge_samples(

@@ -72,11 +72,11 @@ def load_trajectories(
 ) -> LoadedTrajectories:
     """Load sampled trajectories from a file or a folder; 'cnpgen docs trajectories' lists formats and columns.
 
-    Args: path: CSV, JSON, YAML, NPZ, HDF5 or Parquet file, or a folder of them.
+    Args:
+        path: CSV, JSON, YAML, NPZ, HDF5 or Parquet file, or a folder of them.
         problem: Problem, record, or name or path of a problem, pipeline or dataset.
         joints: Names of the problem's joints in the file, in the problem's order; by
-        default the same names. For arrays
-            without names: indices.
+            default the same names. For arrays without names: indices.
         velocities: Names of the columns with their velocities, in the same order, if
             they have other names.
         time: Name of the column with the times, and its unit if it has another than s,
@@ -95,10 +95,12 @@ def load_trajectories(
         scenes: Obstacles around the trajectories: a file of scenes or of plans, or
             loaded scenes; one for each trajectory in order, or one for all.
 
-    Raises: UsageError: A column is missing, a value is not finite, times do not
-        increase, or the file is damaged. UnitError: Positions without a unit are
-        probably in degrees or millimetres, or times in milliseconds. MissingExtraError:
-        The format needs a package that is not installed.
+    Raises:
+        UsageError: A column is missing, a value is not finite, times do not increase,
+            or the file is damaged.
+        UnitError: Positions without a unit are probably in degrees or millimetres, or
+            times in milliseconds.
+        MissingExtraError: The format needs a package that is not installed.
     """
     record = problem_of_samples(problem)
     names = _names(record, "joints", record.joint_names if joints is None else joints)

@@ -30,19 +30,14 @@ from cnpgen.addons.trajectories.smooth_curve import (
 
 Array = NDArray[np.float64]
 
-WINDOWS = (
-    4,
-    3,
-)  # samples that determine positions in a span, and fewer of them for the estimate of the error
-ERROR_FACTORS = (
-    4.0,
-    2.0,
-    2.0,
-)  # on the differences of two interpolations, by the number of given derivatives
+# Samples that determine positions in a span, and fewer of them for the estimate of the
+# error.
+WINDOWS = 4, 3
+# On the differences of two interpolations, by the number of given derivatives.
+ERROR_FACTORS = 4.0, 2.0, 2.0
 COMPARED_PHASES = np.linspace(0, 1, 9)  # of a span
-MAX_DISAGREEMENT = (
-    0.02  # of two estimates of resolved accelerations, relative to the limits
-)
+# Of two estimates of resolved accelerations, relative to the limits.
+MAX_DISAGREEMENT = 0.02
 MAX_RESOLVED_ERROR = 0.2  # of accelerations, relative to the limits
 MAX_UNRESOLVED_SHARE = 0.5  # of the spans, above which none is resolved
 LIMIT_FACTOR = 1.05  # on the acceleration limits
@@ -52,9 +47,9 @@ LIMIT_FACTOR = 1.05  # on the acceleration limits
 class _Polynomials:
     """Polynomials of positions in S spans."""
 
-    weights: (
-        Array  # weights of the data for the Bernstein coefficients, shape (S, d + 1, W)
-    )
+    # Weights of the data for the Bernstein coefficients, shape (S, d + 1, W).
+
+    weights: Array
     data: Array  # data of the spans, scaled by powers of their lengths, shape (S, W, n)
     noise: Array  # largest errors of the data, shape (S, W)
     h: Array  # lengths of the spans [s], shape (S,)

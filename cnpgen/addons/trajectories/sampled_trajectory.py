@@ -24,17 +24,22 @@ class Trajectory:
     The interpolation is linear for positions alone, cubic with velocities, and quintic
     with accelerations.
 
-    Attributes: t: Times [s], shape (K,), increasing from 0. q: Joint positions [rad],
-        shape (K, n). dq: Joint velocities [rad/s], shape (K, n), or None. ddq: Joint
-        accelerations [rad/s^2], shape (K, n), or None. parameters: Values of the
-        problem's parameters in SI units, shape (p,); None without parameters. phase:
-        Phases at the samples, increasing from 0 to 1, for bounds that depend on the
-        phase, shape (K,), or None. obstacle_poses: Poses and sizes of the problem's
-        obstacles (``cnpgen.robots.solid``), shape (width,), in place of its own; None
-        for these.
+    Attributes:
+        t: Times [s], shape (K,), increasing from 0.
+        q: Joint positions [rad], shape (K, n).
+        dq: Joint velocities [rad/s], shape (K, n), or None.
+        ddq: Joint accelerations [rad/s^2], shape (K, n), or None.
+        parameters: Values of the problem's parameters in SI units, shape (p,); None
+            without parameters.
+        phase: Phases at the samples, increasing from 0 to 1, for bounds that depend on
+            the phase, shape (K,), or None.
+        obstacle_poses: Poses and sizes of the problem's obstacles
+            (``cnpgen.robots.solid``), shape (width,), in place of its own; None for
+            these.
 
-    Raises: UsageError: A shape is wrong, the times do not increase from 0, or a value
-        is not finite.
+    Raises:
+        UsageError: A shape is wrong, the times do not increase from 0, or a value is
+            not finite.
     """
 
     t: Array
@@ -112,9 +117,10 @@ class Trajectory:
         Args:
             t: Times [s], shape (K,).
 
-        Returns: Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape
-            (K, n) each. Accelerations of linear spans are 0; they do not include jumps
-            of the velocity.
+        Returns:
+            Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (K,
+            n) each. Accelerations of linear spans are 0; they do not include jumps of
+            the velocity.
         """
         t = self._clipped(t)
         q, dq, ddq = (np.asarray(self._piecewise(t, order)) for order in range(3))

@@ -26,21 +26,21 @@ Array = NDArray[np.float64]
 NEIGHBORS = 5  # samples whose positions and velocities determine an acceleration
 FEW_NEIGHBORS = 3  # of a second, less accurate estimate
 END_SPANS = 3  # at each end, with piecewise linear accelerations
-_PARTS = (  # of the first spans, as shares of their lengths: fine ones where the acceleration changes fastest
+# Of the first spans, as shares of their lengths: fine ones where the acceleration
+# changes fastest.
+_PARTS = (
     (0, 0.02, 0.05, 0.1, 0.17, 0.25, 0.35, 0.5, 0.65, 0.8),
     (0, 0.1, 0.25, 0.4, 0.55, 0.7, 0.85),
     (0, 0.25, 0.5, 0.75),
 )
-MIN_SMOOTHNESS = (
-    0.1  # weight of a change of jerk at an end, relative to one after the first span
-)
+# Weight of a change of jerk at an end, relative to one after the first span.
+MIN_SMOOTHNESS = 0.1
 REGULARIZATION = 1e-10  # of the curvature of a quadratic program
 END_PROGRAM_TOLERANCE = 1e-10
 DAQP_EQUALITY = 5
 MIN_STEP_S = 1e-12  # between samples
-MIN_KNOT_STEP_S = (
-    3e-5  # between knots in a span: rounding of positions changes jerks by eps / step^3
-)
+# Between knots in a span: rounding of positions changes jerks by eps / step^3.
+MIN_KNOT_STEP_S = 3e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,13 +172,15 @@ class _EndProgram:
     """Quadratic program of the accelerations at N knots of one joint."""
 
     curvature: Array  # Hessian of the cost, shape (N, N)
-    gradient: (
-        Array  # gradient of the cost per unit of the jerk at the last knot, shape (N,)
-    )
-    equalities: Array  # rows for the changes of velocity and position in every span, and for known accelerations
+    # Gradient of the cost per unit of the jerk at the last knot, shape (N,).
+    gradient: Array
+    # Rows for the changes of velocity and position in every span, and for known
+    # accelerations.
+    equalities: Array
     jerks: Array  # rows for the jerks between knots, shape (N - 1, N)
     h: Array  # lengths of the spans [s]
-    given: bool  # whether the accelerations at all samples are known, not only the last one
+    # Whether the accelerations at all samples are known, not only the last one.
+    given: bool
 
     @classmethod
     def at(cls, t: Array, knots: Array, *, given: bool) -> "_EndProgram":

@@ -28,12 +28,16 @@ def joint_columns(
 ) -> list[str] | None:
     """Return the column of every joint by the names of the joints, or by numbers from 0 or from 1.
 
-    Args: keys: ``key_of`` a column -> its name. joints: Names of the joints in the
-        file. kind: A key of ``KIND_NAMES``.
+    Args:
+        keys: ``key_of`` a column -> its name.
+        joints: Names of the joints in the file.
+        kind: A key of ``KIND_NAMES``.
 
-    Returns: Names of the columns; None without any of the kind.
+    Returns:
+        Names of the columns; None without any of the kind.
 
-    Raises: ValueError: Columns of some joints are missing, or numbers are ambiguous.
+    Raises:
+        ValueError: Columns of some joints are missing, or numbers are ambiguous.
     """
     named = [_column_of(keys, joint.lower(), kind) for joint in joints]
     if all(named):

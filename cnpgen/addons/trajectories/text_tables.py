@@ -27,8 +27,9 @@ def read_text_table(path: Path, separator: str | None) -> TrajectoryTable:
     the rows if it has as many names as they have numbers. Columns without a head are
     numbered from 0.
 
-    Raises: UsageError: The file is too large, not UTF-8, or empty, a row has another
-        length, or a column is there more than once.
+    Raises:
+        UsageError: The file is too large, not UTF-8, or empty, a row has another
+            length, or a column is there more than once.
     """
     lines, comment = _lines(path)
     if not lines:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from cnpgen.addons.trajectories.load_trajectories import LoadedTrajectories
     from cnpgen.problems.problem import Problem
 
+# Of load_trajectories.
 TRAJECTORY_OPTIONS = (
     "joints",
     "velocities",
@@ -30,7 +31,7 @@ TRAJECTORY_OPTIONS = (
     "drop_repeats",
     "parameters",
     "scenes",
-)  # of load_trajectories
+)
 MAX_IGNORED = 8  # unused columns that are listed
 MAX_NOTES = 5  # that are printed
 

@@ -66,8 +66,9 @@ def with_scenes(
     Return the problem with as many further obstacles as the scenes have, and the
     trajectories with their poses and sizes.
 
-    Raises: UsageError: The number of scenes is wrong, a plan file has no scenes or is
-        of a problem with other obstacles, or the trajectories have scenes already.
+    Raises:
+        UsageError: The number of scenes is wrong, a plan file has no scenes or is of a
+            problem with other obstacles, or the trajectories have scenes already.
         DatasetError, MissingExtraError: as of the readers of scenes and plans.
     """
     if any(trajectory.obstacle_poses is not None for trajectory in trajectories):

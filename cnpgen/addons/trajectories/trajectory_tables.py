@@ -19,13 +19,13 @@ from cnpgen.addons.trajectories.text_tables import TEXT_SUFFIXES, read_text_tabl
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable, Values
 from cnpgen.errors import CnpgenError, DatasetError, UsageError, either, requires_extra
 from cnpgen.plans.format import JOINT_NAMES_KEY, PHASE_COLUMN, PLAN_COLUMN
+from cnpgen.problems.scenes.yaml_document import read_yaml
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.store.files.atomic import machine_error, read_file
 from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.hdf5 import open_hdf5
 from cnpgen.store.files.kind import HDF5_SUFFIXES, is_hdf5, kind_of_content
 from cnpgen.store.files.size_limits import MAX_TABLE_BYTES
-from cnpgen.store.files.yaml_document import read_yaml
 from cnpgen.store.layout import SPECIFICATION
 from cnpgen.store.paths import require_path
 from cnpgen.store.scene_table import OBSTACLE_POSES

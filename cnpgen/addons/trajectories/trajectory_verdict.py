@@ -24,13 +24,17 @@ class Decision(StrEnum):
 class ConditionDecision:
     """Decision on one condition of a problem.
 
-    Attributes: decision: The decision. reason: Reason of a decision that is not valid;
-        empty for a valid one. margin: Smallest margin, or largest violation, of any
-        curve that the samples allow. uncertainty: Largest difference of the value from
-        that of the nominal curve, there [unit of the margin]. violated_share: Share of
-        the time in which every curve violates the condition, at the checked times.
+    Attributes:
+        decision: The decision.
+        reason: Reason of a decision that is not valid; empty for a valid one.
+        margin: Smallest margin, or largest violation, of any curve that the samples
+            allow.
+        uncertainty: Largest difference of the value from that of the nominal curve,
+            there [unit of the margin].
+        violated_share: Share of the time in which every curve violates the condition,
+            at the checked times.
         undecided_share: Share of the time in which some curves may violate it and
-        others not.
+            others not.
     """
 
     decision: Decision
@@ -56,11 +60,14 @@ class ConditionDecision:
 class TrajectoryVerdict:
     """Verdict on one sampled trajectory.
 
-    Attributes: decision: Invalid if a condition is, valid if all are, else undecided.
+    Attributes:
+        decision: Invalid if a condition is, valid if all are, else undecided.
         reason: Reason of a decision that is not valid: of the deciding condition; empty
-        for a valid one. conditions: Condition -> decision; empty if the trajectory
-        could not be evaluated. duration: Duration [s]. samples: Number of times that
-        were checked.
+            for a valid one.
+        conditions: Condition -> decision; empty if the trajectory could not be
+            evaluated.
+        duration: Duration [s].
+        samples: Number of times that were checked.
     """
 
     decision: Decision

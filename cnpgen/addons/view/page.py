@@ -16,10 +16,8 @@ from cnpgen.addons.view.view_scene import View, ViewScene
 from cnpgen.errors import CnpgenError, MachineError, UsageError, requires_extra
 
 HOST = "127.0.0.1"
-_NAMES = (
-    HOST,
-    "localhost",
-)  # accepted Host headers; requests that another site redirected have other ones
+# Accepted Host headers; requests that another site redirected have other ones.
+_NAMES = HOST, "localhost"
 _RETRY_S = 2  # time after which a browser reloads an error page
 
 Page = Callable[[int | None, str], str]
@@ -70,11 +68,14 @@ def serve(
     ``/?row=I`` shows another row. An open page checks every second whether it is out of
     date, and then reloads.
 
-    Args: page: (row or None, stamp of the files) -> the page as HTML. Its errors are
-        shown in place of the page. watched: The files that the page depends on; for a
-        recipe also the other files in its folder. port: Port on the loopback address; 0
-        for any free port. MachineError if it is taken. ready: Called with the address
-        once it is served.
+    Args:
+        page: (row or None, stamp of the files) -> the page as HTML. Its errors are
+            shown in place of the page.
+        watched: The files that the page depends on; for a recipe also the other files
+            in its folder.
+        port: Port on the loopback address; 0 for any free port. MachineError if it is
+            taken.
+        ready: Called with the address once it is served.
     """
     from http import HTTPStatus
     from http.server import BaseHTTPRequestHandler, HTTPServer

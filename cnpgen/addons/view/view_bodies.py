@@ -22,9 +22,9 @@ from cnpgen.robots.urdf import urdf_tree
 
 Array = NDArray[np.float64]
 
-LINE_ARM_RADIUS_M = (
-    0.04  # radius of an arm without link geometry, if no constraint gives one
-)
+# Radius of an arm without link geometry, if no constraint gives one.
+
+LINE_ARM_RADIUS_M = 0.04
 MAX_TRIANGLES = 400_000  # of all visual meshes; larger pages open slowly
 PROBE = 0.5  # joint displacement from which the axis of a joint is computed
 BALL = 12  # directions per quarter of a circle in which round bodies have corners

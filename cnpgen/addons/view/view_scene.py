@@ -41,9 +41,8 @@ from cnpgen.world.path import PathWorld
 Array = NDArray[np.float64]
 
 FRAMES_PER_MOTION = 240
-MIN_DRAWN_HEIGHT_M = (
-    0.1  # of obstacles without a lower end, which are drawn down to the floor
-)
+# Of obstacles without a lower end, which are drawn down to the floor.
+MIN_DRAWN_HEIGHT_M = 0.1
 DRAWN_TABLE_M = 5e-3  # thickness of a drawn table
 TIP_PATH_RADIUS_M = 4e-3
 TRIAD_LENGTH_M, TRIAD_RADIUS_M = 0.12, 4e-3  # axes of a drawn frame
@@ -66,7 +65,9 @@ class View:
     labels: Sequence[str]  # of each of the K frames: its time, "start" or "goal"
     times: Sequence[float]  # times of the frames [s]; 0, 1, ... without a motion
     q: Array  # joint positions [rad], shape (K, n)
-    poses: Array  # transposed poses of the joints, the universe first and the tip last, shape (K, joints, 4, 4)
+    # Transposed poses of the joints, the universe first and the tip last, shape (K,
+    # joints, 4, 4).
+    poses: Array
     world: Sequence[Body]  # obstacles, the table and the puck
     path: Sequence[Body] = ()  # path of the tip, of a motion
     curves: Sequence[

@@ -31,13 +31,14 @@ MAX_SUBDIVISIONS = 40  # intervals are then shorter than a picosecond
 class PiecewisePolynomials:
     """Joint positions and their time derivatives as polynomials between knots, in Bernstein form."""
 
-    edges: Array  # phases between which they are polynomials, ascending from 0 to 1, shape (S + 1,)
+    # Phases between which they are polynomials, ascending from 0 to 1, shape (S + 1,).
+    edges: Array
     q: Array  # coefficients [rad], shape (D + 1, S, n)
     dq: Array  # coefficients [rad/s], shape (2 D, S, n)
     ddq: Array  # coefficients [rad/s^2], shape (3 D - 1, S, n)
-    jerk: Array | None = (
-        None  # coefficients [rad/s^3], shape (4 D - 2, S, n), or None if no constraint needs them
-    )
+    # Coefficients [rad/s^3], shape (4 D - 2, S, n), or None if no constraint needs
+    # them.
+    jerk: Array | None = None
 
 
 def polynomials(motion: Motion, *, jerk: bool = False) -> PiecewisePolynomials:
@@ -46,11 +47,13 @@ def polynomials(motion: Motion, *, jerk: bool = False) -> PiecewisePolynomials:
     edges = knots(len(path), len(rate), degree)
     p, p1, p2, *p3 = bernstein_coefficients(path, degree, range(3 + jerk), edges)
     r, r1, *r2 = bernstein_coefficients(rate, degree, range(2 + jerk), edges)
+    # dq = p' r and r' r share one product
     first, r_r = _product(np.concatenate([p1, r1], axis=2), r), _product(r, r)
     dq, r1_r = first[..., :-1], first[..., -1:]
-    ddq = _product(p2, r_r) + _product(p1, r1_r)
+    ddq = _product(p2, r_r) + _product(p1, r1_r)  # p'' r^2 + p' r' r
     if not jerk:
         return PiecewisePolynomials(edges, q=p, dq=dq, ddq=ddq)
+    # jerk = p''' r^3 + 3 p'' r' r^2 + p' (r'' r + r'^2) r
     higher = _product(p3[0], _product(r_r, r)) + _product(p2, 3 * _product(r1_r, r))
     third = higher + _product(p1, _product(_product(r2[0], r) + _product(r1, r1), r))
     return PiecewisePolynomials(edges, q=p, dq=dq, ddq=ddq, jerk=third)
@@ -74,6 +77,7 @@ def find_maximum(
         parts: Number of parts of a span per subdivision, a power of 2.
     """
     best, *at = known
+    # Only spans whose largest coefficient, an upper bound, exceeds what is known matter.
     starts = np.arange(parts)[:, None] / parts
     span, of_row = (rows.max(axis=0) > _search_threshold(best, threshold)).nonzero()
     coefficients, left, width = (
@@ -84,6 +88,8 @@ def find_maximum(
     for _ in range(MAX_SUBDIVISIONS):
         if not len(span):
             break
+        # The coefficients of each part by de Casteljau; the first and the last of them are
+        # values at its ends, which raise the known maximum.
         coefficients = (_subdivision(len(rows), parts) @ coefficients).reshape(
             len(rows), -1
         )
@@ -96,6 +102,7 @@ def find_maximum(
             top = int(values.argmax())
             if values[top] > best:
                 best, *at = float(values[top]), int(of_row[top]), float(s[top])
+        # Parts whose upper bound exceeds the new maximum are subdivided again.
         (span,) = (
             coefficients.max(axis=0) > _search_threshold(best, threshold)
         ).nonzero()
@@ -110,6 +117,8 @@ def find_maximum(
 
 def _search_threshold(best: float, threshold: float) -> float:
     """Return the largest coefficient above which an interval may contain a relevant larger value."""
+    # A maximum near 1 decides about the verdict and is found precisely; far above or
+    # below 1 a coarse value is enough.
     precise = min(
         best + LIMIT_VALUE_TOLERANCE, max(1.0, best + LIMIT_DECISION_TOLERANCE)
     )
@@ -195,6 +204,7 @@ def _products(i: int, j: int) -> Array:
     matrix = np.zeros((j + 1, i + j + 1, i + 1))
     for k in range(i + 1):
         for m in range(j + 1):
+            # B_k^i B_m^j = C(i, k) C(j, m) / C(i + j, k + m) B_(k+m)^(i+j)
             matrix[m, k + m, k] = comb(i, k) * comb(j, m) / comb(i + j, k + m)
     return matrix.reshape(j + 1, -1)
 
@@ -202,6 +212,8 @@ def _products(i: int, j: int) -> Array:
 @cache
 def _subdivision(size: int, parts: int) -> Array:
     """Return de Casteljau's matrix for equal parts, all first coefficients first, shape (parts (d + 1), d + 1)."""
+    # Coefficient k of the first half is the mean of the first k + 1 ones by binomial
+    # weights; the second half is its mirror image.
     first = np.array([[comb(k, m) / 2**k for m in range(size)] for k in range(size)])
     matrices = [np.eye(size)]
     while len(matrices) < parts:

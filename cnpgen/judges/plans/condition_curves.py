@@ -30,16 +30,18 @@ class ConditionCurve:
     """Values of one condition along a motion, with bounds."""
 
     name: str  # name of the condition, as in the verdict
-    label: str  # name of the values: of an equality they are deviations, of several values distances from their bounds
+    # Name of the values: of an equality they are deviations, of several values
+    # distances from their bounds.
+    label: str
     unit: str  # unit of values and bounds, "mm" and "deg" instead of "m" and "rad"
     parts: tuple[str, ...]  # names of the m values; one empty name for a single value
     values: Array  # values, shape (m, K)
     lower: Array  # lower bounds, shape (K,); -inf for none
     upper: Array  # upper bounds, shape (K,); inf for none
     tolerance: float  # violation of a bound that is accepted
-    points: Array | None = (
-        None  # closest points of two bodies in the world [m], shape (K, 2, 3); None if no distance
-    )
+    # Closest points of two bodies in the world [m], shape (K, 2, 3); None if no
+    # distance.
+    points: Array | None = None
     pairs: tuple[
         str, ...
     ] = ()  # names of the closest bodies at every state, empty if it is no distance

@@ -33,9 +33,8 @@ Array = NDArray[np.float64]
 INTERVAL_PARTS = 8  # per subdivision
 MAX_INTERVALS = 256  # that are subdivided at a time
 MAX_LEVELS = 8  # of subdivision: 1 ms becomes 0.06 ns
-MINIMUM_LEVELS = (
-    2  # of subdivision around the smallest margin, even if it cannot change the verdict
-)
+# Of subdivision around the smallest margin, even if it cannot change the verdict.
+MINIMUM_LEVELS = 2
 
 
 def is_contact(constraint: Constraint) -> bool:
@@ -48,10 +47,10 @@ class Intervals:
     """I intervals between samples."""
 
     s: Array  # phases of both ends, shape (I, 2)
-    margin: Array  # smallest distance minus the smallest valid one, at both ends [m], shape (I, 2)
-    lower_bound: (
-        Array  # proven lower bound of the margin over the interval [m], shape (I,)
-    )
+    # Smallest distance minus the smallest valid one, at both ends [m], shape (I, 2).
+    margin: Array
+    # Proven lower bound of the margin over the interval [m], shape (I,).
+    lower_bound: Array
 
     def around_minimum(self) -> NDArray[np.bool_]:
         """Return a mask of the intervals on both sides of the smallest margin, shape (I,)."""
@@ -99,6 +98,8 @@ def _subdivisions(
 ) -> Iterator[tuple[Array, MeasuredCondition]]:
     """Yield phases in subdivided intervals, and the contact condition there."""
     for level in range(MAX_LEVELS):
+        # Intervals that may hide a violation, the most doubtful first, and those around
+        # the smallest margin, so that the printed value is that of the motion.
         chosen = intervals.unresolved()
         if level < MINIMUM_LEVELS and not (early_exit and intervals.margin.min() >= 0):
             chosen |= intervals.around_minimum()
@@ -120,6 +121,7 @@ def _intervals(
 ) -> list[Intervals]:
     """Return the intervals of each contact between neighbors in rows of phases, shape (rows, K), where the world is."""
     world, last = context.world, s.shape[1] - 1
+    # |x(q2) - x(q1)| <= sum over joints of (reach of the joint) |q2_j - q1_j|
     displacements = motion_bounds @ np.abs(world.q[:, 1:] - world.q[:, :-1])
     displacements[last :: last + 1] = -np.inf  # between rows there is no interval
     deviations = chord_deviation_bounds(context.curve, s.ravel(), motion_bounds)
@@ -130,6 +132,7 @@ def _intervals(
         )  # one, or of each
         margin = (contact.g - min_distances[:, None]).min(axis=0).reshape(s.shape)
         proven = np.full(s.size, np.nan)
+        # With a violation at a sample the verdict is decided, and no bound is needed.
         if margin.min() >= 0:
             pairs = pairs_of(world, contact.constraint)
             proven[:-1] = pairs.interval_bounds(

@@ -20,7 +20,8 @@ from cnpgen.judges.plans.scipy_splines import (
 from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
-PATH_ORDERS = 3  # derivatives of the path for accelerations, including order 0; jerks need one more
+# Derivatives of the path for accelerations, including order 0; jerks need one more.
+PATH_ORDERS = 3
 BOUND_PARTS = 4  # of every span, over which derivatives are bounded
 
 
@@ -38,9 +39,8 @@ class EvaluatedTrajectory:
     q: Array  # joint positions [rad]
     dq: Array  # joint velocities [rad/s]
     ddq: Array  # joint accelerations [rad/s^2]
-    jerk: Array | None = (
-        None  # joint jerks [rad/s^3], or None if no constraint needs them
-    )
+    # Joint jerks [rad/s^3], or None if no constraint needs them.
+    jerk: Array | None = None
 
     def is_finite(self) -> bool:
         """Return whether all values are finite."""

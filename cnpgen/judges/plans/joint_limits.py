@@ -65,7 +65,9 @@ class ProvenJointLimits:
     joints: tuple[str, ...]  # names of the joints
     tolerance: Array  # accepted violations, shape (L, n)
     bounds: Array  # lower bounds of all joints, then upper ones, shape (L, 2 n)
-    scale: Array  # units of relative violations: tolerances, or small values, negative for lower bounds, shape (L, 2 n)
+    # Units of relative violations: tolerances, or small values, negative for lower
+    # bounds, shape (L, 2 n).
+    scale: Array
 
     def scaled(self, parameters: Mapping[str, float]) -> "ProvenJointLimits":
         """Return the limits of a sample with these parameters, by name."""
@@ -111,6 +113,7 @@ class ProvenJointLimits:
             ),
             s,
         )
+        # The coefficients bound the function: limits that they meet need no search.
         low = np.array(
             [coefficients.min(axis=0).min(axis=0) for coefficients in functions]
         )

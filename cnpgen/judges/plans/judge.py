@@ -86,15 +86,21 @@ def judge(  # noqa: PLR0917 - all of them are needed to interpret a plan
     (``continuous_collision``). Values that cannot be evaluated give a verdict with that
     reason, not an exception.
 
-    Args: problem: The problem. robot: Its robot. motion: N motions. boundary: Boundary
-        conditions of the motions. scene: Obstacles of the N plans. goal_xyz: Tip
-        positions at the goal [m], shape (N, 3). step: Time step [s]. tracking_error:
-        Largest tracking error of the joints [rad], one number or shape (n,): position
-        constraints must
-            hold for every state within it (``tracking_tube``). None for exact tracking.
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        motion: N motions.
+        boundary: Boundary conditions of the motions.
+        scene: Obstacles of the N plans.
+        goal_xyz: Tip positions at the goal [m], shape (N, 3).
+        step: Time step [s].
+        tracking_error: Largest tracking error of the joints [rad], one number or shape
+            (n,): position constraints must hold for every state within it
+            (``tracking_tube``). None for exact tracking.
 
-    Raises: UsageError: Shapes do not match, the step is not positive or too long, or a
-        tracking error is negative.
+    Raises:
+        UsageError: Shapes do not match, the step is not positive or too long, or a
+            tracking error is negative.
     """
     return Judge(problem, robot, step=step, tracking_error=tracking_error)(
         motion, boundary, scene, goal_xyz

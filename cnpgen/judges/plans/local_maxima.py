@@ -23,12 +23,13 @@ from cnpgen.judges.plans.verdict import Margin
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-PEAK_DECISION_TOLERANCE = (
-    1e-8  # relative to the tolerance: error of a maximum that decides about the verdict
-)
+# Relative to the tolerance: error of a maximum that decides about the verdict.
+
+PEAK_DECISION_TOLERANCE = 1e-8
 PEAK_VALUE_TOLERANCE = 1e-2  # relative to the tolerance: error of any other maximum
 PEAK_PARTS = 6  # of an interval
-MAX_PEAK_ROUNDS = 10  # of division; a smooth maximum needs two or three, a kink one per factor of PEAK_PARTS
+# Of division; a smooth maximum needs two or three, a kink one per factor of PEAK_PARTS.
+MAX_PEAK_ROUNDS = 10
 MAX_PEAK_INTERVALS = 256  # of all conditions that are divided at a time
 MIN_CURVATURE = 1e-30  # relative to the tolerance
 
@@ -39,7 +40,8 @@ class _SampledValues:
 
     of: Indices  # index of the row's condition among the measured ones, shape (R,)
     part: Indices  # index of the row's value in the condition, shape (R,)
-    s: Array  # phases, ascending, shape (R, K); (1, K) if they are the same in every row
+    # Phases, ascending, shape (R, K); (1, K) if they are the same in every row.
+    s: Array
     violation: Array  # violations in multiples of the tolerance, shape (R, K)
 
     def promising(self, largest: Array) -> tuple[Indices, Indices, Array]:
@@ -48,6 +50,8 @@ class _SampledValues:
         Returns:
             ``(of, part, ends)`` of I intervals; ends have shape (I, 2).
         """
+        # A maximum matters if it would change the verdict (cross 1), or the printed value
+        # by more than its tolerance.
         threshold = np.maximum(largest + PEAK_VALUE_TOLERANCE, 0.0)
         threshold = np.where(
             largest <= 1, np.minimum(threshold, 1 + PEAK_DECISION_TOLERANCE), threshold
@@ -128,16 +132,18 @@ def _initial_values(s: Array, measured: Sequence[MeasuredCondition]) -> _Sampled
 
 def _estimated_maxima(s: Array, values: Array) -> Array:
     """Estimate upper bounds of functions between neighboring samples, shape (rows, K - 1)."""
+    # Divided differences estimate the second derivative C at every inner sample. Between
+    # two samples the function is at most the parabola with the largest plausible |C|
+    # through them: its apex lies (c - |rise|)^2 / (4 c) above the higher sample, with
+    # c = C step^2 / 2, if it lies between them at all (c > |rise|).
     step, rise = s[:, 1:] - s[:, :-1], values[:, 1:] - values[:, :-1]
     rate = rise / step
     second = (rate[:, 1:] - rate[:, :-1]) / ((step[:, 1:] + step[:, :-1]) / 2)
     around = np.concatenate(
         [second[:, :1], second[:, :1], second, second[:, -1:], second[:, -1:]], axis=1
     )
-    low, high = (
-        _of_four(np.minimum, around),
-        _of_four(np.maximum, around),
-    )  # at both ends of an interval and next to it
+    # At both ends of an interval and next to it.
+    low, high = _of_four(np.minimum, around), _of_four(np.maximum, around)
     curvature = np.maximum((high - 2 * low) * (step**2 / 2), MIN_CURVATURE)
     excess = np.maximum(curvature - np.abs(rise), 0.0)
     return np.asarray(

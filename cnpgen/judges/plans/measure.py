@@ -88,11 +88,11 @@ class MeasuredCondition:
     constraint: Constraint  # constraint that states the condition
     condition: Condition  # judged values of the constraint at K samples
     g: Array  # values [unit of the condition], shape (m, K)
-    relaxation: Array  # distance by which the bounds are relaxed [unit of the condition], shape (K,)
+    # Distance by which the bounds are relaxed [unit of the condition], shape (K,).
+    relaxation: Array
     tolerance: Array  # accepted violation, shape (m,)
-    uncertainty: Array | float = (
-        0.0  # largest errors of the values, shape (m, K), (m, 1), or one of all; 0 if known
-    )
+    # Largest errors of the values, shape (m, K), (m, 1), or one of all; 0 if known.
+    uncertainty: Array | float = 0.0
 
     @cached_property
     def violation(self) -> Array:
@@ -202,12 +202,10 @@ class EvaluationContext:
     start_tip: Array  # tip position at the start [m], shape (3,)
     world: PathWorld  # the robot; ``move`` moves it
     measured: Sequence[MeasuredCondition]  # conditions at the samples
-    with_uncertainty: AddUncertainty | None = (
-        None  # adds errors to conditions at phases, if the motion is not known
-    )
-    phase_of: Callable[[Array], Array] | None = (
-        None  # phases of the curve -> phases of bounds, if they differ
-    )
+    # Adds errors to conditions at phases, if the motion is not known.
+    with_uncertainty: AddUncertainty | None = None
+    # Phases of the curve -> phases of bounds, if they differ.
+    phase_of: Callable[[Array], Array] | None = None
 
     def move(self, s: Array) -> None:
         """Move the robot to phases s, shape (K,)."""

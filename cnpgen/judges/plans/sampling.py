@@ -14,19 +14,17 @@ Array = NDArray[np.float64]
 
 MIN_SAMPLES = 200  # per motion
 MAX_DURATION_S = 2000.0  # of a motion that is judged, for any time step
-MAX_TIME_SAMPLES = (
-    200_000  # take about one second; longer motions get a longer time step
-)
-TIME_SAMPLE_FACTOR = 1.05  # additional samples in time, because r varies within a cell of the table of times
+# Take about one second; longer motions get a longer time step.
+MAX_TIME_SAMPLES = 200_000
+# Additional samples in time, because r varies within a cell of the table of times.
+TIME_SAMPLE_FACTOR = 1.05
 TABLE_CELLS, EARLY_EXIT_CELLS = 4096, 128  # of equal size in the table of times
 SAMPLES_PER_SPAN = 8  # between two knots, uniform in phase
 SAMPLES_PER_END = 64  # additional, at each end
 END_REGION = 0.05  # phases at each end with additional samples
 MIN_PHASE_STEP = 1e-7  # differences between closer samples are rounding errors
-EARLY_EXIT_PER_SPAN, EARLY_EXIT_PER_END = (
-    8,
-    16,
-)  # samples of early_exit, which has none in time
+# Samples of early_exit, which has none in time.
+EARLY_EXIT_PER_SPAN, EARLY_EXIT_PER_END = 8, 16
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-ZERO_TOLERANCE = 1e-200  # replaces a tolerance of 0 in relative violations, so that they can be compared
+# Replaces a tolerance of 0 in relative violations, so that they can be compared.
+ZERO_TOLERANCE = 1e-200
 
 
 class Reason(StrEnum):
@@ -32,13 +33,19 @@ class Reason(StrEnum):
 class Margin:
     """Margin of a condition where a plan comes closest to violating it, or its largest violation.
 
-    Attributes: name: Name of the condition. reason: Reason under which a violation is
-        counted. unit: SI unit of value, bound, violation and tolerance. part: Name of
-        the condition's value: a joint, an axis, an obstacle, or empty if it has only
-        one. value: Value of the condition. bound: Bound that is closest or violated.
+    Attributes:
+        name: Name of the condition.
+        reason: Reason under which a violation is counted.
+        unit: SI unit of value, bound, violation and tolerance.
+        part: Name of the condition's value: a joint, an axis, an obstacle, or empty if
+            it has only one.
+        value: Value of the condition.
+        bound: Bound that is closest or violated.
         violation: Signed distance outside the bound, negative inside; inf if it could
-        not be evaluated. tolerance: Largest violation that is accepted as valid. time:
-        Time [s]. phase: Phase s.
+            not be evaluated.
+        tolerance: Largest violation that is accepted as valid.
+        time: Time [s].
+        phase: Phase s.
     """
 
     name: str
@@ -85,12 +92,16 @@ class Margin:
 class Metrics:
     """Metrics of a plan, as defined in the paper's tables; nan if they could not be evaluated.
 
-    Attributes: duration: Motion time [s]. effort: Integral of the sum over joints of
-        (torque / limit)^2 over time [s]. jerk: Largest jerk of a joint, in multiples of
-        its limit, by default 5/s x that of its acceleration. hit_speed: Speed of the
-        tip at the goal [m/s]. z_error: Integral of |z - height of the table| over time
-        [m s]; nan without a table. vertical_error: Integral of |roll| + |pitch| of the
-        tip frame over time [rad s]; nan without a vertical.
+    Attributes:
+        duration: Motion time [s].
+        effort: Integral of the sum over joints of (torque / limit)^2 over time [s].
+        jerk: Largest jerk of a joint, in multiples of its limit, by default 5/s x that
+            of its acceleration.
+        hit_speed: Speed of the tip at the goal [m/s].
+        z_error: Integral of |z - height of the table| over time [m s]; nan without a
+            table.
+        vertical_error: Integral of |roll| + |pitch| of the tip frame over time [rad s];
+            nan without a vertical.
     """
 
     duration: float = math.nan
@@ -117,9 +128,11 @@ class Metrics:
 class PaperRule:
     """Result of the paper's looser rules, which the add-on ``paper`` evaluates.
 
-    Attributes: finished: Whether the tip ends at the goal. valid: Whether, in addition,
-        no constraint is violated by the paper's tolerances. broken: Reasons of the
-        violated constraints.
+    Attributes:
+        finished: Whether the tip ends at the goal.
+        valid: Whether, in addition, no constraint is violated by the paper's
+            tolerances.
+        broken: Reasons of the violated constraints.
     """
 
     finished: bool = False
@@ -139,11 +152,14 @@ class PaperRule:
 class Verdict:
     """Result of the independent check of one plan.
 
-    Attributes: reason: ``Reason.OK``, another ``Reason``, or the ``reason`` of the
-        constraint with the largest violation. margins: Condition -> margin; empty if
-        the plan could not be evaluated. metrics: Motion time, errors, effort. paper:
-        Result of the paper's rules; None if they were not evaluated, since the add-on
-        is missing. samples: Number of samples.
+    Attributes:
+        reason: ``Reason.OK``, another ``Reason``, or the ``reason`` of the constraint
+            with the largest violation.
+        margins: Condition -> margin; empty if the plan could not be evaluated.
+        metrics: Motion time, errors, effort.
+        paper: Result of the paper's rules; None if they were not evaluated, since the
+            add-on is missing.
+        samples: Number of samples.
     """
 
     reason: str
@@ -196,7 +212,8 @@ class Verdict:
 def summarize_verdicts(verdicts: Sequence[Verdict]) -> dict[str, Any]:
     """Count verdicts and average their metrics.
 
-    Returns: For JSON: ``plans``; ``valid``, and, if the paper's rules were evaluated,
+    Returns:
+        For JSON: ``plans``; ``valid``, and, if the paper's rules were evaluated,
         ``paper_valid`` and ``finished``, with their ratios; ``reasons``, reason ->
         number of plans; ``metrics_of_valid``, ``metrics_of_paper_valid`` and
         ``metrics_of_all`` (those that could be evaluated), metric -> mean, median, 95 %

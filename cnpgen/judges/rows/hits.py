@@ -40,7 +40,8 @@ FRACTION_TOLERANCES = {
     "float32": 2.5e-7,
 }  # between quotients of stored numbers that were equal
 MIN_PROBABILITY = 1e-9  # of equal fractions by chance
-PARALLEL_TOLERANCE = 1e-9  # relative determinant below which two terms have no vertex that can be computed
+# Relative determinant below which two terms have no vertex that can be computed.
+PARALLEL_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)

@@ -22,12 +22,15 @@ Index = NDArray[np.int64]
 class Check:
     """Result of one check over all states that were verified.
 
-    Attributes: name: Name of the check, that of its condition. unit: SI unit of
-        ``worst`` and ``tolerance``. worst: Violation with the largest ratio to its
-        tolerance; inf if it could not be evaluated. tolerance: Tolerance of that
-        violation. n_failed: Number of rows with a violation above its tolerance, at
-        either end. worst_row: Row of ``worst``, -1 if no row was checked. worst_end:
-        End of the motion of ``worst``.
+    Attributes:
+        name: Name of the check, that of its condition.
+        unit: SI unit of ``worst`` and ``tolerance``.
+        worst: Violation with the largest ratio to its tolerance; inf if it could not be
+            evaluated.
+        tolerance: Tolerance of that violation.
+        n_failed: Number of rows with a violation above its tolerance, at either end.
+        worst_row: Row of ``worst``, -1 if no row was checked.
+        worst_end: End of the motion of ``worst``.
     """
 
     name: str

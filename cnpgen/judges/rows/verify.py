@@ -73,8 +73,8 @@ def verify_rows(
     * "finite": every value is finite; a row that is not fails only this check;
     * "tip position": the tip is at ``start_xyz`` and ``goal_xyz``;
     * every constraint of the problem at a boundary state, under the names of its conditions. Conditions on
-      accelerations are skipped at an end whose accelerations are not stored, unless the row rests there: then ddq = 0,
-      so the static torque is checked;
+      accelerations are skipped at an end whose accelerations are not stored, unless the
+      row rests there: then ddq = 0, so the static torque is checked;
     * "hit direction", if ``hit_speed`` is positive, and "hit speed" along the hit: of the tip at the goal, if the rows
       have ``hit_angle`` and ``hit_speed``;
     * "highest hit speed": ``hit_speed_max`` is the optimum of the linear program that defines it;
@@ -84,12 +84,14 @@ def verify_rows(
 
     The tolerances are ``cnpgen.problems.constraints.constraint.BOUNDARY_TOLERANCES``.
 
-    Args: problem: The problem. robot: Its robot. columns: Field -> values in SI units,
-        shape (rows, width) or (rows,): ``start_q``, ``start_dq``, ``start_ddq``,
-            ``goal_q``, ``goal_dq``, ``start_xyz``, ``goal_xyz``; optionally
-            ``goal_ddq``, ``hit_angle``, ``hit_speed``, ``hit_speed_max``, diagnostics,
-            and ``obstacle_poses``, which replace those of the problem. Other fields
-            must be finite.
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        columns: Field -> values in SI units, shape (rows, width) or (rows,):
+            ``start_q``, ``start_dq``, ``start_ddq``, ``goal_q``, ``goal_dq``,
+            ``start_xyz``, ``goal_xyz``; optionally ``goal_ddq``, ``hit_angle``,
+            ``hit_speed``, ``hit_speed_max``, diagnostics, and ``obstacle_poses``, which
+            replace those of the problem. Other fields must be finite.
         dtype: Float type of the stored rows, which determines the tolerances.
         rule: Rule by which the stages chose the goals; none by default.
 

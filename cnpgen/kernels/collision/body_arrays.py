@@ -95,16 +95,17 @@ def obstacle_bodies(
     """Return the obstacles of one sample as bodies.
 
     Cylinders are exact, with the radius of the corners of the prism that judges use:
-    they contain that prism.
+        they contain that prism.
 
     Args:
         obstacles: Obstacles of the problem.
         numbers: Their poses and sizes, shape (width,), see ``cnpgen.robots.solid``.
         first: Index of the first vertex of the obstacles among all vertices.
 
-    Returns: ``(bodies, vertices, boxes)``: bodies, shape (O,); vertices of meshes,
-        flat; bounding boxes by rows (center, half sizes, rotation, radius), shape (16,
-        O padded).
+    Returns:
+        ``(bodies, vertices, boxes)``: bodies, shape (O,); vertices of meshes, flat;
+        bounding boxes by rows (center, half sizes, rotation, radius), shape (16, O
+        padded).
     """
     bodies, vertices = np.zeros(len(obstacles), BODY), list[Array]()
     centers, halves = np.empty((2, len(obstacles), 3))

@@ -89,8 +89,9 @@ class ClearanceLoss:
             obstacles: The obstacles, arrays with a first axis of length N.
             required: Distance below which a pair has a loss [m].
 
-        Returns: Losses, shape (K, N), and their gradients, shape (K, n, N); nan for
-            states that are not finite.
+        Returns:
+            Losses, shape (K, N), and their gradients, shape (K, n, N); nan for states
+            that are not finite.
         """
         nodes, n, samples = q.shape
         checker = self._checker

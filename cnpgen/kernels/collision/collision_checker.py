@@ -37,9 +37,8 @@ _NAMES = (
 )
 SOURCES = [Path(__file__).with_name(name) for name in _NAMES]
 MAX_JOINTS = 56  # of the arrays in collision.c
-MIN_CONTACT_CAPACITY = (
-    1024  # of the first call; a second one follows where it is too small
-)
+# Of the first call; a second one follows where it is too small.
+MIN_CONTACT_CAPACITY = 1024
 CAPSULE = np.dtype(
     [
         ("frame", np.int64),
@@ -123,15 +122,19 @@ def load_collision_library(
 class CollisionChecker:
     """A robot with link geometry among obstacles, in compiled code.
 
-    Args: library: Library of ``load_collision_library``. robot: The robot, with at most
-        ``MAX_JOINTS`` planned joints. shape: Its link geometry, by default the robot's
-        own. added: Link -> distance that is added to its required ones from obstacles
-        [m], by default 0; -inf for no check. pair_added: Two links -> distance that is
-        added to their required one from each other [m], in the same way.
+    Args:
+        library: Library of ``load_collision_library``.
+        robot: The robot, with at most ``MAX_JOINTS`` planned joints.
+        shape: Its link geometry, by default the robot's own.
+        added: Link -> distance that is added to its required ones from obstacles [m],
+            by default 0; -inf for no check.
+        pair_added: Two links -> distance that is added to their required one from each
+            other [m], in the same way.
 
-    Attributes: link_pairs: Pairs of convex parts of links that must not touch, the one
-        nearer to the base first, shape (M, 2). vertices: Vertices of the convex parts
-        by coordinates, flat [m].
+    Attributes:
+        link_pairs: Pairs of convex parts of links that must not touch, the one nearer
+            to the base first, shape (M, 2).
+        vertices: Vertices of the convex parts by coordinates, flat [m].
     """
 
     def __init__(
@@ -250,10 +253,12 @@ class CollisionChecker:
     ) -> NDArray[np.bool_]:
         """Return a mask of the states with sufficient distances, shape (K,).
 
-        Args: q: Joint positions [rad], shape (n, K). obstacle_distance: Required
-            distance of moving links from obstacles [m]; None for no check.
+        Args:
+            q: Joint positions [rad], shape (n, K).
+            obstacle_distance: Required distance of moving links from obstacles [m];
+                None for no check.
             self_distance: Required distance of links from each other [m]; None for no
-            check.
+                check.
         """
         states = np.ascontiguousarray(q.T)
         clear = np.empty(len(states), np.uint8)
@@ -269,9 +274,11 @@ class CollisionChecker:
     def close_bodies(self, q: Array, within: float, *, of_obstacles: bool) -> Contacts:
         """Measure all pairs of bodies at states where their signed distance is below ``within``.
 
-        Args: q: Joint positions [rad], shape (n, K). within: Distance below which a
-            pair is returned [m]. of_obstacles: Whether to measure pairs (obstacle,
-            moving part), numbered part by part; else ``link_pairs``.
+        Args:
+            q: Joint positions [rad], shape (n, K).
+            within: Distance below which a pair is returned [m].
+            of_obstacles: Whether to measure pairs (obstacle, moving part), numbered
+                part by part; else ``link_pairs``.
         """
         states, capacity = np.ascontiguousarray(q.T), MIN_CONTACT_CAPACITY
         while True:

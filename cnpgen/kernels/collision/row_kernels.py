@@ -41,14 +41,17 @@ class _RowContext(ctypes.Structure):
 class DistanceColumns:
     """Rows of distances.
 
-    Attributes: required: Required distance of every row [m], shape (m,). of_obstacles:
-        Row of every pair (obstacle, moving part), part by part. of_links: Row of every
-        pair of ``CollisionChecker.link_pairs``. obstacle_distance: Largest required
-        distance from obstacles [m], None without such rows. self_distance: Largest
-        required distance of links from each other [m], None without such rows. range:
-        Distance above the required one [m] at which measured values end. The residual
-        of larger ones is 100:
-            solvers do not select rows without a gradient.
+    Attributes:
+        required: Required distance of every row [m], shape (m,).
+        of_obstacles: Row of every pair (obstacle, moving part), part by part.
+        of_links: Row of every pair of ``CollisionChecker.link_pairs``.
+        obstacle_distance: Largest required distance from obstacles [m], None without
+            such rows.
+        self_distance: Largest required distance of links from each other [m], None
+            without such rows.
+        range: Distance above the required one [m] at which measured values end. The
+            residual of larger ones is 100: solvers do not select rows without a
+            gradient.
         scale: Distance of a residual of 1 [m].
     """
 

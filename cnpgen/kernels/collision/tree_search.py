@@ -41,15 +41,19 @@ class _TreeSettings(ctypes.Structure):
 class TreeSettings:
     """Settings of a search, in the order of ``tree_settings`` of tree_search.c.
 
-    Attributes: obstacle_distance: Required distance from obstacles [m]; None for no
-        check. self_distance: Required distance of links from each other [m]; None for
-        no check. margin: Additional distance away from both ends [m]. margin_ramp:
-        Largest joint difference from an end below which the margin is smaller [rad or
-        m]. spacing: Largest joint difference of neighboring checked states [rad or m].
-        extension: Largest length of an edge [rad or m]. max_extensions: Largest number
-        of extensions of the trees. max_nodes: Largest number of nodes of both trees:
-        trees that fill so much space are probably not connected. shortcuts: Attempts to
-        shorten a path.
+    Attributes:
+        obstacle_distance: Required distance from obstacles [m]; None for no check.
+        self_distance: Required distance of links from each other [m]; None for no
+            check.
+        margin: Additional distance away from both ends [m].
+        margin_ramp: Largest joint difference from an end below which the margin is
+            smaller [rad or m].
+        spacing: Largest joint difference of neighboring checked states [rad or m].
+        extension: Largest length of an edge [rad or m].
+        max_extensions: Largest number of extensions of the trees.
+        max_nodes: Largest number of nodes of both trees: trees that fill so much space
+            are probably not connected.
+        shortcuts: Attempts to shorten a path.
     """
 
     obstacle_distance: float | None
@@ -67,8 +71,10 @@ class TreeSettings:
 class EqualityKernel:
     """Equalities that the states of a path meet.
 
-    Attributes: residuals: Compiled kernel ``(q, scene) -> (r, dr/dq)``, the Jacobian
-        column by column. scene: Values of the scene that it takes, shape (width,).
+    Attributes:
+        residuals: Compiled kernel ``(q, scene) -> (r, dr/dq)``, the Jacobian column by
+            column.
+        scene: Values of the scene that it takes, shape (width,).
     """
 
     residuals: Kernel

@@ -12,15 +12,16 @@ from typing import Any
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, cross, dot, scale, subtract
 
 Bounds = list[tuple[Any, Any]]  # (low, high) per axis; None for an unbounded side
-SMOOTHING_M2 = 1e-12  # keeps square roots of squared distances differentiable; squared length of a degenerate segment
+# Keeps square roots of squared distances differentiable; squared length of a degenerate
+# segment.
+SMOOTHING_M2 = 1e-12
 UNBOUNDED_EXTENT_M = 100.0  # extent of a box along an axis without a bound
-MIN_SQUARED_DISTANCE_M2 = (
-    1e-30  # the square root of smaller values has no finite gradient
-)
-MIN_EXTENT_M = 1e-12  # replaces an extent of 0 of a segment along an axis, so that 1 / extent is finite
-MIN_SQUARED_NORMAL_M2 = (
-    1e-16  # squared length of a cross product at which a segment is parallel to an edge
-)
+# The square root of smaller values has no finite gradient.
+MIN_SQUARED_DISTANCE_M2 = 1e-30
+# Replaces an extent of 0 of a segment along an axis, so that 1 / extent is finite.
+MIN_EXTENT_M = 1e-12
+# Squared length of a cross product at which a segment is parallel to an edge.
+MIN_SQUARED_NORMAL_M2 = 1e-16
 MIN_SQUARED_SINE = 1e-12  # squared sine of the angle at which two edges are parallel
 MIN_DENOMINATOR = 1e-30  # m^2; a normal number of float32, too
 

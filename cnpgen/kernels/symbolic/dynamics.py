@@ -73,9 +73,11 @@ def body_motions(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> list[BodyMotion]:
 class Load(NamedTuple):
     """A multiple of the payload that the last body holds in addition.
 
-    Attributes: share: Its mass, as a fraction of that of the payload. centre: Center of
-        mass in the tip frame [m], 3 scalars. shape: Its inertia about the center, as a
-        fraction of that of the payload at equal mass.
+    Attributes:
+        share: Its mass, as a fraction of that of the payload.
+        centre: Center of mass in the tip frame [m], 3 scalars.
+        shape: Its inertia about the center, as a fraction of that of the payload at
+            equal mass.
     """
 
     share: Scalar

@@ -166,8 +166,9 @@ class SymbolicBox(SymbolicSolid):
 class SymbolicHull(SymbolicBox):
     """A convex hull: the intersection of a box and half-spaces in one frame.
 
-    Attributes: planes: Outer unit normals and offsets [m] of the half-spaces, each of
-        shape (4,).
+    Attributes:
+        planes: Outer unit normals and offsets [m] of the half-spaces, each of shape
+            (4,).
     """
 
     planes: Sequence[Sequence[float]] = ()

@@ -45,11 +45,13 @@ from cnpgen.robots.table_frame import table_axes
 class SymbolicState:
     """A robot state as SX with derived quantities, each built on first use.
 
-    Attributes: robot: The robot. q: Joint positions [rad], n scalars. dq: Joint
-        velocities [rad/s]. ddq: Joint accelerations [rad/s^2]. obstacle_poses: Poses
-        and sizes of the obstacles (``cnpgen.robots.solid``), then values for a
-        constraint, then
-            the parameters of the problem.
+    Attributes:
+        robot: The robot.
+        q: Joint positions [rad], n scalars.
+        dq: Joint velocities [rad/s].
+        ddq: Joint accelerations [rad/s^2].
+        obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``), then
+            values for a constraint, then the parameters of the problem.
         obstacles: The obstacles.
         object_size: Edge lengths of the held object [m], or None.
         jerk: Joint jerks [rad/s^3], or None.

@@ -33,12 +33,15 @@ _PRISM_FACTOR = 1 / np.cos(
 class BatchScenes:
     """S scenes of a batch of candidates.
 
-    Attributes: table: Their obstacles, in the stored float type; ``scene_ids`` are the
-        indices in the batch. poses: Poses and sizes of the problem's obstacles in each
-        scene (``Scene.poses``), shape (S, width). grasp_count: Number of grasps, shape
-        (S,); further entries are padding. grasp_position: Positions of the tip [m],
-        shape (S, G, 3). grasp_approach: Unit vectors of the approaches, shape (S, G,
-        3). grasp_tilt: Largest angles from the approach [rad], shape (S, G).
+    Attributes:
+        table: Their obstacles, in the stored float type; ``scene_ids`` are the indices
+            in the batch.
+        poses: Poses and sizes of the problem's obstacles in each scene
+            (``Scene.poses``), shape (S, width).
+        grasp_count: Number of grasps, shape (S,); further entries are padding.
+        grasp_position: Positions of the tip [m], shape (S, G, 3).
+        grasp_approach: Unit vectors of the approaches, shape (S, G, 3).
+        grasp_tilt: Largest angles from the approach [rad], shape (S, G).
     """
 
     table: SceneTable

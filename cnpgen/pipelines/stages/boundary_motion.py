@@ -36,9 +36,8 @@ from cnpgen.store.field import Field
 
 PROJECTION_STEPS = 3  # Newton steps from a millimetre to rounding error
 MAX_VELOCITY_RATIO = 1.005  # largest ratio of a plan's velocity to its limit
-AT_REST_TOLERANCE = (
-    1e-9  # rad/s and rad/s^2: rounding error of a velocity or acceleration that is zero
-)
+# Rad/s and rad/s^2: rounding error of a velocity or acceleration that is zero.
+AT_REST_TOLERANCE = 1e-9
 
 
 def _motion_fields(context: Context, end: str) -> tuple[Field, Field]:

@@ -322,7 +322,9 @@ def _add_capsules(geometry: Any, robot: Robot, radius: float) -> list[int]:
     origins.append(data.oMf[robot.tip_frame].translation.copy())
     added = []
     for a, b in robot.capsule_axes:
-        joint = b  # the body that carries origin b; the joints between a and b lie on the segment's line
+        # The body that carries origin b; the joints between a and b lie on the
+        # segment's line.
+        joint = b
         first, second = (
             data.oMi[joint].actInv(origins[a]),
             data.oMi[joint].actInv(origins[b]),

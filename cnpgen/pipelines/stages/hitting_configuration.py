@@ -117,7 +117,8 @@ class _Search:
     ) -> tuple[Array, NDArray[np.bool_], Array]:
         """Find the optimum of every candidate.
 
-        Returns: ``(q, solved, value)``: configurations [rad], shape (n, N); mask of the
+        Returns:
+            ``(q, solved, value)``: configurations [rad], shape (n, N); mask of the
             candidates with an optimum, within the limits or not, shape (N,); objective,
             -inf for optima outside the limits, shape (N,).
         """

@@ -41,14 +41,12 @@ from cnpgen.kernels.symbolic.linalg import (
 from cnpgen.robots.robot import Robot
 
 MAX_NEWTON_STEP_RAD = 0.6  # Euclidean norm of one Newton step
-MIN_PIVOT = (
-    1e-3  # minimum |pivot| of the reduced Hessian: every step is an ascent direction
-)
+# Minimum |pivot| of the reduced Hessian: every step is an ascent direction.
+MIN_PIVOT = 1e-3
 NEWTON_TOLERANCE_RAD = 1e-6  # length of the last step; convergence is quadratic
 MAX_NEWTON_STEPS = 40
-CONSTRAINT_WEIGHT = (
-    1e3  # weight of J_F^T J_F relative to -H: both are in m^2/rad^2, and of order 1
-)
+# Weight of J_F^T J_F relative to -H: both are in m^2/rad^2, and of order 1.
+CONSTRAINT_WEIGHT = 1e3
 
 
 def objective(robot: Robot) -> Any:
@@ -115,6 +113,8 @@ class Expansion:
         across = [cross(self.direction, axis) for axis in kin.axes]
         across_rate = [cross(self.direction, rate) for rate in axis_rates]
         hessian: list[list[Scalar]] = [[0.0] * self.n for _ in range(self.n)]
+        # H_jk = 2 (A A)_jk + 2 d . (dz_j x J_k + z_j x dJ_k) - multiplier . d2p/dq_j dq_k,
+        # with d . (u x v) = (d x u) . v, so that the cross products with d are shared.
         for j in range(self.n):
             for k in range(j, self.n):
                 third = dot(across_rate[j], kin.jacobian[k]) + dot(
@@ -156,6 +156,8 @@ def _rates(kin: Kinematics, rate: Vec) -> tuple[list[Vec], list[Vec]]:
     turning: Vec = [0.0, 0.0, 0.0]
     origin_rate: Vec = [0.0, 0.0, 0.0]
     previous: Vec = [0.0, 0.0, 0.0]
+    # Forward recursion: joint j moves its origin with the angular velocity of the joints
+    # before it, and dz/dt = omega x z, dJ/dt = dz/dt x (tip - o) + z x (d tip - d o).
     tip_rate = [dot([column[row] for column in kin.jacobian], rate) for row in range(3)]
     axis_rates, column_rates = [], []
     for axis, origin, speed in zip(kin.axes, kin.origins, rate, strict=True):

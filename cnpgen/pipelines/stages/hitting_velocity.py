@@ -41,9 +41,8 @@ from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 
 ZERO_RESIDUAL_M = 1e-11  # residuals below this are treated as zero
-SPEED_SHARE_COLUMN = (
-    "hit_speed_share"  # task column: hit speed as a fraction of the maximum speed
-)
+# Task column: hit speed as a fraction of the maximum speed.
+SPEED_SHARE_COLUMN = "hit_speed_share"
 PARALLEL_TOLERANCE = 1e-9  # relative determinants below this are treated as zero
 
 

@@ -39,7 +39,9 @@ from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
 
-IK_TOLERANCE = 1e-9  # m and rad, before the last step (quadratic convergence, except with joints on their limits)
+# M and rad, before the last step (quadratic convergence, except with joints on their
+# limits).
+IK_TOLERANCE = 1e-9
 MAX_IK_STEPS = 24
 IK_DAMPING = 1e-9
 # Additional damping min(MAX_LIMIT_DAMPING, LIMIT_DAMPING_RATE |e|^2) of the step within

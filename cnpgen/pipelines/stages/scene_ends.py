@@ -38,9 +38,8 @@ RANDOM_STATES = 16  # of a scene, most of which collide
 FIRST_PHASES = (0.5, 0.25, 0.75)  # of a straight line, checked first
 OTHER_PHASES = tuple(k / 16 for k in range(1, 16, 2))
 NO_ENDS = "no collision-free start and goal in the scene"
-NUMBERS_PER_PAIR = (
-    5  # random numbers: kind of start, and two for each of two states, less one
-)
+# Random numbers: kind of start, and two for each of two states, less one.
+NUMBERS_PER_PAIR = 5
 # Inverse kinematics of poses
 METERS_PER_RADIAN = 0.3  # weight of an angle against a distance
 POSE_TOLERANCE = 1e-9  # m and weighted rad, before the last step

@@ -104,16 +104,22 @@ def load_context(
 class CandidateBatch:
     """Batch of candidates and the columns of the remaining ones.
 
-    Attributes: size: Number of candidates in the batch, N. alive: Indices of the
-        remaining candidates in the batch, shape (n,), ascending. outcome: 0 for
-        remaining candidates, otherwise 1 + the index of the rejection reason, shape
-        (N,). reasons: Rejection reasons, in order of first use. columns: Name -> values
-        of the remaining candidates, shape (width, n), contiguous rows. stage: Label of
-        the current stage. origins: Reason -> label of the stage that used it first.
+    Attributes:
+        size: Number of candidates in the batch, N.
+        alive: Indices of the remaining candidates in the batch, shape (n,), ascending.
+        outcome: 0 for remaining candidates, otherwise 1 + the index of the rejection
+            reason, shape (N,).
+        reasons: Rejection reasons, in order of first use.
+        columns: Name -> values of the remaining candidates, shape (width, n),
+            contiguous rows.
+        stage: Label of the current stage.
+        origins: Reason -> label of the stage that used it first.
         drawn: Name -> values of all candidates, shape (width, N), for columns written
-        before any rejection. last: Whether this is the last batch of the pipeline, so
-        that all its candidates are counted. scenes: Scenes of the candidates, whose
-        column ``scene`` has the index of the scene of each, or None.
+            before any rejection.
+        last: Whether this is the last batch of the pipeline, so that all its candidates
+            are counted.
+        scenes: Scenes of the candidates, whose column ``scene`` has the index of the
+            scene of each, or None.
     """
 
     def __init__(self, size: int, *, last: bool = False) -> None:
@@ -194,10 +200,11 @@ class Stage(ABC):
     table. It is registered under a name in cnpgen's registry or by a package's entry
     point in the group ``cnpgen.stages``.
 
-    Attributes: block_rows: Maximum number of rows per block; expensive stages use
-        smaller blocks. replaces: Columns that later stages compute again. For tasks,
-        earlier stages that write or read them
-            are omitted.
+    Attributes:
+        block_rows: Maximum number of rows per block; expensive stages use smaller
+            blocks.
+        replaces: Columns that later stages compute again. For tasks, earlier stages
+            that write or read them are omitted.
         draws_scenes: Whether it sets ``CandidateBatch.scenes``.
     """
 
@@ -243,7 +250,8 @@ class Stage(ABC):
         Args:
             context: Problem, robot and kernel library.
 
-        Returns: A function of (candidates, random) that writes columns of a batch and
+        Returns:
+            A function of (candidates, random) that writes columns of a batch and
             rejects candidates of it. It must draw random numbers with
             ``candidates.draw`` only.
         """

@@ -54,9 +54,12 @@ class Layer:
 class Architecture:
     """A trunk of tanh layers, a configuration head of two tanh layers, and a time head of one layer and exp.
 
-    Attributes: inputs: Number of features. hidden: Width of the trunk and of the
-        configuration head. layers: Depth of the trunk. path_outputs: Outputs of the
-        configuration head (the paper's phi): interior points times joints.
+    Attributes:
+        inputs: Number of features.
+        hidden: Width of the trunk and of the configuration head.
+        layers: Depth of the trunk.
+        path_outputs: Outputs of the configuration head (the paper's phi): interior
+            points times joints.
         rate_outputs: Outputs of the time head: logarithms of the control points of r.
     """
 
@@ -141,11 +144,13 @@ def initial_parameters(
 class Activations:
     """Outputs of every layer for N inputs, as needed by the backward pass.
 
-    Attributes: trunk: The input and every trunk layer's output, shape (N, inputs) and
-        (N, hidden). path_hidden: The configuration head's hidden layer, shape (N,
-        hidden). path: The configuration head, in (-1, 1), shape (N, path_outputs): the
-        paper's phi. log_rate: The time head before its exponential, shape (N,
-        rate_outputs).
+    Attributes:
+        trunk: The input and every trunk layer's output, shape (N, inputs) and (N,
+            hidden).
+        path_hidden: The configuration head's hidden layer, shape (N, hidden).
+        path: The configuration head, in (-1, 1), shape (N, path_outputs): the paper's
+            phi.
+        log_rate: The time head before its exponential, shape (N, rate_outputs).
     """
 
     trunk: tuple[Array, ...]

@@ -1,7 +1,7 @@
 """The network's inputs: start and goal states and derived values, standardized by the training rows.
 
 Features of the obstacles that samples place do not depend on their order: they are
-signed distances at points.
+    signed distances at points.
 """
 
 from __future__ import annotations
@@ -37,9 +37,8 @@ PARAMETERS = "parameters"  # only for problems with parameters
 LINE = "line"  # only if the network corrects its own path
 BLOCKS = (*USUAL, ARRIVAL, PARAMETERS, SCENE, LINE)
 FEATURE_SETS = ("full", "no-scene", "states", "paper")
-MIN_DEVIATION = (
-    1e-7  # SI units; features with a smaller standard deviation are constant
-)
+# SI units; features with a smaller standard deviation are constant.
+MIN_DEVIATION = 1e-7
 PATH_PHASES = 12  # states of the path
 STEP_RAD = 0.15  # rad or m: of every joint to both sides of the path
 RANGE_M = 0.12  # clearance below which points count
@@ -53,9 +52,11 @@ TASKS_PER_BLOCK = 256
 class Features:
     """Standardized features.
 
-    Attributes: blocks: Selected names of ``BLOCKS``, in order. mean: Mean of every
-        feature over the training rows, shape (F,). scale: Reciprocal of the standard
-        deviation; 0 for constant features, shape (F,).
+    Attributes:
+        blocks: Selected names of ``BLOCKS``, in order.
+        mean: Mean of every feature over the training rows, shape (F,).
+        scale: Reciprocal of the standard deviation; 0 for constant features, shape
+            (F,).
     """
 
     blocks: tuple[str, ...]

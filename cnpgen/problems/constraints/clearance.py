@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from cnpgen.world.path import PathWorld
     from cnpgen.world.world import World
 
-MAX_LINK_PENETRATION_M = 1e-4  # of links in a valid motion: the accuracy of distances, no tolerance for collisions
+# Of links in a valid motion: the accuracy of distances, no tolerance for collisions.
+MAX_LINK_PENETRATION_M = 1e-4
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -46,15 +46,18 @@ BOUNDARY_TOLERANCES: dict[str, dict[str, float]] = {
 class Condition:
     """Condition ``lower <= g <= upper`` on one state.
 
-    Attributes: name: Name in messages and reports. unit: SI unit of g, or one per
-        value, as ``units_of_joints`` names them. g: m values: SX scalars in the
-        symbolic form, floats in the measured form. lower: Lower bounds, shape (m,),
-        -inf for no bound. upper: Upper bounds, shape (m,); equal to ``lower`` for
-        equalities. tolerance: Key of ``BOUNDARY_TOLERANCES``, the tolerances of
-        boundary states. parts: Names of the m values; empty for numbered values.
+    Attributes:
+        name: Name in messages and reports.
+        unit: SI unit of g, or one per value, as ``units_of_joints`` names them.
+        g: m values: SX scalars in the symbolic form, floats in the measured form.
+        lower: Lower bounds, shape (m,), -inf for no bound.
+        upper: Upper bounds, shape (m,); equal to ``lower`` for equalities.
+        tolerance: Key of ``BOUNDARY_TOLERANCES``, the tolerances of boundary states.
+        parts: Names of the m values; empty for numbered values.
         sufficient: Whether the condition is conservative: only the measured form can
-        prove a violation. accepted: Violation that a valid motion may have if it
-        differs from sample to sample, shape (m,).
+            prove a violation.
+        accepted: Violation that a valid motion may have if it differs from sample to
+            sample, shape (m,).
     """
 
     name: str
@@ -101,21 +104,28 @@ class Constraint(ABC):
     The unit of ``tolerance`` depends on the kind (unit of the condition, or fraction of
     a limit), so a kind declares it again with ``cnpgen.plugins.field``.
 
-    Attributes: reason: Rejection reason of samples that violate the constraint.
+    Attributes:
+        reason: Rejection reason of samples that violate the constraint.
         boundary_reason: Rejection reason of samples whose ends violate it; by default
-        ``reason``. kinks: Phases at which its ``bound_relaxation`` is not smooth; the
-        verdict checks these. uses_jerk: Whether it uses the jerk, which is computed
-        only for problems with such a constraint. training_weight: Initial weight of the
-        violation in training; None for ``WEIGHT_FACTOR`` times ``weight``.
+            ``reason``.
+        kinks: Phases at which its ``bound_relaxation`` is not smooth; the verdict
+            checks these.
+        uses_jerk: Whether it uses the jerk, which is computed only for problems with
+            such a constraint.
+        training_weight: Initial weight of the violation in training; None for
+            ``WEIGHT_FACTOR`` times ``weight``.
         training_factor: Factor of the limits during training, in (0, 1].
         training_inset: Distance by which other bounds are moved inwards during training
-        [unit of the condition]. has_solver_margin: Whether ``solved`` has a margin for
-        states between grid points; otherwise solvers add one. uses_obstacles: Whether
-        ``measured`` depends on obstacles; otherwise ``met`` checks states of different
-        scenes. scene_width: Number of values that it needs for each motion, see
-        ``scene_values``. tolerance: Maximum violation of a valid motion. budget:
-        Acceptable violation in training. weight: Initial weight of the violation in
-        training, before scaling.
+            [unit of the condition].
+        has_solver_margin: Whether ``solved`` has a margin for states between grid
+            points; otherwise solvers add one.
+        uses_obstacles: Whether ``measured`` depends on obstacles; otherwise ``met``
+            checks states of different scenes.
+        scene_width: Number of values that it needs for each motion, see
+            ``scene_values``.
+        tolerance: Maximum violation of a valid motion.
+        budget: Acceptable violation in training.
+        weight: Initial weight of the violation in training, before scaling.
     """
 
     reason: ClassVar[str]
@@ -153,9 +163,11 @@ class Constraint(ABC):
 
         By default zero; constraints that motions may violate at the start override it.
 
-        Args: condition: One of the conditions of ``measured``. s: Phases, shape (K,).
+        Args:
+            condition: One of the conditions of ``measured``.
+            s: Phases, shape (K,).
             start_tip: Positions of the tip at the start [m], shape (..., 3): for one
-            motion or many.
+                motion or many.
         """
         del condition
         return np.zeros((*start_tip.shape[:-1], len(s)))
@@ -179,8 +191,9 @@ class Constraint(ABC):
             values: ``scene_values`` of one motion, shape (scene_width,).
             start_xyz: Tip position at the start [m], shape (3,).
 
-        Returns: Polylines from start to goal [m], shape (K, 3) each, in the order of
-            their use.
+        Returns:
+            Polylines from start to goal [m], shape (K, 3) each, in the order of their
+            use.
         """
         del values, start_xyz
         return []

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from cnpgen.world.path import PathWorld
     from cnpgen.world.world import World
 
-MAX_HELD_CAPSULE_ERROR_FRACTION = (
-    0.1  # of the free states, in which the capsule of a usable link overlaps the object
-)
+# Of the free states, in which the capsule of a usable link overlaps the object.
+
+MAX_HELD_CAPSULE_ERROR_FRACTION = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)

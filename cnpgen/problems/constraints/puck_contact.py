@@ -24,9 +24,10 @@ if TYPE_CHECKING:
     from cnpgen.world.world import World
 
 
-ADDED_RADIUS_M = (
-    1e-4  # so that motions do not touch the puck within a tolerance of this size
-)
+# So that motions do not touch the puck within a tolerance of this size.
+
+
+ADDED_RADIUS_M = 1e-4
 ROUNDING = 0.02  # of the relaxation near the goal, relative to the overlap
 SOLVER_MARGIN_M, STRAIGHT_HIT_MARGIN_M = 1e-3, 1e-4  # from the puck; of straight hits
 TRAINING_MARGIN_M = 2e-3

@@ -22,20 +22,20 @@ if TYPE_CHECKING:
 
 Vector = tuple[float, float, float]
 Vectors = Sequence[Sequence[float]]  # Python floats, used in scalar products
-BOUND_KINKS = (
-    0.1,
-    0.3,
-)  # phases between which a motion that starts off the manifold must reach it
+# Phases between which a motion that starts off the manifold must reach it.
+BOUND_KINKS = 0.1, 0.3
 
 
 @dataclass(frozen=True)
 class TipRegion:
     """Region of the tip: a manifold with ranges.
 
-    Attributes: point: A point of the manifold [m], shape (3,). held: Unit vectors along
-        which the tip stays at the point, k of them. bounded: Unit vectors along which
-        it stays in a range, m of them, orthogonal to the others. ranges: Ranges
-        relative to the point [m], m of them.
+    Attributes:
+        point: A point of the manifold [m], shape (3,).
+        held: Unit vectors along which the tip stays at the point, k of them.
+        bounded: Unit vectors along which it stays in a range, m of them, orthogonal to
+            the others.
+        ranges: Ranges relative to the point [m], m of them.
     """
 
     point: Array
@@ -70,9 +70,8 @@ class TipManifold(Constraint):
     velocity_name: ClassVar[str]
     acceleration_name: ClassVar[str]
     parts: ClassVar[tuple[tuple[str, ...], tuple[str, ...]]] = ((), ())
-    moves_with_table: ClassVar[bool] = (
-        False  # whether parameters of the problem move it
-    )
+    # Whether parameters of the problem move it.
+    moves_with_table: ClassVar[bool] = False
 
     @property
     @abstractmethod

@@ -33,10 +33,10 @@ def observe(
 ) -> dict[str, NDArray[Any]]:
     """Observe N scenes, in compiled code if there is a C compiler.
 
-    Args: scenes: N scene problems or sequences of obstacles, one scene problem, the
-        scenes of plans or tasks, or their
-            bodies (``scene_bodies``), which saves the conversion of scenes that are
-            observed repeatedly.
+    Args:
+        scenes: N scene problems or sequences of obstacles, one scene problem, the
+            scenes of plans or tasks, or their bodies (``scene_bodies``), which saves
+            the conversion of scenes that are observed repeatedly.
         kind: "cloud", "camera", "distances", "basis" or "tokens", or an observation
             with parameters, such as ``SurfaceCloud(points=1024)``.
         seed: Seed of the points of clouds.
@@ -46,8 +46,9 @@ def observe(
     Returns:
         Name -> array with a first axis of length N; see the kinds of observations.
 
-    Raises: UsageError: There is no such observation, an obstacle is a mesh file, or
-        there are no scenes.
+    Raises:
+        UsageError: There is no such observation, an obstacle is a mesh file, or there
+            are no scenes.
     """
     from cnpgen.kernels.observation.compiled_observations import observation_backend
 

@@ -37,11 +37,14 @@ def obstacles_of_points(
     shrunk to their points, so that they exceed the points by at most the edge length of
     a voxel, beside the radius.
 
-    Args: points: Points in the frame of the robot's base [m], shape (N, 3), without
-        points of the robot itself. radius: Radius of every point [m]. resolution: Edge
-        length of the voxels [m]; it grows where there would be more than
-        ``max_obstacles`` boxes. max_obstacles: Largest number of boxes. name: Name of
-        the boxes, which are numbered.
+    Args:
+        points: Points in the frame of the robot's base [m], shape (N, 3), without
+            points of the robot itself.
+        radius: Radius of every point [m].
+        resolution: Edge length of the voxels [m]; it grows where there would be more
+            than ``max_obstacles`` boxes.
+        max_obstacles: Largest number of boxes.
+        name: Name of the boxes, which are numbered.
 
     Raises:
         UsageError: A point is not finite, or an argument is out of its range.

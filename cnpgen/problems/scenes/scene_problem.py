@@ -26,9 +26,8 @@ from cnpgen.schema.units import PLAUSIBLE_MAX
 
 MAX_SCENE_OBSTACLES = 100  # as many as a problem may have
 MAX_SCENES = 100_000  # of one call
-MAX_BASE_DEPTH_M = (
-    0.01  # of the robot's base in an obstacle, such as the plate that it stands on
-)
+# Of the robot's base in an obstacle, such as the plate that it stands on.
+MAX_BASE_DEPTH_M = 0.01
 MIN_OBSTACLE_SIZE_M = 1e-6
 MAX_ROTATION_ERROR = 1e-6  # of the products of the rows of a rotation matrix
 _SIZES = {
@@ -47,12 +46,15 @@ class SceneError(UsageError):
 class GoalPose:
     """Goal pose of a frame of the robot, in the frame of the robot's base.
 
-    Attributes: frame: Name of the link or frame; empty for the problem's tip. position:
-        Position [m], shape (3,). rotation: Rotation matrix, shape (3, 3).
+    Attributes:
+        frame: Name of the link or frame; empty for the problem's tip.
+        position: Position [m], shape (3,).
+        rotation: Rotation matrix, shape (3, 3).
         position_tolerance: Accepted displacements along the axes of the pose [m], a
-        number or shape (3,). rotation_tolerance: Accepted components of the rotation
-        vector in these axes [rad], a number or shape (3,).
-            About an axis with pi or more, any rotation is accepted.
+            number or shape (3,).
+        rotation_tolerance: Accepted components of the rotation vector in these axes
+            [rad], a number or shape (3,). About an axis with pi or more, any rotation
+            is accepted.
     """
 
     frame: str
@@ -78,13 +80,18 @@ class GoalPose:
 class SceneProblem:
     """One planning problem in a scene: obstacles, a start at rest, and a goal at rest.
 
-    Attributes: name: Name of the scene, unique in its file. obstacles: Obstacles with
-        poses in the frame of the robot's base, which is the world frame. start_q: Joint
-        positions at the start [rad], shape (n,); empty if the file has none. goal_q:
-        Goal states [rad], any of which is a goal, shape (G, n); G may be 0 with a goal
-        pose. goal_pose: Goal pose, or None. joint_names: Names of the n joints; empty
-        for the planned joints of the problem in their order. source: File of the scene,
-        for messages.
+    Attributes:
+        name: Name of the scene, unique in its file.
+        obstacles: Obstacles with poses in the frame of the robot's base, which is the
+            world frame.
+        start_q: Joint positions at the start [rad], shape (n,); empty if the file has
+            none.
+        goal_q: Goal states [rad], any of which is a goal, shape (G, n); G may be 0 with
+            a goal pose.
+        goal_pose: Goal pose, or None.
+        joint_names: Names of the n joints; empty for the planned joints of the problem
+            in their order.
+        source: File of the scene, for messages.
     """
 
     name: str

@@ -23,9 +23,11 @@ class SceneReader(ABC):
     def load(self, path: Path, *, start: int, n: int | None) -> list[SceneProblem]:
         """Read scenes from the number ``start`` on, at most ``n`` of them, or all that follow.
 
-        Raises: UsageError: There are no scenes, or one is invalid; the message names
-            file, scene and element. DatasetError: A file is damaged. MissingExtraError:
-            A package for the format is missing.
+        Raises:
+            UsageError: There are no scenes, or one is invalid; the message names file,
+                scene and element.
+            DatasetError: A file is damaged.
+            MissingExtraError: A package for the format is missing.
         """
 
 

@@ -39,7 +39,8 @@ Array = NDArray[np.float64]
 # more than the condition changes within the verdict's tolerances of boundary
 # conditions, 1e-6 rad, 1e-6 rad/s and 1e-4 rad/s^2.
 BOUNDARY_MARGIN = (1e-5, 1e-5, 1e-3)
-POSITION_MARGIN_RAD = 1e-4  # for motion between the times of the verdict, and its tolerance of boundary conditions
+# For motion between the times of the verdict, and its tolerance of boundary conditions.
+POSITION_MARGIN_RAD = 1e-4
 
 
 class Feasibility(StrEnum):
@@ -89,8 +90,10 @@ def explain_plans(
 ) -> dict[int, Explanation]:
     """Explain why no valid plans of some problems were found.
 
-    Args: plans: The plans. indices: Indices of the plans to explain; by default all
-        whose status is not valid.
+    Args:
+        plans: The plans.
+        indices: Indices of the plans to explain; by default all whose status is not
+            valid.
 
     Returns:
         Index -> explanation.

@@ -59,7 +59,8 @@ class EndState:
     """State at the start of a motion, or at its goal with reversed time."""
 
     q: Array  # joint positions [rad], shape (n,)
-    dq: Array  # joint velocities [rad/s], shape (n,); at the goal the opposite of the motion's
+    # Joint velocities [rad/s], shape (n,); at the goal the opposite of the motion's.
+    dq: Array
 
     def box(self, time: float, limits: JointLimits) -> tuple[Array, Array]:
         """Bound each joint's position ``time`` [s] later: (lower, upper), shape (n,).

@@ -29,10 +29,10 @@ Array = NDArray[np.float64]
 MIN_VIOLATION_M = -0.01  # larger distances from the edge count as this one
 HEIGHT_WEIGHT = 10.0  # of a violation of the height, relative to the rectangle
 TIP_MARGIN_M = 5e-5  # for motion between the times of the verdict
-VERGE_DISTANCE_M = (
-    1.5e-3  # from the edge, up to which splines of the usual size may be too coarse
-)
-MIN_DRIFT_M = 1e-4  # further out than the end itself; an end at rest near the edge is not on the verge
+# From the edge, up to which splines of the usual size may be too coarse.
+VERGE_DISTANCE_M = 1.5e-3
+# Further out than the end itself; an end at rest near the edge is not on the verge.
+MIN_DRIFT_M = 1e-4
 LOCAL_SEARCHES = 3  # from different configurations
 MAX_PROOFS = 3  # of times with a violation, the largest first
 MAX_LP_STEPS = 15
@@ -122,8 +122,11 @@ class TableExit:
 
     end: str  # "start" or "goal"
     time: float  # time from that end [s]
-    distance: float  # smallest distance off the table, or, negative, largest distance from its edge [m]
-    proven: bool  # whether it is proven with all tolerances; otherwise a local search without tolerances found it
+    # Smallest distance off the table, or, negative, largest distance from its edge [m].
+    distance: float
+    # Whether it is proven with all tolerances; otherwise a local search without
+    # tolerances found it.
+    proven: bool
 
 
 def find_table_exit(

@@ -24,7 +24,8 @@ class TipKinematics:
 
     position: Array  # position [m], shape (3,)
     jacobian: Array  # derivative of the position [m/rad], shape (3, n)
-    axes: Array  # axes of revolute joints in the world, zero for prismatic ones, shape (3, n)
+    # Axes of revolute joints in the world, zero for prismatic ones, shape (3, n).
+    axes: Array
 
     def curvature(self, direction: Array) -> Array:
         """Return second derivatives along a direction, shape (n, n): ``c .

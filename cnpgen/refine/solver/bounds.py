@@ -1,4 +1,14 @@
-"""Bounds of the residuals on a grid, tightened against overshoot between grid points."""
+"""Bounds of the residuals on a grid, tightened against overshoot between grid points.
+
+Between two grid points a residual may exceed what it has at both. Bounds are therefore
+tightened in advance, by a share of their half width for limits or a length for
+clearances, fading in from both ends over the phase ``edge``:
+
+    u(s) = c + h (1 - fraction min(s, 1 - s, edge) / edge),    c, h: center, half width.
+
+After convergence midpoints are interpolated by cubic polynomials through four grid
+points, and bounds whose residuals still overshoot there are tightened by the overshoot.
+"""
 
 from dataclasses import dataclass
 from itertools import accumulate
@@ -17,30 +27,22 @@ from cnpgen.robots.solid import place_obstacles
 from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
-END_POINTS = (
-    0,
-    1,
-    2,
-    4,
-    7,
-    11,
-)  # from either end, whose accelerations depend on the last rate control points
-END_RELAXATION = (
-    0.1,
-    0.3,
-)  # phases between which the relaxation of violated end bounds fades out
+# From either end, whose accelerations depend on the last rate control points.
+END_POINTS = 0, 1, 2, 4, 7, 11
+# Phases between which the relaxation of violated end bounds fades out.
+END_RELAXATION = 0.1, 0.3
 MIN_END_RELAXATION = 1e-5  # of scaled residuals: iterations end with larger violations
-UNKNOWN_TOLERANCE = (
-    1e9  # in scaled units, of conditions that only the verdict can check
-)
-PHASE_FACTOR = 1.03  # time-varying bounds close earlier by this factor: motions overshoot where they level out
-PRECISE_FRACTION = (
-    0.1  # of the tolerance of an equality: the largest error of a precise plan
-)
-NEAR_FRACTION = 0.97  # of the distance from a path, on the grid: motions overshoot between its points
-INTERVAL_FRACTION = (
-    0.9  # of the tolerance between grid points: the interpolation has an error
-)
+# In scaled units, of conditions that only the verdict can check.
+UNKNOWN_TOLERANCE = 1e9
+# Time-varying bounds close earlier by this factor: motions overshoot where they level
+# out.
+PHASE_FACTOR = 1.03
+# Of the tolerance of an equality: the largest error of a precise plan.
+PRECISE_FRACTION = 0.1
+# Of the distance from a path, on the grid: motions overshoot between its points.
+NEAR_FRACTION = 0.97
+# Of the tolerance between grid points: the interpolation has an error.
+INTERVAL_FRACTION = 0.9
 
 
 _ORDERS: dict[
@@ -55,12 +57,13 @@ class Tightening:
     """Tightening of the problem's bounds against overshoot between grid points."""
 
     limit: float  # fraction of acceleration, torque and jerk limits
-    gentle: (
-        float  # fraction of position and velocity limits, on which boundary states lie
-    )
+    # Fraction of position and velocity limits, on which boundary states lie.
+    gentle: float
     clearance: float  # distance added to clearances [m]
     band: float  # half width of equalities, as a fraction of their tolerance
-    edge: float  # phase over which the tightening fades in from either end, since boundary states may lie on a limit
+    # Phase over which the tightening fades in from either end, since boundary states
+    # may lie on a limit.
+    edge: float
 
 
 NO_TIGHTENING = Tightening(limit=0.0, gentle=0.0, clearance=0.0, band=0.0, edge=1.0)
@@ -108,14 +111,13 @@ class Bounds:
 
         Midpoints are interpolated with ``Grid.midpoint_weights``.
         """
+        # value at the midpoint of points k + 1 and k + 2 from those at k, ..., k + 3
         centers = sum(
             weights[:, None] * g[k : k + len(midpoint_weights)]
             for k, weights in enumerate(midpoint_weights.T)
         )
-        left, right = (
-            slice(1, -2),
-            slice(2, -1),
-        )  # of the intervals between the second and the last but one
+        # Of the intervals between the second and the last but one.
+        left, right = slice(1, -2), slice(2, -1)
         tolerance = INTERVAL_FRACTION * np.minimum(
             self.interval_tolerance[left], self.interval_tolerance[right]
         )
@@ -124,6 +126,7 @@ class Bounds:
         if not (above.max() > 0 or below.max() > 0):
             return None
         lower, upper = self.lower.copy("F"), self.upper.copy("F")
+        # Both neighbors of a midpoint move inwards by the overshoot there.
         for side in (left, right):
             upper[side] -= np.maximum(above, 0.0)
             lower[side] += np.maximum(below, 0.0)
@@ -278,6 +281,7 @@ class BoundsTemplate:
             NEAR_FRACTION * distance,
             self._s < 1,
         )
+        # |q - q_path| <= distance, in scaled units: the tighter of both bounds holds
         rows = np.ix_(inner, columns)
         lower, upper = bounds.lower.copy("F"), bounds.upper.copy("F")
         lower[rows] = np.maximum(lower[rows], (positions[inner] - band) / scale)
@@ -292,6 +296,8 @@ class BoundsTemplate:
         Required distances [m] have shape (columns,), additional ones shape (K,
         columns).
         """
+        # d >= required + tightening + what collisions between grid points have added; the
+        # last grid point is the goal itself, which no variable moves
         added = _added_clearance(self._s, self._tightening)[:, None]
         lower = (min_distances + added + extra) / DISTANCE_SCALE_M
         lower[self._s == 1] = -np.inf
@@ -375,6 +381,8 @@ def _bounds(
     lower = np.repeat((condition.lower / scale)[None], len(s), axis=0)
     upper = np.repeat((condition.upper / scale)[None], len(s), axis=0)
     if condition.tolerance_kind == "limit":
+        # Boundary states may lie on limits of positions and velocities: these shrink by
+        # the smaller share ``gentle``.
         fraction = tightening.limit if order >= 2 else tightening.gentle
         shrink = (
             1
@@ -383,6 +391,7 @@ def _bounds(
         center, half = (lower + upper) / 2, (upper - lower) / 2
         lower, upper = center - shrink * half, center + shrink * half
     elif condition.is_equality:
+        # An equality gets a band within its tolerance, so that the program has an interior.
         band = tightening.band * constraint.tolerance / scale
         lower, upper = lower - band, upper + band
     elif not constraint.has_solver_margin:

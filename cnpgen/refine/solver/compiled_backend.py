@@ -370,15 +370,8 @@ class CompiledBackend:
         rows = dim + self._m * self._points + ROWS_PER_BLOCK
         scratch = (2 * dim + ROWS_PER_BLOCK) * stride + 8 * (stride + ROWS_PER_BLOCK)
         blocks = rows  # an upper bound: blocks have 8 rows or more
-        sizes = (
-            rows * dim,
-            rows,
-            rows,
-            rows,
-            scratch,
-            dim,
-            blocks,
-        )  # in the order of _Polyhedron
+        # In the order of _Polyhedron.
+        sizes = rows * dim, rows, rows, rows, scratch, dim, blocks
         return _Polyhedron(dim, stride, 0, *self._allocate(sizes))
 
     def _allocate(self, sizes: Sequence[int]) -> list[int]:

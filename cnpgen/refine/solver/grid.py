@@ -14,7 +14,9 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 NODES_PER_CELL = 4  # Gauss nodes of the time integral: relative error below 1e-9
 COST_NODES = 40
-FIRST_JERK_PHASE = 1e-6  # close enough to 0; jerks there differ by some percent from those at the next grid point
+# Close enough to 0; jerks there differ by some percent from those at the next grid
+# point.
+FIRST_JERK_PHASE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -53,8 +55,12 @@ class Bases:
 class Grid:
     """Grid on (0, 1]."""
 
-    s: Array  # phases, shape (K,); at s = 0 everything but the jerk is fixed by the boundary conditions
-    bases: Bases  # bases on the grid, three orders of p and two of r, or four and three where the jerk is constrained
+    # Phases, shape (K,); at s = 0 everything but the jerk is fixed by the boundary
+    # conditions.
+    s: Array
+    # Bases on the grid, three orders of p and two of r, or four and three where the
+    # jerk is constrained.
+    bases: Bases
     time_basis: Array  # basis of r at the nodes of the time integral, shape (Q, R)
     time_weights: Array  # quadrature weights of the time integral, shape (Q,)
     # Bases at the Gauss nodes of the cost term's integral, four orders of p and three

@@ -34,10 +34,11 @@ Array = NDArray[np.float64]
 TEMPLATE_POINTS = 32  # of a grid that is only used to find equalities
 STATES_PER_INTERVAL = 10
 FEEDBACK_MARGIN_M = 2e-4  # added to the required distances between grid points
-MARGIN_EDGE = 0.05  # phase over which the margin fades in from either end, where the clearance may be smaller
-MIN_FED_BACK_M = (
-    1e-6  # an object that stands on something at an end touches it up to rounding
-)
+# Phase over which the margin fades in from either end, where the clearance may be
+# smaller.
+MARGIN_EDGE = 0.05
+# An object that stands on something at an end touches it up to rounding.
+MIN_FED_BACK_M = 1e-6
 MAX_FED_BACK_M = 0.02  # larger collisions are not between grid points
 
 
@@ -189,9 +190,11 @@ class HullFeedback:
             missing = np.maximum(
                 missing - accepted_along(self._near_ends, accepted), 0.0
             )
+        # The margin alone is no collision; deep ones are no matter of the grid.
         worst = float((missing.max(axis=1) - self._margins).max())
         if not MIN_FED_BACK_M < worst < MAX_FED_BACK_M:
             return None
+        # A collision between two grid points is fed back to both of them.
         between = missing.reshape(self._intervals, STATES_PER_INTERVAL, -1).max(axis=1)
         edge = np.zeros((1, between.shape[1]))
         return np.asarray(
@@ -212,6 +215,7 @@ class HullFeedback:
         The depth [m] is that of the verdict, and the least increase for the pairs that
         are closest.
         """
+        # The interval of the collision and its neighbors: the motion will shift a little.
         interval = int(np.searchsorted(self._phases, phase)) - 1
         first, last = max(interval - 1, 0), min(interval + 2, self._intervals)
         window = np.linspace(

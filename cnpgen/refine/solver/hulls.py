@@ -2,9 +2,15 @@
 
 A capsule is some centimetres larger than its link. For parts that are close to each
 other compiled code (``cnpgen.kernels.collision``), or Coal without a compiler, returns
-the distance, the closest points and the direction. The derivative of the distance
-treats the closest points and the direction as constant (envelope theorem): it is the
-velocity of the points along the direction.
+the distance d, the closest points x1 and x2, and the unit vector n from the first to
+the second. The derivative of the distance treats points and direction as constant
+(envelope theorem): it is the velocity of the points along the direction,
+
+    dd/dq_j = n . (dx2/dq_j - dx1/dq_j),
+    n . dx/dq_j = a_j . ((x - o_j) x n)  for a revolute joint that moves x,
+                  a_j . n                for a prismatic one, and 0 for other joints,
+
+with the axis a_j of joint j through its origin o_j, in the world frame.
 """
 
 from ctypes import CDLL
@@ -36,9 +42,8 @@ LINK_CONSTRAINTS, OBJECT_CONSTRAINTS = (
     RobotClearance | SelfClearance,
     ObjectContact | ObjectClearance,
 )
-MEASURED_RANGE_M = (
-    0.04  # above the required distance; larger distances are not measured
-)
+# Above the required distance; larger distances are not measured.
+MEASURED_RANGE_M = 0.04
 
 
 def has_clearance_constraints(problem: Problem, robot: Robot) -> bool:
@@ -55,9 +60,8 @@ class _Group:
     columns: Pairs  # of their distances, shape (P,)
     required: float  # distance [m]
     of_obstacles: bool  # whether they are obstacles and moving parts, else two links
-    numbers: (
-        Pairs  # among all pairs of obstacles and moving parts, or of links, shape (P,)
-    )
+    # Among all pairs of obstacles and moving parts, or of links, shape (P,).
+    numbers: Pairs
 
 
 class Hulls:
@@ -151,6 +155,7 @@ class Hulls:
         self._axes = np.array([joint.axis for joint in robot.chain.joints])
         self._sliding = np.array(robot.prismatic)
         supports = [list(joints) for joints in robot.model.supports]
+        # Joint j moves body b if it is among the joints between the base and b.
         self._moves = np.array(
             [[joint in above for joint in range(1, robot.n + 1)] for above in supports]
         )
@@ -264,15 +269,16 @@ class Hulls:
         for contacts, group in zip(groups, self._groups, strict=True):
             k, column = contacts.k, group.columns[contacts.pair]
             normals = np.repeat(contacts.normal[:, None], 2, axis=1)
-            levers = np.cross(
-                contacts.points, normals
-            )  # of a unit force at the points, about the world's origin
+            # a . ((x - o) x n) = a . (x x n) + (o x a) . n: the first term needs one
+            # product for both points, the second is that of the joint alone.
+            levers = np.cross(contacts.points, normals)
             turning = np.einsum("cjx,cbx->cbj", axes[k], levers)
             turning += np.einsum("cjx,cbx->cbj", np.cross(origins, axes)[k], normals)
             speeds = np.where(
                 self._sliding, np.einsum("cjx,cbx->cbj", axes[k], normals), turning
             )
             speeds *= self._moves[self._bodies.joints_of(group.pairs[contacts.pair])]
+            # Several parts of a pair of links share a column: the closest one decides.
             nearest = contacts.distance <= distances[k, column]
             gradients[k[nearest], column[nearest]] = (speeds[:, 1] - speeds[:, 0])[
                 nearest

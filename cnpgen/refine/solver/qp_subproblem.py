@@ -1,7 +1,13 @@
 """Quadratic programming subproblem of one SQP step: selection of its residuals, and its solution by DAQP.
 
-DAQP gets variables in which the Hessian is the identity. It would transform the program
-itself, but takes twice as long as BLAS.
+With the Cholesky factor H + rho I = L L', the step is d = L^-T y and the elastic
+variable e = z / sqrt(kappa), so that DAQP gets a program whose Hessian is the identity:
+
+    minimize    |y|^2 / 2 + (L^-1 f') y + z^2 / 2 + (c / sqrt(kappa)) z
+    subject to  l - g <= J L^-T y + (v- - v+) z / sqrt(kappa) <= u - g
+
+In terms of e the elastic variable costs c e + kappa e^2 / 2, with c = mu v plus a small
+constant. DAQP would transform the program itself, but takes twice as long as BLAS.
 """
 
 from dataclasses import dataclass
@@ -18,13 +24,16 @@ Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 DAQP_INFINITY = 1e30  # DAQP's value of no bound
-ELASTIC_CURVATURE_ROOT = 0.1  # of the elastic variable's cost; far smaller ones triple the working-set changes
+# Of the elastic variable's cost; far smaller ones triple the working-set changes.
+ELASTIC_CURVATURE_ROOT = 0.1
 ELASTIC_GRADIENT = 1e-3  # of the elastic variable's cost where nothing is violated
 MIN_MULTIPLIER = 1e-9  # smaller multipliers belong to inactive residuals
 QP_TOLERANCE = 1e-6  # primal tolerance of DAQP and of active_set.c
 MAX_WORKING_SET_CHANGES = 3000
-THINNING = 6  # interval of grid points at which residuals are selected without being a local maximum
-MAX_SPEED_DISTANCE = 0.4  # selection distance without accelerations, which grow with the square of the rate
+# Interval of grid points at which residuals are selected without being a local maximum.
+THINNING = 6
+# Selection distance without accelerations, which grow with the square of the rate.
+MAX_SPEED_DISTANCE = 0.4
 DAQP_LOWER, DAQP_UPPER = 3, 1  # DAQP's codes of initially active bounds
 
 
@@ -34,7 +43,8 @@ class Step:
 
     dx: Array  # step of the variables, shape (nx,)
     remaining: float  # fraction of the violations that remains after the step
-    multipliers: Array  # multipliers of all residuals, shape (K, m); 0 for those that are not selected
+    # Multipliers of all residuals, shape (K, m); 0 for those that are not selected.
+    multipliers: Array
     gain: float  # predicted reduction of the objective
 
 
@@ -43,9 +53,8 @@ class ResidualSelection:
     """Rule that selects the residuals of a subproblem."""
 
     violation: float  # largest violation at the current iterate
-    max_distance: (
-        float  # residuals are selected at local maxima within this distance of a bound
-    )
+    # Residuals are selected at local maxima within this distance of a bound.
+    max_distance: float
     # Bound of the change of log r; nonsmooth residuals that it could move over a bound
     # are selected.
     max_log_rate_change: float
@@ -90,6 +99,9 @@ class NumpyBackend:
         distances = np.where(
             bounds.accelerated, distance, min(distance, MAX_SPEED_DISTANCE)
         )
+        # A residual takes part if it is a local maximum near its bound, if it is not
+        # smooth and a change of the rate could move it over its bound, if a rejected step
+        # violated it, or if it was active in the last program.
         selected: Mask = local_maxima(violations) & (violations > -distances)
         selected |= bounds.nonsmooth & (violations > -errors)
         selected |= selection.missed
@@ -135,6 +147,8 @@ class NumpySubproblem:
         k, residual = np.nonzero(self.selected)
         rows, low, high = self._rows(k, residual, unwhiten, relax=relax)
         sense = np.zeros(nx + 1 + len(k), np.int32)
+        # The active residuals of the last program are the initial working set: a positive
+        # multiplier belongs to an upper bound, a negative one to a lower bound.
         if warm is not None:
             before = warm[k, residual]
             sense[nx + 1 :] = DAQP_UPPER * (before > MIN_MULTIPLIER) + DAQP_LOWER * (
@@ -156,6 +170,7 @@ class NumpySubproblem:
         dx = unwhiten @ solution[:-1]
         if flag < 1 or not np.isfinite(dx).all():
             return None
+        # gain = -(f' d + d (H + rho I) d / 2); ``curvature`` lacks the proximal term
         multipliers = np.zeros(self.at.g.shape)
         multipliers[k, residual] = info["lam"][nx + 1 :]
         cost = float(
@@ -197,6 +212,7 @@ class NumpySubproblem:
         )
         rows[nx, -1] = 1 / ELASTIC_CURVATURE_ROOT
         elastic = rows[nx + 1 :, -1]
+        # Relaxed: every residual may exceed its closer bound by e v, not only violated ones.
         if relax:
             upper_is_closer = upper - g < g - lower
             elastic[:] = (
@@ -205,6 +221,8 @@ class NumpySubproblem:
             )
             low = np.where(upper_is_closer, -DAQP_INFINITY, lower - g)
             return rows, low, np.where(upper_is_closer, upper - g, DAQP_INFINITY)
+        # A violated residual keeps only the bound that it violates, relaxed by e times the
+        # violation; its other bound is far away and would only slow the program down.
         above, below = np.maximum(g - upper, 0), np.maximum(lower - g, 0)
         elastic[:] = (below - above) / ELASTIC_CURVATURE_ROOT
         return (
@@ -216,11 +234,14 @@ class NumpySubproblem:
 
 def local_maxima(violations: Array) -> Mask:
     """Return a mask of local maxima along the motion, their neighbors and the thinned grid, shape (K, m)."""
+    # v_k >= v_(k-1) and v_k >= v_(k+1); at the ends one neighbor decides
     peak = np.zeros(violations.shape, bool, order="F")
     peak[1:-1] = (violations[1:-1] >= violations[:-2]) & (
         violations[1:-1] >= violations[2:]
     )
     peak[0], peak[-1] = violations[0] >= violations[1], violations[-1] >= violations[-2]
+    # Maxima move between steps: their neighbors take part, too. The thinned grid keeps
+    # long flat parts from drifting over a bound unseen.
     mask = peak.copy("F")
     mask[1:] |= peak[:-1]
     mask[:-1] |= peak[1:]

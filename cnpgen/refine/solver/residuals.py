@@ -24,7 +24,9 @@ from cnpgen.schema.parsing import stored_values
 
 Array = NDArray[np.float64]
 DISTANCE_SCALE_M = 0.1  # size of a residual of 1
-EQUALITY_SCALE = 20  # tolerances; with fewer the merit function rejects steps for equalities that are met well enough
+# Tolerances; with fewer the merit function rejects steps for equalities that are met
+# well enough.
+EQUALITY_SCALE = 20
 
 
 def stage_values(robot: Robot, problem: Problem) -> Any:

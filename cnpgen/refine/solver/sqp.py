@@ -1,10 +1,24 @@
 """Sequential quadratic programming with a trust region, for one motion.
 
-Each step minimizes a quadratic model of the objective subject to the linearized
-residuals. One elastic variable relaxes violated residuals: the step may leave a
-fraction of every violation. The merit function is the objective plus a multiple of the
-largest violation. A proximal term makes the model strictly convex where the objective
-is flat.
+The variables x are the free path control points and the logarithms of the rate control
+points. With the regularized objective f, scaled residuals g and their bounds l and u,
+
+    minimize f(x)  subject to  l <= g(x) <= u.
+
+A step d from x solves the program
+
+    minimize    f' d + d (H + rho I) d / 2 + c(e)
+    subject to  l - e v-  <=  g + J d  <=  u + e v+,    |d| <= Delta s,    0 <= e <= 1,
+
+where v- and v+ are the present violations of the bounds. The elastic variable e is the
+fraction of every violation that the step may leave, and c(e) its cost
+(``qp_subproblem``). The proximal term rho makes the model strictly convex where the
+objective is flat; s scales the trust region. With the largest violation v and its
+weight mu, the merit function is
+
+    phi(x) = f(x) + mu v(x),    predicted reduction = gain + mu v (1 - e),
+
+where the gain is the reduction of f that the quadratic model predicts.
 
 The merit function alone rejects good steps along a curved manifold, since they leave it
 by their square (the Maratos effect). A step that reduces the objective is therefore
@@ -36,44 +50,35 @@ from cnpgen.refine.solver.qp_subproblem import (
 from cnpgen.refine.solver.transcription import Transcription
 
 Array = NDArray[np.float64]
-RATE_RADIUS_FACTOR = (
-    1.5  # trust radius of the logarithms of the rate, relative to that of the path
-)
+# Trust radius of the logarithms of the rate, relative to that of the path.
+RATE_RADIUS_FACTOR = 1.5
 MAX_RADIUS, MIN_RADIUS = 1.0, 1e-5  # of the trust region
 MAX_STEP_GROWTH = 1.5  # expected factor of the length of successive steps
-SELECTION_DISTANCES = (
-    (0.2, 0.4),
-    (0.05, 0.2),
-    (-1.0, 0.1),
-)  # see ``Settings.selection_distances``
+# See ``Settings.selection_distances``.
+SELECTION_DISTANCES = (0.2, 0.4), (0.05, 0.2), (-1.0, 0.1)
 CONVERGED_PROXIMAL = 1.0  # weight of the proximal term once the objective has converged
-SHORT_MOTION_S = (
-    0.2  # in shorter motions that weight grows with the cube of the ratio of durations
-)
-MAX_REMAINING = 0.9  # a step that leaves a larger fraction of the violations is computed again with relaxed residuals
-PENALTY_FACTOR = 3.0  # times the objective: weight of violations where the penalty makes violations profitable
-STALL_STEPS, STALL_FRACTION = (
-    8,
-    0.9,
-)  # stalled: a larger fraction of the violation is left after so many steps
-MAX_RESTORED_VIOLATION = 0.02  # a stalled iteration with a smaller violation restores feasibility before it ends
-BOUND_SHRINKAGE, MIN_GAIN_FRACTION = (
-    0.7,
-    0.1,
-)  # of the violation bound; smallest fraction of the predicted gain
+# In shorter motions that weight grows with the cube of the ratio of durations.
+SHORT_MOTION_S = 0.2
+# A step that leaves a larger fraction of the violations is computed again with relaxed
+# residuals.
+MAX_REMAINING = 0.9
+# Times the objective: weight of violations where the penalty makes violations
+# profitable.
+PENALTY_FACTOR = 3.0
+# Stalled: a larger fraction of the violation is left after so many steps.
+STALL_STEPS, STALL_FRACTION = 8, 0.9
+# A stalled iteration with a smaller violation restores feasibility before it ends.
+MAX_RESTORED_VIOLATION = 0.02
+# Of the violation bound; smallest fraction of the predicted gain.
+BOUND_SHRINKAGE, MIN_GAIN_FRACTION = 0.7, 0.1
 LAST_STEPS = 3  # before a deadline restore feasibility
 DEADLINE_PROXIMAL = 30.0  # weight of the proximal term in these
-MAX_MIDPOINT_CORRECTIONS = (
-    2  # tightenings of the bounds for violations between grid points
-)
-STEP_TIME_FACTOR = (
-    1.3  # times the largest duration of a step so far is reserved for the next
-)
-ACCEPTED_RATIO, GOOD_RATIO, POOR_RATIO = (
-    0.05,
-    0.7,
-    0.3,
-)  # of reduction to prediction: accept, enlarge, shrink
+# Tightenings of the bounds for violations between grid points.
+MAX_MIDPOINT_CORRECTIONS = 2
+# Times the largest duration of a step so far is reserved for the next.
+STEP_TIME_FACTOR = 1.3
+# Of reduction to prediction: accept, enlarge, shrink.
+ACCEPTED_RATIO, GOOD_RATIO, POOR_RATIO = 0.05, 0.7, 0.3
 
 
 @dataclass(frozen=True)
@@ -91,7 +96,8 @@ class Settings:
     # objective.
     violation_bound: float = 0.3
     max_initial_violation: float = np.inf  # largest violation of a usable initial guess
-    cost_tolerance: float = 1e-3  # relative change of the objective, predicted and actual, at which it has converged
+    # Relative change of the objective, predicted and actual, at which it has converged.
+    cost_tolerance: float = 1e-3
     # Pairs (step length, distance): after a step longer than the first, residuals
     # within the second of a bound are selected.
     selection_distances: tuple[tuple[float, float], ...] = SELECTION_DISTANCES
@@ -106,7 +112,8 @@ class Deadline:
     """Time at which a sequence of steps must have ended: iterations of a solver, or verdicts."""
 
     until: float  # in the clock of ``time.perf_counter`` [s]
-    max_duration: float = 0.0  # time reserved for one step: the largest so far, times ``STEP_TIME_FACTOR`` [s]
+    # Time reserved for one step: the largest so far, times ``STEP_TIME_FACTOR`` [s].
+    max_duration: float = 0.0
 
     def allows(self, steps: int) -> bool:
         """Return whether there is time for so many steps."""
@@ -151,6 +158,8 @@ def minimize(
         and (deadline is None or deadline.allows(1))
     ):
         begun = time.perf_counter()
+        # The last steps before a deadline restore feasibility: a slower valid motion is
+        # worth more than a faster invalid one.
         iterate.restoring = deadline is not None and not deadline.allows(LAST_STEPS)
         iteration += 1
         iterate.advance()
@@ -185,7 +194,8 @@ class _Iterate:
     """State of the iteration: variables, regularized objective, largest violation."""
 
     restoring = False  # whether steps only restore feasibility, before a deadline
-    tightened = False  # whether the last step tightened the bounds for violations between grid points
+    # Whether the last step tightened the bounds for violations between grid points.
+    tightened = False
 
     def __init__(
         self, motion: Transcription, bounds: Bounds, settings: Settings, x: Array
@@ -208,9 +218,8 @@ class _Iterate:
             settings.violation_bound,
             settings.penalty,
         )
-        self._step_length = (
-            MAX_RADIUS  # of the last step, in the norm of the trust region
-        )
+        # Of the last step, in the norm of the trust region.
+        self._step_length = MAX_RADIUS
         self._multipliers: Array | None = None
         self._cost_converged = self._stalled = False
         self._missed = np.zeros(
@@ -230,8 +239,12 @@ class _Iterate:
     def advance(self) -> None:
         """Try a step, and accept it or adapt the trust region and the selection."""
         settings, self.tightened = self._settings, False
+        # A step that only restores feasibility stays close to x: a large proximal weight
+        # makes changes of the objective expensive, the constraints are unchanged.
         restore = self.restoring or self._cost_converged or self._stalled
         proximal = self._restoration_weight() if restore else settings.proximal
+        # After long steps the linearization is poor, so more residuals near their
+        # bounds take part in the program; after short ones a few are enough.
         distance = next(
             distance
             for length, distance in settings.selection_distances
@@ -245,19 +258,21 @@ class _Iterate:
             self.x, self._g, selection, proximal=proximal, penalty=self._penalty
         )
         step = self._propose(subproblem)
-        if step is None:
+        if step is None:  # no feasible point in the box, or a failure of the program
             self._radius *= 0.25
         else:
             self._try(step, subproblem.selected)
         if self.x is not self._start:
             self._violations.append(self.violation)
-        if (
-            self._is_stuck() and self._penalty < self.cost
-        ):  # violations may be profitable
+        # A motion that is 1 % slower costs 1 % of its duration. Where the duration [s] is
+        # larger than mu, a violation may pay for itself: raise mu above it.
+        if self._is_stuck() and self._penalty < self.cost:
             self._penalty, self._violations = (
                 PENALTY_FACTOR * self.cost,
                 [self.violation],
             )
+        # Small violations that do not decrease any more: give up the objective once, and
+        # restore feasibility before the iteration ends.
         if (
             self._is_stuck()
             and not self._stalled
@@ -276,6 +291,7 @@ class _Iterate:
 
     def _is_stuck(self) -> bool:
         """Return whether no iterate was feasible and the smallest violation hardly decreases any more."""
+        # min over the last steps > 0.9 min over all earlier ones, and neither is feasible
         before, recent = (
             self._violations[:-STALL_STEPS],
             self._violations[-STALL_STEPS:],
@@ -292,6 +308,8 @@ class _Iterate:
         """Solve the subproblem; solve it again, relaxed or without warm start, if the step is of little use."""
         box = self._radius * self._scale
         step = subproblem.solve(box, warm=self._multipliers)
+        # An infeasible iterate whose step removes hardly any violation: residuals that
+        # hold now block it. The relaxed program lets all of them grow up to v.
         if self.violation > self._settings.violation_tolerance and (
             step is None or step.remaining > MAX_REMAINING
         ):
@@ -312,9 +330,12 @@ class _Iterate:
         settings = self._settings
         x = self.x + step.dx
         cost, g, violation = self._backend.value(x)
+        # Reductions of the merit function: predicted by the models, and actual.
         gain = step.gain
         predicted = gain + self._penalty * self.violation * (1 - step.remaining)
         reduction = self.cost - cost + self._penalty * (self.violation - violation)
+        # Second way of acceptance: the violation stays below its bound, and the objective
+        # decreases by a fraction of the prediction (against the Maratos effect).
         within_bound = (
             violation <= self._violation_bound
             and self.cost - cost > MIN_GAIN_FRACTION * gain > 0
@@ -324,8 +345,10 @@ class _Iterate:
         if np.isfinite(reduction) and (
             within_bound or reduction > ACCEPTED_RATIO * predicted
         ):
+            # Accepted by the bound alone: it shrinks, so that this cannot go on forever.
             if reduction <= ACCEPTED_RATIO * predicted:
                 self._violation_bound *= BOUND_SHRINKAGE
+            # The models were good: enlarge the region if the step reached its edge.
             if within_bound or reduction > GOOD_RATIO * predicted:
                 self._radius = (
                     min(2.5 * self._radius, MAX_RADIUS)
@@ -337,6 +360,8 @@ class _Iterate:
             self._cost_converged = (
                 max(abs(self.cost - cost), abs(gain)) < settings.cost_tolerance * cost
             )
+            # Converged: the objective cannot be improved (or is given up), and all
+            # residuals hold.
             restored = self._cost_converged or self._stalled or self.restoring
             self.converged = restored and violation < settings.violation_tolerance
             self.x, self.cost, self._g, self.violation, self._step_length = (
@@ -371,6 +396,9 @@ class _Iterate:
 
         Shrink the radius unless they explain the rejection.
         """
+        # Residuals that the step violated although the program had not selected them:
+        # they explain the rejection, and the next program has them. Otherwise the models
+        # are wrong in the region, and a smaller one is tried.
         violated = violations > self._settings.violation_tolerance
         missed = local_maxima(violations) & violated & ~selected
         self._missed |= missed

@@ -1,10 +1,20 @@
 """Transcription of the optimization problem of one motion: variables, residuals on a Chebyshev grid, derivatives.
 
 Variables are the interior path control points and the logarithms of the rate control
-points. Boundary conditions hold by construction: the boundary control points are
-functions of the first and last rate control points (paper, Appendix A). Residuals are
-the problem's constraints, each divided by its scale
-(``cnpgen.refine.solver.residuals``).
+points, x = (C_3, ..., log R_0, ...), which keeps rates positive. Boundary conditions
+hold by construction: the boundary control points are functions of the first and last
+rate control points (paper, Appendix A). Residuals are the problem's constraints, each
+divided by its scale (``cnpgen.refine.solver.residuals``). They are functions of the
+splines w = (p, p', p'', r, r') at a phase s, which are linear in the control points:
+
+    T = integral of 1 / r(s) ds,    dg/dx = dg/dw (dw/dC dC/dx + dw/dR dR/dx),
+
+with dR/d(log R) = R, and with the boundary control points' dependence on R in dC/dx.
+The objective's Hessian in log R keeps the positive part of that of T,
+
+    H = integral of 2 r^-3 (dr/dlog R)(dr/dlog R)' ds,
+
+so that it is positive semidefinite.
 """
 
 from collections.abc import Callable
@@ -25,7 +35,9 @@ from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 T = TypeVar("T")
-RATE_SMOOTHING = 1e-4  # weight of the squared second differences of log r, which selects one of many parametrizations
+# Weight of the squared second differences of log r, which selects one of many
+# parametrizations.
+RATE_SMOOTHING = 1e-4
 
 
 @dataclass(frozen=True)
@@ -49,9 +61,8 @@ class ResidualKernels:
     values: Kernel  # kernel of ``cnpgen.refine.solver.residuals.stage_values``
     jacobian: Kernel  # kernel of ``cnpgen.refine.solver.residuals.stage_jacobian``
     cost_term: CostTerm | None = None  # cost term in addition to the duration, or None
-    cost_residuals: Kernel | None = (
-        None  # kernel of ``cnpgen.refine.solver.residuals.cost_term_residuals``, or None
-    )
+    # Kernel of ``cnpgen.refine.solver.residuals.cost_term_residuals``, or None.
+    cost_residuals: Kernel | None = None
     cost_counts: tuple[
         int, ...
     ] = ()  # number of residuals of every term of the cost term
@@ -146,10 +157,8 @@ class Transcription:
         Nan where accelerations or jerks are free.
         """
         orders = len(self.grid.bases.path)
-        b, unit = (
-            self.boundary,
-            np.eye(1, orders - 1)[0],
-        )  # with r = 1 and r' = 0, w is the state itself
+        # With r = 1 and r' = 0, w is the state itself.
+        b, unit = self.boundary, np.eye(1, orders - 1)[0]
         free = np.full(self.n, np.nan)
         goal_ddq, jerk = (
             free if b.goal_ddq is None else b.goal_ddq[0],
@@ -182,15 +191,18 @@ class Transcription:
         w, path, rate = self._at(x)
         g, jacobian = self.kernels.jacobian(w, self.poses_along)
         log = x[self.split :]
+        # dr/d(log R_j) = B_j R_j at the nodes of the time integral
         log_rate_derivative = self.grid.time_basis * rate
         inverse = 1.0 / (self.grid.time_basis @ rate)
         cost = float(inverse @ self.grid.time_weights) + self.regularization(x)
         gradient = np.zeros(self.nx)
+        # dT/d(log R) = -sum of weight r^-2 dr/d(log R)
         gradient[self.split :] = (
             -((self.grid.time_weights * inverse**2) @ log_rate_derivative)
             + self.smoothing @ log
         )
         curvature = np.zeros((self.nx, self.nx))
+        # H = half' half: a square root, so that one product of matrices builds it
         half = (
             log_rate_derivative
             * np.sqrt(2 * self.grid.time_weights * inverse**3)[:, None]
@@ -208,6 +220,7 @@ class Transcription:
 
     def linearization_errors(self, at: Linearization, step: float) -> Array:
         """Bound the change of residuals by derivatives of r if no log r changes by more than ``step``: (K, m)."""
+        # |r^(i) after - before| <= sum_j |B_j^(i)| R_j step, to first order in the step
         orders, errors = len(self.grid.bases.path), np.zeros(at.g.shape)
         for order in range(1, orders - 1):
             change = np.abs(self.grid.bases.rate[order]) @ at.rate * step
@@ -257,6 +270,8 @@ class Transcription:
     ) -> Array:
         """Convert gradients in w at nodes k, shape (m, width of w), to gradients in the variables, (m, nx)."""
         n, m, orders = self.n, len(k), len(bases.path)
+        # dg/dC = sum over orders of B^(i) dg/dp^(i), for all control points, also those
+        # that the boundary conditions determine
         control = bases.path_at[k] @ state_gradients[:, : orders * n].reshape(
             m, orders, n
         )
@@ -265,6 +280,7 @@ class Transcription:
         out[:, self.split :] = (
             state_gradients[:, None, orders * n :] @ bases.rate_at[k]
         )[:, 0] * rate
+        # Boundary control points depend on the first and last rates: chain rule through them.
         for item in self._boundary_derivatives(rate):
             out[:, self.split + item.variable] += control[:, item.point] @ (
                 item.derivative[0] * rate[item.variable]
@@ -275,6 +291,7 @@ class Transcription:
 @cache
 def _smoothing(points: int) -> Array:
     """Return the Hessian of the regularization, shape (R, R)."""
+    # |D log r|^2 with second differences D: constant and exponential rates cost nothing
     second = np.diff(np.eye(points), 2, axis=0)
     return np.asarray(2 * RATE_SMOOTHING * second.T @ second)
 

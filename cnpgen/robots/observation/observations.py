@@ -29,10 +29,8 @@ Corner = tuple[float, float, float]
 
 MAX_OBSERVED_POINTS = 10_000_000  # of one observation of one scene
 MIN_GRID_EXTENT_M = 1e-6
-WORKSPACE = (
-    (-0.9, -0.9, -0.1),
-    (0.9, 0.9, 1.1),
-)  # corners of the default grids, around an arm like the Panda [m]
+# Corners of the default grids, around an arm like the Panda [m].
+WORKSPACE = (-0.9, -0.9, -0.1), (0.9, 0.9, 1.1)
 
 
 class ObservationBackend:

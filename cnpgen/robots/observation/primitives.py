@@ -38,11 +38,14 @@ POINTS_PER_CHUNK = 65_536  # keeps the temporary arrays of one primitive in the 
 class ConvexMesh:
     """The convex hull of corners, relative to the center of its bounding box.
 
-    Attributes: center: Center of the bounding box in the frame of the mesh [m], shape
-        (3,). half: Half the edge lengths of the bounding box [m], shape (3,). corners:
-        The corners [m], shape (V, 3). triangles: Triangles of the surface: a corner and
-        the edges to the two others [m], shape (T, 3, 3). planes: Outer unit normals n
-        and offsets c of the faces, shape (F, 4): ``n @ x + c <= 0`` inside.
+    Attributes:
+        center: Center of the bounding box in the frame of the mesh [m], shape (3,).
+        half: Half the edge lengths of the bounding box [m], shape (3,).
+        corners: The corners [m], shape (V, 3).
+        triangles: Triangles of the surface: a corner and the edges to the two others
+            [m], shape (T, 3, 3).
+        planes: Outer unit normals n and offsets c of the faces, shape (F, 4): ``n @ x +
+            c <= 0`` inside.
     """
 
     center: Array
@@ -134,9 +137,9 @@ def convex_mesh(address: str) -> ConvexMesh:
 class Primitives:
     """M bodies of simple shapes in the world frame; or those of N scenes, with a first axis of length N.
 
-    Attributes: kinds: Index of each shape in ``KINDS``, shape (M,); ``MESH`` plus the
-        index of its mesh for others; -1 where
-            a scene has fewer bodies.
+    Attributes:
+        kinds: Index of each shape in ``KINDS``, shape (M,); ``MESH`` plus the index of
+            its mesh for others; -1 where a scene has fewer bodies.
         centers: Centers [m], shape (M, 3).
         rotations: Rotation matrices; columns are the axes of a body, shape (M, 3, 3).
         sizes: Sizes [m], shape (M, 3): half the edge lengths of a box, or of the

@@ -43,10 +43,14 @@ def unit_offset(seed: np.uint64) -> float:
 class _Patch:
     """Part of a surface: a rectangle, a triangle, or a surface of revolution.
 
-    Attributes: form: "flat", "triangle", "side", "disc" or "ball". area: Its area
-        [m^2]. base: Corner, or center of the lower end [m], shape (3,). axes: Rows:
-        edges of a rectangle or triangle [m], or unit axes, the last one that of
-        revolution. radius: Radius [m]. height: Height along the axis at its end [m].
+    Attributes:
+        form: "flat", "triangle", "side", "disc" or "ball".
+        area: Its area [m^2].
+        base: Corner, or center of the lower end [m], shape (3,).
+        axes: Rows: edges of a rectangle or triangle [m], or unit axes, the last one
+            that of revolution.
+        radius: Radius [m].
+        height: Height along the axis at its end [m].
     """
 
     form: str

@@ -15,12 +15,12 @@ from cnpgen.robots.shape.convex_part import ConvexPart
 from cnpgen.robots.shape.hull import Array, half_sphere, hull_corners
 
 SEARCH_DIRECTIONS = 3  # initial directions of the search
-POINTS_PER_ROUND = (
-    25  # corners and facets with the largest violations that are added per round
-)
+# Corners and facets with the largest violations that are added per round.
+POINTS_PER_ROUND = 25
 MAX_CAPSULE_ROUNDS = 6  # rounds of the search
 BALL_POINTS = 200  # points that approximate a ball in the computation of facets
-ROUNDING_STEP_M = 1e-5  # ends and radius are multiples of it, so that capsules are equal on all machines
+# Ends and radius are multiples of it, so that capsules are equal on all machines.
+ROUNDING_STEP_M = 1e-5
 
 
 @dataclass(frozen=True)

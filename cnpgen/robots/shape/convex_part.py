@@ -13,9 +13,9 @@ from cnpgen.robots.shape.hull import CUBE, MAX_COORDINATE_M, Array, check_solid
 from cnpgen.robots.shape.inline import corners_of, is_inline
 from cnpgen.robots.urdf import urdf_tree
 
-PRISM_SIDES = (
-    64  # of the prism that contains a cylinder; its corners exceed the radius by 0.12 %
-)
+# Of the prism that contains a cylinder; its corners exceed the radius by 0.12 %.
+
+PRISM_SIDES = 64
 _ANGLES = np.arange(PRISM_SIDES) * (2 * math.pi / PRISM_SIDES)
 _UNIT_PRISM = np.array(
     [[math.cos(angle), math.sin(angle), z] for z in (-1.0, 1.0) for angle in _ANGLES]
@@ -26,9 +26,11 @@ _UNIT_PRISM = np.array(
 class ConvexPart:
     """A convex part of a link: all points within ``radius`` of the convex hull of ``vertices``.
 
-    Attributes: link: Name of the link. vertices: Corners of the hull [m], shape (V, 3);
-        one for a sphere, two for a capsule. radius: Radius around the hull [m]; 0 for
-        boxes, cylinders and meshes.
+    Attributes:
+        link: Name of the link.
+        vertices: Corners of the hull [m], shape (V, 3); one for a sphere, two for a
+            capsule.
+        radius: Radius around the hull [m]; 0 for boxes, cylinders and meshes.
     """
 
     link: str
@@ -45,11 +47,14 @@ class ConvexPart:
 class Contacts(NamedTuple):
     """C pairs of bodies that are close to each other at a state.
 
-    Attributes: pair: Indices of the pairs, shape (C,). k: Indices of the states, shape
-        (C,). distance: Signed distances [m], shape (C,). normal: Unit vectors from the
-        first body to the second in the world frame, shape (C, 3). points: Closest
-        points of both bodies without their radii, in the world frame [m], shape (C, 2,
-        3).
+    Attributes:
+        pair: Indices of the pairs, shape (C,).
+        k: Indices of the states, shape (C,).
+        distance: Signed distances [m], shape (C,).
+        normal: Unit vectors from the first body to the second in the world frame, shape
+            (C, 3).
+        points: Closest points of both bodies without their radii, in the world frame
+            [m], shape (C, 2, 3).
     """
 
     pair: NDArray[np.int64]

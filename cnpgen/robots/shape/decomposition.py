@@ -21,12 +21,14 @@ from cnpgen.errors import MachineError
 from cnpgen.robots.shape.hull import Array, hull_corners
 from cnpgen.store.files.atomic import write_file
 
-CUTS_PER_AXIS = 9  # planes between both ends of a part along each axis that are tried, and as many at faces
+# Planes between both ends of a part along each axis that are tried, and as many at
+# faces.
+CUTS_PER_AXIS = 9
 FACE_TOLERANCE_M = 1e-4  # of the coordinates of points on a face
-MIN_VOLUME_REDUCTION = 0.005  # by a cut, as a fraction of the hull volume of the mesh; smaller cuts are not made
-DECOMPOSITION_REVISION = (
-    2  # of the decomposition; cached parts of another revision are ignored
-)
+# By a cut, as a fraction of the hull volume of the mesh; smaller cuts are not made.
+MIN_VOLUME_REDUCTION = 0.005
+# Of the decomposition; cached parts of another revision are ignored.
+DECOMPOSITION_REVISION = 2
 
 
 @dataclass(frozen=True)

@@ -22,13 +22,11 @@ MAX_PLANES = 24  # that approximate the faces of a hull
 SIMILAR_PLANES_COSINE = math.cos(
     math.radians(3)
 )  # of the angle below which planes are equivalent
-MIN_THICKNESS_M = (
-    1e-6  # coplanar points are extended by this on both sides, so that they have a hull
-)
+# Coplanar points are extended by this on both sides, so that they have a hull.
+MIN_THICKNESS_M = 1e-6
 MAX_CORNERS = 10_000  # of a body; finer meshes take minutes without benefit
-ENCLOSING_PLANES = (
-    2_000  # of the body that replaces a finer one; it is about 0.1 % larger
-)
+# Of the body that replaces a finer one; it is about 0.1 % larger.
+ENCLOSING_PLANES = 2_000
 MAX_COORDINATE_M = 1e4  # larger coordinates are treated as errors of units
 
 

@@ -43,10 +43,13 @@ GAP_STATES = 3_000  # random states: a gap of 2 % has a standard error of 0.3 %
 class PairGap:
     """Overlap of two links in sampled states.
 
-    Attributes: first: Link nearer to the base. second: Other link. parts: Fraction of
-        the sampled states in which their convex parts overlap. meshes: Fraction in
-        which their triangle meshes overlap. rejected: Fraction of the states that all
-        meshes accept in which their convex parts overlap.
+    Attributes:
+        first: Link nearer to the base.
+        second: Other link.
+        parts: Fraction of the sampled states in which their convex parts overlap.
+        meshes: Fraction in which their triangle meshes overlap.
+        rejected: Fraction of the states that all meshes accept in which their convex
+            parts overlap.
     """
 
     first: str
@@ -60,12 +63,14 @@ class PairGap:
 class HullGap:
     """Free space that convex parts reject, at sampled states.
 
-    Attributes: free: Number of sampled states in which no checked pair of meshes
-        overlaps. rejected: Number of these in which convex parts of a checked pair
-        overlap. accepted: Number of sampled states in which no convex parts of a
-        checked pair overlap. pairs: Checked pairs, the one with the largest gap first.
+    Attributes:
+        free: Number of sampled states in which no checked pair of meshes overlaps.
+        rejected: Number of these in which convex parts of a checked pair overlap.
+        accepted: Number of sampled states in which no convex parts of a checked pair
+            overlap.
+        pairs: Checked pairs, the one with the largest gap first.
         hidden: Pairs that are left out, since their convex parts always overlap,
-        although their meshes do not.
+            although their meshes do not.
     """
 
     free: int

@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     import coal
 
 
-_INLINE = "data:application/octet-stream;base64,"  # followed by corners x, y, z [m] as little-endian float64
+# Followed by corners x, y, z [m] as little-endian float64.
+_INLINE = "data:application/octet-stream;base64,"
 _MESHES = (".stl", ".dae", ".obj")
 MAX_DAE_HEAD_BYTES = 1 << 16  # in which a DAE file states its unit
 MAX_MESH_BYTES = 1 << 26  # of a mesh file

@@ -19,19 +19,25 @@ Names = frozenset[str]
 Mask = NDArray[np.bool_]
 
 SAMPLED_STATES = 10_000  # ten times as many gave the same pairs for a Franka Panda
-ALWAYS_FRACTION = 0.95  # links that overlap in a larger fraction of the states are treated as connected
-MAX_CAPSULE_ERROR_FRACTION = 0.05  # maximum fraction of collision-free states in which the capsules of a usable pair overlap
+# Links that overlap in a larger fraction of the states are treated as connected.
+ALWAYS_FRACTION = 0.95
+# Maximum fraction of collision-free states in which the capsules of a usable pair
+# overlap.
+MAX_CAPSULE_ERROR_FRACTION = 0.05
 
 
 @dataclass(frozen=True)
 class LinkPair:
     """Two links that move relative to each other.
 
-    Attributes: first: Link nearer to the base. second: Other link. left_out: Reason to
-        ignore the pair, "adjacent", "always" (in contact) or "disabled" (by an SRDF);
-        or empty. colliding: Fraction of sampled states in which the links overlap; nan
-        for adjacent links. mistaken: Fraction of the other states in which the capsules
-        overlap.
+    Attributes:
+        first: Link nearer to the base.
+        second: Other link.
+        left_out: Reason to ignore the pair, "adjacent", "always" (in contact) or
+            "disabled" (by an SRDF); or empty.
+        colliding: Fraction of sampled states in which the links overlap; nan for
+            adjacent links.
+        mistaken: Fraction of the other states in which the capsules overlap.
     """
 
     first: str
@@ -139,9 +145,12 @@ def joint_poses(model: "pin.Model", states: Array) -> tuple[Array, Array]:
 class CollisionBody:
     """Collision geometry of Coal in the frame of a joint, with a ball that contains it.
 
-    Attributes: center: Center of the ball [m], shape (3,). radius: Radius of the ball
-        [m]. geometry: Geometry of Coal. placement: Pose of the geometry in the frame of
-        the joint, a transform of Coal; None for the identity.
+    Attributes:
+        center: Center of the ball [m], shape (3,).
+        radius: Radius of the ball [m].
+        geometry: Geometry of Coal.
+        placement: Pose of the geometry in the frame of the joint, a transform of Coal;
+            None for the identity.
     """
 
     center: Array
@@ -160,9 +169,11 @@ def body_of_part(part: ConvexPart) -> tuple[str, CollisionBody]:
 class LinkContact:
     """Collision checks of links with Coal at K states.
 
-    Args: poses: Rotations and positions [m] of the joints, as ``sample_poses`` returns
-        them. bodies: Links and their bodies, in the frames of the joints that move
-        them. joints: Link -> index of the joint that moves it.
+    Args:
+        poses: Rotations and positions [m] of the joints, as ``sample_poses`` returns
+            them.
+        bodies: Links and their bodies, in the frames of the joints that move them.
+        joints: Link -> index of the joint that moves it.
     """
 
     def __init__(

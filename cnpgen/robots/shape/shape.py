@@ -38,7 +38,9 @@ Pairs = tuple[LinkPair, ...]
 Parts = tuple[ConvexPart, ...]
 Size = tuple[float, float, float]
 
-SHAPE_REVISION = 1  # of the computation of capsules and pairs; cached results of another revision are ignored
+# Of the computation of capsules and pairs; cached results of another revision are
+# ignored.
+SHAPE_REVISION = 1
 HELD_OBJECT = "held object"  # takes the place of a link's name
 SAMPLED_HELD_STATES = 2000  # states in which the object and the links are compared
 
@@ -47,11 +49,13 @@ SAMPLED_HELD_STATES = 2000  # states in which the object and the links are compa
 class Shape:
     """Collision geometry of a robot.
 
-    Attributes: convex_parts: Convex parts, each in the frame of the joint that moves
-        its link. joints: Link -> number of the planned joint that moves it, counted
-        from 1; 0 for fixed links. capsules: One covering capsule per link, in the frame
-        of the joint that moves it. pairs: Pairs of links that move relative to each
-        other.
+    Attributes:
+        convex_parts: Convex parts, each in the frame of the joint that moves its link.
+        joints: Link -> number of the planned joint that moves it, counted from 1; 0 for
+            fixed links.
+        capsules: One covering capsule per link, in the frame of the joint that moves
+            it.
+        pairs: Pairs of links that move relative to each other.
     """
 
     convex_parts: Parts
@@ -223,9 +227,10 @@ def load_held_shape(
 
     A cache folder keeps capsules and pairs; None for no cache.
 
-    Returns: The convex parts of all links that may not touch the object, then the
-        object; a capsule and a pair for each of these links. Links that the joint of
-        the tip moves do not move relative to the object and are omitted.
+    Returns:
+        The convex parts of all links that may not touch the object, then the object; a
+        capsule and a pair for each of these links. Links that the joint of the tip
+        moves do not move relative to the object and are omitted.
     """
     convex_parts, joints = place_convex_parts(urdf, model)
     if not joints:

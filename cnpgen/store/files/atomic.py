@@ -84,8 +84,9 @@ def committing(path: Path, work: Path | None = None) -> Iterator[Path]:
     file and the last rename wins. The temporary file is in ``work``, on the same file
     system, or in the folder of ``path``. Both folders are created.
 
-    Raises: MachineError: The file cannot be written. ``path`` is unchanged and the
-        temporary file is removed.
+    Raises:
+        MachineError: The file cannot be written. ``path`` is unchanged and the
+            temporary file is removed.
     """
     folder = work or path.parent
     temporary = folder / temporary_name(path.name)
@@ -138,8 +139,10 @@ def _reading(path: Path) -> Iterator[None]:
 def read_file(path: Path, *, max_bytes: int | None = None) -> bytes:
     """Read a whole file of at most ``max_bytes``, by default of any size.
 
-    Raises: DatasetError: The file is missing, too large, or a device or a pipe, whose
-        size is unknown. MachineError: The file cannot be read.
+    Raises:
+        DatasetError: The file is missing, too large, or a device or a pipe, whose size
+            is unknown.
+        MachineError: The file cannot be read.
     """
     with _reading(path):
         status = path.stat()

@@ -20,9 +20,8 @@ from cnpgen.errors import MachineError
 from cnpgen.store.files.file_lock import try_lock, unlock
 
 LIBRARIES, TAPES = "lib", "tape"
-_READ_ONLY_LINK = (
-    "warm"  # in a temporary folder: a link to a cache that is readable but not writable
-)
+# In a temporary folder: a link to a cache that is readable but not writable.
+_READ_ONLY_LINK = "warm"
 _WRITABLE_FOR_OTHERS = stat.S_IWGRP | stat.S_IWOTH
 MAX_LOCK_WAIT_S = 600  # a process that holds a lock longer may have been stopped
 

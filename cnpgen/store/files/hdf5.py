@@ -31,14 +31,8 @@ from cnpgen.store.files.size_limits import (
     MIN_EXPANSION_LIMIT_BYTES,
 )
 
-_DAMAGE = (
-    OSError,
-    KeyError,
-    RuntimeError,
-    ValueError,
-    TypeError,
-    AttributeError,
-)  # errors of h5py for damaged files
+# Errors of h5py for damaged files.
+_DAMAGE = OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError
 _SYSTEM_ERRORS = {
     errno.EACCES,
     errno.EPERM,
@@ -358,9 +352,9 @@ def open_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
 
     All handles are closed at the end of the block, so processes cannot share them.
 
-    Raises: DatasetError: The file is missing, not an HDF5 file, too large, damaged or
-        cut off; also raised for errors
-            within the block.
+    Raises:
+        DatasetError: The file is missing, not an HDF5 file, too large, damaged or cut
+            off; also raised for errors within the block.
         MachineError: The file cannot be read, or does not fit into memory.
     """
     import h5py

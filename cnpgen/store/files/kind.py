@@ -18,12 +18,8 @@ _SIGNATURES = {
 }
 PLANS = "a file of plans"
 _HEAD_BYTES = 256
-_SIGNATURE_OFFSETS = (
-    0,
-    512,
-    1024,
-    2048,
-)  # bytes; the offset is the size of the user block
+# Bytes; the offset is the size of the user block.
+_SIGNATURE_OFFSETS = 0, 512, 1024, 2048
 
 
 def own_kind(head: bytes) -> str:

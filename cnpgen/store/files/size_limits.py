@@ -7,9 +7,8 @@ The limits of recipes are in ``cnpgen.schema.toml``, those of URDFs in
 # HDF5
 MAX_HDF5_BYTES = 1 << 36  # of a file
 MAX_CHECKSUM_FILE_BYTES = 1 << 30  # of a model or a checkpoint, which are read at once
-MAX_EXPANSION = (
-    100  # maximum ratio of the unpacked numbers to the size of the file, ...
-)
+# Maximum ratio of the unpacked numbers to the size of the file, ...
+MAX_EXPANSION = 100
 MIN_EXPANSION_LIMIT_BYTES = (
     1 << 24
 )  # ... unless the unpacked numbers are smaller than this

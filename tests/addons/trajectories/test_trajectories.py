@@ -16,7 +16,7 @@ from cnpgen.errors import UsageError
 from cnpgen.plans import Plans
 from cnpgen.plans.export import export_plans
 from cnpgen.plans.exporter import sample_plan
-from cnpgen.store.files.yaml_document import MAX_YAML_DEPTH, read_yaml
+from cnpgen.problems.scenes.yaml_document import MAX_YAML_DEPTH, read_yaml
 from cnpgen.trajectories import Decision, Trajectory, load_trajectories
 from tests.examples.plan_files import plans_of
 from tests.examples.plans import load, perturbed

@@ -44,19 +44,16 @@ Array = NDArray[np.float64]
 
 MIN_DURATION_S, MAX_DURATION_S = 0.05, 10.0
 MAX_LIMIT_USE = 1.01  # of velocities and accelerations
-MAX_GOAL_ERROR_RAD, MAX_GOAL_ERROR_RAD_S = (
-    2e-5,
-    1e-3,
-)  # the answer ends at the goal exactly
+# The answer ends at the goal exactly.
+MAX_GOAL_ERROR_RAD, MAX_GOAL_ERROR_RAD_S = 2e-5, 1e-3
 MAX_PENALIZED_VIOLATION = 1e-3  # of the height [m], and of tilt and obstacles
 PINOCCHIO = {
     "3.2": "4.0"
 }  # version of Crocoddyl -> that of Pinocchio, whose binary interface its wheels need
 TORQUE_WEIGHT, ACCELERATION_WEIGHT = 1e-6, 1e-4
 LIMIT_WEIGHT = 1e3  # of positions, velocities and accelerations outside their limits
-LIMIT_FRACTION = (
-    0.98  # of velocities and accelerations, because penalties are violated a little
-)
+# Of velocities and accelerations, because penalties are violated a little.
+LIMIT_FRACTION = 0.98
 MANIFOLD_WEIGHT, OBSTACLE_WEIGHT = 1e6, 1e5
 END_ACCELERATION_WEIGHT, GOAL_WEIGHT = 1e3, 1e6
 FACE_NORMALS = np.vstack(

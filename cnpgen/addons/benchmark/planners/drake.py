@@ -33,16 +33,13 @@ Array = NDArray[np.float64]
 SPLINE_ORDER = 4  # cubic, the default of Drake
 MIN_KNOT_DISTANCE_S = 1e-9  # closer knots are one
 MIN_DURATION_S, MAX_DURATION_S = 0.05, 20.0
-MAX_SAMPLED_HEIGHT_ERROR_M = 5e-4  # half of the verdict's tolerance, because samples lie between those of the program
+# Half of the verdict's tolerance, because samples lie between those of the program.
+MAX_SAMPLED_HEIGHT_ERROR_M = 5e-4
 MAX_PLANE_TILT_RAD = 0.01
 INFLUENCE_DISTANCE_M = 0.05  # closer pairs count in the smooth minimum of distances
 MAX_DEPTH_M = 0.0
-OMITTED_ELEMENTS = (
-    "visual",
-    "collision",
-    "dynamics",
-    "mimic",
-)  # of links and joints; obstacles have own geometry
+# Of links and joints; obstacles have own geometry.
+OMITTED_ELEMENTS = "visual", "collision", "dynamics", "mimic"
 
 
 @dataclass(frozen=True)

@@ -41,13 +41,8 @@ Array = NDArray[np.float64]
 
 OUTPUT_PERIOD_S = 0.005
 MIN_WAYPOINT_DISTANCE_RAD = 1e-4  # closer waypoints are joined
-END_RATE_FRACTIONS = (
-    1.0,
-    0.75,
-    0.5,
-    0.25,
-    0.0,
-)  # of the goal's speed, tried in this order
+# Of the goal's speed, tried in this order.
+END_RATE_FRACTIONS = 1.0, 0.75, 0.5, 0.25, 0.0
 STATE_DISTANCE_RAD = 0.03  # largest distance of checked states of an edge
 
 

@@ -30,9 +30,9 @@ from cnpgen.schema.keys import field
 
 Array = NDArray[np.float64]
 
-PROJECTION_TOLERANCE = (
-    1e-3  # default of the package; states of the path may be ten times further away
-)
+# Default of the package; states of the path may be ten times further away.
+
+PROJECTION_TOLERANCE = 1e-3
 MIN_BREAK_DISTANCE_S = 1e-9  # closer breaks of the acceleration are joined
 
 

@@ -31,9 +31,8 @@ from cnpgen.robots.robot import Robot
 Array = NDArray[np.float64]
 
 OBSERVATION_TIME_S = 0.2  # after a motion without a puck
-GAIN_RAD_S = (
-    80.0  # natural frequency of the closed loop; an error decays within about 1/80 s
-)
+# Natural frequency of the closed loop; an error decays within about 1/80 s.
+GAIN_RAD_S = 80.0
 
 
 class Controller:

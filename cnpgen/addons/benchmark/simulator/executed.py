@@ -16,9 +16,9 @@ from cnpgen.judges.plans.metrics import tilt
 
 Array = NDArray[np.float64]
 
-PLANE_TOLERANCE_M = (
-    0.02  # of the mallet's height, as in the Air Hockey Challenge (2023)
-)
+# Of the mallet's height, as in the Air Hockey Challenge (2023).
+
+PLANE_TOLERANCE_M = 0.02
 MAX_GOAL_DISTANCE_M = 0.01  # of a finished motion, as in the paper
 EARLY_CONTACT_M = (
     hockey.PATH_LEFT_AT_CONTACT_M + 0.01
@@ -32,28 +32,38 @@ MAX_PUCK_TIME_S = 4.0  # until the puck arrives
 class Executed:
     """Result of the execution of one plan; inapplicable values are None or nan.
 
-    Attributes: finished: Whether the tip was within 1 cm of the goal when the plan
-        ended. touched_early: Whether the mallet touched the puck more than 10 mm of its
-        planned path before both were to meet. hit: Whether the mallet touched the puck.
-        scored: Whether the puck went into the opponent's goal. collided: Whether object
-        or links penetrated an obstacle by more than 1 mm outside legal contact.
-        hit_time: Time of the first contact of mallet and puck [s]. puck_speed: Speed of
-        the puck after the contact [m/s]. z_error: Integral of |z - height of the table|
-        over the executed plan [m s]. vertical_error: Integral of |roll| + |pitch| of
-        the tip frame over the motion [rad s]. tracking_error: Integral of the sum over
-        joints of |q - q planned| over the motion [rad s]. torque_use: Maximum torque as
-        a fraction of the rated torque; 1 is a saturated motor. goal_distance: Distance
-        of the tip from the goal when the plan ended [m]. contact_distance: Length of
-        the mallet's planned path that was left at the first contact with the puck [m].
+    Attributes:
+        finished: Whether the tip was within 1 cm of the goal when the plan ended.
+        touched_early: Whether the mallet touched the puck more than 10 mm of its
+            planned path before both were to meet.
+        hit: Whether the mallet touched the puck.
+        scored: Whether the puck went into the opponent's goal.
+        collided: Whether object or links penetrated an obstacle by more than 1 mm
+            outside legal contact.
+        hit_time: Time of the first contact of mallet and puck [s].
+        puck_speed: Speed of the puck after the contact [m/s].
+        z_error: Integral of |z - height of the table| over the executed plan [m s].
+        vertical_error: Integral of |roll| + |pitch| of the tip frame over the motion
+            [rad s].
+        tracking_error: Integral of the sum over joints of |q - q planned| over the
+            motion [rad s].
+        torque_use: Maximum torque as a fraction of the rated torque; 1 is a saturated
+            motor.
+        goal_distance: Distance of the tip from the goal when the plan ended [m].
+        contact_distance: Length of the mallet's planned path that was left at the first
+            contact with the puck [m].
         plane_error: Maximum |z - height of the table| of the executed plan [m].
         commanded_plane_error: The same of the commanded positions, which may be below a
-        table that supports the mallet. table_force: Maximum normal force between mallet
-        and table until the puck's result is final [N]. table_friction: Maximum friction
-        force between them [N]. table_contact_time: Time for which they touched [s].
+            table that supports the mallet.
+        table_force: Maximum normal force between mallet and table until the puck's
+            result is final [N].
+        table_friction: Maximum friction force between them [N].
+        table_contact_time: Time for which they touched [s].
         violated_steps: Constraint of the environment -> number of its steps that
-        violate it; None without such. penalty: Penalty points of the environment's
-        rules, without those of computation times. failure: Reason why nothing was
-        executed, or empty.
+            violate it; None without such.
+        penalty: Penalty points of the environment's rules, without those of computation
+            times.
+        failure: Reason why nothing was executed, or empty.
     """
 
     finished: bool = False

@@ -34,20 +34,21 @@ IIWA = {
     "joint_6": Friction(0.196149, 0.1),
     "joint_7": Friction(0.299238, 0.1),
 }
-DRY_FRACTION, VISCOUS_FRACTION = (
-    2e-3,
-    1e-3,
-)  # of the rated torque, the second per rad/s; for other joints
+# Of the rated torque, the second per rad/s; for other joints.
+DRY_FRACTION, VISCOUS_FRACTION = 2e-3, 1e-3
 
 
 @dataclass(frozen=True)
 class Plant:
     """A simulated robot.
 
-    Attributes: name: Its name. title: Deviations from the nominal model, in one line.
-        mass: Factor of masses and inertias. delay: Delay of torques in ticks of the
-        controller, 1 ms each. environment: Folder of an external environment; empty for
-        cnpgen's own simulation.
+    Attributes:
+        name: Its name.
+        title: Deviations from the nominal model, in one line.
+        mass: Factor of masses and inertias.
+        delay: Delay of torques in ticks of the controller, 1 ms each.
+        environment: Folder of an external environment; empty for cnpgen's own
+            simulation.
     """
 
     name: str

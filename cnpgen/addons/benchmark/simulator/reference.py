@@ -57,8 +57,9 @@ def make_reference(
 ) -> Reference:
     """Sample a trajectory of a duration [s] and add a stop, in which all joints decelerate uniformly in the same time.
 
-    Raises: UsageError: The plan never arrives, or plan or stop exceed
-        ``MAX_EXECUTED_DURATION_S``.
+    Raises:
+        UsageError: The plan never arrives, or plan or stop exceed
+            ``MAX_EXECUTED_DURATION_S``.
     """
     if not 0 < duration <= MAX_EXECUTED_DURATION_S:
         raise UsageError(

@@ -22,14 +22,8 @@ IMAGE_WIDTH, IMAGE_HEIGHT = 640, 480
 FILM_FRAMES_PER_S = 25
 SLOW_MOTION_FACTOR = 4
 FILM_TAIL_S = 1.0  # shown after the plan
-HOCKEY_VIEW = (
-    1.3,
-    0.0,
-    0.1,
-    2.6,
-    150.0,
-    -30.0,
-)  # target of the camera [m], distance [m], azimuth and elevation [deg]
+# Target of the camera [m], distance [m], azimuth and elevation [deg].
+HOCKEY_VIEW = 1.3, 0.0, 0.1, 2.6, 150.0, -30.0
 OBJECT_VIEW = (0.3, 0.0, 0.35, 2.4, 180.0, -20.0)
 
 Image = NDArray[np.uint8]

@@ -100,15 +100,17 @@ def simulate_plans(
     On a table, a plan that ends in motion is a hit, and the puck lies 7 cm ahead of its
     end. Plans are executed independently of each other and of the number of processes.
 
-    Args: plans: The plans. plant: The robot, or its name: "nominal", "heavier" or
-        "delayed". environment: A clone of the Air Hockey Challenge's environment, which
-        replaces ``plant``. workers: Processes; default one per available core, or one
-        for few plans. progress: Called with the number of plans executed since the last
-        call.
+    Args:
+        plans: The plans.
+        plant: The robot, or its name: "nominal", "heavier" or "delayed".
+        environment: A clone of the Air Hockey Challenge's environment, which replaces
+            ``plant``.
+        workers: Processes; default one per available core, or one for few plans.
+        progress: Called with the number of plans executed since the last call.
 
-    Raises: UsageError: The plant is unknown, there is less than one worker, or
-        ``environment`` is not a clone or does not
-            support the plans.
+    Raises:
+        UsageError: The plant is unknown, there is less than one worker, or
+            ``environment`` is not a clone or does not support the plans.
         RecipeError: MuJoCo cannot simulate the robot, or the problem needs a plug-in
             that is not installed.
         MachineError: MuJoCo is missing, the environment cannot be imported, or a worker

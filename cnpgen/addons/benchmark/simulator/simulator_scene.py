@@ -29,13 +29,13 @@ Array = NDArray[np.float64]
 SIMULATION_STEP_S = 2.5e-4  # four per tick of the controller
 LINK_RADIUS_M = 0.07  # of the iiwa's links, about half of the clearance of plans
 PUCK_INERTIA = 2.5e-6  # kg m^2; the puck does not turn
-MIN_LINK_LENGTH_M = (
-    1e-3  # shorter links have no shape; the first link collides with nothing
-)
+# Shorter links have no shape; the first link collides with nothing.
+MIN_LINK_LENGTH_M = 1e-3
 UNBOUNDED_DEPTH_M = 5.0  # depth of obstacles without lower end
 MALLET_POINT_RADIUS_M = 1e-3  # of the sphere at the tip that collides
 SUPPORT_DEPTH_M = 0.05  # half thickness of the body that supports the tip
-_SOFT = 'condim="3" solref="0.004 1" solimp="0.95 0.99 0.001"'  # contact of object and obstacles without bouncing
+# Contact of object and obstacles without bouncing.
+_SOFT = 'condim="3" solref="0.004 1" solimp="0.95 0.99 0.001"'
 # as in the Air Hockey Challenge
 _TABLE = 'condim="3" friction="0.08 0.08" solref="0.0125 0.5" solimp="0.9 0.999 0.001"'
 _CENTER_M, _HALF_SIDE_M = (
@@ -43,7 +43,9 @@ _CENTER_M, _HALF_SIDE_M = (
     (hockey.WIDTH_M - hockey.GOAL_WIDTH_M) / 4,
 )
 _SIDES = (("left", 1), ("right", -1))
-_RIMS = {  # the bands and the four halves of both goals' sides: centre and half sizes over the table [m]
+# The bands and the four halves of both goals' sides: centre and half sizes over the
+# table [m].
+_RIMS = {
     **{
         side: (
             _CENTER_M,

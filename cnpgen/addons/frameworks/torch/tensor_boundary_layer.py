@@ -50,13 +50,15 @@ class TensorBoundaryLayer:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Compute control points that meet the boundary conditions from network outputs.
 
-        Args: tasks: N tasks from ``layer.tasks``; constants, copied to the device of
-            phi. phi: Network outputs of the path, shape (N, ``layer.path_outputs``).
+        Args:
+            tasks: N tasks from ``layer.tasks``; constants, copied to the device of phi.
+            phi: Network outputs of the path, shape (N, ``layer.path_outputs``).
             log_rate: Network outputs of the rate, shape (N, ``layer.rate_outputs``), on
-            the same device.
+                the same device.
 
-        Returns: Path [rad] and rate [1/s] control points, shape (N, C, n) and (N, R),
-            in the type of phi, at least float32.
+        Returns:
+            Path [rad] and rate [1/s] control points, shape (N, C, n) and (N, R), in the
+            type of phi, at least float32.
 
         Raises:
             UsageError: A shape is wrong.

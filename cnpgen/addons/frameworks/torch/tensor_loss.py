@@ -35,10 +35,10 @@ class TensorLoss:
     may be repeated. ``start_tip`` is read on the CPU. Problems whose obstacles samples
     place (planners of scenes) are refused: their clearance is measured on the CPU.
 
-    Args: loss: The loss whose problem, nodes, rule, form and margins are used.
+    Args:
+        loss: The loss whose problem, nodes, rule, form and margins are used.
         compiled: Whether ``torch.compile`` fuses the operations, which takes minutes on
-        first use; the gradient is then
-            differentiable once only.
+            first use; the gradient is then differentiable once only.
 
     Raises:
         UsageError: Samples place the obstacles of the problem.
@@ -83,16 +83,19 @@ class TensorLoss:
         A plan that is not finite or has a rate that is not positive has a loss of nan
         and a gradient of 0, so that it does not affect other plans.
 
-        Args: path: Path control points [rad], shape (N, C, n). rate: Rate control
-            points [1/s], shape (N, R), positive, on the same device. weights: Weight of
-            every constraint term (e^alpha), shape (m,); or term -> weight, see
-            ``PlanLoss``. obstacle_poses: Poses and sizes of the obstacles, shape (N,
-            width). start_tip: Positions of the tip at the start [m], shape (N, 3), for
-            time-varying bounds; a constant. shift: Shift of the quadrature nodes, in
-            [0, 1).
+        Args:
+            path: Path control points [rad], shape (N, C, n).
+            rate: Rate control points [1/s], shape (N, R), positive, on the same device.
+            weights: Weight of every constraint term (e^alpha), shape (m,); or term ->
+                weight, see ``PlanLoss``.
+            obstacle_poses: Poses and sizes of the obstacles, shape (N, width).
+            start_tip: Positions of the tip at the start [m], shape (N, 3), for
+                time-varying bounds; a constant.
+            shift: Shift of the quadrature nodes, in [0, 1).
 
-        Returns: The totals, shape (N,), and the integrals without weights, shape (N, 1
-            + m), both differentiable.
+        Returns:
+            The totals, shape (N,), and the integrals without weights, shape (N, 1 + m),
+            both differentiable.
 
         Raises:
             UsageError: A shape is wrong, or a tensor is not real.

@@ -28,8 +28,9 @@ from cnpgen.store.dataset_spec import StoredProblem
 class TensorRobot:
     """``RobotModel`` on tensors of any device; states have shape (N, n).
 
-    Args: problem: The problem, its record, or the name or file of a problem, a pipeline
-        or a dataset.
+    Args:
+        problem: The problem, its record, or the name or file of a problem, a pipeline
+            or a dataset.
 
     Attributes:
         model: Limits, names and scenes of the same problem.
@@ -78,9 +79,12 @@ class TensorRobot:
 
         ``model.constraint_values`` returns their names, bounds and tolerances.
 
-        Args: q: Joint positions [rad], shape (N, n). dq: Joint velocities [rad/s]. ddq:
-            Joint accelerations [rad/s^2]. obstacle_poses: Poses and sizes of the
-            obstacles, ``scene.poses``, shape (N, width).
+        Args:
+            q: Joint positions [rad], shape (N, n).
+            dq: Joint velocities [rad/s].
+            ddq: Joint accelerations [rad/s^2].
+            obstacle_poses: Poses and sizes of the obstacles, ``scene.poses``, shape (N,
+                width).
 
         Returns:
             Values in SI units, shape (N, m).

@@ -15,9 +15,12 @@ def spline_derivatives(
 ) -> tuple[torch.Tensor, ...]:
     """Evaluate clamped uniform B-splines and their derivatives; differentiable in control points and phases.
 
-    Args: control: Control points, shape (N, C, ...). s: Phases in [0, 1], shape (N, K)
-        or (K,). degree: Degree D. orders: Number of results: the value, the first
-        derivative with respect to s, and so on.
+    Args:
+        control: Control points, shape (N, C, ...).
+        s: Phases in [0, 1], shape (N, K) or (K,).
+        degree: Degree D.
+        orders: Number of results: the value, the first derivative with respect to s,
+            and so on.
 
     Returns:
         Tensors of shape (N, K, ...).

@@ -16,7 +16,8 @@ import torch
 from cnpgen.kernels.tape import NAMES, OPERATIONS, Tape
 
 Value = Any  # a tensor, or a constant as a Python number
-MAX_GUARD = 1e-12  # a denominator ``fmax(x, guard)`` with a smaller constant is that of a closest point
+# A denominator ``fmax(x, guard)`` with a smaller constant is that of a closest point.
+MAX_GUARD = 1e-12
 # Below, segment and face or segment are parallel, and their closest points are
 # arbitrary.
 MIN_REGULAR_DENOMINATOR_M2 = 1e-6
@@ -79,8 +80,10 @@ _APPLY: dict[str, Callable[..., Any]] = {
 class TensorTape:
     """A tape that runs on tensors.
 
-    Args: tape: The program, without a loop. results: Indices of the results to compute;
-        operations that they do not need are omitted.
+    Args:
+        tape: The program, without a loop.
+        results: Indices of the results to compute; operations that they do not need are
+            omitted.
     """
 
     def __init__(self, tape: Tape, results: Sequence[int] | None = None) -> None:
@@ -129,8 +132,9 @@ class TensorTape:
     def __call__(self, *arguments: torch.Tensor) -> list[torch.Tensor]:
         """Evaluate the tape.
 
-        Args: arguments: One tensor per input of the tape, shape (width, ...); their
-            further axes are broadcast.
+        Args:
+            arguments: One tensor per input of the tape, shape (width, ...); their
+                further axes are broadcast.
 
         Returns:
             One tensor of shape (width, ...) per selected result.

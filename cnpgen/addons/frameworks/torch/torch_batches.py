@@ -71,8 +71,9 @@ class TensorBatch(dict[str, torch.Tensor]):
     def update(self, *fields: Any, **more: torch.Tensor) -> None:
         """Replace fields by tensors of the same shape.
 
-        Raises: UsageError: A shape differs, for example of batches that torch's
-            ``default_collate`` has stacked.
+        Raises:
+            UsageError: A shape differs, for example of batches that torch's
+                ``default_collate`` has stacked.
         """
         new = dict(*fields, **more)
         for name, values in new.items():
@@ -153,8 +154,9 @@ class BatchDataset(data.IterableDataset[TensorBatch]):  # type: ignore[misc]
     def state_dict(self) -> dict[str, Any]:
         """Return the position after the last yielded batch; see ``Batches.state``.
 
-        Raises: UsageError: The call is inside a worker, which cannot determine the
-            batches that were used.
+        Raises:
+            UsageError: The call is inside a worker, which cannot determine the batches
+                that were used.
         """
         if data.get_worker_info() is not None:
             raise UsageError(
@@ -165,8 +167,9 @@ class BatchDataset(data.IterableDataset[TensorBatch]):  # type: ignore[misc]
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore a position: the next loop starts with the batch after it.
 
-        Raises: UsageError: This is not the state of a loader, or the last batch after
-            it has fewer rows than ranks. DatasetError: The state is of another dataset
-            or split.
+        Raises:
+            UsageError: This is not the state of a loader, or the last batch after it
+                has fewer rows than ranks.
+            DatasetError: The state is of another dataset or split.
         """
         self.batches.load_state(state)

@@ -27,13 +27,16 @@ def control_points(
     The computation runs on the CPU in float64. ``layer.plans`` returns plans of the
     same outputs in float64.
 
-    Args: layer: The boundary layer of the problem. tasks: N tasks from ``layer.tasks``;
-        constants. phi: Network outputs of the path, shape (N, ``layer.path_outputs``),
-        on any device. log_rate: Network outputs of the rate, shape (N,
-        ``layer.rate_outputs``).
+    Args:
+        layer: The boundary layer of the problem.
+        tasks: N tasks from ``layer.tasks``; constants.
+        phi: Network outputs of the path, shape (N, ``layer.path_outputs``), on any
+            device.
+        log_rate: Network outputs of the rate, shape (N, ``layer.rate_outputs``).
 
-    Returns: Path [rad] and rate [1/s] control points, shape (N, C, n) and (N, R), in
-        the type of phi, at least float32.
+    Returns:
+        Path [rad] and rate [1/s] control points, shape (N, C, n) and (N, R), in the
+        type of phi, at least float32.
 
     Raises:
         UsageError: A shape is wrong.
@@ -75,17 +78,21 @@ def plan_loss(
     other plans. This holds for ``total[total.isfinite()].mean()`` and for
     ``total.mean()``, which is nan itself.
 
-    Args: loss: The loss; its ``dtype`` is the precision of values and gradients. path:
-        Path control points [rad], shape (N, C, n), on any device, of any type. rate:
-        Rate control points [1/s], shape (N, R), positive. weights: Weight of every
-        constraint term (e^alpha), shape (m,); or term -> weight, see ``PlanLoss``.
+    Args:
+        loss: The loss; its ``dtype`` is the precision of values and gradients.
+        path: Path control points [rad], shape (N, C, n), on any device, of any type.
+        rate: Rate control points [1/s], shape (N, R), positive.
+        weights: Weight of every constraint term (e^alpha), shape (m,); or term ->
+            weight, see ``PlanLoss``.
         obstacle_poses: Poses and sizes of the obstacles, shape (N, width); a constant,
-        within ``torch.func`` an array. start_tip: Positions of the tip at the start
-        [m], shape (N, 3); a constant, within ``torch.func`` an array. shift: Shift of
-        the quadrature nodes, in [0, 1).
+            within ``torch.func`` an array.
+        start_tip: Positions of the tip at the start [m], shape (N, 3); a constant,
+            within ``torch.func`` an array.
+        shift: Shift of the quadrature nodes, in [0, 1).
 
-    Returns: The totals, shape (N,), and the integrals without weights, shape (N, 1 +
-        m), which have no gradient; both in the precision of the loss.
+    Returns:
+        The totals, shape (N,), and the integrals without weights, shape (N, 1 + m),
+        which have no gradient; both in the precision of the loss.
 
     Raises:
         UsageError: A shape is wrong, or a weight is negative or not finite.

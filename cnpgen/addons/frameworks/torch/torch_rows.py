@@ -23,10 +23,14 @@ class RowDataset(data.Dataset[Tensors]):  # type: ignore[misc]
     batch as it was read. Without ``collate_fn`` torch splits it into rows and stacks
     them again, with the same result.
 
-    Args: dataset: The dataset. split: Name of the split. fields: Names of the fields;
-        by default all fields of real numbers that are not diagnostics. normalize:
-        Whether to normalize, or a normalization other than that of the dataset. dtype:
-        Type of the fields of real numbers.
+    Args:
+        dataset: The dataset.
+        split: Name of the split.
+        fields: Names of the fields; by default all fields of real numbers that are not
+            diagnostics.
+        normalize: Whether to normalize, or a normalization other than that of the
+            dataset.
+        dtype: Type of the fields of real numbers.
     """
 
     def __init__(
