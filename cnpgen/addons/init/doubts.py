@@ -12,7 +12,7 @@ from cnpgen.robots.urdf import number_in, numbers_in
 
 MAX_SPEED_RAD_S = 50.0  # of a revolute joint; faster ones are probably in deg/s
 MAX_ANGLE_RAD = 2 * math.pi + 1e-6  # of a roll, pitch or yaw
-MAX_CENTER_RATIO = 2.0  # distance of a centre of mass / size of its link
+MAX_CENTER_TO_LINK_RATIO = 2.0  # distance of a centre of mass / size of its link
 MIN_CENTER_M = 0.1  # smaller distances are not doubted
 MIN_MASS_KG = 0.01  # of bodies with an inertia
 _ZERO = (0.0, 0.0, 0.0)
@@ -56,7 +56,7 @@ def _of_link(tree: Element, link: Element) -> Iterator[str]:
         yield f"link {name}: it has {mass:g} kg and an <inertia> of zeros, as a point"
     center = np.linalg.norm(numbers_in(inertial.find("origin"), "xyz", _ZERO))
     size = _size(tree, link)
-    if size is not None and center > max(MAX_CENTER_RATIO * size, MIN_CENTER_M):
+    if size is not None and center > max(MAX_CENTER_TO_LINK_RATIO * size, MIN_CENTER_M):
         text = f"link {name}: its center of mass is {center:.3g} m from its origin"
         yield f"{text}, the link reaches {size:.3g} m: is the <origin> of its <inertial> in another frame or unit?"
 

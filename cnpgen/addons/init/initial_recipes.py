@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cnpgen.addons.init.arm import Arm, ArmJoint, arm_notes, with_torques
 from cnpgen.addons.init.draws import comfortable_base, find_boxes
-from cnpgen.addons.init.joint_limits import JointLimits
+from cnpgen.addons.init.joint_limits import StatedJointLimits
 from cnpgen.addons.init.link_overlaps import LinkOverlaps, resolve_overlaps
 from cnpgen.errors import RecipeError
 from cnpgen.make.recipe import DatasetRecipe
@@ -70,7 +70,7 @@ def problem_of(
     srdf: Path | None,
     *,
     skipped_meshes: tuple[str, ...] = (),
-    joint_limits: JointLimits | None = None,
+    joint_limits: StatedJointLimits | None = None,
 ) -> InitialProblem:
     """Make the problem of an arm, or raise RecipeError if it cannot be planned for.
 
@@ -179,7 +179,7 @@ def _problem(
 
 
 def _replaced_limits(
-    arm: Arm, joint_limits: JointLimits | None = None, robot: Robot | None = None
+    arm: Arm, joint_limits: StatedJointLimits | None = None, robot: Robot | None = None
 ) -> dict[str, Any]:
     """Return the limits that the problem states in place of the URDF's, and accelerations of a file."""
     missing = {
@@ -243,7 +243,7 @@ def _with_torque_limits(arm: Arm, robot: Robot) -> tuple[Arm, float, list[str]]:
 
 
 def _with_jerk_limits(
-    problem: Problem, robot: Robot, joint_limits: JointLimits | None
+    problem: Problem, robot: Robot, joint_limits: StatedJointLimits | None
 ) -> Problem:
     """Return the problem with jerk limits in proportion to the acceleration limits, or those of a file.
 

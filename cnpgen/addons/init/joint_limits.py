@@ -22,7 +22,7 @@ _DEFAULTS = ("default_velocity_scaling_factor", "default_acceleration_scaling_fa
 
 
 @dataclass(frozen=True)
-class JointLimits:
+class StatedJointLimits:
     """Limits of a file for the joints of an arm, by joint and key; only those whose flag is true."""
 
     path: Path
@@ -35,7 +35,7 @@ class JointLimits:
         }
 
 
-def read_joint_limits(path: Path, joints: tuple[str, ...]) -> JointLimits:
+def read_joint_limits(path: Path, joints: tuple[str, ...]) -> StatedJointLimits:
     """Read a joint_limits.yaml for the joints of a robot.
 
     Raises:
@@ -59,7 +59,7 @@ def read_joint_limits(path: Path, joints: tuple[str, ...]) -> JointLimits:
                 f"{path}: the URDF has no joint {name!r}{nearest(name, joints)}"
             )
         values[name] = _limits(f"{path}: {name}", table)
-    return JointLimits(path, values)
+    return StatedJointLimits(path, values)
 
 
 def _limits(place: str, table: Any) -> dict[str, float]:
@@ -97,7 +97,7 @@ def _is_true(place: str, value: Any) -> bool:
     return text == "true"
 
 
-def with_joint_limits(arm: Arm, limits: JointLimits) -> Arm:
+def with_joint_limits(arm: Arm, limits: StatedJointLimits) -> Arm:
     """Return an arm whose positions, velocities and torques have the limits of a file where it has some."""
 
     def changed(joint: ArmJoint) -> ArmJoint:

@@ -1,4 +1,4 @@
-"""One trajectory of a file as named columns, before a problem gives them a meaning."""
+"""One trajectory of a file as named columns, before a problem interprets them."""
 
 from __future__ import annotations
 
