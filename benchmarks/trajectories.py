@@ -33,6 +33,7 @@ from cnpgen.addons.trajectories.interpolate import bounded_jerk
 from cnpgen.addons.trajectories.judge_family import FamilyJudge
 from cnpgen.addons.trajectories.judge_samples import judge_samples
 from cnpgen.addons.trajectories.load_trajectories import load_trajectories
+from cnpgen.addons.trajectories.sample_errors import SampleErrors
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.addons.trajectories.trajectory_verdict import Decision, TrajectoryVerdict
 from cnpgen.judges.plans import Verdict
@@ -185,7 +186,8 @@ def measure(plans: Plans, case: Case, truths: tuple[Verdict, ...]) -> Counts:
             bound = JERK_FACTOR * np.abs(motion.at_times(t[None]).jerk[0]).max(axis=0)
             family = bounded_jerk(sampled, bound, error)
         else:
-            counts.add(judge_samples(judge, sampled, error, scene=scene), truth)
+            errors = SampleErrors(case.error, case.error, case.error, 0.0, "")
+            counts.add(judge_samples(judge, sampled, errors, scene=scene), truth)
             continue
         if family is None:
             counts.decisions["contradiction"] += 1

@@ -29,7 +29,7 @@ from cnpgen.addons.benchmark.planners import (
 from cnpgen.addons.benchmark.simulator import rendering
 from cnpgen.addons.benchmark.simulator.execute import load_mujoco
 from cnpgen.addons.clusters.clusters import joined
-from cnpgen.addons.hub.publish import upload_folder
+from cnpgen.addons.hub.publish import upload_files
 from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
 from cnpgen.addons.view import page
 from cnpgen.errors import MissingExtraError
@@ -305,7 +305,7 @@ OPTIONAL = {  # package that cnpgen imports -> extra that installs it, function 
     "yaml": ("ros", lambda: trajectories(".yaml")),
     "huggingface_hub": (
         "hub",
-        lambda: upload_folder(Path(), "user/name", private=False),
+        lambda: upload_files(Path(), [], "user/name", private=False),
     ),
 }
 NAMES_IN_THE_INDEX = {

@@ -10,13 +10,18 @@ from cnpgen.make.recipe import DatasetRecipe, recipe_digest
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.constraints.joint import judged_torque
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem, resolved
+from cnpgen.problems.urdf_dynamics import friction_in, joint_notes
+from cnpgen.robots.drive import Drive
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.inline import corners_of
 from cnpgen.robots.shape.link_pairs import LinkPair
 from cnpgen.robots.shape.shape import Shape
+from cnpgen.robots.urdf import urdf_tree
+from cnpgen.robots.urdf_parameters import urdf_parameters
 from cnpgen.schema import registry
 from cnpgen.schema.keys import PerJoint, Range, keys
 from cnpgen.store.joint_units import unit_of
@@ -114,12 +119,52 @@ def describe_problem(problem: Problem) -> str:
             "",
             "  planning limits",
             *table(_limit_rows(problem, robot), indent="    "),
+            *_drive(problem, robot),
             *_shape(problem, robot),
             "",
             "  constraints",
             *table(constraints or [("none", "")], indent="    "),
         ]
     )
+
+
+def _drive(problem: Problem, robot: Robot) -> list[str]:
+    """Describe which torque is judged, the drives, and further elements of the URDF's joints."""
+    torque = judged_torque(problem.constraint, robot)
+    lines = ["", f"  torque: {torque}"] if torque else []
+    if (drive := robot.drive) is not None:
+        stated = f"friction that is certain {drive.friction_help:.0%}, reversal speed {drive.reversal_speed:g} rad/s"
+        lines += [f"    {stated}", *table(_drive_rows(robot, drive), indent="    ")]
+    tree = urdf_tree(problem.urdf_text)
+    by_name = {each.name: each for each in urdf_parameters(tree).joints.values()}
+    joints = [by_name[name] for name in robot.joint_names]
+    notes = list(joint_notes(tree, joints, soft=problem.limits.soft == "use"))
+    frictions = friction_in(joints)
+    if torque and frictions and problem.drive.urdf_dynamics == "ignore":
+        text = ", ".join(map(str, frictions))
+        notes.append(f"friction of the URDF that is not used: {text}")
+    return lines + [
+        line
+        for note in notes
+        for line in wrap(
+            note, LINE_WIDTH, initial_indent="    ", subsequent_indent="      "
+        )
+    ]
+
+
+def _drive_rows(robot: Robot, drive: Drive) -> list[tuple[str, ...]]:
+    """List the drive of every joint."""
+    columns = [
+        ("rotor inertia", "kg m^2", drive.armature),
+        ("viscous", "N m s/rad", drive.viscous),
+        ("dry", "N m", drive.coulomb),
+        ("motor torque", "N m", drive.torque_limit),
+    ]
+    shown = [
+        (name, *with_units(robot.units(unit), [f"{x:.4g}" for x in values]))
+        for name, unit, values in columns
+    ]
+    return list(zip(("joint", "", *robot.joint_names), *shown, strict=True))
 
 
 def _obstacle(obstacle: Obstacle) -> str:
@@ -348,4 +393,6 @@ def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
         name: {"unit": robot.units(unit), "values": list(getattr(robot, name))}
         for name, unit in LIMITS.items()
     }
+    if torque := judged_torque(problem.constraint, robot):
+        content["torque"] = torque
     return content

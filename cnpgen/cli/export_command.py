@@ -31,7 +31,12 @@ NO_OBSTACLES = "the output lacks the obstacles of the plans: only a problem with
 
 def add_options(parser: Parser) -> None:
     option = parser.add_argument
-    option("file", metavar="FILE", type=recipe_names.present, help="plan file, .h5")
+    option(
+        "file",
+        metavar="FILE",
+        type=recipe_names.present_or_model,
+        help="plan file, .h5",
+    )
     text = "format: npz, csv, parquet, lerobot, mpd, ... ('cnpgen list exporters')"
     option("--to", metavar="FORMAT", required=True, help=text)
     option(
@@ -70,7 +75,12 @@ def run(arguments: argparse.Namespace) -> int:
     plans = _plans(arguments)
     chosen, out = _chosen(plans, arguments), _place(arguments, exporter)
     exported = export_plans(
-        plans, out, to=arguments.to, rate=arguments.rate, only=chosen
+        plans,
+        out,
+        to=arguments.to,
+        rate=arguments.rate,
+        only=chosen,
+        force=arguments.force,
     )
     for why in exported.refused.values():
         print(f"cnpgen: left out: {why}", file=sys.stderr)

@@ -171,6 +171,15 @@ def present(text: str) -> Path:
     return Path(text)
 
 
+def present_or_model(text: str) -> Path:
+    """Read the path of a file or a folder, or the name of a shipped model."""
+    from cnpgen.planner.model_file import shipped_models
+
+    if not os.path.exists(text) and text in (known := shipped_models()):  # noqa: PTH110 - names may be too long
+        return known[text]
+    return present(text)
+
+
 def read_plans(path: Path, *, problem: str | None = None) -> "Plans":
     """Read the plans of a file, as ``cnpgen.load_plans`` does.
 

@@ -56,6 +56,7 @@ def summary_text(file: Path, found: "Evaluation") -> str:
         [
             head,
             checksum_text(found.plans),
+            *([f"torque: {found.judged_torque}"] if found.judged_torque else []),
             "",
             *table(tallies, indent="  ", right=(1, 2)),
         ]

@@ -58,14 +58,11 @@ class Completion:
             self._stages = prepare_steps(
                 _of_tasks(steps, context), lambda stage: stage.complete(context, known)
             )
-            ends: tuple[End, ...] = (
-                "start",
-                "goal",
-            )  # those with given joint states need not be exact
+            # Joint states of the user, and the base configuration of the problem file,
+            # are rounded: the tolerances of motions apply to them.
+            ends: tuple[End, ...] = ("start", "goal")
             stated = [
-                end
-                for end in ends
-                if {f"{end}_q", f"{end}_dq", f"{end}_ddq"} & set(given)
+                end for end in ends if {f"{end}_q", f"{end}_dq", f"{end}_ddq"} & known
             ]
             self._accept = acceptance(context, written, given=stated)
         self._random = np.random.default_rng(

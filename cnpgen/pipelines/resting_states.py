@@ -82,7 +82,7 @@ class RestingStates:
         ]
         return np.array(
             [
-                bool((np.abs(torque) <= self._robot.torque_limit).all())
+                bool((np.abs(torque) <= self._robot.holding_limit).all())
                 for torque in torques
             ],
             bool,

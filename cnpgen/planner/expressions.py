@@ -1,7 +1,7 @@
 """Build the CasADi functions of a planner: residuals that depend on velocity, and largest violations."""
 
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from cnpgen.problems.conditions import (
     state_of_symbols,
 )
 from cnpgen.problems.constraints.constraint import MIN_TOLERANCE, Condition
+from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 
@@ -25,15 +26,67 @@ Array = NDArray[np.float64]
 def speed_residuals(robot: Robot, problem: Problem) -> Any:
     """Build ``(q, dq, ddq, obstacle_poses) -> g``: all bounded values of the problem that depend on velocity.
 
-    With jerk constraints it is ``(q, dq, ddq, jerk, obstacle_poses) -> g``.
+    With jerk constraints it is ``(q, dq, ddq, jerk, obstacle_poses) -> g``. With
+    friction a last argument has the velocities that determine its direction, so that a
+    scaled motion has the friction of the given one and not that of rest.
     """
     import casadi as ca
 
     columns, state = state_of_symbols(robot, problem)
-    conditions = conditions_with_needs(problem, state, columns[1:-1])
+    moving = columns[1:-1]
+    if has_friction(robot):
+        column, rates = symbols("friction_rates", robot.n)
+        columns, state = [*columns, column], replace(state, friction_rates=rates)
+    conditions = conditions_with_needs(problem, state, moving)
     rows = [value for condition, needs in conditions if needs for value in condition.g]
     g = ca.vertcat(*rows) if rows else ca.SX(0, 1)
     return ca.Function("speed_residuals", columns, [g])
+
+
+def has_friction(robot: Robot) -> bool:
+    """Return whether drives have friction, whose direction ``speed_residuals`` takes as an argument."""
+    return robot.drive is not None and bool(
+        robot.drive.coulomb.any() or robot.drive.viscous.any()
+    )
+
+
+@dataclass(frozen=True)
+class _FrictionalState(SymbolicState):
+    """A state of massless links: its motor torques are those of rotors and friction alone."""
+
+    @cached_property
+    def torque(self) -> Vec:
+        """Zero."""
+        return [0.0] * self.robot.n
+
+
+def _linear_rows(robot: Robot, problem: Problem, p1: Vec, friction_rates: Vec) -> Any:
+    """Return the coefficients of r in the rows of ``speed_residuals``: viscous friction, zero in other rows, as SX.
+
+    The torque of a rigid body is quadratic in the velocity without a linear part, so
+    massless links suffice. Friction of a fixed direction is linear in the velocity.
+    """
+    import casadi as ca
+
+    columns, state = state_of_symbols(robot, problem)
+    zero = [0.0] * robot.n
+    q, poses, size = state.q, state.obstacle_poses, problem.object_size
+    still, moving = (
+        _FrictionalState(robot, q, dq, zero, poses, (), size, None, friction_rates)
+        for dq in (zero, p1)
+    )
+    rows: list[Any] = []
+    for constraint in problem.constraint:
+        if isinstance(constraint, JointTorque):
+            pairs = zip(
+                constraint.symbolic(moving), constraint.symbolic(still), strict=True
+            )
+            rows += [x - y for a, b in pairs for x, y in zip(a.g, b.g, strict=True)]
+            continue
+        alone = replace(problem, constraint=(constraint,))
+        conditions = conditions_with_needs(alone, state, columns[1:-1])
+        rows += [0.0] * sum(len(each.g) for each, needs in conditions if needs)
+    return ca.vertcat(*rows)
 
 
 def speed_violation(robot: Robot, problem: Problem) -> Any:
@@ -70,7 +123,9 @@ def speed_coefficients(robot: Robot, problem: Problem) -> Any:
     """Build ``(the column of speed_violation) -> constant, square, mixed``: coefficients of the rate's bounds.
 
     Values of ``speed_residuals`` that are quadratic in dq, without a linear part, and
-    linear in ddq are ``constant + square r^2 + mixed r r'``. Values proportional to dq
+    linear in ddq are ``constant + square r^2 + mixed r r'``. With viscous friction of
+    drives a fourth output has the coefficient of r; the direction of friction is that
+    of the given rates, and both ones near a reversal. Values proportional to dq
     are combined in the last row: the square of the largest fraction of a bound. The
     bounds are those of ``coefficient_bounds``.
     """
@@ -81,11 +136,18 @@ def speed_coefficients(robot: Robot, problem: Problem) -> Any:
         speed_residuals(robot, problem),
         ca.SX.zeros(robot.n),
     )
-    p, p1, p2, _, obstacle_poses = columns
+    p, p1, p2, rates, obstacle_poses = columns
+    drive = robot.drive
+    friction = [p1 * rates[0]] if has_friction(robot) else []
     at_rest, fast, rising = (
-        values(p, *moving, obstacle_poses)
+        values(p, *moving, obstacle_poses, *friction)
         for moving in ((zero, zero), (p1, p2), (zero, p1))
     )
+    square, linear = fast - at_rest, []
+    if drive is not None and drive.viscous.any():
+        parts = map(ca.vertsplit, (p1, friction[0]))
+        linear = [_linear_rows(robot, problem, *parts)]
+        square = square - linear[0]
     bounds = speed_bounds(robot, problem)
     others, fractions = np.flatnonzero(~bounds.proportional).tolist(), []
     for bound in (bounds.lower, bounds.upper):
@@ -95,8 +157,9 @@ def speed_coefficients(robot: Robot, problem: Problem) -> Any:
     none = [ca.SX.zeros(len(largest))]
     coefficients = [
         (at_rest, none),
-        (fast - at_rest, largest),
+        (square, largest),
         (rising - at_rest, none),
+        *((coefficient, none) for coefficient in linear),
     ]
     outputs = [
         ca.densify(ca.vertcat(values_of_rows[others], *last))

@@ -63,6 +63,7 @@ _STRUCTURE = {
 _TRAINING_STRUCTURE = {
     "dataset": {ANY_KEY: ANYTHING},
     "stages": [{ANY_KEY: ANYTHING}],
+    "input_ranges": {"low": [NUMBER], "high": [NUMBER]},
 }  # of the optional keys read
 
 
@@ -238,6 +239,10 @@ def _assembled(content: Content) -> Model:
     via_points = tuple(tuple(map(float, each)) for each in stored.get("via_points", ()))
     config = ModelConfig(**{**stored, "via_points": via_points})
     _check_sizes(problem, architecture, features)
+    for name, values in training.get("input_ranges", {}).items():
+        if len(values) != architecture.inputs:
+            text = f"{architecture.inputs} numbers, got {len(values)}"
+            raise ValueError(f"input_ranges has {name} of {text}")
     joints = len(problem.joint_names)
     if not all(
         len(each) == joints and np.isfinite(each).all() for each in config.via_points

@@ -1,8 +1,10 @@
 /* Fit rates to limits, as in time_parametrization.py; arrays.h precedes this file. All bounded values are
-g = constant + square r^2 + mixed r r', with coefficients of every row at every phase. */
+g = constant + square r^2 + mixed r r', with coefficients of every row at every phase, and, with the viscous friction
+of drives, + linear r. */
 
 typedef struct {
   long joints, pose_width, path_points, points; /* numbers; control points of p and of r */
+  long linear;                                  /* whether rows have linear coefficients */
   long phases, rows, first, last, moves;        /* phases in full vectors; movable control points */
   const double *path, *rate;                    /* bases of p and r, (orders, control points, phases) */
   const double *lower, *upper;                  /* (rows,) */
@@ -17,7 +19,7 @@ typedef struct {
 /* Buffers of one motion; K is the number of phases. */
 typedef struct {
   double *column, *r, *r1;      /* p, p', p'', r, r', obstacle poses, (width, K); r and r' are views of it */
-  double *coefficients;         /* constant, square, mixed, (3, rows, K) */
+  double *coefficients;         /* constant, square, mixed, maybe linear, (3 or 4, rows, K) */
   double *b, *b1;               /* direction of r and r', (K,) */
   double *violations, *before;  /* (K,); control points of r, (points,) */
   double *critical;             /* (rows, W) */
@@ -37,23 +39,28 @@ I double largest(v x) {
   return values[0];
 }
 
-/* r^2 and r r' at W phases as quadratics of the step of r along b. */
-typedef struct { v square[3], mixed[3]; } direction;
+/* r^2, r r' and r at W phases as quadratics of the step of r along b. */
+typedef struct { v square[3], mixed[3], rate[2]; } direction;
 
 I direction direction_at(const workspace *m, long k) {
   v r = at(m->r + k), r1 = at(m->r1 + k), b = at(m->b + k), b1 = at(m->b1 + k);
-  return (direction){{r * r, 2 * r * b, b * b}, {r * r1, r * b1 + r1 * b, b * b1}};
+  return (direction){{r * r, 2 * r * b, b * b}, {r * r1, r * b1 + r1 * b, b * b1}, {r, b}};
 }
 
 /* A row at W phases as a quadratic of the step: g + l x + q x^2. */
 typedef struct { v g, l, q; } quadratic;
 
-I quadratic along(direction d, const double *a, long size) {
+I quadratic along(direction d, const double *a, long size, int has_linear) {
   v constant = at(a), square = at(a + size), mixed = at(a + 2 * size);
-  return (quadratic){
+  quadratic f = {
     constant + square * d.square[0] + mixed * d.mixed[0],
     square * d.square[1] + mixed * d.mixed[1],
     square * d.square[2] + mixed * d.mixed[2]};
+  if (has_linear) {
+    v linear = at(a + 3 * size);
+    f.g += linear * d.rate[0], f.l += linear * d.rate[1];
+  }
+  return f;
 }
 
 /* Upper bound of the change of a row at a step of at most `up`. */
@@ -71,8 +78,9 @@ I limits with_bound(limits found, v margin, v l, v q) {
   return found;
 }
 
-/* Largest step of r along b within the bounds, or the required step back: `advance` of time_parametrization.py. */
-static double advance(const parametrization *p, const workspace *m, long from, long to) {
+/* Largest step of r along b within the bounds, or the required step back: `advance` of time_parametrization.py. The
+compiler makes one function for each value of has_linear. */
+I double advance_rows(const parametrization *p, const workspace *m, long from, long to, int has_linear) {
   const double *restrict lower = p->lower, *restrict upper = p->upper, *restrict coefficients = m->coefficients;
   double *restrict critical = m->critical, up = p->max_increase;
   long rows = p->rows, phases = p->phases, size = rows * phases, steps = (to - from) / W;
@@ -82,14 +90,14 @@ static double advance(const parametrization *p, const workspace *m, long from, l
     direction d = direction_at(m, k);
     v worst = K(-1);
     EACH(row, 0, rows) {
-      quadratic f = along(d, coefficients + row * phases + k, size);
+      quadratic f = along(d, coefficients + row * phases + k, size, has_linear);
       v violation = larger(f.g - upper[row], lower[row] - f.g) + largest_change(f, up);
       put(critical + row * W, violation);
       worst = larger(violation, worst);
     }
     if (!any_lane(worst > K(0))) continue;
     EACH(row, 0, rows) if (any_lane(at(critical + row * W) > K(0))) { /* few: roots and divisions take most of the time */
-      quadratic f = along(d, coefficients + row * phases + k, size);
+      quadratic f = along(d, coefficients + row * phases + k, size, has_linear);
       v above = f.g - upper[row], below = lower[row] - f.g, change = largest_change(f, up);
       if (any_lane(above + change > K(0))) found = with_bound(found, -above, f.l, f.q);
       if (any_lane(below + change > K(0))) found = with_bound(found, -below, -f.l, -f.q);
@@ -99,6 +107,10 @@ static double advance(const parametrization *p, const workspace *m, long from, l
   if (!any_lane(found.violated)) return up;
   double back = -largest(found.back);
   return back > p->max_decrease ? back : p->max_decrease;
+}
+
+static double advance(const parametrization *p, const workspace *m, long from, long to) {
+  return p->linear ? advance_rows(p, m, from, to, 1) : advance_rows(p, m, from, to, 0);
 }
 
 /* out = c[first] basis[first] + ...; `stride` is the distance between control points. */
@@ -159,7 +171,7 @@ static double sweep(const parametrization *p, double *c, const workspace *m) {
 static int parametrize_motion(const parametrization *p, double *c, const workspace *m) {
   double *a = m->coefficients;
   long size = p->rows * p->phases;
-  run(p->coefficients, p, m, (double *const[]){a, a + size, a + 2 * size});
+  run(p->coefficients, p, m, (double *const[]){a, a + size, a + 2 * size, a + 3 * size});
   combine_rates(p, c, 0, p->points, m->r, m->r1);
   int twice = sweep(p, c, m) > p->min_increase;
   if (twice) sweep(p, c, m);
@@ -176,7 +188,7 @@ void parametrize_rates(const parametrization *p, long count, const double *path,
   memory += -((size_t)memory / sizeof(double)) % W;
   workspace m = {.column = memory, .r = memory + numbers * phases};
   m.r1 = m.r + phases, m.coefficients = m.r1 + (1 + p->pose_width) * phases;
-  m.b = m.coefficients + 3 * p->rows * phases, m.b1 = m.b + phases, m.violations = m.b1 + phases;
+  m.b = m.coefficients + (3 + p->linear) * p->rows * phases, m.b1 = m.b + phases, m.violations = m.b1 + phases;
   m.critical = m.violations + phases, m.before = m.critical + p->rows * W;
   EACH(motion, 0, count) {
     double *c = rate + motion * p->points;

@@ -4,7 +4,9 @@ The path stays. So do the two control points of the rate at either end that dete
 velocities and accelerations there; at rest they have no effect, and move. On a fixed
 path a bounded value is ``g = constant + square r^2 + mixed r r'`` with coefficients
 that depend on the phase alone: squares of velocities, accelerations and torques, as in
-time-optimal path parametrization (Bobrow, Dubowsky and Gibson, 1985). So it is a
+time-optimal path parametrization (Bobrow, Dubowsky and Gibson, 1985). The viscous
+friction of drives adds ``linear r``, and dry friction a constant, since its direction
+along a path is that of p'. So it is a
 quadratic of each control point of the rate, or of a factor of them all, and the largest
 step up to the first bound follows in closed form. Every second control point takes a
 fraction of its step, one after the other, then those between them a larger fraction;
@@ -62,6 +64,7 @@ class _TimeParametrization(ctypes.Structure):
 
     _fields_ = (
         *((name, c_long) for name in ("joints", "pose_width", "path_points", "points")),
+        ("linear", c_long),
         *((name, c_long) for name in ("phases", "rows", "first", "last", "moves")),
         *(
             (name, c_void_p)
@@ -134,7 +137,9 @@ class TimeParametrization(PhaseGrid):
                 rate[block], violation[block] = self._parametrize_interpreted(
                     motion[block], obstacle_poses[block]
                 )
-        return Motion(motion.path, rate, motion.degree), violation <= self._tolerance
+        return Motion(
+            motion.path, rate, motion.degree
+        ), violation <= self.violation_tolerance
 
     def _parametrize_interpreted(
         self, motion: Motion, obstacle_poses: Array
@@ -152,7 +157,7 @@ class TimeParametrization(PhaseGrid):
             self.violation(states)[0].reshape(len(motion), -1).max(axis=1)
             for states in (column, new_column)
         )
-        better = after <= np.maximum(before, self._tolerance)
+        better = after <= np.maximum(before, self.violation_tolerance)
         violation = np.where(twice, np.inf, np.where(better, after, before))
         return np.where(better[:, None], rate, motion.rate), violation
 
@@ -166,31 +171,31 @@ class TimeParametrization(PhaseGrid):
             for coefficient in coefficients
         ]
         table, movable = self.rate, slice(self.fixed, rate.shape[1] - self.fixed)
-        increase = _sweep(rate, shaped, self._bounds, table, self.fixed)
+        increase = _sweep(rate, shaped, self.relaxed_bounds, table, self.fixed)
         again = increase > self.min_increase
         some = rate[again]
         _sweep(
             some,
             [coefficient[:, again] for coefficient in shaped],
-            self._bounds,
+            self.relaxed_bounds,
             table,
             self.fixed,
         )
         rate[again] = some
         along = rate[:, movable] @ table[:, :, movable].swapaxes(1, 2)
-        step = advance(shaped, self._bounds, rate @ table.swapaxes(1, 2), along)
+        step = advance(shaped, self.relaxed_bounds, rate @ table.swapaxes(1, 2), along)
         rate[:, movable] *= (1 + step[:, None]) * (1 - self.margin)
         return again
 
     @cached_property
-    def _bounds(self) -> tuple[Array, Array]:
+    def relaxed_bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds, relaxed by rounding errors."""
         return self.lower - BOUND_ROUNDING * np.abs(
             self.lower
         ), self.upper + BOUND_ROUNDING * np.abs(self.upper)
 
     @cached_property
-    def _tolerance(self) -> float:
+    def violation_tolerance(self) -> float:
         """Tolerance of the violation [SI units of the largest bound]."""
         bounds = np.abs(np.concatenate([self.lower, self.upper]))
         return 10 * BOUND_ROUNDING * float(bounds[np.isfinite(bounds)].max(initial=0.0))
@@ -199,7 +204,7 @@ class TimeParametrization(PhaseGrid):
     def _c_arguments(self) -> tuple[_TimeParametrization, list[NDArray[Any]]]:
         """Arguments of time_parametrization.c for the problem, and the arrays that they point to."""
         lower, upper, order, fractions = (
-            *self._bounds,
+            *self.relaxed_bounds,
             *moves_of(self.rate.shape[2], self.fixed),
         )
         tables, spans = [[of(self.path), of(self.rate)] for of in (_by_point, _span_of)]
@@ -210,6 +215,7 @@ class TimeParametrization(PhaseGrid):
             self.coefficients.tape.inputs[0] - 3 * self.joints - 2,
             path_points,
             points,
+            len(self.coefficients.tape.outputs) - 3,
         )
         moves = phases, len(lower), self.fixed, points - self.fixed, len(order)
         addresses = (
@@ -222,7 +228,7 @@ class TimeParametrization(PhaseGrid):
             MAX_RATE_DECREASE,
             self.margin,
             self.min_increase,
-            self._tolerance,
+            self.violation_tolerance,
         )
         return _TimeParametrization(*counts, *moves, *addresses, *bounds), arrays
 
@@ -231,7 +237,9 @@ class TimeParametrization(PhaseGrid):
     ) -> None:
         assert self.library is not None
         rows, phases = (
-            self.coefficients.tape.inputs[0] + 3 * len(self.lower) + 3,
+            self.coefficients.tape.inputs[0]
+            + len(self.coefficients.tape.outputs) * len(self.lower)
+            + 3,
             self.path.shape[1],
         )
         memory = np.empty(
@@ -335,12 +343,14 @@ def advance(
 ) -> Array:
     """Return the largest steps of N rates within the bounds, or the required steps back if one is violated.
 
-    Coefficients (constant, square, mixed) have shape (m, N, K) each, bounds (m,) each,
-    r with r' and their directions (2, N, K).
+    Coefficients (constant, square, mixed and, with viscous friction, linear) have shape
+    (m, N, K) each, bounds (m,) each, r with r' and their directions (2, N, K).
     """
-    (constant, square, mixed), (r, r1), (b, b1) = coefficients, rates, along
+    (constant, square, mixed, *linear), (r, r1), (b, b1) = coefficients, rates, along
     value = constant + (square * r + mixed * r1) * r
     first = (2 * square * r + mixed * r1) * b + mixed * r * b1
+    if linear:
+        value, first = value + linear[0] * r, first + linear[0] * b
     second = (square * b + mixed * b1) * b
     low, high = (bound[:, None, None] for bound in bounds)
     margin = np.stack([high - value, value - low])

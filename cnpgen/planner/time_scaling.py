@@ -2,7 +2,7 @@
 
 At ``r / k`` velocities are 1/k and accelerations 1/k^2 of their values at r. A bounded
 value g(q, dq, ddq) is then ``g0 + b / k + c / k^2``, exactly so for velocities,
-accelerations and torques. Values of g at k = 1, at k = 2 and at rest determine b and c,
+accelerations and torques with friction of a fixed direction. Values of g at k = 1, at k = 2 and at rest determine b and c,
 and the smallest k at which all g are within their bounds follows in closed form. Values
 that depend on the jerk are ``g0 + d / k^3``.
 """
@@ -16,6 +16,7 @@ from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.planner.expressions import (
     SpeedBounds,
+    has_friction,
     speed_bounds,
     speed_residuals,
     speed_violation,
@@ -98,10 +99,14 @@ def make_phase_grid(
 
 @dataclass(frozen=True)
 class TimeScaling(PhaseGrid):
-    """Uniform time scaling of a problem's motions, by the kernel of ``expressions.speed_residuals`` and its bounds."""
+    """Uniform time scaling of a problem's motions, by the kernel of ``expressions.speed_residuals`` and its bounds.
+
+    With ``has_friction`` the kernel takes velocities that determine the direction of friction.
+    """
 
     residuals: Kernel
     bounds: SpeedBounds
+    has_friction: bool = False
 
     def factor(self, motion: Motion, obstacle_poses: Array) -> Array:
         """Return the smallest time scale, at least 1, at which each of N motions from rest to rest meets its limits.
@@ -139,11 +144,14 @@ class TimeScaling(PhaseGrid):
             column[orders * n + orders - 1 :],
         )
         _, *moving = time_derivatives([p, p1, p2, *third], [r, r1, *second])
+        # A scaled motion has the direction of friction of the given one, at rest, too.
+        friction = [moving[0]] if self.has_friction else []
         fast, slow, static = (
             self.residuals(
                 p,
                 *(term / k**order for order, term in enumerate(moving, 1)),
                 obstacle_poses,
+                *friction,
             )[0]
             for k in (1.0, 2.0, np.inf)
         )
@@ -179,6 +187,7 @@ def make_time_scaling(
         speeds.rate,
         residuals,
         speed_bounds(robot, problem),
+        has_friction(robot),
     )
 
 

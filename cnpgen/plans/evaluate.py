@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -18,6 +18,7 @@ from cnpgen.machine.workers import distribute, worker_count
 from cnpgen.plans.format import PlanStatus
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.tips import correct_tips
+from cnpgen.problems.constraints.joint import judged_torque
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import number, numbers
@@ -74,6 +75,12 @@ class Evaluation:
             np.uint8,
         )
 
+    @cached_property
+    def judged_torque(self) -> str:
+        """Torque that was judged, in words: "rigid body", or with drives; empty if the problem limits none."""
+        problem, robot = open_problem(self.plans.problem)
+        return judged_torque(problem.constraint, robot)
+
     def summary(self) -> dict[str, Any]:
         """Return the summary of all plans for JSON ('cnpgen docs verdict')."""
         record = self.plans.problem
@@ -83,6 +90,7 @@ class Evaluation:
             "problem": record.name,
             "problem_sha256": record.comparable_sha256,
             "checksum": self.plans.checksum,
+            **({"torque": self.judged_torque} if self.judged_torque else {}),
             "step_s": self.step,
             **(
                 {"tracking_error_rad": list(self.tracking_error)}

@@ -19,8 +19,11 @@ from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.store.files.atomic import machine_errors, write_file
+from cnpgen.store.files.written_files import claim_files, record_files
 
 MAX_SAMPLES = 1_000_000  # per plan
+PLAN_FILES = "plan_[0-9]*"  # files of a folder that belong to one export
+HELD_JOINTS = "held_joints.yaml"
 MAX_RATE_HZ = 1e6  # steps of 1 us; ROS stamps resolve 1 ns
 
 
@@ -69,8 +72,12 @@ def export_plans(
     to: str,
     rate: float = 1000.0,
     only: Sequence[int] | None = None,
+    force: bool = False,
 ) -> Exported:
-    """Sample plans in time and write them; existing files are replaced.
+    """Sample plans in time and write them.
+
+    An existing file is replaced. In a folder, the files of an earlier export are
+    replaced or removed; files of plans that were not exported by cnpgen are refused.
 
     Formats are "npz", "parquet" and "mpd" (one file), "csv", "joint-trajectory" and
     "ros2-control" (a folder with one file per plan, ``plan_00000.csv``), "lerobot" (a
@@ -87,9 +94,11 @@ def export_plans(
         rate: Samples per second [Hz]; the last instant of a plan is always one of its
             samples.
         only: Indices of the plans to export; all by default.
+        force: Whether plans of other origin in a folder are kept, and replaced if they
+            have the same name.
 
     Raises:
-        UsageError: An argument is invalid.
+        UsageError: An argument is invalid, or the folder has plans of other origin.
         DatasetError: No plan can be exported.
         MachineError: The disk is full or read-only, or a file operation failed.
     """
@@ -138,9 +147,13 @@ def export_plans(
         exporter.write(files[0], sampled, exported)
     else:
         files = [out / f"plan_{index:05d}{exporter.suffix}" for index in kept]
+        names = [path.name for path in files]
+        held_names = [HELD_JOINTS] if problem.held_joints else []
+        claim_files(out, [*names, *held_names], pattern=PLAN_FILES, force=force)
         for path, plan in zip(files, sampled, strict=True):
             exporter.write(path, [plan], exported)
         held = _write_held_joints(out, problem.held_joints)
+        record_files(out, [*names, *held_names])
     invalid = tuple(
         index for index in kept if plans.status[index] == PlanStatus.INVALID
     )
@@ -248,7 +261,7 @@ def _write_held_joints(folder: Path, held: dict[str, float]) -> Path | None:
     """Write the positions of unplanned movable joints."""
     if not held:
         return None
-    path = folder / "held_joints.yaml"
+    path = folder / HELD_JOINTS
     write_file(
         path,
         "".join(f"{json.dumps(name)}: {position}\n" for name, position in held.items()),

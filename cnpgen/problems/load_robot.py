@@ -1,6 +1,6 @@
 """Loading of the robot of a problem, with scaled limits and checks of consistency and of units."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +11,9 @@ from cnpgen.problems.constraints.link_clearance import ObjectClearance
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem, kept_folder
 from cnpgen.robots.chain import chain_from_model
+from cnpgen.robots.drive import Drive
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.robot import Attached, Robot, recipe_errors_in, reduced_model
+from cnpgen.robots.robot import Attached, Robot, read_model, recipe_errors_in
 from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.shape.hull import Array
@@ -20,6 +21,7 @@ from cnpgen.robots.shape.inline import unit_of_mesh
 from cnpgen.robots.shape.mesh_files import find_named_file
 from cnpgen.robots.shape.shape import Shape, load_held_shape, load_shape
 from cnpgen.robots.urdf import read_urdf, urdf_tree
+from cnpgen.robots.urdf_parameters import UrdfJoint
 from cnpgen.schema.keys import PerJoint
 from cnpgen.schema.units import PLAUSIBLE_MAX, suggested_unit
 from cnpgen.store.joint_units import unit_of
@@ -49,14 +51,17 @@ def load_robot(problem: Problem) -> Robot:
     spec, limits = problem.robot, problem.limits
     with recipe_errors_in(problem.path):
         urdf, attached = problem.urdf_text, _attached(problem)
-        model = reduced_model(problem.urdf_path, urdf, spec.joints, attached)
+        model, joints = read_model(problem.urdf_path, urdf, spec.joints, attached)
         chain = chain_from_model(model, attached.tip)
         rated = _given(limits.velocity, "velocity", model.velocityLimit)
         torque = _given(limits.torque, "torque", model.effortLimit)
         velocity = limits.velocity_scale * rated
         most = np.minimum(limits.acceleration_rate * velocity, limits.acceleration_cap)
+        most = np.minimum(most, _rates(joints, "acceleration"))
         acceleration = _given(limits.acceleration, "acceleration", most)
-        jerk = _given(limits.jerk, "jerk", JERK_RATE * acceleration)
+        most = np.minimum(JERK_RATE * acceleration, _rates(joints, "jerk"))
+        jerk = _given(limits.jerk, "jerk", most)
+        drive = _drive(problem, joints, limits.torque_scale, torque)
     center = (
         np.array(model.upperPositionLimit) + np.array(model.lowerPositionLimit)
     ) / 2
@@ -83,6 +88,7 @@ def load_robot(problem: Problem) -> Robot:
         parameters=problem.parameters,
         table_origin=problem.table_origin,
         nominal_parameters=problem.nominal_parameters,
+        drive=drive,
     )
     if errors := list(_errors(problem, robot)):
         raise RecipeError(errors)
@@ -120,18 +126,58 @@ def _attached(problem: Problem) -> Attached:
             name: (each.low, each.high)
             for name, each in zip(spec.joints, ranges, strict=False)
         },
+        uses_soft_limits=problem.limits.soft == "use",
     )
 
 
-def _given(values: PerJoint | None, what: str, otherwise: Array) -> Array:
-    """Return the limits of the problem for all joints, or the defaults."""
+def _rates(joints: Sequence[UrdfJoint], name: str) -> Array:
+    """Return the limits of accelerations or jerks of a URDF 1.2, infinite where it has none, shape (n,)."""
+    return np.array([joint.rates.get(name, np.inf) for joint in joints])
+
+
+def _drive(
+    problem: Problem, joints: Sequence[UrdfJoint], scale: float, torque: Array
+) -> Drive | None:
+    """Return the drives of a problem, None without rotors, friction and limits of motors.
+
+    ``torque`` has the limits at the joint before they are scaled [N m], shape (n,).
+    """
+    spec, none = problem.drive, np.zeros(len(joints))
+    uses = spec.urdf_dynamics == "use"
+    damping, friction = (
+        np.array([getattr(joint, name) * uses for joint in joints])
+        for name in ("damping", "friction")
+    )
+    rotor = _given(spec.rotor_inertia, "rotor_inertia", none, "drive")
+    ratio = _given(spec.gear_ratio, "gear_ratio", none, "drive")
+    terms = {
+        "armature": _given(spec.armature, "armature", rotor * ratio**2, "drive"),
+        "viscous": _given(spec.viscous, "viscous", damping, "drive"),
+        "coulomb": _given(spec.coulomb, "coulomb", friction, "drive"),
+    }
+    limit = scale * _given(spec.torque, "torque", torque, "drive")
+    if spec.torque is None and not any(term.any() for term in terms.values()):
+        return None
+    return Drive(
+        **terms,
+        friction_help=spec.friction_help,
+        reversal_speed=spec.reversal_speed,
+        limits=spec.limits,
+        torque_limit=limit,
+    )
+
+
+def _given(
+    values: PerJoint | None, what: str, otherwise: Array, table: str = "limits"
+) -> Array:
+    """Return the numbers of a table of the problem for all joints, or the defaults."""
     if values is None:
         return np.array(otherwise)
     if len(values.values) not in (1, len(otherwise)):
         n, found = len(otherwise), len(values.values)
         raise RecipeError(
             [
-                f"limits.{what}: needs one number, or {n}, one per planned joint, got {found}"
+                f"{table}.{what}: needs one number, or {n}, one per planned joint, got {found}"
             ]
         )
     return np.broadcast_to(np.array(values.values), len(otherwise)).copy()
@@ -153,11 +199,25 @@ def _errors(problem: Problem, robot: Robot) -> Iterator[str]:
         for name, value in zip(robot.joint_names, values, strict=True):
             if not (np.isfinite(value) and value > 0):
                 yield f"{robot.urdf}: {name}: the {what} limit must be positive and finite, got {value:g}"
+    yield from _drive_errors(problem, robot)
     if any(isinstance(constraint, JointTorque) for constraint in problem.constraint):
         yield from _weightless(robot)
     yield from (errors := list(_position_errors(problem, robot)))
     if not errors:
         yield from _home_errors(problem, robot)
+
+
+def _drive_errors(problem: Problem, robot: Robot) -> Iterator[str]:
+    """Yield error messages for drives whose friction alone exceeds their limits, so that no motion can start."""
+    drive = robot.drive
+    if drive is None or not drive.motor_rows:
+        return
+    for index, name in enumerate(robot.joint_names):
+        friction, limit = drive.resting_friction[index], drive.torque_limit[index]
+        if friction >= limit:
+            unit = unit_of(robot.units("N m"), index)
+            text = f"friction of {friction:.4g} {unit} at rest leaves nothing of the motor's limit of {limit:.4g} {unit}"
+            yield f"{problem.path}: drive: {name}: {text}"
 
 
 def _position_errors(problem: Problem, robot: Robot) -> Iterator[str]:

@@ -98,15 +98,18 @@ class Centrifugal(ObjectiveTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class Effort(ObjectiveTerm):
-    """Squares of the joint torques as fractions of their limits."""
+    """Squares of the joint torques as fractions of their limits; with [drive] those of the motors, without dry friction."""
 
     unit = "s"
 
     def residuals(self, state: SymbolicState) -> Vec:
-        """Return the torques of the inverse dynamics as fractions of their planning limits."""
+        """Return the torques of the inverse dynamics, or of the motors, as fractions of their planning limits."""
+        robot = state.robot
+        drive = robot.drive
+        limits = robot.torque_limit if drive is None else drive.torque_limit
         return [
             tau / float(limit)
-            for tau, limit in zip(state.torque, state.robot.torque_limit, strict=True)
+            for tau, limit in zip(state.linear_torque, limits, strict=True)
         ]
 
 

@@ -19,6 +19,7 @@ from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.link_clearance import ObjectClearance
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.objectives import Centrifugal, ObjectiveTerm
+from cnpgen.robots.drive import NO_DRIVE, DriveSpec
 from cnpgen.robots.obstacle import Obstacle, invalid_obstacle
 from cnpgen.robots.parameter_ranges import (
     NO_PARAMETERS,
@@ -94,6 +95,9 @@ class Problem:
     robot: RobotSpec = field("robot and its planned joints")
     limits: LimitSpec = field(
         "planning limits, as fractions of the URDF's or in their place"
+    )
+    drive: DriveSpec = optional_key(
+        "rotor inertia, friction and limits of the drives", default=NO_DRIVE
     )
     object: HeldObject | None = field("upright cuboid that the tip holds", default=None)
     payload: Payload | None = optional_key("additional load at the tip")

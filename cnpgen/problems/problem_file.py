@@ -12,8 +12,10 @@ import numpy as np
 from cnpgen.errors import PluginError, RecipeError
 from cnpgen.problems.checks import ProblemTables, limit_errors, problem_errors, tables
 from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.objectives import ObjectiveTerm
 from cnpgen.problems.problem import FILES, Problem
+from cnpgen.problems.urdf_dynamics import warn_of_friction
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.inline import inline_mesh, is_inline, mesh_files
 from cnpgen.robots.shape.mesh_files import find_named_file
@@ -94,6 +96,9 @@ def read_problem(path: Path, errors: list[str]) -> Problem | None:
     if problem is None or len(errors) > before:
         return None
     errors.extend(limit_errors(problem, raw))
+    is_stated = "urdf_dynamics" in table.get("drive", {})
+    if raw.urdf is not None and problem.first(JointTorque) and not is_stated:
+        warn_of_friction(raw.urdf, problem.robot.joints, path)
     spec, constraints = (
         replace(problem.robot, geometry=raw.geometry),
         raw.with_object_clearance(problem),

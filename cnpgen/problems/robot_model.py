@@ -178,6 +178,25 @@ class RobotModel:
         return torque.T.copy()
 
     @checked_arguments
+    def motor_torque(
+        self, q: ArrayLike, dq: ArrayLike | None = None, ddq: ArrayLike | None = None
+    ) -> tuple[Array, Array]:
+        """Compute the torques at the motors, seen at the joints: ``tau + J ddq`` and any friction that may act.
+
+        Without [drive] both are those of ``inverse_dynamics``.
+
+        Args:
+            q: Joint positions [rad], shape (N, n) or (n,).
+            dq: Joint velocities [rad/s]; zero by default.
+            ddq: Joint accelerations [rad/s^2]; zero by default.
+
+        Returns:
+            Lowest and highest torques [N m], shape (N, n) each.
+        """
+        low, high = self._run("motor_torque_of", *self._motion(q, dq, ddq))
+        return low.T.copy(), high.T.copy()
+
+    @checked_arguments
     def scene(
         self,
         start_xyz: ArrayLike,
@@ -421,6 +440,22 @@ def inverse_dynamics_of(robot: Robot) -> Any:
         [sx for sx, _ in pairs],
         [ca.cse(ca.densify(ca.vertcat(*torque)))],
     )
+
+
+def motor_torque_of(robot: Robot) -> Any:
+    """Build ``(q, dq, ddq) -> (lowest, highest)``, the torques at the motors."""
+    import casadi as ca
+
+    from cnpgen.kernels.symbolic.linalg import symbols
+    from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
+
+    columns, scalars = zip(
+        *(symbols(name, robot.n) for name in ("q", "dq", "ddq")), strict=True
+    )
+    q, dq, ddq = scalars
+    ends = SymbolicState(robot, q, dq, ddq, [], (), None).motor_torque
+    outputs = [ca.densify(ca.vertcat(*map(ca.SX, end))) for end in ends]
+    return ca.Function("motor_torque_of", list(columns), ca.cse(outputs))
 
 
 def constraint_values_of(robot: Robot, problem: Problem) -> Any:

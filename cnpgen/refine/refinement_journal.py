@@ -2,7 +2,6 @@
 
 import io
 import json
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, UsageError, counted
 from cnpgen.refine.task import Attempt, Outcome
+from cnpgen.store.files.archives import read_arrays
 from cnpgen.store.files.documents import differences, parse_json
 from cnpgen.store.files.journal import JournalFile, open_journal_file
 
@@ -20,8 +20,7 @@ JOURNAL_MAGIC = b"cnpgen journal 1\n"
 # Errors of NumPy and Python for a record with a valid checksum that cnpgen has not
 # written.
 _RECORD_ERRORS = (
-    ValueError, KeyError, TypeError, IndexError, EOFError, AttributeError, RuntimeError, MemoryError, OverflowError,
-    zipfile.BadZipFile,
+    ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError,
 )  # fmt: skip
 
 
@@ -135,16 +134,10 @@ def _pack(indices: Sequence[int], results: Sequence[Attempt]) -> bytes:
 
 
 def _unpack(record: bytes) -> dict[int, Attempt]:
-    with np.load(io.BytesIO(record), allow_pickle=False) as arrays:
-        if any(
-            member.compress_type != zipfile.ZIP_STORED
-            for member in arrays.zip.infolist()
-        ):
-            raise ValueError(
-                "its arrays are compressed"
-            )  # a few bytes could expand to gigabytes
-        numbers, reasons = parse_json(arrays["words"].tobytes().decode())
-        path, rate, cost = (arrays[name] for name in ("path", "rate", "cost"))
+    # Compressed arrays are refused: a few bytes could expand to gigabytes.
+    arrays = read_arrays(record, max_bytes=len(record), stored=True)
+    numbers, reasons = parse_json(arrays["words"].tobytes().decode())
+    path, rate, cost = (arrays[name] for name in ("path", "rate", "cost"))
     return {
         index: Attempt(
             path=path[i],

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.schema.arguments import distinct
 from cnpgen.schema.keys import Range, field, keys
 
 Array = NDArray[np.float64]
@@ -196,7 +197,8 @@ class ParameterRanges:
             if outside.any():
                 row = int(outside.argmax())
                 value = (rows if shown is None else shown)[row, column]
-                return f"{name} must be from {span.low:g} to {span.high:g}, got {value:g} in row {row}"
+                low, high, got = distinct(span.low, span.high, value)
+                return f"{name} must be from {low} to {high}, got {got} in row {row}"
         return ""
 
     def describe(self) -> Iterator[str]:

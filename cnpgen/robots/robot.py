@@ -13,12 +13,19 @@ import numpy as np
 
 from cnpgen.errors import RecipeError, listed, nearest
 from cnpgen.robots.chain import Chain, frame_of, name_links_uniquely
+from cnpgen.robots.drive import Drive
 from cnpgen.robots.parameter_ranges import NO_PARAMETERS, ParameterRanges
 from cnpgen.robots.robot_spec import Payload
 from cnpgen.robots.shape.hull import Array
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.urdf import number_in, urdf_tree
-from cnpgen.robots.urdf_parameters import UrdfParameters, check_model, urdf_parameters
+from cnpgen.robots.urdf_parameters import (
+    NO_SOFT_LIMITS,
+    UrdfJoint,
+    UrdfParameters,
+    check_model,
+    urdf_parameters,
+)
 from cnpgen.store.joint_units import units_of_joints
 
 if TYPE_CHECKING:
@@ -35,6 +42,7 @@ class Attached:
         translation: Origin of the tip frame in it [m], shape (3,).
         payload: Body carried at the tip frame, or None.
         ranges: Planned joint -> position limits [rad] that replace those of the URDF.
+        uses_soft_limits: Whether soft limits of the URDF narrow its position limits.
     """
 
     frame: str
@@ -42,6 +50,7 @@ class Attached:
     translation: Array = field(default_factory=lambda: np.zeros(3))
     payload: Payload | None = None
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    uses_soft_limits: bool = True
 
     @property
     def tip(self) -> str:
@@ -81,6 +90,7 @@ class Robot:
             [m], shape (3,).
         nominal_parameters: Parameters of a sample for which none are given, shape
             (width,).
+        drive: Drives of the joints; None for torques of the rigid body alone.
     """
 
     urdf: Path
@@ -102,6 +112,16 @@ class Robot:
     parameters: ParameterRanges = NO_PARAMETERS
     table_origin: Array = field(default_factory=lambda: np.zeros(3))
     nominal_parameters: Array = field(default_factory=lambda: np.empty(0))
+    drive: Drive | None = None
+
+    @cached_property
+    def holding_limit(self) -> Array:
+        """Limit of torques that hold the arm still: what friction at rest leaves of the planning limits, shape (n,)."""
+        drive = self.drive
+        if drive is None or not drive.motor_rows:
+            return self.torque_limit
+        left = drive.torque_limit - drive.resting_friction
+        return np.minimum(self.torque_limit, left) if drive.limits_joint else left
 
     @property
     def n(self) -> int:
@@ -178,8 +198,16 @@ def reduced_model(
 ) -> "pin.Model":
     """Build the Pinocchio model of a URDF, reduced to the planned joints, with the attachments of a problem.
 
-    The path is for messages. Joints that are not planned are locked at zero.
+    The path is for messages. Joints that are not planned are locked at zero. The model
+    has no rotors and no friction (``Drive``).
     """
+    return read_model(urdf, text, joints, attached)[0]
+
+
+def read_model(
+    urdf: Path, text: str, joints: tuple[str, ...], attached: Attached
+) -> tuple["pin.Model", tuple[UrdfJoint, ...]]:
+    """Build the model of ``reduced_model``, and return the planned joints of the URDF with it."""
     import pinocchio as pin
 
     try:
@@ -223,10 +251,36 @@ def reduced_model(
                 f"robot.joints: must be in the URDF's order {list(reduced.names)[1:]}, got {list(joints)}"
             ]
         )
+    by_name = {joint.name: joint for joint in parameters.joints.values()}
+    planned = tuple(by_name[name] for name in joints)
     with recipe_errors_in(urdf):
         check_model(reduced, parameters)
+        if attached.uses_soft_limits:
+            _narrow_to_soft_limits(reduced, planned, attached)
     attach(reduced, attached)
-    return reduced
+    return reduced, planned
+
+
+def _narrow_to_soft_limits(
+    model: "pin.Model", planned: Sequence[UrdfJoint], attached: Attached
+) -> None:
+    """Intersect the position limits of a model with soft limits, as MoveIt does; ranges of the problem replace both."""
+    errors = []
+    for joint in planned:
+        if joint.soft == NO_SOFT_LIMITS or joint.name in attached.ranges:
+            continue
+        place = model.idx_qs[model.getJointId(joint.name)]
+        hard = model.lowerPositionLimit[place], model.upperPositionLimit[place]
+        low, high = max(hard[0], joint.soft[0]), min(hard[1], joint.soft[1])
+        if low >= high:
+            soft = f"[{joint.soft[0]:g}, {joint.soft[1]:g}]"
+            text = f"joint {joint.name!r}: its soft limits {soft} leave nothing of its limits"
+            errors.append(
+                f'{text} [{hard[0]:g}, {hard[1]:g}]; [limits] soft = "ignore" drops them'
+            )
+        model.lowerPositionLimit[place], model.upperPositionLimit[place] = low, high
+    if errors:
+        raise RecipeError(errors)
 
 
 def _mimic_errors(tree: ElementTree.Element, planned: Sequence[str]) -> Iterator[str]:

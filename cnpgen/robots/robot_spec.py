@@ -175,6 +175,11 @@ class LimitSpec:
     torque: PerJoint | None = optional_key(
         "limits of joint torques in place of the URDF's", unit="N m", low=1e-6
     )
+    soft: str = optional_key(
+        "whether soft limits of the URDF's <safety_controller> elements narrow its position limits",
+        default="use",
+        choices=("use", "ignore"),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,9 +21,14 @@ _INERTIA_ENTRIES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _PARTS = {  # element -> the elements whose numbers are read
     "link": ("inertial",),
     "inertial": ("origin", "mass", "inertia"),
-    "joint": ("origin", "axis", "limit", "parent", "child"),
+    "joint": (
+        *("origin", "axis", "limit", "parent", "child"),
+        *("dynamics", "safety_controller"),
+    ),
 }
-_TURNING_OR_SLIDING = ("revolute", "prismatic", "continuous")
+_LIMITED = ("revolute", "prismatic")
+_TURNING_OR_SLIDING = (*_LIMITED, "continuous")
+NO_SOFT_LIMITS = (-math.inf, math.inf)
 _ZERO = (0.0, 0.0, 0.0)
 MAX_RELATIVE_DIFFERENCE = 1e-9  # of values from two parsers, which round differently
 WORLD = 0  # index of Pinocchio's joint of the root link
@@ -65,6 +70,12 @@ class UrdfJoint:
         axis: Unit axis, shape (3,).
         limits: Limit -> value [rad, rad/s, N m, or with m and N]: "lower", "upper",
             "velocity" and "effort".
+        rates: Limits of URDF 1.2: "acceleration" [rad/s^2], the smaller one if
+            "deceleration" is given, too, and "jerk" [rad/s^3]; without those that are
+            absent or zero.
+        damping: Viscous friction [N m s/rad].
+        friction: Dry friction [N m].
+        soft: Lower and upper soft limits of the position [rad]; infinite for none.
     """
 
     name: str
@@ -74,6 +85,10 @@ class UrdfJoint:
     origin: LinkFrame
     axis: Array
     limits: dict[str, float]
+    rates: dict[str, float]
+    damping: float
+    friction: float
+    soft: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -190,6 +205,8 @@ def _joint(element: Element) -> UrdfJoint:
     for key in ("velocity", "effort"):
         if kind in _TURNING_OR_SLIDING and limits.get(key, 0.0) < 0:
             raise ValueError(f"{key}={limits[key]:g} must not be negative")
+    movable = kind in _TURNING_OR_SLIDING
+    damping, friction = _dynamics(element)
     ends = {
         tag: found.get("link", "")
         for tag in ("parent", "child")
@@ -210,8 +227,51 @@ def _joint(element: Element) -> UrdfJoint:
         child=ends.get("child", ""),
         origin=placement_of(element),
         axis=axis / (length or 1.0),
-        limits=limits if kind in _TURNING_OR_SLIDING else {},
+        limits=limits if movable else {},
+        rates=_rates(limit) if movable else {},
+        damping=damping if movable else 0.0,
+        friction=friction if movable else 0.0,
+        soft=_soft_limits(element) if kind in _LIMITED else NO_SOFT_LIMITS,
     )
+
+
+def _rates(limit: Element | None) -> dict[str, float]:
+    """Read the limits of acceleration and jerk of URDF 1.2; a zero is none."""
+    keys = ("acceleration", "deceleration", "jerk")
+    given = {key: number_in(limit, key, 0.0) for key in keys}
+    for key, value in given.items():
+        if value < 0:
+            raise ValueError(f"{key}={value:g} must not be negative")
+    symmetric = [value for key in keys[:2] if (value := given[key])]
+    rates = {"acceleration": min(symmetric, default=0.0), "jerk": given["jerk"]}
+    return {key: value for key, value in rates.items() if value}
+
+
+def _dynamics(joint: Element) -> tuple[float, float]:
+    """Read damping and friction of a joint."""
+    element = joint.find("dynamics")
+    values = {key: number_in(element, key, 0.0) for key in ("damping", "friction")}
+    for key, value in values.items():
+        if value < 0:
+            raise ValueError(f"<dynamics {key}={value:g}> must not be negative")
+    return values["damping"], values["friction"]
+
+
+def _soft_limits(joint: Element) -> tuple[float, float]:
+    """Read the soft limits of a joint; an absent attribute, or zero for both, is none."""
+    element = joint.find("safety_controller")
+    if element is None:
+        return NO_SOFT_LIMITS
+    keys = ("soft_lower_limit", "soft_upper_limit")
+    low, high = (
+        number_in(element, key, none)
+        for key, none in zip(keys, NO_SOFT_LIMITS, strict=True)
+    )
+    if low > high:
+        raise ValueError(
+            f"its soft limits {low:g} and {high:g} are swapped: exchange them"
+        )
+    return NO_SOFT_LIMITS if low == high == 0 else (low, high)
 
 
 def placement_of(element: Element) -> LinkFrame:
@@ -300,6 +360,13 @@ class _Comparison:
                 yield _difference(
                     f"joint {joint.name!r}", f"its limit {name!r}", limits[name], value
                 )
+        friction = {
+            "damping": (model.damping[v], joint.damping),
+            "friction": (model.upperDryFrictionLimit[v], joint.friction),
+        }
+        for name, (found, value) in friction.items():
+            if not _same(found, value):
+                yield _difference(f"joint {joint.name!r}", f"its {name}", found, value)
 
     def _of_inertia(self, index: int) -> Iterator[str]:
         """Compare the body that a joint moves with the links of which it consists."""

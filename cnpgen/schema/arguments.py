@@ -125,8 +125,20 @@ def check_range(
     outside = ~((low <= array) & (array <= high))
     if outside.any():
         value = float(array[outside].flat[0])
-        text = f"must be from {low:g} to {high:g} {unit}, got {value:g} {unit}"
+        first, last, got = distinct(low, high, value)
+        text = f"must be from {first} to {last} {unit}, got {got} {unit}"
         raise UsageError(text + suggested_unit(value, unit, low, high), argument=name)
+
+
+def distinct(*values: float, digits: int = 6) -> tuple[str, ...]:
+    """Write numbers with as few significant digits as distinguish different ones, at least ``digits``."""
+    different = len({float(value) for value in values if not math.isnan(value)})
+    different += any(math.isnan(value) for value in values)
+    texts = tuple(f"{value:.{digits}g}" for value in values)
+    while len(set(texts)) < different:  # 17 digits distinguish all floats
+        digits += 1
+        texts = tuple(f"{value:.{digits}g}" for value in values)
+    return texts
 
 
 def reject_masked(name: str, values: Any) -> Any:

@@ -8,6 +8,8 @@ _PRISMATIC = {
     "rad/s^2": "m/s^2",
     "rad/s^3": "m/s^3",
     "N m": "N",
+    "kg m^2": "kg",
+    "N m s/rad": "N s/m",
 }
 _SEPARATOR = ", "
 
@@ -16,7 +18,8 @@ _SEPARATOR = ", "
 def units_of_joints(revolute_unit: str, is_prismatic: tuple[bool, ...]) -> str:
     """Return the unit of a joint quantity: one for all joints, or one per joint, separated by commas, if they differ.
 
-    The unit of revolute joints is "rad", "rad/s", "rad/s^2", "rad/s^3" or "N m".
+    The unit of revolute joints is "rad", "rad/s", "rad/s^2", "rad/s^3", "N m",
+    "kg m^2" or "N m s/rad".
     """
     units = [
         _PRISMATIC[revolute_unit] if prismatic else revolute_unit

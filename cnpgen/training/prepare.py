@@ -9,6 +9,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.losses.margins import Margins, suggested_margins
@@ -115,6 +116,7 @@ def prepare_run(
         "command": command,
         **identity(source, settings),
         "stages": source.stages,
+        "input_ranges": input_ranges(rows.features, initial_model),
     }
     projection = make_projection(
         loaded.problem.for_planning,
@@ -173,6 +175,25 @@ def identity(source: TrainingData, settings: TrainingSettings) -> dict[str, Any]
         "cnpgen": __version__,
         "dataset": source.describe(),
         "settings": plain(asdict(settings)),
+    }
+
+
+def input_ranges(
+    inputs: NDArray[Any], initial_model: Model | None = None
+) -> dict[str, list[float]]:
+    """Return the smallest and largest inputs of the network in the training rows, shape (N, F), with eight digits.
+
+    The rows of an initial model count, too, if it stores their ranges. JSON-able.
+    """
+    low, high = inputs.min(axis=0), inputs.max(axis=0)
+    earlier = (
+        None if initial_model is None else initial_model.training.get("input_ranges")
+    )
+    if earlier is not None:
+        low, high = np.minimum(low, earlier["low"]), np.maximum(high, earlier["high"])
+    return {
+        name: [float(f"{value:.8g}") for value in values.tolist()]
+        for name, values in (("low", low), ("high", high))
     }
 
 

@@ -107,7 +107,7 @@ class PathWorld(RobotWorld[Array]):
 
     @cached_property
     def torque(self) -> Array:
-        """Inverse dynamics [N m], shape (n, K)."""
+        """Inverse dynamics of the rigid body [N m], shape (n, K)."""
         import pinocchio as pin
 
         q, dq, ddq = (

@@ -15,6 +15,7 @@ from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import Solid, place_obstacles, pose_width, solids_of
 from cnpgen.world.collision_world import CollisionWorld
+from cnpgen.world.drive import linear_torque, motor_torque
 from cnpgen.world.measured_parameters import MeasuredParameters
 from cnpgen.world.pair_distances import PairDistances
 from cnpgen.world.rigid_bodies import NO_HELD_SHAPE, NO_SHAPE, RigidBodies
@@ -38,7 +39,14 @@ class RobotWorld(ABC, Generic[Value]):
         robot: The robot.
         obstacles: The obstacles.
         parameters: Parameters of the sample.
+        dq: Joint velocities [rad/s], shape (n,) or (n, K).
+        ddq: Joint accelerations [rad/s^2], of the same shape.
+        torque: Inverse dynamics of the rigid body [N m], of the same shape.
     """
+
+    dq: Array
+    ddq: Array
+    torque: Any  # a property of either kind of world
 
     def __init__(
         self,
@@ -77,6 +85,20 @@ class RobotWorld(ABC, Generic[Value]):
         Empty if none were given.
         """
         return self.parameters.scene_values
+
+    @property
+    def motor_torque(self) -> tuple[Array, Array]:
+        """Lowest and highest torques at the motors over all friction that may act [N m], shape (n,) or (n, K)."""
+        if self.robot.drive is None:
+            return self.torque, self.torque
+        return motor_torque(self.robot.drive, self.torque, self.dq, self.ddq)
+
+    @property
+    def linear_torque(self) -> Array:
+        """Torques at the motors without dry friction [N m], those of the rigid body without drives."""
+        if self.robot.drive is None:
+            return np.asarray(self.torque)
+        return linear_torque(self.robot.drive, self.torque, self.dq, self.ddq)
 
     def segment_distances(self, sufficient: float = np.inf) -> list[Value]:
         """Measure the signed distance of every segment of the robot from every obstacle, segment by segment [m].
@@ -245,7 +267,7 @@ class World(RobotWorld[float]):
 
     @property
     def torque(self) -> Array:
-        """Inverse dynamics [N m], shape (n,)."""
+        """Inverse dynamics of the rigid body [N m], shape (n,)."""
         import pinocchio as pin
 
         return np.array(

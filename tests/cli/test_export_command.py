@@ -265,3 +265,10 @@ def test_a_damaged_file_is_one_line(run: Run, hits: Path) -> None:
     assert (code, out) == (1, "")
     assert "damaged or cut off" in err
     assert len(err.splitlines()) == 1
+
+
+def test_a_folder_has_the_plans_of_one_export(run: Run, hits: Path) -> None:
+    assert run(hits, "--to", "csv", "-o", "out")[0] == 0
+    assert len(list(Path("out").glob("plan_*.csv"))) > 1
+    assert run(hits, "--to", "csv", "-o", "out", "--plan", "0", "--force")[0] == 0
+    assert [path.name for path in Path("out").glob("plan_*")] == ["plan_00000.csv"]

@@ -404,7 +404,7 @@ def _read_model(folder: Path, draw: Random) -> None:
     model = load_model(folder / "model.h5")
     str(model)
     if draw.random() < 0.3:
-        base = open_problem(model.problem)[1].base
+        base = open_problem(model.problem)[1].home
         Planner(model, backend="numpy").plan(base, base + 0.1)
 
 

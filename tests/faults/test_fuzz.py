@@ -1,11 +1,18 @@
 """A small run of ``python -m tests.faults``: changed files of every kind give results or CnpgenErrors."""
 
+from pathlib import Path
+from random import Random
+from typing import Any
+
 import pytest
 
+from tests.faults import mutations, scene_subjects, subjects
 from tests.faults.fuzz import Outcome, fuzz
-from tests.faults.subjects import SUBJECTS
+from tests.faults.good_files import make_good_files
+from tests.faults.subjects import SUBJECTS, read_quietly
 
 INPUTS_PER_KIND = 12  # some seconds in total
+UNCHANGED_PER_KIND = 12  # draws of a file of the kind and of the functions that read it
 
 
 @pytest.fixture(scope="module")
@@ -29,3 +36,39 @@ def test_an_input_is_a_function_of_seed_and_index() -> None:
         fuzz(6, seed=3, first=5, kinds=("recipe", "journal")) for _ in range(2)
     )
     assert (first.read, first.refused) == (again.read, again.refused)
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("good")
+    make_good_files(folder)
+    return folder
+
+
+def identity(content: Any, *_: Any, **__: Any) -> Any:
+    """Return the content of a file as it is."""
+    return content
+
+
+@pytest.fixture
+def unchanged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replace the code of all mutations, to which the subjects hold references, by the identity."""
+    functions = [mutations.change_bytes, mutations.change_text, mutations.change_json]
+    functions += [mutations.change_urdf, mutations.changed_number]
+    for function in functions:
+        monkeypatch.setattr(function, "__code__", identity.__code__)
+    for name in ("_change_values", "_changed_content"):
+        monkeypatch.setattr(subjects, name, identity)
+    monkeypatch.setattr(scene_subjects, "change_text_file", identity)
+
+
+@pytest.mark.usefixtures("unchanged")
+@pytest.mark.parametrize("kind", SUBJECTS)
+def test_files_of_every_kind_are_read_unchanged(
+    good: Path, tmp_path: Path, kind: str
+) -> None:
+    for index in range(UNCHANGED_PER_KIND):
+        folder, draw = tmp_path / str(index), Random(f"{kind} {index}")
+        folder.mkdir()
+        SUBJECTS[kind].change(good, folder, draw)
+        read_quietly(SUBJECTS[kind], folder, draw)

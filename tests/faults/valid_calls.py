@@ -33,6 +33,8 @@ EXCLUDED = {  # public callables without a valid call, and the reason
     "plan_scenes": "needs a model for scenes; its arguments are those of scene_plans",
     "solve_scenes": "compiles kernels for minutes; its arguments are those of scene_plans and solve_plans",
     "ConditionDecision": "made by evaluate_trajectories",
+    "SampleErrors": "made by evaluate_trajectories",
+    "Statement": "an enum",
     "Decision": "an enum",
     "TrajectoryEvaluation": "made by evaluate_trajectories",
     "TrajectoryVerdict": "made by evaluate_trajectories",
@@ -673,6 +675,15 @@ def _of_runtime() -> list[ValidCall]:
     base = planner.robot.home
     runtime = results.PlanRuntime(planner, base)
     plan = planner.plan(base, base)
+
+    def resume(measured_q: Any, at: Any = None) -> None:
+        stopped = results.PlanRuntime(planner, base)
+        stopped.stop(0.0)
+        stopped.resume(measured_q, at=at)
+
+    def close(timeout: Any) -> bool:
+        return results.PlanRuntime(planner, base).close(timeout=timeout)
+
     return [
         ValidCall("PlanRuntime", results.PlanRuntime, {"planner": planner, "q": base}),
         ValidCall("PlanRuntime.state_at", runtime.state_at, {"time": 0.0}),
@@ -688,5 +699,6 @@ def _of_runtime() -> list[ValidCall]:
             runtime.replan,
             {"make_plan": lambda *_: plan, "at": 0.0},
         ),
-        ValidCall("PlanRuntime.close", runtime.close),
+        ValidCall("PlanRuntime.resume", resume, {"measured_q": base, "at": 1.0}),
+        ValidCall("PlanRuntime.close", close, {"timeout": 1.0}),
     ]

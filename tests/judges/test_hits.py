@@ -65,7 +65,7 @@ def direction(angle: float) -> np.ndarray:
 def test_the_gradient_agrees_with_differences_up_to_rows_of_the_jacobian() -> None:
     random = np.random.default_rng(0)
     for _ in range(5):
-        q, home = (ROBOT.base + random.uniform(-0.5, 0.5, ROBOT.n) for _ in range(2))
+        q, home = (ROBOT.home + random.uniform(-0.5, 0.5, ROBOT.n) for _ in range(2))
         angle, step = random.uniform(-1, 1), 1e-6
         differences = [
             (value(q + e, home, angle) - value(q - e, home, angle)) / (2 * step)
@@ -132,7 +132,7 @@ def test_goals_of_another_start_are_reported(rows: tuple[Columns, HitRule]) -> N
 def test_f_may_increase_towards_an_active_joint_limit() -> None:
     """A goal is valid if f increases towards its active limit, and invalid if f increases away from it."""
     random = np.random.default_rng(3)
-    q = ROBOT.base + random.uniform(-0.2, 0.2, ROBOT.n)
+    q = ROBOT.home + random.uniform(-0.2, 0.2, ROBOT.n)
     (J,), (gradient,) = _gradients(ROBOT, q[None], q[None], direction(0.3))
     columns = {"goal_q": q[None], "start_q": q[None], "hit_angle": np.array([[0.3]])}
     free = [0, 1, 3]  # as many as tip coordinates, so f cannot increase along them

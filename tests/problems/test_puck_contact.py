@@ -64,7 +64,7 @@ def test_symbolic_and_measured_forms_agree(form):
     function, world = ca.Function("g", columns, symbolic.g), World(ROBOT)
     random, rest = np.random.default_rng(5), np.zeros(6)
     for _ in range(50):
-        q_now = ROBOT.base + random.normal(scale=0.1, size=6)
+        q_now = ROBOT.home + random.normal(scale=0.1, size=6)
         world.set_state(q_now, rest, rest, np.empty(0))
         goal = world.tip_position[:2] + random.normal(scale=0.02, size=2)
         values_now = np.concatenate([goal, goal + 0.07 * HIT])
@@ -94,12 +94,12 @@ def test_the_training_form_grows_linearly_with_a_large_violation():
         np.zeros(6),
     )
     world = World(ROBOT)
-    world.set_state(ROBOT.base, rest, rest, np.empty(0))
+    world.set_state(ROBOT.home, rest, rest, np.empty(0))
     tip = world.tip_position[:2]
     violations = []
     for distance in (0.03, 0.06, 0.2):
         puck = np.add(tip, [0.0, distance])
-        found = float(function(ROBOT.base, np.concatenate([puck - 0.07 * HIT, puck])))
+        found = float(function(ROBOT.home, np.concatenate([puck - 0.07 * HIT, puck])))
         violations.append(max(0.0, penalized.lower[0] - found))
         exact = max(0.0, RADII + ADDED_RADIUS_M + TRAINING_MARGIN_M - distance)
         assert violations[-1] == pytest.approx(
@@ -165,7 +165,7 @@ def test_the_puck_follows_from_the_goal_and_is_out_of_reach_without_a_hit():
 def test_goal_velocities_equal_finite_differences():
     random = np.random.default_rng(2)
     q, dq = (
-        ROBOT.base + random.normal(scale=0.2, size=(5, 6)),
+        ROBOT.home + random.normal(scale=0.2, size=(5, 6)),
         random.normal(size=(5, 6)),
     )
     world, step = PathWorld(ROBOT), 1e-6

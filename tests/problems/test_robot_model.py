@@ -160,7 +160,7 @@ def test_the_drift_is_the_second_derivative_of_positions_at_constant_velocity(
 def test_the_base_configuration_is_free_and_limits_decide_validity(
     model: RobotModel,
 ) -> None:
-    base = model.base[None]
+    base = model.home[None]
     scene = model.scene(*(model.forward_kinematics(base)[0],) * 2)
     values = model.constraint_values(base, scene=scene)
     assert values.violation.shape == (1, len(values.names))
@@ -176,13 +176,13 @@ def test_the_base_configuration_is_free_and_limits_decide_validity(
 
 def test_distances_are_negative_inside_an_obstacle() -> None:
     model = RobotModel("heavy-object")
-    tip = model.forward_kinematics(model.base)[0]
+    tip = model.forward_kinematics(model.home)[0]
     touching, inside = (
         model.scene(tip, tip),
         model.scene(tip + np.array([0, 0, 0.3]), tip + np.array([0, 0, 0.3])),
     )
     distances = [
-        model.min_distance(model.base, scene=scene)[0] for scene in (touching, inside)
+        model.min_distance(model.home, scene=scene)[0] for scene in (touching, inside)
     ]
     assert distances[1] < distances[0]
 

@@ -16,7 +16,7 @@ from cnpgen.robots.plausible_values import (
 from tests.examples.plans import ROBOTS
 
 ROBOT = ROBOTS["airhockey"]
-BASE = ROBOT.base
+BASE = ROBOT.home
 
 
 @pytest.mark.parametrize(

@@ -171,7 +171,7 @@ def test_a_tip_below_the_table_is_a_mistake_with_its_height():
 def test_base_on_its_limit_is_inside():
     robot = load_robot(HEAVY)
     assert (
-        load_robot(changed(HEAVY, base=tuple(robot.position_upper))).base[0]
+        load_robot(changed(HEAVY, base=tuple(robot.position_upper))).home[0]
         == robot.position_upper[0]
     )
 

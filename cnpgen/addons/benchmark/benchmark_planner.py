@@ -12,7 +12,9 @@ import numpy as np
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
+from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord
+from cnpgen.robots.robot import Robot
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.keys import RecipeLocation
@@ -85,6 +87,15 @@ class BenchmarkPlanner(ABC):
         Raises:
             UsageError: The planner does not support problems of this kind.
         """
+
+
+def require_rigid_torque(planner: str, problem: Problem, robot: Robot) -> None:
+    """Raise UsageError if a problem has drives: the planner limits the torque of the rigid body only."""
+    if robot.drive is not None:
+        raise UsageError(
+            f"{planner} limits the torque of the rigid body only, {problem.name!r} has rotors, friction or motor limits"
+            " in [drive]"
+        )
 
 
 def load_kind(name: str) -> type[BenchmarkPlanner]:

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.problems.constraints.joint import judged_torque
+from cnpgen.problems.problem_record import as_record, open_problem
 from cnpgen.store.dataset_spec import DatasetSpec
 from cnpgen.store.dataset_summary import DatasetSummary
 from cnpgen.store.field import Field
@@ -170,6 +172,7 @@ def _making(summary: DatasetSummary) -> str:
         "random numbers": spec.generator,
         "kernels": spec.backend,
         "stored as": spec.dtype,
+        "torque limits": _torque(spec),
         "specification": f"fingerprint `{spec.fingerprint}`",
         "made with": ", ".join(
             f"{name} {version}" for name, version in spec.versions.items()
@@ -180,6 +183,14 @@ def _making(summary: DatasetSummary) -> str:
         "\n".join(lines)
         + "\n\nThe same specification with the same versions gives the same bytes, for any number of workers."
     )
+
+
+def _torque(spec: DatasetSpec) -> str:
+    """Return which torque the problem limits if it states drives; empty for the rigid body."""
+    if "drive" not in spec.recipe["pipeline"]["problem"]:
+        return ""
+    problem, robot = open_problem(as_record(spec.problem))
+    return judged_torque(problem.constraint, robot)
 
 
 def _field_table(fields: Sequence[Field]) -> str:

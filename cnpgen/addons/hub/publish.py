@@ -12,7 +12,6 @@ import json
 import os
 import re
 import shutil
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,8 @@ from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shards
 from cnpgen.store.dataset_summary import summarize_dataset
 from cnpgen.store.files.atomic import check_writable, file_sha256, write_file
 from cnpgen.store.files.documents import render
-from cnpgen.store.layout import CARD, CROISSANT, DOCUMENTS, SPLIT_NAME
+from cnpgen.store.files.written_files import claim_files, record_files
+from cnpgen.store.layout import CARD, CROISSANT, DOCUMENTS
 from cnpgen.store.manifest import load_manifest
 from cnpgen.store.shard import read_shard
 from cnpgen.store.shard_record import load_record
@@ -34,9 +34,6 @@ from cnpgen.store.shard_record import load_record
 HDF5 = "hdf5"  # folder of the dataset in the repository
 HUB = "https://huggingface.co"
 REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}")
-WRITTEN = re.compile(  # paths of tables and shards in the repository
-    rf"{PARQUET}/{SPLIT_NAME.pattern}/\d{{5,}}\.parquet|{HDF5}/{SPLIT_NAME.pattern}/shard-\d{{5,}}\.(h5|json)"
-)
 SOURCE_KEY = b"cnpgen.sha256"  # metadata of a table: the sha256 of its shard
 
 
@@ -48,11 +45,12 @@ def publish_dataset(
     out: str | Path,
     private: bool = False,
     dry_run: bool = False,
+    force: bool = False,
 ) -> str:
     """Write the repository of a dataset and upload it; a second call continues an interrupted one.
 
-    Tables and shards of an earlier state of the dataset are removed, from the folder
-    and from the hub.
+    Only files that this function wrote are uploaded. Tables and shards of an earlier
+    state of the dataset are removed, from the folder and from the hub.
 
     Args:
         folder: Folder of a finished dataset.
@@ -60,13 +58,15 @@ def publish_dataset(
         out: Folder of the repository on this machine.
         private: Whether a new repository is private.
         dry_run: Whether to write the folder only.
+        force: Whether the folder may have other files: they are kept, not uploaded, and
+            replaced if they have the name of a written one.
 
     Returns:
         Address of the repository; empty if it was not uploaded.
 
     Raises:
-        UsageError: The repository has no valid name or is inside the dataset, or the
-            dataset has no license.
+        UsageError: The repository has no valid name or is inside the dataset, its
+            folder has files of other origin, or the dataset has no license.
         DatasetError: The dataset is unfinished or damaged.
         MissingExtraError: pyarrow or huggingface_hub is not installed.
         MachineError: The folder cannot be written, or the upload failed.
@@ -91,29 +91,30 @@ def publish_dataset(
             f"{source} has no license: add license = \"...\" to its recipe, then run 'cnpgen make-dataset' on it again,"
             " which keeps the samples"
         )
-    write_repository(source, spec, target, repository=to)
-    return "" if dry_run else upload_folder(target, to, private=private)
+    files = write_repository(source, spec, target, repository=to, force=force)
+    return "" if dry_run else upload_files(target, files, to, private=private)
 
 
 def write_repository(
-    source: Path, spec: DatasetSpec, target: Path, *, repository: str
-) -> None:
-    """Write card, Parquet view and dataset.
+    source: Path, spec: DatasetSpec, target: Path, *, repository: str, force: bool
+) -> list[str]:
+    """Write card, Parquet view and dataset; return the written files, relative to the folder.
 
-    Finished files of an earlier call are kept, others removed.
+    Finished files of an earlier call are kept, its other ones removed.
     """
     tasks = shards(spec)
     tables = [
         target / PARQUET / task.split / f"{task.index:05d}.parquet" for task in tasks
     ]
     copies = [name for task in tasks for name in (task.file, task.sidecar)]
-    _remove_others(target, {*tables, *(target / HDF5 / name for name in copies)})
+    copies += [name for name in DOCUMENTS if name != CROISSANT]  # without record sets
+    written = [path.relative_to(target).as_posix() for path in tables]
+    written += [f"{HDF5}/{name}" for name in copies] + [CARD, CROISSANT]
+    claim_files(target, written, force=force)
     for task, path in zip(tasks, tables, strict=True):
         _write_table(source, spec, task, path)
-    (target / HDF5 / CROISSANT).unlink(missing_ok=True)
-    for name in (*DOCUMENTS, *copies):
-        if name != CROISSANT:  # which has no record sets
-            _copy(source / name, target / HDF5 / name)
+    for name in copies:
+        _copy(source / name, target / HDF5 / name)
     notes = card_notes((source / CARD).read_text(encoding="utf-8"))
     summary = summarize_dataset(source, spec)
     write_file(
@@ -131,24 +132,8 @@ def write_repository(
         target / CROISSANT,
         render(croissant_of_tables(summary, files, created=created, url=url)) + "\n",
     )
-
-
-def _remove_others(target: Path, present: set[Path]) -> None:
-    """Remove tables and shards of an earlier state.
-
-    Files of other names are kept, and links are not followed.
-    """
-    for path in [
-        path for part in (PARQUET, HDF5) for path in target.glob(f"{part}/*/*")
-    ]:
-        is_own = (
-            WRITTEN.fullmatch(path.relative_to(target).as_posix())
-            and not path.parent.is_symlink()
-        )
-        if is_own and path not in present and path.is_file():
-            path.unlink()
-            with suppress(OSError):  # other files are in it
-                path.parent.rmdir()
+    record_files(target, written)
+    return written
 
 
 def _write_table(source: Path, spec: DatasetSpec, task: ShardTask, path: Path) -> None:
@@ -198,10 +183,12 @@ def _copy(source: Path, target: Path) -> None:
         shutil.copy2(source, target)
 
 
-def upload_folder(folder: Path, repository: str, *, private: bool) -> str:
-    """Upload the folder of a repository and return its address; a second call continues an interrupted one.
+def upload_files(
+    folder: Path, files: list[str], repository: str, *, private: bool
+) -> str:
+    """Upload files of a repository's folder and return its address; a second call continues an interrupted one.
 
-    Other tables and files of the dataset are removed from the repository.
+    Other tables and files of the dataset are removed from the repository on the hub.
     """
     with requires_extra("hub", "huggingface_hub"):
         import huggingface_hub
@@ -217,6 +204,7 @@ def upload_folder(folder: Path, repository: str, *, private: bool) -> str:
             repo_id=repository,
             folder_path=folder,
             repo_type="dataset",
+            allow_patterns=files,  # names without wildcards
             delete_patterns=[
                 f"{part}/*" for part in (PARQUET, HDF5)
             ],  # those that the folder does not contain

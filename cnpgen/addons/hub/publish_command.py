@@ -2,7 +2,8 @@
 
 The repository has a card, a Parquet view and the dataset itself in hdf5/. License,
 creator and citation are those of the recipe's keys; a dataset without a license is
-refused. The same command continues an interrupted upload. 'hf auth login' stores the
+refused, and so is a FOLDER with files that the command did not write: only its own are
+uploaded. The same command continues an interrupted upload. 'hf auth login' stores the
 token of the upload. The path of the folder, or the address of the repository, is
 printed on stdout.
 """
@@ -40,6 +41,8 @@ def add_options(parser: Parser) -> None:
     option(
         "--dry-run", action="store_true", help="write the folder, but upload nothing"
     )
+    text = "keep other files in FOLDER, and replace those with a name of the repository"
+    option("--force", action="store_true", help=text)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -54,6 +57,7 @@ def run(arguments: argparse.Namespace) -> None:
         out=out,
         private=arguments.private,
         dry_run=arguments.dry_run,
+        force=arguments.force,
     )
     if url:
         print(f"cnpgen: uploaded {out}", file=sys.stderr)

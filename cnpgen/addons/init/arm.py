@@ -14,6 +14,12 @@ import numpy as np
 from cnpgen.addons.init.doubts import doubts
 from cnpgen.errors import RecipeError, UsageError, listed
 from cnpgen.problems.checks import frames_of, missing_frame, unread_xacro
+from cnpgen.problems.urdf_dynamics import (
+    JointFriction,
+    friction_in,
+    joint_notes,
+    suggested_use,
+)
 from cnpgen.robots.robot import recipe_errors_in
 from cnpgen.robots.urdf import number_in, read_urdf, urdf_tree
 from cnpgen.robots.urdf_parameters import LinkInertia, UrdfJoint, urdf_parameters
@@ -67,6 +73,13 @@ class Arm:
         str, float
     ]  # locked joints that do not stay at zero -> position [rad or m]
     doubts: tuple[str, ...]  # sentences about numbers that are probably wrong
+    friction: tuple[JointFriction, ...]  # friction of planned joints that have any
+    joint_notes: tuple[str, ...]  # about further elements of planned joints
+
+    @property
+    def urdf_dynamics(self) -> str:
+        """The key of [drive]: whether the problem uses the friction of the URDF."""
+        return suggested_use(self.friction, len(self.planned))
 
     @property
     def has_shape(self) -> bool:
@@ -139,6 +152,8 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
         ),
         locked_positions=_locked_positions(tree, joints.values(), names),
         doubts=_doubts(urdf, tree),
+        friction=tuple(friction_in(moving)),
+        joint_notes=tuple(joint_notes(tree, moving)),
     )
 
 
@@ -206,6 +221,11 @@ def arm_notes(arm: Arm) -> Iterator[str]:
             )
             text = f"the URDF has no {limit} limit of {', '.join(joints)}{reason}"
             yield f"{text}: [limits] has a placeholder, {placeholder}; enter the value of the data sheet"
+    yield from arm.joint_notes
+    if arm.friction:
+        use, shares = arm.urdf_dynamics, ", ".join(map(str, arm.friction))
+        reason = {"use": "", "ignore": ", since the values look like placeholders"}[use]
+        yield f'friction in the URDF: {shares}; [drive] has urdf_dynamics = "{use}"{reason}'
     if light := [
         link for link in arm.moved if link in arm.shaped and not arm.masses.get(link)
     ]:
@@ -292,6 +312,7 @@ def _joint(joint: UrdfJoint) -> ArmJoint:
         "velocity": velocity == 0,
         "torque": effort == 0,
     }
+    lower, upper = max(lower, joint.soft[0]), min(upper, joint.soft[1])
     half = DEFAULT_RANGE_M if joint.kind == "prismatic" else DEFAULT_RANGE_RAD
     return ArmJoint(
         name=joint.name,

@@ -111,7 +111,7 @@ def _measure_states(world: World, states: Array) -> tuple[Array, Array, Array]:
         world.set_state(q, still, still, np.zeros(0))
         tips.append(world.tip_position)
         values.append(np.linalg.svd(world.tip_jacobian, compute_uv=False))
-        load.append(np.abs(world.holding_torque / world.robot.torque_limit).max())
+        load.append(np.abs(world.holding_torque / world.robot.holding_limit).max())
     return np.array(tips), np.array(values), np.array(load)
 
 

@@ -33,6 +33,7 @@ from cnpgen.problems.constraints.joint import (
 from cnpgen.problems.constraints.link_clearance import SelfClearance
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.drive import NO_DRIVE, DriveSpec
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.robot_spec import LimitSpec, RobotSpec
 from cnpgen.schema.keys import PerJoint, Range
@@ -173,6 +174,7 @@ def _problem(
         title=title,
         robot=robot,
         limits=limits,
+        drive=DriveSpec(urdf_dynamics=arm.urdf_dynamics) if arm.friction else NO_DRIVE,
         constraint=constraints,
         path=path.absolute(),
     )
@@ -309,7 +311,7 @@ def _stages(arm: Arm, problem: Problem) -> tuple[Stage, ...]:
         GoalIK(),
         *holding["goal"],
         AtRest(end="start"),
-        AtRest(end="goal"),
+        AtRest(end="goal", acceleration="zero"),
     )
 
 

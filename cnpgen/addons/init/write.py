@@ -47,6 +47,8 @@ def problem_text(initial: InitialProblem, folder: Path) -> str:
     places["robot.packages"] = tuple(
         _from(folder, each) for each in problem.robot.packages
     )
+    if arm.friction:  # stated although "ignore" is the default
+        places["drive.urdf_dynamics"] = problem.drive.urdf_dynamics
     if problem.robot.srdf:
         places["robot.srdf"] = _from(folder, problem.robot.srdf)
     head = [
@@ -282,7 +284,9 @@ class _Writer:
         value = self.values.get(
             name, getattr(table, key.name, None if key.required else key.default)
         )
-        given = table is not None and (key.required or value != key.default)
+        given = table is not None and (
+            key.required or value != key.default or self.values.get(name)
+        )
         note = f". {self.notes[name]}" if name in self.notes else ""
         yield from _comment(
             f"{key.doc}{note}" if given else f"{key.doc} ({key.expected}){note}"

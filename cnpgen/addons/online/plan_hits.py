@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 
 CONTACT_DISTANCE_M = 0.07
 
+RETURNING_SPEED_SHARE = 0.98  # of hits with a way back, by default
+
 _COMPLETIONS: WeakKeyDictionary[Planner, Completion] = WeakKeyDictionary()
 
 
@@ -91,7 +93,7 @@ def plan_hits(
     target: ArrayLike,
     *,
     contact_distance: float | None = None,
-    speed_share: ArrayLike = 1.0,
+    speed_share: ArrayLike | None = None,
     puck_velocity: ArrayLike | None = None,
     meeting_time: ArrayLike | None = None,
     puck_model: PuckModel | None = None,
@@ -120,7 +122,8 @@ def plan_hits(
             [m]; by default that of the problem's constraint ``puck-contact``, or 0.07
             without one.
         speed_share: Speed of the hit as a fraction of the highest possible one, a
-            number or shape (N,).
+            number or shape (N,); by default 1, or 0.98 with ``home``: at the highest
+            speed, joints reach their velocity limits, which the way back then exceeds.
         puck_velocity: Velocity of the puck in the state of the arm, x and y [m/s],
             shape (2,) or (N, 2).
         meeting_time: Time from the state of the arm to the contact [s], a number or
@@ -142,6 +145,8 @@ def plan_hits(
             differs from that of the problem, the model was not trained on hits, or
             ``home`` is given for a model without moving starts.
     """
+    if speed_share is None:
+        speed_share = 1.0 if home is None else RETURNING_SPEED_SHARE
     completion = _COMPLETIONS.get(planner)
     if completion is None:
         completion = _COMPLETIONS[planner] = load_completion(

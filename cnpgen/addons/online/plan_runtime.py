@@ -5,68 +5,34 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
-from enum import Enum
-from typing import Any
+from concurrent.futures import Future
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.addons.online.set_points import (
-    SampledMotion,
-    SetPoint,
-    at_rest,
-    sample_motion,
-)
+from cnpgen.addons.online.kept_stops import KeptStops
+from cnpgen.addons.online.motion_check import MotionChecker
+from cnpgen.addons.online.plan_admission import Admission, Executable, plan_of_request
+from cnpgen.addons.online.replan_requests import ReplanRequests
+from cnpgen.addons.online.set_points import SampledMotion, SetPoint, at_rest
+from cnpgen.addons.online.stops import earliest_stop
+from cnpgen.addons.online.switches import Stop, Switch, SwitchOutcome
+from cnpgen.addons.online.timeline import Timeline
 from cnpgen.errors import CnpgenError, UsageError
 from cnpgen.planner.planner import Planner
-from cnpgen.plans.evaluate import evaluate_plans
-from cnpgen.plans.join import JoinedPlans
-from cnpgen.plans.plans import Plans
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.arguments import number, numbers
+from cnpgen.schema.arguments import distinct, number, numbers
 
 Array = NDArray[np.float64]
-PlanFunction = Callable[[SetPoint], Plans | JoinedPlans | None]
-"""A function of the state at the switch that returns one plan or one sequence of plans from there, or None."""
+PlanFunction = Callable[[SetPoint], Executable | None]
+"""A function of the state at the switch that returns one plan, sequence or hit from there, or None."""
 
-# Of q [rad]; of dq and ddq as fractions of the limits.
-MAX_SWITCH_GAPS = 1e-6, 1e-5, 1e-3
-MAX_END_SPEED = 1e-6  # fraction of the velocity limits: a plan ends at rest
-BRAKING_LOOKAHEADS_S = np.array([0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5])
-
-
-class SwitchOutcome(Enum):
-    """Result of a request to switch to another plan; the value is a description."""
-
-    ACCEPTED = "accepted"
-    NO_PLAN = "the planner returned no plan"
-    FAILED = "the planner raised an error"
-    LATE = "the plan arrived after the switch time"
-    JUMP = "the plan does not start in the state at the switch"
-    MOVING = "the plan does not end at rest"
-    INVALID = "the plan is not valid"
-
-
-@dataclass(frozen=True)
-class Switch:
-    """Result of a request to switch to another plan.
-
-    Attributes:
-        outcome: The result; only accepted plans are executed.
-        time: Switch time [s].
-        detail: Further text, such as the judge's reason; or empty.
-    """
-
-    outcome: SwitchOutcome
-    time: float
-    detail: str = ""
-
-    @property
-    def accepted(self) -> bool:
-        """Whether the plan is executed."""
-        return self.outcome is SwitchOutcome.ACCEPTED
+HISTORY_S = 1.0  # for which ``state_at`` returns the executed motion
+MAX_STEP_S = 0.1  # a joint moves no further from one set point to the next than at its velocity limit in this time
+CLOSING_TIME_S = 2.0  # for which ``close`` waits for a planner
+MAX_LATE_STOPS = 3  # of computed stops whose begin has passed meanwhile
+STOP_LEAD_S = 0.02  # of the next one
+REPORT_SAMPLES = 500  # of the distance that a stop travels
 
 
 class PlanRuntime:
@@ -75,18 +41,25 @@ class PlanRuntime:
     The runtime executes only motions that are valid and end at rest: single plans to
     rest, or sequences such as a hit and its way back. If no valid plan arrives in time,
     the motion in execution continues to its end and the arm rests there. Times are
-    those of the caller's clock.
+    those of the caller's clock, which must be monotonic.
+
+    Plans of models that leave goal accelerations free end with a step of acceleration.
+    The runtime slows down the end of such a motion on its path, so that the
+    acceleration falls to zero; ``Switch.detail`` states the additional time.
 
     ``set_point`` costs microseconds and may run in another thread than planning.
 
     Args:
-        planner: Plans stops (``stop``); its problem defines the limits.
+        planner: Plans are of its robot; its problem defines the limits.
         q: Joint positions of the arm, which is at rest [rad], shape (n,).
         time: Start time [s].
-        judge: Whether to check every plan by the independent verdict, which takes a few
-            milliseconds.
+        judge: Whether to check every plan and stop by the independent verdict, which
+            takes a few milliseconds.
         parameters: Parameters of the problem, such as the mass of the load, which all
             plans have, shape (width,); nominal by default.
+        history: Time for which ``state_at`` returns the executed motion [s].
+        max_step: Largest step from one set point to the next: that of each joint at its
+            velocity limit in this time [s].
 
     Raises:
         UsageError: The positions have another shape or are not finite, or a parameter
@@ -102,21 +75,23 @@ class PlanRuntime:
         time: float = 0.0,
         judge: bool = True,
         parameters: ArrayLike | None = None,
+        history: float = HISTORY_S,
+        max_step: float = MAX_STEP_S,
     ) -> None:
-        self._planner, self._judge = planner, judge
-        self._parameters = _checked_parameters(planner, parameters)
-        positions = numbers("q", q)
-        if positions.shape != (planner.robot.n,) or not np.isfinite(positions).all():
-            raise UsageError(
-                f"must be finite and have shape ({planner.robot.n},), got {q!r:.100}",
-                argument="q",
-            )
-        self._timeline: tuple[SampledMotion, ...] = (
-            at_rest(positions, number("time", time)),
+        self._robot, self._judge, self._checker = planner.robot, judge, MotionChecker()
+        self._admission = Admission(
+            planner, parameters, judge=judge, checker=self._checker
         )
-        self._now = -np.inf
-        self._lock = threading.Lock()
-        self._executor: ThreadPoolExecutor | None = None
+        self._timeline = Timeline(
+            at_rest(_checked_positions("q", q, planner.robot.n), number("time", time)),
+            history=_positive("history", history),
+            max_step=_positive("max_step", max_step) * planner.robot.velocity_limit,
+        )
+        self._lock = threading.RLock()
+        self._kept_stops = KeptStops(self._checker, measured=judge)
+        self._requests = ReplanRequests()
+        self._stop: Stop | None = None  # until the runtime is resumed
+        self._stops, self._closed = 0, False
 
     def __enter__(self) -> PlanRuntime:
         return self
@@ -124,92 +99,87 @@ class PlanRuntime:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def close(self) -> None:
-        """Wait for planning in the background to end, and stop its thread."""
-        if self._executor is not None:
-            self._executor.shutdown(cancel_futures=True)
-            self._executor = None
+    @checked_arguments
+    def close(self, *, timeout: float = CLOSING_TIME_S) -> bool:
+        """Refuse all further plans, and wait for planning in the background to end.
+
+        The motion in execution continues to its end.
+
+        Args:
+            timeout: Longest time to wait [s].
+
+        Returns:
+            Whether planning has ended. A planner that hangs is left in a daemon thread.
+        """
+        with self._lock:
+            self._closed = True
+        self._kept_stops.follow(None)
+        return self._requests.close(_positive("timeout", timeout))
 
     @property
     def end_time(self) -> float:
         """Time from which on the arm is at rest, if no other plan follows [s]."""
-        return self._timeline[-1].end_time
+        return self._timeline.end_time
+
+    @property
+    def stopped(self) -> bool:
+        """Whether a stop was accepted and the runtime has not been resumed."""
+        return self._stop is not None
 
     @checked_arguments
     def set_point(self, time: ArrayLike) -> SetPoint:
         """Return the state to follow, and exclude switches before it.
 
         Args:
-            time: Time [s], one number or ascending times of shape (K,).
+            time: Time [s], one number or ascending times of shape (K,), not before the
+                last one of the previous call.
 
         Returns:
             State of shape (n,), or (K, n).
+
+        Raises:
+            UsageError: The times do not ascend, or a joint would step further than
+                ``max_step`` allows. Nothing changes then.
         """
         times = _checked_times(time)
         with self._lock:
-            self._now = max(self._now, float(np.max(times)))
-            timeline = self._timeline
-        return _evaluate(timeline, times)
+            return self._timeline.serve(times)
 
     @checked_arguments
     def state_at(self, time: ArrayLike) -> SetPoint:
-        """Return the state at a future time, from which a new plan may start.
-
-        See ``set_point``.
-        """
-        return _evaluate(self._timeline, _checked_times(time))
-
-    @checked_arguments
-    def switch(self, plan: Plans | JoinedPlans | None, at: float) -> Switch:
-        """Switch to a plan at a time, if it is valid, ends at rest and arrives in time.
+        """Return the state at a future time, from which a new plan may start, or at a past one.
 
         Args:
-            plan: One plan or one sequence, from ``state_at(at)`` to rest; None is
-                refused.
+            time: Time [s], one number or ascending times of shape (K,), at most
+                ``history`` before the last time of ``set_point``.
+        """
+        times = _checked_times(time)
+        with self._lock:
+            return self._timeline.state_at(times)
+
+    @checked_arguments
+    def switch(self, plan: Executable | None, at: float) -> Switch:
+        """Switch to a plan at a time, if it is valid, ends at rest and arrives in time.
+
+        A motion that was accepted for a later time is replaced, and ``Switch.detail``
+        says so.
+
+        Args:
+            plan: One plan, one sequence, or one hit of ``plan_hits``, from
+                ``state_at(at)`` to rest; None is refused.
             at: Switch time [s], not before the last time of ``set_point``.
 
         Raises:
             UsageError: There are several plans, or they are of another robot.
         """
-        at = number("at", at)
-        if plan is None:
-            return Switch(SwitchOutcome.NO_PLAN, at)
-        self._check_plan(plan)
-        if at < self._now:
-            return Switch(SwitchOutcome.LATE, at)
-        if (outcome := self._find_reason(plan)) is not None:
-            return Switch(outcome[0], at, outcome[1])
-        motion = sample_motion(plan, at)
-        with self._lock:
-            if at < self._now:
-                return Switch(SwitchOutcome.LATE, at)
-            if detail := self._jump(motion, at):
-                return Switch(SwitchOutcome.JUMP, at, detail)
-            before = [
-                part
-                for part in self._timeline
-                if part.start < at or part is self._timeline[0]
-            ]
-            timeline = (*before, motion)
-            first = max(
-                (
-                    index
-                    for index, part in enumerate(timeline)
-                    if part.start <= self._now
-                ),
-                default=0,
-            )
-            self._timeline = timeline[
-                first:
-            ]  # without motions that ended because another one followed
-        return Switch(SwitchOutcome.ACCEPTED, at)
+        return self._switch(plan, number("at", at), self._stops)
 
     @checked_arguments
     def replan(self, make_plan: PlanFunction, at: float) -> Future[Switch]:
         """Plan in the background and switch if the plan arrives in time.
 
         Requests are served one after the other. The motion in execution continues if a
-        request is refused.
+        request is refused. A stop refuses all requests made before it.
 
         Args:
             make_plan: Called in the background with the state at the switch.
@@ -217,155 +187,171 @@ class PlanRuntime:
 
         Returns:
             Future of the result; errors of ``make_plan`` are results, too.
+
+        Raises:
+            UsageError: The runtime is closed.
         """
-        if self._executor is None:
-            self._executor = ThreadPoolExecutor(
-                max_workers=1, thread_name_prefix="cnpgen-replan"
-            )
-        return self._executor.submit(self._replan, make_plan, number("at", at))
+        at, stops = number("at", at), self._stops
+        return self._requests.submit(lambda: self._replan(make_plan, at, stops), at)
 
     @checked_arguments
-    def stop(self, at: float) -> Switch:
-        """Stop as fast as the planner can from a time on; if no stop is valid, the motion continues to its end.
+    def stop(self, at: float) -> Stop:
+        """Stop as early as possible from a time on, and refuse all plans until ``resume``.
+
+        The arm stops on the path of the motion in execution, so that no obstacle is
+        touched. If its path is shorter than a stop, the motion continues to its end. If
+        the time has passed when the stop is computed, one that was computed before is
+        used, which begins at most 0.1 s later.
 
         Args:
             at: Time at which the stop begins [s].
 
-        Raises:
-            UsageError: The planner's model does not plan from moving states to rest.
+        Returns:
+            Begin and end of the stop and the distance that each joint travels.
         """
         at = number("at", at)
-        current = _part_at(self._timeline, at)
-        if at >= current.end_time:
-            return Switch(SwitchOutcome.ACCEPTED, at, "the arm is at rest")
-        return self.switch(
-            plan_stop(self._planner, current, at, parameters=self._parameters), at
-        )
+        with self._lock:
+            self._stops += 1  # refuses all plans of earlier requests
+            if self._stop is not None:
+                return self._stop
+            begin = max(at, self._timeline.now)
+            self._stop = _report(self._timeline.part_at(begin), begin)
+            dropped = self._timeline.drop_after(begin)
+        self._requests.refuse_waiting(SwitchOutcome.STOPPED)
+        return self._stop_on_path(begin, dropped)
 
-    def _replan(self, make_plan: PlanFunction, at: float) -> Switch:
+    @checked_arguments
+    def resume(self, measured_q: ArrayLike, *, at: float | None = None) -> None:
+        """Accept plans again after a stop. The arm rests at its measured positions until a plan follows.
+
+        Args:
+            measured_q: Joint positions of the arm, which is at rest [rad], shape (n,).
+            at: Time from which on they are the set points [s], not before the end of
+                the stop; by default the last time of ``set_point``.
+
+        Raises:
+            UsageError: The runtime was not stopped, or the stop has not ended.
+        """
+        q = _checked_positions("measured_q", measured_q, self._robot.n)
+        with self._lock:
+            time = self._timeline.now if at is None else number("at", at)
+            if self._stop is None:
+                raise UsageError("the runtime was not stopped, so it cannot resume")
+            if time < self._timeline.end_time or time < self._timeline.now:
+                raise UsageError(
+                    f"the stop ends at {self._timeline.end_time:.6g} s, and {time:.6g} s"
+                    " is before that or before the last set point",
+                    concerns="at",
+                )
+            self._timeline.restart(at_rest(q, time))
+            self._stop = None
+            self._stops += 1
+
+    def _stop_on_path(self, begin: float, dropped: list[float]) -> Stop:
+        """Compute a stop and follow it, or a kept one if it comes too late."""
+        for _ in range(MAX_LATE_STOPS):
+            motion = self._timeline.part_at(begin)
+            with self._kept_stops.paused():
+                stop = earliest_stop(self._checker, motion, begin, measured=self._judge)
+            with self._lock:
+                now = self._timeline.now
+                if now > begin:
+                    kept = self._kept_stops.after(motion, now)
+                    if kept is None:
+                        begin = now + STOP_LEAD_S
+                        continue
+                    begin, stop = kept
+                self._timeline.replace_last(stop)
+                break
+        self._kept_stops.follow(None)
+        with self._lock:
+            motion = self._timeline.part_at(begin)
+            self._stop = _report(motion, begin, _replaced(dropped))
+            return self._stop
+
+    def _switch(self, plan: Executable | None, at: float, stops: int) -> Switch:
+        """Switch to a plan that was requested after a number of stops and resumptions."""
+        plan, reason = plan_of_request(plan)
+        if plan is None:
+            return Switch(SwitchOutcome.NO_PLAN, at, reason)
+        if refusal := self._refusal(at, stops):
+            return Switch(refusal, at)
+        motion, detail = self._admission.refusal_or_motion(plan, at)
+        if isinstance(motion, SwitchOutcome):
+            return Switch(motion, at, detail)
+        with self._lock:
+            if refusal := self._refusal(at, stops):
+                return Switch(refusal, at)
+            before = self._timeline.state_at(np.array(at))
+            if jump := self._admission.jump(before, motion):
+                return Switch(SwitchOutcome.JUMP, at, jump)
+            replaced = _replaced(self._timeline.append(motion))
+            self._kept_stops.follow(motion)
+        detail = "; ".join(filter(None, (detail, replaced)))
+        return Switch(SwitchOutcome.ACCEPTED, at, detail)
+
+    def _refusal(self, at: float, stops: int) -> SwitchOutcome | None:
+        """Return the reason for which no plan is accepted for a time, None if there is none."""
+        with self._lock:
+            if self._closed:
+                return SwitchOutcome.CLOSED
+            if self._stop is not None or stops != self._stops:
+                return SwitchOutcome.STOPPED
+            return SwitchOutcome.LATE if at < self._timeline.now else None
+
+    def _replan(self, make_plan: PlanFunction, at: float, stops: int) -> Switch:
         """Plan and switch; the boundary of the background thread, where errors become results."""
         try:
-            return self.switch(make_plan(self.state_at(at)), at)
+            if refusal := self._refusal(at, stops):
+                return Switch(refusal, at)
+            return self._switch(make_plan(self.state_at(at)), at, stops)
         except Exception as error:  # noqa: BLE001 - errors of the caller's function are results
             kind = "" if isinstance(error, CnpgenError) else f"{type(error).__name__}: "
             return Switch(SwitchOutcome.FAILED, at, f"{kind}{error}")
 
-    def _check_plan(self, plan: Plans | JoinedPlans) -> None:
-        """Raise an error for several plans and for plans of another robot."""
-        if len(plan) != 1:
-            raise UsageError(
-                f"must be one plan or one sequence, got {len(plan)}", argument="plan"
-            )
-        names = self._planner.model.problem.joint_names
-        if plan.problem.joint_names != names:
-            raise UsageError(
-                f"the plan is of {plan.problem.name!r} with other joints than {names}",
-                concerns="plan",
-            )
 
-    def _find_reason(
-        self, plan: Plans | JoinedPlans
-    ) -> tuple[SwitchOutcome, str] | None:
-        """Return the reason why a plan must not be executed at any time.
+def _report(motion: SampledMotion, begin: float, detail: str = "") -> Stop:
+    """Return the result of a stop that begins at a time of a motion [s]."""
+    end = max(begin, motion.end_time)
+    times = np.linspace(begin, end, REPORT_SAMPLES)
+    distance = np.abs(np.diff(motion.at(times).q, axis=0)).sum(axis=0)
+    return Stop(SwitchOutcome.ACCEPTED, begin, detail, end, distance)
 
-        None if there is none.
-        """
-        parts: tuple[Any, ...] = (
-            plan.parts if isinstance(plan, JoinedPlans) else (plan,)
-        )
-        for part in parts:
-            own, expected = part.boundary.parameters, self._parameters
-            if (
-                own is not None
-                and expected is not None
-                and not np.array_equal(own[0], expected)
-            ):
-                return (
-                    SwitchOutcome.INVALID,
-                    f"its parameters are {own[0]}, those of the runtime {expected}",
-                )
-        duration = plan.duration
-        if not np.isfinite(duration).all():
-            return SwitchOutcome.INVALID, "its duration is not finite"
-        speed = np.abs(plan.motion.at_times(duration[:, None]).dq[0, 0])
-        if (speed > MAX_END_SPEED * self._planner.robot.velocity_limit).any():
-            return SwitchOutcome.MOVING, f"up to {speed.max():.3g} rad/s"
-        for part in parts if self._judge else ():
-            (verdict,) = evaluate_plans(part).verdicts
-            if not verdict.valid:
-                return SwitchOutcome.INVALID, str(verdict)
-        return None
 
-    def _jump(self, motion: SampledMotion, at: float) -> str:
-        """Describe the discontinuity at a switch; empty if there is none."""
-        robot = self._planner.robot
-        before, after = (
-            _evaluate(self._timeline, np.array(at)),
-            motion.at(np.array([at])),
-        )
-        limits = (np.ones(robot.n), robot.velocity_limit, robot.acceleration_limit)
-        for name, end, begin, limit, share in zip(
-            SetPoint._fields, before, after, limits, MAX_SWITCH_GAPS, strict=True
-        ):
-            gap = np.abs(begin[0] - end)
-            if not (gap <= share * limit).all():
-                return f"{name} jumps by {gap.max():.3g}"
+def _replaced(starts: list[float]) -> str:
+    """Return a text about replaced motions, empty if there are none."""
+    if not starts:
         return ""
+    times = ", ".join(f"{start:.6g}" for start in starts)
+    return f"replaces the motion that was accepted for {times} s"
 
 
-def plan_stop(
-    planner: Planner,
-    motion: SampledMotion,
-    time: float,
-    *,
-    parameters: ArrayLike | None = None,
-) -> Plans | None:
-    """Plan the fastest valid stop from a state on a motion.
+def _positive(name: str, value: float) -> float:
+    """Return an argument as a positive number.
 
-    The goals are configurations that the motion passes later, which are on the
-    constraint manifold. The plans are judged in the order of their durations. The
-    result is None if none of them is valid. Models that do not plan from moving states
-    raise UsageError.
+    Raises:
+        UsageError: It is not positive.
     """
-    q, dq, ddq = (values[0] for values in motion.at(np.array([time])))
-    goals = motion.at(time + BRAKING_LOOKAHEADS_S).q
-    candidates = planner.plan(
-        q, goals, start_dq=dq, start_ddq=ddq, parameters=parameters
-    )
-    for index in np.argsort(candidates.duration).tolist():
-        plan = candidates[index]
-        if np.isfinite(plan.duration[0]) and evaluate_plans(plan).valid[0]:
-            return plan
-    return None
+    if (found := number(name, value)) <= 0:
+        raise UsageError(f"must be positive, got {found:g}", argument=name)
+    return found
 
 
-def _checked_parameters(planner: Planner, parameters: ArrayLike | None) -> Array | None:
-    """Return the parameters of all plans, shape (width,).
-
-    None if the problem has none.
-    """
-    ranges = planner.model.problem.parameters
-    if parameters is None:
-        return planner.robot.nominal_parameters if ranges else None
-    rows = ranges.checked(numbers("parameters", parameters))
-    if len(rows) != 1:
+def _checked_positions(name: str, q: ArrayLike, n: int) -> Array:
+    """Return finite positions of n joints, shape (n,)."""
+    positions = numbers(name, q)
+    if positions.shape != (n,) or not np.isfinite(positions).all():
         raise UsageError(
-            f"must have shape ({len(ranges)},), got {np.shape(parameters)}",
-            argument="parameters",
+            f"must be finite and have shape ({n},), got {q!r:.100}", argument=name
         )
-    return np.asarray(rows[0])
-
-
-def _part_at(timeline: tuple[SampledMotion, ...], time: float) -> SampledMotion:
-    """Return the motion in execution at a time."""
-    return next(
-        (part for part in reversed(timeline) if part.start <= time), timeline[0]
-    )
+    return positions
 
 
 def _checked_times(time: ArrayLike) -> Array:
-    """Return finite times of shape () or (K,), K > 0."""
+    """Return finite ascending times of shape () or (K,), K > 0."""
     times = numbers("time", time)
+    if np.asarray(time).dtype == bool:
+        raise UsageError(f"must be times [s], got {time!r:.100}", argument="time")
     if times.ndim > 1 or not times.size:
         raise UsageError(
             f"must be a number or ascending times of shape (K,), got shape {times.shape}",
@@ -373,16 +359,10 @@ def _checked_times(time: ArrayLike) -> Array:
         )
     if not (math.isfinite(times) if times.ndim == 0 else np.isfinite(times).all()):
         raise UsageError(f"must be finite, got {time!r:.100}", argument="time")
+    if times.ndim and (falls := np.diff(times) < 0).any():
+        first = int(falls.argmax())
+        later, earlier = distinct(times[first], times[first + 1])
+        raise UsageError(
+            f"must ascend, got {later} s and then {earlier} s", argument="time"
+        )
     return times
-
-
-def _evaluate(timeline: tuple[SampledMotion, ...], times: Array) -> SetPoint:
-    """Return the states at times of shape () or (K,)."""
-    flat = np.atleast_1d(times)
-    last = timeline[-1]
-    if flat[0] >= last.start:
-        states = last.at(flat)
-    else:
-        rows = [_part_at(timeline, time).at(np.array([time])) for time in flat.tolist()]
-        states = SetPoint(*(np.concatenate(parts) for parts in zip(*rows, strict=True)))
-    return states if times.ndim else SetPoint(*(values[0] for values in states))

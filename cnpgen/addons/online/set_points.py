@@ -49,11 +49,16 @@ class SampledMotion:
         coefficients: Polynomials of the cells, in units of the cell width, shape
             (cells, 6, n).
         end: Positions at the end [rad], shape (n,).
+        plan: Plan or sequence whose path the motion follows; None for an arm at rest.
+        plan_times: Time since the start of the plan at which it passes the state at
+            each edge [s], shape (cells + 1,).
     """
 
     edges: Array
     coefficients: Array
     end: Array
+    plan: Plans | JoinedPlans | None
+    plan_times: Array
 
     @property
     def start(self) -> float:
@@ -91,31 +96,71 @@ class SampledMotion:
 
 def sample_motion(plan: Plans | JoinedPlans, start: float) -> SampledMotion:
     """Sample one plan, or one sequence of plans, that starts at a time [s]."""
-    parts = plan.parts if isinstance(plan, JoinedPlans) else (plan,)
-    begins = plan.begins[:, 0].tolist() if isinstance(plan, JoinedPlans) else [0.0]
-    ends = [*begins[1:], float(plan.duration[0])]
     edges, coefficients, last = [], [], np.zeros(0)
-    for part, begin, end in zip(parts, begins, ends, strict=True):
+    for part, begin, end in parts_of(plan):
         if end <= begin:
             continue  # the next part replaces it at once
-        cells = ceil((end - begin) / MAX_GRID_STEP_S)
-        times, width = np.linspace(0.0, end - begin, cells + 1), (end - begin) / cells
+        times = grid(end - begin)
         states = part.motion.at_times(times[None])
-        nodes = np.stack(
-            [states.q[0], states.dq[0] * width, states.ddq[0] * width**2], axis=1
-        )
         coefficients.append(
-            np.einsum(
-                "ij,cjn->cin", _QUINTIC, np.concatenate([nodes[:-1], nodes[1:]], axis=1)
-            )
+            _cells(times, SetPoint(states.q[0], states.dq[0], states.ddq[0]))
         )
-        edges.append(start + begin + times[:-1])
+        edges.append(begin + times[:-1])
         last = states.q[0, -1]
+    plan_times = np.append(np.concatenate(edges), float(plan.duration[0]))
     return SampledMotion(
-        np.append(np.concatenate(edges), start + ends[-1]),
-        np.concatenate(coefficients),
-        last,
+        start + plan_times, np.concatenate(coefficients), last, plan, plan_times
     )
+
+
+def parts_of(plan: Plans | JoinedPlans) -> list[tuple[Plans, float, float]]:
+    """Return the parts of one plan or sequence, with their begins and ends since its start [s]."""
+    if isinstance(plan, Plans):
+        return [(plan, 0.0, float(plan.duration[0]))]
+    begins = plan.begins[:, 0].tolist()
+    ends = [*begins[1:], float(plan.duration[0])]
+    return list(zip(plan.parts, begins, ends, strict=True))
+
+
+def grid(duration: float) -> Array:
+    """Return the edges of equal cells of at most ``MAX_GRID_STEP_S`` from 0 to a duration [s], shape (cells + 1,)."""
+    return np.linspace(0.0, duration, ceil(duration / MAX_GRID_STEP_S) + 1)
+
+
+def sample_states(
+    times: Array, states: SetPoint, plan: Plans | JoinedPlans, plan_times: Array
+) -> SampledMotion:
+    """Return the motion through states at times [s], shape (K,), which follows the path of a plan."""
+    return SampledMotion(times, _cells(times, states), states.q[-1], plan, plan_times)
+
+
+def joined_motions(first: SampledMotion, second: SampledMotion) -> SampledMotion:
+    """Return a motion up to the start of a second one, which follows the path of the same plan, and then that one."""
+    (kept,) = np.nonzero(first.edges < second.start)
+    # The last cell of the first motion ends at the start of the second: its polynomial
+    # is evaluated in its own unit of time, so it is sampled again.
+    times = np.append(first.edges[kept], second.start)
+    plan_times = np.interp(times, first.edges, first.plan_times)
+    return SampledMotion(
+        np.append(times[:-1], second.edges),
+        np.concatenate([_cells(times, first.at(times)), second.coefficients]),
+        second.end,
+        second.plan,
+        np.append(plan_times[:-1], second.plan_times),
+    )
+
+
+def _cells(times: Array, states: SetPoint) -> Array:
+    """Return the quintic Hermite polynomials between states at times, shape (K - 1, 6, n)."""
+    width = np.diff(times)[:, None]
+    ends = [
+        np.stack([q, dq * width, ddq * width**2], axis=1)
+        for q, dq, ddq in (
+            (part[:-1] for part in states),
+            (part[1:] for part in states),
+        )
+    ]
+    return np.asarray(np.einsum("ij,cjn->cin", _QUINTIC, np.concatenate(ends, axis=1)))
 
 
 def at_rest(q: ArrayLike, start: float) -> SampledMotion:
@@ -123,4 +168,5 @@ def at_rest(q: ArrayLike, start: float) -> SampledMotion:
     end = np.array(q, np.float64)
     coefficients = np.zeros((1, 6, len(end)))
     coefficients[0, 0] = end
-    return SampledMotion(start + np.array([0.0, MAX_GRID_STEP_S]), coefficients, end)
+    edges = start + np.array([0.0, MAX_GRID_STEP_S])
+    return SampledMotion(edges, coefficients, end, None, np.zeros(2))

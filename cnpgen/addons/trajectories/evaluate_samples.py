@@ -2,9 +2,10 @@
 
 With --problem, FILE may also hold sampled trajectories: CSV, JSON, YAML, NPZ, HDF5 or
 Parquet, messages of ROS and MoveIt, or a folder of such files ('cnpgen docs
-trajectories'). Each trajectory and condition is valid, invalid or undecided. The exit
-code is then 0 if all are valid, otherwise 1; 2 for damaged files and files of other
-kinds.
+trajectories'). Each trajectory is invalid, a valid motion through it exists, it is
+valid for all curves, or it is undecided. The exit code is then 0 if a valid motion
+exists for all, or they are valid for all curves, otherwise 1; 2 for damaged files and
+files of other kinds.
 """
 
 import argparse
@@ -37,8 +38,12 @@ def add_options(options: Options) -> None:
     option("--interpolation", choices=("hold", "linear", "cubic", "quintic"), help=text)
     text = "judge every curve through the samples whose jerks are at most J [rad/s^3]: one number, or one per joint"
     option("--max-jerk", metavar="J,...", type=values.amounts, help=text)
-    text = "largest error of the samples in SI units: one number, or of positions, velocities and accelerations"
+    text = "largest error of the samples in SI units: one number, or of q, dq and ddq (default: their rounding)"
     option("--noise", metavar="E,...", type=values.errors, help=text)
+    text = "largest error of the times, such as 2ms; default: their rounding"
+    option("--time-jitter", metavar="T", type=values.seconds, help=text)
+    text = "judge the positions alone"
+    option("--ignore-velocities", action="store_true", default=None, help=text)
 
 
 def accepts(arguments: argparse.Namespace) -> bool:
@@ -51,7 +56,13 @@ def accepts(arguments: argparse.Namespace) -> bool:
     if holds_trajectories(arguments.file):
         return True
     refuse_trajectory_options(
-        arguments, arguments.file, "interpolation", "max_jerk", "noise"
+        arguments,
+        arguments.file,
+        "interpolation",
+        "max_jerk",
+        "noise",
+        "time_jitter",
+        "ignore_velocities",
     )
     return False
 
@@ -77,7 +88,9 @@ def run(arguments: argparse.Namespace) -> int:
             loaded.problem,
             loaded.trajectories,
             interpolation=arguments.interpolation,
-            noise=arguments.noise or 0.0,
+            noise=arguments.noise,
+            time_jitter=arguments.time_jitter,
+            ignore_velocities=bool(arguments.ignore_velocities),
             max_jerk=arguments.max_jerk,
             step=arguments.step,
             workers=arguments.workers or 1,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -14,13 +14,24 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.addons.trajectories.interpolate import bounded_jerk, interpolated
 from cnpgen.addons.trajectories.judge_family import FamilyJudge
-from cnpgen.addons.trajectories.judge_samples import judge_samples
+from cnpgen.addons.trajectories.judge_samples import (
+    NO_JITTER_BOUND,
+    judge_samples,
+    refute,
+    with_jitter,
+)
+from cnpgen.addons.trajectories.sample_errors import SampleErrors, errors_of
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.addons.trajectories.trajectory_scenes import problem_of_samples
-from cnpgen.addons.trajectories.trajectory_verdict import Decision, TrajectoryVerdict
+from cnpgen.addons.trajectories.trajectory_verdict import (
+    Decision,
+    Statement,
+    TrajectoryVerdict,
+)
 from cnpgen.errors import UsageError, counted
 from cnpgen.judges.plans.judge import check_step
 from cnpgen.plans.evaluate import MAX_VERDICT_STEP_S, judged_in_parts
+from cnpgen.problems.constraints.joint import judged_torque
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
 from cnpgen.robots.scene import Scene
@@ -45,12 +56,14 @@ class TrajectoryEvaluation:
         problem: The problem.
         trajectories: The trajectories, in the order of the problem's joints.
         verdicts: Verdicts, in the same order.
+        errors: Largest errors of the samples that were used, in the same order.
         step: Maximum distance of checked times [s].
     """
 
     problem: ProblemRecord
     trajectories: tuple[Trajectory, ...]
     verdicts: tuple[TrajectoryVerdict, ...]
+    errors: tuple[SampleErrors, ...]
     step: float
 
     def __repr__(self) -> str:
@@ -66,9 +79,26 @@ class TrajectoryEvaluation:
         return {str(decision): found[str(decision)] for decision in Decision}
 
     @property
+    def statements(self) -> dict[str, int]:
+        """Numbers of trajectories by the statement that is proven."""
+        found = Counter(str(verdict.statement) for verdict in self.verdicts)
+        return {str(statement): found[str(statement)] for statement in Statement}
+
+    @property
+    def assumed_errors(self) -> dict[str, int]:
+        """Errors that were assumed since the numbers are rounded, with the number of trajectories."""
+        return dict(Counter(each.source for each in self.errors if each.source))
+
+    @property
     def valid(self) -> NDArray[np.bool_]:
-        """Whether each trajectory is proven to be valid, shape (N,)."""
+        """Whether each trajectory is proven to be valid, or a valid motion through it exists, shape (N,)."""
         return np.array([verdict.valid for verdict in self.verdicts], bool)
+
+    @property
+    def judged_torque(self) -> str:
+        """Torque that was judged, in words; empty if the problem limits none."""
+        problem, robot = open_problem(self.problem)
+        return judged_torque(problem.constraint, robot)
 
     def summary(self) -> dict[str, Any]:
         """Return the summary of all trajectories for JSON ('cnpgen docs trajectories')."""
@@ -84,9 +114,12 @@ class TrajectoryEvaluation:
             "format_version": TRAJECTORY_EVALUATION_VERSION,
             "problem": self.problem.name,
             "problem_sha256": self.problem.comparable_sha256,
+            **({"torque": self.judged_torque} if self.judged_torque else {}),
             "step_s": self.step,
             "trajectories": len(self.verdicts),
             **self.counts,
+            "statements": self.statements,
+            "assumed_errors": self.assumed_errors,
             "reasons": dict(
                 Counter(str(v.reason) for v in self.verdicts if v.reason).most_common()
             ),
@@ -100,30 +133,37 @@ def evaluate_trajectories(
     trajectories: Sequence[Trajectory],
     *,
     interpolation: Literal["hold", "linear", "cubic", "quintic"] | None = None,
-    noise: ArrayLike = 0.0,
+    noise: ArrayLike | None = None,
+    time_jitter: float | None = None,
     max_jerk: ArrayLike | None = None,
+    ignore_velocities: bool = False,
     step: float = MAX_VERDICT_STEP_S,
     workers: int = 1,
     progress: Callable[[int], None] | None = None,
 ) -> TrajectoryEvaluation:
     """Judge sampled trajectories: valid, invalid or undecided.
 
-    By default, the motion that the samples resolve is judged. It is valid if the smooth
-    curve through exact samples with velocities is valid; otherwise all curves within
-    the errors of the resolution decide. With ``interpolation``, the curve of a
-    controller is judged. With ``max_jerk``, all curves through the samples whose jerks
-    are within it are judged. With noise, so are all curves of samples within the noise.
-    A trajectory is valid if every curve is valid, invalid if every curve violates a
-    condition, and otherwise undecided. Obstacles that depend on the ends of a motion
-    are placed at its first and last sample.
+    Lower bounds come first: a trajectory is invalid if no curve through its samples,
+    within their errors, meets the joint limits. By default, it is valid if a curve
+    within the errors of all samples is: a valid motion exists. Otherwise all curves
+    within the errors of the samples' resolution decide. With ``interpolation``, the
+    curve of a controller is judged. With ``max_jerk``, all curves through the samples
+    whose jerks are within it are judged. They are valid if every curve is, invalid if
+    every curve violates a condition, and otherwise undecided. Obstacles that depend on
+    the ends of a motion are placed at its first and last sample.
 
     Args:
         problem: Problem, record, or name or path of a problem, pipeline or dataset.
         trajectories: The trajectories, with the problem's joints in their order.
         interpolation: "hold", "linear", "cubic" or "quintic"; not with ``max_jerk``.
         noise: Largest error of the samples in SI units: one number for positions,
-            velocities and accelerations, or three.
+            velocities and accelerations, or three; by default half a unit of the
+            rounding that the numbers show, which is stated in the result.
+        time_jitter: Largest error of the times [s]; by default half a unit of their
+            rounding.
         max_jerk: Bound of the jerks [rad/s^3], one number or shape (n,).
+        ignore_velocities: Whether velocities and accelerations of the samples are not
+            used.
         step: Maximum distance of checked times [s].
         workers: Number of processes.
         progress: Called with the number of trajectories that were judged since the last
@@ -142,21 +182,28 @@ def evaluate_trajectories(
         raise UsageError(
             "interpolation and max_jerk exclude each other", concerns="interpolation"
         )
-    errors = non_negative("noise", noise, 3)
+    values = None if noise is None else non_negative("noise", noise, 3)
+    jitter = None
+    if time_jitter is not None:
+        jitter = float(non_negative("time_jitter", time_jitter, 1)[0])
     jerk = None if max_jerk is None else non_negative("max_jerk", max_jerk, n)
     task = partial(
         _judge,
         record=record,
         interpolation=interpolation,
-        noise=errors,
+        noise=values,
+        jitter=jitter,
         max_jerk=jerk,
         step=step,
     )
     chosen = tuple(trajectories)
-    verdicts = judged_in_parts(
+    if ignore_velocities:
+        chosen = tuple(replace(each, dq=None, ddq=None) for each in chosen)
+    judged = judged_in_parts(
         task, chosen, size=TRAJECTORIES_PER_TASK, workers=workers, progress=progress
     )
-    return TrajectoryEvaluation(record, chosen, tuple(verdicts), step)
+    verdicts, errors = zip(*judged, strict=True)
+    return TrajectoryEvaluation(record, chosen, verdicts, errors, step)
 
 
 def check_trajectories(
@@ -222,28 +269,50 @@ def _judge(  # noqa: PLR0917 - the arguments of evaluate_trajectories
     trajectories: Sequence[Trajectory],
     record: ProblemRecord,
     interpolation: Literal["hold", "linear", "cubic", "quintic"] | None,
-    noise: Array,
+    noise: Array | None,
+    jitter: float | None,
     max_jerk: Array | None,
     step: float,
-) -> list[TrajectoryVerdict]:
+) -> list[tuple[TrajectoryVerdict, SampleErrors]]:
+    """Judge some trajectories, with the errors of their samples."""
     problem, robot = open_problem(record)
     judge = FamilyJudge(problem, robot, step=step)
-    verdicts = []
+    found = []
     for trajectory in trajectories:
-        if max_jerk is None and interpolation is None:
-            verdicts.append(judge_samples(judge, trajectory, noise))
-            continue
-        if max_jerk is None:
-            family = interpolated(trajectory, interpolation, noise)
-        else:
-            bounded = bounded_jerk(trajectory, max_jerk, noise)
-            if bounded is None:
-                verdicts.append(
-                    TrajectoryVerdict(
-                        Decision.UNDECIDED, CONTRADICTION, duration=trajectory.duration
-                    )
-                )
-                continue
-            family = bounded
-        verdicts.append(judge(family, trajectory))
-    return verdicts
+        errors = errors_of(trajectory, noise, jitter)
+        verdict = refute(judge, trajectory, errors)
+        if verdict is None and max_jerk is None and interpolation is None:
+            verdict = judge_samples(judge, trajectory, errors)
+        if verdict is None:
+            moved = with_jitter(errors, judge.limits(trajectory.parameters), trajectory)
+            verdict = _judge_assumed(
+                judge, trajectory, moved.values, interpolation, max_jerk
+            )
+        found.append((verdict, errors))
+    return found
+
+
+def _judge_assumed(
+    judge: FamilyJudge,
+    trajectory: Trajectory,
+    noise: Array,
+    interpolation: Literal["hold", "linear", "cubic", "quintic"] | None,
+    max_jerk: Array | None,
+) -> TrajectoryVerdict:
+    """Judge all curves that meet a stated assumption."""
+    if not np.isfinite(noise).all():
+        return TrajectoryVerdict(
+            Decision.UNDECIDED, NO_JITTER_BOUND, duration=trajectory.duration
+        )
+    if max_jerk is None:
+        family = interpolated(trajectory, interpolation, noise)
+        text = f"{interpolation} interpolation"
+    else:
+        bounded = bounded_jerk(trajectory, max_jerk, noise)
+        if bounded is None:
+            return TrajectoryVerdict(
+                Decision.UNDECIDED, CONTRADICTION, duration=trajectory.duration
+            )
+        largest = ", ".join(f"{value:g}" for value in np.unique(max_jerk))
+        family, text = bounded, f"jerks of at most {largest} rad/s^3"
+    return replace(judge(family, trajectory), assumption=text)

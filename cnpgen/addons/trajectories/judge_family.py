@@ -9,13 +9,16 @@ without phases has the share of its duration as phase.
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain, product
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.curve_family import ORDERS, UNDEFINED, CurveFamily
+from cnpgen.addons.trajectories.refuted_torques import TorqueLimit
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.addons.trajectories.trajectory_verdict import (
+    DECIDING_ERROR,
     ConditionDecision,
     Decision,
     TrajectoryVerdict,
@@ -48,17 +51,17 @@ from cnpgen.judges.plans.sampling import (
     times,
 )
 from cnpgen.judges.plans.verdict import ZERO_TOLERANCE, Margin, Reason
+from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import pose_width
 from cnpgen.world.path import PathWorld
+from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 
 MIN_SPAN_PARTS = 2  # between two knots
-# An error this large, in SI units, is that of a missing derivative.
-DECIDING_ERROR = 1e3
 
 
 class FamilyJudge:
@@ -84,6 +87,28 @@ class FamilyJudge:
             else self._limits.scaled(dict(zip(names, parameters, strict=True)))
         )
 
+    def torque_limit(self) -> TorqueLimit | None:
+        """Return the torque limit of the problem, or None."""
+        constraint = next(
+            (each for each in self._problem.constraint if type(each) is JointTorque),
+            None,
+        )
+        if constraint is None:
+            return None
+        (condition,) = constraint.measured(cast(World, self._moved))
+        limit, allowed = condition.upper, constraint.allowed(condition)
+        return TorqueLimit(condition.name, constraint.reason, limit, allowed)
+
+    def torques(
+        self, q: Array, dq: Array, ddq: Array, parameters: Array | None = None
+    ) -> Array:
+        """Evaluate the inverse dynamics at K states of shape (K, n), shape (K, n) [N m]."""
+        rows, tip = None if parameters is None else parameters[None], np.zeros((1, 3))
+        poses = scene_of(self._problem, tip, tip, tip, rows).poses[0]
+        q, dq, ddq = (np.ascontiguousarray(values.T) for values in (q, dq, ddq))
+        self._moved.set_path(q, dq, ddq, poses, np.zeros_like(q))
+        return np.ascontiguousarray(self._moved.torque.T)
+
     def __call__(
         self,
         family: CurveFamily,
@@ -91,6 +116,7 @@ class FamilyJudge:
         *,
         scene: Array | None = None,
         smooth: CurveFamily | None = None,
+        step: float | None = None,
     ) -> TrajectoryVerdict:
         """Judge one family; values that cannot be evaluated give an undecided verdict.
 
@@ -99,7 +125,7 @@ class FamilyJudge:
         sizes of the obstacles, then values for a constraint and parameters, shape
         (width,); by default, they follow from the ends of the curves and the
         parameters. Joint limits that ``smooth``, another curve at the same times,
-        violates are not valid.
+        violates are not valid. The step replaces that of the judge [s].
         """
         if not family.duration < MAX_DURATION_S or len(family.t) > MAX_TIME_SAMPLES:
             reason = f"{Reason.TOO_LONG}: at most {MAX_DURATION_S:g} s and {MAX_TIME_SAMPLES:,} samples are judged"
@@ -107,16 +133,17 @@ class FamilyJudge:
                 Decision.UNDECIDED, reason, duration=family.duration
             )
         with np.errstate(all="ignore"):  # overflows give inf or nan, which are detected
-            return self._judge(family, trajectory, scene, smooth)
+            s = checked_phases(family, step or self._step)
+            return self._judge(family, trajectory, s, scene, smooth)
 
     def _judge(
         self,
         family: CurveFamily,
         trajectory: Trajectory,
+        s: Array,
         scene: Array | None,
         smooth: CurveFamily | None,
     ) -> TrajectoryVerdict:
-        s = checked_phases(family, self._step)
         table = np.array([[0.0, 1.0], [0.0, family.duration]])
         samples = Samples(s, times(s, table))
         states = family.evaluate(s, jerk=self._problem.uses_jerk)
@@ -220,7 +247,7 @@ def checked_phases(family: CurveFamily, step: float) -> Array:
 
 
 def _decided(
-    margin: Margin, error: float, certain: float, *shares: float
+    margin: Margin, error: float, certain: float, violated: float, undecided: float
 ) -> ConditionDecision:
     """Decide a condition by the worst margin of any curve and the largest relative violation that every curve has."""
     if margin.ok:
@@ -229,7 +256,7 @@ def _decided(
         decision, reason = Decision.INVALID, margin.reason
     else:
         decision, reason = Decision.UNDECIDED, _doubt(margin, error)
-    return ConditionDecision(decision, reason, margin, error, *shares)
+    return ConditionDecision(decision, reason, margin, error, violated, undecided)
 
 
 def _doubt(margin: Margin, error: float) -> str:

@@ -1,17 +1,27 @@
-"""Verdict on samples without a stated interpolation: what they resolve decides, and a valid curve through them proves.
+"""Verdict on samples: lower bounds refute, and a valid curve through the samples proves that a valid motion exists.
 
-A trajectory is valid if its samples resolve the motion and the smooth curve through
-them is valid. At both ends this curve has the smallest changes of acceleration within
-the limits, which samples of faster changes allow. Otherwise every condition is decided
-for all curves within the errors of the samples' resolution. Exact positions without
-derivatives at 100 Hz or more are connected by lines. Lines hide velocities between
-samples, so joint limits must also hold for polynomials through the positions around
-every span.
+Lower bounds of every curve come first, in every mode: they end most faulty recordings.
+Without a stated interpolation, curves within the errors of all samples are then judged
+as plans are: the smooth curve through samples that resolve the motion, and the smoothest
+spline within the errors. If neither is valid, every condition is decided for all curves
+within the estimated errors of the samples' resolution. Exact positions without
+derivatives at 100 Hz or more are connected by lines instead. Lines hide velocities
+between samples, so joint limits must also hold for polynomials through the positions
+around every span.
 """
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.addons.trajectories.contradicting_columns import (
+    CONTRADICTION,
+    explain_velocities,
+)
+from cnpgen.addons.trajectories.curve_family import CurveFamily
 from cnpgen.addons.trajectories.interpolate import (
     data_of,
     family_of_data,
@@ -19,11 +29,27 @@ from cnpgen.addons.trajectories.interpolate import (
     through_positions,
 )
 from cnpgen.addons.trajectories.judge_family import FamilyJudge
+from cnpgen.addons.trajectories.refuted_limits import (
+    BOTH,
+    VELOCITIES,
+    RefutedLimit,
+    largest_values,
+    refuted_limits,
+)
+from cnpgen.addons.trajectories.refuted_torques import refuted_torques
 from cnpgen.addons.trajectories.resolved_curves import is_resolved, resolved_curves
+from cnpgen.addons.trajectories.sample_errors import SampleErrors, is_negligible
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.addons.trajectories.smooth_curve import AccelerationLimits, smooth_curve
-from cnpgen.addons.trajectories.trajectory_verdict import TrajectoryVerdict
+from cnpgen.addons.trajectories.trajectory_verdict import (
+    ConditionDecision,
+    Decision,
+    TrajectoryVerdict,
+)
+from cnpgen.addons.trajectories.witness import witness
+from cnpgen.judges.plans.bernstein import find_maximum
 from cnpgen.judges.plans.joint_limits import ProvenJointLimits, quantity_of
+from cnpgen.judges.plans.judge import MAX_STEP_S
 
 Array = NDArray[np.float64]
 
@@ -33,44 +59,100 @@ MAX_LINEAR_SPAN_S = 0.0101
 SMOOTH_NEIGHBORS = 8  # positions that determine velocities between two of them
 # Of the tolerance of accelerations and jerks that the smooth curve uses.
 TOLERANCE_SHARE = 0.9
+LINES = "the positions are connected by lines"
+NO_JITTER_BOUND = "a jitter of the times needs limits of velocities and accelerations"
+RESOLUTION = "errors between the samples are as estimated from their resolution"
+
+
+def refute(
+    judge: FamilyJudge, trajectory: Trajectory, errors: SampleErrors
+) -> TrajectoryVerdict | None:
+    """Return the verdict on samples through which no curve within the joint limits leads; None if bounds refute none."""
+    limits = judge.limits(trajectory.parameters)
+    alone = replace(trajectory, dq=None, ddq=None)
+    found = refuted_limits(limits, alone, errors)
+    if found or trajectory.dq is None:
+        found = found or _refuted_torques(judge, trajectory, errors, limits)
+        return _refutation(trajectory, found) if found else None
+    found = refuted_limits(limits, trajectory, errors)
+    if not found:
+        found = _refuted_torques(judge, trajectory, errors, limits)
+        return _refutation(trajectory, found) if found else None
+    worst = next((each for each in found if each.samples == BOTH), found[0])
+    if worst.samples not in {BOTH, VELOCITIES}:
+        return _refutation(trajectory, found)
+    joint = limits.joints.index(worst.margin.part)
+    text = explain_velocities(trajectory, errors, joint, limits.joints)
+    if not text and worst.samples != BOTH:
+        return _refutation(trajectory, found)
+    detail = f"{worst.detail}; {text}" if text else worst.detail
+    return _refutation(trajectory, [worst], CONTRADICTION, detail)
 
 
 def judge_samples(
     judge: FamilyJudge,
     trajectory: Trajectory,
-    noise: Array,
+    errors: SampleErrors,
     *,
     scene: Array | None = None,
 ) -> TrajectoryVerdict:
     """Judge the motion that samples resolve.
 
-    The noise is the largest error of positions, velocities and accelerations [rad,
-    rad/s, rad/s^2], shape (3,). For the scene see ``FamilyJudge``.
+    Jitter must be part of the errors of the values (``with_jitter``) but for the curves
+    that meet samples within it. For the scene see ``FamilyJudge``.
     """
-    limits = acceleration_limits(judge.limits(trajectory.parameters))
-    if (
-        trajectory.dq is None
-        and not noise.any()
-        and np.diff(trajectory.t).max() <= MAX_LINEAR_SPAN_S
-    ):
-        line = interpolated(trajectory, "linear", noise)
-        return judge(
-            line,
-            trajectory,
-            scene=scene,
-            smooth=through_positions(trajectory, SMOOTH_NEIGHBORS),
-        )
-    if not noise.any() and is_resolved(trajectory, limits.acceleration):
-        curves = [smooth_curve(trajectory, limits)]
-        if trajectory.ddq is not None:
-            curves.insert(0, family_of_data(trajectory.t, data_of(trajectory)))
-        for curve in curves:
-            verdict = None if curve is None else judge(curve, trajectory, scene=scene)
-            if verdict is not None and verdict.valid:
+    limits = judge.limits(trajectory.parameters)
+    ends = acceleration_limits(limits)
+    moved = with_jitter(errors, limits, trajectory)
+    exact = is_negligible(moved, trajectory, ends.acceleration)
+    detail = ""
+    for curve, step in _curves(trajectory, errors, ends, exact=exact):
+        excess = _joint_limit_excess(curve, limits)
+        if excess is None:
+            verdict = judge(curve, trajectory, scene=scene, step=step)
+            if verdict.valid:
                 return verdict
-    return judge(
-        resolved_curves(trajectory, noise, limits.acceleration), trajectory, scene=scene
-    )
+            excess = (
+                str(verdict.conditions[verdict.decisive].margin)
+                if verdict.conditions
+                else ""
+            )
+        detail = (
+            f"a smooth curve within the errors is not valid: {excess}" if excess else ""
+        )
+    noise = np.zeros(3) if exact else moved.values
+    if not np.isfinite(noise).all():
+        return TrajectoryVerdict(
+            Decision.UNDECIDED, NO_JITTER_BOUND, duration=trajectory.duration
+        )
+    if exact and _is_dense(trajectory):
+        line = interpolated(trajectory, "linear", noise)
+        smooth = through_positions(trajectory, SMOOTH_NEIGHBORS)
+        found = judge(line, trajectory, scene=scene, smooth=smooth)
+        return _assuming(LINES, found, detail)
+    family = resolved_curves(trajectory, noise, ends.acceleration)
+    return _assuming(RESOLUTION, judge(family, trajectory, scene=scene), detail)
+
+
+def _assuming(
+    assumption: str, found: TrajectoryVerdict, detail: str
+) -> TrajectoryVerdict:
+    """Return a verdict under an assumption; an undecided one says why no valid motion was found."""
+    undecided = found.decision == Decision.UNDECIDED
+    return replace(found, assumption=assumption, detail=detail if undecided else "")
+
+
+def with_jitter(
+    errors: SampleErrors, limits: ProvenJointLimits, trajectory: Trajectory
+) -> SampleErrors:
+    """Return errors of values at the stated times: under the limits, a time within d moves a position by V d at most."""
+    if not errors.t:
+        return errors
+    largest = largest_values(limits)
+    names = ("dq", "ddq", "jerk")[: len(data_of(trajectory))]
+    moved = [float(largest[name].max()) * errors.t for name in names]
+    q, dq, ddq = errors.values + np.array([*moved, 0.0, 0.0])[:3]
+    return replace(errors, q=float(q), dq=float(dq), ddq=float(ddq))
 
 
 def acceleration_limits(limits: ProvenJointLimits) -> AccelerationLimits:
@@ -87,3 +169,92 @@ def acceleration_limits(limits: ProvenJointLimits) -> AccelerationLimits:
                 smallest[quantity], np.maximum(allowed, 0.0)
             )
     return AccelerationLimits(smallest["ddq"], smallest["jerk"])
+
+
+def _is_dense(trajectory: Trajectory) -> bool:
+    """Return whether positions without derivatives are close enough to be connected by lines."""
+    return trajectory.dq is None and np.diff(trajectory.t).max() <= MAX_LINEAR_SPAN_S
+
+
+def _curves(
+    trajectory: Trajectory,
+    errors: SampleErrors,
+    limits: AccelerationLimits,
+    *,
+    exact: bool,
+) -> Iterator[tuple[CurveFamily, float | None]]:
+    """Yield curves within the errors of all samples, with the step at which they are judged."""
+    if exact and is_resolved(trajectory, limits.acceleration):
+        if trajectory.ddq is not None:
+            yield family_of_data(trajectory.t, data_of(trajectory)), None
+        if (curve := smooth_curve(trajectory, limits)) is not None:
+            yield curve, None
+    if (curve := witness(trajectory, errors)) is not None:
+        yield curve, MAX_STEP_S
+
+
+def _joint_limit_excess(curve: CurveFamily, limits: ProvenJointLimits) -> str | None:
+    """Return the first joint limit that a curve exceeds, or None; Bernstein coefficients prove it at little cost."""
+    n = len(limits.joints)
+    for limit, constraint in enumerate(limits.constraints):
+        values = getattr(curve.polynomials, quantity_of(constraint))
+        violations = values[..., np.arange(2 * n) % n] - limits.bounds[limit]
+        relative = violations / limits.scale[limit]
+        maximum = find_maximum(relative, curve.edges, threshold=1.0)
+        if maximum[0] > 1:
+            time = maximum[2] * curve.duration
+            return str(limits.margin_at(limit, maximum, time))
+    return None
+
+
+def _refuted_torques(
+    judge: FamilyJudge,
+    trajectory: Trajectory,
+    errors: SampleErrors,
+    limits: ProvenJointLimits,
+) -> list[RefutedLimit]:
+    """Return the torque limit that no curve within the other joint limits meets."""
+    allowed, largest = judge.torque_limit(), largest_values(limits)
+    error = with_jitter(errors, limits, replace(trajectory, dq=None, ddq=None)).q
+    if allowed is None or not np.isfinite(error):
+        return []
+    found = refuted_torques(
+        partial(judge.torques, parameters=trajectory.parameters),
+        allowed,
+        trajectory.t,
+        trajectory.q,
+        error=error,
+        largest=(largest["dq"], largest["ddq"]),
+        joint_names=limits.joints,
+    )
+    return [] if found is None else [found]
+
+
+def _refutation(
+    trajectory: Trajectory,
+    found: list[RefutedLimit],
+    reason: str = "",
+    detail: str = "",
+) -> TrajectoryVerdict:
+    """Return the verdict by refuted limits, of which the first decides."""
+    conditions = {
+        each.margin.name: ConditionDecision(
+            Decision.INVALID,
+            reason or each.margin.reason,
+            each.margin,
+            0.0,
+            None,
+            None,
+            detail or each.detail,
+        )
+        for each in reversed(found)  # two limits of one name: the worse one stays
+    }
+    first = conditions[found[0].margin.name]
+    return TrajectoryVerdict(
+        Decision.INVALID,
+        first.reason,
+        conditions,
+        trajectory.duration,
+        len(trajectory.t),
+        first.detail,
+    )

@@ -167,9 +167,14 @@ def write_json(
 def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
     """Return the counts, and for every condition the decisions with the worst margin."""
     counts = ", ".join(
-        f"{count:,} {decision}" for decision, count in found.counts.items()
+        f"{count:,} {statement}" for statement, count in found.statements.items()
     )
-    lines = [f"{file}: trajectories of {found.problem.name}: {counts}", ""]
+    lines = [f"{file}: trajectories of {found.problem.name}: {counts}"]
+    lines += [f"torque: {found.judged_torque}"] if found.judged_torque else []
+    for source, count in found.assumed_errors.items():
+        text = f"{source} is assumed for {count:,}, at least that of the numbers"
+        lines.append(f"{text}; --noise and --time-jitter state a sensor's")
+    lines.append("")
     decided: list[tuple[str, ...]] = [
         (
             "condition",
@@ -189,16 +194,18 @@ def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
             for index, v in enumerate(found.verdicts)
             if name in v.conditions
         ]
-        worst, entry = max(entries, key=lambda item: item[1].margin.severity)
+        worst, entry = max(
+            entries, key=lambda item: (item[1].is_measured, item[1].margin.severity)
+        )
         shares = [
-            max(getattr(e, share) for _, e in entries)
+            _largest([getattr(e, share) for _, e in entries])
             for share in ("violated_share", "undecided_share")
         ]
         counted = [
             f"{decisions[decision]:,}" for decision in ("valid", "invalid", "undecided")
         ]
-        decided.append((name, *counted, *(f"{share:.1%}" for share in shares), ""))
-        margins.append((name, *margin_cells(entry.margin.to_dict(), worst)))
+        decided.append((name, *counted, *shares, ""))
+        margins.append((name, *margin_cells(entry.to_dict()["margin"], worst)))
     if summary["conditions"]:
         lines += [*table(decided, indent="  ", right=(1, 2, 3, 4, 5)), ""]
         lines += table(margins, indent="  ", right=(1, 2, 4, 5))
@@ -210,6 +217,12 @@ def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
         ),
     ]
     return "\n".join(lines).rstrip()
+
+
+def _largest(shares: list[float | None]) -> str:
+    """Format the largest share of time that was measured."""
+    known = [share for share in shares if share is not None]
+    return f"{max(known):.1%}" if known else "-"
 
 
 def listing_text(found: "TrajectoryEvaluation", labels: tuple[str, ...]) -> str:

@@ -2,7 +2,6 @@
 
 import json
 import re
-import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from cnpgen.errors import CnpgenError, DatasetError, UsageError, either, require
 from cnpgen.plans.format import JOINT_NAMES_KEY, PHASE_COLUMN, PLAN_COLUMN
 from cnpgen.problems.scenes.yaml_document import read_yaml
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
+from cnpgen.store.files.archives import ArchiveError, read_arrays
 from cnpgen.store.files.atomic import machine_error, read_file
 from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.hdf5 import open_hdf5
@@ -31,7 +31,10 @@ from cnpgen.store.paths import require_path
 from cnpgen.store.scene_table import OBSTACLE_POSES
 
 JOINT_NAMES = "joint_names"  # array of an archive, dataset or attribute of HDF5
-MAX_ARCHIVE_BYTES = 1 << 32  # of the arrays of an archive
+MAX_ARCHIVE_BYTES = 1 << 30  # of the arrays of an archive
+MAX_PARQUET_VALUES = (
+    25_000_000  # of a table: they take up to 50 bytes each while it is read
+)
 MAX_FEATURE_WIDTH = 10_000  # values of a feature of LeRobot
 HELD_JOINTS_FILE = "held_joints.yaml"  # beside exported plans; it holds no trajectory
 LEROBOT_INFO = "meta/info.json"  # in a folder of LeRobot
@@ -130,21 +133,8 @@ def _read_text(path: Path) -> Iterator[TrajectoryTable]:
 
 def _read_npz(path: Path) -> Iterator[TrajectoryTable]:
     try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(member.file_size for member in archive.infolist())
-        if size > MAX_ARCHIVE_BYTES:
-            raise UsageError(
-                f"{path} holds {size:,} bytes, expected at most {MAX_ARCHIVE_BYTES:,}"
-            )
-        with np.load(path, allow_pickle=False) as loaded:
-            arrays = {name: loaded[name] for name in loaded.files}
-    except (
-        zipfile.BadZipFile,
-        ValueError,
-        KeyError,
-        EOFError,
-        NotImplementedError,
-    ) as error:
+        arrays = read_arrays(path, max_bytes=MAX_ARCHIVE_BYTES)
+    except ArchiveError as error:
         raise UsageError(
             f"{path} is not an archive of NumPy arrays, or is damaged: {error}"
         ) from error
@@ -222,11 +212,14 @@ def read_parquet(path: Path) -> Any:
     content = read_file(path, max_bytes=MAX_TABLE_BYTES)
     try:
         file = pyarrow.parquet.ParquetFile(pyarrow.BufferReader(content))
+        groups = [file.metadata.row_group(i) for i in range(file.num_row_groups)]
+        # Values that repeat take no space in the file, so values are counted.
         size = sum(
-            file.metadata.row_group(index).total_byte_size
-            for index in range(file.num_row_groups)
+            max(group.column(i).num_values, group.num_rows)
+            for group in groups
+            for i in range(group.num_columns)
         )
-        if size <= MAX_ARCHIVE_BYTES:
+        if size <= MAX_PARQUET_VALUES:
             return file.read()
     except (
         pyarrow.ArrowException,
@@ -237,7 +230,7 @@ def read_parquet(path: Path) -> Any:
             f"{path} is not a Parquet file, or is damaged: {error}"
         ) from error
     raise UsageError(
-        f"{path} holds {size:,} bytes, expected at most {MAX_ARCHIVE_BYTES:,}"
+        f"{path} holds {size:,} values, expected at most {MAX_PARQUET_VALUES:,}"
     )
 
 

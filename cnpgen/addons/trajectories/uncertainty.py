@@ -16,7 +16,9 @@ from cnpgen.addons.trajectories.curve_family import UNDEFINED, CurveFamily
 from cnpgen.judges.plans.continuous_collision import is_contact
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
 from cnpgen.judges.plans.measure import MeasuredCondition, measure
+from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.problem import Problem
+from cnpgen.world.drive import friction_bounds
 from cnpgen.world.path import PathWorld
 
 Array = NDArray[np.float64]
@@ -92,10 +94,39 @@ def uncertainty_of(  # noqa: PLR0917 - the family, and everything that measures 
         found = _changes(problem, family, world, scenes, smooth, s, starts)
         for condition, change in zip(smooth, found, strict=True):
             relaxed = float(ends[0]) if condition.relaxation.any() else 0.0
-            errors[_key(condition)] = change + relaxed
+            friction = _friction_changes(family, world, condition, s, starts)
+            errors[_key(condition)] = change + relaxed + friction
     else:
         errors |= {_key(condition): 0.0 for condition in smooth}
     return Uncertainty(s[starts], errors)
+
+
+def _friction_changes(
+    family: CurveFamily,
+    world: PathWorld,
+    condition: MeasuredCondition,
+    s: Array,
+    starts: NDArray[np.intp],
+) -> Array | float:
+    """Bound the changes of the friction of drives in every block, shape (m, B); 0 for other conditions.
+
+    Friction changes within a few samples about a reversal, which the midpoint of a
+    block may miss. It rises with the velocity, so both ends of the velocities bound it.
+    """
+    drive, is_torque = world.robot.drive, isinstance(condition.constraint, JointTorque)
+    parts = condition.condition.parts
+    if drive is None or not is_torque or not parts:
+        return 0.0
+    dq, error = family.evaluate(s, jerk=False).dq, family.bounds_at(s)[1]
+    joints = [world.robot.joint_names.index(part) for part in parts]
+    nominal = friction_bounds(drive, dq)
+    moved = [friction_bounds(drive, dq + sign * error) for sign in (-1, 1)]
+    changes = [
+        np.abs(other - bound)[joints]
+        for ends in moved
+        for other, bound in zip(ends, nominal, strict=True)
+    ]
+    return np.asarray(np.maximum.reduceat(np.max(changes, axis=0), starts, axis=1))
 
 
 def _changes(  # noqa: PLR0917 - as of uncertainty_of

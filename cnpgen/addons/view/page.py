@@ -2,9 +2,11 @@
 
 import base64
 import json
+import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
+from threading import Lock
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -18,6 +20,8 @@ from cnpgen.errors import CnpgenError, MachineError, UsageError, requires_extra
 HOST = "127.0.0.1"
 # Accepted Host headers; requests that another site redirected have other ones.
 _NAMES = HOST, "localhost"
+_CONNECTION_TIME_S = 10.0  # of one read or write: idle connections are closed then
+_MAX_ROW_DIGITS = 18
 _RETRY_S = 2  # time after which a browser reloads an error page
 
 Page = Callable[[int | None, str], str]
@@ -78,11 +82,19 @@ def serve(
         ready: Called with the address once it is served.
     """
     from http import HTTPStatus
-    from http.server import BaseHTTPRequestHandler, HTTPServer
+    from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+    drawing = Lock()  # pages are drawn one after the other
 
     class Handler(BaseHTTPRequestHandler):
+        timeout = _CONNECTION_TIME_S  # of every read and write
+
         def do_GET(self) -> None:
-            address = urlsplit(self.path)
+            try:
+                address = urlsplit(self.path)
+            except ValueError:  # such as "http://["
+                self._answer("not an address", status=HTTPStatus.BAD_REQUEST)
+                return
             if (self.headers.get("Host") or "").rpartition(":")[0] not in _NAMES:
                 self._answer(
                     "expected the address of this machine", status=HTTPStatus.FORBIDDEN
@@ -96,11 +108,13 @@ def serve(
 
         def _show(self, row: str) -> None:
             try:
-                if row and not (row.isascii() and row.isdigit()):
+                if row and not (
+                    row.isascii() and row.isdigit() and len(row) <= _MAX_ROW_DIGITS
+                ):
                     raise UsageError(f"row: expected a number from 0, got {row[:20]!r}")
-                self._answer(
-                    page(int(row) if row else None, stamp(watched)), kind="text/html"
-                )
+                with drawing:
+                    text = page(int(row) if row else None, stamp(watched))
+                self._answer(text, kind="text/html")
             except CnpgenError as error:
                 self._answer(str(error), status=HTTPStatus.INTERNAL_SERVER_ERROR)
 
@@ -124,8 +138,18 @@ def serve(
         def log_message(self, *_: object) -> None:
             """Do not log requests."""
 
+    class Server(ThreadingHTTPServer):
+        daemon_threads = True  # an idle connection does not delay the end
+
+        def handle_error(self, request: object, client_address: object) -> None:  # noqa: ARG002
+            """Report an error of one connection in one line; clients that leave are no error."""
+            error = sys.exception()
+            if not isinstance(error, ConnectionError | TimeoutError):
+                text = f"{type(error).__name__}: {error}".partition("\n")[0]
+                print(f"cnpgen: --serve: {text[:200]}", file=sys.stderr)
+
     try:
-        server = HTTPServer((HOST, port), Handler)
+        server = Server((HOST, port), Handler)
     except OSError as error:
         raise MachineError(
             f"--serve: cannot listen on port {port}: {error.strerror}"

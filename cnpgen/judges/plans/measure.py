@@ -178,10 +178,10 @@ def name_part(
     """Name one of a condition's values by its index: empty if it is the only one, a number for those of plug-ins."""
     if len(condition.g) == 1:
         return ""
-    if isinstance(constraint, _PER_JOINT):
-        return problem.robot.joints[part]
     if condition.parts:
         return condition.parts[part]
+    if isinstance(constraint, _PER_JOINT):
+        return problem.robot.joints[part]
     if isinstance(constraint, ObjectContact):
         return problem.obstacle[part].name
     return f"[{part}]"

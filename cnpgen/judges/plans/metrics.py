@@ -18,7 +18,9 @@ def metrics_of(
 ) -> Metrics:
     """Compute the metrics of one motion from its joint jerks at the samples [rad/s^3], shape (n, K); nan if unknown."""
     robot = world.robot
-    torque_ratio = world.torque / robot.torque_limit[:, None]
+    drive = robot.drive
+    limit = robot.torque_limit if drive is None else drive.torque_limit
+    torque_ratio = world.linear_torque / limit[:, None]
     table, tip = problem.first(Table), world.parameters.on_table(world.tip_position)
     upright = any(isinstance(constraint, Vertical) for constraint in problem.constraint)
     return Metrics(

@@ -187,8 +187,20 @@ def shares_of_limits(world: PathWorld) -> dict[str, Array]:
             if world.jerk is None
             else {"jerk": world.jerk / robot.jerk_limit[:, None]}
         ),
-        "torque": world.torque / robot.torque_limit[:, None],
+        **_torque_shares(world),
     }
+
+
+def _torque_shares(world: PathWorld) -> dict[str, Array]:
+    """Return the limited torques at the joints and, with drives, the larger bound of those at the motors."""
+    robot, drive = world.robot, world.robot.drive
+    joint = {"torque": world.torque / robot.torque_limit[:, None]}
+    if drive is None:
+        return joint
+    low, high = world.motor_torque
+    motor = np.where(high > -low, high, low) / drive.torque_limit[:, None]
+    shares = joint if drive.limits_joint else {}
+    return shares | ({"motor torque": motor} if drive.motor_rows else {})
 
 
 def _draw_joints(
@@ -202,7 +214,7 @@ def _draw_joints(
             axis.plot(t, 100 * values, linewidth=1.2, label=joint)
         _draw_limits(axis, float(np.nanmax(np.abs(share), initial=0.0)))
         for margin in margins:
-            if margin.name == f"joint {name}":
+            if margin.name in {f"joint {name}", f"highest {name}", f"lowest {name}"}:
                 k = int(np.abs(t - margin.time).argmin())
                 value = 100 * share[robot.joint_names.index(margin.part), k]
                 _mark(axis, margin.time, float(np.clip(value, *axis.get_ylim())))

@@ -94,7 +94,8 @@ class Metrics:
 
     Attributes:
         duration: Motion time [s].
-        effort: Integral of the sum over joints of (torque / limit)^2 over time [s].
+        effort: Integral of the sum over joints of (torque / limit)^2 over time [s],
+            with drives that of the motors without dry friction.
         jerk: Largest jerk of a joint, in multiples of its limit, by default 5/s x that
             of its acceleration.
         hit_speed: Speed of the tip at the goal [m/s].

@@ -258,7 +258,7 @@ def _stored_diagnostics(
 
 
 def _holding_torque_ratio(world: World) -> float:
-    return float(np.max(np.abs(world.holding_torque) / world.robot.torque_limit))
+    return float(np.max(np.abs(world.holding_torque) / world.robot.holding_limit))
 
 
 def _measure(

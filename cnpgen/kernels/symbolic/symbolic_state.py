@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Self
 
+from cnpgen.kernels.symbolic.drive import linear_torque, motor_torque
 from cnpgen.kernels.symbolic.dynamics import (
     Load,
     acceleration_at,
@@ -55,6 +56,8 @@ class SymbolicState:
         obstacles: The obstacles.
         object_size: Edge lengths of the held object [m], or None.
         jerk: Joint jerks [rad/s^3], or None.
+        friction_rates: Velocities that determine the direction of friction in place of
+            dq (``motor_torque`` of ``cnpgen.kernels.symbolic.drive``), or None.
     """
 
     robot: Robot
@@ -65,6 +68,7 @@ class SymbolicState:
     obstacles: tuple[Obstacle, ...]
     object_size: tuple[float, float, float] | None
     jerk: Vec | None = None
+    friction_rates: Vec | None = None
 
     @classmethod
     def of_symbols(
@@ -146,8 +150,23 @@ class SymbolicState:
 
     @cached_property
     def torque(self) -> Vec:
-        """Inverse dynamics [N m]."""
+        """Inverse dynamics of the rigid body [N m]."""
         return self.inverse_dynamics(self.ddq)
+
+    @cached_property
+    def motor_torque(self) -> tuple[Vec, Vec]:
+        """Lowest and highest torque at the motors over all friction that may act [N m]."""
+        if self.robot.drive is None:
+            return self.torque, self.torque
+        moving = self.torque, self.dq, self.ddq
+        return motor_torque(self.robot.drive, *moving, self.friction_rates)
+
+    @cached_property
+    def linear_torque(self) -> Vec:
+        """Torque at the motors without dry friction [N m], that of the rigid body without drives."""
+        if self.robot.drive is None:
+            return self.torque
+        return linear_torque(self.robot.drive, self.torque, self.dq, self.ddq)
 
     def inverse_dynamics(self, ddq: Vec) -> Vec:
         """Return the torque [N m] of the sample's load at other accelerations [rad/s^2]."""

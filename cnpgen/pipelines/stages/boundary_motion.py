@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.kernels.symbolic.drive import linear_torque, motor_torque
 from cnpgen.kernels.symbolic.dynamics import inverse_dynamics
 from cnpgen.kernels.symbolic.kinematics import (
     bias_acceleration,
@@ -326,8 +327,11 @@ def table_acceleration(robot: Robot) -> Any:
     torque = inverse_dynamics(robot.chain, q, dq, particular)
     shifted = inverse_dynamics(robot.chain, q, dq, add(particular, direction))
     change = [b - a for a, b in zip(torque, shifted, strict=True)]
-    bounds = [*limit, *(float(x) for x in robot.torque_limit)]
-    low, high = _interval([*particular, *torque], [*direction, *change], bounds)
+    torques, changes, torque_bounds = _limited_torques(
+        robot, (torque, change), dq, (particular, direction)
+    )
+    bounds = [*limit, *torque_bounds]
+    low, high = _interval([*particular, *torques], [*direction, *changes], bounds)
     t = low + s[0] * (high - low)
     ddq = add(particular, scale(direction, t))
     admissible = ca.logic_and(low <= 0, high >= 0)
@@ -336,6 +340,33 @@ def table_acceleration(robot: Robot) -> Any:
         "table_acceleration",
         [q_sx, dq_sx, u_sx, s_sx],
         [ca.vertcat(*ddq), interval_length],
+    )
+
+
+def _limited_torques(
+    robot: Robot, torque: tuple[Vec, Vec], dq: Vec, ddq: tuple[Vec, Vec]
+) -> tuple[Vec, Vec, list[float]]:
+    """Return values, changes along a direction, and bounds of all limited torques.
+
+    ``torque`` and ``ddq`` have values and changes. The friction of a drive does not
+    change, since the velocity does not.
+    """
+    value, change = torque
+    limit = [float(x) for x in robot.torque_limit]
+    if robot.drive is None:
+        return value, change, limit
+    drive, zero = robot.drive, [0.0] * robot.n
+    lowest, highest = motor_torque(drive, value, dq, ddq[0])
+    motor_change = linear_torque(drive, change, zero, ddq[1])
+    values, changes, bounds = (
+        (value, change, limit) if drive.limits_joint else ([], [], [])
+    )
+    rows = [(highest, joint) for joint in drive.motor_rows]
+    rows += [(lowest, joint) for joint in drive.uncertain_rows]
+    return (
+        [*values, *(end[joint] for end, joint in rows)],
+        [*changes, *(motor_change[joint] for _, joint in rows)],
+        [*bounds, *(float(drive.torque_limit[joint]) for _, joint in rows)],
     )
 
 

@@ -53,7 +53,10 @@ class GravityTorque(Stage):
 
 
 def torque_ratio(robot: Robot) -> Any:
-    """Build ``q -> max_i |gravity torque_i| / limit_i``, with the problem's parameters ``(q, parameters) -> ...``."""
+    """Build ``q -> max_i |gravity torque_i| / limit_i``, with the problem's parameters ``(q, parameters) -> ...``.
+
+    The limit is ``Robot.holding_limit``: friction at rest may act in either direction.
+    """
     import casadi as ca
 
     (q_sx, q), (parameters_sx, parameters) = (
@@ -64,7 +67,7 @@ def torque_ratio(robot: Robot) -> Any:
     torque = SymbolicState(robot, q, zero, zero, parameters, (), None).torque
     ratios = (
         ca.fabs(value) / limit
-        for value, limit in zip(torque, robot.torque_limit.tolist(), strict=True)
+        for value, limit in zip(torque, robot.holding_limit.tolist(), strict=True)
     )
     arguments = [q_sx, parameters_sx] if parameters else [q_sx]
     return ca.Function("torque_ratio", arguments, [reduce(ca.fmax, ratios, ca.SX(0))])

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from cnpgen.problems.constraints.constraint import Array, Condition, Constraint
+from cnpgen.robots.drive import RIGID
 from cnpgen.schema.keys import field
+from cnpgen.store.joint_units import units_of_joints
 
 if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
@@ -127,11 +129,52 @@ class JointJerk(_RelativeLimit):
 
 @dataclass(frozen=True, kw_only=True)
 class JointTorque(_RelativeLimit):
-    """Constraint: joint torques, including the payload, are within their limits: ``|ID(q, dq, ddq)| <= limit``."""
+    """Constraint: joint torques, including the payload, are within their limits: ``|ID(q, dq, ddq)| <= limit``.
+
+    With [drive], the torques of the motors are within theirs, too: the highest and the
+    lowest over all friction that may act.
+    """
 
     reason = "joint torque limit"
     training_weight, training_factor = 1.5, 0.97
     condition_name, unit, rates, limit = "joint torque", "N m", "torque", "torque_limit"
+
+    def _within(
+        self, state: "SymbolicState | World", factor: Any
+    ) -> tuple[Condition, ...]:
+        drive = state.robot.drive
+        if drive is None:
+            return super()._within(state, factor)
+        joint = super()._within(state, factor) if drive.limits_joint else ()
+        low, high = state.motor_torque
+        # Both rows have both bounds: the redundant ones never bind, since high >= low.
+        highest = _of_joints(
+            state.robot, "highest motor torque", high, drive.motor_rows
+        )
+        lowest = _of_joints(
+            state.robot, "lowest motor torque", low, drive.uncertain_rows
+        )
+        return (*joint, *highest, *lowest)
+
+
+def _of_joints(
+    robot: "Robot", name: str, torque: Sequence[Any] | Array, joints: tuple[int, ...]
+) -> tuple[Condition, ...]:
+    """Return the condition that motor torques of some joints are within their limits, none without joints."""
+    if robot.drive is None or not joints:
+        return ()
+    limit = robot.drive.torque_limit[list(joints)]
+    unit = units_of_joints("N m", tuple(robot.prismatic[joint] for joint in joints))
+    parts = tuple(robot.joint_names[joint] for joint in joints)
+    g = [torque[joint] for joint in joints]
+    return (Condition(name, unit, g, -limit, limit, "limit", parts),)
+
+
+def judged_torque(constraints: Sequence[Constraint], robot: "Robot") -> str:
+    """Return which torque the constraints limit, in words; empty if they limit none."""
+    if not any(isinstance(each, JointTorque) for each in constraints):
+        return ""
+    return RIGID if robot.drive is None else robot.drive.summary
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -32,6 +32,7 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.store.joint_units import unit_of
 from cnpgen.trajectory.boundary import Boundary
+from cnpgen.world.drive import friction_bounds
 from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
@@ -203,15 +204,13 @@ def _has_acceleration(problem: Problem, world: World, torque: JointTorque) -> bo
 
     robot, q, dq = world.robot, world.q, world.dq
     acceleration = joint_limits(problem, robot, tolerances=1.0).acceleration
-    limit = (
-        robot.torque_limit * (1 + torque.tolerance + BOUNDARY_MARGIN[2])
-        + BOUNDARY_MARGIN[2]
-    )
     model, data = world.parameters.model, world.parameters.model.createData()
     bias = np.array(pin.rnea(model, data, q, dq, np.zeros(robot.n)))
     inertia = np.array(
         [pin.rnea(model, data, q, dq, unit) - bias for unit in np.eye(robot.n)]
     ).T
+    inertia, bias, limit = _limited_torques(robot, inertia, bias, dq)
+    limit = limit * (1 + torque.tolerance + BOUNDARY_MARGIN[2]) + BOUNDARY_MARGIN[2]
     solved = linprog(
         np.zeros(robot.n),
         A_ub=np.vstack([inertia, -inertia]),
@@ -220,6 +219,33 @@ def _has_acceleration(problem: Problem, world: World, torque: JointTorque) -> bo
         method="highs",
     )
     return bool(solved.status != 2)  # 2: infeasible
+
+
+def _limited_torques(
+    robot: Robot, inertia: Array, bias: Array, dq: Array
+) -> tuple[Array, Array, Array]:
+    """Return matrix, torque without acceleration, and limit of all limited torques: (m, n), (m,), (m,).
+
+    With drives they are the torques at the joints and at the motors, whose friction has
+    a highest and a lowest value.
+    """
+    drive = robot.drive
+    if drive is None:
+        return inertia, bias, robot.torque_limit
+    lowest, highest = friction_bounds(drive, dq)
+    with_rotors = inertia + np.diag(drive.armature)
+    rows = [
+        (with_rotors[joint], bias[joint] + highest[joint], drive.torque_limit[joint])
+        for joint in drive.motor_rows
+    ]
+    rows += [
+        (with_rotors[joint], bias[joint] + lowest[joint], drive.torque_limit[joint])
+        for joint in drive.uncertain_rows
+    ]
+    if drive.limits_joint:
+        rows += list(zip(inertia, bias, robot.torque_limit, strict=True))
+    matrices, values, limits = zip(*rows, strict=True)
+    return np.array(matrices), np.array(values), np.array(limits)
 
 
 def _cannot_brake(problem: Problem, robot: Robot, boundary: Boundary) -> Iterator[str]:

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import MachineError
 from cnpgen.robots.shape.hull import Array, hull_corners
-from cnpgen.store.files.atomic import write_file
+from cnpgen.store.files.archives import read_arrays
+from cnpgen.store.files.cache_entry import MAX_ENTRY_BYTES, read_entry, write_entry
 
 # Planes between both ends of a part along each axis that are tried, and as many at
 # faces.
@@ -79,15 +79,14 @@ def convex_parts(
         else keep / f"parts-{_identity(points, triangles, most)}.npz"
     )
     if kept is not None:
-        with suppress(OSError, ValueError, KeyError):
-            return _read(kept)
+        with suppress(ValueError):
+            return _read(read_entry(kept))
     parts = [
         hull_corners(part.used_points)
         for part in cut_parts(TriangleMesh(points, triangles), most)
     ]
     if kept is not None:
-        with suppress(MachineError):
-            write_file(kept, _written(parts))
+        write_entry(kept, _written(parts))
     return parts
 
 
@@ -182,13 +181,12 @@ def _written(parts: Sequence[Array]) -> bytes:
     return file.getvalue()
 
 
-def _read(file: Path) -> list[Array]:
+def _read(entry: bytes | None) -> list[Array]:
     """Read parts; raise ValueError if there are none or if they are not finite."""
-    with np.load(file, allow_pickle=False) as content:
-        parts = [
-            np.asarray(content[name], float).reshape(-1, 3)
-            for name in sorted(content.files)
-        ]
+    if entry is None:
+        raise ValueError("no entry, or a damaged one")
+    arrays = read_arrays(entry, max_bytes=MAX_ENTRY_BYTES)
+    parts = [np.asarray(arrays[name], float).reshape(-1, 3) for name in sorted(arrays)]
     if not parts or not all(np.isfinite(part).all() for part in parts):
         raise ValueError("no parts")
     return parts

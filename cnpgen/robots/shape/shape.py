@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.errors import MachineError, RecipeError, nearest
+from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.chain import Chain, frame_of
 from cnpgen.robots.robot_spec import HeldObject
 from cnpgen.robots.shape.capsule import Capsule, covering_capsule, covers
@@ -28,7 +28,7 @@ from cnpgen.robots.shape.link_pairs import (
 )
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.robots.urdf_changes import disabled_pairs
-from cnpgen.store.files.atomic import write_file
+from cnpgen.store.files.cache_entry import read_entry, write_entry
 
 if TYPE_CHECKING:
     import pinocchio as pin
@@ -144,15 +144,12 @@ def _cached(
     The JSON values determine the result. Without a folder, it is computed.
     """
     name = f"shape-{hashlib.sha256(json.dumps([SHAPE_REVISION, *numbers]).encode()).hexdigest()[:32]}.json"
-    if keep is not None:
-        with suppress(OSError, ValueError, KeyError, TypeError):
-            return _read(
-                json.loads((keep / name).read_text(encoding="utf-8")), convex_parts
-            )
+    if keep is not None and (entry := read_entry(keep / name)) is not None:
+        with suppress(ValueError, KeyError, TypeError, RecursionError):
+            return _read(json.loads(entry), convex_parts)
     capsules, pairs = compute()
     if keep is not None:
-        with suppress(MachineError):
-            write_file(keep / name, json.dumps(_written(capsules, pairs)))
+        write_entry(keep / name, json.dumps(_written(capsules, pairs)).encode())
     return capsules, pairs
 
 

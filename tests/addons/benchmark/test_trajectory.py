@@ -119,10 +119,11 @@ def test_the_verdict_is_that_of_the_evaluation_of_the_same_curve(
     } == {
         name: entry.decision == "valid" for name, entry in expected.conditions.items()
     }
-    assert (
-        verdict.margins["joint velocity"]
-        == expected.conditions["joint velocity"].margin
-    )
+    margin = expected.conditions["joint velocity"].margin
+    if speed == 1:
+        assert verdict.margins["joint velocity"] == margin
+    else:  # a lower bound of all curves
+        assert 1 < margin.severity <= verdict.margins["joint velocity"].severity
 
 
 @pytest.mark.parametrize("known", ["positions", "velocities", "accelerations"])

@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 
 import cnpgen
-from cnpgen.addons.hub.publish import publish_dataset, upload_folder
+from cnpgen.addons.hub.publish import publish_dataset, upload_files
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
 from cnpgen.make.make_dataset import make_dataset
+from cnpgen.store.files.written_files import LIST
 
 RECIPE = """
 name = "hits"
@@ -129,29 +130,39 @@ def test_mlcroissant_iterates_the_record_sets(dataset: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_files_of_an_earlier_state_are_removed_and_others_kept(
-    dataset: Path, tmp_path: Path
+def test_files_of_an_earlier_state_are_removed_and_others_refused_by_name(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("pyarrow")
-    old = [
-        "parquet/train/00007.parquet",
-        "parquet/gone/00000.parquet",
-        "hdf5/train/shard-00007.h5",
-    ]
-    old += ["hdf5/gone/shard-00000.h5", "hdf5/gone/shard-00000.json"]
-    own = [
-        "parquet/train/notes.txt",
-        "hdf5/gone/notes.md",
-        "figures/train/00007.parquet",
-    ]
-    for name in old + own:
+    private, card = tmp_path / ".env", tmp_path / "README.md"
+    private.write_text("KEY=1")
+    card.write_text("mine")
+    arguments = ["publish", str(dataset), "--to", "lab/hits", "--dry-run"]
+    arguments += ["-o", str(tmp_path)]
+    assert main(arguments) == 2
+    message = capsys.readouterr().err
+    assert "that were edited since: .env, README.md; choose another" in message
+    assert "or --force" in message
+    assert card.read_text() == "mine"
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".env", "README.md"]
+    assert main([*arguments, "--force"]) == 0
+    assert private.read_text() == "KEY=1"
+    assert card.read_text() != "mine"
+    private.unlink()
+    listing = json.loads((tmp_path / LIST).read_text())
+    stale = ["parquet/gone/00007.parquet", "hdf5/train/shard-00007.h5"]
+    for name in stale:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("earlier")
-    publish_dataset(dataset, "lab/hits", out=tmp_path, dry_run=True)
-    assert not [name for name in old if (tmp_path / name).exists()]
-    assert all((tmp_path / name).exists() for name in own)
+        listing["files"][name] = ""
+    (tmp_path / LIST).write_text(json.dumps(listing))
+    assert main(arguments) == 0
+    assert not [name for name in stale if (tmp_path / name).exists()]
     assert not (tmp_path / "parquet" / "gone").exists()
     assert (tmp_path / "hdf5" / "train" / "shard-00000.h5").exists()
+    card.write_text("edited since")
+    assert main(arguments) == 2
+    assert "README.md" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("inside", [".", "hub", "train/hub"])
@@ -200,9 +211,11 @@ def test_the_repository_is_created_and_uploaded(
                 if fnmatch(name, pattern)
             }
             present = {
-                path.relative_to(local).as_posix()
+                name
                 for path in local.rglob("*")
                 if path.is_file()
+                for name in [path.relative_to(local).as_posix()]
+                if any(fnmatch(name, each) for each in options["allow_patterns"])
             }
             remote.difference_update(matching - present)
             remote.update(present)
@@ -217,6 +230,9 @@ def test_the_repository_is_created_and_uploaded(
         "-o",
         str(tmp_path / "out"),
     ]
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "id_rsa").write_text("private")
+    arguments.append("--force")
     assert main(arguments) == 0
     assert capsys.readouterr().out.strip() == "https://hub.example.org/lab/hits"
     assert calls[0] == (
@@ -225,6 +241,7 @@ def test_the_repository_is_created_and_uploaded(
     )
     assert calls[1][1]["folder_path"] == tmp_path / "out"
     assert remote & {*stale, *others} == others
+    assert not {"id_rsa", LIST} & remote
     assert {
         "README.md",
         "parquet/train/00000.parquet",
@@ -246,7 +263,7 @@ def test_the_client_accepts_the_arguments(
         )
         monkeypatch.setattr(huggingface_hub.HfApi, name, function)
     assert (
-        upload_folder(tmp_path, "lab/hits", private=True)
+        upload_files(tmp_path, ["README.md"], "lab/hits", private=True)
         == "https://hub.example.org/lab/hits"
     )
     assert [options["repo_type"] for options in calls] == ["dataset", "dataset"]

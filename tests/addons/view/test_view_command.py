@@ -6,6 +6,7 @@ import re
 import shutil
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import urllib.error
@@ -301,7 +302,7 @@ def test_what_cannot_be_meant_is_refused(words, said, capsys):
 @needs_meshcat
 def test_a_plan_is_shown_with_meshes_where_its_problem_is_named(tmp_path, capsys):
     file = _with_visual(tmp_path, "package://crane/meshes/wedge.stl")
-    base, still = load_robot(load_problem(file)).base[None], np.zeros((1, 4))
+    base, still = load_robot(load_problem(file)).home[None], np.zeros((1, 4))
     boundary = cnpgen.Boundary(base, still, still, base, still)
     points, rate = np.tile(base, (1, 15, 1)), np.ones((1, 20))
     plans = cnpgen.make_plans(
@@ -371,8 +372,10 @@ def served(*words: str) -> Iterator[str]:
     command = [sys.executable, "-m", "cnpgen", "view", *words, "--serve", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
-        yield process.stdout.readline().strip()
-        process.send_signal(signal.SIGINT)
+        try:
+            yield process.stdout.readline().strip()
+        finally:
+            process.send_signal(signal.SIGINT)
     assert process.returncode == 130
 
 
@@ -409,6 +412,35 @@ def test_a_page_is_served_to_this_machine_and_follows_its_files(plans, tmp_path)
         file.write_bytes(b"no plan")
         assert got(f"{address}stamp")[2] != in_page(text)["stamp"]
         assert got(address)[0] == 500
+
+
+@needs_meshcat
+def test_idle_malformed_and_leaving_clients_do_not_disturb_others(plans):
+    with served(str(plans)) as address:
+        port = int(address.rstrip("/").rpartition(":")[2])
+
+        def send(request: bytes) -> bytes:
+            with socket.create_connection(("127.0.0.1", port), HANGING) as client:
+                client.sendall(request)
+                return client.makefile("rb").readline()
+
+        with (
+            socket.create_connection(("127.0.0.1", port), HANGING),  # idle
+            socket.create_connection(("127.0.0.1", port), HANGING) as slow,
+        ):
+            slow.sendall(b"GET / HT")
+            assert got(f"{address}stamp")[0] == 200
+        for _ in range(3):  # leave before the answer
+            with socket.create_connection(("127.0.0.1", port), HANGING) as leaving:
+                leaving.sendall(b"GET / HTTP/1.1\r\nHost: localhost:1\r\n\r\n")
+                leaving.setsockopt(
+                    socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0)
+                )
+        status, _, said = got(f"{address}?row={'9' * 5000}")
+        assert (status, len(said) < 200) == (500, True)
+        assert b" 400 " in send(b"GET http://[ HTTP/1.1\r\nHost: localhost:1\r\n\r\n")
+        assert b"404" in send(b"GET /%00%ff HTTP/1.1\r\nHost: localhost:1\r\n\r\n")
+        assert got(address)[0] == 200
 
 
 @needs_meshcat

@@ -204,7 +204,7 @@ class Search(PathSearch):
                 x.low <= position[0] <= x.high and y.low <= position[1] <= y.high
             )
         gravity_torque = pin.computeGeneralizedGravity(self._robot.model, self._data, q)
-        if np.any(np.abs(gravity_torque) > self._robot.torque_limit):
+        if np.any(np.abs(gravity_torque) > self._robot.holding_limit):
             return False
         corners = position + (CUBE * self._size) @ rotation.T
         return all(

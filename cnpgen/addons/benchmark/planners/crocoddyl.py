@@ -21,6 +21,7 @@ from cnpgen.addons.benchmark.benchmark_planner import (
     BenchmarkPlanner,
     Plan,
     Setting,
+    require_rigid_torque,
 )
 from cnpgen.addons.benchmark.planners.obstacle_boxes import (
     Box,
@@ -75,6 +76,7 @@ class Crocoddyl(BenchmarkPlanner):
         """Import Crocoddyl and check the kind of problem."""
         load_crocoddyl()
         problem, robot = open_problem(setting.problem)
+        require_rigid_torque("crocoddyl", problem, robot)
         require_table_or_transport(problem)
 
         def plan(task: Plans) -> Answer:

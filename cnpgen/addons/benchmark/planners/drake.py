@@ -14,7 +14,12 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.addons.benchmark.benchmark_planner import BenchmarkPlanner, Plan, Setting
+from cnpgen.addons.benchmark.benchmark_planner import (
+    BenchmarkPlanner,
+    Plan,
+    Setting,
+    require_rigid_torque,
+)
 from cnpgen.addons.benchmark.planners.obstacle_boxes import require_table_or_transport
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.errors import UsageError, requires_extra
@@ -62,6 +67,7 @@ class Drake(BenchmarkPlanner):
         """Import Drake and check that it can model the problem."""
         load_drake()
         problem, robot = open_problem(setting.problem)
+        require_rigid_torque("drake", problem, robot)
         require_table_or_transport(problem)
         if (
             robot.attached.payload is not None

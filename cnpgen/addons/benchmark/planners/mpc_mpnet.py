@@ -18,6 +18,7 @@ from cnpgen.addons.benchmark.benchmark_planner import (
     BenchmarkPlanner,
     Plan,
     Setting,
+    require_rigid_torque,
 )
 from cnpgen.addons.benchmark.planners.sst import Tree, radii_of
 from cnpgen.addons.benchmark.planners.state_check import StateCheck
@@ -64,6 +65,7 @@ class MPCMPNet(BenchmarkPlanner):
     def prepare(self, setting: Setting) -> Plan:
         """Load the network and the kernel that checks states."""
         problem, robot = open_problem(setting.problem)
+        require_rigid_torque("mpc-mpnet", problem, robot)
         check = StateCheck(problem, robot)
         network = load_proposals(shipped_proposals(problem.name))
         if network.architecture.inputs != 4 * robot.n + len(problem.obstacle):

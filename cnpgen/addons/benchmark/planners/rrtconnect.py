@@ -19,6 +19,7 @@ from cnpgen.addons.benchmark.benchmark_planner import (
     BenchmarkPlanner,
     Plan,
     Setting,
+    require_rigid_torque,
 )
 from cnpgen.addons.benchmark.planners.cbirrt import (
     PathSearch,
@@ -122,6 +123,8 @@ class RRTConnect(BenchmarkPlanner):
         problem, robot = open_problem(setting.problem)
         search_for = path_searches(problem, robot)
         torque_limited = problem.first(JointTorque) is not None
+        if torque_limited:
+            require_rigid_torque("rrtconnect", problem, robot)
 
         def plan(task: Plans) -> Answer:
             seed_ompl(ompl, setting, task)

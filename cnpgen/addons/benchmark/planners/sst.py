@@ -24,6 +24,7 @@ from cnpgen.addons.benchmark.benchmark_planner import (
     BenchmarkPlanner,
     Plan,
     Setting,
+    require_rigid_torque,
 )
 from cnpgen.addons.benchmark.planners.state_check import StateCheck
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
@@ -204,6 +205,7 @@ class SST(BenchmarkPlanner):
     def prepare(self, setting: Setting) -> Plan:
         """Load the kernel that checks states."""
         problem, robot = open_problem(setting.problem)
+        require_rigid_torque("sst", problem, robot)
         radii, check = (
             radii_of(problem, self.witness_radius),
             StateCheck(problem, robot),

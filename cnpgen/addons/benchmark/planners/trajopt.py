@@ -20,6 +20,7 @@ from cnpgen.addons.benchmark.benchmark_planner import (
     BenchmarkPlanner,
     Plan,
     Setting,
+    require_rigid_torque,
 )
 from cnpgen.addons.benchmark.planners.obstacle_boxes import (
     Box,
@@ -63,6 +64,7 @@ class TrajOpt(BenchmarkPlanner):
     def prepare(self, setting: Setting) -> Plan:
         """Choose the constraints at the knots."""
         problem, robot = open_problem(setting.problem)
+        require_rigid_torque("trajopt", problem, robot)
         require_table_or_transport(problem)
 
         def plan(task: Plans) -> Answer:

@@ -100,6 +100,11 @@ def execute_in_challenge(
         UsageError: The environment aborted.
         MachineError: The environment cannot be imported or has another version.
     """
+    if scene.robot.drive is not None:
+        raise UsageError(
+            f"the plant {scene.plant.name!r} has drives of its own, {scene.problem.name!r} states others in [drive]",
+            concerns="plant",
+        )
     environment = _environment(scene.plant.environment)
     try:
         start_q, start_speed = (

@@ -17,7 +17,11 @@ from cnpgen.addons.benchmark.simulator.executed import (
     outcome_of,
     puck_is_done,
 )
-from cnpgen.addons.benchmark.simulator.plant import Plant, rated_torque
+from cnpgen.addons.benchmark.simulator.plant import (
+    Plant,
+    rated_torque,
+    rotor_inertia,
+)
 from cnpgen.addons.benchmark.simulator.reference import TICK_S, Reference
 from cnpgen.addons.benchmark.simulator.simulator_scene import (
     SIMULATION_STEP_S,
@@ -39,14 +43,16 @@ class Controller:
     """Computed torque, within the rated torques: ``M(q) (ddq* + w^2 (q* - q) + 2 w (dq* - dq)) + h(q, dq)``.
 
     w is ``GAIN_RAD_S``. If a torque would exceed its limit, the acceleration is scaled
-    down in its direction, and the holding torque keeps priority. The robot is nominal:
-    of a plant, only the delay counts. ``limit`` has the rated torques [N m], shape
+    down in its direction, and the holding torque keeps priority. The robot is nominal,
+    with the rotors of its drives but without friction: of a plant, only the delay
+    counts. ``limit`` has the rated torques [N m], shape
     (n,).
     """
 
     def __init__(self, problem: Problem, robot: Robot, plant: Plant) -> None:
-        self._model = robot.model
-        self._data = robot.model.createData()
+        self._model = robot.model.copy()
+        self._model.armature = rotor_inertia(robot)
+        self._data = self._model.createData()
         self.limit = rated_torque(problem, robot)
         self._delay = plant.delay
         self._delayed: deque[Array] = deque()

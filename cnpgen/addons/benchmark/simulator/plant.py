@@ -86,7 +86,10 @@ def as_plant(plant: Plant | str, *, argument: str = "plant") -> Plant:
 
 
 def joint_friction(problem: Problem, robot: Robot) -> tuple[Friction, ...]:
-    """Return the friction of the planned joints: that of the iiwa, or a fraction of the rated torque."""
+    """Return the friction of the planned joints: that of the drives, of the iiwa, or a fraction of the rated torque."""
+    if robot.drive is not None:
+        terms = robot.drive.coulomb.tolist(), robot.drive.viscous.tolist()
+        return tuple(Friction(*each) for each in zip(*terms, strict=True))
     if set(robot.joint_names) <= IIWA.keys():
         return tuple(IIWA[name] for name in robot.joint_names)
     return tuple(
@@ -97,4 +100,10 @@ def joint_friction(problem: Problem, robot: Robot) -> tuple[Friction, ...]:
 
 def rated_torque(problem: Problem, robot: Robot) -> Array:
     """Return the torque limits of the problem or else of the URDF, at which the motors saturate [N m], shape (n,)."""
-    return robot.torque_limit / problem.limits.torque_scale
+    limit = robot.torque_limit if robot.drive is None else robot.drive.torque_limit
+    return limit / problem.limits.torque_scale
+
+
+def rotor_inertia(robot: Robot) -> Array:
+    """Return the inertias of the rotors seen at the joints [kg m^2], shape (n,); zero without drives."""
+    return np.zeros(robot.n) if robot.drive is None else robot.drive.armature

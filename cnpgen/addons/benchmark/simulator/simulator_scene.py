@@ -15,7 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.addons.benchmark.simulator import hockey
-from cnpgen.addons.benchmark.simulator.plant import Plant, joint_friction
+from cnpgen.addons.benchmark.simulator.plant import (
+    Plant,
+    joint_friction,
+    rotor_inertia,
+)
 from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
@@ -133,6 +137,7 @@ def _arm(scene: SimulatorScene) -> Iterator[str]:
     chain = scene.robot.chain
     last = len(chain.joints) - 1
     ends = [joint.translation for joint in chain.joints[1:]] + [chain.tip_translation]
+    rotors = rotor_inertia(scene.robot).tolist()
     for index, (joint, end, friction) in enumerate(
         zip(chain.joints, ends, joint_friction(scene.problem, scene.robot), strict=True)
     ):
@@ -142,7 +147,8 @@ def _arm(scene: SimulatorScene) -> Iterator[str]:
         )
         yield f'<body name="link {index + 1}" {place}>{_inertial(joint, scene.plant.mass)}'
         yield f'<joint name="joint {index + 1}" type="{kind}" axis="{_numbers(joint.axis)}"'
-        yield f' damping="{friction.viscous}" frictionloss="{friction.dry}"/>'
+        rotor = f' armature="{rotors[index]}"' if rotors[index] else ""
+        yield f' damping="{friction.viscous}" frictionloss="{friction.dry}"{rotor}/>'
         if np.linalg.norm(end) > MIN_LINK_LENGTH_M:
             is_last = index == last
             radius, color = (

@@ -19,6 +19,7 @@ from cnpgen.problems.robot_model import (
     RobotModel,
     constraint_values_of,
     inverse_dynamics_of,
+    motor_torque_of,
     tip_pose,
 )
 from cnpgen.schema.argument_types import checked_arguments
@@ -66,6 +67,13 @@ class TensorRobot:
         """Compute joint torques [N m], payload included, shape (N, n)."""
         (torque,) = self._run(inverse_dynamics_of, *self._states(q, dq, ddq))
         return torque.T
+
+    def motor_torque(
+        self, q: torch.Tensor, dq: torch.Tensor, ddq: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Compute the lowest and highest torques at the motors [N m], as ``RobotModel`` does, shape (N, n) each."""
+        low, high = self._run(motor_torque_of, *self._states(q, dq, ddq))
+        return low.T, high.T
 
     def constraint_values(
         self,

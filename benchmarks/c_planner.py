@@ -1,0 +1,184 @@
+"""Planners in C: time per plan as a fraction of ``Planner.plan``, and instructions per plan.
+
+Python and C plan the same boundary problems in turn, in one run and one thread of this
+machine; the clock is the CPU time. C times include the check of every motion, which
+``Planner.plan`` does not have. Instructions are counted by callgrind where valgrind is
+installed: their relative spread over the inputs is (p99 - p1) / median.
+
+    python benchmarks/c_planner.py
+    python benchmarks/c_planner.py --model airhockey-online --options "-O2"
+"""
+
+import argparse
+import shlex
+import shutil
+import subprocess
+import tempfile
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from common import arguments, cpu_of, median, report, table
+
+from cnpgen.addons.deploy.export_planner import planner_files, write_planner
+from cnpgen.kernels.compiler import require_compiler
+from cnpgen.machine.threads import one_thread
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
+from cnpgen.planner.model_file import find_model
+from cnpgen.planner.planner import Planner
+from cnpgen.trajectory.boundary import Boundary
+
+MODELS = ("airhockey-hit", "airhockey-online", "heavy-object")
+PROBLEMS = 200
+INSTRUCTION_PROBLEMS = 40
+DRIVER = r"""
+#define _POSIX_C_SOURCE 200809L
+#include "@.h"
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+static @_memory memory;
+static double now(void) {
+  struct timespec t;
+  clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
+  return 1e6 * (double)t.tv_sec + 1e-3 * (double)t.tv_nsec;
+}
+int main(int count, char **arguments) {
+  @_motion motion;
+  static @_request requests[@COUNT];
+  double numbers[@WIDTH];
+  int n = 0, only = count > 2 ? atoi(arguments[2]) : -1;
+  FILE *file = fopen("requests.bin", "rb");
+  while (file && n < @COUNT && fread(numbers, sizeof numbers, 1, file) == 1)
+    memcpy(&requests[n++], numbers, sizeof numbers);
+  if (only >= 0) return @_plan(&requests[only], &motion, &memory) > 6;
+  for (long i = 0, calls = atol(arguments[1]); i < calls; i++) {
+    double start = now();
+    @_plan(&requests[i % n], &motion, &memory);
+    printf("%.3f\n", now() - start);
+  }
+  return 0;
+}
+"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--model", action="append", help=f"default: {', '.join(MODELS)}"
+    )
+    parser.add_argument("--calls", type=int, default=20_000, help="calls in C")
+    parser.add_argument("--repeat", type=int, default=5, help="repetitions")
+    text = "options of the compiler (default: -O2 -fno-math-errno -fno-trapping-math)"
+    parser.add_argument(
+        "--options", default="-O2 -fno-math-errno -fno-trapping-math", help=text
+    )
+
+
+def build(model: str, folder: Path, boundary: Boundary, options: str) -> Path:
+    """Export and compile a planner and a program that times it; write the requests."""
+    files = planner_files(find_model(model))
+    write_planner(files, folder)
+    name = next(iter(files)).removesuffix(".c")
+    columns = list(boundary.conditions().values())
+    if boundary.parameters is not None:
+        columns.append(boundary.parameters)
+    rows = np.concatenate(columns, axis=1)
+    rows.tofile(folder / "requests.bin")
+    text = DRIVER.replace("@COUNT", str(len(rows))).replace(
+        "@WIDTH", str(rows.shape[1])
+    )
+    (folder / "time.c").write_text(text.replace("@", name))
+    command = [*shlex.split(require_compiler()), "-std=c11", *shlex.split(options)]
+    command += ["time.c", f"{name}.c", "-o", "time", "-lm"]
+    subprocess.run(command, cwd=folder, check=True)
+    return folder / "time"
+
+
+def one_by_one(planner: Planner, boundary: Boundary, rows: range) -> None:
+    for row in rows:
+        conditions = {name: values[row] for name, values in boundary.arrays().items()}
+        planner.plan(**conditions)
+
+
+def spread_of_instructions(program: Path) -> tuple[float | None, float | None]:
+    """Return the median of the instructions of a plan, and their relative spread over problems.
+
+    None if valgrind does not know an instruction of the program.
+    """
+    counts = []
+    for row in range(-1, INSTRUCTION_PROBLEMS):
+        # Row -1 makes no call: its instructions are those of the program around it.
+        calls = ["0"] if row < 0 else ["0", str(row)]
+        out = subprocess.run(
+            ["valgrind", "--tool=callgrind", "--callgrind-out-file=/dev/null", str(program), *calls],
+            cwd=program.parent, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        if "Collected :" not in out.stderr or out.returncode < 0:
+            return None, None
+        counts.append(int(out.stderr.split("Collected :")[1].split()[0]))
+    own = np.array(counts[1:]) - counts[0]
+    low, high = np.percentile(own, [1, 99])
+    return float(np.median(own)), float((high - low) / np.median(own))
+
+
+@one_thread()
+def measure(model: str, folder: Path, given: argparse.Namespace) -> dict[str, Any]:
+    planner = Planner(model)
+    dataset = planner.model.training["dataset"]["name"]
+    boundary = draw_boundary_problems(dataset, PROBLEMS, seed=3).boundary
+    boundary = planner._checked(boundary)
+    program = build(model, folder, boundary, given.options)
+    python, c = [], []
+    one_by_one(planner, boundary, range(20))
+    for _ in range(given.repeat):
+        rows = range(PROBLEMS)
+        python.append(cpu_of(partial(one_by_one, planner, boundary, rows)) / PROBLEMS)
+        lines = subprocess.run(
+            [str(program), str(given.calls // given.repeat)],
+            cwd=folder, capture_output=True, text=True, check=True,
+        ).stdout.split()  # fmt: skip
+        c.append(np.array(lines, float) * 1e-6)
+    every = np.concatenate(c)
+    ratio = median(p / float(np.median(own)) for p, own in zip(python, c, strict=True))
+    result = {
+        "model": model,
+        "Python / C": ratio,
+        "p99 / median": float(np.quantile(every, 0.99) / np.median(every)),
+        "p99.99 / median": float(np.quantile(every, 0.9999) / np.median(every)),
+        "instructions": None,
+        "spread": None,
+    }
+    if shutil.which("valgrind"):
+        result["instructions"], result["spread"] = spread_of_instructions(program)
+    return result
+
+
+def main() -> None:
+    given = arguments(__doc__, add_options)
+    results = []
+    for model in given.model or MODELS:
+        with tempfile.TemporaryDirectory() as folder:
+            results.append(measure(model, Path(folder), given))
+    head, *rows = show(results)
+    report(
+        {"options": given.options, "c_planner": results},
+        [table(f"planners in C, {given.options}", head, rows)],
+        as_json=given.json,
+    )
+
+
+def show(results: list[dict[str, Any]]) -> list[list[str]]:
+    """Return the head and the rows of the table."""
+    rows = [list(results[0])]
+    for result in results:
+        count, spread = result["instructions"], result["spread"]
+        numbers = [f"{result[name]:.1f}" for name in list(result)[1:4]]
+        counted = ["-", "-"] if count is None else [f"{count:,.0f}", f"{spread:.1%}"]
+        rows.append([result["model"], *numbers, *counted])
+    return rows
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,289 @@
+"""Plans with drives: torques by two independent judges, duration and CPU time against the rigid problem in one run.
+
+Boundary problems of both shipped pipelines with drives are solved with [drive] and without it. Both sets of plans are
+judged at 2,001 phases by Pinocchio's inverse dynamics with rotors, viscous friction and the exact sign of dry friction,
+and by MuJoCo's inverse dynamics with armature and damping (its dry friction is a soft constraint whose sign is wrong near
+a reversal, so it is added as c sign(dq)). A plan exceeds a limit above 1.005 of it, the tolerance of the problems. Columns
+"motor" count motor torques with the exact law, "no friction" those without friction, "joint" torques at the joint.
+Another plant has a Stribeck law and parameters that are 30 % larger. The CPU time of solving is that of calls in
+alternation, with compiled kernels.
+
+    python benchmarks/drives.py
+    python benchmarks/drives.py --problems 300 --repeat 5
+"""
+
+import argparse
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from common import arguments, cpu_of, median, progress, report, table
+from scipy.spatial.transform import Rotation
+
+import cnpgen
+from cnpgen.kernels.library import choose_backend, problem_kernels
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
+from cnpgen.planner.time_parametrization import make_time_parametrization
+from cnpgen.plans.plans import Plans
+from cnpgen.problems.problem_record import ProblemRecord, open_problem
+from cnpgen.refine.refine_plans import solve_plans
+from cnpgen.robots.drive import Drive
+from cnpgen.robots.robot import Robot
+
+PIPELINES = ("heavy-object-drive", "panda-scenes-drive")
+PHASES = 2001  # of every plan
+TOLERANCE = 1.005  # of a limit
+STRIBECK_RATIO, STRIBECK_SPEED = 1.5, 0.1  # breakaway / dry friction; rad/s
+PARAMETER_ERROR = 1.3  # factor of rotors and friction of the other plant
+MOTIONS, CALLS, SLOWER = 512, 9, 0.8  # of the time parametrization; factor of rates
+MOVING = 1e-9  # rad/s, above which dry friction has a direction
+
+
+@dataclass(frozen=True)
+class States:
+    """States of all plans, shape (N, K, n) each."""
+
+    q: np.ndarray
+    dq: np.ndarray
+    ddq: np.ndarray
+    duration: np.ndarray  # shape (N,)
+
+
+def states_of(plans: Plans) -> States:
+    """Evaluate plans at equidistant times."""
+    rows = [
+        plans.states_at(share * plans.duration) for share in np.linspace(0, 1, PHASES)
+    ]
+    q, dq, ddq = (np.stack(each, axis=1) for each in zip(*rows, strict=True))
+    return States(q, dq, ddq, plans.duration)
+
+
+def pinocchio_torque(robot: Robot, armature: np.ndarray) -> Callable[..., np.ndarray]:
+    """Return Pinocchio's inverse dynamics with rotors."""
+    import pinocchio as pin
+
+    model = robot.model.copy()
+    model.armature = armature.copy()
+    data = model.createData()
+    return lambda q, dq, ddq: pin.rnea(model, data, q, dq, ddq).copy()
+
+
+def mujoco_torque(robot: Robot, drive: Drive) -> Callable[..., np.ndarray]:
+    """Return MuJoCo's inverse dynamics with armature and damping, which does not share code with Pinocchio."""
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_string(_mjcf(robot, drive))
+    data = mujoco.MjData(model)
+
+    def torque(q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
+        data.qpos[:], data.qvel[:], data.qacc[:] = q, dq, ddq
+        mujoco.mj_inverse(model, data)
+        return np.array(data.qfrc_inverse)
+
+    return torque
+
+
+def _mjcf(robot: Robot, drive: Drive) -> str:
+    """Write the chain of a robot with its drives as MJCF."""
+
+    def text(values: Any) -> str:
+        return " ".join(repr(float(value)) for value in np.ravel(values))
+
+    parts = ['<mujoco><compiler angle="radian" autolimits="true"/>']
+    parts.append(f'<option gravity="{text(robot.chain.gravity)}"/><worldbody>')
+    for joint, rotor, damping in zip(
+        robot.chain.joints, drive.armature, drive.viscous, strict=True
+    ):
+        x, y, z, w = Rotation.from_matrix(joint.rotation).as_quat()
+        tensor = joint.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+        parts.append(
+            f'<body pos="{text(joint.translation)}" quat="{text([w, x, y, z])}">'
+            f'<inertial pos="{text(joint.com)}" mass="{joint.mass!r}" fullinertia="{text(tensor)}"/>'
+            f'<joint axis="{text(joint.axis)}" armature="{rotor}" damping="{damping}"/>'
+        )
+    return "".join([*parts, "</body>" * robot.n, "</worldbody></mujoco>"])
+
+
+def along(torque: Callable[..., np.ndarray], states: States) -> np.ndarray:
+    """Evaluate torques of all states, shape (N, K, n)."""
+    out = np.empty_like(states.q)
+    for index in np.ndindex(out.shape[:2]):
+        out[index] = torque(states.q[index], states.dq[index], states.ddq[index])
+    return out
+
+
+def exceeding(torque: np.ndarray, limit: np.ndarray) -> dict[str, Any]:
+    """Count the plans above the tolerance of a limit, and return the largest ratio."""
+    ratio = (np.abs(torque) / limit).max(axis=(1, 2))
+    return {"plans": int((ratio > TOLERANCE).sum()), "largest": float(ratio.max())}
+
+
+def judge(plans: Plans, drive: Drive, robot: Robot) -> dict[str, Any]:
+    """Count the plans whose torques exceed a limit, by both judges and on another plant."""
+    states = states_of(plans)
+    sign = np.sign(states.dq) * (np.abs(states.dq) > MOVING)
+    b, c, limit = drive.viscous, drive.coulomb, drive.torque_limit
+    rotors = along(pinocchio_torque(robot, drive.armature), states)
+    smooth = rotors + b * states.dq
+    other = along(mujoco_torque(robot, drive), states)
+    joint = rotors - drive.armature * states.ddq
+    stribeck = 1 + (STRIBECK_RATIO - 1) * np.exp(-np.abs(states.dq) / STRIBECK_SPEED)
+    worse = joint + PARAMETER_ERROR * (
+        drive.armature * states.ddq + b * states.dq + c * sign * stribeck
+    )
+    rate = np.diff(smooth, axis=1) / (states.duration[:, None, None] / (PHASES - 1))
+    return {
+        "motor": exceeding(smooth + c * sign, limit),
+        "motor, MuJoCo": exceeding(other + c * sign, limit),
+        "no friction": exceeding(rotors, limit),
+        "joint": exceeding(joint, robot.torque_limit),
+        "other plant": exceeding(worse, limit),
+        "difference of judges [N m]": float(np.abs(other - smooth).max()),
+        "torque rate [N m/s]": np.abs(rate).max(axis=(0, 1)).round(1).tolist(),
+    }
+
+
+def without_drive(problems: Plans) -> Plans:
+    """Return the same boundary problems of the rigid robot."""
+    record = problems.problem
+    content = {key: value for key, value in record.content.items() if key != "drive"}
+    rigid = ProblemRecord(json.dumps(content, ensure_ascii=False), record.urdf)
+    return replace(problems, problem=rigid)
+
+
+def parametrization_us(solved: dict[str, Plans]) -> dict[str, float] | None:
+    """Return the CPU time of the time parametrization of one motion [us]; None if the problem bounds the jerk."""
+    problems = {key: open_problem(plans.problem) for key, plans in solved.items()}
+    if any(problem.uses_jerk for problem, _ in problems.values()):
+        return None
+    backend = choose_backend(None)
+    parametrizations = {
+        key: make_time_parametrization(
+            problem, robot, problem_kernels(problem, robot, *backend), at_rest=True
+        )
+        for key, (problem, robot) in problems.items()
+    }
+    plans = solved["drives"]
+    motion = plans.motion[np.resize(np.arange(len(plans)), MOTIONS)]
+    motion = replace(motion, rate=SLOWER * motion.rate)
+    poses = np.resize(plans.scene.poses, (MOTIONS, plans.scene.poses.shape[1]))
+    times: dict[str, list[float]] = {key: [] for key in solved}
+    for _ in range(CALLS):
+        for key, each in parametrizations.items():
+            times[key].append(cpu_of(partial(each.parametrize, motion, poses)))
+    return {key: 1e6 * median(values) / MOTIONS for key, values in times.items()}
+
+
+def measure(name: str, options: argparse.Namespace) -> dict[str, Any]:
+    """Solve the problems of a pipeline with and without drives, and judge both."""
+    progress(f"{name}: {options.problems} problems")
+    problems = draw_boundary_problems(name, options.problems, seed=options.seed)
+    _, robot = open_problem(problems.problem)
+    assert robot.drive is not None
+    sets = {"rigid": without_drive(problems), "drives": problems}
+    solved = {key: solve_plans(each, workers=1).plans for key, each in sets.items()}
+    cpu: dict[str, list[float]] = {key: [] for key in sets}
+    for _ in range(options.repeat):
+        for key, each in sets.items():
+            cpu[key].append(cpu_of(partial(solve_plans, each, workers=1)))
+    valid = {
+        key: cnpgen.evaluate_plans(each, workers=1).valid
+        for key, each in solved.items()
+    }
+    both = valid["rigid"] & valid["drives"]
+    ratios = solved["drives"].duration[both] / solved["rigid"].duration[both]
+    return {
+        "problems": len(problems),
+        "valid": {key: int(each.sum()) for key, each in valid.items()},
+        "duration ratio": {
+            "mean": float(
+                solved["drives"].duration[both].mean()
+                / solved["rigid"].duration[both].mean()
+            ),
+            "median": float(np.median(ratios)),
+            "largest": float(ratios.max()),
+        },
+        "CPU ratio": median(cpu["drives"]) / median(cpu["rigid"]),
+        "CPU [s]": cpu,
+        "time parametrization [us]": parametrization_us(solved),
+        **{
+            key: judge(each[np.flatnonzero(valid[key])], robot.drive, robot)
+            for key, each in solved.items()
+        },
+    }
+
+
+def tables(results: dict[str, dict[str, Any]]) -> list[str]:
+    """Format the results."""
+    counted = ("motor", "motor, MuJoCo", "no friction", "joint", "other plant")
+    head = ["problem", "plans", "valid", *counted]
+    rows = [
+        [name, key, f"{found['valid'][key]} of {found['problems']}"]
+        + [
+            f"{found[key][c]['plans']} ({found[key][c]['largest']:.3f})"
+            for c in counted
+        ]
+        for name, found in results.items()
+        for key in ("rigid", "drives")
+    ]
+    second = [
+        [
+            name,
+            *(
+                f"{found['duration ratio'][c]:.4f}"
+                for c in ("mean", "median", "largest")
+            ),
+            f"{found['CPU ratio']:.2f}",
+            _fitting(found["time parametrization [us]"]),
+            f"{found['drives']['difference of judges [N m]']:.1e}",
+        ]
+        for name, found in results.items()
+    ]
+    rates = [
+        [
+            name,
+            ", ".join(f"{rate:g}" for rate in found["drives"]["torque rate [N m/s]"]),
+        ]
+        for name, found in results.items()
+    ]
+    title = "plans above 1.005 of a limit (largest torque / limit)"
+    ratio = [
+        *("problem", "duration: mean", "median", "largest", "CPU of solving"),
+        *("time parametrization [us]", "judges differ [N m]"),
+    ]
+    return [
+        table(title, head, rows, left=2),
+        table("with drives / rigid", ratio, second),
+        table(
+            "largest rate of motor torques by joint [N m/s]",
+            ["problem", "rates"],
+            rates,
+            left=2,
+        ),
+    ]
+
+
+def _fitting(times: dict[str, float] | None) -> str:
+    """Format the times of the time parametrization."""
+    return "-" if times is None else f"{times['drives']:.0f} / {times['rigid']:.0f}"
+
+
+def main() -> None:
+    """Print the figures."""
+
+    def add(parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("--problems", type=int, default=40)
+        parser.add_argument("--seed", type=int, default=11)
+        parser.add_argument("--repeat", type=int, default=3, help="timed calls of each")
+        parser.add_argument("--sets", nargs="+", choices=PIPELINES, default=PIPELINES)
+
+    options = arguments(__doc__, add)
+    results = {name: measure(name, options) for name in options.sets}
+    report(results, tables(results), as_json=options.json)
+
+
+if __name__ == "__main__":
+    main()

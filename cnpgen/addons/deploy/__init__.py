@@ -1,0 +1,1 @@
+"""Planners as files for robots: a trained model becomes one C file without dependencies."""

@@ -1,0 +1,170 @@
+"""Admission of plans: a plan is executed only if it is valid and ends at rest without an acceleration."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cnpgen.addons.online.motion_check import MotionChecker
+from cnpgen.addons.online.plan_hits import PlannedHits
+from cnpgen.addons.online.set_points import SampledMotion, SetPoint, sample_motion
+from cnpgen.addons.online.stops import settled
+from cnpgen.addons.online.switches import SwitchOutcome
+from cnpgen.errors import UsageError
+from cnpgen.planner.planner import Planner
+from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.plans.join import JoinedPlans
+from cnpgen.plans.plans import Plans
+from cnpgen.schema.arguments import numbers
+
+Array = NDArray[np.float64]
+Executable = Plans | JoinedPlans | PlannedHits
+
+MAX_SWITCH_GAPS = (
+    1e-6,
+    1e-5,
+    1e-3,
+)  # of q [rad]; of dq and ddq as fractions of the limits
+MAX_END_SPEED = 1e-6  # fraction of the velocity limits: a plan ends at rest
+MAX_END_ACCELERATION = 1e-3  # fraction of the limits: larger ones are reduced to zero
+
+
+class Admission:
+    """Rules by which a runtime accepts the plans of one robot.
+
+    Args:
+        planner: A planner of the robot; its problem defines the limits.
+        judge: Whether plans are judged.
+        parameters: Parameters of the problem, shape (width,); nominal by default.
+        checker: Memory of measurements.
+    """
+
+    def __init__(
+        self,
+        planner: Planner,
+        parameters: ArrayLike | None,
+        *,
+        judge: bool,
+        checker: MotionChecker,
+    ) -> None:
+        self._planner, self._judge, self._checker = planner, judge, checker
+        self._parameters = _checked_parameters(planner, parameters)
+
+    def refusal_or_motion(
+        self, plan: Plans | JoinedPlans, at: float
+    ) -> tuple[SwitchOutcome | SampledMotion, str]:
+        """Return the motion of a plan that starts at a time [s], or the reason to refuse it, each with a text.
+
+        Raises:
+            UsageError: There are several plans, or they are of another robot.
+        """
+        self._check_plan(plan)
+        return self._find_reason(plan) or self._settled(plan, at)
+
+    def _settled(
+        self, plan: Plans | JoinedPlans, at: float
+    ) -> tuple[SwitchOutcome | SampledMotion, str]:
+        """Return the motion of a plan, slower at its end if it would end with an acceleration, and a text about it."""
+        motion = sample_motion(plan, at)
+        acceleration = plan.motion.at_times(plan.duration[:, None]).ddq[0, 0]
+        share = np.abs(acceleration / self._planner.robot.acceleration_limit).max()
+        if share <= MAX_END_ACCELERATION:
+            return motion, ""
+        text = f"it ends with {share:.3g} of the acceleration limit"
+        slower = settled(self._checker, motion, measured=self._judge)
+        if slower is None:
+            return SwitchOutcome.ACCELERATING if self._judge else motion, text
+        added = slower.end_time - motion.end_time
+        return slower, f"{text}, which falls to 0 in {added:.3g} s more"
+
+    def _check_plan(self, plan: Plans | JoinedPlans) -> None:
+        """Raise an error for several plans and for plans of another robot."""
+        if len(plan) != 1:
+            raise UsageError(
+                f"must be one plan or one sequence, got {len(plan)}", argument="plan"
+            )
+        names = self._planner.model.problem.joint_names
+        if plan.problem.joint_names != names:
+            raise UsageError(
+                f"the plan is of {plan.problem.name!r} with other joints than {names}",
+                concerns="plan",
+            )
+
+    def _find_reason(
+        self, plan: Plans | JoinedPlans
+    ) -> tuple[SwitchOutcome, str] | None:
+        """Return the reason why a plan must not be executed at any time.
+
+        None if there is none.
+        """
+        parts: tuple[Any, ...] = (
+            plan.parts if isinstance(plan, JoinedPlans) else (plan,)
+        )
+        for part in parts:
+            own, expected = part.boundary.parameters, self._parameters
+            if (
+                own is not None
+                and expected is not None
+                and not np.array_equal(own[0], expected)
+            ):
+                return (
+                    SwitchOutcome.INVALID,
+                    f"its parameters are {own[0]}, those of the runtime {expected}",
+                )
+        duration = plan.duration
+        if not np.isfinite(duration).all():
+            return SwitchOutcome.INVALID, "its duration is not finite"
+        speed = np.abs(plan.motion.at_times(duration[:, None]).dq[0, 0])
+        if (speed > MAX_END_SPEED * self._planner.robot.velocity_limit).any():
+            return SwitchOutcome.MOVING, f"up to {speed.max():.3g} rad/s"
+        for part in parts if self._judge else ():
+            (verdict,) = evaluate_plans(part).verdicts
+            if not verdict.valid:
+                return SwitchOutcome.INVALID, str(verdict)
+        return None
+
+    def jump(self, before: SetPoint, motion: SampledMotion) -> str:
+        """Describe the discontinuity between a state and the start of a motion; empty if there is none."""
+        robot = self._planner.robot
+        after = motion.at(np.array([motion.start]))
+        limits = (np.ones(robot.n), robot.velocity_limit, robot.acceleration_limit)
+        for name, end, begin, limit, share in zip(
+            SetPoint._fields, before, after, limits, MAX_SWITCH_GAPS, strict=True
+        ):
+            gap = np.abs(begin[0] - end)
+            if not (gap <= share * limit).all():
+                return f"{name} jumps by {gap.max():.3g}"
+        return ""
+
+
+def plan_of_request(
+    plan: Executable | None,
+) -> tuple[Plans | JoinedPlans | None, str]:
+    """Return the plan or sequence of a request, or None and the reason why there is none."""
+    if not isinstance(plan, PlannedHits):
+        return (plan, "") if plan is None or len(plan) else (None, "it has 0 plans")
+    hits = plan
+    if len(hits.reasons) != 1:
+        raise UsageError(f"must be one hit, got {len(hits.reasons)}", argument="plan")
+    if not len(hits.plans):
+        return None, hits.reasons[0]
+    return hits.plans if hits.return_plans is None else hits.sequences, ""
+
+
+def _checked_parameters(planner: Planner, parameters: ArrayLike | None) -> Array | None:
+    """Return the parameters of all plans, shape (width,).
+
+    None if the problem has none.
+    """
+    ranges = planner.model.problem.parameters
+    if parameters is None:
+        return planner.robot.nominal_parameters if ranges else None
+    rows = ranges.checked(numbers("parameters", parameters))
+    if len(rows) != 1:
+        raise UsageError(
+            f"must have shape ({len(ranges)},), got {np.shape(parameters)}",
+            argument="parameters",
+        )
+    return np.asarray(rows[0])

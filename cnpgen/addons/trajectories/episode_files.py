@@ -1,0 +1,277 @@
+"""Episodes of recorded data: folders of LeRobot v3, HDF5 files of robomimic and Minari, and folders of CSV files."""
+
+import json
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.addons.trajectories.trajectory_tables import (
+    LEROBOT_INFO,
+    read_parquet,
+    read_trajectory_tables,
+)
+from cnpgen.errors import UsageError, listed
+from cnpgen.store.files.atomic import read_file
+from cnpgen.store.files.documents import parse_json
+from cnpgen.store.files.kind import HDF5_SUFFIXES
+from cnpgen.store.files.size_limits import MAX_TABLE_BYTES
+
+Array = NDArray[np.float64]
+
+STATE, ACTION = "observation.state", "action"
+ROBOMIMIC_KEY = "obs/robot0_joint_pos"
+NOMINAL_TOLERANCE = 1e-3  # of a period, of times that are a grid
+TIME_COLUMNS = ("t", "time", "timestamp", "time_from_start")
+LEROBOT_HOME = "HF_LEROBOT_HOME"
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One recorded episode.
+
+    Attributes:
+        name: Number or name of the episode.
+        t: Times [s], shape (K,).
+        state: Measured values, shape (K, w).
+        action: Commanded values, shape (K, v), or None.
+        names: Names of the measured values.
+        frame: Index of every frame, shape (K,).
+        length: Number of frames that the description states, or None.
+    """
+
+    name: str
+    t: Array
+    state: Array
+    action: Array | None
+    names: tuple[str, ...]
+    frame: NDArray[np.int64]
+    length: int | None = None
+
+    @property
+    def is_nominal(self) -> bool:
+        """Whether the times are a grid, such as frame index / fps: no clock was recorded."""
+        steps = np.diff(self.t)
+        if not len(steps) or not np.isfinite(steps).all():
+            return True
+        period = float(np.median(steps))
+        return bool((np.abs(steps - period) <= NOMINAL_TOLERANCE * abs(period)).all())
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Episodes of a path, and what its description states.
+
+    Attributes:
+        episodes: The episodes.
+        robot: Type of the robot; empty if not stated. kind: "lerobot", "hdf5" or "csv".
+    """
+
+    episodes: tuple[Episode, ...]
+    robot: str
+    kind: str
+
+
+def read_recording(
+    path: str, *, key: str | None = None, rate: float | None = None
+) -> Recording:
+    """Read all episodes of a path, or of USER/NAME in LeRobot's home.
+
+    Args:
+        path: Folder or file.
+        key: Name of the positions in an HDF5 file.
+        rate: Frames per second [Hz] of a file without times.
+
+    Raises: UsageError: The path is missing, damaged or of an unknown format.
+    """
+    folder = Path(path)
+    if not folder.exists():
+        home = os.environ.get(LEROBOT_HOME, "~/.cache/huggingface/lerobot")
+        folder = Path(home).expanduser() / path
+    if not folder.exists():
+        text = f"{path} is not there, neither as a path nor in {folder.parent}"
+        raise UsageError(text, argument="path")
+    if (folder / LEROBOT_INFO).is_file():
+        return _read_lerobot(folder)
+    if folder.is_file() and folder.suffix.lower() in HDF5_SUFFIXES:
+        return _read_hdf5(folder, key, rate)
+    return _read_tables(folder, rate)
+
+
+def _read_lerobot(folder: Path) -> Recording:
+    """Read a dataset of LeRobot v3."""
+    try:
+        content = read_file(folder / LEROBOT_INFO, max_bytes=MAX_TABLE_BYTES)
+        info = parse_json(content.decode())
+        version, features = str(info["codebase_version"]), info["features"]
+        names = _feature_names(features[STATE])
+        robot = str(info.get("robot_type") or "")
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        text = (
+            f"{folder / LEROBOT_INFO} does not describe measured states: {error!r:.200}"
+        )
+        raise UsageError(text, argument="path") from error
+    if not version.startswith("v3"):
+        text = f"{folder} has LeRobot's format {version}, expected v3.0"
+        raise UsageError(text, argument="path")
+    lengths = _stated_lengths(folder)
+    episodes = []
+    for file in sorted(folder.glob("data/*/*.parquet")):
+        table = read_parquet(file)
+        for name in ("timestamp", "episode_index", "frame_index", STATE):
+            if name not in table.column_names:
+                raise UsageError(
+                    f"{file}: there is no column {name!r}", argument="path"
+                )
+        number = _column(table, "episode_index", file, 1)[:, 0]
+        t = _column(table, "timestamp", file, 1)[:, 0]
+        frame = _column(table, "frame_index", file, 1)[:, 0].astype(np.int64)
+        state = _column(table, STATE, file, len(names))
+        action = None
+        if ACTION in table.column_names:
+            width = len(_feature_names(features.get(ACTION, {"shape": [len(names)]})))
+            action = _column(table, ACTION, file, width)
+        for index in dict.fromkeys(number.tolist()):
+            rows = number == index
+            part = None if action is None else action[rows]
+            length = lengths.get(int(index))
+            episodes.append(
+                Episode(
+                    f"{index:g}", t[rows], state[rows], part, names, frame[rows], length
+                )
+            )
+    if not episodes:
+        raise UsageError(f"{folder} holds no episodes", argument="path")
+    return Recording(tuple(episodes), robot, "lerobot")
+
+
+def _stated_lengths(folder: Path) -> dict[int, int]:
+    """Return the stated numbers of frames by episode."""
+    found: dict[int, int] = {}
+    for file in sorted(folder.glob("meta/episodes/*/*.parquet")):
+        table = read_parquet(file)
+        if {"episode_index", "length"} <= set(table.column_names):
+            columns = (
+                table.column(name).to_pylist() for name in ("episode_index", "length")
+            )
+            found |= dict(zip(*columns, strict=True))
+    return found
+
+
+def _feature_names(feature: Any) -> tuple[str, ...]:
+    """Return the names of a feature's values: a list, a list in an object, or indices."""
+    width, names = int(feature["shape"][0]), feature.get("names")
+    if isinstance(names, dict):
+        names = next(iter(names.values()))
+    if not isinstance(names, list) or len(names) != width:
+        names = range(width)
+    return tuple(map(str, names))
+
+
+def _column(table: Any, name: str, file: Path, width: int) -> Array:
+    """Return a column of numbers, shape (rows, width)."""
+    try:
+        values = np.array(table.column(name).to_pylist(), float)
+        return values.reshape(table.num_rows, width)
+    except (TypeError, ValueError) as error:
+        text = f"{file}: column {name!r}: expected {width} numbers per row"
+        raise UsageError(text, argument="path") from error
+
+
+def _read_hdf5(path: Path, key: str | None, rate: float | None) -> Recording:
+    """Read the episodes of robomimic, ``data/demo_0/obs/...``, or Minari, ``episode_0/observations``."""
+    import h5py
+
+    try:
+        with h5py.File(path) as file:
+            robomimic = "data" in file
+            root = file["data"] if robomimic else file
+            key = key or (ROBOMIMIC_KEY if robomimic else "observations")
+            if rate is None and robomimic:
+                rate = _control_rate(root.attrs.get("env_args", "{}"))
+            if rate is None:
+                raise UsageError(
+                    f"{path} has no times: state {{rate}}", remedies={"rate": 30}
+                )
+            episodes = tuple(_hdf5_episodes(path, root, key, rate))
+    except (OSError, KeyError) as error:
+        text = f"{path} is not a file of episodes, or is damaged: {error!s:.200}"
+        raise UsageError(text, argument="path") from error
+    if not episodes:
+        raise UsageError(f"{path} holds no episodes", argument="path")
+    return Recording(episodes, "", "hdf5")
+
+
+def _hdf5_episodes(path: Path, root: Any, key: str, rate: float) -> Iterator[Episode]:
+    """Yield the episodes of a group in the order of their numbers."""
+    groups = [name for name in root if hasattr(root[name], "keys")]
+    for name in sorted(groups, key=lambda text: (len(text), text)):
+        group = root[name]
+        if key not in group or not hasattr(group[key], "shape"):
+            found: list[str] = []
+            group.visititems(
+                lambda item, value, found=found: (
+                    found.append(item) if hasattr(value, "shape") else None
+                )
+            )
+            text = f"{path}: {name} has no array {key!r}, only {listed(found, 12)}"
+            raise UsageError(f"{text}: state {{key}}", remedies={"key": found[:1]})
+        state = np.asarray(group[key], float)
+        if state.ndim != 2:
+            text = f"{path}: {name}/{key} must have two dimensions, got {state.shape}"
+            raise UsageError(text, argument="path")
+        frame = np.arange(len(state))
+        names = tuple(map(str, range(state.shape[1])))
+        yield Episode(name, frame / rate, state, None, names, frame)
+
+
+def _control_rate(text: str | bytes) -> float | None:
+    """Return the control frequency that robomimic's description of the environment states [Hz]."""
+    try:
+        found = json.loads(text)["env_kwargs"]["control_freq"]
+        return float(found) if float(found) > 0 else None
+    except (ValueError, KeyError, TypeError):
+        return None
+
+
+def _read_tables(path: Path, rate: float | None) -> Recording:
+    """Read one episode of each table, such as the CSV files of a folder."""
+    episodes = []
+    for table in read_trajectory_tables(path):
+        columns = {
+            name: values.astype(float)
+            for name, values in table.columns.items()
+            if values.ndim == 1 and values.dtype.kind in "biuf"
+        }
+        times = [name for name in columns if name.split(" ")[0].lower() in TIME_COLUMNS]
+        names = tuple(name for name in columns if name not in times)
+        if not names:
+            raise UsageError(
+                f"{table.place} has no columns of numbers", argument="path"
+            )
+        state = np.stack([columns[name] for name in names], axis=1)
+        frame = np.arange(len(state))
+        if not times and rate is None:
+            text = f"{table.place} has no times: state {{rate}}"
+            raise UsageError(text, remedies={"rate": 30})
+        t = columns[times[0]] if times else frame / (rate or 1.0)
+        episodes.append(Episode(Path(table.place).name, t, state, None, names, frame))
+    return Recording(tuple(episodes), "", "csv")
+
+
+def chosen(recording: Recording, episodes: Sequence[int] | None) -> tuple[Episode, ...]:
+    """Return the episodes of some numbers, all by default; raise UsageError for a missing one."""
+    if episodes is None:
+        return recording.episodes
+    by_name = {episode.name: episode for episode in recording.episodes}
+    numbered = dict(enumerate(recording.episodes))
+    found = [by_name.get(str(k)) or numbered.get(k) for k in episodes]
+    missing = [k for k, episode in zip(episodes, found, strict=True) if episode is None]
+    if missing:
+        text = f"there is no episode {missing[0]}: {len(recording.episodes)} are numbered from 0"
+        raise UsageError(text, argument="episodes")
+    return tuple(episode for episode in found if episode is not None)

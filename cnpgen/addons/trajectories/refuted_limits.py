@@ -1,0 +1,147 @@
+"""Joint limits that no curve through samples meets: lower bounds of derivatives outside the limits of a problem.
+
+The limits are those of the problem's constraints. A limit is refuted if the mean of its
+quantity (``lower_bounds``) exceeds it by more than the tolerance. The bound itself is
+the number that is reported: no curve has less.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.addons.trajectories.lower_bounds import (
+    MeanDerivatives,
+    first_derivatives,
+    second_derivatives,
+    second_derivatives_with_velocities,
+    third_derivatives,
+    value_intervals,
+)
+from cnpgen.addons.trajectories.sample_errors import SampleErrors
+from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.judges.plans.joint_limits import ProvenJointLimits, quantity_of
+from cnpgen.judges.plans.verdict import Margin
+
+Array = NDArray[np.float64]
+
+MIN_VIOLATION = 1.001  # in tolerances: rounding of the bounds proves nothing
+POSITIONS, VELOCITIES, BOTH = "positions", "velocities", "positions and velocities"
+_ORDERS = ("q", "dq", "ddq", "jerk")
+
+
+@dataclass(frozen=True)
+class RefutedLimit:
+    """A joint limit that no curve through the samples meets.
+
+    Attributes:
+        margin: The bound as value of the limit, with joint and time.
+        samples: Columns that prove it.
+        condition: Condition under which it holds, such as that another limit is met;
+            empty without one.
+    """
+
+    margin: Margin
+    samples: str
+    condition: str = ""
+
+    @property
+    def detail(self) -> str:
+        """The bound with its place, for the output."""
+        return bound_text(self.margin, self.condition)
+
+
+def bound_text(margin: Margin, condition: str = "") -> str:
+    """Format a lower bound: ``at least 360 rad/s^2 at 0.50 s, joint 1 (limit 12)``."""
+    word = "at least" if margin.value >= margin.bound else "at most"
+    value = f"{word} {margin.value:.4g} {margin.unit} at {margin.time:.2f} s"
+    text = f"{value}, {margin.part} (limit {margin.bound:.4g})"
+    return f"{text}, unless {condition}" if condition else text
+
+
+def refuted_limits(
+    limits: ProvenJointLimits, trajectory: Trajectory, errors: SampleErrors
+) -> list[RefutedLimit]:
+    """Return the joint limits that no curve through samples within their errors meets, worst first."""
+    found: dict[int, tuple[float, RefutedLimit]] = {}
+    largest = largest_values(limits)
+    for order, samples, condition, bounds in _bounds(trajectory, errors, largest):
+        for limit, constraint in enumerate(limits.constraints):
+            if quantity_of(constraint) != _ORDERS[order]:
+                continue
+            excess, margin = _worst(limits, limit, bounds, trajectory.duration)
+            if excess > found.get(limit, (MIN_VIOLATION,))[0]:
+                found[limit] = excess, RefutedLimit(margin, samples, condition)
+    ordered = sorted(found.values(), key=lambda item: -item[0])
+    return [refuted for _, refuted in ordered]
+
+
+def largest_values(limits: ProvenJointLimits) -> dict[str, Array]:
+    """Return the largest absolute values within the limits and tolerances, by quantity, shape (n,) each; inf without."""
+    n = len(limits.joints)
+    largest = {order: np.full(n, np.inf) for order in _ORDERS}
+    for constraint, bounds, tolerance in zip(
+        limits.constraints, limits.bounds, limits.tolerance, strict=True
+    ):
+        name = quantity_of(constraint)
+        allowed = np.maximum(-bounds[:n], bounds[n:]) + tolerance
+        largest[name] = np.minimum(largest[name], allowed)
+    return largest
+
+
+def _worst(
+    limits: ProvenJointLimits, limit: int, bounds: MeanDerivatives, duration: float
+) -> tuple[float, Margin]:
+    """Return the largest relative violation of a limit by bounds, and its margin."""
+    # A supremum above ``low`` violates upper limits, an infimum below ``high`` lower ones.
+    values = np.concatenate([bounds.high, bounds.low], axis=1)
+    with np.errstate(invalid="ignore", over="ignore"):
+        relative = (values - limits.bounds[limit]) / limits.scale[limit]
+    relative = np.where(np.isfinite(relative), relative, -np.inf)
+    k, row = np.unravel_index(int(relative.argmax()), relative.shape)
+    time = float(bounds.t[k])
+    maximum = float(relative[k, row]), int(row), time / duration
+    return maximum[0], limits.margin_at(limit, maximum, time)
+
+
+def _bounds(
+    trajectory: Trajectory, errors: SampleErrors, largest: dict[str, Array]
+) -> Iterator[tuple[int, str, str, MeanDerivatives]]:
+    """Yield all bounds: order of the derivative, columns, condition, and the bounds of a distance."""
+    t, q, dq, ddq = trajectory.t, trajectory.q, trajectory.dq, trajectory.ddq
+    # Under a limit V, a time within d moves a position by at most V d.
+    moved = [
+        float((largest[name] * errors.t).max()) if errors.t else 0.0
+        for name in ("dq", "ddq")
+    ]
+    conditions = [
+        f"a {name} limit is exceeded" if errors.t else ""
+        for name in ("velocity", "velocity or acceleration")
+    ]
+    # A position is reached at some time, whatever the jitter.
+    yield from _each(0, POSITIONS, "", value_intervals(t, q, errors.q))
+    if np.isfinite(moved[0]):
+        jerks = third_derivatives(t, q, errors.q + moved[0])
+        yield from _each(3, POSITIONS, conditions[0], jerks)
+    yield from _each(1, POSITIONS, "", first_derivatives(t, q, errors.q, errors.t))
+    yield from _each(2, POSITIONS, "", second_derivatives(t, q, errors.q, errors.t))
+    if dq is None:
+        return
+    yield from _each(1, VELOCITIES, "", value_intervals(t, dq, errors.dq))
+    yield from _each(2, VELOCITIES, "", first_derivatives(t, dq, errors.dq, errors.t))
+    yield from _each(3, VELOCITIES, "", second_derivatives(t, dq, errors.dq, errors.t))
+    if np.isfinite(moved).all():
+        of_both = errors.q + moved[0], errors.dq + moved[1]
+        both = second_derivatives_with_velocities(t, q, dq, of_both)
+        yield from _each(2, BOTH, conditions[1], both)
+    if ddq is not None:
+        yield from _each(2, "accelerations", "", value_intervals(t, ddq, errors.ddq))
+        rates = first_derivatives(t, ddq, errors.ddq, errors.t)
+        yield from _each(3, "accelerations", "", rates)
+
+
+def _each(
+    order: int, samples: str, condition: str, found: Iterator[MeanDerivatives]
+) -> Iterator[tuple[int, str, str, MeanDerivatives]]:
+    return ((order, samples, condition, bounds) for bounds in found)

@@ -1,0 +1,194 @@
+"""A smooth curve within the errors of all samples: if the independent judge accepts it, a valid motion exists.
+
+The curve is a quintic spline with knots at the samples, one for each column of data
+(positions; velocities; accelerations). Of all splines it minimizes the squared
+differences from the samples plus a weight times the integral of the squared jerk
+(Reinsch 1967). The normal equations are banded; all joints share a factorization. The
+largest weight that keeps a joint within its errors is chosen for each joint.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.addons.trajectories.curve_family import CurveFamily
+from cnpgen.addons.trajectories.interpolate import data_of, family_of_data
+from cnpgen.addons.trajectories.sample_errors import SampleErrors
+from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+DEGREE = 5
+MIN_ERRORS = np.array([1e-9, 1e-7, 1e-5])  # of q, dq, ddq: agreement with exact samples
+EXPONENTS = np.arange(
+    6.0, -15.0, -1.0
+)  # of the weight of the jerk, with a span as unit
+REFINED = 0.5  # of an exponent
+MIN_WITNESS_SAMPLES = 4
+JITTER_PARTS = 9  # times within the jitter at which a curve may meet a sample
+
+
+def witness(trajectory: Trajectory, errors: SampleErrors) -> CurveFamily | None:
+    """Return the smoothest curve within the errors of all samples; None if none of its weights is.
+
+    Values of one sample belong to one time within the jitter.
+    """
+    if len(trajectory.t) < MIN_WITNESS_SAMPLES:
+        return None
+    # A sample taken d late differs by |dq| d; the largest allowed share is tried first.
+    shares = (0.8, 0.0) if errors.t else (0.0,)
+    for share in shares:
+        fit = _fitted(trajectory, errors, share)
+        if fit is not None and _is_within(fit, trajectory, errors):
+            return family_of_data(trajectory.t, fit.at(trajectory.t))
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class _Splines:
+    """Splines of n joints with coefficients of shape (N, n)."""
+
+    knots: Array
+    coefficients: Array
+
+    def at(self, t: Array) -> list[Array]:
+        """Return positions, velocities and accelerations, shape (K, n) each."""
+        from scipy.interpolate import BSpline
+
+        spline = BSpline(self.knots, self.coefficients, DEGREE)
+        return [np.asarray(spline(t, order)) for order in range(3)]
+
+
+@dataclass(frozen=True, eq=False)
+class _NormalEquations:
+    """Normal equations of the samples and of the jerk in banded form, with a span as unit of time."""
+
+    knots: Array  # in seconds
+    data: Array  # upper bands of the samples' part, shape (DEGREE + 1, N)
+    jerk: Array  # upper bands of the jerk's part
+    right: Array  # right-hand sides, shape (N, n)
+
+    def solve(self, exponent: float) -> Array | None:
+        """Return the coefficients for a weight of 10^exponent; None if rounding makes the equations singular."""
+        from scipy.linalg import LinAlgError, solveh_banded
+
+        try:
+            return np.asarray(
+                solveh_banded(self.data + 10.0**exponent * self.jerk, self.right)
+            )
+        except LinAlgError:
+            return None
+
+
+def _fitted(
+    trajectory: Trajectory, errors: SampleErrors, jitter_share: float
+) -> _Splines | None:
+    """Return the splines with the largest weights whose differences are within the errors."""
+    data, t = data_of(trajectory), trajectory.t
+    allowed = np.maximum(errors.values, MIN_ERRORS)[: len(data)]
+    rates = [np.abs(np.gradient(values, t, axis=0)) for values in data]
+    limits = [
+        e + jitter_share * errors.t * rate
+        for e, rate in zip(allowed, rates, strict=True)
+    ]
+    equations = _equations(t, data, allowed)
+    chosen = np.full((len(equations.right), trajectory.q.shape[1]), np.nan)
+
+    def keep(exponent: float, candidates: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Store the solutions of candidates within the errors, and return which these are."""
+        solution = equations.solve(exponent)
+        if solution is None or not np.isfinite(solution).all():
+            return np.zeros_like(candidates)
+        found = _Splines(equations.knots, solution).at(t)
+        close = np.all(
+            [
+                (np.abs(value - given) <= limit).all(axis=0)
+                for value, given, limit in zip(found, data, limits, strict=False)
+            ],
+            axis=0,
+        )
+        chosen[:, close & candidates] = solution[:, close & candidates]
+        return np.asarray(close & candidates)
+
+    at = np.full(chosen.shape[1], np.nan)  # exponents
+    for exponent in EXPONENTS:
+        at[keep(exponent, np.isnan(at))] = exponent
+        if not np.isnan(at).any():
+            break
+    if np.isnan(at).any():
+        return None
+    for exponent in np.unique(at):
+        keep(exponent + REFINED, at == exponent)
+    return _Splines(equations.knots, chosen)
+
+
+def _equations(t: Array, data: list[Array], errors: Array) -> _NormalEquations:
+    """Return the normal equations of K samples; data of shape (K, n) each."""
+    from scipy.interpolate import BSpline
+
+    h = t[-1] / (len(t) - 1)
+    inner = np.repeat(t[1:-1], len(data))
+    knots = np.concatenate([[t[0]] * (DEGREE + 1), inner, [t[-1]] * (DEGREE + 1)])
+    scaled, times = knots / h, t / h
+    times[-1] = scaled[-1]
+    # Rows of derivatives are those of lower degree times differences of coefficients.
+    rows, total, right = np.eye(1), 0.0, 0.0
+    difference: Any = None
+    for order, values in enumerate(data):
+        basis = BSpline.design_matrix(
+            times, scaled[order : len(scaled) - order], DEGREE - order
+        )
+        rows = basis if difference is None else basis @ difference
+        weight = (errors[0] / (errors[order] * h**order)) ** 2
+        total = total + weight * (rows.T @ rows)
+        right = right + weight * (rows.T @ (values * h**order))
+        difference = _difference(scaled, order, difference)
+    for order in range(len(data), 3):
+        difference = _difference(scaled, order, difference)
+    nodes, weights = np.polynomial.legendre.leggauss(DEGREE - 2)
+    spans = np.diff(times)
+    points = (times[:-1, None] + spans[:, None] * (nodes + 1) / 2).ravel()
+    third = BSpline.design_matrix(points, scaled[3:-3], DEGREE - 3) @ difference
+    strength = (spans[:, None] * weights / 2).ravel()
+    jerk = third.T @ third.multiply(strength[:, None])
+    return _NormalEquations(knots, _bands(total), _bands(jerk), np.asarray(right))
+
+
+def _difference(knots: Array, order: int, before: Any) -> Any:
+    """Return the matrix from coefficients to those of the derivative of the next order (de Boor 1978, ch. X)."""
+    from scipy.sparse import diags_array
+
+    size = len(knots) - DEGREE - 1 - order
+    inner = knots[order : len(knots) - order]
+    degree = DEGREE - order
+    scale = degree / (inner[degree + 1 : degree + size] - inner[1:size])
+    matrix = diags_array(
+        (-scale, scale), offsets=(0, 1), shape=(size - 1, size)
+    ).tocsr()
+    return matrix if before is None else matrix @ before
+
+
+def _bands(matrix: Any) -> Array:
+    """Return the upper bands of a symmetric sparse matrix as of ``scipy.linalg.solveh_banded``."""
+    bands = np.zeros((DEGREE + 1, matrix.shape[0]))
+    for offset in range(min(DEGREE + 1, matrix.shape[0])):
+        bands[DEGREE - offset, offset:] = matrix.diagonal(offset)
+    return bands
+
+
+def _is_within(splines: _Splines, trajectory: Trajectory, errors: SampleErrors) -> bool:
+    """Return whether splines meet every sample within its errors at one time within the jitter."""
+    t, data = trajectory.t, data_of(trajectory)
+    allowed = np.maximum(errors.values, MIN_ERRORS) * (1 + 1e-9)
+    met = np.zeros(len(t), bool)
+    for offset in np.linspace(-1, 1, JITTER_PARTS if errors.t else 1):
+        shift = offset * errors.t if errors.t else 0.0
+        values = splines.at(np.clip(t + shift, t[0], t[-1]))
+        close = [
+            (np.abs(value - given) <= limit).all(axis=1)
+            for value, given, limit in zip(values, data, allowed, strict=False)
+        ]
+        met |= np.all(close, axis=0)
+    return bool(met.all())

@@ -1,0 +1,133 @@
+"""Friction, soft limits and further elements of joints in a URDF: what is used of them, in words.
+
+Published values of <dynamics> are often placeholders for simulators: of 69 URDFs in
+example-robot-data, 17 have friction that takes half of the effort or more. So neither
+use nor disregard is a silent default.
+"""
+
+import math
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+from cnpgen.errors import RecipeError
+from cnpgen.robots.urdf_parameters import (
+    NO_SOFT_LIMITS,
+    UrdfJoint,
+    urdf_parameters,
+)
+
+MAX_PLAUSIBLE_SHARE = 0.5  # of the effort that friction takes at the velocity limit
+_FORCES = {True: ("N s/m", "N"), False: ("N m s/rad", "N m")}  # of prismatic joints
+
+
+@dataclass(frozen=True)
+class JointFriction:
+    """Friction of a joint in a URDF: viscous [N m s/rad], dry [N m], and its share of the effort at full speed."""
+
+    joint: UrdfJoint
+
+    @property
+    def share(self) -> float:
+        """Fraction of the effort that friction takes at the velocity limit; infinite without an effort."""
+        effort = self.joint.limits.get("effort", 0.0)
+        speed = self.joint.limits.get("velocity", 0.0)
+        friction = self.joint.damping * speed + self.joint.friction
+        return friction / effort if effort else math.inf
+
+    def __str__(self) -> str:
+        viscous, dry = _FORCES[self.joint.kind == "prismatic"]
+        share = f"{self.share:.0%} of" if math.isfinite(self.share) else "no"
+        values = f"damping {self.joint.damping:g} {viscous}, friction {self.joint.friction:g} {dry}"
+        return f"{self.joint.name} ({values}: {share} effort at full speed)"
+
+
+def friction_in(joints: Sequence[UrdfJoint]) -> list[JointFriction]:
+    """Return the friction of the joints that have any."""
+    return [JointFriction(each) for each in joints if each.damping or each.friction]
+
+
+def suggested_use(frictions: Sequence[JointFriction], joints: int) -> str:
+    """Return "use", or "ignore" for values that look like placeholders: large shares, or one pair for all joints."""
+    pairs = {(each.joint.damping, each.joint.friction) for each in frictions}
+    placeholders = len(frictions) == joints > 1 and len(pairs) == 1
+    large = any(each.share >= MAX_PLAUSIBLE_SHARE for each in frictions)
+    return "ignore" if placeholders or large else "use"
+
+
+def warn_of_friction(tree: Element, planned: Sequence[str], path: Path) -> None:
+    """Warn that the friction of planned joints is ignored, since a problem file does not state what to do with it."""
+    try:
+        every = urdf_parameters(tree).joints.values()
+    except RecipeError:  # loading the robot raises it
+        return
+    if frictions := friction_in([each for each in every if each.name in planned]):
+        listing = ", ".join(map(str, frictions))
+        warnings.warn(
+            f"{path}: friction of the URDF is ignored: {listing}; write urdf_dynamics ="
+            ' "use" or "ignore" in [drive] to choose',
+            UserWarning,
+            stacklevel=4,
+        )
+
+
+def joint_notes(
+    tree: Element, joints: Sequence[UrdfJoint], *, soft: bool = True
+) -> Iterator[str]:
+    """Yield a sentence for each further element of planned joints: soft limits, rates, controllers, transmissions.
+
+    ``soft`` is whether soft limits are used.
+    """
+    yield from _controller_notes(tree, joints, soft=soft)
+    for rate in ("acceleration", "jerk"):
+        if given := [each.name for each in joints if rate in each.rates]:
+            yield f"the URDF limits the {rate} of {', '.join(given)}; [limits] replaces it"
+    reduced = {
+        joint.get("name", "")
+        for transmission in tree.findall("transmission")
+        for joint in transmission.findall("joint")
+        if transmission.find(".//mechanicalReduction") is not None
+    }
+    if found := [each.name for each in joints if each.name in reduced]:
+        text = "a gear ratio without a rotor inertia has no effect, and is not used"
+        yield f"<transmission> of {', '.join(found)}: {text}"
+
+
+def _controller_notes(
+    tree: Element, joints: Sequence[UrdfJoint], *, soft: bool
+) -> Iterator[str]:
+    """Yield sentences about the <safety_controller> elements of joints."""
+    names = {each.name for each in joints}
+    elements = {
+        name: controller
+        for joint in tree.findall("joint")
+        if (name := joint.get("name", "")) in names
+        and (controller := joint.find("safety_controller")) is not None
+    }
+    limited = {each.name: each.soft for each in joints if each.soft != NO_SOFT_LIMITS}
+    narrower = [each for each in joints if _is_narrowed(each)]
+    if narrower:
+        ranges = ", ".join(
+            f"{each.name} [{each.soft[0]:g}, {each.soft[1]:g}]" for each in narrower
+        )
+        effect = "narrow the position limits" if soft else "are ignored"
+        yield f"soft limits of the URDF {effect}: {ranges}"
+    if none := [name for name in elements if name not in limited]:
+        yield f"no soft limits, or zero for both, which stands for none: {', '.join(none)}"
+    gains = [
+        key
+        for key in ("k_position", "k_velocity")
+        if any(each.get(key) is not None for each in elements.values())
+    ]
+    if gains:
+        yield f"not used of <safety_controller>: {', '.join(gains)}"
+
+
+def _is_narrowed(joint: UrdfJoint) -> bool:
+    """Return whether a soft limit of a joint is within its hard limits."""
+    low, high = joint.soft
+    return low > joint.limits.get("lower", -math.inf) or high < joint.limits.get(
+        "upper", math.inf
+    )

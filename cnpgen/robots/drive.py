@@ -1,0 +1,146 @@
+"""Drives of joints: rotor inertia, friction and motor limits, as a problem states them and as checks use them.
+
+All values are seen at the joint, through the gear. With the rigid torque tau of the
+inverse dynamics, the motor delivers ``tau + J ddq + b dq + c F(dq)``, where F is the
+sign of the velocity and, at rest, any value of [-1, 1]. 'cnpgen docs drives' has the
+model.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.robots.parameter_ranges import optional_key
+from cnpgen.schema.keys import PerJoint
+
+Array = NDArray[np.float64]
+
+MIN_REVERSAL_SPEED = 0.01  # rad/s; the verdict resolves reversals of 1 ms
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriveSpec:
+    """Drives of the joints: rotor inertia, friction and limits of the motors, each number once or one per joint."""
+
+    urdf_dynamics: str = optional_key(
+        "whether damping and friction of the URDF's <dynamics> elements are those of the drives; 'viscous' and"
+        " 'coulomb' replace them",
+        default="ignore",
+        choices=("use", "ignore"),
+    )
+    armature: PerJoint | None = optional_key(
+        "inertia of the rotor seen at the joint: rotor inertia times the square of the gear ratio",
+        unit="kg m^2",
+        low=0.0,
+    )
+    rotor_inertia: PerJoint | None = optional_key(
+        "inertia of the rotor at the motor, with 'gear_ratio' in place of 'armature'",
+        unit="kg m^2",
+        low=0.0,
+    )
+    gear_ratio: PerJoint | None = optional_key(
+        "motor velocity / joint velocity", low=1e-3
+    )
+    viscous: PerJoint | None = optional_key(
+        "viscous friction at the joint", unit="N m s/rad", low=0.0
+    )
+    coulomb: PerJoint | None = optional_key(
+        "dry friction at the joint", unit="N m", low=0.0
+    )
+    friction_help: float = optional_key(
+        "fraction of the friction that is certain to act: 0 if plans may not rely on any",
+        default=0.0,
+        low=0.0,
+        high=1.0,
+    )
+    reversal_speed: float = optional_key(
+        "speed below which the direction of friction is uncertain",
+        unit="rad/s",
+        default=0.05,
+        low=MIN_REVERSAL_SPEED,
+        plausible=10.0,
+    )
+    limits: str = optional_key(
+        "side of the gear whose torque is limited",
+        default="both",
+        choices=("both", "joint", "motor"),
+    )
+    torque: PerJoint | None = optional_key(
+        "limits of the torques of the motors, seen at the joint; by default those of [limits]",
+        unit="N m",
+        low=1e-6,
+    )
+
+    def validate(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, error) pairs."""
+        if (self.rotor_inertia is None) != (self.gear_ratio is None):
+            given = "gear_ratio" if self.rotor_inertia is None else "rotor_inertia"
+            yield (
+                given,
+                "'rotor_inertia' and 'gear_ratio' determine the armature together: give both, or 'armature'",
+            )
+        if self.armature is not None and self.rotor_inertia is not None:
+            yield (
+                "armature",
+                "is also given by 'rotor_inertia' and 'gear_ratio', expected one of them",
+            )
+
+
+NO_DRIVE = DriveSpec()
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Drives of a robot; values are seen at the joints, for prismatic ones with kg, N s/m, N and m/s.
+
+    Attributes:
+        armature: Inertia of the rotors J [kg m^2], shape (n,).
+        viscous: Viscous friction b [N m s/rad], shape (n,).
+        coulomb: Dry friction c [N m], shape (n,).
+        friction_help: Certain fraction h of the friction.
+        reversal_speed: Speed w [rad/s] below which its direction is uncertain.
+        limits: "both", "joint" or "motor".
+        torque_limit: Symmetric planning limit of motor torques [N m], shape (n,).
+    """
+
+    armature: Array
+    viscous: Array
+    coulomb: Array
+    friction_help: float
+    reversal_speed: float
+    limits: str
+    torque_limit: Array
+
+    @property
+    def limits_joint(self) -> bool:
+        """Whether the torque at the joint, which the links alone cause, is limited."""
+        return self.limits in {"both", "joint"}
+
+    @cached_property
+    def motor_rows(self) -> tuple[int, ...]:
+        """Joints with limited motor torque; without drive terms of its own it is the torque at the joint."""
+        return tuple(range(len(self.armature))) if self.limits != "joint" else ()
+
+    @cached_property
+    def uncertain_rows(self) -> tuple[int, ...]:
+        """Those whose highest and lowest motor torques differ: with dry friction, or viscous friction that may fail."""
+        uncertain = (self.coulomb > 0) | ((self.viscous > 0) & (self.friction_help < 1))
+        return tuple(joint for joint in self.motor_rows if uncertain[joint])
+
+    @cached_property
+    def resting_friction(self) -> Array:
+        """Largest friction of the envelope at dq = 0 [N m], shape (n,): ``c + (1 - h) b w``."""
+        uncertain = 1 - self.friction_help
+        return np.asarray(self.coulomb + uncertain * self.viscous * self.reversal_speed)
+
+    @property
+    def summary(self) -> str:
+        """Description of the torque that is judged, in a few words."""
+        sides = {"both": "both sides", "joint": "the joint", "motor": "the motor"}
+        return f"rigid body and drives, limits on {sides[self.limits]}"
+
+
+RIGID = "rigid body"  # the torque that is judged without drives

@@ -1,0 +1,86 @@
+"""Drives in the simulation: rotors and friction in the plant, rotors in the controller; baselines refuse by name."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cnpgen.addons.benchmark.benchmark_planner import require_rigid_torque
+from cnpgen.addons.benchmark.simulator.challenge import execute_in_challenge
+from cnpgen.addons.benchmark.simulator.execute import Controller
+from cnpgen.addons.benchmark.simulator.plant import (
+    PLANTS,
+    Plant,
+    joint_friction,
+    rated_torque,
+)
+from cnpgen.addons.benchmark.simulator.simulator_scene import SimulatorScene, scene_xml
+from cnpgen.errors import UsageError
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_file import load_problem
+
+mujoco = pytest.importorskip("mujoco")
+PROBLEM = load_problem("heavy-object-drive")
+ROBOT = load_robot(PROBLEM)
+
+
+def scene(plant: Plant = PLANTS["nominal"]) -> SimulatorScene:
+    heights = np.full(len(PROBLEM.obstacle), -1.0)
+    return SimulatorScene(PROBLEM, ROBOT, plant, heights)
+
+
+def test_the_plant_has_the_drives_of_the_problem() -> None:
+    drive, model = ROBOT.drive, mujoco.MjModel.from_xml_string(scene_xml(scene()))
+    assert drive is not None
+    np.testing.assert_allclose(model.dof_armature, drive.armature)
+    np.testing.assert_allclose(model.dof_damping, drive.viscous)
+    np.testing.assert_allclose(model.dof_frictionloss, drive.coulomb)
+    assert [each.dry for each in joint_friction(PROBLEM, ROBOT)] == list(drive.coulomb)
+    np.testing.assert_allclose(
+        rated_torque(PROBLEM, ROBOT) * PROBLEM.limits.torque_scale, drive.torque_limit
+    )
+
+
+def test_inverse_dynamics_of_the_plant_are_the_torques_of_the_motors() -> None:
+    """MuJoCo and Pinocchio share no code; dry friction, which is soft in MuJoCo, is left out."""
+    model = mujoco.MjModel.from_xml_string(scene_xml(scene()))
+    model.dof_frictionloss[:] = 0
+    data, drive = mujoco.MjData(model), ROBOT.drive
+    reference, random = ROBOT.model.createData(), np.random.default_rng(4)
+    assert drive is not None
+    for _ in range(20):
+        q = random.uniform(ROBOT.position_lower, ROBOT.position_upper)
+        dq, ddq = random.uniform(-1, 1, (2, ROBOT.n))
+        data.qpos[:], data.qvel[:], data.qacc[:] = q, dq, ddq
+        mujoco.mj_inverse(model, data)
+        torque = pin.rnea(ROBOT.model, reference, q, dq, ddq)
+        expected = torque + drive.armature * ddq + drive.viscous * dq
+        np.testing.assert_allclose(data.qfrc_inverse, expected, atol=1e-6)
+
+
+def test_the_controller_accelerates_the_rotors() -> None:
+    control, drive = Controller(PROBLEM, ROBOT, PLANTS["nominal"]), ROBOT.drive
+    assert drive is not None
+    q, dq = ROBOT.home, np.zeros(ROBOT.n)
+    data, ddq = ROBOT.model.createData(), np.full(ROBOT.n, 0.5)
+    torque = control(q, dq, (q, dq, ddq))
+    rigid = pin.rnea(ROBOT.model, data, q, dq, ddq)
+    np.testing.assert_allclose(torque, rigid + drive.armature * ddq, atol=1e-9)
+
+
+def test_parts_without_drives_refuse_by_name() -> None:
+    with pytest.raises(UsageError, match="trajopt limits the torque of the rigid body"):
+        require_rigid_torque("trajopt", PROBLEM, ROBOT)
+    rigid = load_problem("heavy-object")
+    require_rigid_torque("trajopt", rigid, load_robot(rigid))
+    strange = scene(Plant("challenge", "another one", environment="folder"))
+    with pytest.raises(UsageError, match="has drives of its own"):
+        execute_in_challenge(strange, None, np.zeros(7))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["trajopt", "sst", "mpc-mpnet"])
+def test_baselines_refuse_drives(name: str) -> None:
+    from cnpgen.addons.benchmark.benchmark_planner import Setting, load_planner
+    from cnpgen.problems.problem_record import record_problem
+
+    with pytest.raises(UsageError, match=f"{name} limits the torque of the rigid body"):
+        load_planner(name, {}).prepare(Setting(record_problem(PROBLEM)))

@@ -1,0 +1,374 @@
+"""Stops of the runtime: they latch, hold in any order of requests, and are valid by an integration of their own."""
+
+import threading
+import time
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cnpgen.addons.online.motion_check import MotionChecker
+from cnpgen.addons.online.plan_hits import plan_hits
+from cnpgen.addons.online.plan_runtime import PlanRuntime
+from cnpgen.addons.online.set_points import sample_motion
+from cnpgen.addons.online.stops import earliest_stop
+from cnpgen.addons.online.switches import SwitchOutcome
+from cnpgen.errors import UsageError
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
+from cnpgen.planner.planner import Planner
+from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.plans.plans import Plans
+from cnpgen.problems.problem_record import open_problem
+from tests.conftest import some
+
+TARGET = [2.49, 0.0]  # m
+TICK_S = 1e-3
+
+
+@pytest.fixture(scope="module")
+def planner() -> Planner:
+    return Planner("airhockey-online")
+
+
+@pytest.fixture
+def executing(planner) -> PlanRuntime:
+    """A runtime that executes a hit and the way back from time 0 on."""
+    home, still = planner.robot.home, np.zeros(6)
+    runtime = PlanRuntime(planner, home)
+    assert runtime.switch(
+        plan_hits(planner, (home, still, still), [1.0, 0.1], TARGET, home=home), 0.0
+    ).accepted
+    return runtime
+
+
+def valid_plans(name: str, count: int) -> tuple[Planner, list[Plans]]:
+    """Plans from rest to rest of a shipped model that are valid."""
+    planner = Planner(name)
+    problems = draw_boundary_problems(name, count, seed=7)
+    plans = planner.plan_batch(problems.boundary, columns=problems.columns)
+    valid = np.flatnonzero(evaluate_plans(plans).valid)
+    return planner, [plans[[row]] for row in valid]
+
+
+def check_states(problem, parameters, times, states) -> None:
+    """Check states at equal distances by an integration and by the inverse dynamics of Pinocchio."""
+    robot = open_problem(problem)[1]
+    q, dq, ddq = states
+    step = np.diff(times)[:, None]
+    # The integrals of a cubic through derivatives at both ends: errors of step^4.
+    speed = dq[0] + np.cumsum((ddq[1:] + ddq[:-1]) / 2 * step, axis=0)
+    travel = (dq[1:] + dq[:-1]) / 2 * step - (ddq[1:] - ddq[:-1]) / 12 * step**2
+    np.testing.assert_allclose(speed, dq[1:], atol=2e-3)
+    np.testing.assert_allclose(q[0] + np.cumsum(travel, axis=0), q[1:], atol=1e-6)
+    factors = dict(zip(robot.parameters.names, parameters, strict=True))
+    assert (np.abs(dq) <= 1.002 * robot.velocity_limit).all()
+    assert (np.abs(ddq) <= 1.005 * robot.acceleration_limit).all()
+    model, data = robot.model, robot.model.createData()
+    if "payload_mass" not in factors:
+        for state in zip(q[::5], dq[::5], ddq[::5], strict=True):
+            assert (
+                np.abs(pin.rnea(model, data, *state)) <= 1.006 * robot.torque_limit
+            ).all()
+
+
+def distance_from_path(q, path) -> float:
+    """The largest distance of positions from a densely sampled path [rad]."""
+    return max(np.abs(path - row).max(axis=1).min() for row in q)
+
+
+@pytest.mark.parametrize("at", [0.03, 0.2, 0.35, 0.45, 0.6, 0.8, 0.86])
+def test_a_stop_is_on_the_path_within_the_limits_and_never_later_than_the_motion(
+    planner, executing, at
+):
+    end = executing.end_time
+    times = np.arange(at, end + 0.01, TICK_S)
+    path = executing.state_at(np.arange(0, end, 1e-4)).q
+    stop = executing.stop(at)
+    assert stop.accepted
+    assert stop.time == at
+    assert at < stop.end_time == executing.end_time <= end
+    states = executing.state_at(times)
+    check_states(planner.model.problem, [], times, states)
+    assert distance_from_path(states.q[::10], path) < 1e-3
+    travelled = np.abs(np.diff(executing.state_at(times).q, axis=0)).sum(axis=0)
+    np.testing.assert_allclose(stop.distance, travelled, atol=1e-4)
+    rest = executing.state_at(stop.end_time)
+    assert not rest.dq.any()
+    assert not rest.ddq.any()
+    before = executing.state_at(np.array([stop.end_time - 1e-5]))
+    assert np.abs(before.ddq / planner.robot.acceleration_limit).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    "name", some(["heavy-object", "panda-cup", "panda-scenes", "ur5-wipe"])
+)
+def test_stops_of_transports_and_among_obstacles_are_valid(name):
+    plans = valid_plans(name, 12)[1]
+    rng, stops, checker = np.random.default_rng(3), 0, MotionChecker()
+    for plan in plans:
+        motion = sample_motion(plan, 0.0)
+        for at in rng.uniform(0.0, motion.end_time, 4):
+            stop = earliest_stop(checker, motion, at, measured=True)
+            assert stop.end_time <= motion.end_time
+            assert not checker.violation(stop, at, stop.end_time)
+            times = np.arange(at, stop.end_time, TICK_S)
+            if stop is not motion and len(times) > 1:
+                check_states(plan.problem, [], times, stop.at(times))
+                stops += 1
+    assert stops > len(plans)
+    assert len(plans) >= 3
+
+
+def test_a_stop_holds_although_a_replan_was_being_computed(planner, executing):
+    home, go_on, started = planner.robot.home, threading.Event(), threading.Event()
+
+    def make_plan(state):
+        started.set()
+        assert go_on.wait(60)
+        return planner.plan(state.q, home, start_dq=state.dq, start_ddq=state.ddq)
+
+    with executing:
+        executing.set_point(0.1)
+        running = executing.replan(make_plan, 0.2)
+        waiting = executing.replan(lambda _: None, 0.3)
+        assert started.wait(60)
+        stop = executing.stop(0.25)
+        resting = executing.state_at(3.0).q
+        assert waiting.result(timeout=60).outcome is SwitchOutcome.STOPPED
+        go_on.set()
+        assert running.result(timeout=60).outcome is SwitchOutcome.STOPPED
+        later = executing.replan(make_plan, 2.0).result(timeout=60)
+        assert later.outcome is SwitchOutcome.STOPPED
+        plan = planner.plan(resting, home)
+        assert executing.switch(plan, 2.0).outcome is SwitchOutcome.STOPPED
+    assert executing.end_time == stop.end_time
+    np.testing.assert_array_equal(executing.state_at(3.0).q, resting)
+
+
+def test_a_stopped_runtime_resumes_at_rest_and_only_after_the_stop(planner, executing):
+    with pytest.raises(UsageError, match="was not stopped, so it cannot resume"):
+        executing.resume(planner.robot.home)
+    executing.set_point(0.15)
+    stop = executing.stop(0.2)
+    assert executing.stop(0.3) is stop  # a second stop changes nothing
+    measured = executing.state_at(stop.end_time).q + 1e-3
+    with pytest.raises(UsageError, match="is before that or before the last set"):
+        executing.resume(measured)
+    executing.set_point(np.arange(0.15, stop.end_time + 0.5, 0.01))
+    for wrong in (measured[:3], np.full(6, np.nan), "here"):
+        with pytest.raises(UsageError, match="measured_q must be"):
+            executing.resume(wrong)
+    assert executing.stopped
+    executing.resume(measured)
+    assert not executing.stopped
+    at = stop.end_time + 1.0
+    with pytest.raises(UsageError, match="was not stopped"):
+        executing.resume(measured, at=at)
+    state = executing.set_point([at - 0.2, at])
+    np.testing.assert_array_equal(state.q, [measured, measured])
+    assert not state.dq.any()
+    assert executing.switch(planner.plan(measured, planner.robot.home), at).accepted
+
+
+def test_a_stop_that_comes_too_late_uses_a_kept_one(planner, executing, monkeypatch):
+    from cnpgen.addons.online import plan_runtime
+
+    def slow(*arguments, **named):
+        executing.set_point(np.arange(0.1, 0.35, 0.01))  # the clock runs meanwhile
+        return earliest_stop(*arguments, **named)
+
+    end, begun = executing.end_time, time.monotonic()
+    while len(executing._kept_stops._stops) < 6 and time.monotonic() < begun + 60:
+        time.sleep(0.01)
+    monkeypatch.setattr(plan_runtime, "earliest_stop", slow)
+    stop = executing.stop(0.2)
+    assert 0.34 < stop.time <= 0.34 + 0.1
+    assert stop.end_time < end
+    times = np.arange(0.34, stop.end_time, TICK_S)
+    check_states(planner.model.problem, [], times, executing.state_at(times))
+
+
+def test_an_accepted_switch_is_not_dropped_silently(planner):
+    home = planner.robot.home
+    away = home + np.array([0.2, 0, 0, 0, 0, 0])
+    runtime = PlanRuntime(planner, home, judge=False)
+    assert runtime.switch(planner.plan(home, away), 0.5).detail.count("replaces") == 0
+    sooner = runtime.switch(planner.plan(home, away), 0.2)
+    assert sooner.accepted
+    assert "replaces the motion that was accepted for 0.5 s" in sooner.detail
+    stopped = runtime.stop(0.1)
+    assert stopped.detail == "replaces the motion that was accepted for 0.2 s"
+    np.testing.assert_array_equal(runtime.state_at([0.3, 2.0]).q, [home, home])
+
+
+def test_motions_end_without_an_acceleration_and_report_the_additional_time(
+    planner, executing
+):
+    home, still = planner.robot.home, np.zeros(6)
+    hit = plan_hits(planner, (home, still, still), [1.0, 0.1], TARGET, home=home)
+    switch = PlanRuntime(planner, home).switch(hit, 0.0)
+    assert "of the acceleration limit, which falls to 0 in" in switch.detail
+    end = executing.end_time
+    states = executing.state_at(end - np.array([1e-2, 1e-3, 1e-4, 1e-5]))
+    share = np.abs(states.ddq / planner.robot.acceleration_limit).max(axis=1)
+    assert (share < [1.01, 0.3, 0.03, 0.003]).all()
+    times = np.arange(0.0, end, TICK_S)
+    check_states(planner.model.problem, [], times, executing.state_at(times))
+
+
+def test_hits_with_a_way_back_are_accepted_by_default(planner):
+    home, still = planner.robot.home, np.zeros(6)
+    for puck in ([0.9, 0.1], [1.0, 0.3], [1.1, -0.2], [1.2, 0.0]):
+        hits = plan_hits(planner, (home, still, still), puck, TARGET, home=home)
+        switch = PlanRuntime(planner, home).switch(hits, 0.0)
+        assert switch.accepted, switch
+
+
+def test_a_failed_replan_gives_its_reason(planner, executing):
+    home = planner.robot.home
+
+    def out_of_reach(state):
+        return plan_hits(planner, state, [3.0, 0.0], TARGET, home=home)
+
+    with executing:
+        hit = executing.replan(out_of_reach, 0.4).result(timeout=60)
+        empty = executing.replan(lambda s: out_of_reach(s).plans, 0.4)
+        assert empty.result(timeout=60).outcome is SwitchOutcome.NO_PLAN
+    assert hit.outcome is SwitchOutcome.NO_PLAN
+    assert hit.detail == "no hitting configuration"
+
+
+def test_close_returns_although_a_planner_hangs(executing):
+    release, started = threading.Event(), threading.Event()
+
+    def hang(_):
+        started.set()
+        release.wait(60)
+
+    hanging = executing.replan(hang, 0.4)
+    assert started.wait(60)
+    waiting = executing.replan(lambda _: None, 0.4)
+    begun = time.monotonic()
+    assert not executing.close(timeout=0.2)
+    assert time.monotonic() - begun < 10
+    assert hanging.result(timeout=1).outcome is SwitchOutcome.CLOSED
+    assert waiting.result(timeout=1).outcome is SwitchOutcome.CLOSED
+    with pytest.raises(UsageError, match="runtime is closed"):
+        executing.replan(lambda _: None, 0.5)
+    release.set()
+    assert executing.close()  # the planner has returned, and its thread has ended
+    for timeout in (0.0, -1.0, np.nan, True):
+        with pytest.raises(UsageError, match="timeout must be"):
+            executing.close(timeout=timeout)
+
+
+def test_set_points_in_the_past_are_refused_and_the_history_is_what_was_executed(
+    planner,
+):
+    home = planner.robot.home
+    runtime = PlanRuntime(planner, home)
+    away = home + np.array([0.2, 0, 0, 0, 0, 0])
+    assert runtime.switch(planner.plan(home, away), 1.0).accepted
+    times = np.arange(0.0, 3.0, 0.01)
+    executed = runtime.set_point(times)
+    assert runtime.switch(planner.plan(away, home), 4.0).accepted
+    for past in (0.999, 0.5, 2.98, [3.5, 0.5], -1e9, [2.995, 2.994]):
+        with pytest.raises(UsageError, match=r"^time must"):
+            runtime.set_point(past)
+    recent = times >= 2.99 - 1.0
+    history = runtime.state_at(times[recent])
+    for old, kept in zip(executed, history, strict=True):
+        np.testing.assert_array_equal(old[recent], kept)
+    for past in (0.999, 1.98, -1.0):
+        with pytest.raises(UsageError, match=r"must be from 1\.99 s on"):
+            runtime.state_at(past)
+    np.testing.assert_array_equal(runtime.set_point(2.99).q, executed.q[-1])
+
+
+def test_steps_above_the_stated_one_are_refused_and_change_nothing(planner, executing):
+    executing.set_point(0.2)
+    for ahead in (0.6, [0.21, 0.6]):
+        with pytest.raises(UsageError, match=r"time must have smaller steps: joint \d"):
+            executing.set_point(ahead)
+    executing.set_point(0.201)
+    patient = PlanRuntime(planner, planner.robot.home, max_step=9.0, history=0.25)
+    assert patient.switch(
+        planner.plan(planner.robot.home, planner.robot.home + 0.01), 0.0
+    ).outcome in {SwitchOutcome.INVALID, SwitchOutcome.ACCEPTED}
+    patient.set_point(5.0)
+
+
+@pytest.mark.parametrize(
+    "time", [True, [False, True], [0.3, 0.2], [0.0, np.nan], [0.2, 0.3, 0.29999]]
+)
+def test_descending_times_booleans_and_nan_are_refused(executing, time):
+    for evaluate in (executing.set_point, executing.state_at):
+        with pytest.raises(UsageError, match=r"^time must"):
+            evaluate(time)
+    with pytest.raises(UsageError, match="at must be a finite number"):
+        executing.stop(True)
+
+
+@pytest.fixture(scope="module")
+def transport() -> tuple[Planner, Plans]:
+    planner, plans = valid_plans("heavy-object", 4)
+    return planner, plans[0]
+
+
+@pytest.mark.parametrize("seed", some(range(400), kept=4))
+def test_nothing_changes_after_a_stop_in_any_order_of_requests(transport, seed):
+    planner, there = transport
+    rng = np.random.default_rng(seed)
+    runtime = PlanRuntime(planner, there.boundary.start_q[0])
+    assert runtime.switch(there, 0.0).accepted
+    delays = rng.uniform(0.0, 0.02, 8)
+
+    def make_plan(state):
+        time.sleep(float(rng.uniform(0.0, 0.03)))
+        if not state.dq.any():
+            return planner.plan(state.q, there.boundary.start_q[0])
+        return there if rng.uniform() < 0.5 else None
+
+    at = rng.uniform(0.02, runtime.end_time, 6)
+    requests = [
+        lambda: runtime.replan(make_plan, at[0]),
+        lambda: runtime.replan(make_plan, runtime.end_time + at[1]),
+        lambda: runtime.switch(make_plan(runtime.state_at(at[2])), at[2]),
+        lambda: runtime.stop(at[3]),
+        lambda: runtime.stop(at[4]),
+        lambda: runtime.set_point(0.5 * at.min()),
+        lambda: runtime.close(timeout=0.01),
+    ]
+    if rng.uniform() < 0.5:
+        requests.pop()  # without a close
+    rng.shuffle(requests)
+
+    def later(request, delay):
+        time.sleep(delay)
+        try:
+            request()
+        except UsageError as error:
+            # A closed runtime refuses requests; a clock may be ahead of a request.
+            assert "closed" in str(error) or "must not be before" in str(error)  # noqa: PT017
+
+    threads = [
+        threading.Thread(target=later, args=pair)
+        for pair in zip(requests, delays, strict=False)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+        assert not thread.is_alive()
+    stop = runtime.stop(9.9)  # the one that was accepted
+    times = np.arange(0.0, stop.end_time + 0.1, TICK_S)
+    first = runtime.state_at(times)
+    check_states(there.problem, [], times, first)
+    assert runtime.switch(there, 0.0).outcome in {
+        SwitchOutcome.STOPPED,
+        SwitchOutcome.CLOSED,
+    }
+    time.sleep(0.05)
+    for before, after in zip(first, runtime.state_at(times), strict=True):
+        np.testing.assert_array_equal(before, after)
+    runtime.close()
