@@ -101,7 +101,7 @@ def test_without_scenes_a_problem_whose_samples_bring_them_is_refused(
         assert "--scenes" in text
     words = ["evaluate", str(files[0]), "--problem", "panda-scenes"]
     assert main([*words, "--scenes", str(files[1])]) == 1
-    assert "1 valid, 1 invalid" in capsys.readouterr().out
+    assert "trajectories of panda-3kg: 1 invalid, 1 " in capsys.readouterr().out
 
 
 def test_imported_plans_have_the_scenes(lines: Plans, files: tuple[Path, Path]) -> None:
