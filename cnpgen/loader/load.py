@@ -1,6 +1,7 @@
 """Opening a dataset for training; incomplete and damaged datasets are refused."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from cnpgen.errors import DatasetError
@@ -44,10 +45,12 @@ def load_dataset(
         DatasetError: The dataset is unfinished, or a part is missing or damaged.
         MachineError: A file cannot be read.
     """
-    folder, verify = Path(folder), flag("verify", verify)
+    verify = flag("verify", verify)
     stored = open_dataset(
-        folder, allow_incomplete=flag("allow_incomplete", allow_incomplete)
+        Path(folder), allow_incomplete=flag("allow_incomplete", allow_incomplete)
     )
+    folder = stored.folder.absolute()  # the working folder may change
+    stored = replace(stored, folder=folder)
     if stored.manifest is None:
         summary = summarize_dataset(folder, stored.spec, allow_incomplete=True)
         statistics, made = summary.statistics, summary.records

@@ -431,6 +431,10 @@ def _parameter_errors(plans: Plans, rows: int) -> Iterator[tuple[str, str]]:
             "boundary",
             f"parameters must have shape {(rows, width)} (plans, parameters of the problem), got {parameters.shape}",
         )
+    elif parameters is not None and (
+        text := plans.problem.parameters.out_of_range(parameters)
+    ):
+        yield "boundary", f"parameters: {text}"
 
 
 def _rows(plans: Plans) -> int:

@@ -103,7 +103,7 @@ def scene_plans(
         )
     zero, spec, count = np.zeros_like(start), problem.trajectory, len(scenes)
     poses = np.array(
-        [_obstacle_poses(full, len(problem.obstacle), scene) for scene in scenes]
+        [poses_of_scene(full, len(problem.obstacle), scene) for scene in scenes]
     )
     files = list(dict.fromkeys(scene.source for scene in scenes if scene.source))
     others = f" and {len(files) - 1} other files" if len(files) > 1 else ""
@@ -246,7 +246,7 @@ def joint_order(scene: SceneProblem, robot: Robot, states: Array, end: str) -> A
     return np.clip(states, robot.position_lower, robot.position_upper)
 
 
-def _obstacle_poses(problem: Problem, fixed: int, scene: SceneProblem) -> Array:
+def poses_of_scene(problem: Problem, fixed: int, scene: SceneProblem) -> Array:
     """Return the poses and sizes of the problem's own obstacles and those of a scene, shape (width,)."""
     numbers, slices = place_obstacles(problem.obstacle), number_slices(problem.obstacle)
     free: dict[str, list[int]] = {}

@@ -17,8 +17,10 @@ from cnpgen.robots.robot import Attached, Robot, read_model, recipe_errors_in
 from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.shape.hull import Array
+from cnpgen.robots.shape.inline import unit_of_mesh
+from cnpgen.robots.shape.mesh_files import find_named_file
 from cnpgen.robots.shape.shape import Shape, load_held_shape, load_shape
-from cnpgen.robots.urdf import urdf_tree
+from cnpgen.robots.urdf import read_urdf, urdf_tree
 from cnpgen.robots.urdf_parameters import UrdfJoint
 from cnpgen.schema.keys import PerJoint
 from cnpgen.schema.units import PLAUSIBLE_MAX, suggested_unit
@@ -304,10 +306,10 @@ def _robot_errors(robot: Robot, problem: Problem) -> Iterator[str]:
         if max(center, gyration) > MAX_CENTER_RATIO * reach:
             text = f"the center of mass is {center:.3g} m away, the radius of gyration {gyration:.3g} m"
             yield f"{name}: {text}, the arm {reach:.3g} m long; an <inertial> is in kg, m and kg m^2, not in mm or g"
-    yield from _link_errors(robot, reach)
+    yield from _link_errors(problem, robot, reach)
 
 
-def _link_errors(robot: Robot, reach: float) -> Iterator[str]:
+def _link_errors(problem: Problem, robot: Robot, reach: float) -> Iterator[str]:
     """Yield error messages for sizes of links."""
     if robot.shape is None:
         return
@@ -320,7 +322,7 @@ def _link_errors(robot: Robot, reach: float) -> Iterator[str]:
     }
     small = {link: size for link, size in sizes.items() if size < MIN_MESH_M}
     for link, size in large.items():
-        remedy = 'write scale="0.001 0.001 0.001" in the <mesh> of a file in mm'
+        remedy = _scale_remedy(problem, link)
         yield f"link {link!r}: its collision geometry is {size:.3g} m large, the arm {reach:.3g} m; {remedy}"
     remedy = "remove the scale of its <mesh> elements, or correct it"
     for link in (
@@ -331,6 +333,29 @@ def _link_errors(robot: Robot, reach: float) -> Iterator[str]:
     largest = max(size for link, size in sizes.items() if robot.shape.joints[link])
     if largest < MIN_LINK_RATIO * reach:
         yield f"no moving link is larger than {largest:.3g} m, where the arm is {reach:.3g} m long; {remedy}"
+
+
+def _scale_remedy(problem: Problem, link: str) -> str:
+    """Return the remedy for a mesh that is too large: the unit that its file states, or millimetres."""
+    tree = urdf_tree(read_urdf(problem.urdf_path))
+    meshes = [
+        mesh
+        for element in tree.findall("link")
+        if element.get("name") == link
+        for mesh in element.iterfind("*/geometry/mesh")
+    ]
+    for mesh in meshes:
+        try:
+            name = mesh.get("filename", "")
+            unit = unit_of_mesh(
+                find_named_file(name, problem.urdf_path, problem.packages)
+            )
+        except (RecipeError, OSError):
+            continue
+        if unit != 1.0:
+            scale = " ".join([f"{unit:g}"] * 3)
+            return f'write scale="{scale}" in its <mesh>: {name} states a unit of {unit:g} m'
+    return 'write scale="0.001 0.001 0.001" in the <mesh> of a file in mm'
 
 
 def _mesh_links(urdf: str) -> set[str]:

@@ -37,10 +37,12 @@ from cnpgen.robots.solid import pose_width
 from cnpgen.robots.urdf import read_urdf
 from cnpgen.robots.urdf_changes import (
     PAYLOAD,
+    with_collision_geometry,
     with_disabled_pairs,
     with_ignored_pairs,
     with_locked_joints,
     with_payload_link,
+    with_point_masses,
 )
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
@@ -373,8 +375,11 @@ class Problem:
         text = with_locked_joints(
             read_urdf(self.urdf_path), positions, is_stored=self.is_stored
         )
+        text = with_point_masses(text)
         if not self.uses_link_geometry:
             return text
+        if not self.is_stored:
+            text = with_collision_geometry(text, spec.visual_links, spec.skipped_meshes)
         keep = kept_folder() if spec.convex_parts > 1 else None
         text = with_inline_meshes(
             text,

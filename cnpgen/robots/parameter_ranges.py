@@ -177,22 +177,29 @@ class ParameterRanges:
                 argument="parameters",
             )
         rows = values.reshape(-1, len(self))
+        if text := self.out_of_range(np.nan_to_num(rows, nan=np.inf), shown=rows):
+            raise UsageError(text, argument="parameters")
+        return rows
+
+    def out_of_range(self, rows: Array, *, shown: Array | None = None) -> str:
+        """Return an error text if a value of shape (N, width) is outside of its range, otherwise "".
+
+        Values that are not numbers pass: the verdict reports them. The text shows
+        values of ``shown``, by default the same.
+        """
         for column, (name, span) in enumerate(
             zip(self.names, self.ranges, strict=True)
         ):
             rounding = RANGE_ROUNDING * max(abs(span.low), abs(span.high))
-            outside = ~(
-                (rows[:, column] >= span.low - rounding)
-                & (rows[:, column] <= span.high + rounding)
+            outside = (rows[:, column] < span.low - rounding) | (
+                rows[:, column] > span.high + rounding
             )
             if outside.any():
                 row = int(outside.argmax())
-                low, high, got = distinct(span.low, span.high, rows[row, column])
-                raise UsageError(
-                    f"{name} must be from {low} to {high}, got {got} in row {row}",
-                    argument="parameters",
-                )
-        return rows
+                value = (rows if shown is None else shown)[row, column]
+                low, high, got = distinct(span.low, span.high, value)
+                return f"{name} must be from {low} to {high}, got {got} in row {row}"
+        return ""
 
     def describe(self) -> Iterator[str]:
         """Yield a text of every parameter with its range in SI units."""

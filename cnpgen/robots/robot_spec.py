@@ -75,6 +75,14 @@ class RobotSpec:
         " found by sampling",
         default="",
     )
+    visual_links: tuple[str, ...] = optional_key(
+        "links without a <collision> element whose <visual> elements take its place",
+        default=(),
+    )
+    skipped_meshes: tuple[str, ...] = optional_key(
+        "links whose collision meshes are left out, so that nothing checks them",
+        default=(),
+    )
     ignored_pairs: tuple[tuple[str, str], ...] = optional_key(
         "pairs of links whose collisions are not checked, besides those of the SRDF",
         default=(),

@@ -117,6 +117,72 @@ def _fix(joint: Element, position: float, is_stored: bool) -> list[str]:
     return []
 
 
+def with_point_masses(urdf: str) -> str:
+    """Return a URDF in which a mass without an <inertia> is a point.
+
+    URDF parsers drop the mass, with errors on stderr.
+    """
+    try:
+        robot = urdf_tree(urdf)
+    except ValueError:  # the reader of the robot raises the error
+        return urdf
+    inertials = [
+        inertial
+        for inertial in robot.iterfind("link/inertial")
+        if inertial.find("inertia") is None and inertial.find("mass") is not None
+    ]
+    for inertial in inertials:
+        zeros = dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")
+        inertial.append(Element("inertia", zeros))
+    return ElementTree.tostring(robot, encoding="unicode") if inertials else urdf
+
+
+def with_collision_geometry(
+    urdf: str, visual: Iterable[str], skipped: Iterable[str]
+) -> str:
+    """Return a URDF with other collision elements.
+
+    Args:
+        urdf: Text of the URDF.
+        visual: Links without a <collision> element that get one for each <visual>.
+        skipped: Links whose collision meshes are removed.
+
+    Raises:
+        RecipeError: There is no such link.
+    """
+    visual, skipped = tuple(visual), tuple(skipped)
+    if not visual and not skipped:
+        return urdf
+    robot, errors = urdf_tree(urdf), list[str]()
+    links = {link.get("name", ""): link for link in robot.findall("link")}
+    for key, names in {"visual_links": visual, "skipped_meshes": skipped}.items():
+        errors += [
+            f"robot.{key}: the URDF has no link {name!r}{nearest(name, links)}"
+            for name in names
+            if name not in links
+        ]
+    if errors:
+        raise RecipeError(errors)
+    for name in visual:
+        link = links[name]
+        if link.find("collision") is None:
+            link.extend(_as_collision(each) for each in link.findall("visual"))
+    for name in skipped:
+        for element in links[name].findall("collision"):
+            if element.find("geometry/mesh") is not None:
+                links[name].remove(element)
+    return ElementTree.tostring(robot, encoding="unicode")
+
+
+def _as_collision(visual: Element) -> Element:
+    """Return a <collision> element with the place and the geometry of a <visual> element."""
+    collision = Element("collision")
+    collision.extend(
+        part for tag in ("origin", "geometry") for part in visual.findall(tag)
+    )
+    return collision
+
+
 def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
     """Return the rotation about a unit axis (Rodrigues), shape (3, 3)."""
     x, y, z = axis

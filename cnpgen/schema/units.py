@@ -21,7 +21,14 @@ _QUANTITIES: dict[str, tuple[str, float, dict[str, str]]] = {
     "s": (
         "a time",
         3600.0,
-        {"s": "1", "ms": "0.001", "us": "0.000001", "min": "60", "h": "3600"},
+        {
+            "s": "1",
+            "ms": "0.001",
+            "us": "0.000001",
+            "ns": "0.000000001",
+            "min": "60",
+            "h": "3600",
+        },
     ),
     "rad": ("an angle", 8 * math.pi, {"rad": "1", "mrad": "0.001", "deg": _DEG}),
     "rad/s": (

@@ -1,14 +1,17 @@
 """Tracking tube: its verdict holds for random states within it, and is exact for joint limits."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from cnpgen.errors import UsageError
 from cnpgen.judges.plans.continuous_collision import is_contact
 from cnpgen.judges.plans.evaluated_trajectory import evaluate_trajectory
-from cnpgen.judges.plans.judge import judge
-from cnpgen.judges.plans.verdict import Verdict
+from cnpgen.judges.plans.judge import Judge, judge
+from cnpgen.judges.plans.verdict import Margin, Verdict
 from cnpgen.problems.constraints.clearance import ObjectContact
+from cnpgen.problems.constraints.puck_contact import PuckContact
 from cnpgen.world.path import PathWorld
 from tests.examples.plans import Plan, load
 
@@ -32,8 +35,8 @@ def test_no_state_within_the_tube_violates_more_than_the_verdict_states(
         offset = error * random.uniform(-1, 1, states.q.shape)
         world.set_path(states.q + offset, states.dq, states.ddq, poses)
         for constraint in plan.problem.constraint:
-            if isinstance(constraint, ObjectContact):
-                continue  # the object stands on the pedestals
+            if isinstance(constraint, ObjectContact | PuckContact):
+                continue  # the object stands on the pedestals, the puck is hit
             for condition in constraint.judged(world):
                 if condition.name not in tube.margins or not is_widened(
                     exact, tube, condition.name
@@ -52,6 +55,60 @@ def test_no_state_within_the_tube_violates_more_than_the_verdict_states(
                 )
                 checked.add(condition.name)
     assert len(checked) >= 2
+
+
+@pytest.mark.parametrize("error", [5e-5, 1e-4, 2e-4])
+def test_the_contact_of_a_hit_is_intended_within_the_tube(error: float) -> None:
+    plan, random = load("hit"), np.random.default_rng(5)
+    verdict = plan.judged(tracking_error=error)
+    assert verdict.margins["puck distance"].ok
+    (contact,) = (c for c in plan.problem.constraint if isinstance(c, PuckContact))
+    world = PathWorld(plan.robot, plan.problem.obstacle, plan.problem.object_size)
+    phases = np.linspace(0, 1, 2000)
+    states = evaluate_trajectory(plan.motion, phases, jerk=False)
+    poses, touched = plan.scene.poses[0], 0
+    world.set_path(states.q, states.dq, states.ddq, poses)
+    planned = world.tip_position
+    for _ in range(10):
+        signs = random.choice([-1.0, 1.0], states.q.shape)
+        world.set_path(states.q + error * signs, states.dq, states.ddq, poses)
+        touches = contact.touches(
+            world.tip_position.T, np.asarray(world.scene_values)[None]
+        )
+        displacement = np.linalg.norm(world.tip_position - planned, axis=0).max()
+        distances = contact.distances_from_contact_region(world)
+        assert distances[touches].max(initial=0) <= 2 * displacement + 1e-4
+        touched += touches.sum()
+    assert touched  # a hit touches the puck at its end
+
+
+def test_a_puck_beside_the_path_needs_the_displacement_as_clearance() -> None:
+    plan = load("hit")
+    (contact,) = (c for c in plan.problem.constraint if isinstance(c, PuckContact))
+    world = PathWorld(plan.robot, plan.problem.obstacle, plan.problem.object_size)
+    states = evaluate_trajectory(plan.motion, np.linspace(0, 1, 4000), jerk=False)
+    world.set_path(states.q, states.dq, states.ddq, plan.scene.poses[0])
+    x, y = world.tip_position[:2]
+    along = np.array([np.gradient(x), np.gradient(y)])[:, 2000]
+    across = np.array([-along[1], along[0]]) / np.hypot(*along)
+    puck = np.array([x[2000], y[2000]]) + (contact.contact_range + 2e-4) * across
+    while (gap := np.hypot(x - puck[0], y - puck[1]).min()) < (
+        contact.contact_range + 1.5e-4
+    ):
+        puck += (contact.contact_range + 2e-4 - gap) * across
+    goal = puck + np.array([contact.contact_distance, 0])  # far from the path
+    poses = plan.scene.poses.copy()
+    poses[0, -4:] = [*goal, *puck]
+    scene = dataclasses.replace(plan.scene, poses=poses)
+
+    def margin(error: float | None) -> Margin:
+        judge = Judge(plan.problem, plan.robot, tracking_error=error)
+        (verdict,) = judge(plan.motion, plan.boundary, scene, plan.goal_xyz)
+        return verdict.margins["puck distance"]
+
+    assert margin(None).ok
+    assert not margin(1e-3).ok
+    assert margin(1e-3).violation > margin(None).violation + 5e-4
 
 
 def is_widened(exact: Verdict, tube: Verdict, name: str) -> bool:

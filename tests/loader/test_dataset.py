@@ -52,6 +52,15 @@ def test_a_dataset_describes_its_content(dataset: Dataset, folder: Path) -> None
     assert repr(dataset) == f"<two-shards 1.0.0 in {folder}: 50 train, 10 validation>"
 
 
+def test_a_dataset_opened_by_a_relative_path_is_read_in_another_working_folder(
+    copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(copy.parent)
+    dataset = load_dataset(copy.name)
+    monkeypatch.chdir("/")
+    assert dataset.arrays("train", fields=["goal_p"])["goal_p"].shape == (50, 2)
+
+
 def test_the_repr_is_one_line(dataset: Dataset) -> None:
     batches = dataset.batches(8, seed=3, fields=ALL)
     batch = next(iter(batches))

@@ -8,12 +8,15 @@ import h5py
 import numpy as np
 import pytest
 
+from cnpgen.cli.main import main
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.loader.load import load_dataset
 from cnpgen.planner.model import Model
 from cnpgen.planner.plan_requests import read_file, read_rows
+from cnpgen.plans.plan_file import load_plans
 from cnpgen.training.data import open_training_data
 from tests.conftest import columns_of
+from tests.examples.example_robots import needs_robots
 from tests.examples.models import boundary_of_columns, untrained_model
 
 Tiny = Callable[[str], Path]
@@ -124,3 +127,15 @@ def test_sample_ids_that_are_not_integers_raise_an_error(tmp_path, model):
         DatasetError, match="sample_id must hold 2 integers, got float64"
     ):
         read_file(path, model)
+
+
+@needs_robots
+@pytest.mark.slow
+def test_a_shipped_model_plans_for_the_recipe_of_its_name_with_a_warning_if_it_differs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = str(tmp_path / "plans.h5")
+    assert main(["plan", "panda-scenes", "--n", "2", "-o", out]) == 0
+    text = "the model 'panda-scenes' was trained on rows of 'panda-tables'"
+    assert text in capsys.readouterr().err
+    assert len(load_plans(out)) == 2

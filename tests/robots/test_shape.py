@@ -194,7 +194,8 @@ def test_only_meshes_of_a_bounded_size_are_given_to_their_reader(tmp_path, monke
     file = write_crane(tmp_path)
     monkeypatch.setattr("cnpgen.robots.shape.inline.MAX_MESH_BYTES", 400)
     with pytest.raises(
-        RecipeError, match=r"wedge.stl: has 484 bytes, expected a mesh of at most 400$"
+        RecipeError,
+        match=r"wedge.stl: has 484 bytes, expected a mesh of at most 400 .a mesh of link 'fore'",
     ):
         with_inline_meshes(file.read_text(), file)
     (tmp_path / "crane" / "secret.txt").write_text("secret")

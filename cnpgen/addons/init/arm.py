@@ -1,12 +1,17 @@
 """An arm in a URDF: its frames and links, the joints that move a tip, and missing limits."""
 
+from __future__ import annotations
+
 import math
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from cnpgen.addons.init.doubts import doubts
 from cnpgen.errors import RecipeError, UsageError, listed
 from cnpgen.problems.checks import frames_of, missing_frame, unread_xacro
 from cnpgen.problems.urdf_dynamics import (
@@ -16,13 +21,14 @@ from cnpgen.problems.urdf_dynamics import (
     suggested_use,
 )
 from cnpgen.robots.robot import recipe_errors_in
-from cnpgen.robots.urdf import read_urdf, urdf_tree
+from cnpgen.robots.urdf import number_in, read_urdf, urdf_tree
 from cnpgen.robots.urdf_parameters import LinkInertia, UrdfJoint, urdf_parameters
 
 # Ranges to either side, where the URDF has none.
 DEFAULT_RANGE_RAD, DEFAULT_RANGE_M = math.pi, 0.5
 MAX_INERTIA_ERROR = 0.01  # relative; published URDFs round their numbers
 MAX_LIMITED_RAD = 1000.0  # largest limit of a revolute joint that is one
+_FINGER = re.compile(r"finger|knuckle|thumb|jaw|claw")  # in names of links
 DEFAULT_SPEED = 1.0  # rad/s or m/s, where the URDF has none
 
 
@@ -41,6 +47,7 @@ class ArmJoint:
     missing: tuple[
         str, ...
     ]  # limits that the URDF does not have: "position", "velocity", "torque"
+    replaced: tuple[str, ...] = ()  # limits of the same names that another file states
 
 
 @dataclass(frozen=True)
@@ -61,6 +68,11 @@ class Arm:
     ]  # links that planned joints move with inertias that no body has
     shaped: tuple[str, ...]  # links that have a ``<collision>`` element
     meshes: tuple[str, ...]  # mesh files that links name
+    visual: tuple[str, ...]  # links that have a ``<visual>`` and no ``<collision>``
+    locked_positions: Mapping[
+        str, float
+    ]  # locked joints that do not stay at zero -> position [rad or m]
+    doubts: tuple[str, ...]  # sentences about numbers that are probably wrong
     friction: tuple[JointFriction, ...]  # friction of planned joints that have any
     joint_notes: tuple[str, ...]  # about further elements of planned joints
 
@@ -73,6 +85,10 @@ class Arm:
     def has_shape(self) -> bool:
         """Whether links that move have collision geometry."""
         return bool(set(self.shaped) & set(self.moved))
+
+    def with_visual_shapes(self) -> Arm:
+        """Return the arm whose links without ``<collision>`` elements have their visual geometry."""
+        return replace(self, shaped=(*self.shaped, *self.visual))
 
 
 def read_arm(urdf: Path, tip: str | None) -> Arm:
@@ -96,7 +112,7 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
         raise RecipeError(
             [f"{urdf}: has no <link>, expected a URDF (an SRDF is given by --srdf)"]
         )
-    tip = tip if tip is not None else _only_leaf(urdf, links, joints)
+    tip = tip if tip is not None else _default_tip(urdf, links, joints)
     if text := missing_frame(tree, urdf, tip):
         raise UsageError(f"--tip: {text}")
     moving = [joint for joint in _path(tip, joints) if joint.kind != "fixed"]
@@ -109,6 +125,7 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
     planned = tuple(map(_joint, moving))
     moved = tuple(link for link in links if moving[0] in _path(link, joints))
     names = {joint.name for joint in planned}
+    shaped = _links_with(tree, "collision")
     locked = [
         joint.name
         for joint in joints.values()
@@ -128,19 +145,67 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
         impossible=tuple(
             link for link in moved if _is_impossible(parameters.inertias[link])
         ),
-        shaped=tuple(
-            link.get("name", "")
-            for link in tree.findall("link")
-            if link.find("collision") is not None
-        ),
+        shaped=shaped,
         meshes=tuple(mesh.get("filename", "") for mesh in tree.iterfind("link//mesh")),
+        visual=tuple(
+            link for link in _links_with(tree, "visual") if link not in shaped
+        ),
+        locked_positions=_locked_positions(tree, joints.values(), names),
+        doubts=_doubts(urdf, tree),
         friction=tuple(friction_in(moving)),
         joint_notes=tuple(joint_notes(tree, moving)),
     )
 
 
+def _links_with(tree: Element, tag: str) -> tuple[str, ...]:
+    """Return the names of the links that have an element."""
+    return tuple(
+        link.get("name", "")
+        for link in tree.findall("link")
+        if link.find(tag) is not None
+    )
+
+
+def _doubts(urdf: Path, tree: Element) -> tuple[str, ...]:
+    try:
+        return tuple(doubts(tree))
+    except ValueError as error:
+        raise RecipeError([f"{urdf}: {error}"]) from error
+
+
+def _locked_positions(
+    tree: Element, joints: Iterable[UrdfJoint], planned: Collection[str]
+) -> dict[str, float]:
+    """Return the positions of locked joints that cannot stay at zero: the nearest limit.
+
+    Joints that others mimic with an offset are locked at zero by name, so that their
+    followers get the offset. Followers are not listed: they follow.
+    """
+    mimics = {
+        joint.get("name", ""): mimic
+        for joint in tree.findall("joint")
+        if (mimic := joint.find("mimic")) is not None
+    }
+    offset_of = {
+        mimic.get("joint", "")
+        for mimic in mimics.values()
+        if number_in(mimic, "offset", 0.0)
+    }
+    positions = {}
+    for joint in joints:
+        if joint.kind not in {"revolute", "prismatic", "continuous"}:
+            continue
+        if joint.name in planned or joint.name in mimics:
+            continue
+        low, high = joint.limits.get("lower", 0.0), joint.limits.get("upper", 0.0)
+        nearest = 0.0 if joint.kind == "continuous" else min(max(0.0, low), high)
+        if nearest or joint.name in offset_of:
+            positions[joint.name] = nearest
+    return positions
+
+
 def arm_notes(arm: Arm) -> Iterator[str]:
-    """Yield a sentence for each finding: planned joints, placeholders of limits, and links without mass."""
+    """Yield a sentence for each finding: planned joints, placeholders of limits, doubtful numbers, and missing elements."""
     yield f"the tip is {arm.tip}; planned joints: {', '.join(joint.name for joint in arm.planned)}"
     placeholders = {
         "position": f"{DEFAULT_RANGE_RAD:.3g} rad or {DEFAULT_RANGE_M:g} m to either side",
@@ -168,6 +233,13 @@ def arm_notes(arm: Arm) -> Iterator[str]:
     if arm.impossible:
         text = "a principal inertia is negative or exceeds the sum of the others; torques may be wrong"
         yield f"no body has the <inertia> of {', '.join(arm.impossible)}: {text}"
+    yield from arm.doubts
+    if unchecked := [link for link in arm.visual if link not in arm.shaped]:
+        text = "nothing checks their collisions; --collision-from-visual uses their <visual> elements"
+        yield f"links with a <visual> and no <collision> element: {', '.join(unchecked)}: {text}"
+    for name, position in arm.locked_positions.items():
+        if position:
+            yield f"the locked joint {name} is at {position:g}, its limit nearest to zero, as zero is outside of its limits"
 
 
 def with_torques(arm: Arm, torques: list[float]) -> Arm:
@@ -181,9 +253,13 @@ def with_torques(arm: Arm, torques: list[float]) -> Arm:
     )
 
 
-def _only_leaf(urdf: Path, links: list[str], joints: Mapping[str, UrdfJoint]) -> str:
+def _default_tip(urdf: Path, links: list[str], joints: Mapping[str, UrdfJoint]) -> str:
+    """Return the only link without a child; in place of fingers, the link that carries them."""
     parents = {joint.parent for joint in joints.values()}
-    leaves = [link for link in links if link not in parents]
+    ends = [link for link in links if link not in parents]
+    leaves = list(dict.fromkeys(_without_fingers(link, joints) for link in ends))
+    inner = {joint.parent for leaf in leaves for joint in _path(leaf, joints)}
+    leaves = [leaf for leaf in leaves if leaf not in inner or len(leaves) == 1]
     if len(leaves) != 1:
         leaf_text = (
             f"{len(leaves)} links have no child: {', '.join(leaves)}"
@@ -192,6 +268,13 @@ def _only_leaf(urdf: Path, links: list[str], joints: Mapping[str, UrdfJoint]) ->
         )
         raise UsageError(f"--tip must name the tip frame of {urdf.name}: {leaf_text}")
     return leaves[0]
+
+
+def _without_fingers(link: str, joints: Mapping[str, UrdfJoint]) -> str:
+    """Return the nearest link towards the root that is no finger by its name."""
+    while _FINGER.search(link.lower()) and link in joints:
+        link = joints[link].parent
+    return link
 
 
 def _path(frame: str, joints: Mapping[str, UrdfJoint]) -> list[UrdfJoint]:

@@ -54,12 +54,19 @@ def add_options(parser: Parser) -> None:
     )
     text = "an SRDF file, whose disabled pairs of links are not checked for collisions"
     option("--srdf", metavar="FILE", type=Path, help=text)
+    text = "MoveIt's joint_limits.yaml, whose limits replace those of the URDF"
+    option("--joint-limits", metavar="FILE", type=Path, help=text)
+    text = "use the <visual> elements of links that have no <collision> element"
+    option("--collision-from-visual", action="store_true", help=text)
+    text = "leave out the collision meshes of a link, such as a broken one; may be repeated"
+    option("--skip-mesh", metavar="LINK", action="append", default=[], help=text)
     option("--force", action="store_true", help="overwrite existing files")
 
 
 def run(arguments: argparse.Namespace) -> None:
     from cnpgen.addons.init.arm import read_arm
     from cnpgen.addons.init.initial_recipes import dataset_of, problem_of
+    from cnpgen.addons.init.joint_limits import read_joint_limits, with_joint_limits
     from cnpgen.addons.init.write import FILES, problem_text, sampling_texts
     from cnpgen.robots.shape.mesh_files import packages_of_environment
 
@@ -69,6 +76,13 @@ def run(arguments: argparse.Namespace) -> None:
         return
     check_absent(folder, FILES, force=arguments.force)
     arm = read_arm(arguments.urdf, arguments.tip)
+    if arguments.collision_from_visual:
+        arm = arm.with_visual_shapes()
+    limits = None
+    if arguments.joint_limits is not None:
+        names = (*(joint.name for joint in arm.planned), *arm.locked)
+        limits = read_joint_limits(arguments.joint_limits, names)
+        arm = with_joint_limits(arm, limits)
     packages = (
         *arguments.packages,
         *packages_of_environment(arm.meshes, arm.urdf, arguments.packages),
@@ -77,7 +91,15 @@ def run(arguments: argparse.Namespace) -> None:
         warnings.simplefilter(
             "ignore", RuntimeWarning
         )  # about the robot, which are in the notes
-        initial = problem_of(arm, folder.name, folder, packages, arguments.srdf)
+        initial = problem_of(
+            arm,
+            folder.name,
+            folder,
+            packages,
+            arguments.srdf,
+            skipped_meshes=tuple(arguments.skip_mesh),
+            joint_limits=limits,
+        )
         _write(folder, {FILES[0]: problem_text(initial, folder)})
         sys.stderr.writelines(f"note: {note}\n" for note in initial.notes)
         recipe, share = dataset_of(initial, folder)

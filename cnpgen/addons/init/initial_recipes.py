@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.addons.init.arm import Arm, ArmJoint, arm_notes, with_torques
-from cnpgen.addons.init.draws import MAX_LOAD, comfortable_base, find_boxes
+from cnpgen.addons.init.draws import comfortable_base, find_boxes
+from cnpgen.addons.init.joint_limits import StatedJointLimits
 from cnpgen.addons.init.link_overlaps import LinkOverlaps, resolve_overlaps
+from cnpgen.errors import RecipeError
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.stages.boundary_motion import AtRest
@@ -43,6 +45,7 @@ GUESS_RANGE_RAD, GUESS_RANGE_M = 0.5, 0.1
 # Jerk limits per acceleration limit [1/s]; Franka Research 3: 500 ('cnpgen docs
 # references').
 INITIAL_JERK_RATE = 100.0
+MAX_OVERLOAD = 10.0  # torque that gravity needs / torque limit of the URDF
 TORQUE_SCALE = 0.8  # planning limit / URDF limit of joint torques
 # Of the random states in which a joint's torque limit must suffice to hold the arm.
 MIN_HOLDING_FRACTION = 0.25
@@ -61,16 +64,25 @@ class InitialProblem:
 
 
 def problem_of(
-    arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], srdf: Path | None
+    arm: Arm,
+    name: str,
+    folder: Path,
+    packages: tuple[Path, ...],
+    srdf: Path | None,
+    *,
+    skipped_meshes: tuple[str, ...] = (),
+    joint_limits: StatedJointLimits | None = None,
 ) -> InitialProblem:
     """Make the problem of an arm, or raise RecipeError if it cannot be planned for.
 
     ``packages`` are folders that are searched for packages of the URDF, the SRDF
-    disables pairs of links.
+    disables pairs of links, and collision meshes of skipped links are left out.
     """
     problem = _problem(
         with_torques(arm, [1.0] * len(arm.planned)), name, folder, packages, srdf
     )
+    spec = replace(problem.robot, skipped_meshes=skipped_meshes)
+    problem = replace(problem, robot=spec)
     with warnings.catch_warnings(
         record=True
     ) as caught:  # such as those about simplified meshes
@@ -82,9 +94,12 @@ def problem_of(
         *dict.fromkeys(str(each.message) for each in caught),
         *(overlaps.notes if overlaps else ()),
     ]
-    arm, overloaded = _with_torque_limits(arm, robot)
-    limits = replace(problem.limits, **_replaced_limits(arm))
-    problem = _with_jerk_limits(replace(problem, limits=limits), robot)
+    arm, scale, overloaded = _with_torque_limits(arm, robot)
+    limits = replace(
+        problem.limits, torque_scale=scale, **_replaced_limits(arm, joint_limits, robot)
+    )
+    problem = replace(problem, limits=limits)
+    problem = _with_jerk_limits(problem, robot, joint_limits)
     if (
         robot.chain.joints[-1].mass > 0
     ):  # torques of links without masses are meaningless
@@ -134,6 +149,9 @@ def _problem(
         base=centre,
         geometry="urdf" if arm.has_shape else "paper-capsules",
         packages=tuple(str(each.absolute()) for each in packages),
+        locked_joints=tuple(arm.locked_positions),
+        locked_positions=tuple(arm.locked_positions.values()),
+        visual_links=tuple(link for link in arm.visual if link in arm.shaped),
         srdf="" if srdf is None else str(srdf.absolute()),
     )
     limits = LimitSpec(
@@ -162,10 +180,22 @@ def _problem(
     )
 
 
-def _replaced_limits(arm: Arm) -> dict[str, Any]:
-    """Return the limits that the problem states in place of the URDF's."""
-    missing = {name for joint in arm.planned for name in joint.missing}
+def _replaced_limits(
+    arm: Arm, joint_limits: StatedJointLimits | None = None, robot: Robot | None = None
+) -> dict[str, Any]:
+    """Return the limits that the problem states in place of the URDF's, and accelerations of a file."""
+    missing = {
+        name for joint in arm.planned for name in (*joint.missing, *joint.replaced)
+    }
+    stated = {} if joint_limits is None else joint_limits.of("max_acceleration")
+    accelerations = None
+    if stated and robot is not None:
+        pairs = zip(robot.joint_names, robot.acceleration_limit.tolist(), strict=True)
+        accelerations = PerJoint(
+            tuple(stated.get(name, usual) for name, usual in pairs)
+        )
     return {
+        "acceleration": accelerations,
         "position": tuple(Range(each.lower, each.upper) for each in arm.planned)
         if "position" in missing
         else None,
@@ -178,39 +208,59 @@ def _replaced_limits(arm: Arm) -> dict[str, Any]:
     }
 
 
-def _with_torque_limits(arm: Arm, robot: Robot) -> tuple[Arm, list[str]]:
+def _with_torque_limits(arm: Arm, robot: Robot) -> tuple[Arm, float, list[str]]:
     """Replace torque limits that are missing or below the torques that gravity needs.
 
-    Return notes about the latter.
+    Return the planning limit relative to them, and notes about the latter.
+
+    Raises: RecipeError: Gravity needs so much torque that masses are in another unit.
     """
     moving, at_rest = _torques(robot)
-    notes, planned = [], []
+    notes, planned, scale = list[str](), list[ArmJoint](), TORQUE_SCALE
     for joint, load in zip(
         arm.planned,
         np.quantile(at_rest, MIN_HOLDING_FRACTION, axis=0).tolist(),
         strict=True,
     ):
-        if 0 < MAX_LOAD * TORQUE_SCALE * joint.effort < load:
-            unit = "N" if joint.kind == "prismatic" else "N m"
-            text = f"{joint.name}: gravity needs {load:.4g} {unit}, where the URDF allows {joint.effort:g} {unit}"
+        unit = "N" if joint.kind == "prismatic" else "N m"
+        text = f"{joint.name}: gravity needs {load:.4g} {unit}, where the URDF allows {joint.effort:g} {unit}"
+        if 0 < MAX_OVERLOAD * joint.effort < load:
+            raise RecipeError(
+                [f"{arm.urdf}: {text}: are its masses in g? <mass> is in kg"]
+            )
+        if 0 < joint.effort < load:
             notes.append(
-                f"{text}; the placeholder of a missing limit replaces it in [limits]"
+                f"{text}: check the masses of its links; the placeholder of a missing limit replaces it in [limits]"
             )
             missing = tuple(dict.fromkeys((*joint.missing, "torque")))
             planned.append(replace(joint, effort=0.0, missing=missing))
         else:
+            if 0 < TORQUE_SCALE * joint.effort < load:
+                scale = 1.0
+                notes.append(f"{text}: 'torque_scale' is 1, so that it can be held")
             planned.append(joint)
     torques = [float(max(1, math.ceil(each))) for each in moving.max(axis=0)]
-    return with_torques(replace(arm, planned=tuple(planned)), torques), notes
+    arm = with_torques(replace(arm, planned=tuple(planned)), torques)
+    return arm, scale, notes
 
 
-def _with_jerk_limits(problem: Problem, robot: Robot) -> Problem:
-    """Return the problem with jerk limits in proportion to the acceleration limits.
+def _with_jerk_limits(
+    problem: Problem, robot: Robot, joint_limits: StatedJointLimits | None
+) -> Problem:
+    """Return the problem with jerk limits in proportion to the acceleration limits, or those of a file.
 
     URDFs have none.
     """
+    stated = {} if joint_limits is None else joint_limits.of("max_jerk")
+    accelerations = problem.limits.acceleration
+    limits_of = (
+        robot.acceleration_limit.tolist()
+        if accelerations is None
+        else accelerations.values
+    )
     jerks = tuple(
-        float(f"{INITIAL_JERK_RATE * limit:.3g}") for limit in robot.acceleration_limit
+        stated.get(name, float(f"{INITIAL_JERK_RATE * limit:.3g}"))
+        for name, limit in zip(robot.joint_names, limits_of, strict=True)
     )
     limits = replace(problem.limits, jerk=PerJoint(jerks))
     *others, acceleration = problem.constraint[:3]

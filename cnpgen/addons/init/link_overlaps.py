@@ -12,6 +12,7 @@ from cnpgen.robots.shape.hull_gap import GAP_STATES, HullGap, PairGap, measure_h
 from cnpgen.robots.shape.inline import mesh_links
 from cnpgen.robots.shape.link_pairs import LinkPair
 from cnpgen.robots.urdf import read_urdf
+from cnpgen.robots.urdf_changes import with_collision_geometry
 
 # Fraction of the free states that convex parts may reject without further
 # decomposition.
@@ -59,13 +60,21 @@ def _gap(problem: Problem) -> HullGap:
     robot, path = load_robot(problem), problem.urdf_path
     assert robot.shape is not None
     return measure_hull_gap(
-        read_urdf(path), path, problem.packages, model=robot.model, shape=robot.shape
+        _urdf(problem), path, problem.packages, model=robot.model, shape=robot.shape
+    )
+
+
+def _urdf(problem: Problem) -> str:
+    """Return the URDF that names its mesh files, with the collision elements of the problem."""
+    spec = problem.robot
+    return with_collision_geometry(
+        read_urdf(problem.urdf_path), spec.visual_links, spec.skipped_meshes
     )
 
 
 def _decompose(problem: Problem, gap: HullGap) -> tuple[Problem, HullGap]:
     """Decompose links, into more parts each time, until the gap is small."""
-    meshes = mesh_links(read_urdf(problem.urdf_path))
+    meshes = mesh_links(_urdf(problem))
     chosen: list[str] = []
     for count in PART_COUNTS:
         if gap.fraction <= MAX_GAP and not gap.hidden:

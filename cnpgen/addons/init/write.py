@@ -114,10 +114,11 @@ def _about(initial: InitialProblem, robot: Robot) -> Iterator[str]:
     heavy = [link for link in arm.moved if arm.masses.get(link)]
     light = [link for link in arm.moved if not arm.masses.get(link)]
     mass = sum(arm.masses[link] for link in heavy)
+    elsewhere = " or at 'locked_positions'" if arm.locked_positions else ""
     facts = [
         (
             "locked",
-            f"joints that are not planned and stay at zero: {', '.join(arm.locked) or 'none'}",
+            f"joints that are not planned and stay at zero{elsewhere}: {', '.join(arm.locked) or 'none'}",
         )
     ]
     facts += [

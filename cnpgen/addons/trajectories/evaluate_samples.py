@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
     with Meter(quiet=not sys.stderr.isatty(), noun="trajectory") as meter:
         meter.begin(f"judging {arguments.file}", count)
         found = evaluate_trajectories(
-            problem,
+            loaded.problem,
             loaded.trajectories,
             interpolation=arguments.interpolation,
             noise=arguments.noise,

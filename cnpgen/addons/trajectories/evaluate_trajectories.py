@@ -22,6 +22,7 @@ from cnpgen.addons.trajectories.judge_samples import (
 )
 from cnpgen.addons.trajectories.sample_errors import SampleErrors, errors_of
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.addons.trajectories.trajectory_scenes import problem_of_samples
 from cnpgen.addons.trajectories.trajectory_verdict import (
     Decision,
     Statement,
@@ -32,7 +33,9 @@ from cnpgen.judges.plans.judge import check_step
 from cnpgen.plans.evaluate import MAX_VERDICT_STEP_S, judged_in_parts
 from cnpgen.problems.constraints.joint import judged_torque
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
+from cnpgen.problems.problem_record import ProblemRecord, open_problem
+from cnpgen.robots.scene import Scene
+from cnpgen.robots.solid import pose_width
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import number, numbers
 from cnpgen.store.dataset_spec import StoredProblem
@@ -172,7 +175,7 @@ def evaluate_trajectories(
         RecipeError: A required plug-in is not installed.
     """
     check_step(step := number("step", step))
-    record = as_record(problem)
+    record = problem_of_samples(problem)
     n = len(record.joint_names)
     check_trajectories(trajectories, record)
     if interpolation is not None and max_jerk is not None:
@@ -206,8 +209,9 @@ def evaluate_trajectories(
 def check_trajectories(
     trajectories: Sequence[Trajectory], record: ProblemRecord
 ) -> None:
-    """Check that there are trajectories with the joints and the parameters of a problem."""
+    """Check that there are trajectories with the joints, the parameters and the scenes of a problem."""
     n, names = len(record.joint_names), ", ".join(record.parameters.names)
+    problem = open_problem(record)[0]
     if not len(trajectories):
         raise UsageError("there are no trajectories", concerns="trajectories")
     for index, trajectory in enumerate(trajectories):
@@ -221,6 +225,7 @@ def check_trajectories(
                 f"trajectory {index} has {trajectory.q.shape[1]} joints, the problem plans {n}",
                 concerns="trajectories",
             )
+        _check_scene(index, trajectory, problem)
         if trajectory.parameters is not None:
             record.parameters.checked(trajectory.parameters)
         elif names:
@@ -228,6 +233,22 @@ def check_trajectories(
             raise UsageError(
                 text, concerns="trajectories", remedies={"parameters": None}
             )
+
+
+def _check_scene(index: int, trajectory: Trajectory, problem: Problem) -> None:
+    """Check that a trajectory has the obstacles that samples of a problem place."""
+    if trajectory.obstacle_poses is not None:
+        obstacles = tuple(problem.obstacle)
+        Scene(obstacles, np.empty((1, pose_width(obstacles)))).with_poses(
+            trajectory.obstacle_poses[None]
+        )  # checks the shape and the values
+    elif problem.has_sample_obstacles:
+        text = f"trajectory {index} has no scene: samples of {problem.name!r} place its obstacles, which"
+        raise UsageError(
+            f"{text} {{scenes}} gives",
+            concerns="trajectories",
+            remedies={"scenes": None},
+        )
 
 
 def non_negative(name: str, value: ArrayLike, size: int) -> Array:

@@ -4,7 +4,8 @@ The plans are initial guesses: 'cnpgen refine' optimizes them and keeps their en
 'cnpgen evaluate' judges them. Formats and columns are those of 'cnpgen evaluate'
 ('cnpgen docs trajectories'). The ends are moved onto the constraints by a change of
 positions of at most three times the noise, or 1 mrad. The plan file is printed on
-stdout.
+stdout. The exit code is 1 if a plan is farther from its samples than 2 mrad plus the
+noise; these plans are listed with their distance.
 """
 
 import argparse
@@ -22,6 +23,10 @@ from cnpgen.cli.parser import Parser
 from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from cnpgen.addons.trajectories.import_trajectories import ImportedTrajectories
+    from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
     from cnpgen.plans import Plans
 
 
@@ -63,13 +68,11 @@ def add_options(parser: Parser) -> None:
         default=False,
         help=text,
     )
-    text = "also refine the plans, with at most this difference of every joint from the imported path, such as 2deg"
+    text = "also refine the plans, with at most this difference of every joint from the samples of the file, such as 2deg"
     option("--stay-within", metavar="E", type=values.angle, help=text)
 
 
-def run(arguments: argparse.Namespace) -> None:
-    import numpy as np
-
+def run(arguments: argparse.Namespace) -> int:
     from cnpgen.addons.trajectories.import_trajectories import import_trajectories
     from cnpgen.cli.refine_command import check_place
     from cnpgen.plans.plan_file import save_plans
@@ -84,52 +87,72 @@ def run(arguments: argparse.Namespace) -> None:
     problem = problem_of(arguments)
     loaded = load_file(arguments, problem)
     imported = import_trajectories(
-        problem,
+        loaded.problem,
         loaded.trajectories,
         noise=arguments.noise or 0.0,
         at_rest=arguments.at_rest,
         source=f"imported from {arguments.file.name}",
     )
-    plans = (
-        imported.plans
-        if arguments.stay_within is None
-        else _refined(imported.plans, arguments.stay_within)
-    )
+    _report(imported)
+    plans = imported.plans
+    if arguments.stay_within is not None and imported.meets_samples.all():
+        plans = _refined(imported, loaded.trajectories, arguments.stay_within)
     save_plans(arguments.out, plans)
-    points = imported.plans.path_control_points.shape[1]
-    print(
-        f"imported {counted(len(imported.plans), 'plan')} with {points} control points of the path;"
-        f" largest distance from the samples {imported.deviation.max():.2g} rad",
-        file=sys.stderr,
-    )
-    failed = np.flatnonzero(np.isnan(imported.snapped)).tolist()
-    for index in failed:
-        print(
-            f"plan {index}: the ends cannot be moved onto the constraints by a small change",
-            file=sys.stderr,
-        )
-    largest = (
-        float(np.nanmax(imported.snapped)) if len(failed) < len(imported.plans) else 0.0
-    )
-    print(
-        f"ends moved by at most {largest:.2g} rad to meet the constraints",
-        file=sys.stderr,
-    )
     print(arguments.out)
+    return 0 if imported.meets_samples.all() else 1
 
 
-def _refined(plans: "Plans", distance: float) -> "Plans":
-    """Refine plans near their paths.
+def _report(imported: "ImportedTrajectories") -> None:
+    """Print the distances of plans from their samples, and the changes of their ends, on stderr."""
+    import numpy as np
 
-    Report the number of valid plans and the largest distance on stderr.
+    plans, deviation = imported.plans, imported.deviation
+    points = plans.path_control_points.shape[1]
+    lines = [
+        f"imported {counted(len(plans), 'plan')} with {points} control points of the path;"
+        f" largest distance from the samples {deviation.max():.2g} rad"
+    ]
+    lines += [
+        f"plan {index}: {deviation[index]:.2g} rad from its samples, more than {imported.max_deviation:.2g} rad:"
+        f" {points} control points are too few, separate the motion into several"
+        for index in np.flatnonzero(~imported.meets_samples).tolist()
+    ]
+    failed = np.flatnonzero(np.isnan(imported.snapped)).tolist()
+    lines += [
+        f"plan {index}: the ends cannot be moved onto the constraints by a small change"
+        for index in failed
+    ]
+    moved = np.nanmax(imported.snapped) if len(failed) < len(plans) else 0.0
+    lines.append(f"ends moved by at most {moved:.2g} rad to meet the constraints")
+    print("\n".join(lines), file=sys.stderr)
+
+
+def _refined(
+    imported: "ImportedTrajectories",
+    trajectories: "Sequence[Trajectory]",
+    distance: float,
+) -> "Plans":
+    """Refine plans within a distance of the samples of their file [rad].
+
+    The distance of the fit is part of it. Report the number of valid plans and the
+    largest distance on stderr.
     """
+    from cnpgen.addons.trajectories.import_trajectories import distance_from_samples
     from cnpgen.refine.options import RefineOptions
     from cnpgen.refine.refine_plans import refine_plans
 
-    refinement = refine_plans(plans, options=RefineOptions(stay_within=distance))
-    valid, largest = int(refinement.valid.sum()), float(refinement.deviation.max())
+    plans, fit = imported.plans, float(imported.deviation.max())
+    if fit >= distance:
+        raise UsageError(
+            f"--stay-within must be above the distance of the plans from their samples, {fit:.2g} rad,"
+            f" got {distance:.2g} rad"
+        )
+    options = RefineOptions(stay_within=distance - fit)
+    refinement = refine_plans(plans, options=options)
+    valid = int(refinement.valid.sum())
+    largest = distance_from_samples(refinement.plans, plans, trajectories).max()
     print(
-        f"refined: {valid} of {len(plans)} valid, at most {largest:.2g} rad from the imported path",
+        f"refined: {valid} of {len(plans)} valid, at most {largest:.2g} rad from the imported samples",
         file=sys.stderr,
     )
     return refinement.plans

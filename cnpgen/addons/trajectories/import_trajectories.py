@@ -18,16 +18,19 @@ from cnpgen.addons.trajectories.evaluate_trajectories import (
     non_negative,
 )
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.addons.trajectories.trajectory_scenes import problem_of_samples
+from cnpgen.errors import UsageError
 from cnpgen.judges.plans.continuous_collision import is_contact
 from cnpgen.machine.threads import one_thread
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.constraints.constraint import End
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_record import as_record, open_problem
+from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.dataset_spec import StoredProblem
+from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.trajectory.boundary import Boundary, join_boundaries
 from cnpgen.trajectory.fit import fit_motion, largest_error
 from cnpgen.trajectory.samples import sampled_boundary
@@ -40,7 +43,7 @@ State = tuple[Array, Array, Array]
 
 # Of the positions at the samples, plus the noise, with more control points otherwise.
 MAX_FIT_ERROR_RAD = 2e-3
-GROWTH = (1.0, 1.6, 2.6)  # of the number of control points of the path
+GROWTH = 1.6  # of the number of control points of the path, per attempt
 FIT_SAMPLES_PER_POINT = 4  # of the path, at most
 # Of the path, from which velocities of the samples are not needed.
 MIN_SAMPLES_PER_POINT = 2
@@ -64,6 +67,8 @@ class ImportedTrajectories:
         plans: The plans, with one number of control points for all.
         deviation: Largest distance of a plan from its samples over all joints [rad],
             shape (N,).
+        max_deviation: Largest distance that the fit may have [rad]; plans are farther
+            from their samples only if no path of ``MAX_CONTROL_POINTS`` meets it.
         snapped: Largest change of a boundary position [rad], shape (N,); nan where the
             constraints cannot be met by a small change, so that the boundary conditions
             are those of the samples.
@@ -71,7 +76,13 @@ class ImportedTrajectories:
 
     plans: Plans
     deviation: Array
+    max_deviation: float
     snapped: Array
+
+    @property
+    def meets_samples(self) -> NDArray[np.bool_]:
+        """Whether each plan is within the stated error of its samples, shape (N,)."""
+        return np.asarray(self.deviation <= self.max_deviation)
 
 
 @checked_arguments
@@ -89,7 +100,8 @@ def import_trajectories(
     Boundary conditions are those of the first and the last sample; derivatives that are
     not given are estimated, and zero within the noise. The states are then moved onto
     the constraints of the problem, by a change of positions of at most three times the
-    noise or 1 mrad. The path has as many control points as the samples require.
+    noise or 1 mrad. The path has as many control points as the samples require for an
+    error of 2 mrad plus the noise, at most ``MAX_CONTROL_POINTS``.
 
     Args:
         problem: Problem, record, or name or path of a problem, pipeline or dataset.
@@ -104,7 +116,7 @@ def import_trajectories(
         UsageError: An argument is invalid, or a trajectory has another number of
             joints.
     """
-    record = as_record(problem)
+    record = problem_of_samples(problem)
     check_trajectories(trajectories, record)
     errors = non_negative("noise", noise, 3)
     snapper = StateSnapper(*open_problem(record))
@@ -116,20 +128,37 @@ def import_trajectories(
         [boundary for boundary, _ in ends],
         np.array([change for _, change in ends]),
     )
-    motions, deviation = _fitted(
-        trajectories,
-        boundaries,
-        record.trajectory,
-        MAX_FIT_ERROR_RAD + float(errors[0]),
-    )
+    max_error = MAX_FIT_ERROR_RAD + float(errors[0])
+    motions, deviation = _fitted(trajectories, boundaries, record.trajectory, max_error)
+    poses = [trajectory.obstacle_poses for trajectory in trajectories]
+    placed = [row for row in poses if row is not None]
+    if 0 < len(placed) < len(poses):
+        raise UsageError("some have scenes and others not", argument="trajectories")
     plans = make_plans(
         record,
         join_boundaries(boundaries),
+        columns={OBSTACLE_POSES: np.array(placed)} if placed else {},
         path_control_points=np.concatenate([motion.path for motion in motions]),
         rate_control_points=np.concatenate([motion.rate for motion in motions]),
         source=source,
     )
-    return ImportedTrajectories(plans, deviation, snapped)
+    return ImportedTrajectories(plans, deviation, max_error, snapped)
+
+
+def distance_from_samples(
+    plans: Plans, imported: Plans, trajectories: Sequence[Trajectory]
+) -> Array:
+    """Compute the largest distances of refined paths from the samples of their imported plans [rad], shape (N,).
+
+    A path is compared at the phases that the imported plan has at the times of the
+    samples, as a refined plan may be faster or slower.
+    """
+    rows = zip(plans, imported, trajectories, strict=True)
+    distances = []
+    for plan, before, trajectory in rows:
+        s = before.motion.phase_at(trajectory.t[None])
+        distances.append(np.abs(plan.motion.at(s).q[0] - trajectory.q).max())
+    return np.array(distances)
 
 
 def _boundary(
@@ -219,8 +248,8 @@ def _fitted(
     max_error: float,
 ) -> tuple[list[Motion], Array]:
     """Fit all trajectories with the smallest number of control points that meets the error; also return the errors."""
-    for factor in GROWTH:
-        points = min(round(factor * spec.path_control_points), MAX_CONTROL_POINTS)
+    points = spec.path_control_points
+    while True:
         larger = replace(spec, path_control_points=points)
         motions = [
             fit_motion(*_fit_samples(each, points), spec=larger, boundary=boundary)
@@ -230,9 +259,9 @@ def _fitted(
         errors = np.array(
             [largest_error(motion, each.t, each.q) for motion, each in pairs]
         )
-        if (errors <= max_error).all():
-            break
-    return motions, errors
+        if (errors <= max_error).all() or points >= MAX_CONTROL_POINTS:
+            return motions, errors
+        points = min(round(GROWTH * points), MAX_CONTROL_POINTS)
 
 
 class StateSnapper:

@@ -161,6 +161,9 @@ class FamilyJudge:
         if scene is None:
             poses = self._obstacle_poses(states.q, states.dq, trajectory.parameters)
             scenes = self._possible_scenes(family, states, poses, trajectory.parameters)
+            if (placed := trajectory.obstacle_poses) is not None:
+                for each in (poses, *scenes):
+                    each[: len(placed)] = placed
         else:
             poses, scenes = scene, []
         self._world.set_path(states.q, states.dq, states.ddq, poses, states.jerk)

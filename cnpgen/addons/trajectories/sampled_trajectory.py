@@ -33,6 +33,9 @@ class Trajectory:
             without parameters.
         phase: Phases at the samples, increasing from 0 to 1, for bounds that depend on
             the phase, shape (K,), or None.
+        obstacle_poses: Poses and sizes of the problem's obstacles
+            (``cnpgen.robots.solid``), shape (width,), in place of its own; None for
+            these.
 
     Raises:
         UsageError: A shape is wrong, the times do not increase from 0, or a value is
@@ -45,6 +48,7 @@ class Trajectory:
     ddq: Array | None = None
     parameters: Array | None = None
     phase: Array | None = None
+    obstacle_poses: Array | None = None
 
     def __post_init__(self) -> None:
         t, q, dq = checked_samples(self.t, self.q, self.dq)
@@ -63,6 +67,14 @@ class Trajectory:
             raise UsageError(
                 f"must have shape (p,), got {parameters.shape}", argument="parameters"
             )
+        poses = self.obstacle_poses
+        if poses is not None:
+            poses = numbers("obstacle_poses", poses)
+            if poses.ndim != 1:
+                raise UsageError(
+                    f"must have shape (width,), got {poses.shape}",
+                    argument="obstacle_poses",
+                )
         phase = None if self.phase is None else numbers("phase", self.phase)
         if phase is not None:
             _check_phase(phase, len(t))
@@ -73,6 +85,7 @@ class Trajectory:
             "ddq": ddq,
             "parameters": parameters,
             "phase": phase,
+            "obstacle_poses": poses,
         }
         for name, values in arrays.items():
             object.__setattr__(self, name, values)  # lists become arrays

@@ -7,11 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.cli import values
+from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Options, options_of
 from cnpgen.cli.terminal import table
 from cnpgen.cli.verdict_text import margin_cells, margin_head
-from cnpgen.errors import UsageError, listed
+from cnpgen.errors import UsageError, counted, listed
 
 if TYPE_CHECKING:
     from cnpgen.addons.trajectories.evaluate_trajectories import TrajectoryEvaluation
@@ -19,8 +19,21 @@ if TYPE_CHECKING:
     from cnpgen.problems.problem import Problem
 
 # Of load_trajectories.
-TRAJECTORY_OPTIONS = "joints", "unit", "rate", "separate_by", "unwrap", "parameters"
+TRAJECTORY_OPTIONS = (
+    "joints",
+    "velocities",
+    "time",
+    "unit",
+    "rate",
+    "separator",
+    "separate_by",
+    "unwrap",
+    "drop_repeats",
+    "parameters",
+    "scenes",
+)
 MAX_IGNORED = 8  # unused columns that are listed
+MAX_NOTES = 5  # that are printed
 
 
 def add_trajectory_options(option: Options) -> None:
@@ -33,6 +46,14 @@ def add_trajectory_options(option: Options) -> None:
         help="names of the problem's joints in the file, in order",
     )
     add(
+        "--velocities",
+        metavar="A,B,...",
+        type=values.names,
+        help="columns with the velocities of these joints, if they have other names",
+    )
+    text = "column of the times, with its unit if it has another than s: 'stamp [ms]'"
+    add("--time", metavar="COLUMN", help=text)
+    add(
         "--unit",
         choices=("rad", "deg"),
         help="unit of columns without a unit in their name (default: rad)",
@@ -43,20 +64,27 @@ def add_trajectory_options(option: Options) -> None:
         type=values.hertz,
         help="samples per second of a file without times",
     )
-    add(
-        "--separate-by",
-        metavar="COLUMN",
-        help="column whose value differs from trajectory to trajectory",
-    )
+    text = "separator of columns in text files (default: the comma, semicolon, tab or spaces of the first line)"
+    add("--separator", metavar="TEXT", help=text)
+    text = "column whose value differs from trajectory to trajectory"
+    add("--separate-by", metavar="COLUMN", help=text)
     add(
         "--unwrap",
         action="store_true",
         default=None,
         help="continue angles that jump by more than half a turn",
     )
+    add(
+        "--drop-repeats",
+        action="store_true",
+        default=None,
+        help="drop rows that repeat the time and the positions of the row before",
+    )
 
     text = "values of the problem's parameters that the file does not have, such as payload_mass=6kg"
     add("--parameters", metavar="NAME=V,...", type=values.parameters, help=text)
+    text = "obstacles around the trajectories: a file of scenes or of plans; one for each trajectory, or one for all"
+    add("--scenes", metavar="FILE", type=recipe_names.present, help=text)
     text = "body at the tip, in place of the problem's: mass [kg], or mass and centre of mass in the tip frame [m]"
     add("--payload", metavar="M[,X,Y,Z]", type=values.payload, help=text)
 
@@ -76,6 +104,7 @@ def refuse_trajectory_options(
 
 def problem_of(arguments: argparse.Namespace) -> "str | Problem":
     """Return the problem of a command, with the payload of its options."""
+    from cnpgen.addons.trajectories.trajectory_scenes import problem_of_samples
     from cnpgen.problems.problem_record import as_problem
     from cnpgen.robots.robot_spec import Payload
 
@@ -92,7 +121,7 @@ def problem_of(arguments: argparse.Namespace) -> "str | Problem":
         if not centre
         else Payload(mass=mass, centre=(centre[0], centre[1], centre[2]))
     )
-    return replace(as_problem(name), payload=body)
+    return replace(as_problem(problem_of_samples(name)), payload=body)
 
 
 def load_file(
@@ -109,6 +138,10 @@ def load_file(
             f"columns that are not used: {listed(loaded.ignored, MAX_IGNORED)}",
             file=sys.stderr,
         )
+    for note in loaded.notes[:MAX_NOTES]:
+        print(f"note: {note}", file=sys.stderr)
+    if (more := len(loaded.notes) - MAX_NOTES) > 0:
+        print(f"note: {counted(more, 'further note')}", file=sys.stderr)
     return loaded
 
 

@@ -59,6 +59,14 @@ def along_trajectory(
     world.set_path(q, dq, ddq, place_obstacles(problem.obstacle), jerk)
     tip, velocity = world.tip_position.T, world.tip_velocity.T
     parameters = None if trajectory.parameters is None else trajectory.parameters[None]
-    scene = scene_of(problem, tip[:1], tip[-1:], velocity[-1:], parameters)
+    poses = trajectory.obstacle_poses
+    scene = scene_of(
+        problem,
+        tip[:1],
+        tip[-1:],
+        velocity[-1:],
+        parameters,
+        obstacle_poses=None if poses is None else poses[None],
+    )
     world.set_path(q, dq, ddq, scene.poses[0], jerk)
     return world, share if phase_of is None else phase_of(share), t, scene

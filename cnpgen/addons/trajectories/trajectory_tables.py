@@ -2,30 +2,35 @@
 
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cnpgen.addons.trajectories.message_tables import (
+    MESSAGE_TIME,
+    is_joint_state,
+    table_of_states,
+    tables_of_document,
+)
+from cnpgen.addons.trajectories.text_tables import TEXT_SUFFIXES, read_text_table
+from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable, Values
 from cnpgen.errors import CnpgenError, DatasetError, UsageError, either, requires_extra
 from cnpgen.plans.format import JOINT_NAMES_KEY, PHASE_COLUMN, PLAN_COLUMN
 from cnpgen.problems.scenes.yaml_document import read_yaml
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.store.files.archives import ArchiveError, read_arrays
 from cnpgen.store.files.atomic import machine_error, read_file
-from cnpgen.store.files.csv_table import read_csv_table
 from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.hdf5 import open_hdf5
 from cnpgen.store.files.kind import HDF5_SUFFIXES, is_hdf5, kind_of_content
 from cnpgen.store.files.size_limits import MAX_TABLE_BYTES
 from cnpgen.store.layout import SPECIFICATION
 from cnpgen.store.paths import require_path
+from cnpgen.store.scene_table import OBSTACLE_POSES
 
-Values = NDArray[Any]
-
+JOINT_NAMES = "joint_names"  # array of an archive, dataset or attribute of HDF5
 MAX_ARCHIVE_BYTES = 1 << 30  # of the arrays of an archive
 MAX_PARQUET_VALUES = (
     25_000_000  # of a table: they take up to 50 bytes each while it is read
@@ -38,39 +43,19 @@ LEROBOT_ENVIRONMENT = "observation.environment_state"
 _PART_OF_ARCHIVE = re.compile(
     rf"(.+?)_(t|{PHASE_COLUMN}|q|dq|ddq|jerk|{'|'.join(PARAMETER_UNITS)})"
 )
-MESSAGE_TIME = "t [s]"  # of formats that define the unit
-_POINT_FIELDS = {"positions": "q", "velocities": "dq", "accelerations": "ddq"}
-# Keys of messages that hold messages.
-_NESTING = "joint_trajectory", "trajectory", "trajectories", "solution"
+_POSE_NAME = re.compile(rf"{OBSTACLE_POSES}(_[0-9]+)?")  # a value of LeRobot
 
 
-@dataclass(frozen=True, eq=False)
-class TrajectoryTable:
-    """One trajectory, or several of equal columns, as a file has them.
-
-    Attributes:
-        place: The file and the part of it, for messages.
-        columns: Name -> values, shape (K,), (K, w) or (N, K, w); texts are kept as
-            texts.
-        joint_names: Names of the joints of columns with one value per joint; empty if
-            the file does not name them.
-        lines: Numbers of the lines of a text file, for messages.
-    """
-
-    place: str
-    columns: Mapping[str, Values]
-    joint_names: tuple[str, ...] = ()
-    lines: tuple[int, ...] = ()
-
-
-def read_trajectory_tables(path: Path) -> list[TrajectoryTable]:
+def read_trajectory_tables(
+    path: Path, *, separator: str | None = None
+) -> list[TrajectoryTable]:
     """Read all trajectories of a file, or of all files of a folder in the order of their names.
 
-    Raises:
-        UsageError: The file does not exist, is damaged or of an unknown format; the
-            message names the place.
-        MissingExtraError: The format needs a package that is not installed.
-        MachineError: The file cannot be read.
+    The separator of columns in text files is found by default.
+
+    Raises: UsageError: The file does not exist, is damaged or of an unknown format; the
+        message names the place. MissingExtraError: The format needs a package that is
+        not installed. MachineError: The file cannot be read.
     """
     if (path / LEROBOT_INFO).is_file():
         return list(_read_lerobot(path))
@@ -80,17 +65,24 @@ def read_trajectory_tables(path: Path) -> list[TrajectoryTable]:
             raise UsageError(
                 f"{path} has no files of trajectories, expected {either(sorted(_READERS))}"
             )
-        return [table for file in files for table in read_trajectory_tables(file)]
+        return [
+            table
+            for file in files
+            for table in read_trajectory_tables(file, separator=separator)
+        ]
     if not path.exists():
         raise UsageError(
             f"{path} is not there, expected a file of trajectories or a folder of them"
         )
-    read = _READERS.get(path.suffix.lower())
+    suffix = path.suffix.lower()
+    read = _READERS.get(suffix)
     if read is None:
         raise UsageError(
             f"{path} has an unknown format, expected {either(sorted(_READERS))}"
         )
     try:
+        if suffix in TEXT_SUFFIXES:
+            return [read_text_table(path, separator)]
         return list(read(path))
     except OSError as error:
         raise machine_error("read", path, error) from error
@@ -135,17 +127,8 @@ def holds_trajectories(path: Path) -> bool:
         return False
 
 
-def _read_csv(path: Path) -> Iterator[TrajectoryTable]:
-    table = read_csv_table(path, example="t,joint_1,joint_2")
-    columns: dict[str, Values] = {}
-    for name in table.names:
-        try:
-            columns[name] = table.numbers(name)
-        except DatasetError:  # a column of texts; an error only if it is used
-            columns[name] = np.array(table.texts(name), np.str_)
-    yield TrajectoryTable(
-        str(path), columns, lines=tuple(line for line, _ in table.lines)
-    )
+def _read_text(path: Path) -> Iterator[TrajectoryTable]:
+    yield read_text_table(path, None)
 
 
 def _read_npz(path: Path) -> Iterator[TrajectoryTable]:
@@ -155,14 +138,27 @@ def _read_npz(path: Path) -> Iterator[TrajectoryTable]:
         raise UsageError(
             f"{path} is not an archive of NumPy arrays, or is damaged: {error}"
         ) from error
-    names = tuple(map(str, arrays.pop("joint_names", np.array([], np.str_)).ravel()))
+    names = tuple(map(str, arrays.pop(JOINT_NAMES, np.array([], np.str_)).ravel()))
     yield from _split(path, arrays, names)
 
 
 def _read_hdf5(path: Path) -> Iterator[TrajectoryTable]:
     with open_hdf5(path) as file:
-        arrays = {name: column.read() for name, column in file.columns().items()}
-    yield from _split(path, arrays, ())
+        names: tuple[str, ...] = ()
+        if JOINT_NAMES in file.attributes:
+            names = file.attributes.texts(JOINT_NAMES)
+        if JOINT_NAMES in file.names():
+            others = file.texts(JOINT_NAMES)
+            if names and others != names:
+                raise UsageError(
+                    f"{path}: the attribute {JOINT_NAMES} names {', '.join(names)}, the dataset {', '.join(others)}"
+                )
+            names = others
+        arrays = {
+            name: column.read()
+            for name, column in file.columns(without=(JOINT_NAMES,)).items()
+        }
+    yield from _split(path, arrays, names)
 
 
 def _split(
@@ -170,7 +166,8 @@ def _split(
 ) -> Iterator[TrajectoryTable]:
     """Yield the trajectories of an archive: ``plan_00000_t`` and so on, or ``t`` and ``q`` of all."""
     parts: dict[str, dict[str, Values]] = {}
-    for name, values in arrays.items():
+    of_plans = {} if "q" in arrays else arrays  # "ref_q" beside "q" is no plan "ref"
+    for name, values in of_plans.items():
         if match := _PART_OF_ARCHIVE.fullmatch(name):
             parts.setdefault(match[1], {})[match[2]] = values
     parts = {label: columns for label, columns in parts.items() if "q" in columns}
@@ -282,20 +279,22 @@ def _read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
     parameters = {
         name: k for k, name in enumerate(described) if name in PARAMETER_UNITS
     }
+    scene = [k for k, name in enumerate(described) if _POSE_NAME.fullmatch(name)]
+    environment_key = [LEROBOT_ENVIRONMENT] if parameters or scene else []
     for path in sorted(folder.glob("data/*/*.parquet")):
         table = read_parquet(path)
         needed = (
             "timestamp",
             "episode_index",
             key,
-            *([LEROBOT_ENVIRONMENT] if parameters else []),
+            *environment_key,
         )
         missing = [name for name in needed if name not in table.column_names]
         if missing:
             raise UsageError(
                 f"{path}: there is no column {missing[0]!r}, only {', '.join(table.column_names)}"
             )
-        widths = 1, 1, len(names), *([len(described)] if parameters else [])
+        widths = 1, 1, len(names), *([len(described)] if environment_key else [])
         columns_of = zip(needed, widths, strict=True)
         times, episodes, values, *environment = (
             _number_column(table, name, path, width) for name, width in columns_of
@@ -305,6 +304,8 @@ def _read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
             columns: dict[str, Values] = {MESSAGE_TIME: times[rows, 0]}
             columns |= {name: values[rows, k] for k, name in enumerate(names)}
             columns |= {name: environment[0][rows, k] for name, k in parameters.items()}
+            if scene:
+                columns[OBSTACLE_POSES] = environment[0][rows][:, scene]
             yield TrajectoryTable(f"{folder}: episode {episode:g}", columns)
 
 
@@ -336,136 +337,25 @@ def _read_json(path: Path) -> Iterator[TrajectoryTable]:
         document = parse_json(read_file(path, max_bytes=MAX_TABLE_BYTES).decode())
     except ValueError as error:
         raise UsageError(f"{path} is not JSON: {error}") from error
-    yield from _from_document(document, str(path))
+    yield from tables_of_document(document, str(path))
 
 
 def _read_yaml(path: Path) -> Iterator[TrajectoryTable]:
     documents = read_yaml(path, numbers=True)
+    states = [document for document in documents if document is not None]
+    if states and is_joint_state(states[0]):
+        yield table_of_states(states, str(path))
+        return
     for index, document in enumerate(documents):
         if document is not None:  # topics echoed by ROS end with an empty document
-            yield from _from_document(
+            yield from tables_of_document(
                 document,
                 f"{path}: document {index}" if len(documents) > 2 else str(path),
             )
 
 
-def _from_document(document: Any, place: str) -> Iterator[TrajectoryTable]:
-    """Yield the trajectories of a message, of a list of messages or rows, or of an object of columns."""
-    if (
-        isinstance(document, list)
-        and document
-        and all(isinstance(entry, dict) for entry in document)
-    ):
-        if any(key in document[0] for key in ("points", *_NESTING)):
-            for index, entry in enumerate(document):
-                yield from _from_document(entry, f"{place}: [{index}]")
-        else:
-            yield TrajectoryTable(place, _from_rows(document, place))
-    elif isinstance(document, dict) and "points" in document:
-        yield _from_message(document, place)
-    elif isinstance(document, dict) and (
-        key := next((key for key in _NESTING if document.get(key)), None)
-    ):
-        yield from _from_document(document[key], f"{place}: {key}")
-    elif isinstance(document, dict) and any(
-        isinstance(values, list) for values in document.values()
-    ):
-        names = document.get("joint_names", [])
-        columns = {
-            str(key): _array(values, f"{place}: {key}")
-            for key, values in document.items()
-            if isinstance(values, list) and values and key != "joint_names"
-        }
-        yield TrajectoryTable(
-            place, columns, tuple(map(str, names)) if isinstance(names, list) else ()
-        )
-    else:
-        expected = "a JointTrajectory or RobotTrajectory message, a list of rows, or an object of columns"
-        raise UsageError(f"{place}: expected {expected}, got {type(document).__name__}")
-
-
-def _from_rows(rows: Sequence[Mapping[str, Any]], place: str) -> dict[str, Values]:
-    """Return the columns of a list of objects with the same keys."""
-    for index, row in enumerate(rows):
-        if row.keys() != rows[0].keys():
-            other = sorted(map(str, row.keys() ^ rows[0].keys()))[0]
-            raise UsageError(f"{place}: [{index}]: {other!r} is not in every row")
-    return {
-        str(key): _array([row[key] for row in rows], f"{place}: {key}")
-        for key in rows[0]
-    }
-
-
-def _array(values: list[Any], place: str) -> Values:
-    """Return a list as an array of numbers or texts."""
-    try:
-        found = np.array(values)
-    except ValueError as error:
-        raise UsageError(f"{place}: its rows have different lengths") from error
-    if found.dtype.kind not in "biufU":
-        raise UsageError(f"{place}: expected numbers, got {values[0]!r:.60}")
-    return found
-
-
-def _from_message(message: Mapping[str, Any], place: str) -> TrajectoryTable:
-    """Return the points of a ``trajectory_msgs/JointTrajectory``, of ROS 1 or 2."""
-    names, points = message.get("joint_names"), message["points"]
-    if (
-        not isinstance(names, list)
-        or not all(isinstance(name, str) for name in names)
-        or not names
-    ):
-        raise UsageError(
-            f"{place}: joint_names must be a list of names, got {names!r:.60}"
-        )
-    if not isinstance(points, list) or not points:
-        raise UsageError(
-            f"{place}: points must be a list of points, got {points!r:.60}"
-        )
-    columns: dict[str, list[Any]] = {MESSAGE_TIME: []}
-    for index, point in enumerate(points):
-        where = f"{place}: points[{index}]"
-        if not isinstance(point, dict):
-            raise UsageError(f"{where} must be an object, got {point!r:.60}")
-        columns[MESSAGE_TIME].append(_seconds(point.get("time_from_start"), where))
-        for key, name in _POINT_FIELDS.items():
-            values = point.get(key) or []
-            if not values and name != "q" and not columns.get(name):
-                continue
-            if not isinstance(values, list) or len(values) != len(names):
-                count = len(values) if isinstance(values, list) else repr(values)[:60]
-                raise UsageError(
-                    f"{where}.{key} must have {len(names)} values, one per joint, got {count}"
-                )
-            if len(columns.setdefault(name, [])) != index:
-                raise UsageError(f"{where}.{key}: earlier points have none")
-            columns[name].append(values)
-    return TrajectoryTable(
-        place,
-        {name: _array(rows, f"{place}: {name}") for name, rows in columns.items()},
-        tuple(names),
-    )
-
-
-def _seconds(stamp: Any, where: str) -> float:
-    """Return a time of ROS 1 (secs, nsecs), ROS 2 (sec, nanosec), or a number [s]."""
-    if isinstance(stamp, dict):
-        parts = [
-            stamp.get(first, stamp.get(second, 0))
-            for first, second in (("sec", "secs"), ("nanosec", "nsecs"))
-        ]
-        whole, nano = parts
-        if isinstance(whole, int | float) and isinstance(nano, int | float):
-            return float(whole) + 1e-9 * float(nano)
-    elif isinstance(stamp, int | float) and not isinstance(stamp, bool):
-        return float(stamp)
-    raise UsageError(
-        f"{where}.time_from_start must be a time such as {{sec, nanosec}}, got {stamp!r:.60}"
-    )
-
-
 _READERS: dict[str, Callable[[Path], Iterator[TrajectoryTable]]] = {
-    ".csv": _read_csv,
+    **dict.fromkeys(TEXT_SUFFIXES, _read_text),
     ".h5": _read_hdf5,
     ".hdf5": _read_hdf5,
     ".json": _read_json,

@@ -179,10 +179,11 @@ def _scene_of_trajectories(
         ["split"],
         f"--split is for the folder of a dataset, got {arguments.what}",
     )
-    problem = as_problem(problem_of(arguments))
+    named = problem_of(arguments)
     loaded = load_file(
-        argparse.Namespace(**vars(arguments) | {"file": Path(arguments.what)}), problem
+        argparse.Namespace(**vars(arguments) | {"file": Path(arguments.what)}), named
     )
+    problem = as_problem(named).with_obstacles(as_problem(loaded.problem).obstacle)
     count = len(loaded.trajectories)
     if (row := max(rows)) >= count:
         raise UsageError(
@@ -190,7 +191,7 @@ def _scene_of_trajectories(
         )
     chosen = [loaded.trajectories[row] for row in rows]
     titles = [f"{problem.name}: {loaded.labels[row]}" for row in rows]
-    verdicts = evaluate_trajectories(problem, chosen).verdicts
+    verdicts = evaluate_trajectories(loaded.problem, chosen).verdicts
     scene = scene_of_trajectories(
         problem, load_robot(problem), chosen, titles, verdicts
     )

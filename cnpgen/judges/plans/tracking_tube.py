@@ -7,10 +7,17 @@ displacement of the robot's points, which motion bounds give (Schwarzer et al. 2
 Other conditions are measured again with every joint moved to both sides, one by one and
 in random combinations. The sum of the changes, times a factor for curvature, bounds
 their change.
+
+Contact of the mallet with the puck is intended at the end of a hit. The tip may be in
+the disc of permitted contact, and with an error it then touches the puck beside the
+disc. So the distance must be larger by the change d only farther than d from the disc,
+and by the distance from the disc nearer to it. Where the robot touches the puck, the
+planned tip is then within d of the disc, and the tip itself within 2 d.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +29,7 @@ from cnpgen.judges.plans.measure import EvaluationContext, MeasuredCondition, me
 from cnpgen.problems.conditions import measured_needs
 from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.joint import JointPosition
+from cnpgen.problems.constraints.puck_contact import PuckContact
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.arguments import check_range
@@ -88,9 +96,14 @@ class TrackingTube:
                 condition.condition.name,
             ) not in self._position_conditions:
                 return condition
-            return replace(
-                condition, uncertainty=self._largest_change(context, condition, s)
-            )
+            change = self._largest_change(context, condition, s)
+            if isinstance(condition.constraint, PuckContact):
+                self._move(context, s)
+                distances = condition.constraint.distances_from_contact_region(
+                    cast(World, self._world)
+                )
+                change = np.minimum(change, distances)
+            return replace(condition, uncertainty=change)
 
         measured = [add(condition, context.samples.s) for condition in context.measured]
         return replace(context, measured=measured, with_uncertainty=add)
@@ -115,16 +128,9 @@ class TrackingTube:
         self, context: EvaluationContext, condition: MeasuredCondition, s: Array
     ) -> Array:
         """Return the largest change of the values of a smooth condition in the tube at phases s, shape (m, K)."""
-        states = context.curve.evaluate(s, jerk=self._problem.uses_jerk)
 
         def values(offset: Array) -> Array:
-            self._world.set_path(
-                states.q + offset[:, None],
-                states.dq,
-                states.ddq,
-                context.obstacle_poses,
-                states.jerk,
-            )
+            self._move(context, s, offset)
             conditions = measure(
                 condition.constraint, self._world, s, context.start_tip
             )
@@ -144,3 +150,16 @@ class TrackingTube:
         for signs in random.choice([-1.0, 1.0], (TUBE_COMBINATIONS, len(self._error))):
             np.maximum(total, np.abs(values(signs * self._error) - nominal), out=total)
         return np.asarray(TUBE_CURVATURE_FACTOR * total)
+
+    def _move(
+        self, context: EvaluationContext, s: Array, offset: Array | float = 0.0
+    ) -> None:
+        """Move the world of the tube to the states of a plan at phases s, with joints moved by an offset [rad]."""
+        states = context.curve.evaluate(s, jerk=self._problem.uses_jerk)
+        self._world.set_path(
+            states.q + np.reshape(offset, (-1, 1)),
+            states.dq,
+            states.ddq,
+            context.obstacle_poses,
+            states.jerk,
+        )

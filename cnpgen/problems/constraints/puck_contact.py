@@ -161,6 +161,21 @@ class PuckContact(Constraint):
         )
         return touching
 
+    def distances_from_contact_region(self, world: World) -> Array:
+        """Return the distances of K tips from the disc of permitted contact [m], shape (K,); 0 within it.
+
+        The disc touches the goal, and its diameter of length ``last`` is opposite to
+        the hit.
+        """
+        x, y = world.parameters.on_table(world.tip_position)[:2]
+        values = world.scene_values
+        if not len(values):
+            return np.full(np.shape(x), PUCK_OUT_OF_REACH_M)
+        goal, puck = np.asarray(values[:2]), np.asarray(values[2:4])
+        center = goal - (puck - goal) * (self.last / 2 / self.contact_distance)
+        distance = np.hypot(x - center[0], y - center[1])
+        return np.asarray(np.maximum(distance - self.last / 2, 0.0))
+
     def solved(self, world: World) -> tuple[Condition, ...]:
         """Return the form for solvers."""
         return self._cone(*self._measured_distances(world), SOLVER_MARGIN_M)

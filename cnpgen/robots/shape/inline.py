@@ -80,7 +80,11 @@ def with_inline_meshes(
                 for part in _parts_of_file(file, scale_of(mesh), parts, keep)
             ]
         except RecipeError as error:
-            errors += error.errors
+            name = link.get("name", "")
+            errors += [
+                f"{text} (a mesh of link {name!r}; without it: skipped_meshes = [{name!r}] in [robot])"
+                for text in error.errors
+            ]
         else:
             mesh.attrib.pop("scale", None)
             _replace(link, element, mesh, addresses)
@@ -239,15 +243,17 @@ def _warn_about(path: Path, points: Array, scale: Array) -> None:
     if thickness < MIN_THICKNESS_M:
         text = f"the mesh is flat, and a body of {2e3 * MIN_THICKNESS_M:g} mm replaces it: is it a collision mesh?"
         warnings.warn(f"{path}: {text}", RuntimeWarning, stacklevel=2)
-    unit = _unit_of_dae(path) if path.suffix.lower() == ".dae" else 1.0
+    unit = unit_of_mesh(path)
     if unit != 1.0 and (scale == 1.0).all():
         text = f"the file states a unit of {unit:g} m, which is ignored as by Pinocchio: its numbers are read in m"
         remedy = f'if they are not, write scale="{unit:g} {unit:g} {unit:g}" in its <mesh> element'
         warnings.warn(f"{path}: {text}; {remedy}", RuntimeWarning, stacklevel=2)
 
 
-def _unit_of_dae(path: Path) -> float:
-    """Return the unit of a DAE file [m]; 1 if it states none."""
+def unit_of_mesh(path: Path) -> float:
+    """Return the unit that a mesh file states [m]; 1 if it states none, as all but DAE files."""
+    if path.suffix.lower() != ".dae":
+        return 1.0
     with path.open("rb") as file:
         found = re.search(
             rb"<unit\b[^>]*\bmeter\s*=\s*[\"']([0-9.eE+-]{1,32})[\"']",

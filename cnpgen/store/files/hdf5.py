@@ -8,7 +8,7 @@ that are loaded as code.
 import errno
 import io
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -117,6 +117,17 @@ class Attributes:
             )
         return AttributeManager(SimpleNamespace(id=self._item))[name]
 
+    def texts(self, name: str) -> tuple[str, ...]:
+        """Return a text or a list of texts.
+
+        Other types and large values raise DatasetError.
+        """
+        from h5py import AttributeManager, h5a
+
+        attribute = h5a.open(self._item, name.encode())
+        _check_texts(self.path, f"the attribute {name!r}", attribute)
+        return _as_texts(AttributeManager(SimpleNamespace(id=self._item))[name])
+
     def some(self, names: Iterable[str]) -> dict[str, Any]:
         """Return the existing attributes among ``names``."""
         return {name: self[name] for name in names if name in self}
@@ -207,9 +218,29 @@ class Hdf5:
             )
         return [_decoded(self.path, name) for name in self._root]
 
-    def columns(self) -> Mapping[str, Column]:
-        """Return all datasets; see ``__getitem__``."""
-        return {name: self[name] for name in self}
+    def columns(self, *, without: Collection[str] = ()) -> Mapping[str, Column]:
+        """Return all datasets but those of some names; see ``__getitem__``."""
+        return {name: self[name] for name in self if name not in without}
+
+    def texts(self, name: str) -> tuple[str, ...]:
+        """Return a dataset of texts.
+
+        Other types, large values and texts in another file raise DatasetError.
+        """
+        from h5py import Dataset, h5d
+
+        dataset = self._open(name)
+        if not isinstance(dataset, h5d.DatasetID):
+            raise DatasetError(f"{self.path}: {name} must be a dataset of texts")
+        layout = dataset.get_create_plist()
+        if layout.get_layout() == h5d.VIRTUAL or layout.get_external_count():
+            raise DatasetError(
+                f"{self.path}: the texts of {name} are in another file, which is not read"
+            )
+        if layout.get_nfilters():
+            raise DatasetError(f"{self.path}: the texts of {name} must not be packed")
+        _check_texts(self.path, name, dataset)
+        return _as_texts(Dataset(dataset)[()])
 
     def _open(self, name: str) -> Any:
         """Open an object of the file."""
@@ -282,6 +313,29 @@ class Hdf5:
             raise DatasetError(
                 f"{self.path} is damaged or cut off: {name} reaches outside its end"
             )
+
+
+def _check_texts(path: Path, what: str, item: Any) -> None:
+    """Check that an attribute or a dataset has texts, at most one dimension, and a possible size."""
+    from h5py import h5t
+
+    kind, space = item.get_type(), item.get_space()
+    count = space.get_simple_extent_npoints()
+    if kind.get_class() != h5t.STRING or space.get_simple_extent_ndims() > 1:
+        raise DatasetError(f"{path}: {what} must be a list of texts")
+    if count > MAX_NAMES or count * kind.get_size() > MAX_ATTRIBUTE_BYTES:
+        raise DatasetError(
+            f"{path}: {what} is larger than {MAX_NAMES:,} texts or {MAX_ATTRIBUTE_BYTES:,} bytes"
+        )
+
+
+def _as_texts(values: Any) -> tuple[str, ...]:
+    """Return one text or an array of texts, of h5py's types, as a tuple."""
+    entries = np.ravel(np.asarray(values, object)).tolist()
+    return tuple(
+        entry.decode("utf-8", "replace") if isinstance(entry, bytes) else str(entry)
+        for entry in entries
+    )
 
 
 def _type_text(dataset: Any) -> str:

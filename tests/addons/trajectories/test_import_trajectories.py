@@ -1,11 +1,13 @@
 """Plans imported from samples: they follow the samples, meet the constraints at their ends, and can be refined."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import cnpgen
+from cnpgen.addons.trajectories import import_trajectories as import_module
 from cnpgen.addons.trajectories.import_trajectories import StateSnapper
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
@@ -134,6 +136,38 @@ def test_the_number_of_control_points_grows_with_the_detail_of_the_samples() -> 
     assert points[0] == 15 < points[1]
 
 
+def scan(strokes: int) -> Trajectory:
+    """A scan of 20 s at rest at both ends."""
+    t = np.arange(2001) / 100
+    q = np.tile([-0.3, 0.6975, 0, -0.5049, 0, 1.9286], (len(t), 1))
+    q[:, 0] += 0.25 * (1 - np.cos(2 * np.pi * t * strokes / 20))
+    return Trajectory(t, q)
+
+
+@pytest.mark.slow
+def test_a_long_scan_gets_as_many_control_points_as_it_needs() -> None:
+    imported = import_trajectories("airhockey", [scan(20)], at_rest=True)
+    assert imported.meets_samples.all()
+    assert imported.deviation[0] <= imported.max_deviation == 2e-3
+    assert imported.plans.path_control_points.shape[1] > 39
+
+
+def test_a_path_that_no_number_of_control_points_meets_is_named_with_exit_code_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(import_module, "MAX_CONTROL_POINTS", 24)
+    trajectory, file = scan(20), tmp_path / "scan.csv"
+    rows = np.column_stack([trajectory.t, trajectory.q])
+    names = ",".join(["t", *(f"q{k}" for k in range(1, 7))])
+    np.savetxt(file, rows, delimiter=",", header=names, comments="")
+    out = str(tmp_path / "scan.h5")
+    words = ["import", str(file), "--problem", "airhockey", "--at-rest", "-o", out]
+    assert main([*words, "--stay-within", "2deg"]) == 1
+    text = capsys.readouterr().err
+    assert re.search(r"plan 0: 0\.\d+ rad from its samples, more than 0\.002 rad", text)
+    assert "refined" not in text
+
+
 def test_no_trajectories_and_other_numbers_of_joints_are_refused() -> None:
     with pytest.raises(UsageError, match="no trajectories"):
         import_trajectories("airhockey", [])
@@ -189,7 +223,7 @@ def test_refining_stays_within_a_distance_of_the_imported_path(
     ]
     assert main([*words, "--stay-within", "1deg"]) == 0
     assert (
-        "1 of 1 valid, at most 0.017 rad from the imported path"
+        "1 of 1 valid, at most 0.017 rad from the imported samples"
         in capsys.readouterr().err
     )
     near = cnpgen.load_plans(tmp_path / "plans.h5")

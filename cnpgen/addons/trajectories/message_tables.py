@@ -1,0 +1,225 @@
+"""Documents of JSON and YAML as tables: messages of ROS and MoveIt, lists of rows, and objects of columns."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable
+from cnpgen.errors import UsageError
+
+Values = NDArray[Any]
+
+MESSAGE_TIME = "t [s]"  # of formats that define the unit
+_POINT_FIELDS = {"positions": "q", "velocities": "dq", "accelerations": "ddq"}
+_STATE_FIELDS = {"position": "q", "velocity": "dq"}  # of sensor_msgs/JointState
+_NESTING = (
+    "joint_trajectory",
+    "trajectory",
+    "trajectories",
+    "planned_trajectory",
+    "solution",
+    "motion_plan_response",
+    "goal",
+    "result",
+    "response",
+)  # keys of messages that hold messages: plans, action goals and responses of MoveIt
+_OTHER_POINTS = "multi_dof_joint_trajectory"  # motions of a base
+_SUCCESS = 1  # moveit_msgs/MoveItErrorCodes
+
+
+def tables_of_document(document: Any, place: str) -> Iterator[TrajectoryTable]:
+    """Yield the trajectories of a message, of a list of messages or rows, or of an object of columns."""
+    if (
+        isinstance(document, list)
+        and document
+        and all(isinstance(entry, dict) for entry in document)
+    ):
+        if is_joint_state(document[0]):
+            yield table_of_states(document, place)
+        elif any(key in document[0] for key in ("points", *_NESTING)):
+            for index, entry in enumerate(document):
+                yield from tables_of_document(entry, f"{place}: [{index}]")
+        else:
+            yield TrajectoryTable(place, _from_rows(document, place))
+    elif isinstance(document, dict) and "points" in document:
+        yield _from_message(document, place)
+    elif isinstance(document, dict) and (
+        key := next((key for key in _NESTING if document.get(key)), None)
+    ):
+        _check_message(document, place)
+        yield from tables_of_document(document[key], f"{place}: {key}")
+    elif isinstance(document, dict) and any(
+        isinstance(values, list) for values in document.values()
+    ):
+        names = document.get("joint_names", [])
+        columns = {
+            str(key): _array(values, f"{place}: {key}")
+            for key, values in document.items()
+            if isinstance(values, list) and values and key != "joint_names"
+        }
+        yield TrajectoryTable(
+            place, columns, tuple(map(str, names)) if isinstance(names, list) else ()
+        )
+    else:
+        expected = "a JointTrajectory or RobotTrajectory message, a list of rows, or an object of columns"
+        raise UsageError(f"{place}: expected {expected}, got {type(document).__name__}")
+
+
+def _check_message(message: Mapping[str, Any], place: str) -> None:
+    """Refuse motions of a base, and responses of requests that failed."""
+    other = message.get(_OTHER_POINTS)
+    if isinstance(other, dict) and other.get("points"):
+        raise UsageError(
+            f"{place}: {_OTHER_POINTS} has points: the base of the robot must not move"
+        )
+    code = message.get("error_code")
+    value = code.get("val", _SUCCESS) if isinstance(code, dict) else _SUCCESS
+    if value != _SUCCESS:
+        raise UsageError(
+            f"{place}: error_code is {value!r:.20}, expected {_SUCCESS}: the request failed"
+        )
+
+
+def is_joint_state(document: Any) -> bool:
+    """Return whether a document is a ``sensor_msgs/JointState``."""
+    return isinstance(document, dict) and {"name", "position"} <= document.keys()
+
+
+def table_of_states(messages: Sequence[Any], place: str) -> TrajectoryTable:
+    """Return one trajectory of a stream of ``sensor_msgs/JointState``.
+
+    Joints are found by their names in every message. Times are those of the stamps,
+    counted from the first.
+    """
+    names: list[str] = []
+    stamps, columns = [], {name: list[Values]() for name in _STATE_FIELDS.values()}
+    for index, message in enumerate(messages):
+        where = f"{place}: [{index}]"
+        if not is_joint_state(message):
+            raise UsageError(f"{where} is no JointState message as the others are")
+        order = _names(message["name"], f"{where}: name")
+        names = names or order
+        if set(order) != set(names):
+            other = sorted(set(order) ^ set(names))[0]
+            raise UsageError(
+                f"{where}: joint {other!r} is not in every message; the first has {', '.join(names)}"
+            )
+        rows = [order.index(name) for name in names]
+        header = message.get("header")
+        stamp = header.get("stamp") if isinstance(header, dict) else None
+        stamps.append(_seconds(stamp, f"{where}.header.stamp"))
+        for key, column in _STATE_FIELDS.items():
+            values = message.get(key) or []
+            if column != "q" and not values and not columns[column]:
+                continue
+            if not isinstance(values, list) or len(values) != len(names):
+                raise UsageError(
+                    f"{where}.{key} must have {len(names)} values, one per joint"
+                )
+            columns[column].append(_array(values, f"{where}.{key}")[rows])
+    t = np.array([float(stamp - stamps[0]) for stamp in stamps])
+    found = {MESSAGE_TIME: t} | {
+        name: np.stack(rows) for name, rows in columns.items() if rows
+    }
+    if len(found.get("dq", t)) != len(t):
+        raise UsageError(f"{place}: some messages have velocities and others not")
+    return TrajectoryTable(place, found, tuple(names))
+
+
+def _from_rows(rows: Sequence[Mapping[str, Any]], place: str) -> dict[str, Values]:
+    """Return the columns of a list of objects with the same keys."""
+    for index, row in enumerate(rows):
+        if row.keys() != rows[0].keys():
+            other = sorted(map(str, row.keys() ^ rows[0].keys()))[0]
+            raise UsageError(f"{place}: [{index}]: {other!r} is not in every row")
+    return {
+        str(key): _array([row[key] for row in rows], f"{place}: {key}")
+        for key in rows[0]
+    }
+
+
+def _array(values: list[Any], place: str) -> Values:
+    """Return a list as an array of numbers or texts."""
+    try:
+        found = np.array(values)
+    except ValueError as error:
+        raise UsageError(f"{place}: its rows have different lengths") from error
+    if found.dtype.kind not in "biufU":
+        raise UsageError(f"{place}: expected numbers, got {values[0]!r:.60}")
+    return found
+
+
+def _from_message(message: Mapping[str, Any], place: str) -> TrajectoryTable:
+    """Return the points of a ``trajectory_msgs/JointTrajectory``, of ROS 1 or 2."""
+    points = message["points"]
+    names = _names(message.get("joint_names"), f"{place}: joint_names")
+    if not isinstance(points, list) or not points:
+        raise UsageError(
+            f"{place}: points must be a list of points, got {points!r:.60}"
+        )
+    columns: dict[str, list[Any]] = {MESSAGE_TIME: []}
+    for index, point in enumerate(points):
+        where = f"{place}: points[{index}]"
+        if not isinstance(point, dict):
+            raise UsageError(f"{where} must be an object, got {point!r:.60}")
+        stamp = _seconds(point.get("time_from_start"), f"{where}.time_from_start")
+        columns[MESSAGE_TIME].append(float(stamp))
+        for key, name in _POINT_FIELDS.items():
+            values = point.get(key) or []
+            if not values and name != "q" and not columns.get(name):
+                continue
+            if not isinstance(values, list) or len(values) != len(names):
+                count = len(values) if isinstance(values, list) else repr(values)[:60]
+                raise UsageError(
+                    f"{where}.{key} must have {len(names)} values, one per joint, got {count}"
+                )
+            if len(columns.setdefault(name, [])) != index:
+                raise UsageError(f"{where}.{key}: earlier points have none")
+            columns[name].append(values)
+    return TrajectoryTable(
+        place,
+        {name: _array(rows, f"{place}: {name}") for name, rows in columns.items()},
+        tuple(names),
+    )
+
+
+def _names(names: Any, place: str) -> list[str]:
+    """Return the names of joints, all different."""
+    if (
+        not isinstance(names, list)
+        or not all(isinstance(name, str) for name in names)
+        or not names
+    ):
+        raise UsageError(f"{place} must be a list of names, got {names!r:.60}")
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise UsageError(f"{place}: the joint {twice[0]!r} is there more than once")
+    return names
+
+
+def _seconds(stamp: Any, where: str) -> Fraction:
+    """Return a time of ROS 1 (secs, nsecs), ROS 2 (sec, nanosec), or a number [s].
+
+    Fractions keep all digits of times since 1970.
+    """
+    parts: list[Any] = [stamp, 0]
+    if isinstance(stamp, dict):
+        parts = [
+            stamp.get(first, stamp.get(second, 0))
+            for first, second in (("sec", "secs"), ("nanosec", "nsecs"))
+        ]
+    if all(
+        isinstance(part, int | float)
+        and not isinstance(part, bool)
+        and math.isfinite(part)
+        for part in parts
+    ):
+        return Fraction(parts[0]) + Fraction(parts[1]) / 10**9
+    raise UsageError(
+        f"{where} must be a time such as {{sec, nanosec}}, got {stamp!r:.60}"
+    )

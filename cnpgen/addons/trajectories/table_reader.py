@@ -1,0 +1,436 @@
+"""Reader of one trajectory: the columns of a table as times, positions and derivatives of a problem's joints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.addons.trajectories.table_columns import (
+    KIND_NAMES,
+    TIME_NAMES,
+    is_number,
+    joint_columns,
+    key_of,
+)
+from cnpgen.addons.trajectories.table_units import (
+    DEGREE,
+    Readings,
+    check_units,
+    plain,
+    stated_factor,
+)
+from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable
+from cnpgen.errors import UsageError, listed, nearest
+from cnpgen.plans.format import PHASE_COLUMN
+from cnpgen.problems.problem_record import ProblemRecord
+from cnpgen.store.scene_table import OBSTACLE_POSES
+
+Array = NDArray[np.float64]
+
+MAX_RATE_DEVIATION = 0.01  # of a stated rate from that of the file's times, relative
+UNUSED_KINDS = ("jerk", "effort", "efforts")  # not reported as ignored
+MAX_EXACT_START_S = 1e6  # later times of the first sample lose digits in float64
+MAX_LISTED = 12  # columns in messages
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadOptions:
+    """Options of ``load_trajectories``; the joints have one name in the file for each of the problem."""
+
+    joints: tuple[str, ...]
+    velocities: tuple[str, ...] = ()
+    time: str | None = None
+    degrees: bool = False
+    rate: float | None = None
+    unwrap: bool = False
+    drop_repeats: bool = False
+    separated: bool = False  # into parts of a file
+    parameters: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass
+class TableReader:
+    """Reader of one trajectory of a table.
+
+    ``used`` has the names of the columns that were read, ``notes`` sentences about how.
+    """
+
+    table: TrajectoryTable
+    record: ProblemRecord
+    options: ReadOptions
+    velocity_limit: Array
+    used: set[str] = field(default_factory=set)
+    notes: list[str] = field(default_factory=list)
+
+    def trajectory(self) -> Trajectory:
+        """Return the trajectory; its parameters are None if some are missing."""
+        self._check_names()
+        columns = {kind: self._kind(kind) for kind in KIND_NAMES}
+        q = columns["q"]
+        if q is None:
+            raise self._error(self._missing())
+        if not len(q):
+            raise self._error("there are no positions, expected at least one row")
+        t = self._times(len(q))
+        for name, values in (("times", t), *columns.items()):
+            if values is not None and len(values) != len(q):
+                raise self._error(f"{len(values)} {name} for {len(q)} positions")
+        phase = (
+            self._numbers(PHASE_COLUMN, ndim=1)
+            if PHASE_COLUMN in self.table.columns
+            else None
+        )
+        rows: dict[str, Any] = {
+            "t": t,
+            "q": q,
+            "dq": columns["dq"],
+            "ddq": columns["ddq"],
+        }
+        rows["phase"] = phase
+        if self.options.drop_repeats:
+            rows = self._without_repeats(rows)
+        if self.options.unwrap:
+            turning = [not sliding for sliding in self.record.prismatic_joints]
+            rows["q"][:, turning] = np.unwrap(rows["q"][:, turning], axis=0)
+        if rows["t"][0] > 0 and not self.options.separated:
+            self.notes.append(
+                f"{self.table.place} begins at t = {rows['t'][0]:.6g} s: the motion before its first sample is not known"
+            )
+        rows["t"] = rows["t"] - rows["t"][0]
+        return self._checked(rows)
+
+    def _checked(self, rows: dict[str, Any]) -> Trajectory:
+        """Return the trajectory of rows with parameters and scene, after a check of its units."""
+        parameters, poses = self._parameters(), self._obstacle_poses()
+        try:
+            if parameters is not None:
+                self.record.parameters.checked(parameters)
+            trajectory = Trajectory(**rows, parameters=parameters, obstacle_poses=poses)
+        except UsageError as error:
+            raise self._error(str(error)) from error
+        return trajectory
+
+    def check_units(self, trajectory: Trajectory) -> None:
+        """Check the units that the columns of the trajectory do not state; see ``table_units``."""
+        time = self._time_column()
+        unknown = self.options.rate is None and time is not None
+        stated = not unknown or self._stated(time or "") is not None
+        if not stated:
+            angle = "deg" if self.options.degrees else "rad"
+            self.notes.append(
+                f"columns without a unit are read in s, {angle} and m, and their derivatives"
+            )
+        readings = Readings(
+            self.table.place,
+            None if stated else time,
+            joints=not self._has_unit("q"),
+            velocities=not self._has_unit("dq"),
+        )
+        check_units(readings, trajectory, self.velocity_limit)
+
+    def _without_repeats(self, rows: dict[str, Any]) -> dict[str, Any]:
+        """Drop rows that repeat the time and the positions of the row before."""
+        repeated = np.append(False, np.diff(rows["t"]) == 0)
+        moved = repeated & np.append(False, (np.diff(rows["q"], axis=0) != 0).any(1))
+        if moved.any():
+            raise self._error(
+                f"{self._row_text(int(moved.argmax()))} has the time of the row before and other positions"
+            )
+        if repeated.any():
+            self.notes.append(
+                f"{self.table.place}: {int(repeated.sum()):,} repeated rows are dropped"
+            )
+        return {
+            name: None if values is None else values[~repeated]
+            for name, values in rows.items()
+        }
+
+    def unused(self) -> list[str]:
+        """Return the names of the columns that were not read, except those of known other kinds."""
+        names = [name for name in self.table.columns if name not in self.used]
+        return [
+            name for name in names if not plain(name).lower().startswith(UNUSED_KINDS)
+        ]
+
+    def _error(self, text: str, **details: Any) -> UsageError:
+        return UsageError(f"{self.table.place}: {text}", **details)
+
+    def _check_names(self) -> None:
+        """Check that no name is there twice, also with different units, and that options name columns."""
+        known: dict[str, str] = {}
+        for name in self.table.columns:
+            if (other := known.setdefault(key_of(name), name)) != name:
+                raise self._error(f"the columns {other!r} and {name!r} have one name")
+        names = self.table.joint_names
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise self._error(f"the joint {twice[0]!r} is there more than once")
+        if not self.table.has_head:
+            self._check_numbered()
+
+    def _check_numbered(self) -> None:
+        """Check that columns without names are those of times and joints, or named by options."""
+        options, width = self.options, len(self.table.columns)
+        if all(joint.isdecimal() for joint in options.joints):
+            return
+        n = len(options.joints)
+        if width == n + (options.rate is None):
+            return
+        raise self._error(
+            f"{width} columns without a head, expected {n + 1} of times and joints:"
+            " {joints} gives the columns of the joints, {time} that of the times, numbered from 0",
+            remedies={"joints": ",".join(map(str, range(1, n + 1))), "time": "0"},
+        )
+
+    def _parameters(self) -> Array | None:
+        """Return the values of the problem's parameters, shape (p,)."""
+        ranges = self.record.parameters
+        columns = {plain(name): name for name in self.table.columns}
+        found = dict(self.options.parameters)
+        for parameter, unit in zip(ranges.names, ranges.value_units, strict=True):
+            if (name := columns.get(parameter)) is None:
+                continue
+            values = np.unique(
+                self._numbers(name, ndim=self.table.columns[name].ndim and 1)
+            )
+            if len(values) != 1:
+                raise self._error(
+                    f"{name} must have one value, got {values[0]:g} and {values[-1]:g}"
+                )
+            found[parameter] = float(values[0]) * self._factor(name, unit, 1.0)
+        if not ranges or found.keys() != set(ranges.names):
+            return None
+        return np.array([found[name] for name in ranges.names])
+
+    def _obstacle_poses(self) -> Array | None:
+        """Return the poses and sizes of obstacles in the rows of a file, shape (width,), or None without any."""
+        if OBSTACLE_POSES not in self.table.columns:
+            return None
+        rows = self._numbers(OBSTACLE_POSES, ndim=2)
+        if (rows != rows[0]).any():
+            raise self._error(
+                f"{OBSTACLE_POSES} must be the same in every row: obstacles do not move"
+            )
+        return np.asarray(rows[0])
+
+    def _times(self, count: int) -> Array:
+        """Return the times of the samples [s]."""
+        name, rate = self._time_column(), self.options.rate
+        if rate is not None and (
+            name is None or not self._has_times_of_rate(name, rate)
+        ):
+            return np.asarray(np.arange(count) / rate)
+        if name is not None:
+            return self._seconds(name)
+        text = f"no column of times ({', '.join(TIME_NAMES)})"
+        if similar := self._increasing_columns(count):
+            raise self._error(
+                f"{text}: {listed(similar, MAX_LISTED)} increases as times do, {{time}} names the column",
+                remedies={"time": similar[0]},
+            )
+        raise self._error(f"{text}: state {{rate}}", remedies={"rate": 100})
+
+    def _increasing_columns(self, count: int) -> list[str]:
+        """Return the columns that may be times: numbers that increase, and do not count the rows."""
+        return [
+            name
+            for name, values in self.table.columns.items()
+            if name not in self.used
+            and values.shape == (count,)
+            and values.dtype.kind in "iuf"
+            and count > 1
+            and (np.diff(values) > 0).all()
+            and not (np.diff(values) == 1).all()
+        ]
+
+    def _seconds(self, name: str) -> Array:
+        stated = self._stated(name)
+        if stated is not None and stated[0] != "s":
+            raise self._error(f"{name} must have a unit of s")
+        factor = 1.0 if stated is None else stated[1]
+        values = self._numbers(name, ndim=1)
+        # Integers of times since 1970 in ns have more digits than a float.
+        first = self.table.columns[name][0]
+        if self.table.columns[name].dtype.kind in "iu":
+            values = (self.table.columns[name] - first).astype(float) + (
+                float(first) if abs(float(first) * factor) < MAX_EXACT_START_S else 0.0
+            )
+        return values * factor
+
+    def _stated(self, name: str) -> tuple[str, float] | None:
+        """Return the unit of a column of times: that of its name, or that of the option."""
+        return stated_factor(name) or stated_factor(self.options.time or "")
+
+    def _has_times_of_rate(self, name: str, rate: float) -> bool:
+        """Return whether the file has increasing times.
+
+        Raise UsageError if they do not agree with a stated rate.
+        """
+        try:
+            steps = np.diff(self._seconds(name))
+        except UsageError:
+            return False
+        step = float(np.median(steps)) if len(steps) else 0.0
+        if step > 0 and abs(step * rate - 1) > MAX_RATE_DEVIATION:
+            steps_of = f"{name} of {self.table.place} has steps of {step:.3g} s"
+            text = f"must agree with the times of the file, got {rate:g} Hz; {steps_of}: omit it"
+            raise UsageError(text, argument="rate")
+        return step > 0
+
+    def _time_column(self) -> str | None:
+        if self.options.time is not None:
+            return self._named_column(self.options.time, "time")
+        if not self.table.has_head:
+            return None if self.options.rate is not None else "0"
+        return next(
+            (name for name in self.table.columns if plain(name).lower() in TIME_NAMES),
+            None,
+        )
+
+    def _named_column(self, name: str, argument: str) -> str:
+        """Return the column that an option names, with or without its unit."""
+        columns = self.table.columns
+        if name in columns:
+            return name
+        keys = {key_of(column): column for column in columns}
+        if (key := key_of(name)) not in keys:
+            raise UsageError(
+                f"{self.table.place}: there is no column {name!r}, only {listed(list(columns), MAX_LISTED)}"
+                f"{nearest(name, columns)}",
+                argument=argument,
+            )
+        return keys[key]
+
+    def _kind(self, kind: str) -> Array | None:
+        """Return positions, velocities or accelerations of the problem's joints, shape (K, n), or None."""
+        if kind == "dq" and self.options.velocities:
+            stated = self.options.velocities
+            return self._stacked(
+                [self._named_column(name, "velocities") for name in stated], kind
+            )
+        for word in KIND_NAMES[kind]:
+            for name, values in self.table.columns.items():
+                if plain(name).lower() == word and values.ndim == 2:
+                    return self._selected(name) * self._factors(
+                        [name] * len(self.options.joints), kind
+                    )
+        names = self._scalar_columns(kind)
+        return None if names is None else self._stacked(names, kind)
+
+    def _stacked(self, names: list[str], kind: str) -> Array:
+        columns = np.stack([self._numbers(name, ndim=1) for name in names], axis=1)
+        return np.asarray(columns * self._factors(names, kind))
+
+    def _selected(self, name: str) -> Array:
+        """Return the problem's joints of an array with one column per joint."""
+        values, joints = self._numbers(name, ndim=2), self.options.joints
+        width, named = values.shape[1], self.table.joint_names
+        if named and len(named) != width:
+            raise self._error(
+                f"{name} has {width} columns, joint_names has {len(named)}"
+            )
+        if named:
+            missing = [joint for joint in joints if joint not in named]
+            if missing:
+                raise self._error(
+                    f"there is no joint {missing[0]!r}, only {', '.join(named)}"
+                )
+            return values[:, [named.index(joint) for joint in joints]]
+        if all(joint.isdecimal() and int(joint) < width for joint in joints):
+            return values[:, [int(joint) for joint in joints]]
+        if width != len(joints):
+            raise self._error(
+                f"{name} has {width} columns, the problem plans {len(joints)} joints"
+            )
+        return values
+
+    def _scalar_columns(self, kind: str) -> list[str] | None:
+        """Return the column of every joint, or None without any."""
+        joints, table = self.options.joints, self.table
+        if not table.has_head:
+            if kind != "q":
+                return None
+            if all(joint.isdecimal() for joint in joints):
+                return [self._named_column(joint, "joints") for joint in joints]
+            first = int(self.options.rate is None)
+            return [str(k + first) for k in range(len(joints))]
+        keys = {
+            key_of(name): name
+            for name, values in table.columns.items()
+            if values.ndim == 1
+        }
+        try:
+            return joint_columns(keys, joints, kind)
+        except ValueError as error:
+            raise self._error(str(error)) from error
+
+    def _has_unit(self, kind: str) -> bool:
+        """Return whether a column of a kind states its unit."""
+        words = KIND_NAMES[kind]
+        return any(
+            stated_factor(name) is not None
+            for name in self.used
+            if any(word in plain(name).lower() for word in words) or kind == "q"
+            if name != self._time_column()
+        )
+
+    def _numbers(self, name: str, *, ndim: int) -> Array:
+        """Return a column as numbers."""
+        self.used.add(name)
+        values = self.table.columns[name]
+        if values.ndim != ndim or values.dtype.kind not in "biuf":
+            if values.ndim != 1 or ndim != 1:
+                raise self._error(
+                    f"{name} must have {ndim} dimensions of numbers, got shape {values.shape}"
+                )
+            # The column has texts; the first one that is not a number is named.
+            row = next(
+                (k for k, value in enumerate(values.tolist()) if not is_number(value)),
+                0,
+            )
+            raise self._error(
+                f"{self._row_text(row)}: {name} must be a number, got {values[row].item()!r:.60}"
+            )
+        return values.astype(float)
+
+    def _row_text(self, row: int) -> str:
+        lines = self.table.lines
+        return f"line {lines[row]}" if lines else f"row {row}"
+
+    def _factors(self, names: Sequence[str], kind: str) -> Array:
+        """Return the factors to SI units of the columns of a kind, one per joint, shape (n,)."""
+        exponent = {"q": "", "dq": "/s", "ddq": "/s^2"}[kind]
+        turning = ("rad", DEGREE if self.options.degrees else 1.0)
+        units = [
+            ("m", 1.0) if slides else turning for slides in self.record.prismatic_joints
+        ]
+        parts = zip(names, units, strict=True)
+        return np.array(
+            [
+                self._factor(name, unit + exponent, usual)
+                for name, (unit, usual) in parts
+            ]
+        )
+
+    def _factor(self, name: str, unit: str, default: float) -> float:
+        """Return the factor to SI of a column by the unit in its name, such as ``[deg/s]``; a default without one."""
+        stated = stated_factor(name)
+        if stated is None:
+            return default
+        if stated[0] != unit:
+            text = name[name.rindex("[") + 1 :].rstrip(" ]")
+            raise self._error(f"{name} must have a unit of {unit}, got {text!r}")
+        return stated[1]
+
+    def _missing(self) -> str:
+        """Return the message for missing positions."""
+        joint, columns = (
+            self.options.joints[0],
+            ", ".join(list(self.table.columns)[:12]),
+        )
+        expected = f"q {joint}, {joint}_position, {joint} and so on, or an array q"
+        return f"no columns with joint positions, expected {expected}; there are {columns or 'no columns'}"

@@ -1,0 +1,129 @@
+"""Obstacles of sampled trajectories: those of scene files, or of the plans that were sampled."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.errors import UsageError, counted
+from cnpgen.make.recipe import load_dataset_recipe
+from cnpgen.plans.plan_file import load_plans
+from cnpgen.plans.scene_plans import capacity_of, poses_of_scene, shape_of
+from cnpgen.problems.obstacles import with_capacity
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.problem_record import (
+    ProblemRecord,
+    as_problem,
+    as_record,
+    record_problem,
+)
+from cnpgen.problems.scenes.scene_problem import SceneProblem
+from cnpgen.problems.scenes.scene_reader import read_scenes
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.scene import PARKED_POSITION_M
+from cnpgen.schema.arguments import concerning
+from cnpgen.schema.catalogue import find_recipe
+from cnpgen.schema.toml import Kind, read_table
+from cnpgen.store.files.kind import PLANS
+from cnpgen.store.paths import file_kind
+from cnpgen.store.scene_table import OBSTACLE_POSES
+
+Array = NDArray[np.float64]
+
+
+_KINDS: tuple[Kind, ...] = ("problem", "pipeline", "dataset")
+
+
+def problem_of_samples(problem: object) -> ProblemRecord:
+    """Return the record of a problem from any argument of ``as_problem``.
+
+    For the name or file of a pipeline or dataset, it has the places for the obstacles
+    that its samples bring.
+    """
+    if not isinstance(problem, str | Path):
+        return as_record(problem)
+    with concerning("problem"):
+        path, errors = find_recipe(_KINDS, problem), list[str]()
+        table = read_table(path, _KINDS, errors) or {}
+        if {"pipeline", "problem"} & table.keys():
+            return record_problem(load_dataset_recipe(path).pipeline.problem)
+    return as_record(problem)
+
+
+def with_scenes(
+    record: ProblemRecord,
+    trajectories: Sequence[Trajectory],
+    scenes: str | Path | Sequence[SceneProblem],
+) -> tuple[ProblemRecord, tuple[Trajectory, ...]]:
+    """Place the obstacles of scenes around trajectories: one scene for each, or one for all.
+
+    Return the problem with as many further obstacles as the scenes have, and the
+    trajectories with their poses and sizes.
+
+    Raises:
+        UsageError: The number of scenes is wrong, a plan file has no scenes or is of a
+            problem with other obstacles, or the trajectories have scenes already.
+        DatasetError, MissingExtraError: as of the readers of scenes and plans.
+    """
+    if any(trajectory.obstacle_poses is not None for trajectory in trajectories):
+        raise UsageError("the trajectories have scenes of their own", argument="scenes")
+    problem = as_problem(record)
+    if not isinstance(scenes, str | Path):
+        placed, poses = _of_problems(problem, scenes)
+    elif file_kind(Path(scenes)) == PLANS:
+        placed, poses = _of_plans(problem, Path(scenes))
+    else:
+        placed, poses = _of_problems(problem, read_scenes(Path(scenes)))
+    if len(poses) not in {1, len(trajectories)}:
+        raise UsageError(
+            f"must have one scene, or one for each of {counted(len(trajectories), 'trajectory')}, got {len(poses)}",
+            argument="scenes",
+        )
+    rows = np.broadcast_to(poses, (len(trajectories), poses.shape[1]))
+    pairs = zip(trajectories, rows, strict=True)
+    return record_problem(placed), tuple(
+        replace(trajectory, obstacle_poses=row.copy()) for trajectory, row in pairs
+    )
+
+
+def _of_problems(
+    problem: Problem, scenes: Sequence[SceneProblem]
+) -> tuple[Problem, Array]:
+    """Return the problem with the capacity for scenes, and the poses of their obstacles, shape (N, width)."""
+    own = problem.with_obstacles(problem.own_obstacles)
+    capacity = Counter(map(shape_of, _parked(problem))) | Counter(capacity_of(scenes))
+    placed = with_capacity(own, capacity)
+    fixed = len(own.obstacle)
+    return placed, np.array([poses_of_scene(placed, fixed, scene) for scene in scenes])
+
+
+def _of_plans(problem: Problem, path: Path) -> tuple[Problem, Array]:
+    """Return the problem with the obstacles that plans place, and their poses, shape (N, width)."""
+    plans = load_plans(path)
+    if OBSTACLE_POSES not in plans.columns:
+        raise UsageError(
+            f"{path} has no scenes: its plans have no column {OBSTACLE_POSES}",
+            argument="scenes",
+        )
+    other = as_problem(plans.problem)
+    if other.own_obstacles != problem.own_obstacles:
+        raise UsageError(
+            f"{path} is of {other.name!r}, whose obstacles are others than those of {problem.name!r}",
+            argument="scenes",
+        )
+    return problem.with_obstacles(other.obstacle), plans.columns[OBSTACLE_POSES]
+
+
+def _parked(problem: Problem) -> list[Obstacle]:
+    """Return the obstacles that samples place."""
+    return [
+        obstacle
+        for obstacle in problem.obstacle
+        if obstacle.position == PARKED_POSITION_M
+    ]

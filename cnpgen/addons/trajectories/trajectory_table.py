@@ -1,0 +1,30 @@
+"""One trajectory of a file as named columns, before a problem interprets them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+Values = NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryTable:
+    """One trajectory, or several of equal columns, as a file has them.
+
+    Attributes: place: The file and the part of it, for messages. columns: Name ->
+        values, shape (K,), (K, w) or (N, K, w); texts are kept as texts. joint_names:
+        Names of the joints of columns with one value per joint; empty if the file does
+        not name them. lines: Numbers of the lines of a text file, for messages.
+        has_head: Whether the file names its columns, which are numbered from 0
+        otherwise.
+    """
+
+    place: str
+    columns: Mapping[str, Values]
+    joint_names: tuple[str, ...] = ()
+    lines: tuple[int, ...] = ()
+    has_head: bool = True

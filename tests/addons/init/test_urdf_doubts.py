@@ -1,0 +1,309 @@
+"""URDFs of other programs: stated limits are kept, and what is doubtful, missing or broken is named."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cnpgen.addons.init.arm import arm_notes, read_arm
+from cnpgen.addons.init.initial_recipes import InitialProblem, problem_of
+from cnpgen.addons.init.joint_limits import read_joint_limits, with_joint_limits
+from cnpgen.cli.main import main
+from cnpgen.errors import RecipeError, UsageError
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.robots.robot import Robot
+
+BOX = '<geometry><box size="0.4 0.08 0.08"/></geometry>'
+INERTIA = '<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.06" iyz="0" izz="0.06"/>'
+UPPER = f'<inertial><origin xyz="0.2 0 0"/><mass value="4"/>{INERTIA}</inertial>'
+SHAPE = f'<collision><origin xyz="0.2 0 0"/>{BOX}</collision>'
+LIMIT = '<limit lower="-2" upper="2" velocity="2" effort="120"/>'
+FINGER = """<link name="{name}"><collision><origin xyz="0.05 0 0"/><geometry><box size="0.1 0.02 0.02"/></geometry>
+</collision></link><joint name="{joint}" type="revolute"><parent link="wrist"/><child link="{name}"/>
+<origin xyz="0.1 0.03 0"/><axis xyz="0 0 1"/><limit lower="{low}" upper="1.2" velocity="1" effort="10"/>{mimic}</joint>"""
+
+
+def finger(
+    name: str = "f1", joint: str = "g1", low: float = -0.1, mimic: str = ""
+) -> str:
+    return FINGER.format(name=name, joint=joint, low=low, mimic=mimic)
+
+
+def write(
+    path: Path,
+    *,
+    upper: str = UPPER + SHAPE,
+    limit: str = LIMIT,
+    more: str = "",
+    root: str = "",
+) -> Path:
+    """Write an arm with two joints on a base, whose first link is ``upper``."""
+    path.write_text(f"""<robot name="arm">{root}
+<link name="base"><collision><origin xyz="0 0 0.05"/><geometry><box size="0.2 0.2 0.1"/></geometry></collision></link>
+<link name="upper">{upper}</link>
+<link name="wrist"><inertial><origin xyz="0.1 0 0"/><mass value="0.5"/>{INERTIA}</inertial>
+<collision><origin xyz="0.1 0 0"/><geometry><box size="0.2 0.05 0.05"/></geometry></collision></link>
+<joint name="j1" type="revolute"><parent link="base"/><child link="upper"/><origin xyz="0 0 0.3"/>
+<axis xyz="0 1 0"/>{limit}</joint>
+<joint name="j2" type="revolute"><parent link="upper"/><child link="wrist"/><origin xyz="0.45 0 0"/>
+<axis xyz="0 1 0"/>{LIMIT}</joint>
+{more}</robot>""")
+    return path
+
+
+def initial(path: Path, tip: str | None = "wrist", **options: Any) -> InitialProblem:
+    return problem_of(
+        read_arm(path, tip), "arm", path.parent / "arm", (), None, **options
+    )
+
+
+def notes(path: Path, tip: str | None = "wrist") -> str:
+    return "\n".join(arm_notes(read_arm(path, tip)))
+
+
+LIFT = """<link name="rail"/><joint name="lift" type="prismatic"><parent link="rail"/><child link="base"/>
+<axis xyz="0 0 1"/><limit lower="0" upper="0.4" velocity="0.1" effort="{effort}"/></joint>"""
+
+
+@pytest.mark.parametrize(("effort", "scale"), [(70, 0.8), (50, 1.0)])
+def test_a_torque_limit_above_the_gravity_load_is_kept(
+    tmp_path: Path, effort: float, scale: float
+) -> None:
+    path = write(tmp_path / "a.urdf", root=LIFT.format(effort=effort))
+    made = initial(path)  # the load is 4.5 kg, 44.1 N
+    assert made.problem.limits.torque is None
+    assert made.problem.limits.torque_scale == scale
+    robot = load_robot(made.problem)
+    assert robot.torque_limit[0] == pytest.approx(scale * effort)
+
+
+def test_a_torque_limit_below_the_gravity_load_is_replaced_with_a_doubt(
+    tmp_path: Path,
+) -> None:
+    made = initial(write(tmp_path / "a.urdf", root=LIFT.format(effort=20)))
+    assert made.problem.limits.torque is not None
+    (note,) = (note for note in made.notes if "gravity needs" in note)
+    assert "lift: gravity needs 44.14 N, where the URDF allows 20 N" in note
+    assert "check the masses" in note
+
+
+def test_masses_in_grams_are_refused(tmp_path: Path) -> None:
+    upper = UPPER.replace('value="4"', 'value="4000"') + SHAPE
+    with pytest.raises(
+        RecipeError, match=r"j1: gravity needs .* are its masses in g\?"
+    ):
+        initial(write(tmp_path / "a.urdf", upper=upper))
+
+
+def test_a_link_without_a_collision_element_is_named_and_can_use_its_visual(
+    tmp_path: Path,
+) -> None:
+    visual = SHAPE.replace("collision>", "visual>")
+    path = write(tmp_path / "a.urdf", upper=UPPER + visual)
+    assert "links with a <visual> and no <collision> element: upper" in notes(path)
+    assert links(load_robot(initial(path).problem)) == {"base", "wrist"}
+    arm = read_arm(path, "wrist").with_visual_shapes()
+    assert "no <collision> element" not in "\n".join(arm_notes(arm))
+    made = problem_of(arm, "arm", tmp_path / "arm", (), None)
+    assert made.problem.robot.visual_links == ("upper",)
+    with_collision = write(tmp_path / "b.urdf", upper=UPPER + visual + SHAPE)
+    expected = load_robot(initial(with_collision).problem)
+    found = load_robot(made.problem)
+    assert corners(found, "upper") == pytest.approx(corners(expected, "upper"))
+
+
+def links(robot: Robot) -> set[str]:
+    assert robot.shape is not None
+    return {part.link for part in robot.shape.convex_parts}
+
+
+def corners(robot: Robot, link: str) -> np.ndarray:
+    assert robot.shape is not None
+    (part,) = (part for part in robot.shape.convex_parts if part.link == link)
+    return np.array(part.vertices)
+
+
+def test_a_locked_joint_moves_to_the_limit_nearest_to_zero(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.urdf", more=finger(low=0.3))
+    assert "the locked joint g1 is at 0.3, its limit nearest to zero" in notes(path)
+    spec = initial(path).problem.robot
+    assert dict(zip(spec.locked_joints, spec.locked_positions, strict=True)) == {
+        "g1": 0.3
+    }
+    inside = write(tmp_path / "b.urdf", more=finger())
+    assert initial(inside).problem.robot.locked_joints == ()
+
+
+def test_followers_of_a_locked_joint_have_their_offset(tmp_path: Path) -> None:
+    mimic = '<mimic joint="g1" multiplier="2" offset="0.4"/>'
+    more = finger() + finger("f2", "g2", mimic=mimic)
+    spec = initial(write(tmp_path / "a.urdf", more=more)).problem
+    assert spec.robot.locked_joints == ("g1",)
+    joint = re.search(
+        r'<joint name="g2" type="fixed">.*?rpy="([^"]*)"', spec.urdf_text, re.S
+    )
+    assert joint is not None
+    assert np.allclose([float(v) for v in joint[1].split()], [0, 0, 0.4])
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        (
+            {"limit": LIMIT.replace('velocity="2"', 'velocity="180"')},
+            "joint j1: its velocity limit is 180 rad/s; 180 deg/s would be 3.142 rad/s",
+        ),
+        (
+            {
+                "upper": UPPER
+                + SHAPE.replace('xyz="0.2 0 0"', 'xyz="0.2 0 0" rpy="0 90 0"')
+            },
+            "link upper: <origin rpy> has the angle 90 rad; 90 deg would be 1.571 rad",
+        ),
+        (
+            {"upper": UPPER.replace("0.2 0 0", "1.4 0 0") + SHAPE},
+            "link upper: its center of mass is 1.4 m from its origin, the link reaches 0.45 m",
+        ),
+        (
+            {"upper": re.sub('i(..)="[^"]*"', r'i\1="0"', UPPER) + SHAPE},
+            "link upper: it has 4 kg and an <inertia> of zeros",
+        ),
+        (
+            {"upper": UPPER.replace(INERTIA, "") + SHAPE},
+            "link upper: its <inertial> has no <inertia>, so that its 4 kg count as a point",
+        ),
+    ],
+)
+def test_doubtful_numbers_are_named(
+    tmp_path: Path, changes: dict[str, str], text: str
+) -> None:
+    assert text in notes(write(tmp_path / "a.urdf", **changes))
+    assert text not in notes(write(tmp_path / "b.urdf"))
+
+
+def test_a_mass_without_inertia_counts_and_the_parser_prints_no_error(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = write(tmp_path / "a.urdf", upper=UPPER.replace(INERTIA, "") + SHAPE)
+    robot = load_robot(initial(path).problem)
+    assert robot.chain.joints[0].mass == pytest.approx(4.0)
+    assert capfd.readouterr().err == ""
+
+
+def dae(path: Path, unit: float) -> Path:
+    corners = " ".join(
+        f"{x} {y} {z}" for x in (0, 0.4 / unit) for y in (0, 8) for z in (0, 5)
+    )
+    faces = "0 1 3 0 3 2 4 6 7 4 7 5 0 4 5 0 5 1 2 3 7 2 7 6 0 2 6 0 6 4 1 5 7 1 7 3"
+    path.write_text(f"""<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit name="u" meter="{unit}"/><up_axis>Z_UP</up_axis></asset><library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="pa" count="24">{corners}</float_array><technique_common>
+<accessor source="#pa" count="8" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
+<param name="Z" type="float"/></accessor></technique_common></source><vertices id="v">
+<input semantic="POSITION" source="#p"/></vertices><triangles count="12">
+<input semantic="VERTEX" source="#v" offset="0"/><p>{faces}</p></triangles></mesh></geometry>
+</library_geometries><library_visual_scenes><visual_scene id="s"><node id="n">
+<instance_geometry url="#g"/></node></visual_scene>
+</library_visual_scenes><scene><instance_visual_scene url="#s"/></scene></COLLADA>""")
+    return path
+
+
+MESH = '<collision><geometry><mesh filename="{name}"/></geometry></collision>'
+
+
+@pytest.mark.parametrize("unit", [0.01, 0.001])
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_the_remedy_for_a_mesh_in_another_unit_is_the_unit_of_its_file(
+    tmp_path: Path, unit: float
+) -> None:
+    dae(tmp_path / "a.dae", unit)
+    upper = UPPER + MESH.format(name="a.dae")
+    path = write(tmp_path / "a.urdf", upper=upper)
+    with pytest.raises(
+        RecipeError, match=f'write scale="{unit} {unit} {unit}" in its <mesh>'
+    ):
+        initial(path)
+    scaled = upper.replace('"a.dae"', f'"a.dae" scale="{unit} {unit} {unit}"')
+    assert "upper" in links(load_robot(initial(write(path, upper=scaled)).problem))
+
+
+def test_a_broken_mesh_names_its_link_and_can_be_left_out(tmp_path: Path) -> None:
+    (tmp_path / "broken.stl").write_bytes(b"solid nothing")
+    path = write(tmp_path / "a.urdf", upper=UPPER + MESH.format(name="broken.stl"))
+    with pytest.raises(RecipeError, match=r"a mesh of link 'upper'; .*skipped_meshes"):
+        initial(path)
+    made = initial(path, skipped_meshes=("upper",))
+    assert "upper" not in links(load_robot(made.problem))
+    with pytest.raises(
+        RecipeError, match="skipped_meshes: the URDF has no link 'uper'"
+    ):
+        initial(path, skipped_meshes=("uper",))
+
+
+def test_the_default_tip_is_no_finger(tmp_path: Path) -> None:
+    more = finger("left_finger") + finger("right_finger", "g2")
+    assert read_arm(write(tmp_path / "a.urdf", more=more), None).tip == "wrist"
+    tcp = '<link name="tcp"/><joint name="jt" type="fixed"><parent link="wrist"/><child link="tcp"/></joint>'
+    assert read_arm(write(tmp_path / "b.urdf", more=more + tcp), None).tip == "tcp"
+    with pytest.raises(UsageError, match="2 links have no child: f1, tcp"):
+        read_arm(write(tmp_path / "c.urdf", more=finger() + tcp), None)
+
+
+LIMITS = """default_velocity_scaling_factor: 0.1
+joint_limits:
+  j1:
+    has_velocity_limits: true
+    max_velocity: 1.5
+    has_acceleration_limits: true
+    max_acceleration: 3.0
+    has_position_limits: true
+    min_position: -1.0
+    max_position: 0.5
+  j2:
+    has_velocity_limits: false
+    max_velocity: 0.1
+    has_jerk_limits: true
+    max_jerk: 44.0
+"""
+
+
+def test_limits_of_moveit_replace_those_of_the_urdf(tmp_path: Path) -> None:
+    pytest.importorskip("yaml")
+    (tmp_path / "limits.yaml").write_text(LIMITS)
+    path = write(tmp_path / "a.urdf")
+    limits = read_joint_limits(tmp_path / "limits.yaml", ("j1", "j2"))
+    arm = with_joint_limits(read_arm(path, "wrist"), limits)
+    made = problem_of(arm, "arm", tmp_path / "arm", (), None, joint_limits=limits)
+    robot, usual = load_robot(made.problem), load_robot(initial(path).problem)
+    assert robot.position_lower.tolist() == [-1.0, -2.0]
+    assert robot.position_upper.tolist() == [0.5, 2.0]
+    assert robot.rated_velocity.tolist() == [1.5, 2.0]
+    assert robot.acceleration_limit[0] == 3.0
+    assert robot.acceleration_limit[1] == usual.acceleration_limit[1]
+    assert robot.jerk_limit.tolist() == [300.0, 44.0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ("j1:", "j9:", "the URDF has no joint 'j9'"),
+        ("max_velocity: 1.5", "max_velocty: 1.5", "unknown key 'max_velocty'"),
+        ("    max_velocity: 1.5\n", "", "max_velocity must be a number, got None"),
+        ("max_acceleration: 3.0", "max_acceleration: 0.0", "must be positive, got 0"),
+        ("min_position: -1.0", "min_position: 1.0", "must be below max_position"),
+        ("has_jerk_limits: true", "has_jerk_limits: 1", "must be true or false"),
+        ("joint_limits:", "limits:", "expected 'joint_limits'"),
+    ],
+)
+def test_faults_in_limits_of_moveit_are_named(
+    tmp_path: Path, old: str, new: str, text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("yaml")
+    assert LIMITS.count(old) >= 1
+    (tmp_path / "limits.yaml").write_text(LIMITS.replace(old, new, 1))
+    words = ["init", str(tmp_path / "arm"), "--urdf", str(write(tmp_path / "a.urdf"))]
+    limits = str(tmp_path / "limits.yaml")
+    assert main([*words, "--tip", "wrist", "--joint-limits", limits]) == 2
+    assert text in capsys.readouterr().err

@@ -1,0 +1,143 @@
+"""Obstacles of sampled trajectories: a problem whose samples bring them is judged with them only."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cnpgen
+from cnpgen.cli.main import main
+from cnpgen.errors import UsageError
+from cnpgen.plans.plans import Plans
+from cnpgen.plans.scene_plans import scene_plans
+from cnpgen.problems.problem_record import as_problem
+from cnpgen.problems.scenes.scene_problem import SceneProblem
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.trajectories import import_trajectories, load_trajectories
+from cnpgen.trajectory.boundary import Boundary
+from tests.examples.example_robots import needs_robots
+
+pytestmark = needs_robots
+
+START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
+GOAL = START + np.array([0.8, 0, 0, 0, 0, 0, 0])
+
+
+def scene(x: float) -> SceneProblem:
+    """A column at half of the turn, in the way if it is near the robot."""
+    direction = np.array([np.cos(0.4), np.sin(0.4)])
+    column = Obstacle(
+        name="column",
+        kind="cylinder",
+        position=(*(x * direction).tolist(), 0.5),
+        radius=0.05,
+        length=1.0,
+    )
+    return SceneProblem(
+        name=f"column at {x}", start_q=START, goal_q=GOAL[None], obstacles=(column,)
+    )
+
+
+@pytest.fixture(scope="module")
+def lines() -> Plans:
+    """Two straight lines: one through a column, one that turns before a column."""
+    plans = scene_plans(as_problem("panda-3kg"), [scene(0.4), scene(1.2)])
+    share = np.concatenate(
+        [[0, 0], np.linspace(0, 1, plans.path_control_points.shape[1] - 4), [1, 1]]
+    )
+    path = START + (GOAL - START) * share[None, :, None]
+    return replace(
+        plans,
+        path_control_points=np.repeat(path, 2, axis=0),
+        rate_control_points=np.full_like(plans.rate_control_points, 0.2),
+    )
+
+
+@pytest.fixture(scope="module")
+def files(lines: Plans, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    folder = tmp_path_factory.mktemp("scenes")
+    cnpgen.save_plans(folder / "plans.h5", lines)
+    cnpgen.export_plans(lines, folder / "lines", to="csv", rate=100)
+    return folder / "lines", folder / "plans.h5"
+
+
+def test_the_verdict_in_the_scenes_of_a_plan_file_is_that_of_the_plans(
+    lines: Plans, files: tuple[Path, Path]
+) -> None:
+    expected = cnpgen.evaluate_plans(lines, workers=1).valid.tolist()
+    assert expected == [False, True]
+    for problem in ("panda-3kg", "panda-scenes"):
+        loaded = load_trajectories(files[0], problem, scenes=files[1])
+        found = cnpgen.evaluate_trajectories(loaded.problem, loaded.trajectories)
+        assert found.valid.tolist() == expected
+        clearance = found.verdicts[0].conditions["robot clearance"]
+        assert "cylinder" in clearance.margin.part
+
+
+def test_one_scene_is_that_of_all_and_other_numbers_are_refused(
+    files: tuple[Path, Path],
+) -> None:
+    loaded = load_trajectories(files[0], "panda-3kg", scenes=[scene(0.4)])
+    found = cnpgen.evaluate_trajectories(loaded.problem, loaded.trajectories)
+    assert found.valid.tolist() == [False, False]
+    with pytest.raises(UsageError, match="one for each of 2 trajectories, got 3"):
+        load_trajectories(files[0], "panda-3kg", scenes=[scene(1.0)] * 3)
+
+
+def test_without_scenes_a_problem_whose_samples_bring_them_is_refused(
+    files: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = str(tmp_path / "out")
+    for words in (
+        ["evaluate", str(files[0])],
+        ["import", str(files[0]), "-o", f"{out}.h5"],
+        ["view", str(files[0]), "-o", f"{out}.html"],
+    ):
+        assert main([*words, "--problem", "panda-scenes"]) == 2
+        assert "has no scene: samples of 'panda-3kg' place" in (
+            text := capsys.readouterr().err
+        )
+        assert "--scenes" in text
+    words = ["evaluate", str(files[0]), "--problem", "panda-scenes"]
+    assert main([*words, "--scenes", str(files[1])]) == 1
+    assert "trajectories of panda-3kg: 1 invalid, 1 " in capsys.readouterr().out
+
+
+def test_imported_plans_have_the_scenes(lines: Plans, files: tuple[Path, Path]) -> None:
+    loaded = load_trajectories(files[0], "panda-3kg", scenes=files[1])
+    imported = import_trajectories(loaded.problem, loaded.trajectories)
+    assert np.array_equal(
+        imported.plans.columns["obstacle_poses"], lines.columns["obstacle_poses"]
+    )
+    assert cnpgen.evaluate_plans(imported.plans, workers=1).valid.tolist() == [
+        False,
+        True,
+    ]
+
+
+def test_a_dataset_of_lerobot_has_its_scenes(lines: Plans, tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    cnpgen.export_plans(lines, tmp_path / "le", to="lerobot", rate=100)
+    loaded = load_trajectories(tmp_path / "le", lines.problem)
+    found = cnpgen.evaluate_trajectories(loaded.problem, loaded.trajectories)
+    assert not found.verdicts[0].valid
+    decisions = [v.conditions["robot clearance"].decision for v in found.verdicts]
+    assert decisions == ["invalid", "valid"]
+    with pytest.raises(UsageError, match="have scenes of their own"):
+        load_trajectories(tmp_path / "le", lines.problem, scenes=[scene(1.0)])
+
+
+def test_scenes_of_other_obstacles_and_plans_without_scenes_are_refused(
+    files: tuple[Path, Path], tmp_path: Path
+) -> None:
+    rest = START[None]
+    plans = cnpgen.make_plans(
+        "panda-3kg",
+        Boundary(rest, 0 * rest, 0 * rest, rest, 0 * rest),
+        path_control_points=np.repeat(rest[:, None], 15, axis=1),
+        rate_control_points=np.ones((1, 20)),
+    )
+    cnpgen.save_plans(tmp_path / "free.h5", plans)
+    with pytest.raises(UsageError, match=r"free\.h5 has no scenes"):
+        load_trajectories(files[0], "panda-3kg", scenes=tmp_path / "free.h5")
