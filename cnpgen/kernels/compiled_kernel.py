@@ -28,8 +28,8 @@ from cnpgen.kernels.tape import Tape
 
 CACHE_LINE_DOUBLES = 8
 _first: dict[
-    str, LoadedCode
-] = {}  # code of the first level by content, of this process
+    tuple[Path, str], LoadedCode
+] = {}  # code of the first level of this process
 
 
 def kernel_address(tape: Tape, cache_folder: Path) -> int:

@@ -19,6 +19,9 @@ FIRST, FINAL = (
     1,
 )  # levels: generated ten times faster; as fast as an optimizing compiler's code
 SOURCES = ("lowering", "vector_functions", "llvm_text", "llvm_module", "machine_code")
+_engines: list[
+    Any
+] = []  # owners of all loaded code, whose addresses other code may have
 LOCK = threading.RLock()  # around every call of LLVM, also of other threads at a fork
 
 os.register_at_fork(
@@ -138,7 +141,7 @@ def generate(text: str, level: int, processor: Processor | None = None) -> bytes
 
 
 def load(code: bytes) -> LoadedCode:
-    """Load an object file that ``generate`` made for this processor.
+    """Load an object file that ``generate`` made for this processor; LLVM crashes on any other content.
 
     Raises: MachineError: LLVM cannot load it.
     """
@@ -153,6 +156,7 @@ def load(code: bytes) -> LoadedCode:
             engine.finalize_object()
         except RuntimeError as error:
             raise MachineError(f"LLVM cannot load a kernel: {error}") from error
+        _engines.append(engine)
         return LoadedCode(engine)
 
 

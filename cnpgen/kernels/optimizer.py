@@ -5,7 +5,6 @@ The process holds a lock, so that there is one per cache; it ends when no reques
 
 import ctypes
 import os
-import subprocess
 import sys
 import threading
 from collections.abc import Iterator
@@ -59,7 +58,7 @@ class Replacer:
         self._waiting: list[Replacement] = []
         self._mutex = threading.Lock()
         self._thread: threading.Thread | None = None
-        self._processes: list[subprocess.Popen[bytes]] = []
+        self._processes: list[int] = []  # their identifiers
 
     def add(self, replacement: Replacement) -> None:
         """Wait for the final code of a kernel."""
@@ -104,30 +103,21 @@ class Replacer:
         if code is not None:
             target = ctypes.c_void_p.from_address(replacement.code.address("target"))
             target.value = code.address("kernel")
-            self._processes = [one for one in self._processes if one.poll() is None]
+            self._processes = [one for one in self._processes if _runs(one)]
             return True
         return not requested or not self._start_process(replacement)
 
     def _start_process(self, replacement: Replacement) -> bool:
         """Start the process unless it runs; return False if it was started too often."""
-        if any(process.poll() is None for process in self._processes):
+        if any(map(_runs, self._processes)):
             return True
         with optimizer_lock(replacement.request.parent) as free:
             if not free:
                 return True
         if len(self._processes) == MAX_STARTS:
             return False
-        folder = str(replacement.cache_folder.absolute())
         with suppress(OSError):
-            self._processes.append(
-                subprocess.Popen(
-                    [sys.executable, "-c", START, folder, *sys.path],
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,
-                    start_new_session=True,
-                )
-            )
+            self._processes.append(_start(replacement.cache_folder.absolute()))
             return True
         return False
 
@@ -144,6 +134,25 @@ class Replacer:
         self._thread, self._processes = None, []
         self._mutex.release()
         self._start_thread()
+
+
+def _start(cache_folder: Path) -> int:
+    """Start the detached process of a cache; it outlives this one, unlike a child of ``subprocess``."""
+    command = [sys.executable, "-c", START, str(cache_folder), *sys.path]
+    nothing = [
+        (os.POSIX_SPAWN_OPEN, stream, os.devnull, os.O_RDWR, 0) for stream in range(3)
+    ]
+    return os.posix_spawn(
+        sys.executable, command, os.environ, file_actions=nothing, setsid=True
+    )
+
+
+def _runs(process: int) -> bool:
+    """Return whether a process that this one has started still runs."""
+    try:
+        return os.waitpid(process, os.WNOHANG) == (0, 0)
+    except ChildProcessError:
+        return False
 
 
 replacer = Replacer()
