@@ -21,8 +21,8 @@ from pathlib import Path
 HERE = Path(__file__).parents[1]
 COMMANDS = {
     "make-dataset airhockey-hit": "make-dataset airhockey-hit --n 400 -o OUT/hits --workers 1",
-    "plan airhockey-hit": "plan INPUTS/hits --model airhockey-hit --n 100 -o OUT/plans.h5",
-    "refine": "refine INPUTS/plans.h5 -o OUT/refined.h5 --n 4",
+    "plan airhockey-hit": "plan INPUTS/hits --model airhockey-hit --n 4 -o OUT/plans.h5",
+    "refine": "refine INPUTS/plans.h5 -o OUT/refined.h5",
     "solve airhockey-hit": "solve airhockey-hit --n 4 -o OUT/solved.h5",
     "solve heavy-object": "solve heavy-object --n 4 -o OUT/solved.h5",
 }  # fmt: skip
