@@ -62,7 +62,7 @@ stdout is data, stderr everything else. Exit codes:
   0    done
   1    the answer is no: a dataset or a file is damaged, unfinished or of another problem; samples or plans are invalid
   2    a wrong argument, such as a missing path or one of another kind, or an error in a recipe
-  3    the machine: no permission to read or write a path, a full disk, no compiler, a broken library; also an internal
+  3    the machine: no permission to read or write a path, a full disk, a broken library; also an internal
        error of cnpgen
   130  interrupted (Ctrl-C); finished shards and plans are kept, the same command resumes
   141  the reader of stdout closed it

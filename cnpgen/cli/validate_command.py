@@ -12,7 +12,7 @@ every bit is equal; elsewhere samples must agree to 1e-9.
 Findings are printed on stdout, one per line, as FILE: PROBLEM, followed by a summary of
 the checks; --quiet prints the findings only. A line that begins with "note:" is no
 finding. Exit codes: 0 no findings, 1 findings, 2 a wrong argument, 3 this machine
-cannot check it: --regenerate of a compiled dataset needs a C compiler, and --deep and
+cannot check it: --regenerate of a compiled dataset needs LLVM, and --deep and
 --regenerate need the plug-ins of the dataset.
 """
 

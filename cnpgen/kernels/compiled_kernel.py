@@ -1,47 +1,62 @@
-"""Kernels in shared libraries, compiled once with the C compiler of the machine and cached by content."""
+"""Kernels as machine code, generated once by LLVM and cached by content."""
 
 import ctypes
-import hashlib
-import logging
-import shlex
-import tempfile
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cnpgen.errors import MachineError
-from cnpgen.kernels.compiler import (
-    compiler_version,
-    flags_of,
-    require_compiler,
-    run_compiler,
-    target,
+from cnpgen.kernels.call_text import CALL, PYTHON_FUNCTIONS
+from cnpgen.kernels.code_cache import (
+    MAX_DIRECT,
+    content_key,
+    final_text,
+    find_final,
+    make_final,
+    make_first,
+    note_generation,
+    request_final,
+    tape_key,
 )
-from cnpgen.kernels.emit import VECTORS, emit, prelude
 from cnpgen.kernels.kernel import Array, GridKernel, Kernel, check_arguments, check_grid
+from cnpgen.kernels.machine_code import LoadedCode, define_symbol
+from cnpgen.kernels.optimizer import Replacement, replacer
 from cnpgen.kernels.tape import Tape
-from cnpgen.store.files.cache_folder import (
-    LIBRARIES,
-    exclusive_lock,
-    is_trusted,
-    make_private_folder,
-    make_read_only_for_others,
-    read_only_cache,
-    require_trusted,
-)
 
-CALL_SOURCE = Path(__file__).with_name("call.c")
 CACHE_LINE_DOUBLES = 8
-# GCC's register allocator takes minutes at -O2 for longer tapes, without a gain.
-MAX_O2_INSTRUCTIONS = 6000
-_LOG = logging.getLogger(__name__)
+_first: dict[
+    tuple[Path, str], LoadedCode
+] = {}  # code of the first level of this process
+
+
+def kernel_address(tape: Tape, cache_folder: Path) -> int:
+    """Return the address of a tape's machine code; generate it if the cache lacks it or its copy is damaged.
+
+    A long tape gets code of the first level, whose address stays the same when the final code
+    replaces it.
+
+    Raises: MachineError: LLVM does not work, or the cache folder is writable for other
+        users.
+    """
+    key = tape_key(tape)
+    if (code := find_final(key, cache_folder)) is not None:
+        return code.address("kernel")
+    place = cache_folder, key
+    if place not in _first:
+        note_generation(cache_folder)
+        if len(tape) <= MAX_DIRECT or not sys.executable:
+            return make_final(key, final_text(tape), cache_folder).address("kernel")
+        code = _first[place] = make_first(tape)
+        if request := request_final(key, tape, cache_folder):
+            replacer.add(Replacement(key, request, code, cache_folder))
+    return _first[place].address("dispatch")
 
 
 class _Callee(ctypes.Structure):
-    """The struct ``callee`` of call.c."""
+    """The struct ``callee`` of ``call_text``."""
 
     _fields_ = (
         ("kernel", ctypes.c_void_p),
@@ -52,14 +67,11 @@ class _Callee(ctypes.Structure):
 
 
 class CompiledKernel(Kernel):
-    """A tape as machine code of its library.
+    """A tape as machine code."""
 
-    The cache folder also has the library of call.c.
-    """
-
-    def __init__(self, tape: Tape, library: Path, cache_folder: Path) -> None:
+    def __init__(self, tape: Tape, cache_folder: Path) -> None:
         super().__init__(tape)
-        self._address = ctypes.cast(_load(library), ctypes.c_void_p).value
+        self._address = kernel_address(tape, cache_folder)
         sizes = len(tape.inputs), len(tape.outputs)
         widths = (ctypes.c_long * sum(sizes))(*tape.inputs, *tape.outputs)
         self._callee, self._call = (
@@ -82,12 +94,17 @@ class CompiledKernel(Kernel):
         return self._address
 
 
+_GRID_FUNCTION = ctypes.CFUNCTYPE(
+    None, ctypes.c_long, ctypes.c_long, *[ctypes.c_void_p] * 4
+)
+
+
 class CompiledGridKernel(GridKernel):
     """A tape with a grid as machine code."""
 
-    def __init__(self, tape: Tape, library: Path) -> None:
+    def __init__(self, tape: Tape, cache_folder: Path) -> None:
         super().__init__(tape)
-        self._function = _load(library)
+        self._function = _GRID_FUNCTION(kernel_address(tape, cache_folder))
 
     def __call__(self, *arguments: Array, out: Sequence[Array]) -> None:
         """Evaluate the grid; see ``GridKernel``."""
@@ -103,29 +120,16 @@ class CompiledGridKernel(GridKernel):
             )
 
 
-def _load(library: Path) -> Any:
-    try:
-        function = ctypes.CDLL(str(library)).kernel
-    except (OSError, AttributeError) as error:
-        raise MachineError(
-            f"cannot load the compiled kernel {library}: {error}; delete it and run again"
-        ) from error
-    function.restype = None
-    return function
-
-
 @cache
 def _load_call(cache_folder: Path) -> Any:
-    """Return the function ``call`` of call.c."""
-    library = compile_source([CALL_SOURCE], cache_folder)
-    try:
-        function = ctypes.PyDLL(str(library)).call
-    except OSError as error:
-        raise MachineError(
-            f"cannot load the library that calls compiled kernels, {library}: {error}"
-        ) from error
-    function.argtypes = (ctypes.POINTER(_Callee), ctypes.py_object, ctypes.py_object)
-    return function
+    """Return the function ``call`` of ``call_text``."""
+    for name in PYTHON_FUNCTIONS:
+        define_symbol(name, getattr(ctypes.pythonapi, name))
+    code = make_final(content_key(CALL.encode()), CALL, cache_folder)
+    kind = ctypes.PYFUNCTYPE(
+        ctypes.c_int, ctypes.POINTER(_Callee), ctypes.py_object, ctypes.py_object
+    )
+    return kind(code.address("call"))
 
 
 def _strides(arrays: Sequence[Array]) -> "ctypes.Array[ctypes.c_long]":
@@ -174,139 +178,3 @@ def address_of(array: Any) -> int:
         )  # a third of the time of the array interface
     except (TypeError, ValueError):  # read-only, strided, or empty
         return int(array.__array_interface__["data"][0])
-
-
-def optimization_level(tape: Tape) -> str:
-    """Return the optimization level of the compiler for a tape."""
-    return "-O1" if len(tape) > MAX_O2_INSTRUCTIONS else "-O2"
-
-
-@cache
-def _emitter_digest() -> str:
-    source = Path(emit.__code__.co_filename).read_bytes()
-    return hashlib.sha256(source + VECTORS.read_bytes()).hexdigest()
-
-
-def library_file_stem(tape: Tape, compiler: str) -> str:
-    """Return the stem of the library's file name, which contains a digest of all inputs of the compilation."""
-    return _stem(tape.name, tape.to_bytes(), optimization_level(tape), compiler)
-
-
-def _stem(name: str, content: bytes, level: str, compiler: str) -> str:
-    identity = hashlib.sha256(content)
-    flags = (*flags_of(level), *shlex.split(compiler)[1:])
-    for text in (*flags, compiler_version(compiler), target(), _emitter_digest()):
-        identity.update(text.encode() + b"\0")
-    return f"{name}-{identity.hexdigest()[:24]}"
-
-
-def find_library(folder: Path, stem: str) -> Path | None:
-    """Return a trusted library whose content has the digest in its file name, or None.
-
-    Loading a damaged library would crash the process.
-    """
-    libraries = (path for path in folder.glob(f"{stem}-*.so") if is_trusted(path))
-    return next(
-        (path for path in libraries if path.stem == f"{stem}-{_content_digest(path)}"),
-        None,
-    )
-
-
-def _content_digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:24]
-
-
-def find_compiled(tape: Tape, cache_folder: Path) -> Path | None:
-    """Return the library of a tape if it is in the cache.
-
-    Raises:
-        MachineError: There is no working compiler, or the cache folder is unreadable or
-            writable for other users.
-    """
-    return _find(library_file_stem(tape, require_compiler()), cache_folder)
-
-
-def _find(stem: str, cache_folder: Path) -> Path | None:
-    try:
-        libraries = (
-            find_library(folder / LIBRARIES, stem)
-            for folder in require_trusted(cache_folder)
-        )
-        return next((library for library in libraries if library), None)
-    except OSError as error:
-        raise _unusable(cache_folder, error) from error
-
-
-def compile_tape(tape: Tape, cache_folder: Path) -> Path:
-    """Return the library of a tape; compile it if the cache lacks it or its copy is damaged.
-
-    Raises:
-        MachineError: There is no working compiler, or the cache folder is not writable
-            or writable for other users.
-    """
-    stem = library_file_stem(tape, require_compiler())
-    return _compile(stem, lambda: emit(tape), optimization_level(tape), cache_folder)
-
-
-def compile_source(paths: Sequence[Path], cache_folder: Path) -> Path:
-    """Return the library of handwritten C source that uses the double vectors of kernels.
-
-    The files are concatenated in their order; the last one names the library.
-
-    Raises:
-        MachineError: See ``compile_tape``.
-    """
-    text, level = (
-        "".join(
-            [prelude("float64"), *(path.read_text(encoding="utf-8") for path in paths)]
-        ),
-        "-O3",
-    )
-    stem = _stem(paths[-1].stem, text.encode(), level, require_compiler())
-    return _compile(stem, lambda: text, level, cache_folder)
-
-
-def _compile(
-    stem: str, source: Callable[[], str], level: str, cache_folder: Path
-) -> Path:
-    """Compile C source unless its library is cached, also by another process while this one waited for the lock."""
-    if library := _find(stem, cache_folder):
-        return library
-    libraries = cache_folder / LIBRARIES
-    try:
-        make_private_folder(libraries)
-        require_trusted(cache_folder)
-        with exclusive_lock(libraries / f".{stem}.lock"):
-            return find_library(libraries, stem) or _build(
-                stem, source, level, cache_folder
-            )
-    except OSError as error:
-        raise _unusable(cache_folder, error) from error
-
-
-def _build(
-    stem: str, source: Callable[[], str], level: str, cache_folder: Path
-) -> Path:
-    libraries = cache_folder / LIBRARIES
-    if linked := read_only_cache(cache_folder):
-        _LOG.info(
-            "compiling kernels for this run only: the cache %s lacks them and is not writable",
-            linked,
-        )
-    else:
-        _LOG.info("compiling kernels, once per problem and machine")
-    with tempfile.TemporaryDirectory(dir=libraries, prefix=".build-") as folder:
-        source_file, built = (
-            Path(folder) / f"{stem.rpartition('-')[0]}.c",
-            Path(folder) / "kernel.so",
-        )
-        source_file.write_text(source(), encoding="utf-8")
-        run_compiler(require_compiler(), level, source_file, built)
-        make_read_only_for_others(built)
-        return built.replace(libraries / f"{stem}-{_content_digest(built)}.so")
-
-
-def _unusable(cache_folder: Path, error: OSError) -> MachineError:
-    return MachineError(
-        f"cannot use the kernel cache {cache_folder / LIBRARIES}: {error.strerror or error}"
-    )

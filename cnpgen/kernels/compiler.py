@@ -34,7 +34,6 @@ LIMIT_S_PER_BYTE = 3e-3  # of source
 MAX_VERSION_TIME_S = 10
 NOTICE_AFTER_S = 60  # a user hears of a compiler that takes longer
 _LOG = logging.getLogger(__name__)
-_running: set["subprocess.Popen[str]"] = set()  # compilers of all threads
 
 
 @cache
@@ -140,7 +139,6 @@ def _run(
             f"the C compiler {compiler} does not run: {error}"
         ) from error
     with process:
-        _running.add(process)
         try:
             out, errors = _outputs(process, compiler, seconds, purpose)
         except BaseException as error:
@@ -151,8 +149,6 @@ def _run(
                     f"the C compiler {compiler} took more than {seconds:g} s {purpose}: {hint}"
                 ) from error
             raise
-        finally:
-            _running.discard(process)
     return subprocess.CompletedProcess(command, process.returncode, out, errors)
 
 
@@ -178,15 +174,6 @@ def _outputs(
 def _kill(process: "subprocess.Popen[str]") -> None:
     with suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
-
-
-def kill_compilers() -> None:
-    """Kill the compilers that other threads of this process wait for.
-
-    Their compilation fails.
-    """
-    for process in tuple(_running):
-        _kill(process)
 
 
 @cache

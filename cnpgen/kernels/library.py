@@ -5,8 +5,8 @@ import hashlib
 import inspect
 import json
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -15,13 +15,8 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from cnpgen.errors import MachineError, UsageError
-from cnpgen.kernels.compiled_kernel import (
-    CompiledGridKernel,
-    CompiledKernel,
-    compile_source,
-    compile_tape,
-)
-from cnpgen.kernels.compiler import require_compiler
+from cnpgen.kernels.c_library import load_library
+from cnpgen.kernels.compiled_kernel import CompiledGridKernel, CompiledKernel
 from cnpgen.kernels.interpreted_kernel import (
     InterpretedGridKernel,
     InterpretedKernel,
@@ -29,7 +24,6 @@ from cnpgen.kernels.interpreted_kernel import (
     MappedKernel,
 )
 from cnpgen.kernels.kernel import GridKernel, Kernel
-from cnpgen.kernels.parallel_compilation import CompilerPool
 from cnpgen.kernels.tape import CODES, Dtype, GridSpec, Loop, Tape, tape_from_function
 from cnpgen.schema import addons, registry
 from cnpgen.schema.registry import package_digest
@@ -67,7 +61,6 @@ class KernelLibrary:
             problem).
         structure: Digest of the arguments without the poses and sizes of obstacles, or
             None; see ``load_by_structure``.
-        compiler_pool: Pool that compiles kernels, inside ``compile_in_parallel``.
     """
 
     backend: Backend
@@ -75,7 +68,6 @@ class KernelLibrary:
     identity: str
     arguments: Mapping[str, Any] = field(default_factory=dict)
     structure: str | None = None
-    compiler_pool: CompilerPool | None = field(default=None, repr=False)
 
     def load_by_structure(
         self, builder: Callable[..., Any], **parameters: Any
@@ -106,26 +98,7 @@ class KernelLibrary:
         tape = self._tape(builder, parameters, loop=loop)
         if self.backend == "numpy":
             return InterpretedKernel(tape)
-        if self.compiler_pool is not None:
-            return self.compiler_pool.kernel(tape)
-        return CompiledKernel(
-            tape, compile_tape(tape, self.cache_folder), self.cache_folder
-        )
-
-    @contextmanager
-    def compile_in_parallel(self) -> Iterator[None]:
-        """Compile the kernels that are loaded in the context in parallel; all are compiled when it ends.
-
-        Raises:
-            MachineError: A compiler failed.
-        """
-        pool = self.compiler_pool = CompilerPool(self.cache_folder)
-        try:
-            yield
-            pool.wait()
-        finally:
-            self.compiler_pool = None
-            pool.close()
+        return CompiledKernel(tape, self.cache_folder)
 
     def load_grid(
         self,
@@ -144,13 +117,16 @@ class KernelLibrary:
         tape = self._tape(builder, parameters, grid=grid, dtype=dtype)
         if self.backend == "numpy":
             return InterpretedGridKernel(tape)
-        return CompiledGridKernel(tape, compile_tape(tape, self.cache_folder))
+        return CompiledGridKernel(tape, self.cache_folder)
 
     def load_source(self, *paths: Path) -> ctypes.CDLL | None:
-        """Return the library of C source that follows ``arrays.h`` (``compile_source``); None if not "compiled"."""
+        """Return the library of C source that follows ``arrays.h``.
+
+        None if the backend is not "compiled", or, after a warning, without a C compiler.
+        """
         if self.backend != "compiled":
             return None
-        return ctypes.CDLL(str(compile_source([ARRAYS, *paths], self.cache_folder)))
+        return load_library((ARRAYS, *paths), self.cache_folder)
 
     def tape(self, builder: Callable[..., Any], **parameters: Any) -> Tape:
         """Return the tape of an SX function without compiling it; see ``load``."""
@@ -317,7 +293,7 @@ def choose_backend(requested: str | None = None) -> tuple[Backend, Path]:
     if requested in {"numpy", "casadi"}:
         return requested, folder
     try:
-        _try_compiler(folder)
+        _try_generator(folder)
     except MachineError as error:
         if requested == "compiled":
             raise
@@ -327,17 +303,14 @@ def choose_backend(requested: str | None = None) -> tuple[Backend, Path]:
     return "compiled", folder
 
 
-def _try_compiler(folder: Path) -> None:
-    """Compile, load and run the smallest kernel; raise MachineError if that fails."""
-    require_compiler()
+def _try_generator(folder: Path) -> None:
+    """Generate, load and run the smallest kernel; raise MachineError if that fails."""
     codes = np.array([CODES["INPUT"], CODES["TWICE"], CODES["OUTPUT"]], np.int16)
     operands = np.array([0, 0, 1], np.int32)
     tape = Tape(
         "selftest", (1,), (1,), codes, operands, np.zeros(3, np.int32), np.zeros(3)
     )
-    kernel = CompiledKernel(tape, compile_tape(tape, folder), folder)
+    kernel = CompiledKernel(tape, folder)
     (result,) = kernel(np.arange(5.0)[None])
     if not np.array_equal(result[0], 2 * np.arange(5.0)):
-        raise MachineError(
-            "the C compiler generates wrong code: 2 x differs from x + x"
-        )
+        raise MachineError("LLVM generates wrong code: 2 x differs from x + x")

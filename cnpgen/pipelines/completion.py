@@ -53,18 +53,17 @@ class Completion:
         self._derived = _derived(given)
         known = {*given, *self._derived}
         written = written_columns(pipeline.path, steps, context)
-        with context.kernels.compile_in_parallel():
-            self._tip = context.kernels.load(tip_position)
-            self._stages = prepare_steps(
-                _of_tasks(steps, context), lambda stage: stage.complete(context, known)
-            )
-            # Joint states of the user, and the base configuration of the problem file,
-            # are rounded: the tolerances of motions apply to them.
-            ends: tuple[End, ...] = ("start", "goal")
-            stated = [
-                end for end in ends if {f"{end}_q", f"{end}_dq", f"{end}_ddq"} & known
-            ]
-            self._accept = acceptance(context, written, given=stated)
+        self._tip = context.kernels.load(tip_position)
+        self._stages = prepare_steps(
+            _of_tasks(steps, context), lambda stage: stage.complete(context, known)
+        )
+        # Joint states of the user, and the base configuration of the problem file,
+        # are rounded: the tolerances of motions apply to them.
+        ends: tuple[End, ...] = ("start", "goal")
+        stated = [
+            end for end in ends if {f"{end}_q", f"{end}_dq", f"{end}_ddq"} & known
+        ]
+        self._accept = acceptance(context, written, given=stated)
         self._random = np.random.default_rng(
             0
         )  # for plug-ins that bypass candidates.draw

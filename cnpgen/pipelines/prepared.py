@@ -88,11 +88,8 @@ class PreparedPipeline:
         self.families = drawn[0].family_names if drawn else ()
         self.fields = stored_fields(steps, self.context)
         written = written_columns(pipeline.path, steps, self.context)
-        with self.context.kernels.compile_in_parallel():
-            self._stages = prepare_steps(
-                steps, lambda stage: stage.prepare(self.context)
-            )
-            self._accept = acceptance(self.context, written)
+        self._stages = prepare_steps(steps, lambda stage: stage.prepare(self.context))
+        self._accept = acceptance(self.context, written)
 
     def block(
         self,

@@ -140,18 +140,17 @@ class BoundaryLayer:
             self._kernels,
         )
         fixed, placed = self._fixed_at_goal, self.problem.sample_obstacles
-        with kernels.compile_in_parallel():
-            prepare = make_task_preprocessor(
-                problem,
-                robot,
-                kernels,
-                self._config,
-                fixed_at_goal=fixed,
-                placed=placed,
-            )
-            return prepare, make_projection(
-                problem, kernels, steps=self.projection_steps, fixed_at_goal=fixed
-            )
+        prepare = make_task_preprocessor(
+            problem,
+            robot,
+            kernels,
+            self._config,
+            fixed_at_goal=fixed,
+            placed=placed,
+        )
+        return prepare, make_projection(
+            problem, kernels, steps=self.projection_steps, fixed_at_goal=fixed
+        )
 
     @checked_arguments
     @one_thread()

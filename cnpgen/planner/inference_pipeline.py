@@ -372,36 +372,33 @@ def make_inference_pipeline(
     ``scale_time`` is for motions from rest to rest only.
     """
     problem, robot, kernels = loaded.problem.for_planning, loaded.robot, loaded.kernels
-    with kernels.compile_in_parallel():
-        placed = loaded.problem.sample_obstacles
-        prepare = make_task_preprocessor(
-            problem,
-            robot,
-            kernels,
-            config,
-            fixed_at_goal=fixed_at_goal,
-            placed=placed,
-            observed=observed,
-        )
-        path = kernels.load(
-            projected_path,
-            steps=effective_steps(kernels, config.projection_steps),
-            fixed_at_goal=fixed_at_goal,
-            within_limits=config.within_limits,
-        )
-        time_scaling = (
-            make_time_scaling(problem, robot, kernels) if scale_time else None
-        )
-        time_parametrization = (
-            make_time_parametrization(problem, robot, kernels, at_rest=scale_time)
-            if config.time_parametrized
-            else None
-        )
-        via_points = (
-            make_via_points(problem, kernels, np.array(config.via_points))
-            if config.via_points
-            else None
-        )
+    placed = loaded.problem.sample_obstacles
+    prepare = make_task_preprocessor(
+        problem,
+        robot,
+        kernels,
+        config,
+        fixed_at_goal=fixed_at_goal,
+        placed=placed,
+        observed=observed,
+    )
+    path = kernels.load(
+        projected_path,
+        steps=effective_steps(kernels, config.projection_steps),
+        fixed_at_goal=fixed_at_goal,
+        within_limits=config.within_limits,
+    )
+    time_scaling = make_time_scaling(problem, robot, kernels) if scale_time else None
+    time_parametrization = (
+        make_time_parametrization(problem, robot, kernels, at_rest=scale_time)
+        if config.time_parametrized
+        else None
+    )
+    via_points = (
+        make_via_points(problem, kernels, np.array(config.via_points))
+        if config.via_points
+        else None
+    )
     return InferencePipeline(
         prepare, path, time_scaling, time_parametrization, via_points
     )

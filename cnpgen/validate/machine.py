@@ -21,6 +21,7 @@ from cnpgen.machine.versions import installed_version, processor_entry
 
 REQUIRED_MODULES = (
     "numpy", "scipy", "casadi", "pinocchio", "coal", "h5py", "joblib", "psutil", "tqdm", "daqp", "threadpoolctl",
+    "llvmlite",
 )  # fmt: skip
 OPTIONAL_MODULES = ("matplotlib",)
 PROJECTS = {"pinocchio": "pin"}  # on PyPI, where it is not called like its module
@@ -68,7 +69,9 @@ class MachineReport:
         libraries: Project -> version, "missing" or "broken".
         hdf5: Version of the HDF5 library.
         environment: Relevant environment variables set by the user.
-        compiler: C compiler and its version; empty if there is none.
+        generator: Generator of machine code and its processor; empty if it does not
+            work.
+        compiler: C compiler of handwritten code and its version; empty if there is none.
         backend: Backend of the kernels; empty if none works.
         backend_reason: Reason for the choice of the backend.
         cache_folder: Folder of cached kernels.
@@ -92,6 +95,7 @@ class MachineReport:
     libraries: dict[str, str]
     hdf5: str
     environment: dict[str, str]
+    generator: str
     compiler: str
     backend: str
     backend_reason: str
@@ -135,7 +139,8 @@ def check_machine() -> MachineReport:
         environment={
             name: environment[name] for name in VARIABLES if environment.get(name)
         },
-        compiler=_value_or(_compiler, ""),
+        generator=_value_or(_generator, ""),
+        compiler=_check_compiler(findings),
         backend=backend,
         backend_reason=reason,
         cache_folder=cache,
@@ -237,11 +242,24 @@ def _hdf5_version() -> str:
     return str(h5py.version.hdf5_version)
 
 
-def _compiler() -> str:
-    from cnpgen.kernels.compiler import compiler_version, find_compiler
+def _generator() -> str:
+    from cnpgen.kernels.machine_code import generator_version, this_processor
 
-    path = find_compiler()
-    return f"{path}, {compiler_version(path)}" if path else ""
+    return f"{generator_version()}, for {this_processor().name}"
+
+
+def _check_compiler(findings: _Findings) -> str:
+    """Return the C compiler and its version, or an empty text and a note on what is slower."""
+    try:
+        from cnpgen.kernels.compiler import compiler_version, require_compiler
+
+        path = require_compiler()
+        return f"{path}, {compiler_version(path)}"
+    except Exception as error:  # noqa: BLE001 - broken libraries raise anything
+        findings.notes.append(
+            f"{error}; collisions, trees, refining and observations run in NumPy, which is slower"
+        )
+        return ""
 
 
 def _cache_folder() -> str:
@@ -270,9 +288,9 @@ def _check_backend(findings: _Findings, cache: str) -> tuple[str, str, bool]:
     if str(folder) != cache:
         shutil.rmtree(folder, ignore_errors=True)  # a temporary folder of this check
     reason = (
-        "a test kernel was compiled and is correct"
+        "a test kernel was generated and is correct"
         if backend == "compiled"
-        else "no C compiler works"
+        else "LLVM does not work"
     )
     return backend, reason, str(folder) == cache
 

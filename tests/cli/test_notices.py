@@ -27,9 +27,9 @@ def test_what_is_said_for_every_kernel_is_printed_once_per_command(
 ) -> None:
     def refine(*_: Any, **__: Any) -> NoReturn:
         for name in (
-            "cnpgen.kernels.compiled_kernel",
-            "cnpgen.kernels.compiled_kernel",
-            "cnpgen.kernels.parallel_compilation",
+            "cnpgen.kernels.code_cache",
+            "cnpgen.kernels.code_cache",
+            "cnpgen.kernels.c_library",
         ):
             logging.getLogger(name).info("building it")
         raise UsageError("enough")

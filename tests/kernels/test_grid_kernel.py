@@ -2,17 +2,13 @@
 
 import itertools
 import math
-import platform
 from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
 
-from cnpgen.kernels import compiler
-from cnpgen.kernels.compiled_kernel import CompiledGridKernel, compile_tape
-from cnpgen.kernels.compiler import find_compiler
-from cnpgen.kernels.emit import emit
+from cnpgen.kernels.compiled_kernel import CompiledGridKernel
 from cnpgen.kernels.interpreted_kernel import (
     POINTS_PER_BLOCK,
     InterpretedGridKernel,
@@ -20,12 +16,13 @@ from cnpgen.kernels.interpreted_kernel import (
 )
 from cnpgen.kernels.kernel import GridKernel
 from cnpgen.kernels.library import KernelLibrary
+from cnpgen.kernels.lowering import lower
 from cnpgen.kernels.tape import Axes, GridSpec, Loop, Tape, tape_from_function
-from tests.conftest import needs_compiler, some
-from tests.kernels.test_kernels import BINARY, REFERENCE, SPECIAL, UNARY, machine_flags
+from tests.conftest import needs_compiler
+from tests.kernels.test_kernels import BINARY, REFERENCE, SPECIAL, UNARY
 
 Array = np.ndarray
-BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
+BACKENDS = ["compiled", "numpy", "casadi"]
 DTYPES = ["float64", "float32"]
 AXES: tuple[Axes, ...] = ("point", "lane", "node", "fixed")
 GRID = GridSpec(AXES, ("point", "lane"))
@@ -40,7 +37,7 @@ def kernel_of(
     return (
         InterpretedGridKernel(tape)
         if backend == "numpy"
-        else CompiledGridKernel(tape, compile_tape(tape, folder))
+        else CompiledGridKernel(tape, folder)
     )
 
 
@@ -292,7 +289,7 @@ def single_operations(cache_folder: Path) -> dict[str, GridKernel]:
         backend: kernel_of(
             function, grid, backend=backend, dtype="float32", folder=cache_folder
         )
-        for backend in ["numpy", *(["compiled"] if find_compiler() else [])]
+        for backend in ["numpy", "compiled"]
     }
 
 
@@ -332,7 +329,6 @@ def unary(name: str, dtype: str, folder: Path, x: Array) -> list[Array]:
     return [result[0, 0] for result in out]
 
 
-@needs_compiler
 @pytest.mark.parametrize(
     ("limit", "allowed"), [(10.0, 2.0), (256.0, 2.0), (8192.0, 3.0)]
 )
@@ -346,7 +342,6 @@ def test_sine_and_cosine_in_float32_are_within_ulps_also_next_to_their_zeros(
         assert ulps(found, exact(x.astype(float))).max() <= allowed
 
 
-@needs_compiler
 @pytest.mark.parametrize(
     ("dtype", "overflow", "underflow"),
     [("float64", 709.78, -745.13), ("float32", 88.72, -103.97)],
@@ -369,7 +364,6 @@ def test_the_exponential_is_within_2_ulp_from_zero_to_infinity(
     ).all()
 
 
-@needs_compiler
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_minima_and_maxima_with_a_constant_ignore_a_nan(cache_folder, dtype):
     x, bound = ca.SX.sym("x"), ca.SX.sym("bound")
@@ -377,8 +371,9 @@ def test_minima_and_maxima_with_a_constant_ignore_a_nan(cache_folder, dtype):
     function = ca.Function("clipped", [x, bound], [clipped, ca.fmax(x, -x)])
     grid = GridSpec(("point", "fixed"), ("point", "point"))
     tape = tape_from_function(function, grid=grid, dtype=dtype)
-    assert emit(tape).count("larger(") - emit(tape).count("v larger(") > 0
-    kernel = CompiledGridKernel(tape, compile_tape(tape, cache_folder))
+    operations = [step.operation for step in lower(tape)]
+    assert operations.count("lesser") == operations.count("larger") == 1
+    kernel = CompiledGridKernel(tape, cache_folder)
     values = np.array(
         [math.nan, -math.inf, math.inf, 0.0, -0.5, 1.0, 2.5, math.nan, 3.0], dtype
     )
@@ -388,37 +383,3 @@ def test_minima_and_maxima_with_a_constant_ignore_a_nan(cache_folder, dtype):
         out[0][0, 0], [0.25, 0.25, 2.0, 0.25, 0.25, 1.0, 2.0, 0.25, 2.0]
     )
     np.testing.assert_array_equal(out[1][0, 0], np.fmax(values, -values))
-
-
-@needs_compiler
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="instruction sets of x86-64")
-@pytest.mark.parametrize(
-    ("march", "needs"),
-    some(
-        [
-            ("x86-64", ""),
-            ("sandybridge", "avx"),
-            ("haswell", "avx2"),
-            ("skylake-avx512", "avx512f"),
-        ],
-        1,
-        "slow",
-    ),
-)
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_the_emitted_c_compiles_for_every_vector_width_and_gives_the_same_numbers(
-    mixed, tmp_path, monkeypatch, dtype, march, needs
-):
-    monkeypatch.setattr(compiler, "vector_flags", lambda: (f"-march={march}",))
-    tape = tape_from_function(mixed, grid=GRID, dtype=dtype)
-    path = compile_tape(tape, tmp_path)
-    if needs and needs not in machine_flags():
-        return
-    arguments = arguments_of(5, 37, dtype)
-    found, expected = (
-        [np.zeros((3, 5, 37), dtype), np.zeros((1, 37), dtype)] for _ in range(2)
-    )
-    CompiledGridKernel(tape, path)(*arguments, out=found)
-    InterpretedGridKernel(tape)(*arguments, out=expected)
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)

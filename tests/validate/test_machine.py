@@ -1,5 +1,6 @@
 """Check of the machine: what works, what is missing, and remedies."""
 
+import ctypes
 import dataclasses
 import importlib
 import json
@@ -13,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from cnpgen.cli.doctor_command import machine_text
+from cnpgen.kernels.c_library import compile_source
 from cnpgen.kernels.compiler import find_compiler
 from cnpgen.machine import threads
 from cnpgen.validate import machine
@@ -128,11 +130,12 @@ def test_a_missing_plotting_library_is_only_a_note(monkeypatch):
     assert any("--plot" in note for note in report.notes)
 
 
-def test_without_a_compiler_the_numpy_backend_runs(monkeypatch, fresh_compiler):
+def test_without_a_compiler_kernels_are_generated(monkeypatch, fresh_compiler):
     monkeypatch.setenv("CC", "no-such-compiler")
     report = check_machine()
     assert report.ok
-    assert report.backend == "numpy"
+    assert report.backend == "compiled"
+    assert report.generator.startswith("llvmlite ")
     assert report.compiler == ""
     assert report.environment["CC"] == "no-such-compiler"
     assert any("no C compiler" in note for note in report.notes)
@@ -159,7 +162,9 @@ def test_the_compiler_of_a_package_is_used_if_there_is_no_other(
     monkeypatch.syspath_prepend(tmp_path)
     report = check_machine()
     assert report.compiler.startswith(sys.executable)
-    assert report.backend == "compiled"
+    source = tmp_path / "one.c"
+    source.write_text("int one(void) { return 1; }")
+    assert ctypes.CDLL(str(compile_source([source], tmp_path / "cache"))).one() == 1
 
 
 @pytest.mark.extended
@@ -176,7 +181,9 @@ def test_the_compiler_of_ziglang_compiles_without_a_home_folder(
         monkeypatch.setenv(variable, value)
     report = check_machine()
     assert "ziglang" in report.compiler
-    assert report.backend == "compiled"
+    source = tmp_path / "one.c"
+    source.write_text("int one(void) { return 1; }")
+    assert ctypes.CDLL(str(compile_source([source], tmp_path / "cache"))).one() == 1
     assert list((tmp_path / "cache" / "ziglang").iterdir())
 
 

@@ -454,18 +454,12 @@ def test_blocks_are_regenerated_with_the_backend_of_the_specification(tmp_path):
 
 @pytest.mark.slow
 @needs_compiler
-def test_blocks_of_compiled_kernels_need_a_compiler_and_nothing_else_does(
+def test_blocks_of_compiled_kernels_need_no_compiler(
     tiny: Tiny, monkeypatch, fresh_compiler
 ):
     folder = tiny("airhockey-hit")
     monkeypatch.setenv("CC", "no-such-compiler")
-    with pytest.raises(
-        MachineError, match="was made by the compiled backend, which does not work here"
-    ) as caught:
-        validate_dataset(folder, deep=True, regenerate=1, workers=1)
-    assert "CC is 'no-such-compiler'" in str(caught.value)
-    assert "all checks but regenerate= work without it" in str(caught.value)
-    assert validate_dataset(folder, deep=True, workers=1).ok
+    assert validate_dataset(folder, deep=True, regenerate=1, workers=1).ok
 
 
 # --- arguments --------------------------------------------------------------------------------------------------------
@@ -493,12 +487,15 @@ def test_a_folder_that_holds_something_else_is_refused(tmp_path):
 
 
 def test_a_backend_that_does_not_work_here_is_a_machine_error(
-    damaged: Path, monkeypatch, fresh_compiler
+    damaged: Path, monkeypatch
 ):
-    if load_dataset_spec(damaged).backend != "compiled":
-        pytest.skip("no C compiler on this machine")
-    monkeypatch.setenv("CC", "/bin/false")
-    with pytest.raises(MachineError, match="/bin/false"):
+    def fail(*_: object) -> None:
+        raise MachineError("LLVM cannot be loaded")
+
+    monkeypatch.setattr("cnpgen.kernels.compiled_kernel.find_final", fail)
+    with pytest.raises(
+        MachineError, match="made by the compiled backend, which does not work here"
+    ):
         validate_dataset(damaged, regenerate=1)
     assert validate_dataset(damaged, deep=True, workers=1).ok
 

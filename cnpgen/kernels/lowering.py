@@ -1,0 +1,250 @@
+"""Lowering: a tape becomes a list of arithmetic steps whose rounding is decided, before any machine code exists.
+
+Sine, cosine and exponential become polynomials, equal steps are merged, and products are
+contracted to fused multiply-adds by a rule of the tape alone. So every vector width,
+optimization level and instruction set rounds in the same places and gives equal bits.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.kernel import axis_names
+from cnpgen.kernels.tape import NAMES, Tape
+from cnpgen.kernels.vector_functions import exponential, sine_and_cosine
+
+MAX_CONTRACTED = 6000  # longer tapes are not contracted: their published digests are those of plain products
+MAX_DUPLICATED = 13  # statements of a block of C that GCC duplicates
+STATEMENTS = {  # of C for a step; 1 for those that are not listed
+    "constant": 0, "input": 0, "output": 0, "min": 6, "max": 6, "lt": 2, "le": 2, "eq": 2, "ne": 2, "not": 2,
+    "if_else_zero": 3, "and": 6, "or": 6, "sign": 8,
+}  # fmt: skip
+COMMUTATIVE = {"add", "mul", "eq", "ne", "and", "or"}
+ARITHMETIC = {
+    "ADD": "add", "SUB": "sub", "MUL": "mul", "DIV": "div", "NEG": "neg", "SQRT": "sqrt", "FABS": "abs",
+    "SIGN": "sign", "LT": "lt", "LE": "le", "EQ": "eq", "NE": "ne", "NOT": "not",
+    "AND": "and", "OR": "or", "IF_ELSE_ZERO": "if_else_zero",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Step:
+    """One operation on vectors.
+
+    Attributes: operation: Its name: an entry of ``llvm_text.TEMPLATES``, "constant",
+        "input", "output" or "fma". operands: Indices of earlier steps; of an input:
+        argument and component; of an output: the value, result and component; of
+        "fma": a, b, c of ``a b + c``. value: The number of a constant. signs: Of an
+        "fma": whether the product and the addend are negated.
+    """
+
+    operation: str
+    operands: tuple[int, ...] = ()
+    value: float = 0.0
+    signs: tuple[bool, bool] = (False, False)
+
+
+class StepList:
+    """Steps in order; an operation on equal operands is entered once."""
+
+    def __init__(self, *, single: bool) -> None:
+        self.single = single
+        self.steps: list[Step] = []
+        self._known: dict[Any, int] = {}
+
+    def add(self, operation: str, *operands: int) -> int:
+        """Return the index of an operation's result."""
+        key = (operation, *operands)
+        if operation in COMMUTATIVE and operands[0] > operands[1]:
+            key = (operation, operands[1], operands[0])
+        return self._enter(key, Step(operation, operands))
+
+    def number(self, value: float) -> int:
+        """Return the index of a constant."""
+        return self._enter(np.float64(value).tobytes(), Step("constant", (), value))
+
+    def output(self, value: int, result: int, component: int) -> None:
+        """Enter a result, which is never merged."""
+        self.steps.append(Step("output", (value, result, component)))
+
+    def _enter(self, key: Any, step: Step) -> int:
+        index = self._known.setdefault(key, len(self.steps))
+        if index == len(self.steps):
+            self.steps.append(step)
+        return index
+
+
+def lower(tape: Tape) -> list[Step]:
+    """Return the steps of a tape, contracted, without those that no result needs."""
+    entered = StepList(single=tape.dtype == "float32")
+    uniform = uniform_arguments(tape)
+    never_nan: set[int] = set()  # steps
+    place: dict[int, int] = {}  # instruction -> step
+    columns = (tape.operation, tape.a, tape.b, tape.constant)
+    for k, (code, a, b, constant) in enumerate(
+        zip(*(column.tolist() for column in columns), strict=True)
+    ):
+        name = NAMES[code]
+        if name == "OUTPUT":
+            entered.output(place[a], b, int(constant))
+        elif name == "CONST":
+            place[k] = entered.number(constant)
+            never_nan |= set() if np.isnan(constant) else {place[k]}
+        elif name == "INPUT":
+            place[k] = entered.add("input", a, b)
+            never_nan |= {place[k]} if a in uniform else set()
+        elif name in ("FMIN", "FMAX"):
+            place[k] = _lower_extremum(entered, name, place[a], place[b], never_nan)
+        else:
+            place[k] = _lower_operation(entered, name, place[a], place[b])
+    steps = entered.steps
+    if len(tape) <= MAX_CONTRACTED:
+        steps = _contracted(tape, steps)
+    return _without_unused(steps)
+
+
+def _lower_operation(steps: StepList, name: str, a: int, b: int) -> int:
+    if name == "SQ":
+        return steps.add("mul", a, a)
+    if name == "TWICE":
+        return steps.add("add", a, a)
+    if name == "INV":
+        return steps.add("div", steps.number(1.0), a)
+    if name in ("SIN", "COS"):
+        return sine_and_cosine(steps, a)[name == "COS"]
+    if name == "EXP":
+        return exponential(steps, a)
+    operation = ARITHMETIC[name]
+    unary = operation in ("neg", "sqrt", "abs", "sign", "not")
+    return steps.add(operation, a) if unary else steps.add(operation, a, b)
+
+
+def _lower_extremum(
+    steps: StepList, name: str, a: int, b: int, never_nan: set[int]
+) -> int:
+    """Enter a minimum or maximum: one instruction if the second operand is not nan."""
+    if b in never_nan:
+        index = steps.add({"FMIN": "lesser", "FMAX": "larger"}[name], a, b)
+    else:
+        index = steps.add({"FMIN": "min", "FMAX": "max"}[name], a, b)
+    never_nan |= {index} if never_nan & {a, b} else set()
+    return index
+
+
+def uniform_arguments(tape: Tape) -> set[int]:
+    """Return the arguments that are equal in all lanes; they must not be nan."""
+    axes = tape.grid.arguments if tape.grid else ()
+    return {index for index, kind in enumerate(axes) if "lanes" not in axis_names(kind)}
+
+
+def value_operands(step: Step) -> tuple[int, ...]:
+    """Return the steps that a step reads."""
+    if step.operation in ("input", "constant"):
+        return ()
+    return step.operands[:1] if step.operation == "output" else step.operands
+
+
+def _contracted(tape: Tape, steps: list[Step]) -> list[Step]:
+    """Replace products by fused multiply-adds.
+
+    A product is contracted if every use of it is a sum or a difference with another
+    value in the same section. Products are visited in order, so that of ``a b + c d`` the
+    first one is contracted.
+    """
+    steps = list(steps)
+    needed = _needed(steps)
+    section = _sections(tape, steps, needed)
+    uses: list[list[int]] = [[] for _ in steps]
+    for index in needed:
+        for operand in value_operands(steps[index]):
+            uses[operand].append(index)
+    for index in needed:
+        sums = uses[index]
+        if steps[index].operation == "mul" and all(
+            steps[use].operation in ("add", "sub")
+            and steps[use].operands.count(index) == 1
+            and section[use] == section[index]
+            for use in sums
+        ):
+            for use in sums:
+                steps[use] = _fused(steps[use], index, steps[index].operands)
+    return steps
+
+
+def _sections(
+    tape: Tape, steps: list[Step], needed: Sequence[int]
+) -> NDArray[np.integer[Any]]:
+    """Return the section of every step; products and sums of different sections are not contracted.
+
+    The sections are the basic blocks of the C code that datasets were made with, as GCC 12
+    forms them, so that these datasets keep their bits. In a loop, values that do not depend
+    on the state are computed before it. Else a block ends at every load and store of lanes,
+    which branch at the last lanes; GCC duplicates short blocks for both branches, so that
+    neighboring short blocks are one.
+    """
+    if tape.loop:
+        return _computed_before_loop(steps)
+    uniform = uniform_arguments(tape)
+    branches = [
+        step.operation == "output"
+        or (step.operation == "input" and step.operands[0] not in uniform)
+        for step in steps
+    ]
+    block = np.cumsum([0, *branches])[1:]
+    length = np.zeros(len(steps) + 1)
+    for index in needed:
+        length[block[index]] += STATEMENTS.get(steps[index].operation, 1)
+    # Block 0, before the first branch, is never duplicated.
+    duplicated = np.append(False, length[1:] <= MAX_DUPLICATED)
+    apart = np.append(True, ~(duplicated[1:] & duplicated[:-1]))
+    section: NDArray[np.integer[Any]] = np.cumsum(apart)[block]
+    return section
+
+
+def _computed_before_loop(steps: list[Step]) -> NDArray[np.integer[Any]]:
+    """Return 1 for steps that do not depend on the state, argument 0 of a loop, else 0."""
+    before: list[bool] = []
+    for step in steps:
+        if step.operation == "input":
+            before.append(step.operands[0] != 0)
+        else:
+            before.append(all(before[operand] for operand in value_operands(step)))
+    return np.array(before, int)
+
+
+def _fused(total: Step, product: int, factors: tuple[int, ...]) -> Step:
+    """Return a sum or difference with one product as one fused step."""
+    first, second = total.operands
+    minus = total.operation == "sub"
+    if first == product:  # a b - c
+        return Step("fma", (*factors, second), signs=(False, minus))
+    return Step("fma", (*factors, first), signs=(minus, False))  # c - a b
+
+
+def _needed(steps: list[Step]) -> list[int]:
+    """Return the indices of the steps that some result needs, in order."""
+    needed = np.array([step.operation == "output" for step in steps], bool)
+    for index in range(len(steps) - 1, -1, -1):
+        if needed[index]:
+            needed[list(value_operands(steps[index]))] = True
+    return np.flatnonzero(needed).tolist()
+
+
+def _without_unused(steps: list[Step]) -> list[Step]:
+    """Return the needed steps with their operands renumbered."""
+    needed = _needed(steps)
+    renumbered = dict(zip(needed, range(len(needed)), strict=True))
+    return list(_renumbered([steps[index] for index in needed], renumbered))
+
+
+def _renumbered(steps: list[Step], index: dict[int, int]) -> Iterator[Step]:
+    for step in steps:
+        count = len(value_operands(step))
+        operands = (
+            *(index[operand] for operand in step.operands[:count]),
+            *step.operands[count:],
+        )
+        yield Step(step.operation, operands, step.value, step.signs)
