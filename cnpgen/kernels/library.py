@@ -208,13 +208,15 @@ def _versions() -> list[str]:
 def _source_digests(builder: Callable[..., Any]) -> list[str]:
     """Return digests of the sources that a builder may use; kernels are rebuilt when one of them changes.
 
-    In this package these are ``BUILDER_PACKAGES`` and the builder's own subpackage or
-    add-on; losses also use the conditions of published rules. A plug-in's builder may
+    In the core these are ``BUILDER_PACKAGES`` and the builder's own subpackage; losses
+    also use the conditions of published rules. The builder of an add-on or a plug-in may
     import anything: the digests cover this package and the plug-in's.
     """
     module = builder.__module__
     if module.partition(".")[0] != "cnpgen":
         return [_digest_of(PACKAGE_FOLDER), package_digest(module.partition(".")[0])]
+    if addons.addon_of(module):
+        return [_digest_of(PACKAGE_FOLDER)]
     shared = (PACKAGE_FOLDER / name for name in BUILDER_PACKAGES)
     own = subpackage_of(module)
     digests = [_digest_of(*shared), _digest_of(PACKAGE_FOLDER / own)]

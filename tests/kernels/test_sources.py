@@ -87,6 +87,7 @@ BUILDERS = sorted(filter(makes_functions, MODULES))
 def test_the_builders_of_every_package_are_found() -> None:
     assert {subpackage_of(name) for name in BUILDERS} == {
         "addons/benchmark",
+        "addons/deploy",
         "losses",
         "pipelines",
         "planner",
@@ -96,7 +97,10 @@ def test_the_builders_of_every_package_are_found() -> None:
     }
 
 
-@pytest.mark.parametrize("module", BUILDERS)
+OF_CORE = [name for name in BUILDERS if not name.startswith("cnpgen.addons.")]
+
+
+@pytest.mark.parametrize("module", OF_CORE)
 def test_all_imports_of_a_builder_are_in_the_key_of_its_tapes(module: str) -> None:
     own = subpackage_of(module).replace("/", ".")
     hashed = tuple(f"cnpgen.{package}" for package in (*BUILDER_PACKAGES, own))
