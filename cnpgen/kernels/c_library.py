@@ -89,8 +89,9 @@ def compile_source(paths: Sequence[Path], cache_folder: Path) -> Path:
     The files are concatenated in their order; the last one names the library. A library
     that the cache lacks, or whose copy is damaged, is compiled.
 
-    Raises: MachineError: There is no working compiler, or the cache folder is not
-        writable or writable for other users.
+    Raises:
+        MachineError: There is no working compiler, or the cache folder is not writable
+            or writable for other users.
     """
     parts = [prelude("float64"), *(path.read_text(encoding="utf-8") for path in paths)]
     text = "".join(parts)

@@ -63,7 +63,8 @@ def final_text(tape: Tape) -> str:
 def find_final(key: str, cache_folder: Path) -> LoadedCode | None:
     """Return final code from this process or the cache, or None.
 
-    Raises: MachineError: Other users may change files of the cache.
+    Raises:
+        MachineError: Other users may change files of the cache.
     """
     place = cache_folder, key
     if place not in _loaded and (code := _read(key, cache_folder)) is not None:

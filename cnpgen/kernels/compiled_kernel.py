@@ -38,8 +38,9 @@ def kernel_address(tape: Tape, cache_folder: Path) -> int:
     A long tape gets code of the first level, whose address stays the same when the final code
     replaces it.
 
-    Raises: MachineError: LLVM does not work, or the cache folder is writable for other
-        users.
+    Raises:
+        MachineError: LLVM does not work, or the cache folder is writable for other
+            users.
     """
     key = tape_key(tape)
     if (code := find_final(key, cache_folder)) is not None:

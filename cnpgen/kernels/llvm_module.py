@@ -15,7 +15,8 @@ import numpy as np
 
 from cnpgen.kernels.kernel import axis_names
 from cnpgen.kernels.llvm_text import CONSTANTS, PAD, StepText
-from cnpgen.kernels.lowering import Step, lower, uniform_arguments
+from cnpgen.kernels.lowering import lower, uniform_arguments
+from cnpgen.kernels.steps import Step
 from cnpgen.kernels.tape import Tape
 
 ONCE = "i64 %n, ptr %in, ptr %ld, ptr %out"
@@ -25,8 +26,11 @@ GRID = "i64 %nodes, i64 %n, ptr %in, ptr %ld, ptr %out, ptr %lo"
 def module_text(tape: Tape, vector_bytes: int, *, replaceable: bool = False) -> str:
     """Return the LLVM IR of a tape for vectors of a size.
 
-    Args: replaceable: Add ``dispatch``, a function like ``kernel`` that jumps to the
-        address in the variable ``target``, at first that of ``kernel``.
+    Args:
+        tape: The tape.
+        vector_bytes: Size of a vector.
+        replaceable: Add ``dispatch``, a function like ``kernel`` that jumps to the
+            address in the variable ``target``, at first that of ``kernel``.
     """
     real, _, suffix, *_ = CONSTANTS[tape.dtype]
     lanes = vector_bytes // np.dtype(tape.dtype).itemsize

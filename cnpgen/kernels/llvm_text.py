@@ -12,7 +12,7 @@ from functools import cache
 
 import numpy as np
 
-from cnpgen.kernels.lowering import Step
+from cnpgen.kernels.steps import Step
 from cnpgen.kernels.tape import Tape
 
 Read = Callable[[int, str, int, int], str]  # step, its name, argument, component
@@ -137,8 +137,12 @@ done:
 class StepText:
     """Text of steps for one type and number of lanes.
 
-    Attributes: real: LLVM's type of one lane. vector: That of all lanes. flags: That of
-        a comparison. size: Bytes of one lane. lanes: Lanes of a vector.
+    Attributes:
+        real: LLVM's type of one lane.
+        vector: That of all lanes.
+        flags: That of a comparison.
+        size: Bytes of one lane.
+        lanes: Lanes of a vector.
     """
 
     def __init__(self, tape: Tape, lanes: int) -> None:

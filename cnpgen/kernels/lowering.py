@@ -6,13 +6,13 @@ optimization level and instruction set rounds in the same places and gives equal
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import axis_names
+from cnpgen.kernels.steps import Step, StepList
 from cnpgen.kernels.tape import NAMES, Tape
 from cnpgen.kernels.vector_functions import exponential, sine_and_cosine
 
@@ -22,59 +22,11 @@ STATEMENTS = {  # of C for a step; 1 for those that are not listed
     "constant": 0, "input": 0, "output": 0, "min": 6, "max": 6, "lt": 2, "le": 2, "eq": 2, "ne": 2, "not": 2,
     "if_else_zero": 3, "and": 6, "or": 6, "sign": 8,
 }  # fmt: skip
-COMMUTATIVE = {"add", "mul", "eq", "ne", "and", "or"}
 ARITHMETIC = {
     "ADD": "add", "SUB": "sub", "MUL": "mul", "DIV": "div", "NEG": "neg", "SQRT": "sqrt", "FABS": "abs",
     "SIGN": "sign", "LT": "lt", "LE": "le", "EQ": "eq", "NE": "ne", "NOT": "not",
     "AND": "and", "OR": "or", "IF_ELSE_ZERO": "if_else_zero",
 }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Step:
-    """One operation on vectors.
-
-    Attributes: operation: Its name: an entry of ``llvm_text.TEMPLATES``, "constant",
-        "input", "output" or "fma". operands: Indices of earlier steps; of an input:
-        argument and component; of an output: the value, result and component; of
-        "fma": a, b, c of ``a b + c``. value: The number of a constant. signs: Of an
-        "fma": whether the product and the addend are negated.
-    """
-
-    operation: str
-    operands: tuple[int, ...] = ()
-    value: float = 0.0
-    signs: tuple[bool, bool] = (False, False)
-
-
-class StepList:
-    """Steps in order; an operation on equal operands is entered once."""
-
-    def __init__(self, *, single: bool) -> None:
-        self.single = single
-        self.steps: list[Step] = []
-        self._known: dict[Any, int] = {}
-
-    def add(self, operation: str, *operands: int) -> int:
-        """Return the index of an operation's result."""
-        key = (operation, *operands)
-        if operation in COMMUTATIVE and operands[0] > operands[1]:
-            key = (operation, operands[1], operands[0])
-        return self._enter(key, Step(operation, operands))
-
-    def number(self, value: float) -> int:
-        """Return the index of a constant."""
-        return self._enter(np.float64(value).tobytes(), Step("constant", (), value))
-
-    def output(self, value: int, result: int, component: int) -> None:
-        """Enter a result, which is never merged."""
-        self.steps.append(Step("output", (value, result, component)))
-
-    def _enter(self, key: Any, step: Step) -> int:
-        index = self._known.setdefault(key, len(self.steps))
-        if index == len(self.steps):
-            self.steps.append(step)
-        return index
 
 
 def lower(tape: Tape) -> list[Step]:

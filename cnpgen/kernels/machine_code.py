@@ -18,7 +18,14 @@ FIRST, FINAL = (
     0,
     1,
 )  # levels: generated ten times faster; as fast as an optimizing compiler's code
-SOURCES = ("lowering", "vector_functions", "llvm_text", "llvm_module", "machine_code")
+SOURCES = (
+    "steps",
+    "lowering",
+    "vector_functions",
+    "llvm_text",
+    "llvm_module",
+    "machine_code",
+)
 _engines: list[
     Any
 ] = []  # owners of all loaded code, whose addresses other code may have
@@ -33,8 +40,10 @@ os.register_at_fork(
 class Processor:
     """The processor that code is generated for.
 
-    Attributes: triple: LLVM's name of architecture and system. name: LLVM's name of the
-        model. features: Its instruction sets, in LLVM's notation.
+    Attributes:
+        triple: LLVM's name of architecture and system.
+        name: LLVM's name of the model.
+        features: Its instruction sets, in LLVM's notation.
     """
 
     triple: str
@@ -52,7 +61,8 @@ class Processor:
 class LoadedCode:
     """Machine code in memory; it stays there as long as the process runs.
 
-    Attributes: engine: LLVM's owner of the memory.
+    Attributes:
+        engine: LLVM's owner of the memory.
     """
 
     engine: Any
@@ -125,7 +135,8 @@ def set_background_options() -> None:
 def generate(text: str, level: int, processor: Processor | None = None) -> bytes:
     """Return the object file of LLVM IR.
 
-    Raises: MachineError: LLVM refuses the IR or the processor.
+    Raises:
+        MachineError: LLVM refuses the IR or the processor.
     """
     processor = processor or this_processor()
     with LOCK:
@@ -143,7 +154,8 @@ def generate(text: str, level: int, processor: Processor | None = None) -> bytes
 def load(code: bytes) -> LoadedCode:
     """Load an object file that ``generate`` made for this processor; LLVM crashes on any other content.
 
-    Raises: MachineError: LLVM cannot load it.
+    Raises:
+        MachineError: LLVM cannot load it.
     """
     with LOCK:
         llvm = _llvm()

@@ -41,8 +41,11 @@ START = "import sys; sys.path[:] = sys.argv[2:]; from cnpgen.kernels.optimizer i
 class Replacement:
     """First code that waits for final code.
 
-    Attributes: key: Name of the final code. request: Path of the request. code: The
-        first code. cache_folder: Where the final code will be.
+    Attributes:
+        key: Name of the final code.
+        request: Path of the request.
+        code: The first code.
+        cache_folder: Where the final code will be.
     """
 
     key: str

@@ -9,20 +9,23 @@ exponential everywhere, of sine and cosine for |x| up to 2^20, also next to thei
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from cnpgen.kernels.lowering import StepList
+from cnpgen.kernels.steps import StepList
 
 
 @dataclass(frozen=True)
 class Precision:
     """Constants of one floating-point type.
 
-    Attributes: rounding_shift: 1.5 * 2^(mantissa bits): x + shift has the nearest
-        integer in its last bits. two_over_pi: 2 / pi. pi_2: Parts of pi / 2, the largest
-        first. sine: Coefficients of sin(r) / r - 1 in r^2, the highest first. cosine:
-        Those of (cos(r) - 1 + r^2 / 2) / r^2. log2e: log2(e). ln2: Parts of ln 2.
+    Attributes:
+        rounding_shift: 1.5 * 2^(mantissa bits): x + shift has the nearest integer in
+            its last bits.
+        two_over_pi: 2 / pi.
+        pi_2: Parts of pi / 2, the largest first.
+        sine: Coefficients of sin(r) / r - 1 in r^2, the highest first.
+        cosine: Those of (cos(r) - 1 + r^2 / 2) / r^2.
+        log2e: log2(e).
+        ln2: Parts of ln 2.
         max_exponent: exp(-x) is 0 and exp(x) infinite beyond it.
     """
 
@@ -76,7 +79,7 @@ EXP_Q = (
 )  # fmt: skip
 
 
-def sine_and_cosine(steps: "StepList", x: int) -> tuple[int, int]:
+def sine_and_cosine(steps: StepList, x: int) -> tuple[int, int]:
     """Enter the sine and the cosine of one angle; the one that is not used is removed later."""
     p = SINGLE if steps.single else DOUBLE
     shift = steps.number(p.rounding_shift)
@@ -98,7 +101,7 @@ def sine_and_cosine(steps: "StepList", x: int) -> tuple[int, int]:
     )
 
 
-def exponential(steps: "StepList", x: int) -> int:
+def exponential(steps: StepList, x: int) -> int:
     """Enter the exponential: exp(x) = 2^n exp(r) with r = x - n ln 2."""
     p = SINGLE if steps.single else DOUBLE
     shift, limit = steps.number(p.rounding_shift), steps.number(p.max_exponent)
@@ -112,14 +115,14 @@ def exponential(steps: "StepList", x: int) -> int:
     return steps.add("times_power_of_two", x, shifted, reduced)
 
 
-def _reduced_single(steps: "StepList", r: int) -> int:
+def _reduced_single(steps: StepList, r: int) -> int:
     """Enter exp(r) = P(r) r^2 + r + 1."""
     square = steps.add("mul", r, r)
     tail = steps.add("mul", polynomial(steps, r, EXP_SINGLE), square)
     return steps.add("add", steps.add("add", tail, r), steps.number(1.0))
 
 
-def _reduced_double(steps: "StepList", r: int) -> int:
+def _reduced_double(steps: StepList, r: int) -> int:
     """Enter exp(r) = 1 + 2 p / (q - p) with p = r P(r^2), q = Q(r^2)."""
     z = steps.add("mul", r, r)
     p = steps.add("mul", r, polynomial(steps, z, EXP_P))
@@ -129,7 +132,7 @@ def _reduced_double(steps: "StepList", r: int) -> int:
     return steps.add("add", steps.number(1.0), twice)
 
 
-def polynomial(steps: "StepList", x: int, coefficients: Sequence[float]) -> int:
+def polynomial(steps: StepList, x: int, coefficients: Sequence[float]) -> int:
     """Enter a polynomial by Horner's rule; its coefficients begin with the highest."""
     value = steps.number(coefficients[0])
     for coefficient in coefficients[1:]:

@@ -121,8 +121,12 @@ class Problem:
     # In a dataset, a plan or a model: implausible sizes and limits were accepted
     # before.
     is_stored: bool = False
-    # ``urdf_text`` if it was read before: that of the same problem, or a stored one.
+    # ``urdf_text`` of a stored problem, which is not read again.
     read_urdf_text: str | None = dataclasses.field(
+        default=None, compare=False, repr=False
+    )
+    # A problem with the same robot: its ``urdf_text``, read when it is needed.
+    same_robot: "Problem | None" = dataclasses.field(
         default=None, compare=False, repr=False
     )
 
@@ -144,8 +148,8 @@ class Problem:
         return self.replaced(obstacle=tuple(obstacles))
 
     def replaced(self, **fields: Any) -> "Problem":
-        """Return the problem with other fields; the text of the URDF stays, because it is expensive to read again."""
-        return dataclasses.replace(self, read_urdf_text=self.urdf_text, **fields)
+        """Return the problem with other fields and the same text of the URDF, which is expensive to read again."""
+        return dataclasses.replace(self, same_robot=self.same_robot or self, **fields)
 
     @property
     def has_sample_obstacles(self) -> bool:
@@ -370,6 +374,8 @@ class Problem:
         """
         if self.read_urdf_text is not None:
             return self.read_urdf_text
+        if self.same_robot is not None:
+            return self.same_robot.urdf_text
         spec = self.robot
         positions = dict(zip(spec.locked_joints, spec.locked_positions, strict=True))
         text = with_locked_joints(

@@ -68,9 +68,12 @@ class Scene:
 
     def __getitem__(self, index: int | slice | Sequence[int] | NDArray[Any]) -> Scene:
         """Select samples; an integer selects one sample and keeps the first axis."""
-        rows = slice(index, index + 1 or None) if isinstance(index, int) else index
-        if isinstance(index, int):  # ends a loop over the samples, too
-            self._check_sample(index, "index")
+        rows: Any = index
+        if isinstance(index, int):
+            self._check_sample(index, "index")  # ends a loop over the samples, too
+            rows = slice(index, index + 1 or None)
+        elif isinstance(index, tuple):
+            rows = list(index)  # NumPy reads a tuple as one index of each axis
         try:
             return Scene(self.obstacles, self.poses[rows])
         except IndexError as error:

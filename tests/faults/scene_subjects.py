@@ -77,7 +77,7 @@ def make_scene_files(folder: Path) -> None:
             )
         except MissingExtraError:
             continue
-    rows = [{"t": 0.1 * k, "q": [0.1 * k] * 6} for k in range(4)]
+    rows = [{"t": k / EXPORT_RATE_HZ, "q": [0.1 * k] * 6} for k in range(4)]
     (trajectories / "rows.json").write_text(json.dumps(rows), encoding="utf-8")
     (trajectories / "columns.yaml").write_text(
         f"t: {[row['t'] for row in rows]}\nq: {[row['q'] for row in rows]}\n",

@@ -69,7 +69,7 @@ def test_an_archive_whose_damage_a_library_reports_with_the_content_of_the_file(
         2, "little"
     )  # the length of the member's name, which zipfile's message repeats
     path.write_bytes(content)
-    with pytest.raises(UsageError, match="more characters") as caught:
+    with pytest.raises(UsageError) as caught:
         load_trajectories(path, "airhockey")
     assert str(caught.value).startswith(f"{path} is not an archive")
     assert len(str(caught.value)) <= MAX_LINE_LENGTH

@@ -88,7 +88,11 @@ def test_the_card_of_a_repository_says_where_the_scenes_are(
 ) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     write_repository(
-        dataset, cnpgen.load_dataset(dataset).spec, tmp_path, repository="lab/scenes"
+        dataset,
+        cnpgen.load_dataset(dataset).spec,
+        tmp_path,
+        repository="lab/scenes",
+        force=False,
     )
     table, ids = (
         parquet.read_table(tmp_path / "parquet/train/00001.parquet"),

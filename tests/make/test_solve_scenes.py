@@ -100,7 +100,7 @@ def test_new_scenes_read_neither_the_urdf_nor_the_robot_again(
         pytest.fail("the URDF is read again")
 
     monkeypatch.setattr("cnpgen.problems.problem.read_urdf", refused)
-    monkeypatch.setattr("cnpgen.problems.load_robot.reduced_model", refused)
+    monkeypatch.setattr("cnpgen.robots.robot.reduced_model", refused)
     assert scene_plans(problem, SCENES[:1]).problem == first.problem
     assert (
         scene_plans(problem, SCENES).problem != first.problem

@@ -40,8 +40,10 @@ CODES = {  # code -> cause, in the order of their numbers
 class Names:
     """Names of a planner in C.
 
-    Attributes: name: Prefix of functions and types, [a-z0-9_]. model: Name of the model
-        for comments. model_sha256: Digest of the model file.
+    Attributes:
+        name: Prefix of functions and types, [a-z0-9_].
+        model: Name of the model for comments.
+        model_sha256: Digest of the model file.
     """
 
     name: str

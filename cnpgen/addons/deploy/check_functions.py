@@ -63,7 +63,8 @@ def position_violations(robot: Robot, problem: Problem) -> Any:
 def relaxed(problem: Problem) -> list[int]:
     """Return the indices of the constraints whose bounds are relaxed for a start off the manifold.
 
-    Raises: UsageError: Another kind than those of this package relaxes its bounds.
+    Raises:
+        UsageError: Another kind than those of this package relaxes its bounds.
     """
     indices = []
     for index, constraint in enumerate(problem.constraint):

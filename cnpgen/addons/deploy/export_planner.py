@@ -19,7 +19,8 @@ def planner_files(model_file: Path, rows: Path | None = None) -> dict[str, str]:
     The training rows of a dataset give the ranges of the network's inputs, if it is
     passed.
 
-    Raises: UsageError: The file is no model, or of a kind that C files do not support.
+    Raises:
+        UsageError: The file is no model, or of a kind that C files do not support.
         DatasetError: The file is damaged.
     """
     model = load_model(model_file)

@@ -32,8 +32,10 @@ _NO_RANGES = "since the model stores no ranges"
 class InputRanges:
     """Ranges of the inputs, shape (F,) each.
 
-    Attributes: low: Smallest inputs. high: Largest inputs. source: A text that says
-        where they are from.
+    Attributes:
+        low: Smallest inputs.
+        high: Largest inputs.
+        source: A text that says where they are from.
     """
 
     low: Array
@@ -46,8 +48,9 @@ def input_ranges(
 ) -> InputRanges:
     """Return the ranges of the inputs: of a dataset, or stored in the model, or a substitute.
 
-    Raises: DatasetError: The dataset is damaged, or not of the rows that the model was
-        trained on.
+    Raises:
+        DatasetError: The dataset is damaged, or not of the rows that the model was
+            trained on.
     """
     stored = model.training.get("input_ranges")
     if rows is not None:

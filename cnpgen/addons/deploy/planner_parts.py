@@ -57,11 +57,16 @@ MAX_POSITION_WORK = (
 class PlannerParts:
     """Parts of a planner in C; made by ``planner_parts``.
 
-    Attributes: model: The model. problem: Its problem. robot: Its robot. tapes: Tapes
-        by the name of their C function; those that the model does not use are absent.
-        parametrization: Time parametrization, or None. scaling: Bounds of the rows of
-        ``speed_residuals`` if time is scaled, or None. phases: Phases of the grid,
-        shape (K,). checked_phases: Indices of those at which positions are checked.
+    Attributes:
+        model: The model.
+        problem: Its problem.
+        robot: Its robot.
+        tapes: Tapes by the name of their C function; those that the model does not use
+            are absent.
+        parametrization: Time parametrization, or None.
+        scaling: Bounds of the rows of ``speed_residuals`` if time is scaled, or None.
+        phases: Phases of the grid, shape (K,).
+        checked_phases: Indices of those at which positions are checked.
         ranges: Ranges of the network's inputs.
     """
 

@@ -187,7 +187,7 @@ def _making(summary: DatasetSummary) -> str:
 
 def _torque(spec: DatasetSpec) -> str:
     """Return which torque the problem limits if it states drives; empty for the rigid body."""
-    if "drive" not in spec.recipe["pipeline"]["problem"]:
+    if "drive" not in spec.recipe["pipeline"].get("problem", {}):
         return ""
     problem, robot = open_problem(as_record(spec.problem))
     return judged_torque(problem.constraint, robot)

@@ -213,7 +213,8 @@ def _with_torque_limits(arm: Arm, robot: Robot) -> tuple[Arm, float, list[str]]:
 
     Return the planning limit relative to them, and notes about the latter.
 
-    Raises: RecipeError: Gravity needs so much torque that masses are in another unit.
+    Raises:
+        RecipeError: Gravity needs so much torque that masses are in another unit.
     """
     moving, at_rest = _torques(robot)
     notes, planned, scale = list[str](), list[ArmJoint](), TORQUE_SCALE

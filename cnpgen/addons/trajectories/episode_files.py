@@ -15,9 +15,10 @@ from cnpgen.addons.trajectories.trajectory_tables import (
     read_parquet,
     read_trajectory_tables,
 )
-from cnpgen.errors import UsageError, listed
+from cnpgen.errors import DatasetError, UsageError, listed
 from cnpgen.store.files.atomic import read_file
 from cnpgen.store.files.documents import parse_json
+from cnpgen.store.files.hdf5 import open_nested_hdf5
 from cnpgen.store.files.kind import HDF5_SUFFIXES
 from cnpgen.store.files.size_limits import MAX_TABLE_BYTES
 
@@ -86,7 +87,8 @@ def read_recording(
         key: Name of the positions in an HDF5 file.
         rate: Frames per second [Hz] of a file without times.
 
-    Raises: UsageError: The path is missing, damaged or of an unknown format.
+    Raises:
+        UsageError: The path is missing, damaged or of an unknown format.
     """
     folder = Path(path)
     if not folder.exists():
@@ -184,10 +186,8 @@ def _column(table: Any, name: str, file: Path, width: int) -> Array:
 
 def _read_hdf5(path: Path, key: str | None, rate: float | None) -> Recording:
     """Read the episodes of robomimic, ``data/demo_0/obs/...``, or Minari, ``episode_0/observations``."""
-    import h5py
-
     try:
-        with h5py.File(path) as file:
+        with open_nested_hdf5(path) as file:
             robomimic = "data" in file
             root = file["data"] if robomimic else file
             key = key or (ROBOMIMIC_KEY if robomimic else "observations")
@@ -198,7 +198,7 @@ def _read_hdf5(path: Path, key: str | None, rate: float | None) -> Recording:
                     f"{path} has no times: state {{rate}}", remedies={"rate": 30}
                 )
             episodes = tuple(_hdf5_episodes(path, root, key, rate))
-    except (OSError, KeyError) as error:
+    except (DatasetError, KeyError) as error:
         text = f"{path} is not a file of episodes, or is damaged: {error!s:.200}"
         raise UsageError(text, argument="path") from error
     if not episodes:

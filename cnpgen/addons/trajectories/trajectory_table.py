@@ -15,12 +15,15 @@ Values = NDArray[Any]
 class TrajectoryTable:
     """One trajectory, or several of equal columns, as a file has them.
 
-    Attributes: place: The file and the part of it, for messages. columns: Name ->
-        values, shape (K,), (K, w) or (N, K, w); texts are kept as texts. joint_names:
-        Names of the joints of columns with one value per joint; empty if the file does
-        not name them. lines: Numbers of the lines of a text file, for messages.
+    Attributes:
+        place: The file and the part of it, for messages.
+        columns: Name -> values, shape (K,), (K, w) or (N, K, w); texts are kept as
+            texts.
+        joint_names: Names of the joints of columns with one value per joint; empty if
+            the file does not name them.
+        lines: Numbers of the lines of a text file, for messages.
         has_head: Whether the file names its columns, which are numbered from 0
-        otherwise.
+            otherwise.
     """
 
     place: str

@@ -53,9 +53,11 @@ def read_trajectory_tables(
 
     The separator of columns in text files is found by default.
 
-    Raises: UsageError: The file does not exist, is damaged or of an unknown format; the
-        message names the place. MissingExtraError: The format needs a package that is
-        not installed. MachineError: The file cannot be read.
+    Raises:
+        UsageError: The file does not exist, is damaged or of an unknown format; the
+            message names the place.
+        MissingExtraError: The format needs a package that is not installed.
+        MachineError: The file cannot be read.
     """
     if (path / LEROBOT_INFO).is_file():
         return list(_read_lerobot(path))

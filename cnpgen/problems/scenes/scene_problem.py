@@ -230,7 +230,8 @@ def make_mesh(
             )
     if not (np.abs([*vertices.ravel(), *origin]) <= MAX_COORDINATE_M).all():
         raise SceneError(
-            f"{where}: points and position must be finite and at most {MAX_COORDINATE_M:g}"
+            f"{where}: points and position must be finite and at most {MAX_COORDINATE_M:g}",
+            concerns="points",
         )
     if not is_rotation(turn):
         raise SceneError(

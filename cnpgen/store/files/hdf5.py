@@ -357,6 +357,25 @@ def open_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
             off; also raised for errors within the block.
         MachineError: The file cannot be read, or does not fit into memory.
     """
+    with _checked_file(path, content) as (file, size):
+        yield Hdf5(path, Attributes(path, file.id), file.id, size)
+
+
+@contextmanager
+def open_nested_hdf5(path: Path) -> Iterator[Any]:
+    """Open an HDF5 file with groups for reading, as an ``h5py.File``.
+
+    Raises:
+        DatasetError: As ``open_hdf5``.
+        MachineError: As ``open_hdf5``.
+    """
+    with _checked_file(path, None) as (file, _):
+        yield file
+
+
+@contextmanager
+def _checked_file(path: Path, content: bytes | None) -> Iterator[tuple[Any, int]]:
+    """Yield an ``h5py.File``, whose heaps have been checked, and its size."""
     import h5py
 
     if content is None and not path.is_file():
@@ -372,7 +391,7 @@ def open_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
         with h5py.File(
             source, "r", locking="best-effort" if content is None else None
         ) as file:
-            yield Hdf5(path, Attributes(path, file.id), file.id, size)
+            yield file, size
     except MemoryError as error:
         raise MachineError(
             f"cannot read {path}: its content does not fit into memory"

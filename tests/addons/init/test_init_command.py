@@ -318,9 +318,9 @@ def test_hulls_that_reject_free_space_are_decomposed_and_the_gap_is_shown(
         "decomposing base, fore, turret into at most 4 convex parts each"
         not in capsys.readouterr().out
     )
-    robot = load_problem(tmp_path / "made" / "problem.toml").robot
+    robot = load_problem(tmp_path / "arm" / "problem.toml").robot
     assert (robot.convex_parts, robot.decomposed, robot.hull_gap) == (4, ("fore",), 0.0)
-    head = head_of(tmp_path / "made" / "problem.toml")
+    head = head_of(tmp_path / "arm" / "problem.toml")
     assert (
         "free space: convex hulls of the meshes reject 1.65% of the states that the meshes accept"
         in head
@@ -328,7 +328,7 @@ def test_hulls_that_reject_free_space_are_decomposed_and_the_gap_is_shown(
     assert re.search(
         r"turret fore +14.25% +3.00% +3.00% +0.00%", re.sub(" +", " ", head)
     )
-    assert main(["show", str(tmp_path / "made" / "problem.toml")]) == 0
+    assert main(["show", str(tmp_path / "arm" / "problem.toml")]) == 0
     text = "gap: 0.00% of the random states in which no triangle meshes overlap are rejected by the convex parts"
     assert text in capsys.readouterr().out
 
@@ -342,7 +342,7 @@ def test_pairs_in_permanent_contact_are_named(tmp_path):
     assert (
         main(["init", str(tmp_path / "arm"), "--urdf", str(urdf), "--tip", "hand"]) == 0
     )
-    head = head_of(tmp_path / "made" / "problem.toml")
+    head = head_of(tmp_path / "arm" / "problem.toml")
     assert "not checked, since they are always in contact: base, arm" in head
 
 
@@ -352,14 +352,14 @@ def test_pairs_that_leave_no_free_state_are_ignored_with_a_note(tmp_path, monkey
     assert (
         main(["init", str(tmp_path / "arm"), "--urdf", str(urdf), "--tip", "hand"]) == 0
     )
-    problem = load_problem(tmp_path / "made" / "problem.toml")
+    problem = load_problem(tmp_path / "arm" / "problem.toml")
     pairs = problem.robot.ignored_pairs
     assert pairs
     shape = load_robot(problem).shape
     assert {
         (pair.first, pair.second) for pair in shape.pairs if pair.left_out == "disabled"
     } == set(pairs)
-    head = head_of(tmp_path / "made" / "problem.toml")
+    head = head_of(tmp_path / "arm" / "problem.toml")
     for first, second in pairs:
         text = f"no state is free of collisions: {first}, {second} (their convex parts overlap in"
         assert f"ignored, since otherwise {text}" in head
@@ -386,14 +386,14 @@ def test_an_srdf_is_used_and_named_from_the_recipes(tmp_path):
         )
         == 0
     )
-    problem = load_problem(tmp_path / "made" / "problem.toml")
+    problem = load_problem(tmp_path / "arm" / "problem.toml")
     assert problem.robot.srdf == "../crane.srdf"
     pairs = load_robot(problem).shape.pairs
     assert [
         (pair.first, pair.second) for pair in pairs if pair.left_out == "disabled"
     ] == [("base", "hand")]
     assert "collisions are not noticed: base and hand (" in head_of(
-        tmp_path / "made" / "problem.toml"
+        tmp_path / "arm" / "problem.toml"
     )
 
 
@@ -413,12 +413,12 @@ def test_a_torque_limit_below_what_gravity_needs_is_replaced(tmp_path):
         [ELBOW[0], ("revolute", "0 1 0", weak), ELBOW[2]],
         mass=8.0,
     )
-    assert main(["init", "made", "--urdf", str(urdf)]) == 0
+    assert main(["init", str(tmp_path / "arm"), "--urdf", str(urdf)]) == 0
     assert re.search(
         r"joint_2: gravity needs [\d.]+ N m, where the URDF allows 3 N m",
         head_of(tmp_path / "arm/problem.toml"),
     )
-    torque = load_problem(tmp_path / "made" / "problem.toml").limits.torque.values
+    torque = load_problem(tmp_path / "arm" / "problem.toml").limits.torque.values
     assert (torque[0], torque[2]) == (90, 90)
     assert torque[1] > 30
 
@@ -505,7 +505,7 @@ def test_meshes_in_millimetres_are_refused_with_a_remedy(
 def test_findings_are_printed_as_notes(tmp_path, capsys):
     continuous = ("continuous", "0 0 1", '<limit velocity="0" effort="20"/>')
     urdf = write_arm(tmp_path / "arm.urdf", [continuous, *ELBOW[1:]], mass=0)
-    assert main(["init", "made", "--urdf", str(urdf)]) == 0
+    assert main(["init", str(tmp_path / "arm"), "--urdf", str(urdf)]) == 0
     notes = [
         line.removeprefix("note: ")
         for line in capsys.readouterr().err.splitlines()
@@ -534,7 +534,7 @@ def test_limits_of_many_turns_stand_for_none(tmp_path, capsys):
             'lower="-2" upper="2"', 'lower="-1e16" upper="1e16"', 1
         )
     )
-    assert main(["init", "made", "--urdf", str(urdf)]) == 0
+    assert main(["init", str(tmp_path / "arm"), "--urdf", str(urdf)]) == 0
     assert "the URDF has no position limit of joint_1" in capsys.readouterr().err
 
 
@@ -554,7 +554,7 @@ def test_a_urdf_in_the_place_of_an_srdf_and_the_reverse_are_named(tmp_path, caps
 def test_inertias_that_no_body_has_are_noted(tmp_path):
     urdf = write_arm(tmp_path / "arm.urdf", ELBOW)
     urdf.write_text(urdf.read_text().replace('ixx="0.01"', 'ixx="0.05"', 1))
-    assert main(["init", "made", "--urdf", str(urdf)]) == 0
+    assert main(["init", str(tmp_path / "arm"), "--urdf", str(urdf)]) == 0
     assert (
         "no body has the <inertia> of link_1: a principal inertia is negative"
         in head_of(tmp_path / "arm/problem.toml")
@@ -733,7 +733,7 @@ def test_a_tip_that_reaches_no_box_is_refused(tmp_path, capsys):
     said = refused(capsys, 2, tmp_path / "arm", "--urdf", urdf)
     assert "the tip reaches less than 2 % of every box of positions near" in said
     assert (
-        load_problem(tmp_path / "made" / "problem.toml").name == "arm"
+        load_problem(tmp_path / "arm" / "problem.toml").name == "arm"
     )  # the problem is written none the less
 
 
