@@ -16,7 +16,7 @@ import numpy as np
 from cnpgen.kernels.kernel import axis_names
 from cnpgen.kernels.llvm_text import CONSTANTS, PAD, StepText
 from cnpgen.kernels.lowering import lower, uniform_arguments
-from cnpgen.kernels.steps import Step
+from cnpgen.kernels.steps import ArithmeticStep
 from cnpgen.kernels.tape import Tape
 
 ONCE = "i64 %n, ptr %in, ptr %ld, ptr %out"
@@ -90,7 +90,7 @@ br label %block
 """
 
 
-def _lanes(tape: Tape, steps: list[Step], text: StepText) -> str:
+def _lanes(tape: Tape, steps: list[ArithmeticStep], text: StepText) -> str:
     """Return the function that evaluates full vectors of lanes once."""
     uniform = uniform_arguments(tape)
     summed = _summed(tape)
@@ -128,7 +128,7 @@ ret void
 }}"""
 
 
-def _iterated_lanes(tape: Tape, steps: list[Step], text: StepText) -> str:
+def _iterated_lanes(tape: Tape, steps: list[ArithmeticStep], text: StepText) -> str:
     """Return the function that iterates full vectors of lanes; converged lanes keep their values."""
     assert tape.loop is not None
     vector, flags, width = text.vector, text.flags, tape.inputs[0]

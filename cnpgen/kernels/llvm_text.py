@@ -12,7 +12,7 @@ from functools import cache
 
 import numpy as np
 
-from cnpgen.kernels.steps import Step
+from cnpgen.kernels.steps import ArithmeticStep
 from cnpgen.kernels.tape import Tape
 
 Read = Callable[[int, str, int, int], str]  # step, its name, argument, component
@@ -166,7 +166,7 @@ class StepText:
             f"{name} = shufflevector {self.vector} %w{k}, {self.vector} poison, <{self.lanes} x i32> zeroinitializer"
         )
 
-    def body(self, steps: list[Step], read: Read, write: Write) -> str:
+    def body(self, steps: list[ArithmeticStep], read: Read, write: Write) -> str:
         """Return the instructions of all steps; ``read`` and ``write`` return those of inputs and outputs."""
         lines: list[str] = []
         names: list[str] = []
@@ -188,7 +188,7 @@ class StepText:
                 lines.append(template.format(k=k, t=name, **values))
         return "\n".join(lines)
 
-    def _fused(self, k: int, step: Step, a: str, b: str, c: str) -> str:
+    def _fused(self, k: int, step: ArithmeticStep, a: str, b: str, c: str) -> str:
         """Return ``a b + c`` with one rounding; the signs are exact."""
         v, lines = self.vector, ""
         if step.signs[0]:

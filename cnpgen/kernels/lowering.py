@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import axis_names
-from cnpgen.kernels.steps import Step, StepList
+from cnpgen.kernels.steps import ArithmeticStep, StepList
 from cnpgen.kernels.tape import NAMES, Tape
 from cnpgen.kernels.vector_functions import exponential, sine_and_cosine
 
@@ -29,7 +29,7 @@ ARITHMETIC = {
 }  # fmt: skip
 
 
-def lower(tape: Tape) -> list[Step]:
+def lower(tape: Tape) -> list[ArithmeticStep]:
     """Return the steps of a tape, contracted, without those that no result needs."""
     entered = StepList(single=tape.dtype == "float32")
     uniform = uniform_arguments(tape)
@@ -92,14 +92,14 @@ def uniform_arguments(tape: Tape) -> set[int]:
     return {index for index, kind in enumerate(axes) if "lanes" not in axis_names(kind)}
 
 
-def value_operands(step: Step) -> tuple[int, ...]:
+def value_operands(step: ArithmeticStep) -> tuple[int, ...]:
     """Return the steps that a step reads."""
     if step.operation in ("input", "constant"):
         return ()
     return step.operands[:1] if step.operation == "output" else step.operands
 
 
-def _contracted(tape: Tape, steps: list[Step]) -> list[Step]:
+def _contracted(tape: Tape, steps: list[ArithmeticStep]) -> list[ArithmeticStep]:
     """Replace products by fused multiply-adds.
 
     A product is contracted if every use of it is a sum or a difference with another
@@ -127,7 +127,7 @@ def _contracted(tape: Tape, steps: list[Step]) -> list[Step]:
 
 
 def _sections(
-    tape: Tape, steps: list[Step], needed: Sequence[int]
+    tape: Tape, steps: list[ArithmeticStep], needed: Sequence[int]
 ) -> NDArray[np.integer[Any]]:
     """Return the section of every step; products and sums of different sections are not contracted.
 
@@ -156,7 +156,7 @@ def _sections(
     return section
 
 
-def _computed_before_loop(steps: list[Step]) -> NDArray[np.integer[Any]]:
+def _computed_before_loop(steps: list[ArithmeticStep]) -> NDArray[np.integer[Any]]:
     """Return 1 for steps that do not depend on the state, argument 0 of a loop, else 0."""
     before: list[bool] = []
     for step in steps:
@@ -167,16 +167,18 @@ def _computed_before_loop(steps: list[Step]) -> NDArray[np.integer[Any]]:
     return np.array(before, int)
 
 
-def _fused(total: Step, product: int, factors: tuple[int, ...]) -> Step:
+def _fused(
+    total: ArithmeticStep, product: int, factors: tuple[int, ...]
+) -> ArithmeticStep:
     """Return a sum or difference with one product as one fused step."""
     first, second = total.operands
     minus = total.operation == "sub"
     if first == product:  # a b - c
-        return Step("fma", (*factors, second), signs=(False, minus))
-    return Step("fma", (*factors, first), signs=(minus, False))  # c - a b
+        return ArithmeticStep("fma", (*factors, second), signs=(False, minus))
+    return ArithmeticStep("fma", (*factors, first), signs=(minus, False))  # c - a b
 
 
-def _needed(steps: list[Step]) -> list[int]:
+def _needed(steps: list[ArithmeticStep]) -> list[int]:
     """Return the indices of the steps that some result needs, in order."""
     needed = np.array([step.operation == "output" for step in steps], bool)
     for index in range(len(steps) - 1, -1, -1):
@@ -185,18 +187,20 @@ def _needed(steps: list[Step]) -> list[int]:
     return np.flatnonzero(needed).tolist()
 
 
-def _without_unused(steps: list[Step]) -> list[Step]:
+def _without_unused(steps: list[ArithmeticStep]) -> list[ArithmeticStep]:
     """Return the needed steps with their operands renumbered."""
     needed = _needed(steps)
     renumbered = dict(zip(needed, range(len(needed)), strict=True))
     return list(_renumbered([steps[index] for index in needed], renumbered))
 
 
-def _renumbered(steps: list[Step], index: dict[int, int]) -> Iterator[Step]:
+def _renumbered(
+    steps: list[ArithmeticStep], index: dict[int, int]
+) -> Iterator[ArithmeticStep]:
     for step in steps:
         count = len(value_operands(step))
         operands = (
             *(index[operand] for operand in step.operands[:count]),
             *step.operands[count:],
         )
-        yield Step(step.operation, operands, step.value, step.signs)
+        yield ArithmeticStep(step.operation, operands, step.value, step.signs)

@@ -30,7 +30,7 @@ from cnpgen.kernels.tape import Tape
 from cnpgen.store.files.cache_folder import LIBRARIES, is_trusted, trust_problem
 from cnpgen.store.files.file_lock import try_lock, unlock
 
-POLL_INTERVAL_S = 0.1
+CHECK_INTERVAL_S = 0.1
 MAX_STARTS = 3  # of the process by one command, so that a broken one is not started again and again
 NICENESS = 5  # the command itself comes first
 LOCK_NAME = ".optimizer.lock"
@@ -92,7 +92,7 @@ class Replacer:
                 if not self._waiting:
                     self._thread = None
                     return
-            interval.wait(POLL_INTERVAL_S)
+            interval.wait(CHECK_INTERVAL_S)
 
     def _done(self, replacement: Replacement) -> bool:
         """Replace code if its final code is there; return whether waiting has ended."""

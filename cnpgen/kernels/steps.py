@@ -9,7 +9,7 @@ COMMUTATIVE = {"add", "mul", "eq", "ne", "and", "or"}
 
 
 @dataclass(frozen=True)
-class Step:
+class ArithmeticStep:
     """One operation on vectors.
 
     Attributes:
@@ -32,7 +32,7 @@ class StepList:
 
     def __init__(self, *, single: bool) -> None:
         self.single = single
-        self.steps: list[Step] = []
+        self.steps: list[ArithmeticStep] = []
         self._known: dict[Any, int] = {}
 
     def add(self, operation: str, *operands: int) -> int:
@@ -40,17 +40,19 @@ class StepList:
         key = (operation, *operands)
         if operation in COMMUTATIVE and operands[0] > operands[1]:
             key = (operation, operands[1], operands[0])
-        return self._enter(key, Step(operation, operands))
+        return self._enter(key, ArithmeticStep(operation, operands))
 
     def number(self, value: float) -> int:
         """Return the index of a constant."""
-        return self._enter(np.float64(value).tobytes(), Step("constant", (), value))
+        return self._enter(
+            np.float64(value).tobytes(), ArithmeticStep("constant", (), value)
+        )
 
     def output(self, value: int, result: int, component: int) -> None:
         """Enter a result, which is never merged."""
-        self.steps.append(Step("output", (value, result, component)))
+        self.steps.append(ArithmeticStep("output", (value, result, component)))
 
-    def _enter(self, key: Any, step: Step) -> int:
+    def _enter(self, key: Any, step: ArithmeticStep) -> int:
         index = self._known.setdefault(key, len(self.steps))
         if index == len(self.steps):
             self.steps.append(step)
