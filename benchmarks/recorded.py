@@ -312,7 +312,7 @@ def cpu_times(
     listing = folder / "episodes.json"
     tasks = [(problem, list(map(str, paths)), 5e-5) for paths in episodes.values()]
     listing.write_text(json.dumps(tasks))
-    command = [python, "-c", TIMER, str(listing)]
+    command = [python, "-P", "-c", TIMER, str(listing)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return [tuple(each) for each in json.loads(done.stdout)]
 

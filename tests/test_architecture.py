@@ -65,7 +65,7 @@ HEAVY = (
     "imageio",
     "ompl",
 )
-FRAMEWORKS = ("torch", "jax", "tensorflow")
+FRAMEWORKS = ("torch", "jax")
 MODULES = sorted(
     path.relative_to(PACKAGE).with_suffix("")
     for path in PACKAGE.rglob("*.py")
@@ -396,7 +396,6 @@ def test_every_module_is_imported_or_registered() -> None:
         "__main__",
         "benchmark",
         "interop.jax",
-        "interop.tensorflow",
         "interop.torch",
         "plugins",
         "recipes",
