@@ -123,9 +123,7 @@ def _with_scales(problem: Problem, robot: Robot, scene: SceneProblem) -> Problem
         ),
         jerk=PerJoint(tuple(robot.jerk_limit.tolist())),
     )
-    scaled = replace(problem, limits=limits)
-    vars(scaled)["urdf_text"] = problem.urdf_text  # cached, expensive to read again
-    return scaled
+    return problem.replaced(limits=limits)
 
 
 def _with_mass(
