@@ -1,6 +1,7 @@
 """Exceptions of the public interface, their exit codes, and parts of their messages."""
 
 import difflib
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -102,6 +103,16 @@ class RecipeError(CnpgenError):
 
     def __str__(self) -> str:
         return "\n".join(self.errors)
+
+    @property
+    def mistakes(self) -> tuple[str, ...]:
+        """The former name of ``errors``, for one version."""
+        warnings.warn(
+            "RecipeError.mistakes is errors; the next version has no mistakes",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        return self.errors
 
 
 class PluginError(RecipeError):

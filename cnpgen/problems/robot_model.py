@@ -17,6 +17,7 @@ from cnpgen.robots.scene import Scene
 from cnpgen.robots.shape.hull import Array
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import numbers
+from cnpgen.schema.old_keywords import old_attribute
 from cnpgen.store.dataset_spec import StoredProblem
 
 if TYPE_CHECKING:
@@ -102,6 +103,8 @@ class RobotModel:
         RecipeError: The recipe has errors.
         MachineError: The backend is not available.
     """
+
+    base = old_attribute("base", "home")
 
     @checked_arguments
     def __init__(

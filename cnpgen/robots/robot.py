@@ -26,6 +26,7 @@ from cnpgen.robots.urdf_parameters import (
     check_model,
     urdf_parameters,
 )
+from cnpgen.schema.old_keywords import old_attribute
 from cnpgen.store.joint_units import units_of_joints
 
 if TYPE_CHECKING:
@@ -115,6 +116,7 @@ class Robot:
     nominal_parameters: Array = field(default_factory=lambda: np.empty(0))
     drive: Drive | None = None
     built_model: "pin.Model | None" = field(default=None, compare=False, repr=False)
+    base = old_attribute("base", "home")
 
     @cached_property
     def holding_limit(self) -> Array:

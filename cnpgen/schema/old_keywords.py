@@ -1,8 +1,8 @@
-"""Keywords of an earlier version: for one version a function accepts them, with a warning."""
+"""Keywords and names of an earlier version: for one version they are accepted, with a warning."""
 
 import dataclasses
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
 Options = TypeVar("Options")
@@ -40,3 +40,32 @@ def with_old_keywords(
     )
     changed: Options = dataclasses.replace(chosen, **old)
     return changed
+
+
+def old_attribute(old: str, new: str) -> Any:
+    """Return a property with the former name of an attribute, which warns that it has a new one."""
+
+    def read(owner: Any) -> Any:
+        warnings.warn(
+            f"{type(owner).__name__}.{old} is {new}; the next version has no {old}",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        return getattr(owner, new)
+
+    return property(read, doc=f"The former name of ``{new}``.")
+
+
+def errors_of(made: Any) -> Iterable[tuple[str, str]]:
+    """Return the (key, error) pairs of a table's own check, also of a plug-in with the former name of the method."""
+    if hasattr(made, "validate"):
+        return list(made.validate())
+    if not hasattr(made, "find_mistakes"):
+        return ()
+    name = type(made).__name__
+    warnings.warn(
+        f"{name}.find_mistakes: name the method validate; the next version does not call find_mistakes",
+        DeprecationWarning,
+        stacklevel=2,
+    )
+    return list(made.find_mistakes())

@@ -11,6 +11,7 @@ from typing import Any, NoReturn, TypeVar, get_args, get_origin
 
 from cnpgen.errors import nearest
 from cnpgen.schema.keys import Key, PerJoint, Range, RecipeLocation, keys
+from cnpgen.schema.old_keywords import errors_of
 from cnpgen.schema.units import (
     PLAUSIBLE_MAX,
     parse_number,
@@ -109,7 +110,7 @@ class _Parser:
         }
         if len(self.errors) == before:
             made = cls(**values)
-            self.check(getattr(made, "validate", tuple)(), where)
+            self.check(errors_of(made), where)
             return made
         self.check(_first_errors_of(_partly(cls, known, values)), where)
         return None
@@ -209,7 +210,7 @@ def _first_errors_of(made: object) -> list[tuple[str, str]]:
     """List the errors of an object up to the first check that uses a value with an error."""
     found: list[tuple[str, str]] = []
     with suppress(TypeError, AttributeError):
-        for error in getattr(made, "validate", tuple)():
+        for error in errors_of(made):
             found.append(error)  # noqa: PERF402 - keeps the errors before an error
     return found
 
