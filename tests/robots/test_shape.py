@@ -27,6 +27,7 @@ from cnpgen.robots.urdf_changes import (
     with_disabled_pairs,
     with_ignored_pairs,
 )
+from cnpgen.store.files.cache_entry import read_entry, write_entry
 from tests.examples.shaped_robot import (
     CLAW,
     LINKS,
@@ -415,15 +416,18 @@ def test_capsules_and_pairs_are_kept_and_what_was_damaged_is_found_again(
         third = load(file, tmp_path / "kept")
     assert repr(third.pairs) == repr(again.pairs)
     np.testing.assert_array_equal(third.capsules[3].first, again.capsules[3].first)
-    whole = kept.read_text()
-    thinner = json.loads(whole)
+    whole = kept.read_bytes()
+    content = read_entry(kept)
+    assert content is not None
+    thinner = json.loads(content)
     thinner["capsules"][2]["radius"] *= 0.9  # it no longer covers the link
-    for damaged in (whole[:-40], json.dumps(thinner)):
-        kept.write_text(damaged)
+    write_entry(tmp_path / "thinner", json.dumps(thinner).encode())
+    for damaged in (whole[:-40], (tmp_path / "thinner").read_bytes()):
+        kept.write_bytes(damaged)
         found = load(file, tmp_path / "kept")
         assert repr(found.pairs) == repr(again.pairs)
         assert [c.radius for c in found.capsules] == [c.radius for c in again.capsules]
-    assert kept.read_text() == whole
+    assert kept.read_bytes() == whole
 
 
 def test_nothing_is_kept_where_others_may_write(tmp_path, monkeypatch):
