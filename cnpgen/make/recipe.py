@@ -170,7 +170,7 @@ def restore_dataset_recipe(
 ) -> DatasetRecipe:
     """Rebuild a recipe from its resolved form in a specification.
 
-    Its URDF file belongs into ``folder``.
+    Its URDF file must be in ``folder``.
     """
     pipeline_table = content["pipeline"]
     missing = missing_kinds(registry.STAGES, tables(pipeline_table, "stage"))

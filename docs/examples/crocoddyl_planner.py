@@ -14,7 +14,7 @@ The package that holds this module registers the planner in its pyproject.toml:
     [project.entry-points."cnpgen.planners"]
     crocoddyl = "crocoddyl_planner:Crocoddyl"
 
-The wheels of Crocoddyl 3.2 need Pinocchio 4.0, so it belongs into an environment of its own.
+The wheels of Crocoddyl 3.2 need Pinocchio 4.0, so it needs an environment of its own.
 """
 
 from __future__ import annotations
