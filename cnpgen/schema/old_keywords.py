@@ -2,7 +2,7 @@
 
 import dataclasses
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, TypeVar
 
 Options = TypeVar("Options")
@@ -56,16 +56,18 @@ def old_attribute(old: str, new: str) -> Any:
     return property(read, doc=f"The former name of ``{new}``.")
 
 
-def errors_of(made: Any) -> Iterable[tuple[str, str]]:
-    """Return the (key, error) pairs of a table's own check, also of a plug-in with the former name of the method."""
+def errors_of(made: Any) -> Iterator[tuple[str, str]]:
+    """Yield the (key, error) pairs of a table's own check, also of a plug-in with the former name of the method.
+
+    The pairs come one by one: a check that fails at a value of a wrong type has reported the errors before it.
+    """
     if hasattr(made, "validate"):
-        return list(made.validate())
-    if not hasattr(made, "find_mistakes"):
-        return ()
-    name = type(made).__name__
-    warnings.warn(
-        f"{name}.find_mistakes: name the method validate; the next version does not call find_mistakes",
-        DeprecationWarning,
-        stacklevel=2,
-    )
-    return list(made.find_mistakes())
+        yield from made.validate()
+    elif hasattr(made, "find_mistakes"):
+        name = type(made).__name__
+        warnings.warn(
+            f"{name}.find_mistakes: name the method validate; the next version does not call find_mistakes",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        yield from made.find_mistakes()
