@@ -1,0 +1,80 @@
+"""Checks of raw action chunks: a chunk that no motion within the limits can follow is refused, not smoothed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cnpgen.addons.trajectories.refuted_limits import refuted_limits
+from cnpgen.addons.trajectories.sample_errors import SampleErrors
+from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.errors import UsageError
+from cnpgen.judges.plans.joint_limits import joint_limits
+from cnpgen.problems.constraints.joint import JointPosition
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
+from cnpgen.schema.arguments import numbers
+from cnpgen.world.path import PathWorld
+
+Array = NDArray[np.float64]
+
+POSITION_INSET_RAD = 5e-3  # of clipped positions: a smooth path overshoots its samples
+
+
+class ChunkChecks:
+    """Checks of the chunks of one problem.
+
+    Args:
+        problem: The problem; its limits of velocities, accelerations and jerks apply.
+        robot: Its robot.
+        length: Number of samples of a chunk.
+        rate: Samples per second [Hz].
+        noise: Largest random error of the positions [rad].
+    """
+
+    def __init__(
+        self, problem: Problem, robot: Robot, *, length: int, rate: float, noise: float
+    ) -> None:
+        speeds = tuple(c for c in problem.constraint if type(c) is not JointPosition)
+        limited = replace(problem, constraint=speeds)
+        world = PathWorld(robot, problem.obstacle, problem.object_size)
+        self._limits = joint_limits(limited, world)
+        self._errors = SampleErrors(noise, 0.0, 0.0, 0.0, "")
+        self._times = np.arange(length) / rate
+        middle = (robot.position_lower + robot.position_upper) / 2
+        self._low = np.minimum(robot.position_lower + POSITION_INSET_RAD, middle)
+        self._high = np.maximum(robot.position_upper - POSITION_INSET_RAD, middle)
+        self._n, self._columns = robot.n, 0
+
+    def read(self, chunk: ArrayLike) -> tuple[Array, Array]:
+        """Return positions, shape (K, n), and the other columns, shape (K, D - n).
+
+        Raises:
+            UsageError: The shape is wrong, or differs from that of earlier chunks.
+        """
+        values = numbers("chunk", chunk)
+        length, n = len(self._times), self._n
+        if values.ndim != 2 or len(values) != length or values.shape[1] < n:
+            raise UsageError(
+                f"must have shape ({length}, D) with at least {n} columns, the joints,"
+                f" got {values.shape}",
+                argument="chunk",
+            )
+        if self._columns not in {0, values.shape[1]}:
+            raise UsageError(
+                f"has {values.shape[1]} columns, earlier ones have {self._columns}",
+                argument="chunk",
+            )
+        self._columns = values.shape[1]
+        return values[:, :n], values[:, n:]
+
+    def refuted(self, q: Array) -> str:
+        """Return a limit that no motion within the noise of samples, shape (K, n), meets; empty if none is proven."""
+        found = refuted_limits(self._limits, Trajectory(self._times, q), self._errors)
+        return f"{found[0].margin.name}: {found[0].detail}" if found else ""
+
+    def clipped(self, q: Array) -> Array:
+        """Return positions inside of the position limits, shape (K, n)."""
+        return np.clip(q, self._low, self._high)
