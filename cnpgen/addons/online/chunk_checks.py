@@ -20,7 +20,9 @@ from cnpgen.world.path import PathWorld
 
 Array = NDArray[np.float64]
 
-POSITION_INSET_RAD = 5e-3  # of clipped positions: a smooth path overshoots its samples
+MIN_SAMPLES = 8  # of a chunk after the join: fewer have no reliable velocity
+MAX_DURATION = 1.2  # of a motion, in chunk lengths
+SAMPLE_ROUNDING = 1e-6  # samples
 
 
 class ChunkChecks:
@@ -43,9 +45,6 @@ class ChunkChecks:
         self._limits = joint_limits(limited, world)
         self._errors = SampleErrors(noise, 0.0, 0.0, 0.0, "")
         self._times = np.arange(length) / rate
-        middle = (robot.position_lower + robot.position_upper) / 2
-        self._low = np.minimum(robot.position_lower + POSITION_INSET_RAD, middle)
-        self._high = np.maximum(robot.position_upper - POSITION_INSET_RAD, middle)
         self._n, self._columns = robot.n, 0
 
     def read(self, chunk: ArrayLike) -> tuple[Array, Array]:
@@ -75,6 +74,28 @@ class ChunkChecks:
         found = refuted_limits(self._limits, Trajectory(self._times, q), self._errors)
         return f"{found[0].margin.name}: {found[0].detail}" if found else ""
 
-    def clipped(self, q: Array) -> Array:
-        """Return positions inside of the position limits, shape (K, n)."""
-        return np.clip(q, self._low, self._high)
+
+def checked_errors(tracking_error: ArrayLike, n: int) -> Array:
+    """Return positive tracking errors, shape (n,)."""
+    errors = numbers("tracking_error", tracking_error)
+    if errors.shape not in {(), (n,)} or not (errors > 0).all():
+        raise UsageError(
+            f"must be one positive number or {n} of them, got {tracking_error!r:.100}",
+            argument="tracking_error",
+        )
+    return np.broadcast_to(errors, (n,))
+
+
+def horizon(stop_after: float | None, length: int, rate: float) -> int:
+    """Return the number of samples that a motion follows, so that it rests after a time [s]."""
+    if stop_after is None:
+        return length
+    samples = int(stop_after / MAX_DURATION * rate + SAMPLE_ROUNDING) + 1
+    if samples < MIN_SAMPLES:
+        least = MAX_DURATION * (MIN_SAMPLES - 1) / rate
+        raise UsageError(
+            f"must be at least {least:.3g} s, the time of {MIN_SAMPLES} samples,"
+            f" got {stop_after:g}",
+            argument="stop_after",
+        )
+    return min(samples, length)

@@ -3,41 +3,39 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.addons.online.chunk_checks import ChunkChecks
-from cnpgen.addons.online.chunk_fit import ChunkFit, chunk_fit
-from cnpgen.addons.online.chunk_progress import ChunkProgress, ExecutedChunk
-from cnpgen.addons.online.chunk_speeds import ChunkSpeeds
+from cnpgen.addons.online.callers_clock import ROUNDING_S, CallersClock
+from cnpgen.addons.online.chunk_checks import (
+    MIN_SAMPLES,
+    ChunkChecks,
+    checked_errors,
+    horizon,
+)
+from cnpgen.addons.online.chunk_motions import ChunkMotion, ChunkMotions
+from cnpgen.addons.online.chunk_progress import ChunkProgress
 from cnpgen.addons.online.plan_runtime import PlanRuntime, positive
-from cnpgen.addons.online.set_points import SetPoint
 from cnpgen.addons.online.switches import ChunkJoin, SwitchOutcome
 from cnpgen.errors import UsageError
 from cnpgen.machine.threads import one_thread
-from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_record, open_problem
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer, number, numbers
 from cnpgen.store.dataset_spec import StoredProblem
-from cnpgen.trajectory.spline import basis
-from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
 
-MIN_SAMPLES = 8  # of a chunk after the join: fewer have no reliable velocity
-MAX_DURATION = 1.2  # of a motion, in chunk lengths
 NOISE_RAD = 1e-3
 STOP_DELAY_S = 0.05  # of a stop after its cause: it is computed meanwhile
 GRID_STEP_S = 4e-3  # of sampled motions, whose knots are 0.1 s apart
 MAX_MEASURED_SPEED = 1.1  # fraction of the velocity limits
 MAX_RESTING_SPEED = 0.05  # fraction of the velocity limits, of an arm that is at rest
-CLOCK_ROUNDING_S = 1e-9
 
 
 class ChunkSetPoint(NamedTuple):
@@ -46,25 +44,6 @@ class ChunkSetPoint(NamedTuple):
     q: Array
     dq: Array
     ddq: Array
-    others: Array
-
-
-@dataclass(frozen=True)
-class _Candidate:
-    """A motion of a chunk in its own timing, with its fit and faster rates.
-
-    Attributes:
-        fit: Matrices of the fit.
-        plan: The motion.
-        rates: Rate control points of all speeds [1/s], shape (M, R).
-        distance: Largest distance from the raw samples [rad].
-        others: Other columns from the join on, shape (K, D - n).
-    """
-
-    fit: ChunkFit
-    plan: Plans
-    rates: Array
-    distance: float
     others: Array
 
 
@@ -130,10 +109,10 @@ class ChunkExecutor:
         self._length = integer("length", length, least=MIN_SAMPLES)
         self._max_distance = positive("max_distance", max_distance)
         self._stale_after = positive("stale_after", stale_after)
-        self._tracking_error = _checked_error(tracking_error, self._robot.n)
+        self._tracking_error = checked_errors(tracking_error, self._robot.n)
         if (max_speed := number("speed", speed)) < 1:
             raise UsageError(f"must be at least 1, got {speed:g}", argument="speed")
-        self._horizon = _horizon(stop_after, self._length, self._rate)
+        self._horizon = horizon(stop_after, self._length, self._rate)
         self._checks = ChunkChecks(
             opened,
             self._robot,
@@ -141,13 +120,18 @@ class ChunkExecutor:
             rate=self._rate,
             noise=positive("noise", noise),
         )
-        self._speeds = ChunkSpeeds(self._record, max_speed)
+        self._motions = ChunkMotions(self._record, self._rate, max_speed)
+        # The matrices of all lengths that delays leave.
+        delay = (self._stale_after + self._join) * max_speed
+        for skipped in range(int(delay * self._rate) + 2):
+            length = min(self._length - skipped, self._horizon)
+            if length >= MIN_SAMPLES:
+                self._motions.prepare(length)
         self._lock = threading.RLock()
         self._runtime: PlanRuntime | None = None
         self._latched: SwitchOutcome | None = SwitchOutcome.STOPPED
-        self._offset: float | None = None  # of the caller's clock to the runtime's
-        self._observed = self._stepped = -np.inf  # last observation and step
-        self._prepare()
+        self._clock = CallersClock(self._stale_after)
+        self._observed = -np.inf  # time of the last observation
 
     @property
     def stopped(self) -> SwitchOutcome | None:
@@ -186,8 +170,7 @@ class ChunkExecutor:
                         f"the arm needs {left:.3g} s more of set points to stop"
                     )
                 self._runtime.resume(q)
-            if self._offset is not None:
-                self._observed = max(self._stepped, self._runtime.now + self._offset)
+            self._observed = self._clock.last(self._runtime.now)
             self._latched = None
 
     @checked_arguments
@@ -251,7 +234,7 @@ class ChunkExecutor:
             if cause is not None:
                 self._latch(cause)
         if self._latched is not None:
-            return self._result(self._latched, inner)
+            return self._refusal(self._latched, inner)
         return self._join_chunk(runtime, inner, q, others, inner - now + observed)
 
     def _join_chunk(
@@ -259,90 +242,41 @@ class ChunkExecutor:
     ) -> ChunkJoin:
         """Check a chunk, fit a motion to it and switch to it; times are those of the runtime."""
         if not (np.isfinite(q).all() and np.isfinite(others).all()):
-            return self._result(SwitchOutcome.NOT_FINITE, now)
+            return self._refusal(SwitchOutcome.NOT_FINITE, now)
         if detail := self._checks.refuted(q):
-            return self._result(SwitchOutcome.OUTLIER, now, detail)
+            return self._refusal(SwitchOutcome.OUTLIER, now, detail)
         at, skipped = self._progress.next_sample(observed, now + self._join, self._rate)
         if self._length - skipped < MIN_SAMPLES:
             detail = (
                 f"{max(self._length - skipped, 0)}, expected at least {MIN_SAMPLES}"
             )
-            return self._result(SwitchOutcome.SHORT, at, detail)
+            return self._refusal(SwitchOutcome.SHORT, at, detail)
         used = slice(skipped, skipped + self._horizon)
-        motion = self._candidate(q[used], others[used], runtime.state_at(at))
-        found = {"distance": motion.distance, "skipped": skipped}
-        if motion.distance > self._max_distance:
-            detail = (
-                f"{motion.distance:.3g} rad, expected at most {self._max_distance:g}"
-            )
-            return self._result(SwitchOutcome.FAR, at, detail, **found)
-        return self._switch(runtime, motion, at, found)
-
-    def _candidate(self, q: Array, others: Array, state: SetPoint) -> _Candidate:
-        """Fit a motion from a state of the running one to the samples after the join, in their own timing."""
-        fit = chunk_fit(len(q), self._rate)
-        inside = self._checks.clipped(q)
-        speeds = self._speeds.speeds
-        running = fit.running_speed(inside, state, float(speeds[-1]))
-        rates = fit.rate(running, speeds)
-        samples = fit.blended(inside, state, running)
-        boundary, path = fit.fit(samples, state, rates[0])
-        if len(self._record.parameters):
-            nominal = self._robot.nominal_parameters[None]
-            boundary = replace(boundary, parameters=nominal)
-        plan = make_plans(
-            self._record,
-            boundary,
-            path_control_points=path[None],
-            rate_control_points=rates[:1],
-            degree=fit.spec.degree,
-            source="action chunk",
-        )
-        reached = basis(fit.phases, len(path), fit.spec.degree) @ path
-        return _Candidate(fit, plan, rates, float(np.abs(reached - q).max()), others)
+        motion = self._motions.motion(q[used], others[used], runtime.state_at(at))
+        distance = motion.distance
+        join = ChunkJoin(SwitchOutcome.FAR, at, distance=distance, skipped=skipped)
+        if distance <= self._max_distance:
+            return self._switch(runtime, motion, join)
+        text = f"{distance:.3g} rad, expected at most {self._max_distance:g}"
+        return self._in_callers_time(replace(join, detail=text))
 
     def _switch(
-        self,
-        runtime: PlanRuntime,
-        motion: _Candidate,
-        at: float,
-        found: dict[str, float],
+        self, runtime: PlanRuntime, motion: ChunkMotion, join: ChunkJoin
     ) -> ChunkJoin:
         """Switch to the fastest speed that is valid, or to the chunk's own timing."""
-        fit, rates = motion.fit, motion.rates
-        fastest = 0
-        if len(rates) > 1:
-            paths = np.repeat(motion.plan.path_control_points, len(rates), axis=0)
-            motions = Motion(paths, rates, fit.spec.degree)
-            fastest = self._speeds.fastest(motions, motion.plan.scene.poses)
-        for index in dict.fromkeys((fastest, 0)):
-            plan = replace(motion.plan, rate_control_points=rates[index : index + 1])
-            s = np.linspace(0, 1, len(fit.times))
-            executed = ExecutedChunk(
-                plan,
-                at,
-                self._progress.at(at),
-                plan.motion.time_at(s)[0],
-                fit.times,
-                motion.others,
-                fit.step,
-            )
+        for index in dict.fromkeys((self._motions.fastest(motion), 0)):
+            plan, speed = motion.at_speed(index)
+            executed = self._progress.executed(motion, plan, join.time)
             self._progress.add(executed)
-            switch = runtime.switch(plan, at)
+            switch = runtime.switch(plan, join.time)
             if not switch.accepted:
                 self._progress.remove(executed)
+            join = replace(
+                join, outcome=switch.outcome, detail=switch.detail, speed=speed
+            )
             if switch.outcome is not SwitchOutcome.INVALID:
                 break
-        speed = float(rates[index].max()) * fit.duration
-        return self._result(switch.outcome, at, switch.detail, **found, speed=speed)
-
-    def _prepare(self) -> None:
-        """Compute the matrices of all lengths that delays leave."""
-        delay = (self._stale_after + self._join) * float(self._speeds.speeds[-1])
-        for skipped in range(int(delay * self._rate) + 2):
-            length = min(self._length - skipped, self._horizon)
-            if length >= MIN_SAMPLES:
-                self._speeds.grid(chunk_fit(length, self._rate).spec)
+        return self._in_callers_time(join)
 
     def _start(self, q: Array) -> PlanRuntime:
         """Start a runtime at rest; a motion that stands still loads the judge before the first chunk."""
@@ -356,34 +290,19 @@ class ChunkExecutor:
         )
         self._progress = ChunkProgress(runtime)
         samples = np.tile(q, (self._horizon, 1))
-        still = self._candidate(samples, samples[:, :0], runtime.state_at(0.0))
-        self._speeds.fastest(still.plan.motion, still.plan.scene.poses)
-        runtime.switch(still.plan, 0.0)
+        still = self._motions.motion(samples, samples[:, :0], runtime.state_at(0.0))
+        runtime.switch(still.at_speed(self._motions.fastest(still))[0], 0.0)
         return runtime
 
     def _read_clock(
         self, time: float, *, is_step: bool = False
     ) -> tuple[PlanRuntime, float]:
-        """Return the runtime and its time at a time of the caller's clock [s].
-
-        After a step of the clock its time continues from the last set point, and the
-        arm stops.
-        """
+        """Return the runtime and its time at a time of the caller's clock [s]; the arm stops if the clock steps."""
         runtime = self._checked_runtime()
-        with self._lock:
-            if self._offset is None:
-                self._offset = time - runtime.now
-            inner = time - self._offset
-            # Another thread may have served set points since the time of a step.
-            earliest = runtime.now - (self._stale_after if is_step else 0.0)
-            stepped_back = is_step and time < self._stepped
-            self._stepped = time if is_step else self._stepped
-            ahead = inner - runtime.now > self._stale_after
-            if inner >= earliest - CLOCK_ROUNDING_S and not (stepped_back or ahead):
-                return runtime, inner if is_step else max(inner, runtime.now)
-            self._offset = time - runtime.now
-        self._latch(SwitchOutcome.CLOCK, in_background=not is_step)
-        return runtime, runtime.now
+        inner, is_continuous = self._clock.read(time, runtime.now, is_step=is_step)
+        if not is_continuous:
+            self._latch(SwitchOutcome.CLOCK, in_background=not is_step)
+        return runtime, inner
 
     def _checked_runtime(self) -> PlanRuntime:
         if self._runtime is None:
@@ -405,7 +324,7 @@ class ChunkExecutor:
 
     def _age(self, now: float, observed: float) -> SwitchOutcome | None:
         """Return why the observation of a chunk is too old or not new; None if it is neither."""
-        if observed > now + CLOCK_ROUNDING_S:
+        if observed > now + ROUNDING_S:
             return SwitchOutcome.CLOCK
         if now - observed > self._stale_after:
             return SwitchOutcome.STALE
@@ -439,41 +358,13 @@ class ChunkExecutor:
             )
         return state[0], state[1]
 
-    def _result(
-        self, outcome: SwitchOutcome, at: float, detail: str = "", **found: float
+    def _refusal(
+        self, outcome: SwitchOutcome, at: float, detail: str = ""
     ) -> ChunkJoin:
-        """Return the result of a step at a time of the runtime, in the caller's time."""
-        runtime, offset = self._checked_runtime(), self._offset or 0.0
-        return ChunkJoin(
-            outcome,
-            at + offset,
-            detail,
-            end_time=runtime.end_time + offset,
-            **found,  # type: ignore[arg-type]
-        )
+        return self._in_callers_time(ChunkJoin(outcome, at, detail))
 
-
-def _checked_error(tracking_error: ArrayLike, n: int) -> Array:
-    """Return positive tracking errors, shape (n,)."""
-    errors = numbers("tracking_error", tracking_error)
-    if errors.shape not in {(), (n,)} or not (errors > 0).all():
-        raise UsageError(
-            f"must be one positive number or {n} of them, got {tracking_error!r:.100}",
-            argument="tracking_error",
-        )
-    return np.broadcast_to(errors, (n,))
-
-
-def _horizon(stop_after: float | None, length: int, rate: float) -> int:
-    """Return the number of samples that a motion follows, so that it rests after a time [s]."""
-    if stop_after is None:
-        return length
-    samples = int(stop_after / MAX_DURATION * rate + CLOCK_ROUNDING_S) + 1
-    if samples < MIN_SAMPLES:
-        least = MAX_DURATION * (MIN_SAMPLES - 1) / rate
-        raise UsageError(
-            f"must be at least {least:.3g} s, the time of {MIN_SAMPLES} samples,"
-            f" got {stop_after:g}",
-            argument="stop_after",
-        )
-    return min(samples, length)
+    def _in_callers_time(self, join: ChunkJoin) -> ChunkJoin:
+        """Return a result of the runtime with times of the caller's clock."""
+        offset = self._clock.offset or 0.0
+        end = self._checked_runtime().end_time + offset
+        return replace(join, time=join.time + offset, end_time=end)

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.addons.online.chunk_checks import SAMPLE_ROUNDING
+from cnpgen.addons.online.chunk_motions import ChunkMotion
 from cnpgen.addons.online.plan_runtime import PlanRuntime
 from cnpgen.plans.plans import Plans
 
 Array = NDArray[np.float64]
 
 MAX_CHUNKS = 32  # that are kept
-SAMPLE_ROUNDING = 1e-6  # samples
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +60,15 @@ class ChunkProgress:
     def __init__(self, runtime: PlanRuntime) -> None:
         self._runtime = runtime
         self._chunks: deque[ExecutedChunk] = deque(maxlen=MAX_CHUNKS)
+
+    def executed(self, motion: ChunkMotion, plan: Plans, at: float) -> ExecutedChunk:
+        """Return the chunk of a motion that joins at a time [s] with a plan of one of its speeds."""
+        fit, s = motion.fit, np.linspace(0, 1, len(motion.fit.times))
+        times = plan.motion.time_at(s)[0]
+        before = self.at(at)
+        return ExecutedChunk(
+            plan, at, before, times, fit.times, motion.others, fit.step
+        )
 
     def add(self, chunk: ExecutedChunk) -> None:
         """Add a chunk that is executed from its join on."""

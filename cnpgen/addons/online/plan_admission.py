@@ -82,7 +82,7 @@ class Admission:
     ) -> tuple[SwitchOutcome | SampledMotion, str]:
         """Return the motion of a plan, slower at its end if it would end with an acceleration, and a text about it."""
         motion = sample_motion(plan, at, step=self._step)
-        acceleration = plan.motion.at_times(plan.duration[:, None]).ddq[0, 0]
+        _, _, acceleration = _end_of(plan)
         share = np.abs(acceleration / self._robot.acceleration_limit).max()
         if share <= MAX_END_ACCELERATION:
             return motion, ""
@@ -130,7 +130,7 @@ class Admission:
         duration = plan.duration
         if not np.isfinite(duration).all():
             return SwitchOutcome.INVALID, "its duration is not finite"
-        speed = np.abs(plan.motion.at_times(duration[:, None]).dq[0, 0])
+        speed = np.abs(_end_of(plan).dq)
         if (speed > MAX_END_SPEED * self._robot.velocity_limit).any():
             return SwitchOutcome.MOVING, f"up to {speed.max():.3g} rad/s"
         for part in parts if self._judge else ():
@@ -161,6 +161,13 @@ class Admission:
             if not (gap <= share * limit).all():
                 return f"{name} jumps by {gap.max():.3g}"
         return ""
+
+
+def _end_of(plan: Plans | JoinedPlans) -> SetPoint:
+    """Return the state at the end of one plan or sequence."""
+    last = plan.parts[-1] if isinstance(plan, JoinedPlans) else plan
+    states = last.motion.at(np.ones(1))
+    return SetPoint(states.q[0, 0], states.dq[0, 0], states.ddq[0, 0])
 
 
 def plan_of_request(

@@ -97,8 +97,9 @@ class PlanRuntime:
         grid_step: float = MAX_GRID_STEP_S,
     ) -> None:
         with concerning("planner"):
-            is_planner = isinstance(planner, Planner)
-            record = as_record(planner.model.problem if is_planner else planner)
+            record = as_record(
+                planner.model.problem if isinstance(planner, Planner) else planner
+            )
         self._robot = robot = open_problem(record)[1]
         self._judge, self._checker = judge, MotionChecker()
         self._admission = Admission(
