@@ -150,12 +150,12 @@ class ChunkExecutor:
             UsageError: The arm moves, or a stop has not ended.
         """
         q, dq = self._checked_state(measured)
-        if (
-            moving := np.abs(dq) > MAX_RESTING_SPEED * self._robot.velocity_limit
-        ).any():
-            joint = self._record.joint_names[int(moving.argmax())]
+        resting = np.abs(dq) <= MAX_RESTING_SPEED * self._robot.velocity_limit
+        if not resting.all():  # nan does not rest
+            joint = int(resting.argmin())
+            name = self._record.joint_names[joint]
             raise UsageError(
-                f"the arm must be at rest, but {joint} moves at {dq[moving][0]:.3g} rad/s",
+                f"the arm must be at rest, but {name} moves at {dq[joint]:.3g} rad/s",
                 concerns="measured",
             )
         with self._lock:
@@ -328,7 +328,8 @@ class ChunkExecutor:
             return SwitchOutcome.CLOCK
         if now - observed > self._stale_after:
             return SwitchOutcome.STALE
-        return SwitchOutcome.REPLAYED if observed <= self._observed else None
+        is_new = observed > self._observed + ROUNDING_S
+        return None if is_new else SwitchOutcome.REPLAYED
 
     def _mismatch(
         self, runtime: PlanRuntime, time: float, measured: tuple[Array, Array]
