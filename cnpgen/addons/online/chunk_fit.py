@@ -32,11 +32,11 @@ MIN_RUNNING_SPEED = 0.75  # of u: slower starts would end after 1.2 times the ch
 DEGREE = 7
 RATE_POINTS = 20
 FIXED_POINTS = 3  # of the path at either end, by position, velocity and acceleration
-MIN_PATH_POINTS, MAX_PATH_POINTS = 12, 24
-SAMPLES_PER_POINT = 2.0
+MIN_PATH_POINTS, MAX_PATH_POINTS = 12, 20
+SAMPLES_PER_POINT = 2.5
 END_SAMPLES = 8  # whose parabola gives the state of a chunk at its ends
 BLEND_SAMPLES = 24  # in which the difference to the running motion vanishes
-SMOOTHNESS = 2e-6  # rad of residuals that are worth 1 rad/s^3 of jerk
+SMOOTHNESS = 4e-5  # rad of residuals that are worth 1 rad/s^3 of jerk
 MIN_SPEED2 = 1e-4  # (rad/s)^2 of a chunk that has a direction
 PHASES = 129  # of the table of chunk times
 
