@@ -111,6 +111,7 @@ class Loop:
     time: float = 0.0
     points: list[Any] = field(default_factory=list)
     measured: list[tuple[Array, Array]] = field(default_factory=list)
+    resets: list[int] = field(default_factory=list)  # numbers of points before them
 
     def run(self, duration: float) -> None:
         """Serve set points for a time [s]."""
@@ -129,6 +130,7 @@ class Loop:
         self.run(0.1 if self.points else 0.0)
         self.executor.reset((q, np.zeros_like(q)))
         self.plant.q, self.plant.frozen = q, False
+        self.resets.append(len(self.points))
         self.run(TICK_S)
 
 
@@ -219,7 +221,7 @@ def with_plant(plans: Plans, count: int) -> dict[str, Any]:
             last: tuple[float, Array] | None = None
             while (chunk := policy.chunk(loop.plant.q)) is not None:
                 observed, event = loop.time, random.uniform()
-                loop.plant.frozen = event > 0.97
+                loop.plant.frozen |= event > 0.97
                 loop.run(random.uniform(0.05, 0.3) if event > 0.03 else 0.7)
                 if 0.03 < event < 0.06 and last is not None:  # an older one arrives
                     observed, chunk = last
@@ -233,26 +235,30 @@ def with_plant(plans: Plans, count: int) -> dict[str, Any]:
                     stops[cause.name] += 1
                     break
                 loop.run(0.2)
-    robot = open_problem(plans.problem)[1]
     commanded = [(x.q, x.dq) for x in loop.points]
+    robot = open_problem(plans.problem)[1]
     return {
         "joined": accepted / good,
         "outcomes": dict(outcomes),
         "stops": dict(stops),
-        **dict(_uses("commanded", commanded, robot)),
-        **dict(_uses("measured", loop.measured, robot)),
+        **dict(_uses("commanded", commanded, loop.resets, robot)),
+        **dict(_uses("measured", loop.measured, loop.resets, robot)),
     }
 
 
-def _uses(name: str, states: list[tuple[Array, Array]], robot: Any) -> Iterator[Any]:
-    """Yield the largest velocities and accelerations as shares of their limits; resets are left out."""
-    q, dq = (np.array(part) for part in zip(*states, strict=True))
-    placed = np.abs(np.diff(q, axis=0)).max(axis=1) > 0.1
-    placed |= np.append(placed[1:], False) | np.append(False, placed[:-1])
-    acceleration = np.abs(np.diff(dq, axis=0))[~placed] / TICK_S
-    yield f"{name} velocity", float((np.abs(dq) / robot.velocity_limit).max())
-    share = acceleration / robot.acceleration_limit
-    yield f"{name} acceleration", float(share.max())
+def _uses(
+    name: str, states: list[tuple[Array, Array]], resets: list[int], robot: Any
+) -> Iterator[tuple[str, float]]:
+    """Yield the largest velocities and accelerations between resets as shares of their limits."""
+    parts = [
+        np.array([dq for _, dq in states[begin:end]])
+        for begin, end in zip(resets, [*resets[1:], len(states)], strict=True)
+    ]
+    shares = [np.abs(dq) / robot.velocity_limit for dq in parts]
+    changes = [np.abs(np.diff(dq, axis=0)) / TICK_S for dq in parts]
+    yield f"{name} velocity", max(float(x.max()) for x in shares)
+    shares = [change / robot.acceleration_limit for change in changes]
+    yield f"{name} acceleration", max(float(x.max(initial=0)) for x in shares)
 
 
 def todays_times(found: Figures, count: int = 24) -> list[float]:

@@ -20,7 +20,7 @@ from cnpgen.world.path import PathWorld
 
 Array = NDArray[np.float64]
 
-MIN_SAMPLES = 8  # of a chunk after the join: fewer have no reliable velocity
+MIN_CHUNK_SAMPLES = 8  # of a chunk after the join: fewer have no reliable velocity
 MAX_DURATION = 1.2  # of a motion, in chunk lengths
 SAMPLE_ROUNDING = 1e-6  # samples
 
@@ -91,10 +91,10 @@ def horizon(stop_after: float | None, length: int, rate: float) -> int:
     if stop_after is None:
         return length
     samples = int(stop_after / MAX_DURATION * rate + SAMPLE_ROUNDING) + 1
-    if samples < MIN_SAMPLES:
-        least = MAX_DURATION * (MIN_SAMPLES - 1) / rate
+    if samples < MIN_CHUNK_SAMPLES:
+        least = MAX_DURATION * (MIN_CHUNK_SAMPLES - 1) / rate
         raise UsageError(
-            f"must be at least {least:.3g} s, the time of {MIN_SAMPLES} samples,"
+            f"must be at least {least:.3g} s, the time of {MIN_CHUNK_SAMPLES} samples,"
             f" got {stop_after:g}",
             argument="stop_after",
         )

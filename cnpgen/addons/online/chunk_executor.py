@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.addons.online.callers_clock import ROUNDING_S, CallersClock
 from cnpgen.addons.online.chunk_checks import (
-    MIN_SAMPLES,
+    MIN_CHUNK_SAMPLES,
     ChunkChecks,
     checked_errors,
     horizon,
@@ -106,7 +106,7 @@ class ChunkExecutor:
         self._record = as_record(problem)
         opened, self._robot = open_problem(self._record)
         self._rate, self._join = positive("rate", rate), positive("join", join)
-        self._length = integer("length", length, least=MIN_SAMPLES)
+        self._length = integer("length", length, least=MIN_CHUNK_SAMPLES)
         self._max_distance = positive("max_distance", max_distance)
         self._stale_after = positive("stale_after", stale_after)
         self._tracking_error = checked_errors(tracking_error, self._robot.n)
@@ -125,7 +125,7 @@ class ChunkExecutor:
         delay = (self._stale_after + self._join) * max_speed
         for skipped in range(int(delay * self._rate) + 2):
             length = min(self._length - skipped, self._horizon)
-            if length >= MIN_SAMPLES:
+            if length >= MIN_CHUNK_SAMPLES:
                 self._motions.prepare(length)
         self._lock = threading.RLock()
         self._runtime: PlanRuntime | None = None
@@ -246,10 +246,8 @@ class ChunkExecutor:
         if detail := self._checks.refuted(q):
             return self._refusal(SwitchOutcome.OUTLIER, now, detail)
         at, skipped = self._progress.next_sample(observed, now + self._join, self._rate)
-        if self._length - skipped < MIN_SAMPLES:
-            detail = (
-                f"{max(self._length - skipped, 0)}, expected at least {MIN_SAMPLES}"
-            )
+        if self._length - skipped < MIN_CHUNK_SAMPLES:
+            detail = f"{max(self._length - skipped, 0)}, expected at least {MIN_CHUNK_SAMPLES}"
             return self._refusal(SwitchOutcome.SHORT, at, detail)
         used = slice(skipped, skipped + self._horizon)
         motion = self._motions.motion(q[used], others[used], runtime.state_at(at))

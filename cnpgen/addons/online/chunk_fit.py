@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 BRAKING_SHARE = 0.24  # b, of the phase: D is 1.14 times the chunk
 RAMP_SHARE = 0.3  # of the phase, in which u changes from the running speed
 MIN_RUNNING_SPEED = 0.75  # of u: slower starts would end after 1.2 times the chunk
-DEGREE = 7
+CHUNK_DEGREE = 7
 RATE_POINTS = 20
 FIXED_POINTS = 3  # of the path at either end, by position, velocity and acceleration
 MIN_PATH_POINTS, MAX_PATH_POINTS = 12, 20
@@ -125,7 +125,7 @@ def chunk_fit(length: int, rate: float) -> ChunkFit:
         np.clip(round(length / SAMPLES_PER_POINT), MIN_PATH_POINTS, MAX_PATH_POINTS)
     )
     spec = TrajectorySpec(
-        degree=DEGREE, path_control_points=points, rate_control_points=RATE_POINTS
+        degree=CHUNK_DEGREE, path_control_points=points, rate_control_points=RATE_POINTS
     )
     fine = np.linspace(0, 1, 4001)
     phases = np.interp(np.arange(length) * step, chunk_times(fine, duration), fine)
@@ -133,7 +133,10 @@ def chunk_fit(length: int, rate: float) -> ChunkFit:
     inner = np.linspace(0, 1, 4 * points)
     weight = SMOOTHNESS / duration**3 * np.sqrt(length / len(inner))
     rows = np.concatenate(
-        [basis(phases, points, DEGREE), weight * basis(inner, points, DEGREE, 3)]
+        [
+            basis(phases, points, CHUNK_DEGREE),
+            weight * basis(inner, points, CHUNK_DEGREE, 3),
+        ]
     )
     ends = np.r_[:FIXED_POINTS, points - FIXED_POINTS : points]
     samples = min(END_SAMPLES, length)
@@ -184,8 +187,8 @@ def _decay(length: int, step: float) -> Array:
 
 def _greville(points: int) -> Array:
     """Return the phases at which control points act: means of the inner knots of their basis functions."""
-    knots = clamped_knots(points, DEGREE)
-    return np.array([knots[i + 1 : i + 1 + DEGREE].mean() for i in range(points)])
+    knots = clamped_knots(points, CHUNK_DEGREE)
+    return np.array([knots[i + 1 : i + 1 + CHUNK_DEGREE].mean() for i in range(points)])
 
 
 def _smooth_step(x: Array) -> Array:

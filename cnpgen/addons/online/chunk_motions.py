@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 POSITION_INSET_RAD = 5e-3  # of clipped positions: a smooth path overshoots its samples
 SPEED_STEP = 0.125  # between the speeds that are compared
-CHECK_INTERVALS = 95  # between the phases at which they are compared
+SPEED_CHECK_INTERVALS = 95  # between the phases at which they are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +112,7 @@ class ChunkMotions:
     def _grid(self, spec: TrajectorySpec) -> PhaseGrid:
         """Return the phases at which splines of a kind are compared with the limits; it is kept."""
         if (grid := self._grids.get(spec)) is None:
-            s, degree = chebyshev(CHECK_INTERVALS), spec.degree
+            s, degree = chebyshev(SPEED_CHECK_INTERVALS), spec.degree
             path, rate = (
                 np.stack([basis(s, points, degree, order) for order in range(orders)])
                 for points, orders in (
