@@ -106,7 +106,8 @@ def toppra(robot: Robot, state: SetPoint, chunk: Array, _: float) -> Executed | 
 def ruckig(robot: Robot, state: SetPoint, chunk: Array, _: float) -> Executed | None:
     """Move to the last sample at rest as fast as possible (Berscheid and Kroeger, 2021)."""
     still = np.zeros((1, robot.n))
-    boundary = Boundary(*(x[None] for x in (*state, chunk[-1])), still)
+    q, dq, ddq, goal = (x[None] for x in (*state, chunk[-1]))
+    boundary = Boundary(q, dq, ddq, goal, still)
     found = time_optimal_motion(load_ruckig(), robot, boundary)
     if found is None or found.dq is None or found.ddq is None:
         return None

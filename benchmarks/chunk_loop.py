@@ -45,7 +45,8 @@ class Policy:
             return None
         found = self.at(now + np.arange(LENGTH) / RATE)
         found += self._random.uniform(-NOISE_RAD, NOISE_RAD, found.shape)
-        return found + self._random.uniform(-OFFSET_RAD, OFFSET_RAD, found.shape[1])
+        found += self._random.uniform(-OFFSET_RAD, OFFSET_RAD, found.shape[1])
+        return found
 
 
 class Plant:

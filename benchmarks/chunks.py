@@ -106,7 +106,7 @@ def note(
     jumps = [np.abs(x - y).max() for x, y in zip(before, after, strict=True)]
     found.jumps = np.maximum(found.jumps, jumps)
     found.distances.append(join.distance)
-    found.plans.append(parts[-1].plan)
+    found.plans.append(parts[-1].plan)  # type: ignore[arg-type]
     found.cases.append((state, chunk[join.skipped :]))
 
 
