@@ -15,7 +15,7 @@ from cnpgen.judges.plans.joint_limits import joint_limits
 from cnpgen.problems.constraints.joint import JointPosition
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
-from cnpgen.schema.arguments import numbers
+from cnpgen.schema.arguments import number, numbers
 from cnpgen.world.path import PathWorld
 
 Array = NDArray[np.float64]
@@ -73,6 +73,15 @@ class ChunkChecks:
         """Return a limit that no motion within the noise of samples, shape (K, n), meets; empty if none is proven."""
         found = refuted_limits(self._limits, Trajectory(self._times, q), self._errors)
         return f"{found[0].margin.name}: {found[0].detail}" if found else ""
+
+
+def bounded(name: str, value: float, low: float, high: float) -> float:
+    """Return an argument as a number from a least to a largest value."""
+    if not low <= (found := number(name, value)) <= high:
+        raise UsageError(
+            f"must be from {low:g} to {high:g}, got {found:g}", argument=name
+        )
+    return found
 
 
 def checked_errors(tracking_error: ArrayLike, n: int) -> Array:

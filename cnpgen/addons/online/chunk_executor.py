@@ -14,6 +14,7 @@ from cnpgen.addons.online.callers_clock import ROUNDING_S, CallersClock
 from cnpgen.addons.online.chunk_checks import (
     MIN_CHUNK_SAMPLES,
     ChunkChecks,
+    bounded,
     checked_errors,
     horizon,
 )
@@ -32,6 +33,8 @@ from cnpgen.store.dataset_spec import StoredProblem
 Array = NDArray[np.float64]
 
 NOISE_RAD = 1e-3
+RATES_HZ, TIMES_S = (0.1, 1000.0), (1e-3, 60.0)  # ranges of options
+MAX_CHUNK_SAMPLES, MAX_SPEED = 1000, 10.0
 STOP_DELAY_S = 0.05  # of a stop after its cause: it is computed meanwhile
 GRID_STEP_S = 4e-3  # of sampled motions, whose knots are 0.1 s apart
 MAX_MEASURED_SPEED = 1.1  # fraction of the velocity limits
@@ -105,13 +108,15 @@ class ChunkExecutor:
     ) -> None:
         self._record = as_record(problem)
         opened, self._robot = open_problem(self._record)
-        self._rate, self._join = positive("rate", rate), positive("join", join)
-        self._length = integer("length", length, least=MIN_CHUNK_SAMPLES)
+        self._rate = bounded("rate", rate, *RATES_HZ)
+        self._join = bounded("join", join, *TIMES_S)
+        self._length = integer(
+            "length", length, least=MIN_CHUNK_SAMPLES, most=MAX_CHUNK_SAMPLES
+        )
         self._max_distance = positive("max_distance", max_distance)
-        self._stale_after = positive("stale_after", stale_after)
+        self._stale_after = bounded("stale_after", stale_after, *TIMES_S)
         self._tracking_error = checked_errors(tracking_error, self._robot.n)
-        if (max_speed := number("speed", speed)) < 1:
-            raise UsageError(f"must be at least 1, got {speed:g}", argument="speed")
+        max_speed = bounded("speed", speed, 1.0, MAX_SPEED)
         self._horizon = horizon(stop_after, self._length, self._rate)
         self._checks = ChunkChecks(
             opened,
@@ -123,10 +128,9 @@ class ChunkExecutor:
         self._motions = ChunkMotions(self._record, self._rate, max_speed)
         # The matrices of all lengths that delays leave.
         delay = (self._stale_after + self._join) * max_speed
-        for skipped in range(int(delay * self._rate) + 2):
-            length = min(self._length - skipped, self._horizon)
-            if length >= MIN_CHUNK_SAMPLES:
-                self._motions.prepare(length)
+        skipped = min(int(delay * self._rate) + 1, self._length - MIN_CHUNK_SAMPLES)
+        for left in range(self._length - skipped, self._length + 1):
+            self._motions.prepare(min(left, self._horizon))
         self._lock = threading.RLock()
         self._runtime: PlanRuntime | None = None
         self._latched: SwitchOutcome | None = SwitchOutcome.STOPPED
@@ -150,6 +154,8 @@ class ChunkExecutor:
             UsageError: The arm moves, or a stop has not ended.
         """
         q, dq = self._checked_state(measured)
+        if not np.isfinite(q).all():
+            raise UsageError(f"must be finite, got {q}", argument="measured")
         resting = np.abs(dq) <= MAX_RESTING_SPEED * self._robot.velocity_limit
         if not resting.all():  # nan does not rest
             joint = int(resting.argmin())

@@ -190,14 +190,16 @@ class PlanRuntime:
         with self._lock:
             return self._timeline.state_at(times)
 
+    @checked_arguments
     def plan_at(self, time: float) -> tuple[Plans | JoinedPlans | None, float]:
         """Return the plan whose path is followed at a time [s], and the time since its start at which it is there [s].
 
         They differ from those of the plan while the arm stops. At rest it is None.
         """
+        found = number("time", time)
         with self._lock:
-            part = self._timeline.part_at(time)
-        return part.plan, float(np.interp(time, part.edges, part.plan_times))
+            part = self._timeline.part_at(found)
+        return part.plan, float(np.interp(found, part.edges, part.plan_times))
 
     @checked_arguments
     def switch(self, plan: Executable | None, at: float) -> Switch:

@@ -426,10 +426,12 @@ def test_other_columns_are_retimed_by_the_same_map_and_never_lead():
 
 def test_wrong_options_and_shapes_are_refused(controller):
     for change, text in (
-        ({"speed": 0.5}, "speed must be at least 1"),
-        ({"rate": 0.0}, "rate must be positive"),
-        ({"join": -1.0}, "join must be positive"),
+        ({"speed": 0.5}, "speed must be from 1 to 10"),
+        ({"rate": 0.0}, "rate must be from 0.1 to 1000"),
+        ({"join": -1.0}, "join must be from 0.001 to 60"),
         ({"length": 7}, "length"),
+        ({"length": 10**6}, "length"),
+        ({"stale_after": 1e9}, "stale_after must be from"),
         ({"stop_after": 0.1}, "stop_after must be at least 0.28 s"),
         (
             {"tracking_error": [0.1, 0.2]},
