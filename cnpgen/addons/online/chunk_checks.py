@@ -84,6 +84,18 @@ def bounded(name: str, value: float, low: float, high: float) -> float:
     return found
 
 
+def checked_state(measured: tuple[ArrayLike, ArrayLike], n: int) -> tuple[Array, Array]:
+    """Return measured positions and velocities, shape (n,) each; they may be nan."""
+    state = [numbers("measured", values) for values in measured]
+    shapes = [values.shape for values in state]
+    if shapes != [(n,), (n,)]:
+        raise UsageError(
+            f"must be positions and velocities of shape ({n},), got shapes {shapes}",
+            argument="measured",
+        )
+    return state[0], state[1]
+
+
 def checked_errors(tracking_error: ArrayLike, n: int) -> Array:
     """Return positive tracking errors, shape (n,)."""
     errors = numbers("tracking_error", tracking_error)

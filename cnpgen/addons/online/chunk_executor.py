@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,18 +15,21 @@ from cnpgen.addons.online.chunk_checks import (
     ChunkChecks,
     bounded,
     checked_errors,
+    checked_state,
     horizon,
 )
 from cnpgen.addons.online.chunk_motions import ChunkMotion, ChunkMotions
 from cnpgen.addons.online.chunk_progress import ChunkProgress
 from cnpgen.addons.online.plan_runtime import PlanRuntime, positive
+from cnpgen.addons.online.set_points import ChunkSetPoint
 from cnpgen.addons.online.switches import ChunkJoin, SwitchOutcome
 from cnpgen.errors import UsageError
 from cnpgen.machine.threads import one_thread
+from cnpgen.plans.plausible import check_units_of_states
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_record, open_problem
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.arguments import integer, number, numbers
+from cnpgen.schema.arguments import concerning, integer, number
 from cnpgen.store.dataset_spec import StoredProblem
 
 Array = NDArray[np.float64]
@@ -39,15 +41,6 @@ STOP_DELAY_S = 0.05  # of a stop after its cause: it is computed meanwhile
 GRID_STEP_S = 4e-3  # of sampled motions, whose knots are 0.1 s apart
 MAX_MEASURED_SPEED = 1.1  # fraction of the velocity limits
 MAX_RESTING_SPEED = 0.05  # fraction of the velocity limits, of an arm that is at rest
-
-
-class ChunkSetPoint(NamedTuple):
-    """Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (n,), and the other columns, (D - n,)."""
-
-    q: Array
-    dq: Array
-    ddq: Array
-    others: Array
 
 
 class ChunkExecutor:
@@ -153,9 +146,13 @@ class ChunkExecutor:
         Raises:
             UsageError: The arm moves, or a stop has not ended.
         """
-        q, dq = self._checked_state(measured)
+        q, dq = checked_state(measured, self._robot.n)
         if not np.isfinite(q).all():
             raise UsageError(f"must be finite, got {q}", argument="measured")
+        with concerning("measured"):
+            check_units_of_states(
+                self._robot, {"start_q": q[None], "start_dq": dq[None]}, noun="state"
+            )
         resting = np.abs(dq) <= MAX_RESTING_SPEED * self._robot.velocity_limit
         if not resting.all():  # nan does not rest
             joint = int(resting.argmin())
@@ -230,7 +227,7 @@ class ChunkExecutor:
             UsageError: A shape is wrong, or the executor was never reset.
         """
         q, others = self._checks.read(chunk)
-        state = self._checked_state(measured)
+        state = checked_state(measured, self._robot.n)
         now = number("time", time)
         observed = number("observed_at", observed_at)
         runtime, inner = self._read_clock(now, is_step=True)
@@ -339,29 +336,10 @@ class ChunkExecutor:
         self, runtime: PlanRuntime, time: float, measured: tuple[Array, Array]
     ) -> SwitchOutcome | None:
         """Return TRACKING if a measured state is too far from the set point or too fast; None otherwise."""
-        q, dq = measured
-        error = np.abs(q - runtime.state_at(time).q)
-        follows = (error <= self._tracking_error).all()  # nan does not follow
-        fastest = MAX_MEASURED_SPEED * self._robot.velocity_limit
-        return (
-            None
-            if follows and (np.abs(dq) <= fastest).all()
-            else SwitchOutcome.TRACKING
-        )
-
-    def _checked_state(
-        self, measured: tuple[ArrayLike, ArrayLike]
-    ) -> tuple[Array, Array]:
-        """Return measured positions and velocities, shape (n,) each; they may be nan."""
-        n = self._robot.n
-        state = [numbers("measured", values) for values in measured]
-        if [values.shape for values in state] != [(n,), (n,)]:
-            raise UsageError(
-                f"must be positions and velocities of shape ({n},),"
-                f" got {[values.shape for values in state]}",
-                argument="measured",
-            )
-        return state[0], state[1]
+        error = np.abs(measured[0] - runtime.state_at(time).q)
+        speed = np.abs(measured[1]) / self._robot.velocity_limit
+        follows = (error <= self._tracking_error) & (speed <= MAX_MEASURED_SPEED)
+        return None if follows.all() else SwitchOutcome.TRACKING  # nan does not follow
 
     def _refusal(
         self, outcome: SwitchOutcome, at: float, detail: str = ""

@@ -37,6 +37,15 @@ class SetPoint(NamedTuple):
     ddq: Array
 
 
+class ChunkSetPoint(NamedTuple):
+    """Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (n,), and the other columns, (D - n,)."""
+
+    q: Array
+    dq: Array
+    ddq: Array
+    others: Array
+
+
 @dataclass(frozen=True, eq=False)
 class SampledMotion:
     """A motion from a start time on, then rest at its end.

@@ -347,6 +347,8 @@ def test_a_new_executor_waits_for_reset(shared):
         fresh.reset((HOME, [0, 0, 0.3, 0, 0, 0, 0]))
     with pytest.raises(UsageError, match="at rest"):
         fresh.reset((HOME, np.full(7, np.nan)))
+    with pytest.raises(UsageError, match="deg"):
+        fresh.reset((np.degrees(HOME), np.zeros(7)))
     with pytest.raises(UsageError, match="finite"):
         fresh.reset((np.full(7, np.nan), np.zeros(7)))
     assert shared.stopped is SwitchOutcome.STOPPED
