@@ -17,6 +17,7 @@ from cnpgen.store.intact import RERUN_HINT
 from cnpgen.store.layout import SPECIFICATION, STATS
 from cnpgen.store.manifest import data_fingerprint
 from cnpgen.store.reader import open_dataset
+from cnpgen.store.remote import local_folder
 from cnpgen.store.shard import storage_dtype
 from cnpgen.store.statistics import FieldStatistics, are_of, statistics_from_json
 
@@ -33,21 +34,23 @@ def load_dataset(
     is read for the first time.
 
     Args:
-        folder: Folder of the dataset.
+        folder: Folder of the dataset, or the URL of a published one as text:
+            ``hf://datasets/USER/NAME@REVISION``, ``https://``, ``s3://`` or ``gs://``.
+            It is downloaded once, into a local cache.
         allow_incomplete: Whether to open the existing shards of a dataset that is
             unfinished or has missing shards.
         verify: Whether to verify the sha256 of every shard when it is read for the
             first time.
 
     Raises:
-        UsageError: The folder does not exist or contains no dataset, or an option is
-            not a bool.
+        UsageError: The folder does not exist or contains no dataset, no installed
+            package reads the URL, or an option is not a bool.
         DatasetError: The dataset is unfinished, or a part is missing or damaged.
-        MachineError: A file cannot be read.
+        MachineError: A file cannot be read, or a server cannot be reached.
     """
     verify = flag("verify", verify)
     stored = open_dataset(
-        Path(folder), allow_incomplete=flag("allow_incomplete", allow_incomplete)
+        Path(local_folder(folder)), allow_incomplete=flag("allow_incomplete", allow_incomplete)
     )
     folder = stored.folder.absolute()  # the working folder may change
     stored = replace(stored, folder=folder)
