@@ -41,7 +41,8 @@ COMMANDS_INTRODUCTION = """\
 All commands with their arguments and options. `python docs/generate.py` writes this page from the parsers.
 `cnpgen --help` and `cnpgen COMMAND --help` print the same texts.
 
-Every command writes data to stdout and everything else to stderr. `--debug` shows the traceback of an error."""
+Every command writes data to stdout and everything else to stderr. `-q` or `--quiet` omits progress, notices and summaries.
+`-v`, `--verbose` or `--debug` prints messages with their times, and the traceback of an error."""
 
 NAMES_INTRODUCTION = """\
 # Python interface
@@ -147,7 +148,7 @@ def _tables(command: argparse.ArgumentParser) -> Iterator[str]:
     options = [
         action
         for action in shown
-        if action.option_strings and action.dest not in {"help", "debug"}
+        if action.option_strings and action.dest not in {"help", "verbose", "quiet"}
     ]
     for head, actions in (("argument", arguments), ("option", options)):
         if actions:

@@ -85,9 +85,6 @@ def add_refine_options(parser: Parser) -> None:
         action="store_true",
         help="replace OUT, and discard another run's OUT.part",
     )
-    parser.add_argument(
-        "--quiet", action="store_true", help="no progress and no summary"
-    )
     add_json(parser)
 
 

@@ -50,7 +50,8 @@ def load_dataset(
     """
     verify = flag("verify", verify)
     stored = open_dataset(
-        Path(local_folder(folder)), allow_incomplete=flag("allow_incomplete", allow_incomplete)
+        Path(local_folder(folder)),
+        allow_incomplete=flag("allow_incomplete", allow_incomplete),
     )
     folder = stored.folder.absolute()  # the working folder may change
     stored = replace(stored, folder=folder)

@@ -57,7 +57,15 @@ def test_every_option_of_every_command_is_on_the_page(generator: ModuleType) -> 
     assert len(commands) >= 20
     for name, command in commands.items():
         section = page.split(f"## `cnpgen {name}`\n")[1].split("\n## ")[0]
-        for option in set(command._option_string_actions) - {"-h", "--help", "--debug"}:
+        for option in set(command._option_string_actions) - {
+            "-h",
+            "--help",
+            "-v",
+            "--verbose",
+            "--debug",
+            "-q",
+            "--quiet",
+        }:
             assert re.search(rf"`([^`]*, )?{option}[ `,]", section), (name, option)
 
 
