@@ -19,7 +19,6 @@ from cnpgen.cli.commands import (
     load_alternatives,
     load_command,
 )
-from cnpgen.cli.completion import complete_words
 from cnpgen.cli.interruption import Terminated, exit_code, interruptible
 from cnpgen.cli.parser import Parser, add_command, add_common
 from cnpgen.cli.terminal import printing_safely
@@ -32,6 +31,7 @@ from cnpgen.errors import (
 )
 from cnpgen.machine import versions
 from cnpgen.machine.threads import prefer_one_thread
+from cnpgen.schema import addons
 
 _DESCRIPTION = "Generate and verify datasets for kinodynamic motion planning, train planners and optimize plans."
 
@@ -70,6 +70,7 @@ stdout is data, stderr everything else. Exit codes:
   143  terminated (SIGTERM, as SLURM and Docker send it); resumable
 """
 
+COMPLETION = "cnpgen.completion"  # functions that print completions and end the process
 _VERBOSE = {"-v", "--verbose", "--debug"}  # options that show tracebacks
 BROKEN_PIPE = 141  # 128 + SIGPIPE, as shells have it
 _OPTIONS = {
@@ -125,7 +126,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(words: list[str], given: argparse.Namespace) -> int:
     """Parse the words into ``given`` and run the command."""
     if "_ARGCOMPLETE" in os.environ:  # set by the functions of argcomplete in the shell
-        complete_words(build_parser())
+        for entry in addons.installed(COMPLETION):
+            entry.load()(build_parser())
     first = next((word for word in words if not word.startswith("-")), "")
     parser = build_parser([first] if first and is_command(first) else None)
     for before, word in zip(["cnpgen", *words], words, strict=False):

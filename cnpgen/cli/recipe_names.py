@@ -85,10 +85,10 @@ def _shipped(*kinds: str) -> list[str]:
 
 def _recipe_or_path(kinds: tuple[str, ...], text: str) -> str:
     """Read a path, or the name of a recipe of one of several kinds."""
+    from cnpgen.loader.remote import local_folder
     from cnpgen.store.files.atomic import check_readable
     from cnpgen.store.files.kind import kind_of_content
     from cnpgen.store.paths import similar_path
-    from cnpgen.store.remote import local_folder
 
     text = str(local_folder(text))
     names, path = _shipped(*kinds), Path(text)
@@ -158,8 +158,8 @@ def model(text: str) -> str:
 
 def dataset(text: str) -> Path:
     """Read the folder of a dataset, or its URL: the folder of its copy."""
+    from cnpgen.loader.remote import local_folder
     from cnpgen.store.paths import require_dataset
-    from cnpgen.store.remote import local_folder
 
     _refuse_shipped(text)
     return require_dataset(local_folder(text))
@@ -167,8 +167,8 @@ def dataset(text: str) -> Path:
 
 def present(text: str) -> Path:
     """Read the path of a file or a folder, or the URL of a dataset: the folder of its copy."""
+    from cnpgen.loader.remote import local_folder
     from cnpgen.store.paths import require_path
-    from cnpgen.store.remote import local_folder
 
     _refuse_shipped(text)
     path = Path(local_folder(text))

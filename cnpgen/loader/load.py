@@ -6,6 +6,7 @@ from pathlib import Path
 
 from cnpgen.errors import DatasetError
 from cnpgen.loader.dataset import Dataset
+from cnpgen.loader.remote import local_folder
 from cnpgen.loader.shard_reader import ShardReader, problem_obstacles
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import flag
@@ -17,7 +18,6 @@ from cnpgen.store.intact import RERUN_HINT
 from cnpgen.store.layout import SPECIFICATION, STATS
 from cnpgen.store.manifest import data_fingerprint
 from cnpgen.store.reader import open_dataset
-from cnpgen.store.remote import local_folder
 from cnpgen.store.shard import storage_dtype
 from cnpgen.store.statistics import FieldStatistics, are_of, statistics_from_json
 
