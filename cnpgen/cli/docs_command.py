@@ -100,8 +100,8 @@ def list_pages() -> dict[str, Path]:
 
 def _rendered(kind: str, folder: Path) -> list[Path]:
     """Return the paths of the pages of a kind that are made from the code; on the site only, there are such files."""
-    names = ["keys", *(entry.name for entry in addons.installed(PAGES))]
-    return [folder / kind / f"{name}.md" for name in names if kind == "reference"]
+    names = [entry.name for entry in addons.installed(PAGES) if kind == "reference"]
+    return [folder / kind / f"{name}.md" for name in names]
 
 
 def page_name(text: str, pages: dict[str, Path]) -> str:
@@ -144,13 +144,18 @@ def page_text(page: Path) -> str:
     """Return the text of a page of ``list_pages``, from its file or from the code."""
     if page not in _rendered(page.parent.name, docs_folder()):
         return page.read_text(encoding="utf-8")
-    if page.stem == "keys":
-        from cnpgen.cli.describe_keys import describe_keys, recipe_types
+    return rendered_page(page.stem)
 
-        return describe_keys(tuple(recipe_types())) + "\n"
-    entry = addons.find(PAGES, page.stem)
-    assert entry is not None, page
-    return f"{addons.load_entry(entry, f'the page {page.stem!r}')()}\n"
+
+def rendered_page(name: str) -> str:
+    """Return a page that is made from the code.
+
+    Raises:
+        MissingAddonError: This installation lacks the add-on that makes it.
+    """
+    entry = addons.find(PAGES, name)
+    assert entry is not None, name
+    return f"{addons.load_entry(entry, f'the page {name!r}')()}\n"
 
 
 def _list(pages: dict[str, Path], *, as_json: bool) -> None:

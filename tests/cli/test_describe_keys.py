@@ -7,7 +7,6 @@ import re
 import pytest
 
 from cnpgen.cli.describe_keys import (
-    describe_keys,
     describe_kind,
     keys_to_dict,
     kind_summary,
@@ -69,7 +68,7 @@ def test_the_page_of_all_keys_is_what_the_command_prints(capsys):
 
 
 def test_every_key_of_every_table_is_on_the_page_with_a_sentence():
-    page = describe_keys(tuple(recipe_types()))
+    page = page_text(list_pages()["keys"])
     named = [
         *recipe_types().values(),
         *(registry.load(group, name) for group, name in KINDS),
@@ -98,7 +97,7 @@ def test_every_key_of_every_table_is_on_the_page_with_a_sentence():
 
 
 def test_no_default_is_a_python_object():
-    page = describe_keys(tuple(recipe_types()))
+    page = page_text(list_pages()["keys"])
     assert "| `parameters` | a table | those of its keys |" in page
     assert not re.search(r"\w\(\w+=", page)
 
@@ -106,7 +105,7 @@ def test_no_default_is_a_python_object():
 def test_every_row_of_every_table_has_four_cells():
     rows = [
         line
-        for line in describe_keys(tuple(recipe_types())).splitlines()
+        for line in page_text(list_pages()["keys"]).splitlines()
         if line.startswith("|")
     ]
     assert len(rows) > 150
@@ -114,7 +113,7 @@ def test_every_row_of_every_table_has_four_cells():
 
 
 def test_a_key_is_described_with_unit_bounds_and_default():
-    page = describe_keys(["problem"])
+    page = page_text(list_pages()["keys"])
     assert "| `velocity_scale` | a number, at least 0.001, at most 1 | 1 |" in page
     assert "| `radius` | a length [m], at least 1e-06 | none |" in page
     assert "| `urdf` | a string | required |" in page
