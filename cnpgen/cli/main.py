@@ -61,7 +61,7 @@ documentation: 'cnpgen docs' lists the pages, 'cnpgen docs PAGE' prints one
 
 stdout is data, stderr everything else. Exit codes:
   0    done
-  1    the answer is no: a dataset or a file is damaged, unfinished or of another problem; samples or plans are invalid
+  1    the check failed: a dataset or a file is damaged, unfinished or of another problem; samples or plans are invalid
   2    a wrong argument, such as a missing path or one of another kind, or an error in a recipe
   3    the machine: no permission to read or write a path, a full disk, a broken library; also an internal
        error of cnpgen
