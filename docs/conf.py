@@ -43,12 +43,20 @@ include_patterns = [
     "pipelines/*.md",
     "problems/*.md",
 ]
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",  # links from names to their source
+    "sphinx_copybutton",
+]
+copybutton_exclude = ".linenos, .gp"
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 myst_heading_anchors = 4  # the anchors of headings are GitHub's
 smartquotes = False  # they would change --n
 highlight_language = "none"  # blocks without a language
 autodoc_typehints_format = "short"
+maximum_signature_line_length = 60  # longer ones have a parameter per line
 autodoc_mock_imports = list(BRIDGES)  # the pages of the bridges need no framework
 napoleon_use_ivar = True  # attributes in docstrings describe those that autodoc lists
 linkcheck_ignore = [
@@ -78,6 +86,7 @@ OTHERS = (
     "README",
     "CHANGELOG",
     "CONTRIBUTING",
+    "CODE_OF_CONDUCT",
     "SECURITY",
     "datasets/**",
     "pipelines/**",
