@@ -35,6 +35,8 @@ _BOX, _CYLINDER = KINDS.index("box"), KINDS.index("cylinder")
 
 def hull_vertices(corners: Array) -> Array:
     """Return corners, shape (V, 3), by coordinates and padded with the first one, shape (3 * padded count,)."""
+    # All lanes of a vector are compared in ``furthest_vertex``; a repeated vertex never
+    # wins.
     padding = np.repeat(corners[:1], -len(corners) % LANES, axis=0)
     return np.concatenate([corners, padding]).T.ravel()
 
@@ -47,6 +49,7 @@ def bounding_boxes(bodies: Bodies, centers: Array, half: Array) -> Array:
     """
     count = bodies.shape[1]
     boxes = np.zeros((len(bodies), 16, count + -count % LANES))
+    # Padding is so far away that its bounding box is never near a capsule.
     boxes[:, :3] = PADDING_DISTANCE_M
     rows = np.concatenate(
         [centers, half, bodies["rotation"], bodies["radius"][..., None]], axis=-1
@@ -61,9 +64,12 @@ def primitive_bodies(obstacles: Primitives, first: int) -> tuple[Bodies, Array, 
     blocks = [hull_vertices(mesh.corners) for mesh in obstacles.meshes]
     ends = np.cumsum([first, *map(len, blocks)])
     box, cylinder, mesh = kinds == _BOX, kinds == _CYLINDER, kinds >= MESH
+    # Spheres and capsules: a segment along z, of length 0 or 2 h, with a radius around
+    # it.
     rounded = (kinds >= 0) & ~(box | cylinder | mesh)
     bodies = np.zeros(kinds.shape, BODY)
     bodies["kind"] = np.where(mesh, HULL, np.where(cylinder, CYLINDER, BOX))
+    # Absent bodies are boxes of size 0 at the padding distance.
     centers = np.where((kinds >= 0)[..., None], obstacles.centers, PADDING_DISTANCE_M)
     bodies["position"], bodies["rotation"] = (
         centers,
@@ -151,6 +157,7 @@ def _fill(body: Any, obstacle: Obstacle, numbers: Array) -> tuple[Array, Array]:
             corners = corners_of(obstacle.mesh)
             low, high = corners.min(axis=0), corners.max(axis=0)
             body["position"], body["rotation"] = center, rotation.ravel()
+            # The bounding box of a mesh is that of its corners in the mesh's own frame.
             return center + rotation @ (low + high) / 2, (high - low) / 2
         else:
             length = math.hypot(*rest[:3])
