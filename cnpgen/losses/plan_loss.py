@@ -128,13 +128,8 @@ class PlanLoss:
         _check_choice("form", form, FORMS)
         check_quadrature(rule, nodes)
         check_memory("nodes", nodes, nodes)
-        self.problem, self.dtype, self.nodes, self.rule, self.form = (
-            as_problem(problem),
-            dtype,
-            nodes,
-            rule,
-            form,
-        )
+        self.problem, self.dtype, self.form = as_problem(problem), dtype, form
+        self.nodes, self.rule = nodes, rule
         self.terms = ("time", *constraint_terms(self.problem))
         self.budgets = np.array(
             [constraint.budget for constraint in self.problem.constraint]
@@ -146,6 +141,7 @@ class PlanLoss:
             _checked_margins(margins).tightening(self.terms[1:]).astype(dtype)
         )
         self._robot = load_robot(self.problem)
+        # Samples that place obstacles have them in ``HullLoss``: the kernels omit them.
         chosen, folder = choose_backend(backend)
         folder = folder if cache_folder is None else Path(cache_folder)
         self._kernels = problem_kernels(
@@ -194,53 +190,53 @@ class PlanLoss:
             self.problem, path, rate, obstacle_poses, start_tip, dtype=self.dtype
         )
         checked = self.checked_weights(weights)
-        orders = self.problem.path_orders
-        table = basis_table(
-            self.problem.trajectory,
-            self.rule,
-            self.nodes,
-            shift,
-            self.dtype,
-            orders=orders,
+        terms, path_gradient, rate_gradient = self._evaluate(
+            batch, checked, shift=shift, gradient=gradient
         )
-        n, selected = len(batch), slice(None) if gradient else slice(0)
-        terms = np.empty((n, len(self.terms)), self.dtype)
-        path_gradient, rate_gradient = (
+        with np.errstate(all="ignore"):
+            total = terms[:, 0] + terms[:, 1:] @ checked
+        return LossValue(total, terms, path_gradient, rate_gradient)
+
+    def _evaluate(
+        self, batch: PlanBatch, weights: Array, *, shift: float, gradient: bool
+    ) -> tuple[Array, Array, Array]:
+        """Return terms and gradients of a batch, block by block; the gradients are empty if they are not requested."""
+        spec, orders = self.problem.trajectory, self.problem.path_orders
+        table = basis_table(
+            spec, self.rule, self.nodes, shift, self.dtype, orders=orders
+        )
+        selected = slice(None) if gradient else slice(0)
+        arrays = (
+            np.empty((len(batch), len(self.terms)), self.dtype),
             np.empty_like(batch.path[selected]),
             np.empty_like(batch.rate[selected]),
         )
-
         # Hulls, kernel and bounds are built on first use: here, before threads start.
         hulls, varying = self._hulls, self._varying(batch, gradient=gradient)
 
         def evaluate_block(rows: slice) -> None:
             part = batch[rows]
-            with (
-                one_thread(),
-                np.errstate(all="ignore"),
-            ):  # an overflow affects its own plan only
+            # An overflow affects its own plan only.
+            with one_thread(), np.errstate(all="ignore"):
                 results = self._integrate(
-                    part, checked, table, varying, gradient=gradient
+                    part, weights, table, varying, gradient=gradient
                 )
                 if hulls is not None:
-                    hulls.add(results, part, checked, table, shift=shift)
-                terms[rows], path_gradient[rows], rate_gradient[rows] = (
-                    part.samples(values) for values in results
-                )
+                    hulls.add(results, part, weights, table, shift=shift)
+                for array, values in zip(arrays, results, strict=True):
+                    array[rows] = part.samples(values)
 
-        self._run(evaluate_block, n)
-        with np.errstate(all="ignore"):
-            total = terms[:, 0] + terms[:, 1:] @ checked
-        return LossValue(total, terms, path_gradient, rate_gradient)
+        self._run(evaluate_block, len(batch))
+        return arrays
 
     def _run(self, evaluate_block: Callable[[slice], None], n: int) -> None:
         """Evaluate blocks of plans.
 
         Compiled kernels release Python's lock, so that threads run in parallel.
         """
-        share = (
-            -(-n // (self._threads * MAX_VECTOR_LANES)) * MAX_VECTOR_LANES
-        )  # whole vectors
+        # Every thread gets a share, in blocks that fit the cache.
+        # Whole vectors.
+        share = -(-n // (self._threads * MAX_VECTOR_LANES)) * MAX_VECTOR_LANES
         size = (
             PLANS_PER_BLOCK
             if self._threads == 1
@@ -268,6 +264,7 @@ class PlanLoss:
         self, batch: PlanBatch, *, gradient: bool
     ) -> list[tuple[Constraint, Condition]]:
         """Return the time-varying bounds; none if the kernel or the plans do without them."""
+        # A kernel without such bounds has an empty argument.
         used = self._kernel(gradient=gradient).tape.inputs[
             relaxation_argument(self.problem)
         ]
@@ -286,15 +283,11 @@ class PlanLoss:
 
         The gradients are empty if they are not requested.
         """
-        nodes, orders, (points, n) = (
-            len(table.s),
-            self.problem.path_orders,
-            batch.path.shape[1:],
-        )
-        rates, poses = (
-            batch.lanes(batch.rate),
-            batch.obstacle_poses[:, : self.problem.for_planning.scene_width],
-        )
+        nodes, orders = len(table.s), self.problem.path_orders
+        points, n = batch.path.shape[1:]
+        # Poses of obstacles that samples place are no argument of the kernels.
+        poses = batch.obstacle_poses[:, : self.problem.for_planning.scene_width]
+        rates = batch.lanes(batch.rate)
         lanes = rates.shape[1]
         # Splines at all nodes by one product: rows are p, p', p'' (orders x nodes), columns
         # are joints x samples.
@@ -309,11 +302,9 @@ class PlanLoss:
         )  # fmt: skip
         if not gradient:
             self._values(*arguments, out=[terms])
-            return (
-                terms,
-                np.empty((points, n, 0), self.dtype),
-                np.empty((len(batch.rate[0]), 0), self.dtype),
-            )
+            empty = ((points, n, 0), (batch.rate.shape[1], 0))
+            by_path, by_rate = (np.empty(shape, self.dtype) for shape in empty)
+            return terms, by_path, by_rate
         by_path, by_rate = np.empty_like(path), np.empty_like(rate)
         self._gradient(*arguments, out=[terms, *by_path.swapaxes(1, 2), by_rate])
         # Chain rule through the splines, which are linear in the control points: the
