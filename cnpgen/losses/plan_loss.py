@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -40,7 +40,14 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.arguments import check_memory, flag, integer, number, numbers
+from cnpgen.schema.arguments import (
+    check_choice,
+    check_memory,
+    flag,
+    integer,
+    number,
+    numbers,
+)
 from cnpgen.store.dataset_spec import StoredProblem
 
 Array = NDArray[Any]
@@ -124,8 +131,8 @@ class PlanLoss:
         threads: int = 1,
     ) -> None:
         self._threads = integer("threads", threads, least=1, most=MAX_LOSS_THREADS)
-        _check_choice("dtype", dtype, DTYPES)
-        _check_choice("form", form, FORMS)
+        check_choice("dtype", dtype, DTYPES)
+        check_choice("form", form, FORMS)
         check_quadrature(rule, nodes)
         check_memory("nodes", nodes, nodes)
         self.problem, self.dtype, self.form = as_problem(problem), dtype, form
@@ -270,6 +277,18 @@ class PlanLoss:
         ]
         return self._time_varying if used and batch.start_tip is not None else []
 
+    def _splines(self, batch: PlanBatch, table: BasisTable) -> tuple[Array, Array]:
+        """Return the path, shape (orders, nodes, n, N), and the rate, shape (orders - 1, nodes, N)."""
+        nodes, orders = len(table.s), self.problem.path_orders
+        points, n = batch.path.shape[1:]
+        rates = batch.lanes(batch.rate)
+        # Splines at all nodes by one product: rows are p, p', p'' (orders x nodes), columns
+        # are joints x samples.
+        path = (table.path @ batch.lanes(batch.path).reshape(points, -1)).reshape(
+            orders, nodes, n, -1
+        )
+        return path, (table.rate @ rates).reshape(orders - 1, nodes, -1)
+
     def _integrate(
         self,
         batch: PlanBatch,
@@ -283,18 +302,11 @@ class PlanLoss:
 
         The gradients are empty if they are not requested.
         """
-        nodes, orders = len(table.s), self.problem.path_orders
         points, n = batch.path.shape[1:]
         # Poses of obstacles that samples place are no argument of the kernels.
         poses = batch.obstacle_poses[:, : self.problem.for_planning.scene_width]
-        rates = batch.lanes(batch.rate)
-        lanes = rates.shape[1]
-        # Splines at all nodes by one product: rows are p, p', p'' (orders x nodes), columns
-        # are joints x samples.
-        path = (table.path @ batch.lanes(batch.path).reshape(points, -1)).reshape(
-            orders, nodes, n, lanes
-        )
-        rate = (table.rate @ rates).reshape(orders - 1, nodes, lanes)
+        path, rate = self._splines(batch, table)
+        lanes = rate.shape[-1]
         terms = np.zeros((len(self.terms), lanes), self.dtype)
         arguments = (
             *path.swapaxes(1, 2), rate, batch.lanes(poses),
@@ -309,11 +321,11 @@ class PlanLoss:
         self._gradient(*arguments, out=[terms, *by_path.swapaxes(1, 2), by_rate])
         # Chain rule through the splines, which are linear in the control points: the
         # transposed products.
-        by_points = table.path.T @ by_path.reshape(orders * nodes, -1)
+        by_points = table.path.T @ by_path.reshape(len(table.path), -1)
         return (
             terms,
             by_points.reshape(points, n, lanes),
-            table.rate.T @ by_rate.reshape((orders - 1) * nodes, -1),
+            table.rate.T @ by_rate.reshape(len(table.rate), -1),
         )
 
     def _relaxation(
@@ -430,14 +442,6 @@ class PlanLoss:
     @cached_property
     def _time_varying(self) -> list[tuple[Constraint, Condition]]:
         return time_varying_conditions(self.problem, self._robot, self.form)
-
-
-def _check_choice(name: str, value: object, known: Sequence[str]) -> None:
-    if value not in known:
-        raise UsageError(
-            f"must be one of {', '.join(known)}, got {value!r}{nearest(str(value), known)}",
-            argument=name,
-        )
 
 
 def _weight(name: str, value: Any) -> float:

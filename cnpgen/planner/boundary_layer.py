@@ -28,7 +28,7 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.arguments import integer, number, numbers
+from cnpgen.schema.arguments import check_choice, integer, number, numbers
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.trajectory.boundary import Boundary
 
@@ -94,16 +94,8 @@ class BoundaryLayer:
         )
         line_steps = integer("line_projection_steps", line_projection_steps, least=0)
         self.projection_steps = integer("projection_steps", projection_steps, least=0)
-        if expected_time not in EXPECTED_TIMES:
-            raise UsageError(
-                f"must be one of {', '.join(EXPECTED_TIMES)}, got {expected_time!r}",
-                argument="expected_time",
-            )
-        if goal_acceleration not in FIXED_AT_GOAL:
-            raise UsageError(
-                f"must be one of {', '.join(FIXED_AT_GOAL)}, got {goal_acceleration!r}",
-                argument="goal_acceleration",
-            )
+        check_choice("expected_time", expected_time, EXPECTED_TIMES)
+        check_choice("goal_acceleration", goal_acceleration, FIXED_AT_GOAL)
         self._config = ModelConfig(
             path_scale=self.path_scale,
             line_projection_steps=line_steps,

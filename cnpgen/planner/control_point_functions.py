@@ -280,10 +280,10 @@ def clipped_to_limits(robot: Robot, point: Vec, step: Vec) -> Vec:
     ]
 
 
-def _gauss_newton(
-    equality: Any, q: list[Vec], obstacle_poses: Vec, inner: Array, response: Array
-) -> list[Vec]:
-    """Return the change of the interior control points that cancels the residuals at the phases to first order."""
+def _linearized(
+    equality: Any, q: list[Vec], obstacle_poses: Vec
+) -> tuple[Vec, list[Vec], list[int]]:
+    """Return residual, row of the Jacobian and phase of every equation at every phase."""
     import casadi as ca
 
     residuals, rows, phases = [], [], []
@@ -296,6 +296,16 @@ def _gauss_newton(
             residuals.append(residual[equation])
             rows.append(ca.vertsplit(columns[equation, :].T))
             phases.append(phase)
+    return residuals, rows, phases
+
+
+def _gauss_newton(
+    equality: Any, q: list[Vec], obstacle_poses: Vec, inner: Array, response: Array
+) -> list[Vec]:
+    """Return the change of the interior control points that cancels the residuals at the phases to first order."""
+    import casadi as ca
+
+    residuals, rows, phases = _linearized(equality, q, obstacle_poses)
     # Step of the control points: dC = -M N^T G^T lambda with the basis N at the phases,
     # the mobility M = (D^T D + w I)^-1 of second differences D, and the Jacobians G.
     # The multipliers solve (G N M N^T G^T + damping I) lambda = residuals.

@@ -159,17 +159,21 @@ def solve_pose_ik(
         J = J * np.repeat([1.0, METERS_PER_RADIAN], 3)[:, None]
         if free is not None:
             error, J = _without_free(error, J, rotations, free)
-        # Levenberg-Marquardt: dq = J^T (J J^T + lambda I)^-1 e with lambda relative to
-        # |e|^2.
-        damping = POSE_DAMPING * np.square(error).sum(axis=1) + 1e-9
-        square = J @ J.swapaxes(1, 2) + damping[:, None, None] * np.eye(6)
-        move = (J.swapaxes(1, 2) @ np.linalg.solve(square, error[..., None]))[..., 0].T
-        # The whole step is shortened, so that its direction stays.
-        move *= np.minimum(
-            1.0, MAX_POSE_STEP_RAD / np.maximum(np.abs(move).max(axis=0), 1e-12)
-        )
-        q = np.where(met, q, np.clip(q + move, low, high))
+        q = np.where(met, q, np.clip(q + _damped_step(error, J), low, high))
     return q, met
+
+
+def _damped_step(error: Array, J: Array) -> Array:
+    """Return one step of Levenberg and Marquardt from errors (K, 6) and Jacobians (K, 6, n), shape (n, K)."""
+    # dq = J^T (J J^T + lambda I)^-1 e with lambda relative to |e|^2.
+    damping = POSE_DAMPING * np.square(error).sum(axis=1) + 1e-9
+    square = J @ J.swapaxes(1, 2) + damping[:, None, None] * np.eye(6)
+    move = (J.swapaxes(1, 2) @ np.linalg.solve(square, error[..., None]))[..., 0].T
+    # The whole step is shortened, so that its direction stays.
+    move *= np.minimum(
+        1.0, MAX_POSE_STEP_RAD / np.maximum(np.abs(move).max(axis=0), 1e-12)
+    )
+    return move
 
 
 def _without_free(

@@ -215,6 +215,14 @@ class _Measurements:
             self.conditions[key].conditions.append(condition)
             self.conditions[key].places.append((row, end))
 
+    def add_hit(self, world: World, row: int, columns: Mapping[str, Array]) -> None:
+        """Record what the hitting speeds of a row need of the world at its goal, along the axes of the table."""
+        along_table = world.parameters.along_table
+        if "hit_speed" in columns:
+            self.hit_velocity[row] = along_table(world.tip_velocity)
+        if "hit_speed_max" in columns:
+            self.hit_jacobian[row] = along_table(world.tip_jacobian)
+
 
 def _verify_block(
     problem: Problem, world: World, columns: dict[str, Array], dtype: str, rule: HitRule
@@ -308,11 +316,8 @@ def _measure(
             for diagnostic in measurements.diagnostics:
                 if np.isfinite(diagnostic.stored[row, index]):
                     diagnostic.recomputed[row, index] = diagnostic.compute(world)
-            along_table = world.parameters.along_table
-            if end == "goal" and "hit_speed" in columns:
-                measurements.hit_velocity[row] = along_table(world.tip_velocity)
-            if end == "goal" and "hit_speed_max" in columns:
-                measurements.hit_jacobian[row] = along_table(world.tip_jacobian)
+            if end == "goal":
+                measurements.add_hit(world, row, columns)
     return measurements
 
 

@@ -119,18 +119,9 @@ def measure_hull_gap(
         for pair, (part, _) in overlaps.items()
     }
     gaps = [
-        (
-            pair,
-            PairGap(
-                pair.first,
-                pair.second,
-                float(part.mean()),
-                float(mesh.mean()),
-                rejected[pair],
-            ),
-        )
+        (pair, PairGap(pair.first, pair.second, float(part.mean()), float(mesh.mean()), rejected[pair]))
         for pair, (part, mesh) in overlaps.items()
-    ]
+    ]  # fmt: skip
     return HullGap(
         free=int(free.sum()),
         rejected=int((free & ~accepted).sum()),
