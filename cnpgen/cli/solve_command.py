@@ -97,7 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
-    from cnpgen.make.solve_scenes import solve_scenes
+    from cnpgen.make.solve_scenes import SceneOptions, solve_scenes
     from cnpgen.problems.problem_record import as_problem
     from cnpgen.problems.scenes.scene_reader import read_scenes
 
@@ -115,7 +115,10 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
     problem = as_problem(arguments.robot)
 
     def solve(_: "Plans", **options: Any) -> "SolvedScenes":
-        return solve_scenes(problem, scenes, payload=arguments.payload, **options)
+        names = options.keys() & {"engine", "address", "begin"}
+        own = {name: options.pop(name) for name in names}
+        run = SceneOptions(payload=arguments.payload, **own)
+        return solve_scenes(problem, scenes, run=run, **options)
 
     return refine_and_save(
         arguments, None, out, title=f"solving {arguments.what}", make=solve

@@ -369,19 +369,41 @@ def _errors(plans: Plans, rows: int | None = None) -> Iterator[tuple[str, str]]:
 
     The default number of plans is that of the paths.
     """
-    path, rate, degree = (
-        plans.path_control_points,
-        plans.rate_control_points,
-        plans.degree,
-    )
+    path = plans.path_control_points
     if path.ndim != 3:
         yield (
             "path_control_points",
             f"path_control_points must have shape (N, C, n), got {path.shape}",
         )
         return
+    rows, n = len(path) if rows is None else rows, path.shape[2]
+    yield from _spline_errors(plans, rows)
+    for name, values in plans.boundary.conditions().items():
+        if values.shape != (rows, n):
+            yield (
+                "boundary",
+                f"{name} must have shape {(rows, n)} (plans, joints), got {values.shape}",
+            )
+    yield from _parameter_errors(plans, rows)
+    for name in ("sample_id", "status"):
+        if getattr(plans, name).shape != (rows,):
+            yield (
+                name,
+                f"{name} must have shape {(rows,)}, got {getattr(plans, name).shape}",
+            )
+    yield from _column_errors(plans, rows)
+    for name in NOTES:
+        if not isinstance(getattr(plans, name), str):
+            yield name, f"{name} must be a text, got {getattr(plans, name)!r:.60}"
+
+
+def _spline_errors(plans: Plans, rows: int) -> Iterator[tuple[str, str]]:
+    path, rate, degree = (
+        plans.path_control_points,
+        plans.rate_control_points,
+        plans.degree,
+    )
     _, points, n = path.shape
-    rows = len(path) if rows is None else rows
     if len(path) != rows:
         yield (
             "path_control_points",
@@ -410,23 +432,6 @@ def _errors(plans: Plans, rows: int | None = None) -> Iterator[tuple[str, str]]:
             "rate_control_points",
             f"rate_control_points must have shape ({rows}, R) with R > {degree}, the degree, got {rate.shape}",
         )
-    for name, values in plans.boundary.conditions().items():
-        if values.shape != (rows, n):
-            yield (
-                "boundary",
-                f"{name} must have shape {(rows, n)} (plans, joints), got {values.shape}",
-            )
-    yield from _parameter_errors(plans, rows)
-    for name in ("sample_id", "status"):
-        if getattr(plans, name).shape != (rows,):
-            yield (
-                name,
-                f"{name} must have shape {(rows,)}, got {getattr(plans, name).shape}",
-            )
-    yield from _column_errors(plans, rows)
-    for name in NOTES:
-        if not isinstance(getattr(plans, name), str):
-            yield name, f"{name} must be a text, got {getattr(plans, name)!r:.60}"
 
 
 def _parameter_errors(plans: Plans, rows: int) -> Iterator[tuple[str, str]]:

@@ -44,10 +44,11 @@ def load_problem(
     return load_recipe(("problem",), name_or_path, relative_to, read_problem)
 
 
+# Of the tables with a key ``use``.
 KIND_READERS: dict[type, Reader] = {
     Constraint: partial(read_kind, registry.CONSTRAINTS),
     ObjectiveTerm: partial(read_kind, registry.OBJECTIVES),
-}  # of the tables with a key ``use``
+}
 
 
 def load_problem_behind(name_or_path: str | Path) -> Problem:
@@ -198,7 +199,8 @@ def _meshes_on_disk(
 ) -> Iterator[str]:
     """Yield error messages for meshes that are not inline."""
     text = "names the mesh {}, expected its corners in the text"
-    with suppress(ValueError):  # loading the robot raises the error
+    # Loading the robot raises the error.
+    with suppress(ValueError):
         for name in mesh_files(urdf)[:1] if problem.uses_link_geometry else ():
             yield (where / "robot" / "urdf").message(text.format(show(name)))
     for index, each in enumerate(problem.obstacle):

@@ -296,9 +296,8 @@ def open_problem(record: ProblemRecord) -> tuple[Problem, Robot]:
 
     with record.restored() as problem:
         if problem.obstacle:
-            with suppress(
-                RecipeError
-            ):  # errors are reported below, with the whole problem
+            # Errors are reported below, with the whole problem.
+            with suppress(RecipeError):
                 content = {**record.content, "obstacle": []}
                 return problem, _robot_of(
                     ProblemRecord(json.dumps(content), record.urdf)

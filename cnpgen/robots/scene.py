@@ -56,9 +56,8 @@ class Scene:
                 f"must be a tuple of obstacles, got {obstacles!r:.60}",
                 argument="obstacles",
             )
-        if poses is None or isinstance(
-            poses, int | float | str
-        ):  # JAX puts other objects in the place of arrays
+        if poses is None or isinstance(poses, int | float | str):
+            # JAX puts other objects in the place of arrays
             raise UsageError(
                 f"must be an array of shape (N, width), got {poses!r:.60}",
                 argument="poses",
@@ -71,10 +70,12 @@ class Scene:
         """Select samples; an integer selects one sample and keeps the first axis."""
         rows: Any = index
         if isinstance(index, int):
-            self._check_sample(index, "index")  # ends a loop over the samples, too
+            # Ends a loop over the samples, too.
+            self._check_sample(index, "index")
             rows = slice(index, index + 1 or None)
         elif isinstance(index, tuple):
-            rows = list(index)  # NumPy reads a tuple as one index of each axis
+            # NumPy reads a tuple as one index of each axis
+            rows = list(index)
         try:
             return Scene(self.obstacles, self.poses[rows])
         except IndexError as error:
@@ -111,7 +112,8 @@ class Scene:
                 f"must have shape {expected} for {len(self.obstacles)} obstacles, got {poses.shape}",
                 argument="obstacle_poses",
             )
-        if not (np.abs(poses) <= MAX_COORDINATE_M).all():  # also false for nan
+        if not (np.abs(poses) <= MAX_COORDINATE_M).all():
+            # Also false for nan.
             sample, entry = np.argwhere(~(np.abs(poses) <= MAX_COORDINATE_M))[
                 0
             ].tolist()

@@ -19,7 +19,6 @@ from cnpgen.kernels import code_cache, compiled_kernel, lowering, machine_code
 from cnpgen.kernels.code_cache import tape_key
 from cnpgen.kernels.compiled_kernel import CompiledGridKernel, CompiledKernel
 from cnpgen.kernels.compiler import require_compiler, run_compiler
-from cnpgen.kernels.emit import emit
 from cnpgen.kernels.interpreted_kernel import InterpretedKernel
 from cnpgen.kernels.llvm_module import module_text
 from cnpgen.kernels.lowering import lower
@@ -33,6 +32,7 @@ from cnpgen.kernels.machine_code import (
 )
 from cnpgen.kernels.tape import CODES, GridSpec, Loop, Tape, tape_from_function
 from tests.conftest import needs_compiler
+from tests.kernels.c_reference import emit
 from tests.kernels.test_kernels import BINARY, SPECIAL, UNARY, machine_flags
 
 Array = np.ndarray

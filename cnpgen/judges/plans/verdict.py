@@ -232,6 +232,7 @@ def summarize_verdicts(verdicts: Sequence[Verdict]) -> dict[str, Any]:
     ]
     counts = {"valid": sum(verdict.valid for verdict in verdicts)}
     rules = [verdict.paper for verdict in verdicts if verdict.paper is not None]
+    # Counts and ratios by the paper's rules only if every plan was judged by them.
     if len(rules) == len(verdicts):
         counts["paper_valid"] = sum(rule.valid for rule in rules)
         counts["finished"] = sum(rule.finished for rule in rules)

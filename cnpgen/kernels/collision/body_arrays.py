@@ -73,6 +73,7 @@ def hull_vertices(corners: Array) -> HullVertices:
 
 
 def _padded(rows: Array, multiple: int) -> Array:
+    """Return rows with copies of the first one, which never change a maximum, up to a multiple."""
     return np.concatenate([rows, np.repeat(rows[:1], -len(rows) % multiple, axis=0)])
 
 
@@ -103,6 +104,7 @@ def bounding_boxes(bodies: Bodies, centers: Array, half: Array) -> Array:
     """
     count = bodies.shape[1]
     boxes = np.zeros((len(bodies), 16, count + -count % LANES))
+    # Padding is so far away that its bounding box is never near a capsule.
     boxes[:, :3] = PADDING_DISTANCE_M
     rows = np.concatenate(
         [centers, half, bodies["rotation"], bodies["radius"][..., None]], axis=-1
@@ -117,9 +119,12 @@ def primitive_bodies(obstacles: Primitives, first: int) -> tuple[Bodies, Array, 
     hulls = [hull_vertices(mesh.corners) for mesh in obstacles.meshes]
     ends = np.cumsum([first, *(len(hull.values) for hull in hulls)])
     box, cylinder, mesh = kinds == _BOX, kinds == _CYLINDER, kinds >= MESH
+    # Spheres and capsules: a segment along z, of length 0 or 2 h, with a radius around
+    # it.
     rounded = (kinds >= 0) & ~(box | cylinder | mesh)
     bodies = np.zeros(kinds.shape, BODY)
     bodies["kind"] = np.where(cylinder, CYLINDER, BOX)  # and hulls, below
+    # Absent bodies are boxes of size 0 at the padding distance.
     centers = np.where((kinds >= 0)[..., None], obstacles.centers, PADDING_DISTANCE_M)
     bodies["position"], bodies["rotation"] = (
         centers,
@@ -202,6 +207,7 @@ def _fill(body: Any, obstacle: Obstacle, numbers: Array) -> tuple[Array, Array]:
             corners = corners_of(obstacle.mesh)
             low, high = corners.min(axis=0), corners.max(axis=0)
             body["position"], body["rotation"] = center, rotation.ravel()
+            # The bounding box of a mesh is that of its corners in the mesh's own frame.
             return center + rotation @ (low + high) / 2, (high - low) / 2
         else:
             length = math.hypot(*rest[:3])

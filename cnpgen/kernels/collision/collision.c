@@ -66,6 +66,7 @@ static void place_robot(const robot_scene *s, const double *q, memory *m) {
     pose *f = m->frame + j + 1;
     const double *T = s->place + 12 * j, *u = s->axis + 3 * j;
     double base[9], local[9];
+    /* T_j = T_{j-1} Place_j Rot(axis_j, q_j): the fixed place of the joint first. */
     transform(before, T + 9, f->p);
     for (int r = 0; r < 3; r++)
       for (int k = 0; k < 3; k++)
@@ -77,6 +78,7 @@ static void place_robot(const robot_scene *s, const double *q, memory *m) {
       memcpy(f->R, base, sizeof base);
       continue;
     }
+    /* About z only two columns change, which is cheaper than the general formula. */
     if (u[2] == 1.0) {
       for (int r = 0; r < 3; r++) {
         f->R[3 * r] = cosine[j] * base[3 * r] + sine[j] * base[3 * r + 1];
@@ -88,6 +90,7 @@ static void place_robot(const robot_scene *s, const double *q, memory *m) {
     double c = cosine[j], d = sine[j];
     for (int r = 0; r < 3; r++)
       for (int k = 0; k < 3; k++) local[3 * r + k] = (1 - c) * u[r] * u[k] + (r == k ? c : 0.0);
+    /* Rodrigues: c I + (1 - c) u u' + d [u]x with c = cos q, d = sin q; this line adds d [u]x. */
     local[1] -= d * u[2], local[2] += d * u[1], local[3] += d * u[2];
     local[5] -= d * u[0], local[6] -= d * u[1], local[7] += d * u[0];
     for (int r = 0; r < 3; r++)
@@ -106,6 +109,8 @@ I v squared_gaps(const double *boxes, long lanes, long o, const double *center, 
   v sum = K(0), x[3];
   for (int i = 0; i < 3; i++) x[i] = center[i] - at(boxes + i * lanes + o);
   for (int i = 0; i < 3; i++) {
+    /* Separating axes: along a face normal of the box, |x| - (extent of the capsule's axis) - (half size) is a lower
+       bound of the distance. The gaps of three orthogonal normals add up as squares. */
     v along = K(0), reach = at(boxes + (3 + i) * lanes + o);
     for (int k = 0; k < 3; k++) {
       v r = at(boxes + (6 + 3 * k + i) * lanes + o);
@@ -123,6 +128,7 @@ static double squared_segment_distance(const double *a, const double *b) { /* Er
   double one[3], two[3], r[3], s = 0.0, t, sum = 0.0;
   less(a + 3, a, one), less(b + 3, b, two), less(a, b, r);
   double aa = dot(one, one), bb = dot(two, two), ab = dot(one, two), ar = dot(one, r), br = dot(two, r);
+  /* s and t minimize |r + s one - t two|^2; a t that was clamped changes the best s. */
   double whole = aa * bb - ab * ab;
   if (whole > 1e-18) s = (ab * br - ar * bb) / whole, s = s < 0 ? 0 : s > 1 ? 1 : s;
   t = bb > 1e-18 ? (ab * s + br) / bb : 0.0, t = t < 0 ? 0 : t > 1 ? 1 : t;
@@ -145,11 +151,14 @@ static void measure_bodies(const robot_scene *s, const body *a, const pose *fa, 
   for (int i = 0; i < 3; i++)
     for (int k = 0; k < 3; k++)
       c.rotation[3 * i + k] = fa->R[i] * fb->R[k] + fa->R[3 + i] * fb->R[3 + k] + fa->R[6 + i] * fb->R[6 + k];
+  /* The normal of the last state is close to the present one; without one, the line between the origins is as good as
+     any. */
   if (dot(guess, guess) > 0) turn_back(fa->R, guess, out->normal);
   else {
     double length = sqrt(dot(c.position, c.position));
     for (int i = 0; i < 3; i++) out->normal[i] = length > 0 ? c.position[i] / length : 0.0;
   }
+  /* A limit below minus the radii asks for a depth of the bodies without their radii, which only EPA measures. */
   measure(&c, limit, contacts || limit + a->radius + b->radius < 0, out);
   turn(fa->R, out->normal, normal);
   memcpy(guess, normal, sizeof normal);
@@ -200,6 +209,7 @@ static int sphere_is_clear(const robot_scene *s, const body *part, const pose *f
 /* Find the contacts of moving parts and obstacles closer than `limit` plus what the link adds; without a list, return 1 at the
 first one. */
 static int meet_obstacles(const robot_scene *s, memory *m, double limit, contact_list *list) {
+  /* From the tip to the base: the outer links sweep the most space, so an early exit comes soon. */
   for (long l = s->n_links - 1; l >= 0; l--) {
     const capsule *link = s->links + l;
     if (!link->frame) continue;
@@ -209,6 +219,7 @@ static int meet_obstacles(const robot_scene *s, memory *m, double limit, contact
     for (int i = 0; i < 3; i++) center[i] = (e[i] + e[3 + i]) / 2, half[i] = (e[3 + i] - e[i]) / 2;
     for (long o = 0; o < s->lanes; o += W) {
       v range = larger(reach + at(s->boxes + 15 * s->lanes + o), K(0));
+      /* W obstacles at once: only bounding boxes closer than the capsule's radius and the limit are measured. */
       vi near = squared_gaps(s->boxes, s->lanes, o, center, half) <= range * range;
       for (int lane = 0; lane < W && o + lane < s->n_obstacles; lane++) {
         if (!near[lane]) continue;
@@ -237,6 +248,7 @@ static int meet_itself(const robot_scene *s, memory *m, double limit, contact_li
   for (long i = 0; i < s->n_link_pairs; i++) {
     long a = s->link_pairs[2 * i], b = s->link_pairs[2 * i + 1];
     double within = limit + s->pair_added[i], reach = s->links[a].radius + s->links[b].radius + within;
+    /* Two capsules that are farther apart than their radii and the limit contain parts that are so, too. */
     if (reach < 0 || squared_segment_distance(m->ends + 6 * a, m->ends + 6 * b) > reach * reach) continue;
     for (long k = s->first_pair[i]; k < s->first_pair[i + 1]; k++) {
       const body *one = s->parts + s->pairs[2 * k], *two = s->parts + s->pairs[2 * k + 1];

@@ -82,15 +82,14 @@ class RowKernels:
         checker: CollisionChecker,
         columns: DistanceColumns,
     ) -> None:
-        rows, m, width = (
-            values.tape.outputs[0],
-            len(columns.required),
-            values.tape.inputs[0],
-        )
+        rows, width = values.tape.outputs[0], values.tape.inputs[0]
+        m = len(columns.required)
         limits = [
             -np.inf if x is None else x
             for x in (columns.obstacle_distance, columns.self_distance)
         ]
+        # Scratch memory of one state: its contacts, then values (m) and gradients (m,
+        # width).
         numbers = NUMBERS_PER_CONTACT * MAX_CONTACTS_PER_STATE + m * (1 + width)
         arrays = (
             np.empty(numbers),
@@ -108,10 +107,8 @@ class RowKernels:
             *addresses, *counts, columns.range, columns.scale, *limits
         )
         self._library = checker.library
-        (
-            self._library.set_row_context.argtypes,
-            self._library.set_row_context.restype,
-        ) = (c_void_p,), None
+        self._library.set_row_context.argtypes = (c_void_p,)
+        self._library.set_row_context.restype = None
         self.values = _RowKernel(self, values, "row_values", (rows + m,))
         self.jacobian = _RowKernel(
             self, jacobian, "row_jacobian", (rows + m, (rows + m) * width)
@@ -119,6 +116,8 @@ class RowKernels:
 
     def activate(self) -> None:
         """Make these kernels those of the thread: their machine code has one context per thread."""
+        # A thread-local pointer: the interface of compiled kernels has no room for a
+        # context.
         self._library.set_row_context(ctypes.addressof(self._context))
 
 
