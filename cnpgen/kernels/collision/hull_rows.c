@@ -19,13 +19,17 @@ typedef struct {
 static _Thread_local row_context *current;
 static _Thread_local long generation;
 static _Thread_local memory *kept; /* of `current` */
+static _Thread_local int lacked_memory; /* the last derivatives are nan */
 
-void set_row_context(row_context *context) {
-  if (context == current && (!context || context->generation == generation)) return;
-  if (kept) free_memory(kept);
-  current = context;
-  generation = context ? context->generation : 0;
+/* Set the context of this thread; return OUT_OF_MEMORY if there is none for it, or was none for the last derivatives. */
+long set_row_context(row_context *context) {
+  if (lacked_memory) return lacked_memory = 0, OUT_OF_MEMORY;
+  if (context == current && (!context || context->generation == generation)) return 0;
+  free_memory(kept);
   kept = context ? make_memory(context->scene) : 0;
+  current = kept ? context : 0;
+  generation = kept ? context->generation : 0;
+  return context && !kept ? OUT_OF_MEMORY : 0;
 }
 
 /* Rate of the distance along a normal if joint j moves a point. */
@@ -100,6 +104,12 @@ void row_jacobian(long points, const double *const *in, const long *strides, dou
   const row_context *c = current;
   long rows = c->rows + c->columns;
   double *inner = malloc((c->rows * c->width * points + 1) * sizeof(double));
+  if (!inner) {
+    lacked_memory = 1;
+    for (long i = 0; i < rows * points; i++) out[0][i] = NAN;
+    for (long i = 0; i < rows * c->width * points; i++) out[1][i] = NAN;
+    return;
+  }
   c->jacobian(points, in, strides, (double *const[]){out[0], inner});
   for (long j = 0; j < c->width; j++)
     memcpy(out[1] + j * rows * points, inner + j * c->rows * points, c->rows * points * sizeof(double));

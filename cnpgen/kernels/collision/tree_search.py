@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.collision.collision_checker import CollisionChecker
-from cnpgen.kernels.compiled_kernel import address_of
+from cnpgen.kernels.compiled_kernel import address_of, require_memory
 from cnpgen.kernels.kernel import Kernel
 
 Array = NDArray[np.float64]
@@ -113,6 +113,7 @@ def find_tree_path(
     if manifold is None:
         search = checker.library.find_path
         search.restype, search.argtypes = c_long, (c_void_p, c_void_p, c_long)
+        search.errcheck = require_memory
         count = search(ctypes.addressof(native), address_of(path), len(path))
     else:
         search, scene = (
@@ -123,6 +124,7 @@ def find_tree_path(
             c_long,
             (*(c_void_p,) * 3, c_long, c_double, c_void_p, c_long),
         )
+        search.errcheck = require_memory
         residuals, rows = manifold.residuals.address, manifold.residuals.tape.outputs[0]
         errors = rows, MAX_PROJECTION_ERROR
         count = search(
