@@ -172,7 +172,7 @@ def aligned_array(count: int) -> Array:
     return memory[-address_of(memory) // memory.itemsize % CACHE_LINE_DOUBLES :][:count]
 
 
-def require_memory(result: int, *_: Any) -> int:
+def require_memory(result: Any, *_: Any) -> Any:
     """Return the result of a function in C, which is negative if it ran out of memory (``errcheck`` of ctypes).
 
     Raises:

@@ -32,9 +32,8 @@ Array = NDArray[np.float64]
 PROBLEM = "heavy-object"
 MODELS = ("heavy-object", "panda-cup", "panda-scenes", "ur5-wipe")  # of single stops
 N_PLANS = 12
-TICK_S = 1e-3
-FINE_TICK_S = 2.5e-4  # of stops, whose jerk jumps at their begin
-TORQUE_STRIDE = 10  # ticks between checked torques
+TICK_S = 2.5e-4  # the jerk jumps at the begin of a stop, within a step of integration
+TORQUE_STRIDE = 40  # ticks between checked torques
 MAX_DELAY_S = 0.01  # of the start of a request, and of planning
 MAX_WAIT_S = 120.0  # for a thread; a longer one hangs
 REFUSED = (  # what a request of a random order may be told
@@ -240,7 +239,7 @@ def stop_at_hard_moments(count: int, *, seed: int = 0) -> StopOutcome:
             outcome.requests[f"{name}, {'stop' if stop is not motion else 'end'}"] += 1
             try:
                 assert stop.end_time <= motion.end_time, "later than not stopping"
-                times = np.arange(at, stop.end_time, FINE_TICK_S)
+                times = np.arange(at, stop.end_time, TICK_S)
                 if len(times) > 1:
                     record = plans[number % len(plans)].problem
                     check_states(record, times, stop.at(times))
