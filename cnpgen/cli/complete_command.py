@@ -54,11 +54,11 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from cnpgen.cli.refine_command import check_place
+    from cnpgen.cli.refine_command import check_free
     from cnpgen.make.complete import complete
     from cnpgen.plans import save_plans
 
-    check_place(arguments.out, force=arguments.force)
+    check_free(arguments.out, force=arguments.force)
     found = complete(arguments.pipeline, arguments.tasks)
     if len(found.plans):
         save_plans(arguments.out, found.plans)

@@ -51,7 +51,7 @@ Each plan is processed independently: --workers and the order of the plans chang
 Coal decide what is valid, as in 'cnpgen evaluate'. Workers append finished plans to OUT.part, four at a time: after
 Ctrl-C, kill -9 or a full disk the same command goes on. An existing OUT is replaced only with --force,
 and only if it is a file of plans. The exit code is 0 if every plan is valid, and 1 if any is not; the file is written
-in either case.
+in either case. If OUT is there already as the result of the same request, the command says so and ends with 0.
 'cnpgen docs refiner' has the formulation.
 """
 
@@ -124,21 +124,30 @@ def refine_and_save(
     *,
     title: str,
     make: "Callable[..., Refinement | SolvedScenes] | None" = None,
+    request: object = None,
 ) -> int:
     """Refine plans, save them, print a summary; return the exit code.
 
     ``make`` is ``refine_plans`` by default, ``solve_plans``, or a function that solves
-    scenes and has no plans.
+    scenes and has no plans; then ``request`` is all that these depend on.
     """
+    from cnpgen.cli.finished import is_finished, record_request
     from cnpgen.plans import save_plans
     from cnpgen.refine.options import RefineOptions
-    from cnpgen.refine.refine_plans import refine_plans
+    from cnpgen.refine.refine_plans import identity_of_run, refine_plans
 
     given = options_of(arguments, *REFINING)
     options = RefineOptions(
         **{name: value for name, value in given.items() if value is not None}
     )
-    check_place(out, force=arguments.force)
+    request = [
+        request if plans is None else identity_of_run(plans, options),
+        make.__name__ if make is not None and plans is not None else "",
+        options.document(),
+    ]
+    if is_finished(out, request, force=arguments.force):
+        return report_finished(arguments, out)
+    check_place(out)
     journal = out.with_name(out.name + ".part")
     finished = [0, 0]
 
@@ -164,6 +173,7 @@ def refine_and_save(
         ):
             _explain(facts, found, meter)
     save_plans(out, found.plans)
+    record_request(out, request)
     journal.unlink(missing_ok=True)
     if not arguments.quiet:
         lines = _summary(
@@ -174,8 +184,30 @@ def refine_and_save(
     return 0 if found.valid.all() else 1
 
 
-def check_place(out: Path, *, force: bool) -> None:
-    """Refuse an output path before any work if it cannot be written or exists."""
+def report_finished(arguments: argparse.Namespace, out: Path) -> int:
+    """Report that the result of the same request is there; return the exit code."""
+    print(f"{out} is there already, of the same request", file=sys.stderr)
+    facts = {"file": str(out), "already_there": True}
+    print(json.dumps(facts, indent=2) if arguments.json else out)
+    return 0
+
+
+def check_free(out: Path, *, force: bool, unless_finished: bool = False) -> None:
+    """Refuse an output path before any work if it exists or cannot be written.
+
+    ``unless_finished`` accepts an existing one whose request is known and may be the
+    same; ``is_finished`` decides later.
+    """
+    from cnpgen.cli.finished import request_file
+
+    is_result = unless_finished and request_file(out).exists()
+    if out.exists() and not force and not is_result:
+        raise UsageError(f"{out} exists: --force replaces it, -o names another file")
+    check_place(out)
+
+
+def check_place(out: Path) -> None:
+    """Refuse an output path before any work if it cannot be written or has another file."""
     from cnpgen.plans.plan_file import check_replaceable
     from cnpgen.store.files.atomic import check_writable
 
@@ -183,8 +215,6 @@ def check_place(out: Path, *, force: bool) -> None:
         raise UsageError(
             f"{out} must be a file that ends in .h5, in a folder that exists"
         )
-    if out.exists() and not force:
-        raise UsageError(f"{out} exists: --force replaces it, -o names another file")
     check_replaceable(out)
     check_writable(out)
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.errors import MachineError
 from cnpgen.kernels.call_text import CALL, PYTHON_FUNCTIONS
 from cnpgen.kernels.code_cache import (
     MAX_DIRECT,
@@ -172,6 +173,17 @@ def aligned_array(count: int) -> Array:
     """Return an uninitialized array of ``count`` float64 values, aligned to a cache line and so to any vector."""
     memory = np.empty(count + CACHE_LINE_DOUBLES)
     return memory[-address_of(memory) // memory.itemsize % CACHE_LINE_DOUBLES :][:count]
+
+
+def require_memory(result: Any, *_: Any) -> Any:
+    """Return the result of a function in C, which is negative if it ran out of memory (``errcheck`` of ctypes).
+
+    Raises:
+        MachineError: The result is negative.
+    """
+    if result < 0:
+        raise MachineError("there is no memory left for collision checks or scenes")
+    return result
 
 
 def address_of(array: Any) -> int:

@@ -1,7 +1,8 @@
 """Problem files, loaded by name or path, and problems restored from records."""
 
+import os
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -153,6 +154,18 @@ def without_defaults(value: Any) -> Any:
         if isinstance(value, list)
         else value
     )
+
+
+@contextmanager
+def names_of_stored_files(folder: Path) -> Iterator[None]:
+    """Name the files of a stored problem in errors without the temporary folder in which they are."""
+    try:
+        yield
+    except RecipeError as error:
+        errors = tuple(line.replace(f"{folder}{os.sep}", "") for line in error.errors)
+        if errors == error.errors:
+            raise
+        raise RecipeError(errors) from error
 
 
 def restore_problem(content: dict[str, Any], urdf: str, folder: Path) -> Problem:

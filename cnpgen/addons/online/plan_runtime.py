@@ -115,6 +115,9 @@ class PlanRuntime:
             max_step=positive("max_step", max_step) * robot.velocity_limit,
         )
         self._lock = threading.RLock()
+        # Held while a stop is computed, so that no ``resume`` comes in between, and a
+        # second ``stop`` returns the finished result.
+        self._stopping = threading.RLock()
         self._kept_stops = KeptStops(self._checker, measured=judge)
         self._keeps_stops = keep_stops
         self._requests = ReplanRequests()
@@ -254,15 +257,16 @@ class PlanRuntime:
             Begin and end of the stop and the distance that each joint travels.
         """
         at = number("at", at)
-        with self._lock:
-            self._stops += 1  # refuses all plans of earlier requests
-            if self._stop is not None:
-                return self._stop
-            begin = max(at, self._timeline.now)
-            self._stop = _report(self._timeline.part_at(begin), begin)
-            dropped = self._timeline.drop_after(begin)
-        self._requests.refuse_waiting(SwitchOutcome.STOPPED)
-        return self._stop_on_path(begin, dropped)
+        with self._stopping:
+            with self._lock:
+                self._stops += 1  # refuses all plans of earlier requests
+                if self._stop is not None:
+                    return self._stop
+                begin = max(at, self._timeline.now)
+                self._stop = _report(self._timeline.part_at(begin), begin)
+                dropped = self._timeline.drop_after(begin)
+            self._requests.refuse_waiting(SwitchOutcome.STOPPED)
+            return self._stop_on_path(begin, dropped)
 
     @checked_arguments
     def resume(self, measured_q: ArrayLike, *, at: float | None = None) -> None:
@@ -277,7 +281,7 @@ class PlanRuntime:
             UsageError: The runtime was not stopped, or the stop has not ended.
         """
         q = _checked_positions("measured_q", measured_q, self._robot.n)
-        with self._lock:
+        with self._stopping, self._lock:
             time = self._timeline.now if at is None else number("at", at)
             if self._stop is None:
                 raise UsageError("the runtime was not stopped, so it cannot resume")

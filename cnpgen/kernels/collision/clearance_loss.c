@@ -28,13 +28,14 @@ static double state_loss(const robot_scene *s, memory *m, const double *q, doubl
 }
 
 /* Losses (nodes, N) and gradients (nodes, n, N) of states (nodes, n, N); `robot` has the obstacles and boxes of N samples. */
-void clearance_losses(const robot_scene *robot, long samples, long nodes, const double *q, double required, double *losses,
+long clearance_losses(const robot_scene *robot, long samples, long nodes, const double *q, double required, double *losses,
                       double *gradients) {
   long capacity = (robot->n_parts + 1) * (robot->n_obstacles + 1), n = robot->n;
   robot_scene s = *robot;
   double *numbers = malloc(10 * capacity * sizeof *numbers);
   long *indices = malloc(2 * capacity * sizeof *indices);
   memory *m = make_memory(robot);
+  if (!numbers || !indices || !m) return free_memory(m), free(numbers), free(indices), OUT_OF_MEMORY;
   contact_list list = {0, capacity, 0, indices, indices + capacity, numbers, numbers + capacity, numbers + 4 * capacity};
   for (long sample = 0; sample < samples; sample++) {
     s.obstacles = robot->obstacles + sample * s.n_obstacles, s.boxes = robot->boxes + sample * 16 * s.lanes;
@@ -50,4 +51,5 @@ void clearance_losses(const robot_scene *robot, long samples, long nodes, const 
     }
   }
   free_memory(m), free(numbers), free(indices);
+  return 0;
 }

@@ -19,7 +19,7 @@ from cnpgen.kernels.collision.collision_checker import (
     CollisionChecker,
     load_collision_library,
 )
-from cnpgen.kernels.compiled_kernel import address_of
+from cnpgen.kernels.compiled_kernel import address_of, require_memory
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.robots.observation.primitives import (
     KINDS,
@@ -67,7 +67,8 @@ class ClearanceLoss:
     """Losses of states of one robot with link geometry among obstacles that differ from sample to sample."""
 
     def __init__(self, library: ctypes.CDLL, robot: Robot) -> None:
-        library.clearance_losses.restype = None
+        library.clearance_losses.restype = c_long
+        library.clearance_losses.errcheck = require_memory
         library.clearance_losses.argtypes = (
             c_void_p,
             c_long,

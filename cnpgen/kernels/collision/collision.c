@@ -31,19 +31,26 @@ typedef struct { /* memory of a batch of checks */
   double *obstacle_normal, *pair_normal; /* last normals in the world frame, the initial guesses */
 } memory;
 
+enum { OUT_OF_MEMORY = -1 }; /* result of functions that allocate memory */
+
+static void free_memory(memory *m) {
+  if (!m) return;
+  free(m->frame), free(m->ends), free(m->work), free(m->obstacle_normal), free(m->pair_normal), free(m);
+}
+
+/* Return memory for a batch of checks; null if there is none left. */
 static memory *make_memory(const robot_scene *s) {
   long pairs = s->first_pair[s->n_link_pairs];
-  memory *m = malloc(sizeof *m);
+  memory *m = calloc(1, sizeof *m);
+  if (!m) return 0;
   m->frame = malloc((s->n + 1) * sizeof *m->frame);
   m->work = malloc(sizeof *m->work);
   m->ends = malloc((6 * s->n_links + 1) * sizeof(double));
   m->obstacle_normal = calloc(3 * s->n_parts * s->n_obstacles + 1, sizeof(double));
   m->pair_normal = calloc(3 * pairs + 1, sizeof(double));
-  return m;
-}
-
-static void free_memory(memory *m) {
-  free(m->frame), free(m->ends), free(m->work), free(m->obstacle_normal), free(m->pair_normal), free(m);
+  if (m->frame && m->work && m->ends && m->obstacle_normal && m->pair_normal) return m;
+  free_memory(m);
+  return 0;
 }
 
 I void transform(const pose *f, const double *x, double *y) {
@@ -271,17 +278,20 @@ static int is_clear(const robot_scene *s, memory *m, const double *q, double obs
   return !(self_limit > -INFINITY && meet_itself(s, m, self_limit, 0));
 }
 
-void clear_states(const robot_scene *s, const double *q, long count, double obstacle_limit, double self_limit,
+long clear_states(const robot_scene *s, const double *q, long count, double obstacle_limit, double self_limit,
                   unsigned char *clear) {
   memory *m = make_memory(s);
+  if (!m) return OUT_OF_MEMORY;
   for (long k = 0; k < count; k++) clear[k] = is_clear(s, m, q + k * s->n, obstacle_limit, self_limit);
   free_memory(m);
+  return 0;
 }
 
 /* Contacts of one group within a limit; returns their number, which may exceed the capacity of the arrays. */
 long find_contacts(const robot_scene *s, const double *q, long count, double limit, int of_obstacles, long capacity,
                    long *pair, long *k, double *distance, double *normal, double *points) {
   memory *m = make_memory(s);
+  if (!m) return OUT_OF_MEMORY;
   contact_list list = {0, capacity, 0, pair, k, distance, normal, points};
   for (; list.state < count; list.state++) {
     place_robot(s, q + list.state * s->n, m);
@@ -293,11 +303,13 @@ long find_contacts(const robot_scene *s, const double *q, long count, double lim
 }
 
 /* Poses of the joints' frames, for tests: rotation and position, shape (count, n + 1, 12). */
-void joint_poses(const robot_scene *s, const double *q, long count, double *out) {
+long joint_poses(const robot_scene *s, const double *q, long count, double *out) {
   memory *m = make_memory(s);
+  if (!m) return OUT_OF_MEMORY;
   for (long k = 0; k < count; k++) {
     place_robot(s, q + k * s->n, m);
     memcpy(out + 12 * (s->n + 1) * k, m->frame, (s->n + 1) * sizeof(pose));
   }
   free_memory(m);
+  return 0;
 }

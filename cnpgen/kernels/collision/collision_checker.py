@@ -19,7 +19,7 @@ from cnpgen.kernels.collision.body_arrays import (
     hull_vertices,
     obstacle_bodies,
 )
-from cnpgen.kernels.compiled_kernel import address_of
+from cnpgen.kernels.compiled_kernel import address_of, require_memory
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
@@ -96,7 +96,12 @@ def load_collision_library(
     """
     library = kernels.load_source(*sources)
     if library is not None:
-        library.clear_states.restype = library.joint_poses.restype = None
+        for function in (
+            library.clear_states,
+            library.find_contacts,
+            library.joint_poses,
+        ):
+            function.restype, function.errcheck = c_long, require_memory
         library.clear_states.argtypes = (
             c_void_p,
             c_void_p,
@@ -105,7 +110,6 @@ def load_collision_library(
             c_double,
             c_void_p,
         )
-        library.find_contacts.restype = c_long
         library.find_contacts.argtypes = (
             c_void_p,
             c_void_p,

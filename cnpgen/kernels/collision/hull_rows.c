@@ -19,14 +19,18 @@ typedef struct {
 static _Thread_local row_context *current;
 static _Thread_local long generation;
 static _Thread_local memory *kept; /* of `current` */
+static _Thread_local int lacked_memory; /* the last derivatives are nan */
 
-void set_row_context(row_context *context) {
+/* Set the context of this thread; return OUT_OF_MEMORY if there is none for it, or was none for the last derivatives. */
+long set_row_context(row_context *context) {
+  if (lacked_memory) return lacked_memory = 0, OUT_OF_MEMORY;
   /* The same address may hold a new context, so the unique number is compared as well. */
-  if (context == current && (!context || context->generation == generation)) return;
-  if (kept) free_memory(kept);
-  current = context;
-  generation = context ? context->generation : 0;
+  if (context == current && (!context || context->generation == generation)) return 0;
+  free_memory(kept);
   kept = context ? make_memory(context->scene) : 0;
+  current = kept ? context : 0;
+  generation = kept ? context->generation : 0;
+  return context && !kept ? OUT_OF_MEMORY : 0;
 }
 
 /* Rate of the distance along a normal if joint j moves a point. */
@@ -105,6 +109,12 @@ void row_jacobian(long points, const double *const *in, const long *strides, dou
   const row_context *c = current;
   long rows = c->rows + c->columns;
   double *inner = malloc((c->rows * c->width * points + 1) * sizeof(double));
+  if (!inner) {
+    lacked_memory = 1;
+    for (long i = 0; i < rows * points; i++) out[0][i] = NAN;
+    for (long i = 0; i < rows * c->width * points; i++) out[1][i] = NAN;
+    return;
+  }
   /* The inner Jacobian has fewer rows, so its columns are copied to the stride of the complete one. */
   c->jacobian(points, in, strides, (double *const[]){out[0], inner});
   for (long j = 0; j < c->width; j++)

@@ -111,18 +111,18 @@ static long follow(search *h, manifold *m, tree *t, long node, const double *tar
       if (k >= met || (jumps && !(is_root && last < 0))) return last;
       if (!valid && !state_is_clear(h, h->q)) return last;
       memcpy(before, h->q, n * sizeof(double));
-      last = add_node(t, h->q, last < 0 ? node : last);
+      if ((last = add_node(t, h->q, last < 0 ? node : last)) < 0) return -1;
     }
   }
   *reached = share == 1.0;
   return last;
 }
 
-/* Replace sections of a path by shorter projected lines; return its number of points. */
+/* Replace sections of a path by shorter projected lines; return its number of points, or OUT_OF_MEMORY. */
 static long shorten_on_manifold(search *h, manifold *m, double *path, long count) {
   long n = h->s->scene->n;
-  tree line = {0, 256, n, malloc(256 * n * sizeof(double)), malloc(256 * sizeof(long))};
-  for (long trial = 0; trial < h->s->shortcuts && count > 2; trial++) {
+  tree line = make_tree(n);
+  for (long trial = 0; trial < h->s->shortcuts && count > 2 && !line.lacks_memory; trial++) {
     long a = (long)(uniform(h) * count), b = (long)(uniform(h) * count);
     if (a > b) { long x = a; a = b, b = x; }
     /* Shorter only if the line needs fewer states than the section has. */
@@ -138,7 +138,8 @@ static long shorten_on_manifold(search *h, manifold *m, double *path, long count
     memmove(path + n * (a + line.count), path + n * (b + 1), (count - b - 1) * n * sizeof(double));
     count -= b - a - (line.count - 1);
   }
-  free(line.q), free(line.parent);
+  if (line.lacks_memory) count = OUT_OF_MEMORY;
+  free_tree(&line);
   return count;
 }
 
@@ -150,32 +151,33 @@ long find_manifold_path(const tree_settings *s, kernel *residuals, const double 
   search h = {s, make_memory(s->scene), s->seed * 0x9E3779B97F4A7C15ull + 88172645463325252ull, malloc(n * sizeof(double))};
   double *numbers = malloc(BLOCK * (n + rows + rows * n) * sizeof(double)), *target = malloc(n * sizeof(double));
   manifold m = {residuals, scene, rows, accuracy, numbers, numbers + BLOCK * n, numbers + BLOCK * (n + rows)};
-  tree trees[2];
-  int reached;
+  tree trees[2] = {make_tree(n), make_tree(n)};
+  int reached = 0, lacks_memory = !h.m || !h.q || !numbers || !target;
+  add_node(trees, s->start, -1), add_node(trees + 1, s->goal, -1);
+  lacks_memory |= trees[0].lacks_memory || trees[1].lacks_memory;
   /* Similar seeds give similar first numbers of xorshift; they are discarded. */
   for (int i = 0; i < 10; i++) uniform(&h);
-  for (int i = 0; i < 2; i++) {
-    trees[i] = (tree){0, 256, n, malloc(256 * n * sizeof(double)), malloc(256 * sizeof(long))};
-    add_node(trees + i, i ? s->goal : s->start, -1);
-  }
-  long end = follow(&h, &m, trees, 0, s->goal, INFINITY, &reached);
-  if (reached) count = join(trees, end, 0, path, max_points);
+  long end = lacks_memory ? -1 : follow(&h, &m, trees, 0, s->goal, INFINITY, &reached);
+  if (lacks_memory || trees[0].lacks_memory) count = OUT_OF_MEMORY;
+  else if (reached) count = join(trees, end, 0, path, max_points);
   for (long trial = 0; trial < s->max_extensions && trees[0].count + trees[1].count < s->max_nodes && !count; trial++) {
     /* The trees take turns. */
     int own = trial % 2;
     for (long j = 0; j < n; j++) target[j] = s->lower[j] + uniform(&h) * (s->upper[j] - s->lower[j]);
     tree *near = trees + own, *other = trees + !own;
     long node = follow(&h, &m, near, nearest_node(near, target), target, s->extension, &reached);
+    if (near->lacks_memory) count = OUT_OF_MEMORY;
     if (node < 0) continue;
     memcpy(target, near->q + n * node, n * sizeof(double));
     long far = follow(&h, &m, other, nearest_node(other, target), target, INFINITY, &reached);
-    if (!reached) continue;
+    if (near->lacks_memory || other->lacks_memory) count = OUT_OF_MEMORY;
+    if (count || !reached) continue;
     count = own ? join(trees, far, node, path, max_points) : join(trees, node, far, path, max_points);
   }
   if (count > 2) count = shorten_on_manifold(&h, &m, path, count);
   /* The last state is on the manifold up to the tolerance only; the path must end at the goal itself. */
-  if (count) memcpy(path + n * (count - 1), s->goal, n * sizeof(double)); /* instead of its projection */
-  for (int i = 0; i < 2; i++) free(trees[i].q), free(trees[i].parent);
+  if (count > 0) memcpy(path + n * (count - 1), s->goal, n * sizeof(double));
+  free_tree(trees), free_tree(trees + 1);
   free(target), free(numbers), free(h.q), free_memory(h.m);
   return count;
 }

@@ -18,6 +18,7 @@ typedef struct {
   long count, capacity, n;
   double *q;
   long *parent;
+  int lacks_memory; /* a node could not be added */
 } tree;
 
 typedef struct {
@@ -68,11 +69,24 @@ static int line_is_clear(search *h, const double *a, const double *b, int check_
   return 1;
 }
 
+static tree make_tree(long n) {
+  tree t = {0, 256, n, malloc(256 * n * sizeof(double)), malloc(256 * sizeof(long)), 0};
+  t.lacks_memory = !t.q || !t.parent;
+  return t;
+}
+
+static void free_tree(tree *t) { free(t->q), free(t->parent); }
+
+/* Add a node; return its index, or -1 if there is no memory left. */
 static long add_node(tree *t, const double *q, long parent) {
+  if (t->lacks_memory) return -1;
   if (t->count == t->capacity) {
+    double *states = realloc(t->q, 2 * t->capacity * t->n * sizeof(double));
+    if (states) t->q = states;
+    long *parents = realloc(t->parent, 2 * t->capacity * sizeof(long));
+    if (parents) t->parent = parents;
+    if (!states || !parents) return t->lacks_memory = 1, -1;
     t->capacity *= 2;
-    t->q = realloc(t->q, t->capacity * t->n * sizeof(double));
-    t->parent = realloc(t->parent, t->capacity * sizeof(long));
   }
   memcpy(t->q + t->n * t->count, q, t->n * sizeof(double));
   t->parent[t->count] = parent;
@@ -119,11 +133,12 @@ static double line_time(const tree_settings *s, const double *a, const double *b
   return most;
 }
 
-/* Replace sections of a path by straight lines between random points on it; return its number of points. */
+/* Replace sections of a path by straight lines between random points on it; return its number of points, or OUT_OF_MEMORY. */
 static long shorten(search *h, double *path, long count, double *copy, long max_points) {
   const tree_settings *s = h->s;
   long n = s->scene->n;
   double *ends = malloc(2 * n * sizeof(double));
+  if (!ends) return OUT_OF_MEMORY;
   for (long trial = 0; trial < s->shortcuts && count > 2 && count + 2 <= max_points; trial++) {
     double whole = 0.0, along[2], section;
     /* Random points are uniform in estimated time, not in length: slow sections are shortened more often. */
@@ -168,19 +183,19 @@ static long shorten(search *h, double *path, long count, double *copy, long max_
   return count;
 }
 
-/* Search for a path from start to goal; return its number of points, at most max_points, or 0 if there is none. */
+/* Search for a path from start to goal; return its number of points, at most max_points, 0 if there is none, or
+OUT_OF_MEMORY. */
 long find_path(const tree_settings *s, double *path, long max_points) {
   long n = s->scene->n, count = 0;
   search h = {s, make_memory(s->scene), s->seed * 0x9E3779B97F4A7C15ull + 88172645463325252ull, malloc(n * sizeof(double))};
   double *target = malloc(n * sizeof(double)), *fresh = malloc(n * sizeof(double));
-  tree trees[2];
+  tree trees[2] = {make_tree(n), make_tree(n)};
+  add_node(trees, s->start, -1), add_node(trees + 1, s->goal, -1);
+  int lacks_memory = !h.m || !h.q || !target || !fresh || trees[0].lacks_memory || trees[1].lacks_memory;
   for (int i = 0; i < 10; i++) uniform(&h);
-  for (int i = 0; i < 2; i++) {
-    trees[i] = (tree){0, 256, n, malloc(256 * n * sizeof(double)), malloc(256 * sizeof(long))};
-    add_node(trees + i, i ? s->goal : s->start, -1);
-  }
+  if (lacks_memory) count = OUT_OF_MEMORY;
   /* Most pairs of states need no tree. */
-  if (line_is_clear(&h, s->start, s->goal, 0)) {
+  else if (line_is_clear(&h, s->start, s->goal, 0)) {
     memcpy(path, s->start, n * sizeof(double)), memcpy(path + n, s->goal, n * sizeof(double));
     count = 2;
   }
@@ -190,6 +205,7 @@ long find_path(const tree_settings *s, double *path, long max_points) {
     for (long j = 0; j < n; j++) target[j] = s->lower[j] + uniform(&h) * (s->upper[j] - s->lower[j]);
     tree *near = trees + own, *other = trees + !own;
     long node = extend(&h, near, nearest_node(near, target), target, fresh, &reached);
+    if (near->lacks_memory) count = OUT_OF_MEMORY;
     if (node < 0) continue;
     memcpy(target, fresh, n * sizeof(double));
     long far = nearest_node(other, target);
@@ -197,13 +213,14 @@ long find_path(const tree_settings *s, double *path, long max_points) {
     do far = extend(&h, other, far, target, fresh, &reached);
     while (far >= 0 && !reached);
     if (far >= 0) count = own ? join(trees, far, node, path, max_points) : join(trees, node, far, path, max_points);
+    if (near->lacks_memory || other->lacks_memory) count = OUT_OF_MEMORY;
   }
   if (count > 2) {
     double *copy = malloc(max_points * n * sizeof(double));
-    count = shorten(&h, path, count, copy, max_points);
+    count = copy ? shorten(&h, path, count, copy, max_points) : OUT_OF_MEMORY;
     free(copy);
   }
-  for (int i = 0; i < 2; i++) free(trees[i].q), free(trees[i].parent);
+  free_tree(trees), free_tree(trees + 1);
   free(target), free(fresh), free(h.q), free_memory(h.m);
   return count;
 }

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.collision.collision_checker import CollisionChecker
-from cnpgen.kernels.compiled_kernel import address_of
+from cnpgen.kernels.compiled_kernel import address_of, require_memory
 from cnpgen.kernels.kernel import Kernel
 
 Array = NDArray[np.float64]
@@ -126,6 +126,7 @@ def _search(
     if manifold is None:
         search = checker.library.find_path
         search.restype, search.argtypes = c_long, (c_void_p, c_void_p, c_long)
+        search.errcheck = require_memory
         count = search(ctypes.addressof(native), address_of(path), len(path))
     else:
         # The kernel projects a block of states at once, so the scene is repeated for
@@ -138,6 +139,7 @@ def _search(
             c_long,
             (*(c_void_p,) * 3, c_long, c_double, c_void_p, c_long),
         )
+        search.errcheck = require_memory
         residuals, rows = manifold.residuals.address, manifold.residuals.tape.outputs[0]
         errors = rows, MAX_PROJECTION_ERROR
         count = search(

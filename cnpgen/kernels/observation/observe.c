@@ -239,8 +239,10 @@ static void scatter(const patch *p, uint64_t start, long n, float *out) {
   }
 }
 
+enum { OUT_OF_MEMORY = -1 }; /* result of functions that allocate memory */
+
 /* Points on the surfaces of each scene, in proportion to the areas of the patches; nan for a scene without bodies. */
-void scene_clouds(const scene_arrays *a, const uint64_t *seed, long count, float *points) {
+long scene_clouds(const scene_arrays *a, const uint64_t *seed, long count, float *points) {
   long most_patches = 0;
   EACH(scene, 0, a->scenes) {
     long sum = 0;
@@ -251,6 +253,7 @@ void scene_clouds(const scene_arrays *a, const uint64_t *seed, long count, float
     most_patches = sum > most_patches ? sum : most_patches;
   }
   patch *p = malloc((most_patches + 1) * sizeof *p);
+  if (!p) return OUT_OF_MEMORY;
   EACH(scene, 0, a->scenes) {
     float *out = points + 3 * count * scene;
     double area = 0, sum = 0, offset = (double)(mixed(seed[scene]) >> 11) / 9007199254740992.0;
@@ -271,6 +274,7 @@ void scene_clouds(const scene_arrays *a, const uint64_t *seed, long count, float
     }
   }
   free(p);
+  return 0;
 }
 
 typedef struct { double origin[3], axes[9]; /* rows: forward, right, down; the last two times half the image's extent */ } view;
@@ -399,9 +403,10 @@ void scene_depths(const scene_arrays *a, const view *camera, long width, long he
 }
 
 /* Points of depth images, evenly distributed over the pixels that see a body; nan if there are none. */
-void depth_clouds(long scenes, const view *camera, long width, long height, const float *depth, const uint64_t *seed,
+long depth_clouds(long scenes, const view *camera, long width, long height, const float *depth, const uint64_t *seed,
                   long count, float *points) {
   int *pixel = malloc((width * height + 1) * sizeof *pixel);
+  if (!pixel) return OUT_OF_MEMORY;
   EACH(scene, 0, scenes) {
     const float *image = depth + scene * width * height;
     float *out = points + 3 * count * scene;
@@ -421,4 +426,5 @@ void depth_clouds(long scenes, const view *camera, long width, long height, cons
     }
   }
   free(pixel);
+  return 0;
 }
