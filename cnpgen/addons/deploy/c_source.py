@@ -64,6 +64,7 @@ def source_text(parts: PlannerParts, names: Names) -> str:
         network_text(parts),
         *(_handwritten(name) for name in _files(parts)),
         _plan(parts),
+        *([] if parts.problem.uses_jerk else [_handwritten("stop.c")]),
     ]
     body = "\n".join(
         [
@@ -198,6 +199,7 @@ def header_text(parts: PlannerParts, names: Names) -> str:
   double violations[{size["CONSTRAINTS"]}];  /* of every constraint, in its tolerances; infinite if not computed */
 """,
         "MEMORY": _memory(parts),
+        "STOP": "" if parts.problem.uses_jerk else _handwritten("stop.h"),
     }
     text = _handwritten("header.h")
     for placeholder, value in fields.items():
