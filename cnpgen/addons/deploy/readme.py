@@ -70,4 +70,4 @@ def _stop(parts: PlannerParts, name: str) -> str:
         return (
             "- A stop is not part of this file, because the problem limits the jerk.\n"
         )
-    return f"- `{name}_find_stop` finds the earliest feasible stop on the path after a time; `{name}_stop_state` is its state.\n"
+    return f"- `{name}_find_stop` finds the earliest feasible stop after a time, and `{name}_stop_state` is its state.\n"

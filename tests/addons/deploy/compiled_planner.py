@@ -59,8 +59,8 @@ double check(const double *in, int width, double *violations) {
   return @_check(&motion, &memory, violations);
 }
 #if !JERK
-int stop(const double *in, int width, double time, long count, double *found, double *times, double *q, double *dq, double *ddq,
-         int *moves) {
+int stop(const double *in, int width, double time, long count, double *found, double *times, double *q, double *dq,
+         double *ddq, int *moves) {
   static @_memory memory;
   @_request request;
   @_motion motion;
