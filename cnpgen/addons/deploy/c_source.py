@@ -14,16 +14,17 @@ from cnpgen.addons.deploy.c_tables import (
 )
 from cnpgen.addons.deploy.c_tape import grid_function, point_function
 from cnpgen.addons.deploy.c_text import comment_text, number, string_literal
-from cnpgen.addons.deploy.planner_parts import PlannerParts
+from cnpgen.addons.deploy.planner_parts import LANES, PlannerParts
 from cnpgen.machine.versions import __version__
 
 SOURCES = Path(__file__).with_name("source")
-POINT_TAPES = ("task", "line_change", "projected_path", "speed_residuals")
+POINT_TAPES = ("task", "line_change", "projected_path")
 GRID_TAPES = {  # tape -> number of phases
     "moving_violations": "PHASES",
     "position_violations": "CHECKED_PHASES",
     "speed_violation": "PHASES",
     "speed_coefficients": "PHASES",
+    "speed_residuals": "LANES",
 }
 CODES = {  # code -> cause, in the order of their numbers
     "VALID": "the motion meets all conditions of the problem at the phases of the grid",
@@ -63,6 +64,7 @@ def source_text(parts: PlannerParts, names: Names) -> str:
         network_text(parts),
         *(_handwritten(name) for name in _files(parts)),
         _plan(parts),
+        *([] if parts.problem.uses_jerk else [_handwritten("stop.c")]),
     ]
     body = "\n".join(
         [
@@ -197,6 +199,7 @@ def header_text(parts: PlannerParts, names: Names) -> str:
   double violations[{size["CONSTRAINTS"]}];  /* of every constraint, in its tolerances; infinite if not computed */
 """,
         "MEMORY": _memory(parts),
+        "STOP": "" if parts.problem.uses_jerk else _handwritten("stop.h"),
     }
     text = _handwritten("header.h")
     for placeholder, value in fields.items():
@@ -287,16 +290,19 @@ def _memory(parts: PlannerParts) -> str:
         "positions": inputs["position_violations"] * rows,
         "rows": most_rows,
     }
-    if "speed_violation" in parts.tapes:
-        fields["violation"] = phases
     if parts.parametrization is not None:
+        fields["violation"] = phases
         fields["coefficients"] = 3 * size["ROWS"] * phases
+    if parts.scaling is not None:
+        fields["moving"] = inputs["speed_residuals"] * LANES
     lines = [f"  double {name}[{count}];" for name, count in fields.items()]
     if parts.parametrization is not None:
         lines += [
             f"  double direction[2][{phases}];",
             f"  double quadratic[{size['ROWS']}][3][{size['LANES']}];",
         ]
+    if parts.scaling is not None:
+        lines.append(f"  double residuals[3][{size['RESIDUALS'] * LANES}];")
     lines += [
         f"  float x[{size['FEATURE_WIDTH']}], hidden[2][{padded(architecture.hidden)}];",
         f"  float phi[{padded(architecture.path_outputs)}], log_rate[{padded(architecture.rate_outputs)}];",

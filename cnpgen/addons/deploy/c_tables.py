@@ -176,8 +176,8 @@ def _grid_tables(parts: PlannerParts) -> Iterable[str]:
     yield table("int", "checked_phase", parts.checked_phases)
     yield table("double", "path_basis", np.array(path))
     yield table("double", "rate_basis", np.array(rate))
-    yield table("int", "path_range", _range(np.array(path)))
-    yield table("int", "rate_range", _range(np.array(rate)))
+    yield table("int", "path_support", _support(np.array(path)))
+    yield table("int", "rate_support", _support(np.array(rate)))
     if parts.position_constraints:
         yield table("int", "position_constraint", parts.position_constraints)
     if parts.moving_constraints:
@@ -190,6 +190,15 @@ def _range(table_of_basis: Array) -> NDArray[np.int64]:
     first = nonzero.argmax(axis=1)
     last = nonzero.shape[1] - nonzero[:, ::-1].argmax(axis=1)
     return np.stack([first - first % LANES, last + -last % LANES], axis=1)
+
+
+def _support(table_of_basis: Array) -> NDArray[np.int64]:
+    """Return the first function that is not 0 in each group of lanes, and the end of those, shape (groups, 2)."""
+    orders, points, _ = table_of_basis.shape
+    groups = table_of_basis.reshape(orders, points, -1, LANES)
+    nonzero = (groups != 0).any(axis=(0, 3)).T
+    end = points - nonzero[:, ::-1].argmax(axis=1)
+    return np.stack([nonzero.argmax(axis=1), end], axis=1)
 
 
 def _bounds(parts: PlannerParts) -> Iterable[str]:

@@ -23,6 +23,7 @@ from cnpgen.planner.control_point_functions import line_change, projected_path
 from cnpgen.planner.expressions import (
     SpeedBounds,
     effective_steps,
+    has_friction,
     speed_bounds,
     speed_coefficients,
     speed_residuals,
@@ -123,7 +124,7 @@ class PlannerParts:
         return np.array(low), np.array(high)
 
 
-def check_supported(model: Model, problem: Problem) -> None:
+def check_supported(model: Model, problem: Problem, robot: Robot) -> None:
     """Raise UsageError for a model that cannot be a C file yet, with the reason."""
     reason = ""
     if problem.has_sample_obstacles or SCENE in model.features.blocks:
@@ -132,6 +133,10 @@ def check_supported(model: Model, problem: Problem) -> None:
         reason = "its network corrects its own path, which C files do not support"
     elif model.config.via_points:
         reason = "it plans along lines through via points, which C files do not support"
+    elif has_friction(robot) and (
+        model.config.time_parametrized or model.is_rest_to_rest
+    ):
+        reason = "its drives have friction, for which C files do not fit rates"
     elif not all(
         np.isfinite(values).all()
         for values in (model.parameters, model.features.mean, model.features.scale)
@@ -199,9 +204,8 @@ def _tapes(
     if steps := effective_steps(kernels, config.line_projection_steps):
         own = {"steps": steps, "with_offsets": False, **options}
         builders["line_change"] = line_change, own
-    if parametrized or model.is_rest_to_rest:
-        builders["speed_violation"] = speed_violation, {}
     if parametrized:
+        builders["speed_violation"] = speed_violation, {}
         builders["speed_coefficients"] = speed_coefficients, {}
     if model.is_rest_to_rest:
         builders["speed_residuals"] = speed_residuals, {}

@@ -40,7 +40,7 @@ The last two options change no number: without errno and floating-point traps, m
 - `{name}_state` is the state at a time. Before the start and after the end the robot is at rest there.
 - `{name}_duration` is the duration [s].
 - `{name}_check` checks a motion on the grid again, and writes the violation of each constraint.
-
+{_stop(parts, name)}
 | code | name | cause |
 |---|---|---|
 {rows}
@@ -57,9 +57,17 @@ A motion may end with a velocity, such as a hit. `{name}_state` is at rest after
   `admit_outside_range = 1` plans outside of it, too.
 - A boundary condition is not compared with the limits before planning, but the check includes both ends.
 - Time stays bounded: every loop has a constant limit. The time parametrization and time scaling depend on the motion.
-- The earliest feasible stop is not part of this file.
 
 ## Identity
 
 Model file sha256 `{names.model_sha256}`, problem sha256 `{parts.model.problem.comparable_sha256}`.
 """
+
+
+def _stop(parts: PlannerParts, name: str) -> str:
+    """Return the line about stops; there are none for problems with limits of the jerk."""
+    if parts.problem.uses_jerk:
+        return (
+            "- A stop is not part of this file, because the problem limits the jerk.\n"
+        )
+    return f"- `{name}_find_stop` finds the earliest feasible stop after a time, and `{name}_stop_state` is its state.\n"

@@ -58,6 +58,26 @@ double check(const double *in, int width, double *violations) {
   @_plan(&request, &motion, &memory);
   return @_check(&motion, &memory, violations);
 }
+#if !JERK
+int stop(const double *in, int width, double time, long count, double *found, double *times, double *q, double *dq,
+         double *ddq, int *moves) {
+  static @_memory memory;
+  @_request request;
+  @_motion motion;
+  @_stop stop;
+  memcpy(&request, in, (size_t)width * sizeof(double));
+  request.admit_outside_range = 1;
+  @_plan(&request, &motion, &memory);
+  int code = @_find_stop(&motion, time, &memory, &stop);
+  found[0] = stop.begin;
+  found[1] = stop.braking_time;
+  for (long i = 0; i < count; i++) {
+    times[i] = time + (stop.begin + stop.braking_time + 1e-9 - time) * (double)i / (double)(count - 1);
+    moves[i] = @_stop_state(&motion, &stop, times[i], q + i * JOINTS, dq + i * JOINTS, ddq + i * JOINTS);
+  }
+  return code;
+}
+#endif
 void run_task(const double *in, double *out) { task(in, out); }
 #if LINE_STEPS
 void run_line(const double *in, double *out) { line_change(in, out); }
@@ -85,6 +105,20 @@ class Planned:
     rate: Array
     duration: Array
     violations: Array
+
+
+@dataclass(frozen=True)
+class CompiledStop:
+    """A stop, and states from the time of its request to its end."""
+
+    exists: bool
+    begin: float
+    braking_time: float
+    times: Array
+    q: Array
+    dq: Array
+    ddq: Array
+    moves: NDArray[np.int32]
 
 
 @dataclass(frozen=True)
@@ -143,6 +177,20 @@ class CompiledPlanner:
         self.library.check.restype = ctypes.c_double
         worst = self.library.check(pointer(request), len(request), pointer(violations))
         return worst, violations
+
+    def stop(self, request: Array, time: float, count: int) -> "CompiledStop":
+        """Plan one request, and stop after a time [s]; return states from then to the end of the stop."""
+        request, found, times = np.array(request, float), np.empty(2), np.empty(count)
+        states = [np.empty((count, self.joints)) for _ in range(3)]
+        moves = np.empty(count, np.int32)
+        exists = self.library.stop(
+            pointer(request),
+            len(request),
+            ctypes.c_double(time),
+            ctypes.c_long(count),
+            *map(pointer, (found, times, *states, moves)),
+        )
+        return CompiledStop(bool(exists), found[0], found[1], times, *states, moves)
 
     def run(self, function: str, values: Array, outputs: int) -> Array:
         """Call a private function of one array and one result."""

@@ -32,6 +32,7 @@ pytestmark = needs_compiler
 
 VALID, NOT_FINITE, MUST_BE_ZERO, OUTSIDE, PARAMETER, NO_RATE, NO_PATH = range(7)
 ROWS = 300
+MANY_ROWS = 10_000
 
 
 def requests_of(boundary: Boundary) -> np.ndarray:
@@ -78,6 +79,23 @@ def test_plans_equal_those_of_python(planned, plans):
     )
     np.testing.assert_allclose(
         planned.duration[valid], plans.duration[valid], rtol=1e-5
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", ["-O2", "-O3 -march=native -ffp-contract=fast"])
+def test_plans_of_many_rows_equal_those_of_python(hits, tmp_path: Path, options: str):
+    boundary = draw_boundary_problems("airhockey-hit", MANY_ROWS, seed=11).boundary
+    planned = compiled_planner("airhockey-hit", tmp_path, *options.split()).plan(
+        requests_of(boundary)
+    )
+    plans, valid = hits.plan_batch(boundary), planned.code == VALID
+    assert valid.mean() > 0.95
+    np.testing.assert_allclose(
+        planned.path[valid], plans.path_control_points[valid], rtol=0, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        planned.rate[valid], plans.rate_control_points[valid], rtol=1e-5
     )
 
 
@@ -318,6 +336,10 @@ int main(void) {
       @_plan(&request, &motion, &memory);
       for (int k = -2; k < 40; k++) sum += @_state(&motion, 0.05 * k, q, dq, ddq) + q[0];
       sum += @_check(&motion, &memory, violations) > 1;
+      for (int k = -1; k < 4; k++) {
+        @_stop stop;
+        sum += @_find_stop(&motion, 0.2 * k, &memory, &stop) + @_stop_state(&motion, &stop, 0.3 * k, q, dq, ddq);
+      }
     }
   }
   return sum == 12345;

@@ -21,7 +21,7 @@ static void lay_out_positions(const NAME_motion *motion, NAME_memory *memory) {
 }
 
 /* Write the largest violation of every constraint, in tolerances of valid motions; return the largest of them by
-conditions on positions, and by those that depend on velocity. */
+conditions on positions, and by those that depend on velocity. The path is laid out already. */
 static void check_grid(const NAME_motion *motion, NAME_memory *memory, double *violations, double worst[2]) {
   worst[0] = worst[1] = -INFINITY;
   for (int i = 0; i < CONSTRAINTS; i++) violations[i] = -INFINITY;
@@ -30,7 +30,7 @@ static void check_grid(const NAME_motion *motion, NAME_memory *memory, double *v
     worst[0] = INFINITY;
     return;
   }
-  lay_out(motion, memory);
+  lay_out_rates(motion->rate, memory);
 #if POSITION_ROWS
   lay_out_positions(motion, memory);
   position_violations(memory->positions, memory->rows);

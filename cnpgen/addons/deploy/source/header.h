@@ -38,7 +38,7 @@ int NAME_state(const NAME_motion *motion, double time, double q[@N@], double dq[
 /* Check a motion at the phases of the grid: write the largest violation of every constraint, in its tolerances, and return
 the largest of them. The motion is valid on the grid up to 1. */
 double NAME_check(const NAME_motion *motion, NAME_memory *memory, double violations[@M@]);
-
+@STOP@
 #ifdef __cplusplus
 }
 #endif

@@ -94,6 +94,7 @@ int NAME_plan(const NAME_request *request, NAME_motion *motion, NAME_memory *mem
     return refuse(UPPER_OUTSIDE_TRAINING_RANGE, request, motion);
   shape(memory->ends, expected_time, motion, memory);
   if (!is_usable(motion)) return refuse(UPPER_PATH_NOT_VALID, request, motion);
+  lay_out_path(motion, memory);
   FIT_RATES
   check_grid(motion, memory, motion->violations, worst);
   if (!(worst[0] <= 1)) return refuse(UPPER_PATH_NOT_VALID, request, motion);
@@ -121,6 +122,7 @@ int NAME_state(const NAME_motion *motion, double time, double q[JOINTS], double 
 
 double NAME_check(const NAME_motion *motion, NAME_memory *memory, double violations[CONSTRAINTS]) {
   double worst[2];
+  lay_out_path(motion, memory);
   check_grid(motion, memory, violations, worst);
   return worst[0] > worst[1] ? worst[0] : worst[1];
 }

@@ -98,7 +98,7 @@ static double violation_of(const double *rate, NAME_memory *memory) {
 static int parametrize(NAME_motion *motion, NAME_memory *memory) {
   double *rate = motion->rate, before[RATE_POINTS], movable[RATE_POINTS];
   memcpy(before, rate, sizeof before);
-  lay_out(motion, memory);
+  lay_out_rates(rate, memory);
   speed_coefficients(memory->column, memory->coefficients);
   int twice = sweep(rate, memory) > MIN_INCREASE;
   if (twice) sweep(rate, memory);

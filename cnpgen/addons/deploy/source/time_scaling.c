@@ -14,56 +14,68 @@ static double smallest_cubic_scale(double margin, double change) {
   return change > margin && margin > 0 && isfinite(k) && k > 1 ? k : 1;
 }
 
-/* Bounded values at a phase, with time scaled by 1 / slowness; at rest if it is 0. */
-static void residuals_at(const NAME_memory *memory, int k, double slowness, double *values) {
-  double in[ORDERS * JOINTS + SCENE + 1], r[ORDERS];
-  for (int order = 0; order < ORDERS - 1; order++) r[order] = memory->column[(ORDERS * JOINTS + order) * PHASES + k];
+/* Bounded values at LANES phases from k on, with time scaled by 1 / slowness; at rest if it is 0. */
+static void residuals_at(NAME_memory *memory, int k, double slowness, double *values) {
+  const double *p = memory->column + k, *r = p + ORDERS * JOINTS * PHASES, *scene = r + (ORDERS - 1) * PHASES;
+  double *in = memory->moving, square = slowness * slowness;
   for (int i = 0; i < JOINTS; i++) {
-    double p1 = memory->column[(JOINTS + i) * PHASES + k], p2 = memory->column[(2 * JOINTS + i) * PHASES + k], scale = slowness;
-    in[i] = memory->column[i * PHASES + k];
-    in[JOINTS + i] = p1 * r[0] * scale;
-    scale *= slowness;
-    in[2 * JOINTS + i] = (p2 * r[0] + p1 * r[1]) * r[0] * scale;
+    const double *p1 = p + (JOINTS + i) * PHASES, *p2 = p1 + JOINTS * PHASES, *r1 = r + PHASES;
+    double *q = in + i * LANES, *dq = q + JOINTS * LANES, *ddq = dq + JOINTS * LANES;
+    for (int l = 0; l < LANES; l++) {
+      q[l] = p[i * PHASES + l];
+      dq[l] = p1[l] * r[l] * slowness;
+      ddq[l] = (p2[l] * r[l] + p1[l] * r1[l]) * r[l] * square;
+    }
 #if JERK
-    double p3 = memory->column[(3 * JOINTS + i) * PHASES + k];
-    scale *= slowness;
-    in[3 * JOINTS + i] = ((p3 * r[0] + 3 * p2 * r[1]) * r[0] + p1 * (r[2] * r[0] + r[1] * r[1])) * r[0] * scale;
+    const double *p3 = p2 + JOINTS * PHASES, *r2 = r1 + PHASES;
+    double *jerk = ddq + JOINTS * LANES;
+    for (int l = 0; l < LANES; l++)
+      jerk[l] = ((p3[l] * r[l] + 3 * p2[l] * r1[l]) * r[l] + p1[l] * (r2[l] * r[l] + r1[l] * r1[l])) * r[l] * square * slowness;
 #endif
   }
-  for (int i = 0; i < SCENE; i++) in[ORDERS * JOINTS + i] = memory->column[(ORDERS * JOINTS + ORDERS - 1 + i) * PHASES + k];
+  for (int i = 0; i < SCENE; i++)
+    for (int l = 0; l < LANES; l++) in[(ORDERS * JOINTS + i) * LANES + l] = scene[i * PHASES + l];
   speed_residuals(in, values);
 }
 
-/* The smallest time scale at a phase. */
-static double scale_at(const NAME_memory *memory, int k) {
-  double fast[RESIDUALS], slow[RESIDUALS], still[RESIDUALS], needed = 1;
-  residuals_at(memory, k, 1, fast);
-  residuals_at(memory, k, 0.5, slow);
-  residuals_at(memory, k, 0, still);
-  for (int row = 0; row < RESIDUALS; row++)
-    for (int side = 0; side < 2; side++) {
-      double sign = side ? -1 : 1, bound = side ? residual_lower[row] : residual_upper[row];
-      if (!(sign * fast[row] > sign * bound)) continue;
-      double margin = sign * (bound - still[row]), change = sign * (fast[row] - still[row]);
-      double half = sign * (slow[row] - still[row]);
-      double square = 2 * (change - 2 * half); /* from g(1) = static + b + c and g(2) = static + b / 2 + c / 4 */
-      double scale = is_cubic[row] ? smallest_cubic_scale(margin, change)
-                                   : smallest_scale(margin, change - square, square);
+/* The smallest scale at which a value that exceeds its upper bound meets it; a lower bound has the opposite signs. */
+static double scale_of(double bound, double fast, double slow, double still, int cubic) {
+  double margin = bound - still, change = fast - still, half = slow - still;
+  double square = 2 * (change - 2 * half); /* from g(1) = static + b + c and g(2) = static + b / 2 + c / 4 */
+  return cubic ? smallest_cubic_scale(margin, change) : smallest_scale(margin, change - square, square);
+}
+
+/* The smallest time scale at LANES phases from k on. All values are evaluated for every motion, so that the time hardly
+depends on it. */
+static double scale_at(NAME_memory *memory, int k) {
+  const double *fast = memory->residuals[0], *slow = memory->residuals[1], *still = memory->residuals[2];
+  double needed = 1;
+  residuals_at(memory, k, 1, memory->residuals[0]);
+  residuals_at(memory, k, 0.5, memory->residuals[1]);
+  residuals_at(memory, k, 0, memory->residuals[2]);
+  for (int row = 0; row < RESIDUALS; row++, fast += LANES, slow += LANES, still += LANES) {
+    double low = residual_lower[row], high = residual_upper[row], exceeds[LANES], any = 0;
+    for (int l = 0; l < LANES; l++) exceeds[l] = (fast[l] > high) | (fast[l] < low) ? 1.0 : 0.0;
+    for (int l = 0; l < LANES; l++) any += exceeds[l];
+    if (!(any > 0)) continue;
+    for (int l = 0; l < LANES; l++) {
+      double scale = 1;
+      if (fast[l] > high) scale = scale_of(high, fast[l], slow[l], still[l], is_cubic[row]);
+      if (fast[l] < low) scale = scale_of(-low, -fast[l], -slow[l], -still[l], is_cubic[row]);
       needed = scale > needed ? scale : needed;
     }
+  }
   return needed;
 }
 
 /* Divide the rates by the smallest scale of time at which the motion meets its limits. */
 static void scale_time(NAME_motion *motion, NAME_memory *memory) {
   double factor = 1;
-  lay_out(motion, memory);
-  speed_violation(memory->column, memory->violation);
-  for (int k = 0; k < PHASES; k++)
-    if (memory->violation[k] > 0) {
-      double scale = scale_at(memory, k);
-      factor = scale > factor ? scale : factor;
-    }
+  lay_out_rates(motion->rate, memory);
+  for (int k = 0; k < PHASES; k += LANES) {
+    double scale = scale_at(memory, k);
+    factor = scale > factor ? scale : factor;
+  }
   if (!(factor > 1)) return;
   factor *= 1 + SCALE_MARGIN;
   factor = factor < MAX_SCALE ? factor : MAX_SCALE;
