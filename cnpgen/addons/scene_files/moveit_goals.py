@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from cnpgen.addons.scene_files.euler_tolerance import rotation_vector_tolerance
+from cnpgen.addons.scene_files.link_constraints import EULER, REGIONS, ROTATION_VECTOR
 from cnpgen.addons.scene_files.moveit_frames import (
     FrameTable,
     frame_id,
@@ -19,9 +20,8 @@ from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError
 from cnpgen.problems.scenes.yaml_document import part, scalar, vector
 from cnpgen.robots.shape.hull import Array
 
-REGIONS = ("box", "sphere", "cylinder")
-EULER, ROTATION_VECTOR = "0", "1"  # codes of the parameterization
-_PARAMETERIZATIONS = {"XYZ_EULER_ANGLES": EULER, "ROTATION_VECTOR": ROTATION_VECTOR}
+_PARAMETRIZATIONS = {"0": EULER, "XYZ_EULER_ANGLES": EULER}
+_PARAMETRIZATIONS |= {"1": ROTATION_VECTOR, "ROTATION_VECTOR": ROTATION_VECTOR}
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +124,7 @@ def read_goal_pose(
             raise SceneError(
                 f"{where}: position and orientation of a goal must be in one frame"
             )
-        turn, tolerance = _orientation(orientations[0], where)
+        turn, tolerance = _goal_orientation(orientations[0], where)
     frame, placed = table.resolve(frame, (center, turn))
     return frame, GoalPose(
         frame=link,
@@ -166,8 +166,8 @@ def _region(constraint: Any, where: str) -> tuple[Array, float]:
     return pose_of(poses[0], where)[0], float(radius)
 
 
-def _orientation(constraint: Any, where: str) -> tuple[Array, Array]:
-    """Return rotation matrix and tolerances of the rotation vector [rad] of an orientation constraint."""
+def orientation_of(constraint: Any, where: str) -> tuple[Array, Array, str]:
+    """Return rotation matrix, tolerances up to pi [rad] and parametrization of an orientation constraint."""
     tolerance = np.array(
         [
             scalar(
@@ -183,14 +183,19 @@ def _orientation(constraint: Any, where: str) -> tuple[Array, Array]:
         )
     value = constraint.get("parameterization")
     text = "0" if value is None else str(value).strip().upper()
-    code = _PARAMETERIZATIONS.get(text, text)
-    if code not in _PARAMETERIZATIONS.values():
+    kind = _PARAMETRIZATIONS.get(text)
+    if kind is None:
         raise SceneError(
             f"{where}: parameterization must be 0 (XYZ_EULER_ANGLES) or 1 (ROTATION_VECTOR), got {value!r:.60}"
         )
-    tolerance = np.minimum(tolerance, np.pi)
     rotation = rotation_of(constraint.get("orientation"), where)
-    if code == ROTATION_VECTOR:
+    return rotation, np.minimum(tolerance, np.pi), kind
+
+
+def _goal_orientation(constraint: Any, where: str) -> tuple[Array, Array]:
+    """Return rotation matrix and tolerances of the rotation vector [rad] of an orientation constraint."""
+    rotation, tolerance, kind = orientation_of(constraint, where)
+    if kind == ROTATION_VECTOR:
         return rotation, tolerance
     try:
         return rotation, rotation_vector_tolerance(tolerance)

@@ -37,6 +37,7 @@ from cnpgen.addons.scene_files.moveit_objects import (
     read_attached,
     read_world,
 )
+from cnpgen.addons.scene_files.moveit_path import read_path_constraints
 from cnpgen.addons.scene_files.moveit_shapes import built
 from cnpgen.addons.scene_files.moveit_unused import UNUSED_ELEMENTS
 from cnpgen.addons.scene_files.octomap import read_octomap
@@ -135,6 +136,7 @@ def _problem(
     )
     problem = _with_goals(request, where, joints, start, table)
     velocity_scale, acceleration_scale = _scales(request, where)
+    constraints = list(read_path_constraints(request, table, where))
     return replace(
         problem,
         name=name,
@@ -149,6 +151,8 @@ def _problem(
             obstacle_frames=tuple(frame for frame, _ in obstacles),
             fixed_frames=tuple(table.used.items()),
             attached=attached,
+            constraints=tuple(each for _, each in constraints),
+            constraint_frames=tuple(frame for frame, _ in constraints),
         ),
     )
 
@@ -212,8 +216,7 @@ def _with_goals(
 
     Its ``goal_constraints`` are alternatives.
     """
-    for key in ("path_constraints", "trajectory_constraints"):
-        _refuse_constraints(request, key, where)
+    _refuse_trajectory_constraints(request, where)
     with_joints, others = _alternatives(request, where)
     joint_goals = read_joint_goals(with_joints, joints, start, where)
     read = (read_goal_pose(entry, table, where) for entry in others)
@@ -261,21 +264,13 @@ def _alternatives(
     return with_joints, others
 
 
-def _refuse_constraints(request: AccountedMapping, key: str, where: str) -> None:
-    """Refuse constraints of the path; a name without constraints is none."""
+def _refuse_trajectory_constraints(request: AccountedMapping, where: str) -> None:
+    """Refuse constraints of waypoints; a name without constraints is none."""
+    key = "trajectory_constraints"
     entry = part(request, key, dict, where)
-    kinds = [
-        kind
-        for kind, value in entry.items()
-        if kind != "name" and not is_default(value)
-    ]
-    if kinds:
-        request.account.refuse(
-            key,
-            entry,
-            "constraints of the path are not supported in scene files; a problem file"
-            " has constraints of every state, such as 'axis'",
-        )
+    if not all(is_default(value) for kind, value in entry.items() if kind != "name"):
+        text = "constraints of waypoints are not supported: give path_constraints"
+        request.account.refuse(key, entry, text)
     mark_read(entry)
 
 

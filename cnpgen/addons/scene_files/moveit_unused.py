@@ -12,7 +12,7 @@ HARMLESS = {
     ".robot_state.multi_dof_joint_state.header": "it has no transforms",
     "link_padding.link_name": "every padding is 0",
     "link_scale.link_name": "every scale is 1",
-    "path_constraints.name": "there are no constraints of the path",
+    "path_constraints.name": "name of constraints",
     "octomap.octomap.header": "the frame is that of the message around it",
     "collision_objects.type": "key of a database of objects",
     "object.type": "key of a database of objects",

@@ -43,7 +43,7 @@ def placed_scene(scene: SceneProblem, robot: Robot, start: Array) -> SceneProble
     """
     request = scene.request
     _warn_of_another_robot(scene, robot)
-    if not (request.places or request.attached):
+    if not request.places:
         return scene
     frames = LinkFrames(scene, robot, start)
     obstacles = []
@@ -60,8 +60,19 @@ def placed_scene(scene: SceneProblem, robot: Robot, start: Array) -> SceneProble
             rotation=rotation @ goal.rotation,
         )
     attached = tuple(_in_link(each, frames) for each in request.attached)
+    names = request.constraint_frames
+    constraints = tuple(
+        each.moved(*frames.fixed_pose(frame, f"the constraint of {each.link!r}"))
+        for each, frame in zip(request.constraints, names, strict=True)
+    )
     plain: SceneRequest = replace(
-        request, obstacle_frames=(), goal_frame="", fixed_frames=(), attached=attached
+        request,
+        obstacle_frames=(),
+        goal_frame="",
+        fixed_frames=(),
+        attached=attached,
+        constraints=constraints,
+        constraint_frames=("",) * len(names),
     )
     placed = replace(scene, obstacles=tuple(obstacles), goal_pose=goal, request=plain)
     return checked_scene(placed)
@@ -98,6 +109,18 @@ class LinkFrames:
             f" lacks{nearest(frame, self.links)}; expected world, a link of the robot,"
             f" an object or a fixed frame of the file; links: {listed(self.links, 12)}"
         )
+
+    def fixed_pose(self, frame: str, what: str) -> Pose:
+        """Return the pose of a frame that no planned joint moves, in the frame of the robot's base."""
+        pose = self.pose(frame, what)
+        if frame in self.links:
+            placed = self._model.frames[frame_of(self._model, frame)]
+            if placed.parentJoint:
+                raise SceneError(
+                    f"{self._scene.place}: {what} is in the frame {frame!r}, which moves"
+                    " with the robot: expected a frame of the world"
+                )
+        return pose
 
     def check_link(self, link: str, what: str) -> None:
         """Raise SceneError for an unknown link."""

@@ -1,4 +1,4 @@
-"""Problem of a request: a robot's problem with the scaling factors and the attached objects of its scenes."""
+"""Problem of a request: a robot's problem with the scaling factors, attached objects and constraints of its scenes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 
-from cnpgen.errors import RecipeError, listed
+from cnpgen.errors import RecipeError, listed, nearest
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
@@ -14,6 +14,7 @@ from cnpgen.problems.problem_record import ProblemRecord, as_problem, record_pro
 from cnpgen.problems.scenes.scene_problem import SceneError, SceneProblem
 from cnpgen.problems.scenes.scene_request import NO_REQUEST, AttachedObject
 from cnpgen.robots.attached_links import attached_link_name, with_attached_link
+from cnpgen.robots.chain import frame_of
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.arguments import check_range, number
@@ -35,7 +36,8 @@ def requested_problem(
     """Return the problem that placed scenes ask for, its robot, and the scenes without these changes.
 
     Scaling factors multiply the limits of velocities and accelerations. Attached
-    objects become links with their geometry and mass.
+    objects become links with their geometry and mass. Constraints are added to those of
+    the problem.
 
     Args:
         problem: The robot's problem.
@@ -56,7 +58,7 @@ def requested_problem(
     for scene in scenes:
         if scene.request.changes != first.request.changes:
             raise SceneError(
-                f"{scene.place} has other scaling factors or attached objects than"
+                f"{scene.place} has other scaling factors, attached objects or path constraints than"
                 f" {first.place}, and the plans of one call share a problem: choose the"
                 " scenes of one problem by {first} and {n}",
                 remedies={"first": None, "n": None},
@@ -64,6 +66,7 @@ def requested_problem(
     if not first.request.changes_problem:
         return problem, robot, list(scenes)
     changed = _with_scales(problem, robot, first)
+    changed = _with_constraints(changed, robot, first)
     if first.request.attached:
         objects = [
             _with_mass(item, problem, first, payload) for item in first.request.attached
@@ -108,8 +111,24 @@ def _without_changes(scene: SceneProblem) -> SceneProblem:
         velocity_scale=NO_REQUEST.velocity_scale,
         acceleration_scale=NO_REQUEST.acceleration_scale,
         attached=(),
+        constraints=(),
+        constraint_frames=(),
     )
     return replace(scene, request=request)
+
+
+def _with_constraints(problem: Problem, robot: Robot, scene: SceneProblem) -> Problem:
+    """Return the problem with the constraints of a request, whose links the planned joints move."""
+    for each in scene.request.constraints:
+        index, model = frame_of(robot.model, each.link), robot.model
+        if index >= model.nframes or not model.frames[index].parentJoint:
+            names = [frame.name for frame in model.frames if frame.parentJoint]
+            raise SceneError(
+                f"{scene.place}: path_constraints name the link {each.link!r}, which no"
+                f" planned joint moves{nearest(each.link, names)}"
+            )
+    constraints = *problem.constraint, *scene.request.constraints
+    return problem.replaced(constraint=constraints)
 
 
 def _with_scales(problem: Problem, robot: Robot, scene: SceneProblem) -> Problem:
@@ -194,9 +213,9 @@ def _check_contacts(robot: Robot, scene: SceneProblem) -> None:
 
 
 def refuse_changes(scenes: Sequence[SceneProblem], why: str) -> None:
-    """Raise SceneError for scaling factors and attached objects where the problem cannot change."""
+    """Raise SceneError for demands of requests that change the problem where it cannot change."""
     for scene in scenes:
         if scene.request.changes_problem:
             raise SceneError(
-                f"{scene.place} has scaling factors or attached objects: {why}"
+                f"{scene.place} has scaling factors, attached objects or path constraints: {why}"
             )

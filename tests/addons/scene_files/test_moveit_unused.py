@@ -309,9 +309,9 @@ def test_the_docs_print_the_tables() -> None:
         (("max_velocity_scaling_factor",), -0.5, "above 0 and at most 1"),
         (("max_acceleration_scaling_factor",), "nan", "above 0 and at most 1"),
         (
-            ("path_constraints", "orientation_constraints"),
-            [{"link_name": "hand"}],
-            "path_constraints is a mapping of orientation_constraints: constraints of",
+            ("path_constraints", "joint_constraints"),
+            [{"joint_name": "hand"}],
+            "path_constraints.joint_constraints is a list of 1: give ranges",
         ),
         (
             ("trajectory_constraints", "constraints"),

@@ -287,7 +287,7 @@ def test_scenes_of_one_call_share_a_problem(tmp_path, robot):
         placed(scene_of(tmp_path, request(max_velocity_scaling_factor=factor)), robot)
         for factor in (0.5, 0.6)
     ]
-    with pytest.raises(SceneError, match="other scaling factors or attached objects"):
+    with pytest.raises(SceneError, match="other scaling factors, attached objects"):
         requested_problem(robot_problem(), robot, scenes)
     with pytest.raises(SceneError, match="solve_scenes changes the problem"):
         scene_plans(robot_problem(), scenes[:1])
