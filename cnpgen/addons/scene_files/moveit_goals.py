@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,17 +34,24 @@ class JointGoals:
     above: Array
 
 
-def read_start(state: Any, where: str) -> tuple[tuple[str, ...], Array, Array | None]:
-    """Return names, positions [rad] and velocities [rad/s] of the joints at the start."""
+def read_start(
+    state: Any, where: str, present: Mapping[str, float]
+) -> tuple[tuple[str, ...], Array, Array | None]:
+    """Return names, positions [rad] and velocities [rad/s] of the joints at the start.
+
+    A state without joints is the present one, which the caller may know.
+    """
     joints = part(state, "joint_state", dict, where)
     names = tuple(map(str, part(joints, "name", list, where)))
     positions = vector(
         part(joints, "position", list, where), "", f"{where}: start_state position"
     )
+    if present and not names and not len(positions):
+        return tuple(present), np.array([*present.values()], float), None
     if not names or len(names) != len(positions):
         raise SceneError(
             f"{where}: start_state needs one position for each name, got {len(positions)} for {len(names)};"
-            " the robot's present state is not known here"
+            " without any it is the robot's present state: give it by --start, or by present in Python"
         )
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise SceneError(f"{where}: start_state has the joint {twice[0]!r} twice")

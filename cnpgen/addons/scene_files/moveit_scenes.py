@@ -9,7 +9,7 @@ fixed transform. Every element is read, refused by name, or one of ``moveit_unus
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from cnpgen.addons.scene_files.moveit_goals import (
     read_joint_goals,
     read_start,
 )
+from cnpgen.addons.scene_files.moveit_meshes import with_mesh_files
 from cnpgen.addons.scene_files.moveit_objects import (
     add_object_frames,
     placed_attached,
@@ -46,6 +47,7 @@ from cnpgen.problems.scenes.scene_problem import (
     SceneError,
     SceneProblem,
 )
+from cnpgen.problems.scenes.scene_reader import ReadingOptions
 from cnpgen.problems.scenes.scene_request import SceneRequest
 from cnpgen.problems.scenes.yaml_document import part, scalar
 from cnpgen.robots.obstacle import Obstacle
@@ -66,7 +68,7 @@ def is_moveit(document: Any) -> bool:
 
 
 def read_moveit(
-    documents: dict[Path, Any], *, allow_unused: Sequence[str] = ()
+    documents: dict[Path, Any], options: ReadingOptions
 ) -> Iterator[tuple[SceneProblem, Account]]:
     """Yield the problems of planning scenes and requests, file -> document, with their accounts.
 
@@ -90,12 +92,15 @@ def read_moveit(
         account = Account(
             f"{scene_path}",
             UNUSED_ELEMENTS,
-            allow_unused=allow_unused,
+            allow_unused=options.allow_unused,
             error=SceneError,
         )
-        scene = accounted(documents[scene_path], account)
-        own = accounted(document, account) if scene_path != path else scene
-        problem = _problem(scene_path, scene, path, own)
+        scene, own = (
+            accounted(with_mesh_files(documents[file], file, options.packages), account)
+            for file in (scene_path, path)
+        )
+        own = scene if scene_path == path else own
+        problem = _problem(scene_path, scene, path, own, options.present)
         account.finish(scene, *([] if own is scene else [own]))
         request = replace(problem.request, accepted=tuple(account.accepted))
         yield replace(problem, request=request), account
@@ -110,7 +115,11 @@ def _partner(path: Path, old: str, new: str) -> Path:
 
 
 def _problem(
-    scene_path: Path, scene: AccountedMapping, path: Path, request: AccountedMapping
+    scene_path: Path,
+    scene: AccountedMapping,
+    path: Path,
+    request: AccountedMapping,
+    present: Mapping[str, float],
 ) -> SceneProblem:
     name = re.sub(r"^(scene|request)[_-]?", "", path.stem) or path.stem
     place, where = f"{scene_path}: scene {name!r}", str(path)
@@ -119,7 +128,7 @@ def _problem(
             "is_diff", "the file must have the whole scene, not changes of one"
         )
     state, own = _states(scene, request, where)
-    joints, start, velocity = read_start(state, where)
+    joints, start, velocity = read_start(state, where, present)
     table = FrameTable(place)
     add_fixed_frames(table, scene, place)
     add_base(table, state, where)
@@ -225,14 +234,15 @@ def _with_goals(
         raise SceneError(
             f"{where}: goal_constraints have neither joint_constraints nor position_constraints"
         )
-    if len(poses) > (0 if with_joints else 1):
-        request.account.unused.append("goal_constraints.position_constraints")
-    frame, pose = poses[0] if poses else ("", None)
+    # joint goals come first; without any, the first pose does
+    frame, pose = ("", None) if with_joints else poses[0]
+    more = poses if with_joints else poses[1:]
     tolerant = np.concatenate([joint_goals.below, joint_goals.above]).any()
     demands = SceneRequest(
         goal_below=joint_goals.below if tolerant else None,
         goal_above=joint_goals.above if tolerant else None,
         goal_frame=frame,
+        other_goal_frames=tuple(frame for frame, _ in more),
     )
     return SceneProblem(
         name="",
@@ -242,6 +252,7 @@ def _with_goals(
         goal_pose=pose,
         joint_names=joints,
         request=demands,
+        other_goal_poses=tuple(pose for _, pose in more),
     )
 
 

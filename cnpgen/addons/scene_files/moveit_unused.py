@@ -36,7 +36,6 @@ UNUSED = {
     ".cartesian_speed_end_effector_link": "max_cartesian_speed is 0",
     ".cartesian_speed_limited_link": "max_cartesian_speed is 0",
     ".robot_state.joint_state": "start_state replaces it",
-    "goal_constraints.position_constraints": "another goal is used; one suffices",
     "joint_state.effort": "torques follow from the motion",
     "multi_dof_joint_state.twist": "the base is fixed",
     "multi_dof_joint_state.wrench": "torques follow from the motion",

@@ -9,7 +9,12 @@ import numpy as np
 
 from cnpgen.errors import listed, nearest
 from cnpgen.problems.scenes.quaternions import roll_pitch_yaw
-from cnpgen.problems.scenes.scene_problem import SceneError, SceneProblem, checked_scene
+from cnpgen.problems.scenes.scene_problem import (
+    GoalPose,
+    SceneError,
+    SceneProblem,
+    checked_scene,
+)
 from cnpgen.problems.scenes.scene_request import (
     BASE_FRAMES,
     AttachedObject,
@@ -52,15 +57,16 @@ def placed_scene(scene: SceneProblem, robot: Robot, start: Array) -> SceneProble
         pose = frames.pose(frame, f"obstacle {obstacle.name!r}")
         obstacles.append(moved_obstacle(obstacle, pose) if frame else obstacle)
     goal = scene.goal_pose
-    if goal is not None and request.goal_frame:
-        position, rotation = frames.pose(request.goal_frame, "the goal pose")
-        goal = replace(
-            goal,
-            position=position + rotation @ goal.position,
-            rotation=rotation @ goal.rotation,
-        )
+    if goal is not None:
+        goal = _moved_goal(goal, request.goal_frame, frames)
+    poses = scene.other_goal_poses
+    origins = request.other_goal_frames or ("",) * len(poses)
+    others = tuple(
+        _moved_goal(pose, frame, frames)
+        for pose, frame in zip(poses, origins, strict=True)
+    )
     attached = tuple(_in_link(each, frames) for each in request.attached)
-    names = request.constraint_frames
+    names = request.constraint_frames or ("",) * len(request.constraints)
     constraints = tuple(
         each.moved(*frames.fixed_pose(frame, f"the constraint of {each.link!r}"))
         for each, frame in zip(request.constraints, names, strict=True)
@@ -69,13 +75,32 @@ def placed_scene(scene: SceneProblem, robot: Robot, start: Array) -> SceneProble
         request,
         obstacle_frames=(),
         goal_frame="",
+        other_goal_frames=(),
         fixed_frames=(),
         attached=attached,
         constraints=constraints,
         constraint_frames=("",) * len(names),
     )
-    placed = replace(scene, obstacles=tuple(obstacles), goal_pose=goal, request=plain)
+    placed = replace(
+        scene,
+        obstacles=tuple(obstacles),
+        goal_pose=goal,
+        other_goal_poses=others,
+        request=plain,
+    )
     return checked_scene(placed)
+
+
+def _moved_goal(goal: GoalPose, frame: str, frames: LinkFrames) -> GoalPose:
+    """Return a goal pose in the frame of the robot's base."""
+    if not frame:
+        return goal
+    position, rotation = frames.pose(frame, "the goal pose")
+    return replace(
+        goal,
+        position=position + rotation @ goal.position,
+        rotation=rotation @ goal.rotation,
+    )
 
 
 class LinkFrames:

@@ -60,6 +60,8 @@ class SceneRequest:
             None.
         goal_above: Tolerances above them.
         goal_frame: Frame of the goal pose.
+        other_goal_frames: Frames of the other goal poses; empty if all are in that of
+            the robot's base.
         obstacle_frames: Frame of the pose of each obstacle; empty for obstacles in the
             frame of the robot's base. Other frames are links of the robot at the start
             state.
@@ -79,6 +81,7 @@ class SceneRequest:
     goal_below: Array | None = None
     goal_above: Array | None = None
     goal_frame: str = ""
+    other_goal_frames: tuple[str, ...] = ()
     obstacle_frames: tuple[str, ...] = ()
     fixed_frames: tuple[tuple[str, bool], ...] = ()
     attached: tuple[AttachedObject, ...] = ()
@@ -92,7 +95,8 @@ class SceneRequest:
     @property
     def places(self) -> bool:
         """Whether poses depend on frames of links."""
-        frames = self.goal_frame, *self.obstacle_frames, *self.constraint_frames
+        poses = self.goal_frame, *self.other_goal_frames, *self.obstacle_frames
+        frames = *poses, *self.constraint_frames
         return any(frames) or bool(self.fixed_frames or self.attached)
 
     @property
