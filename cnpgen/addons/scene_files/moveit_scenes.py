@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from cnpgen.addons.scene_files.moveit_collisions import (
-    check_allowed_collisions,
     check_padding,
     is_true,
+    read_allowed_collisions,
 )
 from cnpgen.addons.scene_files.moveit_frames import (
     FrameTable,
@@ -37,6 +37,7 @@ from cnpgen.addons.scene_files.moveit_objects import (
     placed_attached,
     read_attached,
     read_world,
+    with_touch_links,
 )
 from cnpgen.addons.scene_files.moveit_path import read_path_constraints
 from cnpgen.addons.scene_files.moveit_shapes import built
@@ -136,12 +137,13 @@ def _problem(
     add_object_frames(table, objects)
     carried = [each for one in own for each in read_attached(one, objects, where)]
     add_object_frames(table, {item.name: item for item, _ in carried})
-    names = {*objects, *(item.name for item, _ in carried)}
-    check_allowed_collisions(scene, names, place)
+    names = [each.name for _, each in carried]
+    touching = read_allowed_collisions(scene, objects, names, place)
     check_padding(scene, place)
     obstacles = list(_obstacles(scene, objects, table, place))
     attached = tuple(
-        placed_attached(item, each, table, place) for item, each in carried
+        placed_attached(item, with_touch_links(each, touching), table, place)
+        for item, each in carried
     )
     problem = _with_goals(request, where, joints, start, table)
     velocity_scale, acceleration_scale = _scales(request, where)

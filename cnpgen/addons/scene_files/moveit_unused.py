@@ -25,7 +25,7 @@ HARMLESS = {
     "orientation_constraints.weight": "every constraint must be met",
 }
 UNUSED = {
-    ".allowed_collision_matrix": "pairs of links are those of the robot's problem",
+    ".allowed_collision_matrix": "pairs of links are those of the robot's problem, and objects of the world do not move",
     ".group_name": "the problem of --robot names the planned joints",
     ".pipeline_id": "MoveIt's choice of a planner",
     ".planner_id": "MoveIt's choice of a planner",
