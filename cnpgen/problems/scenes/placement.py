@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from cnpgen.errors import listed, nearest
+from cnpgen.problems.constraints.constraint import LinkConstraint
 from cnpgen.problems.scenes.quaternions import roll_pitch_yaw
 from cnpgen.problems.scenes.scene_problem import (
     GoalPose,
@@ -66,11 +68,7 @@ def placed_scene(scene: SceneProblem, robot: Robot, start: Array) -> SceneProble
         for pose, frame in zip(poses, origins, strict=True)
     )
     attached = tuple(_in_link(each, frames) for each in request.attached)
-    names = request.constraint_frames or ("",) * len(request.constraints)
-    constraints = tuple(
-        each.moved(*frames.fixed_pose(frame, f"the constraint of {each.link!r}"))
-        for each, frame in zip(request.constraints, names, strict=True)
-    )
+    constraints = tuple(_in_world(request, frames))
     plain: SceneRequest = replace(
         request,
         obstacle_frames=(),
@@ -79,7 +77,7 @@ def placed_scene(scene: SceneProblem, robot: Robot, start: Array) -> SceneProble
         fixed_frames=(),
         attached=attached,
         constraints=constraints,
-        constraint_frames=("",) * len(names),
+        constraint_frames=(),
     )
     placed = replace(
         scene,
@@ -135,17 +133,18 @@ class LinkFrames:
             f" an object or a fixed frame of the file; links: {listed(self.links, 12)}"
         )
 
-    def fixed_pose(self, frame: str, what: str) -> Pose:
-        """Return the pose of a frame that no planned joint moves, in the frame of the robot's base."""
-        pose = self.pose(frame, what)
-        if frame in self.links:
-            placed = self._model.frames[frame_of(self._model, frame)]
-            if placed.parentJoint:
-                raise SceneError(
-                    f"{self._scene.place}: {what} is in the frame {frame!r}, which moves"
-                    " with the robot: expected a frame of the world"
-                )
-        return pose
+    def check_moves(self, link: str, what: str, *, moves: bool) -> None:
+        """Raise SceneError for a link that planned joints move, or for one that they do not move."""
+        if link not in self.links:
+            return
+        frame = self._model.frames[frame_of(self._model, link)]
+        if bool(frame.parentJoint) != moves:
+            text = (
+                "a link that planned joints move" if moves else "a frame of the world"
+            )
+            raise SceneError(
+                f"{self._scene.place}: {what} names {link!r}, expected {text}"
+            )
 
     def check_link(self, link: str, what: str) -> None:
         """Raise SceneError for an unknown link."""
@@ -166,6 +165,17 @@ def moved_obstacle(obstacle: Obstacle, pose: Pose) -> Obstacle:
         return replace(obstacle, position=(x, y, z))
     turn = roll_pitch_yaw(rotation @ turned(*obstacle.rotation))
     return replace(obstacle, position=(x, y, z), rotation=turn)
+
+
+def _in_world(request: SceneRequest, frames: LinkFrames) -> Iterator[LinkConstraint]:
+    """Yield the constraints of a request in the frame of the robot's base."""
+    origins = request.constraint_frames or ("",) * len(request.constraints)
+    for constraint, frame in zip(request.constraints, origins, strict=True):
+        what = "a constraint of the path"
+        frames.check_link(constraint.link, what)
+        frames.check_moves(constraint.link, what, moves=True)
+        frames.check_moves(frame, what, moves=False)
+        yield constraint.moved(*frames.pose(frame, what))
 
 
 def _in_link(item: AttachedObject, frames: LinkFrames) -> AttachedObject:

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 
-from cnpgen.errors import RecipeError, listed, nearest
+from cnpgen.errors import RecipeError, listed
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
@@ -14,7 +14,6 @@ from cnpgen.problems.problem_record import ProblemRecord, as_problem, record_pro
 from cnpgen.problems.scenes.scene_problem import SceneError, SceneProblem
 from cnpgen.problems.scenes.scene_request import NO_REQUEST, AttachedObject
 from cnpgen.robots.attached_links import attached_link_name, with_attached_link
-from cnpgen.robots.chain import frame_of
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.arguments import check_range, number
@@ -65,8 +64,8 @@ def requested_problem(
             )
     if not first.request.changes_problem:
         return problem, robot, list(scenes)
-    changed = _with_scales(problem, robot, first)
-    changed = _with_constraints(changed, robot, first)
+    constraints = *problem.constraint, *first.request.constraints
+    changed = _with_scales(problem, robot, first).replaced(constraint=constraints)
     if first.request.attached:
         objects = [
             _with_mass(item, problem, first, payload) for item in first.request.attached
@@ -115,20 +114,6 @@ def _without_changes(scene: SceneProblem) -> SceneProblem:
         constraint_frames=(),
     )
     return replace(scene, request=request)
-
-
-def _with_constraints(problem: Problem, robot: Robot, scene: SceneProblem) -> Problem:
-    """Return the problem with the constraints of a request, whose links the planned joints move."""
-    for each in scene.request.constraints:
-        index, model = frame_of(robot.model, each.link), robot.model
-        if index >= model.nframes or not model.frames[index].parentJoint:
-            names = [frame.name for frame in model.frames if frame.parentJoint]
-            raise SceneError(
-                f"{scene.place}: path_constraints name the link {each.link!r}, which no"
-                f" planned joint moves{nearest(each.link, names)}"
-            )
-    constraints = *problem.constraint, *scene.request.constraints
-    return problem.replaced(constraint=constraints)
 
 
 def _with_scales(problem: Problem, robot: Robot, scene: SceneProblem) -> Problem:

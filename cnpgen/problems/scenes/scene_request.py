@@ -94,10 +94,9 @@ class SceneRequest:
 
     @property
     def places(self) -> bool:
-        """Whether poses depend on frames of links."""
-        poses = self.goal_frame, *self.other_goal_frames, *self.obstacle_frames
-        frames = *poses, *self.constraint_frames
-        return any(frames) or bool(self.fixed_frames or self.attached)
+        """Whether poses depend on frames of links, or links are named."""
+        frames = self.goal_frame, *self.other_goal_frames, *self.obstacle_frames
+        return any((*frames, self.fixed_frames, self.attached, self.constraints))
 
     @property
     def changes(self) -> tuple[object, ...]:

@@ -394,11 +394,11 @@ SPHERE = [{"type": "sphere", "dimensions": [1.0]}]
 @pytest.mark.parametrize(
     ("paths", "text"),
     [
-        (position(SPHERE, [[0, 0, 0]], link_name="gripper"), "no planned joint moves"),
-        (position(SPHERE, [[0, 0, 0]], link_name="panda_link0"), "no planned joint"),
+        (position(SPHERE, [[0, 0, 0]], link_name="gripper"), "the robot lacks"),
+        (position(SPHERE, [[0, 0, 0]], link_name="panda_link0"), "that planned joints"),
         (
             position(SPHERE, [[0, 0, 0]], header={"frame_id": "panda_link4"}),
-            "'panda_link4', which moves with the robot",
+            "'panda_link4', expected a frame of the world",
         ),
         (position(SPHERE, [[0, 0, 0]], header={"frame_id": "lab"}), "the robot lacks"),
         (position(SPHERE, []), "one pose for each"),
