@@ -38,7 +38,7 @@ _KNOWN: dict[str, tuple[str, ...]] = {
     "mesh": ("filename", "scale"),
 }
 _OPAQUE = {"material", "calibration"}  # colors, and the zero of a sensor
-MAX_LISTED = 10
+MAX_LISTED_TAGS = 10
 
 
 def unread_elements(tree: Element) -> Iterator[str]:
@@ -48,7 +48,7 @@ def unread_elements(tree: Element) -> Iterator[str]:
     )
     if counts:
         texts = [f"<{tag}> ({count})" for tag, count in sorted(counts.items())]
-        yield f"elements of other software are not read: {listed(texts, MAX_LISTED)}"
+        yield f"elements of other software are not read: {listed(texts, MAX_LISTED_TAGS)}"
     unknown = Counter[str]()
     for element in tree:
         if element.tag in {"link", "joint"}:
