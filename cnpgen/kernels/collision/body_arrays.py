@@ -41,18 +41,18 @@ _BOX, _CYLINDER = KINDS.index("box"), KINDS.index("cylinder")
 class HullVertices(NamedTuple):
     """Vertices of a hull for ``convex.c``.
 
-    ``values`` are ``count`` coordinates x, then y, then z. With ``blocks``, center (3) and
+    ``values`` are ``vertices`` coordinates x, then y, then z. With ``blocks``, center (3) and
     radius of their bounding spheres follow in the same way.
     """
 
     values: Array
-    count: int
+    vertices: int
     blocks: int
 
     def put(self, bodies: Bodies, where: Any, first: int) -> None:
         """Enter the hull into the bodies at some indices; ``first`` is the index of its values among all."""
         bodies["kind"][where], bodies["first"][where] = HULL, first
-        bodies["count"][where], bodies["blocks"][where] = self.count, self.blocks
+        bodies["count"][where], bodies["blocks"][where] = self.vertices, self.blocks
 
 
 def hull_vertices(corners: Array) -> HullVertices:
