@@ -7,6 +7,7 @@ from cnpgen.plans.exporter import Exporter as Exporter
 from cnpgen.plans.exporter import SampledPlan as SampledPlan
 from cnpgen.problems.constraints.constraint import Condition as Condition
 from cnpgen.problems.constraints.constraint import Constraint as Constraint
+from cnpgen.problems.constraints.constraint import LinkConstraint as LinkConstraint
 from cnpgen.problems.objectives import ObjectiveTerm as ObjectiveTerm
 from cnpgen.schema.keys import PerJoint as PerJoint
 from cnpgen.schema.keys import Range as Range

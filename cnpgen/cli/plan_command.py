@@ -221,7 +221,7 @@ def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
 def _scenes(arguments: argparse.Namespace, model: "Model") -> "Requests":
     """Read the problems of scenes."""
     from cnpgen.planner.plan_requests import scene_requests
-    from cnpgen.problems.scenes.scene_reader import read_scenes
+    from cnpgen.problems.scenes.scene_reader import ReadingOptions, read_scenes
 
     if arguments.split is not None or arguments.other_rows:
         raise UsageError(
@@ -233,7 +233,7 @@ def _scenes(arguments: argparse.Namespace, model: "Model") -> "Requests":
             Path(arguments.problems),
             start=arguments.first or 0,
             n=arguments.n,
-            allow_unused=arguments.allow_unused or (),
+            options=ReadingOptions(arguments.allow_unused or ()),
         ),
     )
 

@@ -40,7 +40,7 @@ LARGE_ANGLES = (
     "accept boundary conditions in a file that are probably in degrees or millimetres"
 )
 ALLOW_UNUSED = (
-    "accept an element of scenes that is refused or unknown, such as path_constraints,"
+    "accept an element of scenes that is refused or unknown, such as is_diff,"
     " without effect; may be repeated"
 )
 WORKERS = "processes; default one per available core, or one for up to 60 plans"

@@ -27,7 +27,7 @@ from cnpgen.cli.refine_command import (
     check_free,
     refine_and_save,
 )
-from cnpgen.errors import DatasetError, UsageError
+from cnpgen.errors import DatasetError, UsageError, listed
 
 if TYPE_CHECKING:
     from cnpgen.make.solve_scenes import SolvedScenes
@@ -65,6 +65,12 @@ def add_options(parser: Parser) -> None:
     option("--allow-unused", metavar="KEY", action="append", help=ALLOW_UNUSED)
     text = "mass of objects that scenes attach with weight 0, such as 2kg"
     option("--payload", metavar="KG", type=values.kilograms, help=text)
+    text = (
+        "present positions of the planned joints, for scenes whose start state is empty"
+    )
+    option("--start", metavar="Q1,Q2,...", type=values.positions, help=text)
+    text = "folder with the packages of mesh files of scenes; may be repeated"
+    option("--packages", metavar="FOLDER", type=Path, action="append", help=text)
     option(
         "-o",
         "--out",
@@ -97,27 +103,37 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
-    from cnpgen.cli.finished import content_sha256
+    import joblib
+
     from cnpgen.make.solve_scenes import SceneOptions, solve_scenes
     from cnpgen.problems.problem_record import as_problem, record_problem
-    from cnpgen.problems.scenes.scene_reader import read_scenes
+    from cnpgen.problems.scenes.scene_reader import ReadingOptions, read_scenes
 
     refuse(
         arguments,
         ["split", "seed", "problem"],
         "--robot is for scenes, which have --first and --n",
     )
+    problem = as_problem(arguments.robot)
+    joints, positions = problem.robot.joints, arguments.start or ()
+    if positions and len(positions) != len(joints):
+        raise UsageError(
+            f"--start must have {len(joints)} positions of {listed(joints)}, got {len(positions)}"
+        )
     scenes = read_scenes(
         Path(arguments.what),
         start=arguments.first or 0,
         n=arguments.n,
-        allow_unused=arguments.allow_unused or (),
+        options=ReadingOptions(
+            arguments.allow_unused or (),
+            arguments.packages or (),
+            dict(zip(joints, positions, strict=False)),
+        ),
     )
-    problem = as_problem(arguments.robot)
     request = [
-        content_sha256(Path(arguments.what)),
+        joblib.hash(scenes),  # with the meshes, which other files may hold
         record_problem(problem).comparable_sha256,
-        options_of(arguments, "first", "n", "allow_unused", "payload"),
+        options_of(arguments, "payload"),
     ]
 
     def solve(_: "Plans", **options: Any) -> "SolvedScenes":
@@ -143,8 +159,8 @@ def _problems(arguments: argparse.Namespace) -> "Plans":
 
     refuse(
         arguments,
-        ["allow_unused", "payload"],
-        "--allow-unused and --payload are for scenes, which need --robot",
+        ["allow_unused", "payload", "start", "packages"],
+        "--allow-unused, --payload, --start and --packages are for scenes, which need --robot",
     )
     what = Path(arguments.what)
     kind = file_kind(what)

@@ -290,6 +290,8 @@ def _plans_of(
 
 def _goals(problem: Problem, robot: Robot, scene: SceneProblem, index: int) -> Array:
     """Return the goal states of a scene that are tried, in this order, shape (G, n), G > 0."""
+    if scene.other_goal_poses:
+        return _of_alternatives(problem, robot, scene, index)
     if not len(scene.goal_q):
         return _states_of_pose(problem, robot, scene, index)
     states = goal_states(scene, robot)
@@ -297,13 +299,41 @@ def _goals(problem: Problem, robot: Robot, scene: SceneProblem, index: int) -> A
     widths = below + above
     if robot.shape is None or (len(states) == 1 and not widths.any()):
         return states[:MAX_GOAL_STATES]
-    resting = RestingStates(problem, robot, scene.obstacles)
-    valid = states[resting.are_ends(states.T.copy())]
+    valid = _valid_ends(problem, robot, scene, states)
     if not len(valid) and widths.any():
         near = _states_within(states, below, above, robot=robot, index=index)
-        valid = near[resting.are_ends(near.T.copy())]
+        valid = _valid_ends(problem, robot, scene, near)
     start = start_state(scene, robot)
     return nearest_states(valid, start, robot) if len(valid) else states[:1]
+
+
+def _valid_ends(
+    problem: Problem, robot: Robot, scene: SceneProblem, states: Array
+) -> Array:
+    """Return the states that can end a motion, shape (K, n)."""
+    resting = RestingStates(problem, robot, scene.obstacles)
+    valid = states[resting.are_ends(states.T.copy())]
+    conditions = EndConditions(problem, robot, scene.obstacles)
+    return np.asarray(valid[conditions.met(valid.T)])
+
+
+def _of_alternatives(
+    problem: Problem, robot: Robot, scene: SceneProblem, index: int
+) -> Array:
+    """Return goal states of all alternatives, the nearest valid ones if there are any, shape (G, n)."""
+    plain = replace(scene, other_goal_poses=())
+    poses = (
+        replace(plain, goal_q=scene.goal_q[:0], goal_pose=pose)
+        for pose in scene.other_goal_poses
+    )
+    found = [_goals(problem, robot, each, index) for each in (plain, *poses)]
+    states = np.concatenate(found)
+    known = states[~np.isnan(states).any(axis=1)]
+    if robot.shape is None or not len(known):
+        return (known if len(known) else states)[:MAX_GOAL_STATES]
+    valid = _valid_ends(problem, robot, scene, known)
+    start = start_state(scene, robot)
+    return nearest_states(valid, start, robot) if len(valid) else known[:1]
 
 
 def _states_within(

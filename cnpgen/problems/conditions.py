@@ -1,4 +1,4 @@
-"""Conditions of a problem at a state, their derivative orders, and the residuals of its equalities.
+"""Conditions of a problem at a state, their derivative orders, and the residuals of those that are projected.
 
 The derivative order is the highest derivative of q that a condition depends on, derived
 from its forms. It is 0 for positions, 1 for velocities, 2 for accelerations and 3 for
@@ -99,15 +99,20 @@ def _changed(
 
 
 def equality_residuals(robot: Robot, problem: Problem) -> Any:
-    """Build ``(q, obstacle_poses) -> (r, dr/dq)``: residuals of the equalities, Jacobian column by column."""
+    """Build ``(q, obstacle_poses) -> (r, dr/dq)``: residuals of the equalities, Jacobian column by column.
+
+    Projected inequalities have their signed violation as residual, which is 0 inside.
+    """
     import casadi as ca
 
     columns, state = state_of_symbols(robot, problem)
     rows = [
-        value - float(target)
+        _violation(value, float(low), float(high))
         for condition, needs in conditions_with_needs(problem, state, columns[1:-1])
-        if needs == 0 and condition.is_equality
-        for value, target in zip(condition.g, condition.lower, strict=True)
+        if needs == 0 and (condition.is_equality or condition.projected)
+        for value, low, high in zip(
+            condition.g, condition.lower, condition.upper, strict=True
+        )
     ]
     residual = ca.vertcat(*rows) if rows else ca.SX(0, 1)
     jacobian = ca.densify(ca.jacobian(residual, columns[0]))
@@ -116,6 +121,16 @@ def equality_residuals(robot: Robot, problem: Problem) -> Any:
         [columns[0], columns[-1]],
         ca.cse([residual, ca.vec(jacobian)]),
     )
+
+
+def _violation(value: Any, low: float, high: float) -> Any:
+    """Return the signed violation of ``low <= value <= high``, or the error of an equality."""
+    import casadi as ca
+
+    if low == high:
+        return value - low
+    below = ca.fmin(value - low, 0) if np.isfinite(low) else 0.0
+    return below + (ca.fmax(value - high, 0) if np.isfinite(high) else 0.0)
 
 
 def state_of_symbols(

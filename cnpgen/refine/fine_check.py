@@ -70,6 +70,10 @@ class FineCheck:
         self.equalities = {
             condition.name for condition in conditions if condition.is_equality
         }
+        # Whether trees of paths project their states.
+        self.projects = bool(self.equalities) or any(
+            condition.projected for condition in conditions
+        )
         limits = np.repeat(
             [condition.tolerance_kind == "limit" for condition in conditions],
             [len(condition.g) for condition in conditions],

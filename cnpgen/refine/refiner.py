@@ -141,7 +141,7 @@ class Refiner:
             poses=self.kernel_poses,
             penetration=self.penetration if self.measures_hulls else None,
         )
-        has_manifold = self.measures_hulls and bool(self.check.equalities)
+        has_manifold = self.measures_hulls and self.check.projects
         self._equalities = (
             kernels.load_by_structure(equality_residuals) if has_manifold else None
         )

@@ -39,11 +39,13 @@ class RobotWorld(ABC, Generic[Value]):
         robot: The robot.
         obstacles: The obstacles.
         parameters: Parameters of the sample.
-        dq: Joint velocities [rad/s], shape (n,) or (n, K).
+        q: Joint positions [rad], shape (n,) or (n, K).
+        dq: Joint velocities [rad/s], of the same shape.
         ddq: Joint accelerations [rad/s^2], of the same shape.
         torque: Inverse dynamics of the rigid body [N m], of the same shape.
     """
 
+    q: Array
     dq: Array
     ddq: Array
     torque: Any  # a property of either kind of world
@@ -156,6 +158,18 @@ class RobotWorld(ABC, Generic[Value]):
                 ["a constraint needs the held object, but the problem has no [object]"]
             )
         return self._object_size
+
+    def joint_pose(self, joint: int) -> tuple[Array, Array]:
+        """Return rotation and position [m] of a joint's frame, shape (3, 3) and (3,), or with an axis of K states.
+
+        Joints are counted from 1.
+        """
+        rotations, origins = self._joint_poses()
+        shape = np.shape(self.q)[1:]  # () or (K,)
+        return (
+            rotations[joint].reshape(3, 3, *shape),
+            origins[joint].reshape(3, *shape),
+        )
 
     @abstractmethod
     def _joint_poses(self) -> tuple[Array, Array]:

@@ -8,6 +8,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from cnpgen.addons.init.urdf_elements import unread_elements
 from cnpgen.robots.urdf import number_in, numbers_in
 
 MAX_SPEED_RAD_S = 50.0  # of a revolute joint; faster ones are probably in deg/s
@@ -19,7 +20,8 @@ _ZERO = (0.0, 0.0, 0.0)
 
 
 def doubts(tree: Element) -> Iterator[str]:
-    """Yield a sentence for every number of a URDF that is probably wrong, with its link or joint."""
+    """Yield a sentence for every number of a URDF that is probably wrong, and for what is not read."""
+    yield from unread_elements(tree)
     for joint in tree.findall("joint"):
         yield from _of_joint(joint)
     for link in tree.findall("link"):

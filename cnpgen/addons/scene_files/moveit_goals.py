@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from cnpgen.addons.scene_files.euler_tolerance import rotation_vector_tolerance
+from cnpgen.addons.scene_files.link_constraints import EULER, REGIONS, ROTATION_VECTOR
 from cnpgen.addons.scene_files.moveit_frames import (
     FrameTable,
     frame_id,
@@ -19,9 +21,8 @@ from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError
 from cnpgen.problems.scenes.yaml_document import part, scalar, vector
 from cnpgen.robots.shape.hull import Array
 
-REGIONS = ("box", "sphere", "cylinder")
-EULER, ROTATION_VECTOR = "0", "1"  # codes of the parameterization
-_PARAMETERIZATIONS = {"XYZ_EULER_ANGLES": EULER, "ROTATION_VECTOR": ROTATION_VECTOR}
+_PARAMETRIZATIONS = {"0": EULER, "XYZ_EULER_ANGLES": EULER}
+_PARAMETRIZATIONS |= {"1": ROTATION_VECTOR, "ROTATION_VECTOR": ROTATION_VECTOR}
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,17 +34,24 @@ class JointGoals:
     above: Array
 
 
-def read_start(state: Any, where: str) -> tuple[tuple[str, ...], Array, Array | None]:
-    """Return names, positions [rad] and velocities [rad/s] of the joints at the start."""
+def read_start(
+    state: Any, where: str, present: Mapping[str, float]
+) -> tuple[tuple[str, ...], Array, Array | None]:
+    """Return names, positions [rad] and velocities [rad/s] of the joints at the start.
+
+    A state without joints is the present one, which the caller may know.
+    """
     joints = part(state, "joint_state", dict, where)
     names = tuple(map(str, part(joints, "name", list, where)))
     positions = vector(
         part(joints, "position", list, where), "", f"{where}: start_state position"
     )
+    if present and not names and not len(positions):
+        return tuple(present), np.array([*present.values()], float), None
     if not names or len(names) != len(positions):
         raise SceneError(
             f"{where}: start_state needs one position for each name, got {len(positions)} for {len(names)};"
-            " the robot's present state is not known here"
+            " without any it is the robot's present state: give it by --start, or by present in Python"
         )
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise SceneError(f"{where}: start_state has the joint {twice[0]!r} twice")
@@ -124,7 +132,7 @@ def read_goal_pose(
             raise SceneError(
                 f"{where}: position and orientation of a goal must be in one frame"
             )
-        turn, tolerance = _orientation(orientations[0], where)
+        turn, tolerance = _goal_orientation(orientations[0], where)
     frame, placed = table.resolve(frame, (center, turn))
     return frame, GoalPose(
         frame=link,
@@ -166,8 +174,8 @@ def _region(constraint: Any, where: str) -> tuple[Array, float]:
     return pose_of(poses[0], where)[0], float(radius)
 
 
-def _orientation(constraint: Any, where: str) -> tuple[Array, Array]:
-    """Return rotation matrix and tolerances of the rotation vector [rad] of an orientation constraint."""
+def orientation_of(constraint: Any, where: str) -> tuple[Array, Array, str]:
+    """Return rotation matrix, tolerances up to pi [rad] and parametrization of an orientation constraint."""
     tolerance = np.array(
         [
             scalar(
@@ -183,14 +191,19 @@ def _orientation(constraint: Any, where: str) -> tuple[Array, Array]:
         )
     value = constraint.get("parameterization")
     text = "0" if value is None else str(value).strip().upper()
-    code = _PARAMETERIZATIONS.get(text, text)
-    if code not in _PARAMETERIZATIONS.values():
+    kind = _PARAMETRIZATIONS.get(text)
+    if kind is None:
         raise SceneError(
             f"{where}: parameterization must be 0 (XYZ_EULER_ANGLES) or 1 (ROTATION_VECTOR), got {value!r:.60}"
         )
-    tolerance = np.minimum(tolerance, np.pi)
     rotation = rotation_of(constraint.get("orientation"), where)
-    if code == ROTATION_VECTOR:
+    return rotation, np.minimum(tolerance, np.pi), kind
+
+
+def _goal_orientation(constraint: Any, where: str) -> tuple[Array, Array]:
+    """Return rotation matrix and tolerances of the rotation vector [rad] of an orientation constraint."""
+    rotation, tolerance, kind = orientation_of(constraint, where)
+    if kind == ROTATION_VECTOR:
         return rotation, tolerance
     try:
         return rotation, rotation_vector_tolerance(tolerance)

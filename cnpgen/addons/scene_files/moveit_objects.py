@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -220,6 +221,14 @@ def read_attached(
         links = tuple(str(each) for each in part(entry, "touch_links", list, where))
         found.append((item, AttachedObject(name, link, (), (), links, mass)))
     return found
+
+
+def with_touch_links(
+    attached: AttachedObject, touching: Mapping[str, tuple[str, ...]]
+) -> AttachedObject:
+    """Return an attached object with further links that may touch it, object -> links."""
+    links = dict.fromkeys((*attached.touch_links, *touching.get(attached.name, ())))
+    return replace(attached, touch_links=tuple(links))
 
 
 def placed_attached(

@@ -9,7 +9,7 @@ fixed transform. Every element is read, refused by name, or one of ``moveit_unus
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from cnpgen.addons.scene_files.moveit_collisions import (
-    check_allowed_collisions,
     check_padding,
     is_true,
+    read_allowed_collisions,
 )
 from cnpgen.addons.scene_files.moveit_frames import (
     FrameTable,
@@ -31,12 +31,15 @@ from cnpgen.addons.scene_files.moveit_goals import (
     read_joint_goals,
     read_start,
 )
+from cnpgen.addons.scene_files.moveit_meshes import with_mesh_files
 from cnpgen.addons.scene_files.moveit_objects import (
     add_object_frames,
     placed_attached,
     read_attached,
     read_world,
+    with_touch_links,
 )
+from cnpgen.addons.scene_files.moveit_path import read_path_constraints
 from cnpgen.addons.scene_files.moveit_shapes import built
 from cnpgen.addons.scene_files.moveit_unused import UNUSED_ELEMENTS
 from cnpgen.addons.scene_files.octomap import read_octomap
@@ -45,6 +48,7 @@ from cnpgen.problems.scenes.scene_problem import (
     SceneError,
     SceneProblem,
 )
+from cnpgen.problems.scenes.scene_reader import ReadingOptions
 from cnpgen.problems.scenes.scene_request import SceneRequest
 from cnpgen.problems.scenes.yaml_document import part, scalar
 from cnpgen.robots.obstacle import Obstacle
@@ -65,7 +69,7 @@ def is_moveit(document: Any) -> bool:
 
 
 def read_moveit(
-    documents: dict[Path, Any], *, allow_unused: Sequence[str] = ()
+    documents: dict[Path, Any], options: ReadingOptions
 ) -> Iterator[tuple[SceneProblem, Account]]:
     """Yield the problems of planning scenes and requests, file -> document, with their accounts.
 
@@ -89,12 +93,15 @@ def read_moveit(
         account = Account(
             f"{scene_path}",
             UNUSED_ELEMENTS,
-            allow_unused=allow_unused,
+            allow_unused=options.allow_unused,
             error=SceneError,
         )
-        scene = accounted(documents[scene_path], account)
-        own = accounted(document, account) if scene_path != path else scene
-        problem = _problem(scene_path, scene, path, own)
+        scene, own = (
+            accounted(with_mesh_files(documents[file], file, options.packages), account)
+            for file in (scene_path, path)
+        )
+        own = scene if scene_path == path else own
+        problem = _problem(scene_path, scene, path, own, options.present)
         account.finish(scene, *([] if own is scene else [own]))
         request = replace(problem.request, accepted=tuple(account.accepted))
         yield replace(problem, request=request), account
@@ -109,7 +116,11 @@ def _partner(path: Path, old: str, new: str) -> Path:
 
 
 def _problem(
-    scene_path: Path, scene: AccountedMapping, path: Path, request: AccountedMapping
+    scene_path: Path,
+    scene: AccountedMapping,
+    path: Path,
+    request: AccountedMapping,
+    present: Mapping[str, float],
 ) -> SceneProblem:
     name = re.sub(r"^(scene|request)[_-]?", "", path.stem) or path.stem
     place, where = f"{scene_path}: scene {name!r}", str(path)
@@ -118,7 +129,7 @@ def _problem(
             "is_diff", "the file must have the whole scene, not changes of one"
         )
     state, own = _states(scene, request, where)
-    joints, start, velocity = read_start(state, where)
+    joints, start, velocity = read_start(state, where, present)
     table = FrameTable(place)
     add_fixed_frames(table, scene, place)
     add_base(table, state, where)
@@ -126,15 +137,17 @@ def _problem(
     add_object_frames(table, objects)
     carried = [each for one in own for each in read_attached(one, objects, where)]
     add_object_frames(table, {item.name: item for item, _ in carried})
-    names = {*objects, *(item.name for item, _ in carried)}
-    check_allowed_collisions(scene, names, place)
+    names = [each.name for _, each in carried]
+    touching = read_allowed_collisions(scene, objects, names, place)
     check_padding(scene, place)
     obstacles = list(_obstacles(scene, objects, table, place))
     attached = tuple(
-        placed_attached(item, each, table, place) for item, each in carried
+        placed_attached(item, with_touch_links(each, touching), table, place)
+        for item, each in carried
     )
     problem = _with_goals(request, where, joints, start, table)
     velocity_scale, acceleration_scale = _scales(request, where)
+    constraints = list(read_path_constraints(request, table, where))
     return replace(
         problem,
         name=name,
@@ -149,6 +162,8 @@ def _problem(
             obstacle_frames=tuple(frame for frame, _ in obstacles),
             fixed_frames=tuple(table.used.items()),
             attached=attached,
+            constraints=tuple(each for _, each in constraints),
+            constraint_frames=tuple(frame for frame, _ in constraints),
         ),
     )
 
@@ -212,8 +227,7 @@ def _with_goals(
 
     Its ``goal_constraints`` are alternatives.
     """
-    for key in ("path_constraints", "trajectory_constraints"):
-        _refuse_constraints(request, key, where)
+    _refuse_trajectory_constraints(request, where)
     with_joints, others = _alternatives(request, where)
     joint_goals = read_joint_goals(with_joints, joints, start, where)
     read = (read_goal_pose(entry, table, where) for entry in others)
@@ -222,14 +236,15 @@ def _with_goals(
         raise SceneError(
             f"{where}: goal_constraints have neither joint_constraints nor position_constraints"
         )
-    if len(poses) > (0 if with_joints else 1):
-        request.account.unused.append("goal_constraints.position_constraints")
-    frame, pose = poses[0] if poses else ("", None)
+    # joint goals come first; without any, the first pose does
+    frame, pose = ("", None) if with_joints else poses[0]
+    more = poses if with_joints else poses[1:]
     tolerant = np.concatenate([joint_goals.below, joint_goals.above]).any()
     demands = SceneRequest(
         goal_below=joint_goals.below if tolerant else None,
         goal_above=joint_goals.above if tolerant else None,
         goal_frame=frame,
+        other_goal_frames=tuple(frame for frame, _ in more),
     )
     return SceneProblem(
         name="",
@@ -239,6 +254,7 @@ def _with_goals(
         goal_pose=pose,
         joint_names=joints,
         request=demands,
+        other_goal_poses=tuple(pose for _, pose in more),
     )
 
 
@@ -261,21 +277,13 @@ def _alternatives(
     return with_joints, others
 
 
-def _refuse_constraints(request: AccountedMapping, key: str, where: str) -> None:
-    """Refuse constraints of the path; a name without constraints is none."""
+def _refuse_trajectory_constraints(request: AccountedMapping, where: str) -> None:
+    """Refuse constraints of waypoints; a name without constraints is none."""
+    key = "trajectory_constraints"
     entry = part(request, key, dict, where)
-    kinds = [
-        kind
-        for kind, value in entry.items()
-        if kind != "name" and not is_default(value)
-    ]
-    if kinds:
-        request.account.refuse(
-            key,
-            entry,
-            "constraints of the path are not supported in scene files; a problem file"
-            " has constraints of every state, such as 'axis'",
-        )
+    if not all(is_default(value) for kind, value in entry.items() if kind != "name"):
+        text = "constraints of waypoints are not supported: give path_constraints"
+        request.account.refuse(key, entry, text)
     mark_read(entry)
 
 

@@ -126,11 +126,6 @@ def _with_poses(entry: Any, what: str, where: str) -> list[tuple[Any, Any]]:
 
 def _vertices(mesh: Any, where: str) -> Array:
     """Return the vertices of a mesh [m], shape (V, 3)."""
-    if isinstance(mesh, dict) and mesh.get("resource") is not None:
-        raise SceneError(
-            f"{where} has the mesh resource {mesh.get('resource')!r:.100}: mesh files are"
-            " not read, give its vertices and triangles"
-        )
     vertices = part(mesh, "vertices", list, where)
     points = [vector(each, "xyz", f"{where}: vertex") for each in vertices]
     _check_triangles(mesh, len(points), where)

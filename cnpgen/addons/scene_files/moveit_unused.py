@@ -12,7 +12,7 @@ HARMLESS = {
     ".robot_state.multi_dof_joint_state.header": "it has no transforms",
     "link_padding.link_name": "every padding is 0",
     "link_scale.link_name": "every scale is 1",
-    "path_constraints.name": "there are no constraints of the path",
+    "path_constraints.name": "name of constraints",
     "octomap.octomap.header": "the frame is that of the message around it",
     "collision_objects.type": "key of a database of objects",
     "object.type": "key of a database of objects",
@@ -25,7 +25,7 @@ HARMLESS = {
     "orientation_constraints.weight": "every constraint must be met",
 }
 UNUSED = {
-    ".allowed_collision_matrix": "pairs of links are those of the robot's problem",
+    ".allowed_collision_matrix": "pairs of links are those of the robot's problem, and objects of the world do not move",
     ".group_name": "the problem of --robot names the planned joints",
     ".pipeline_id": "MoveIt's choice of a planner",
     ".planner_id": "MoveIt's choice of a planner",
@@ -36,7 +36,6 @@ UNUSED = {
     ".cartesian_speed_end_effector_link": "max_cartesian_speed is 0",
     ".cartesian_speed_limited_link": "max_cartesian_speed is 0",
     ".robot_state.joint_state": "start_state replaces it",
-    "goal_constraints.position_constraints": "another goal is used; one suffices",
     "joint_state.effort": "torques follow from the motion",
     "multi_dof_joint_state.twist": "the base is fixed",
     "multi_dof_joint_state.wrench": "torques follow from the motion",

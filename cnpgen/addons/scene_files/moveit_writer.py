@@ -106,10 +106,11 @@ def check_plain(scene: SceneProblem) -> None:
         request.changes_problem
         or any(request.obstacle_frames)
         or request.goal_frame
+        or scene.other_goal_poses
         or request.start_dq is not NO_REQUEST.start_dq
         or request.goal_below is not NO_REQUEST.goal_below
     ):
         raise SceneError(
-            f"{scene.place} has a start velocity, tolerances, frames, scaling factors or attached objects, which are"
-            " not written"
+            f"{scene.place} has a start velocity, tolerances, frames, alternative poses, scaling factors, attached"
+            " objects or path constraints, which are not written"
         )

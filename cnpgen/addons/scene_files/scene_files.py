@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from cnpgen.problems.scenes.scene_problem import (
     check_scenes,
     checked_scene,
 )
+from cnpgen.problems.scenes.scene_reader import ReadingOptions
 from cnpgen.problems.scenes.yaml_document import read_yaml
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
@@ -48,6 +49,8 @@ def load_scenes(
     start: int = 0,
     n: int | None = None,
     allow_unused: Sequence[str] = (),
+    packages: Sequence[str | Path] = (),
+    present: Mapping[str, float] | None = None,
 ) -> list[SceneProblem]:
     """Read the planning problems of scene files.
 
@@ -63,6 +66,10 @@ def load_scenes(
         n: Number of scenes; by default all that follow.
         allow_unused: Keys, or ends of paths such as ``start_state.is_diff``, of
             elements that are accepted without effect.
+        packages: Folders of the packages of MoveIt's mesh files, which are otherwise
+            relative to their scene.
+        present: Joint -> position [rad], the state of the robot that an empty
+            ``start_state`` of MoveIt means.
 
     Raises:
         UsageError: There are no scenes.
@@ -73,12 +80,15 @@ def load_scenes(
     """
     path, start = Path(path), integer("start", start, least=0)
     stop = None if n is None else start + integer("n", n, least=1)
-    files, allowed = _files(path), tuple(allow_unused)
+    options = ReadingOptions(
+        tuple(allow_unused), tuple(map(Path, packages)), present or {}
+    )
+    files, allowed = _files(path), options.allow_unused
     if len(files) == 1 and _is_hdf5(files[0]):
         found = list(read_mpinets(files[0], slice(start, stop), allow_unused=allowed))
     else:
         last = stop if stop is not None else start + MAX_SCENES + 1
-        found = list(itertools.islice(_scenes(files, allowed), start, last))
+        found = list(itertools.islice(_scenes(files, options), start, last))
     scenes = [scene for scene, _ in found]
     if len(scenes) > MAX_SCENES:
         raise SceneError(
@@ -148,13 +158,13 @@ def _files(path: Path) -> list[Path]:
 
 
 def _scenes(
-    files: Sequence[Path], allowed: Sequence[str]
+    files: Sequence[Path], options: ReadingOptions
 ) -> Iterator[tuple[SceneProblem, Account]]:
     """Yield the scenes of several files with their accounts.
 
     Requests of MoveIt belong to scenes in other files.
     """
-    moveit: dict[Path, Any] = {}
+    moveit, allowed = dict[Path, Any](), options.allow_unused
     for file in files:
         if _is_hdf5(file):
             yield from read_mpinets(file, slice(0, None), allow_unused=allowed)
@@ -170,7 +180,7 @@ def _scenes(
                 raise SceneError(
                     f"{file} is neither a planning scene or request of MoveIt nor a robometrics file"
                 )
-    yield from read_moveit(moveit, allow_unused=allowed)
+    yield from read_moveit(moveit, options)
 
 
 def _with_partner(file: Path, moveit: dict[Path, Any]) -> list[Any]:

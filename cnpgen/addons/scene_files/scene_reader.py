@@ -1,12 +1,11 @@
 """The reader of scene files by its name."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from cnpgen.addons.scene_files.scene_files import holds_scenes, load_scenes
 from cnpgen.problems.scenes.scene_problem import SceneProblem
-from cnpgen.problems.scenes.scene_reader import SceneReader
+from cnpgen.problems.scenes.scene_reader import ReadingOptions, SceneReader
 
 
 @dataclass(frozen=True)
@@ -18,12 +17,7 @@ class SceneFiles(SceneReader):
         return holds_scenes(path)
 
     def load(
-        self,
-        path: Path,
-        *,
-        start: int,
-        n: int | None,
-        allow_unused: Sequence[str] = (),
+        self, path: Path, *, start: int, n: int | None, options: ReadingOptions
     ) -> list[SceneProblem]:
         """Read scenes by ``load_scenes``."""
-        return load_scenes(path, start=start, n=n, allow_unused=allow_unused)
+        return load_scenes(path, start=start, n=n, **vars(options))

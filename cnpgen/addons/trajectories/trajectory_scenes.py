@@ -1,4 +1,8 @@
-"""Obstacles of sampled trajectories: those of scene files, or of the plans that were sampled."""
+"""Scenes of sampled trajectories: those of scene files, or of the plans that were sampled.
+
+The demands of requests hold for trajectories, too: scaled limits, attached objects and
+constraints of the path.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
-from cnpgen.errors import UsageError, counted
+from cnpgen.errors import UsageError, counted, listed
 from cnpgen.make.recipe import load_dataset_recipe
 from cnpgen.plans.plan_file import load_plans
-from cnpgen.plans.scene_plans import capacity_of, poses_of_scene, shape_of
+from cnpgen.plans.scene_plans import (
+    capacity_of,
+    poses_of_scene,
+    shape_of,
+    start_state,
+)
+from cnpgen.problems.constraints.constraint import LinkConstraint
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.obstacles import with_capacity
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import (
@@ -23,10 +34,14 @@ from cnpgen.problems.problem_record import (
     as_record,
     record_problem,
 )
+from cnpgen.problems.scenes.placement import placed_scene
+from cnpgen.problems.scenes.requested_problem import requested_problem
 from cnpgen.problems.scenes.scene_problem import SceneProblem
 from cnpgen.problems.scenes.scene_reader import read_scenes
+from cnpgen.robots.attached_links import attached_link_name
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import PARKED_POSITION_M
+from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.arguments import concerning
 from cnpgen.schema.catalogue import find_recipe
 from cnpgen.schema.toml import Kind, read_table
@@ -95,7 +110,13 @@ def with_scenes(
 def _of_problems(
     problem: Problem, scenes: Sequence[SceneProblem]
 ) -> tuple[Problem, Array]:
-    """Return the problem with the capacity for scenes, and the poses of their obstacles, shape (N, width)."""
+    """Return the problem with the demands of scenes and their capacity, and the poses of their obstacles, (N, width)."""
+    if any(each.request.places or each.request.changes_problem for each in scenes):
+        robot = load_robot(problem)
+        placed_scenes = [
+            placed_scene(each, robot, start_state(each, robot)) for each in scenes
+        ]
+        problem, _, scenes = requested_problem(problem, robot, placed_scenes)
     own = problem.with_obstacles(problem.own_obstacles)
     capacity = Counter(map(shape_of, _parked(problem))) | Counter(capacity_of(scenes))
     placed = with_capacity(own, capacity)
@@ -117,7 +138,30 @@ def _of_plans(problem: Problem, path: Path) -> tuple[Problem, Array]:
             f"{path} is of {other.name!r}, whose obstacles are others than those of {problem.name!r}",
             argument="scenes",
         )
+    if lost := _lost_demands(problem, other):
+        raise UsageError(
+            f"{path} is of a problem with {listed(lost)}, which {problem.name!r} lacks:"
+            " give the scene file of its request",
+            argument="scenes",
+        )
     return problem.with_obstacles(other.obstacle), plans.columns[OBSTACLE_POSES]
+
+
+def _lost_demands(problem: Problem, other: Problem) -> list[str]:
+    """List the demands of requests that the problem of plans has, and another one lacks."""
+    links = _links(other) - _links(problem)
+    bodies = sorted(link for link in links if link.startswith(attached_link_name("")))
+    constraints = [
+        f"a constraint of the path of {each.link!r}"
+        for each in other.constraint
+        if isinstance(each, LinkConstraint) and each not in problem.constraint
+    ]
+    return [*map(repr, bodies), *constraints]
+
+
+def _links(problem: Problem) -> set[str]:
+    """Return the names of the links of a problem's robot."""
+    return {link.get("name", "") for link in urdf_tree(problem.urdf_text).iter("link")}
 
 
 def _parked(problem: Problem) -> list[Obstacle]:

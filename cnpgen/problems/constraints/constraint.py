@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,7 @@ class Condition:
             prove a violation.
         accepted: Violation that a valid motion may have if it differs from sample to
             sample, shape (m,).
+        projected: Whether searches of paths project states onto it, as onto equalities.
     """
 
     name: str
@@ -69,6 +70,7 @@ class Condition:
     parts: tuple[str, ...] = ()
     sufficient: bool = False
     accepted: Array | None = None
+    projected: bool = False
 
     @property
     def is_equality(self) -> bool:
@@ -260,3 +262,18 @@ class Constraint(ABC):
         ``world`` holds one state.
         """
         return self.measured(world)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinkConstraint(Constraint):
+    """Base class of constraints on a link in the world, whose frame a request may place.
+
+    Attributes:
+        link: The link.
+    """
+
+    link: str
+
+    @abstractmethod
+    def moved(self, position: Array, rotation: Array) -> Self:
+        """Return the constraint after the motion of its frame by a pose, shapes (3,) and (3, 3)."""

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from cnpgen.errors import listed, nearest
+from cnpgen.problems.constraints.constraint import LinkConstraint
 from cnpgen.problems.scenes.quaternions import roll_pitch_yaw
-from cnpgen.problems.scenes.scene_problem import SceneError, SceneProblem, checked_scene
+from cnpgen.problems.scenes.scene_problem import (
+    GoalPose,
+    SceneError,
+    SceneProblem,
+    checked_scene,
+)
 from cnpgen.problems.scenes.scene_request import (
     BASE_FRAMES,
     AttachedObject,
@@ -43,7 +50,7 @@ def placed_scene(scene: SceneProblem, robot: Robot, start: Array) -> SceneProble
     """
     request = scene.request
     _warn_of_another_robot(scene, robot)
-    if not (request.places or request.attached):
+    if not request.places:
         return scene
     frames = LinkFrames(scene, robot, start)
     obstacles = []
@@ -52,19 +59,46 @@ def placed_scene(scene: SceneProblem, robot: Robot, start: Array) -> SceneProble
         pose = frames.pose(frame, f"obstacle {obstacle.name!r}")
         obstacles.append(moved_obstacle(obstacle, pose) if frame else obstacle)
     goal = scene.goal_pose
-    if goal is not None and request.goal_frame:
-        position, rotation = frames.pose(request.goal_frame, "the goal pose")
-        goal = replace(
-            goal,
-            position=position + rotation @ goal.position,
-            rotation=rotation @ goal.rotation,
-        )
-    attached = tuple(_in_link(each, frames) for each in request.attached)
-    plain: SceneRequest = replace(
-        request, obstacle_frames=(), goal_frame="", fixed_frames=(), attached=attached
+    if goal is not None:
+        goal = _moved_goal(goal, request.goal_frame, frames)
+    poses = scene.other_goal_poses
+    origins = request.other_goal_frames or ("",) * len(poses)
+    others = tuple(
+        _moved_goal(pose, frame, frames)
+        for pose, frame in zip(poses, origins, strict=True)
     )
-    placed = replace(scene, obstacles=tuple(obstacles), goal_pose=goal, request=plain)
+    attached = tuple(_in_link(each, frames) for each in request.attached)
+    constraints = tuple(_in_world(request, frames))
+    plain: SceneRequest = replace(
+        request,
+        obstacle_frames=(),
+        goal_frame="",
+        other_goal_frames=(),
+        fixed_frames=(),
+        attached=attached,
+        constraints=constraints,
+        constraint_frames=(),
+    )
+    placed = replace(
+        scene,
+        obstacles=tuple(obstacles),
+        goal_pose=goal,
+        other_goal_poses=others,
+        request=plain,
+    )
     return checked_scene(placed)
+
+
+def _moved_goal(goal: GoalPose, frame: str, frames: LinkFrames) -> GoalPose:
+    """Return a goal pose in the frame of the robot's base."""
+    if not frame:
+        return goal
+    position, rotation = frames.pose(frame, "the goal pose")
+    return replace(
+        goal,
+        position=position + rotation @ goal.position,
+        rotation=rotation @ goal.rotation,
+    )
 
 
 class LinkFrames:
@@ -99,6 +133,19 @@ class LinkFrames:
             f" an object or a fixed frame of the file; links: {listed(self.links, 12)}"
         )
 
+    def check_moves(self, link: str, what: str, *, moves: bool) -> None:
+        """Raise SceneError for a link that planned joints move, or for one that they do not move."""
+        if link not in self.links:
+            return
+        frame = self._model.frames[frame_of(self._model, link)]
+        if bool(frame.parentJoint) != moves:
+            text = (
+                "a link that planned joints move" if moves else "a frame of the world"
+            )
+            raise SceneError(
+                f"{self._scene.place}: {what} names {link!r}, expected {text}"
+            )
+
     def check_link(self, link: str, what: str) -> None:
         """Raise SceneError for an unknown link."""
         if link not in self.links:
@@ -118,6 +165,17 @@ def moved_obstacle(obstacle: Obstacle, pose: Pose) -> Obstacle:
         return replace(obstacle, position=(x, y, z))
     turn = roll_pitch_yaw(rotation @ turned(*obstacle.rotation))
     return replace(obstacle, position=(x, y, z), rotation=turn)
+
+
+def _in_world(request: SceneRequest, frames: LinkFrames) -> Iterator[LinkConstraint]:
+    """Yield the constraints of a request in the frame of the robot's base."""
+    origins = request.constraint_frames or ("",) * len(request.constraints)
+    for constraint, frame in zip(request.constraints, origins, strict=True):
+        what = "a constraint of the path"
+        frames.check_link(constraint.link, what)
+        frames.check_moves(constraint.link, what, moves=True)
+        frames.check_moves(frame, what, moves=False)
+        yield constraint.moved(*frames.pose(frame, what))
 
 
 def _in_link(item: AttachedObject, frames: LinkFrames) -> AttachedObject:

@@ -1,4 +1,4 @@
-"""Problem of a request: a robot's problem with the scaling factors and the attached objects of its scenes."""
+"""Problem of a request: a robot's problem with the scaling factors, attached objects and constraints of its scenes."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ def requested_problem(
     """Return the problem that placed scenes ask for, its robot, and the scenes without these changes.
 
     Scaling factors multiply the limits of velocities and accelerations. Attached
-    objects become links with their geometry and mass.
+    objects become links with their geometry and mass. Constraints are added to those of
+    the problem.
 
     Args:
         problem: The robot's problem.
@@ -56,14 +57,15 @@ def requested_problem(
     for scene in scenes:
         if scene.request.changes != first.request.changes:
             raise SceneError(
-                f"{scene.place} has other scaling factors or attached objects than"
+                f"{scene.place} has other scaling factors, attached objects or path constraints than"
                 f" {first.place}, and the plans of one call share a problem: choose the"
                 " scenes of one problem by {first} and {n}",
                 remedies={"first": None, "n": None},
             )
     if not first.request.changes_problem:
         return problem, robot, list(scenes)
-    changed = _with_scales(problem, robot, first)
+    constraints = *problem.constraint, *first.request.constraints
+    changed = _with_scales(problem, robot, first).replaced(constraint=constraints)
     if first.request.attached:
         objects = [
             _with_mass(item, problem, first, payload) for item in first.request.attached
@@ -108,6 +110,8 @@ def _without_changes(scene: SceneProblem) -> SceneProblem:
         velocity_scale=NO_REQUEST.velocity_scale,
         acceleration_scale=NO_REQUEST.acceleration_scale,
         attached=(),
+        constraints=(),
+        constraint_frames=(),
     )
     return replace(scene, request=request)
 
@@ -194,9 +198,9 @@ def _check_contacts(robot: Robot, scene: SceneProblem) -> None:
 
 
 def refuse_changes(scenes: Sequence[SceneProblem], why: str) -> None:
-    """Raise SceneError for scaling factors and attached objects where the problem cannot change."""
+    """Raise SceneError for demands of requests that change the problem where it cannot change."""
     for scene in scenes:
         if scene.request.changes_problem:
             raise SceneError(
-                f"{scene.place} has scaling factors or attached objects: {why}"
+                f"{scene.place} has scaling factors, attached objects or path constraints: {why}"
             )

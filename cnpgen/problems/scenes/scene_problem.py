@@ -95,6 +95,8 @@ class SceneProblem:
             in their order.
         source: File of the scene, for messages.
         request: Further demands, such as a start velocity.
+        other_goal_poses: Goal poses that are alternatives to the goal states, or to the
+            goal pose without any.
     """
 
     name: str
@@ -105,6 +107,7 @@ class SceneProblem:
     joint_names: tuple[str, ...] = ()
     source: str = ""
     request: SceneRequest = NO_REQUEST
+    other_goal_poses: tuple[GoalPose, ...] = ()
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -288,44 +291,47 @@ def check_scenes(scenes: Sequence[SceneProblem]) -> None:
                 )
 
 
+def _check_pose(pose: GoalPose, place: str) -> None:
+    """Raise SceneError for a goal pose with invalid numbers."""
+    tolerances = pose.position_tolerance, pose.rotation_tolerance
+    shapes = (
+        np.shape(pose.position),
+        np.shape(pose.rotation),
+        *map(np.shape, tolerances),
+    )
+    if shapes[:2] != ((3,), (3, 3)) or not {(), (3,)}.issuperset(shapes[2:]):
+        text = f"of shape (3,), (3, 3), and (3,) or () for tolerances, got {', '.join(map(str, shapes))}"
+        raise SceneError(
+            f"{place}: a goal pose has a position, a rotation and tolerances {text}"
+        )
+    if not (np.abs([*pose.position, *pose.rotation.ravel()]) <= MAX_COORDINATE_M).all():
+        raise SceneError(
+            f"{place}: the goal pose has numbers that are not finite or too large"
+        )
+    if not is_rotation(pose.rotation):
+        raise SceneError(
+            f"{place}: the rotation of the goal pose is no rotation matrix: {pose.rotation.tolist()}"
+        )
+    limits = PLAUSIBLE_MAX["m"], PLAUSIBLE_MAX["rad"]
+    if any(
+        (each > limit).any()
+        for each, limit in zip(pose.tolerances, limits, strict=True)
+    ):
+        raise SceneError(
+            f"{place}: tolerances of the goal pose are in m and rad, got {pose.tolerances}"
+        )
+    if not all((each >= 0).all() for each in pose.tolerances):
+        raise SceneError(
+            f"{place}: tolerances of the goal pose must not be negative, got {pose.tolerances}"
+        )
+
+
 def checked_scene(scene: SceneProblem) -> SceneProblem:
     """Check a scene and return it with unique names of obstacles."""
     check_count(len(scene.obstacles), scene.place)
-    pose = scene.goal_pose
-    if pose is not None:
-        tolerances = pose.position_tolerance, pose.rotation_tolerance
-        shapes = (
-            np.shape(pose.position),
-            np.shape(pose.rotation),
-            *map(np.shape, tolerances),
-        )
-        if shapes[:2] != ((3,), (3, 3)) or not {(), (3,)}.issuperset(shapes[2:]):
-            text = f"of shape (3,), (3, 3), and (3,) or () for tolerances, got {', '.join(map(str, shapes))}"
-            raise SceneError(
-                f"{scene.place}: a goal pose has a position, a rotation and tolerances {text}"
-            )
-        if not (
-            np.abs([*pose.position, *pose.rotation.ravel()]) <= MAX_COORDINATE_M
-        ).all():
-            raise SceneError(
-                f"{scene.place}: the goal pose has numbers that are not finite or too large"
-            )
-        if not is_rotation(pose.rotation):
-            raise SceneError(
-                f"{scene.place}: the rotation of the goal pose is no rotation matrix: {pose.rotation.tolist()}"
-            )
-        limits = PLAUSIBLE_MAX["m"], PLAUSIBLE_MAX["rad"]
-        if any(
-            (each > limit).any()
-            for each, limit in zip(pose.tolerances, limits, strict=True)
-        ):
-            raise SceneError(
-                f"{scene.place}: tolerances of the goal pose are in m and rad, got {pose.tolerances}"
-            )
-        if not all((each >= 0).all() for each in pose.tolerances):
-            raise SceneError(
-                f"{scene.place}: tolerances of the goal pose must not be negative, got {pose.tolerances}"
-            )
+    for pose in (scene.goal_pose, *scene.other_goal_poses):
+        if pose is not None:
+            _check_pose(pose, scene.place)
     for what, values in (("start", scene.start_q), ("goal", scene.goal_q)):
         if not np.isfinite(values).all():
             raise SceneError(

@@ -3,11 +3,30 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from cnpgen.problems.scenes.scene_problem import SceneProblem
 from cnpgen.schema import addons, registry
+
+
+@dataclass(frozen=True)
+class ReadingOptions:
+    """Options of readers of scenes.
+
+    Attributes:
+        allow_unused: Keys of elements that are accepted without effect.
+        packages: Folders with packages of mesh files.
+        present: Joint -> position [rad], the present state of the robot.
+    """
+
+    allow_unused: Sequence[str] = ()
+    packages: Sequence[Path] = ()
+    present: Mapping[str, float] = field(default_factory=dict)
+
+
+DEFAULT_OPTIONS = ReadingOptions()
 
 
 class SceneReader(ABC):
@@ -22,17 +41,11 @@ class SceneReader(ABC):
 
     @abstractmethod
     def load(
-        self,
-        path: Path,
-        *,
-        start: int,
-        n: int | None,
-        allow_unused: Sequence[str] = (),
+        self, path: Path, *, start: int, n: int | None, options: ReadingOptions
     ) -> list[SceneProblem]:
         """Read scenes from the number ``start`` on, at most ``n`` of them, or all that follow.
 
         Every element of a file is used, refused by name, or cannot change the answer.
-        ``allow_unused`` has the keys of elements that are accepted without effect.
 
         Raises:
             UsageError: There are no scenes, or one is invalid; the message names file,
@@ -52,7 +65,7 @@ def read_scenes(
     *,
     start: int = 0,
     n: int | None = None,
-    allow_unused: Sequence[str] = (),
+    options: ReadingOptions = DEFAULT_OPTIONS,
 ) -> list[SceneProblem]:
     """Read the scenes of a path by the reader that accepts it; errors as of ``SceneReader.load``.
 
@@ -63,7 +76,7 @@ def read_scenes(
     if not readers:
         raise addons.missing("scene_files", f"reading scenes from {path}")
     chosen = next((reader for reader in readers if reader.holds(path)), readers[0])
-    return chosen.load(path, start=start, n=n, allow_unused=allow_unused)
+    return chosen.load(path, start=start, n=n, options=options)
 
 
 def _readers() -> list[SceneReader]:

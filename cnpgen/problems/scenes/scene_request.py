@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cnpgen.problems.constraints.constraint import LinkConstraint
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import Array
 from cnpgen.schema.argument_types import check_fields
@@ -59,12 +60,17 @@ class SceneRequest:
             None.
         goal_above: Tolerances above them.
         goal_frame: Frame of the goal pose.
+        other_goal_frames: Frames of the other goal poses; empty if all are in that of
+            the robot's base.
         obstacle_frames: Frame of the pose of each obstacle; empty for obstacles in the
             frame of the robot's base. Other frames are links of the robot at the start
             state.
         fixed_frames: Frames that the file places, and whether each is the base; only
             the root link of the robot may be one of them.
         attached: Objects that the robot carries.
+        constraints: Constraints on every state, in addition to those of the problem.
+        constraint_frames: Frame of each of them, which must not move; empty for those
+            in the frame of the robot's base.
         accepted: Elements of the file whose loss the caller accepted.
     """
 
@@ -75,9 +81,12 @@ class SceneRequest:
     goal_below: Array | None = None
     goal_above: Array | None = None
     goal_frame: str = ""
+    other_goal_frames: tuple[str, ...] = ()
     obstacle_frames: tuple[str, ...] = ()
     fixed_frames: tuple[tuple[str, bool], ...] = ()
     attached: tuple[AttachedObject, ...] = ()
+    constraints: tuple[LinkConstraint, ...] = ()
+    constraint_frames: tuple[str, ...] = ()
     accepted: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -85,15 +94,16 @@ class SceneRequest:
 
     @property
     def places(self) -> bool:
-        """Whether poses depend on frames of links."""
-        frames = self.goal_frame, *self.obstacle_frames
-        return any(frames) or bool(self.fixed_frames)
+        """Whether poses depend on frames of links, or links are named."""
+        frames = self.goal_frame, *self.other_goal_frames, *self.obstacle_frames
+        return any((*frames, self.fixed_frames, self.attached, self.constraints))
 
     @property
     def changes(self) -> tuple[object, ...]:
-        """Changes of the robot's problem: scaling factors and attached objects."""
+        """Changes of the robot's problem: scaling factors, attached objects and constraints."""
         objects = tuple(each.digest for each in self.attached)
-        return self.velocity_scale, self.acceleration_scale, objects
+        scales = self.velocity_scale, self.acceleration_scale
+        return *scales, objects, self.constraints
 
     @property
     def changes_problem(self) -> bool:

@@ -10,10 +10,12 @@ import pytest
 from cnpgen.addons.init.arm import arm_notes, read_arm
 from cnpgen.addons.init.initial_recipes import InitialProblem, problem_of
 from cnpgen.addons.init.joint_limits import read_joint_limits, with_joint_limits
+from cnpgen.addons.init.urdf_elements import unread_elements
 from cnpgen.cli.main import main
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.urdf import urdf_tree
 
 BOX = '<geometry><box size="0.4 0.08 0.08"/></geometry>'
 INERTIA = '<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.06" iyz="0" izz="0.06"/>'
@@ -307,3 +309,23 @@ def test_faults_in_limits_of_moveit_are_named(
     limits = str(tmp_path / "limits.yaml")
     assert main([*words, "--tip", "wrist", "--joint-limits", limits]) == 2
     assert text in capsys.readouterr().err
+
+
+def test_what_is_not_read_is_listed(tmp_path: Path) -> None:
+    more = "<gazebo/><gazebo><plugin a='1'/></gazebo><sensor name='eye'/><material name='red'/>"
+    limit = LIMIT.replace("effort", "efort") + "<limts/>"
+    shape = SHAPE.replace("collision", "colision") + SHAPE
+    path = write(tmp_path / "arm.urdf", upper=UPPER + shape, limit=limit, more=more)
+    notes = list(unread_elements(urdf_tree(path.read_text())))
+    assert (
+        notes[0]
+        == "elements of other software are not read: <gazebo> (2), <sensor> (1)"
+    )
+    text = "\n".join(notes[1:])
+    assert "<colision> in <link>" in text
+    assert "'collision'" in text
+    assert "<limts> in <joint>" in text
+    assert "the attribute 'efort' of <limit>" in text
+    assert len(notes) == 4
+    plain = write(tmp_path / "plain.urdf")
+    assert not list(unread_elements(urdf_tree(plain.read_text())))

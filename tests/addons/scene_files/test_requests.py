@@ -287,7 +287,7 @@ def test_scenes_of_one_call_share_a_problem(tmp_path, robot):
         placed(scene_of(tmp_path, request(max_velocity_scaling_factor=factor)), robot)
         for factor in (0.5, 0.6)
     ]
-    with pytest.raises(SceneError, match="other scaling factors or attached objects"):
+    with pytest.raises(SceneError, match="other scaling factors, attached objects"):
         requested_problem(robot_problem(), robot, scenes)
     with pytest.raises(SceneError, match="solve_scenes changes the problem"):
         scene_plans(robot_problem(), scenes[:1])
@@ -429,15 +429,31 @@ def test_files_as_robowflex_and_tf_write_them_are_read(tmp_path):
     scene = scene_of(tmp_path, content)
     assert scene.request.obstacle_frames == ("panda_link0",)
     assert not scene.request.changes_problem
-    mesh = {
-        "id": "m",
-        "meshes": [{"resource": "package://a/b.dae"}],
-        "mesh_poses": [{}],
-    }
-    with pytest.raises(
-        SceneError, match=r"mesh resource 'package://a/b\.dae': mesh files"
-    ):
-        scene_of(tmp_path, request(world={"collision_objects": [mesh]}))
+
+
+def matrix(*pairs: tuple[str, str]) -> dict[str, Any]:
+    """Return an allowed collision matrix of links and objects."""
+    names = ["panda_link0", "panda_link5", "stick", "post", "shelf"]
+    allowed = {*pairs, *(pair[::-1] for pair in pairs)}
+    rows = [{"enabled": [(a, b) in allowed for b in names]} for a in names]
+    return {"entry_names": names, "entry_values": rows}
+
+
+def test_allowed_pairs_of_attached_objects_and_links_are_touch_links(tmp_path):
+    shelf = box("shelf", [0.1, 0.1, 0.1], [0.8, 0, 0.2], "panda_link0")
+    world = {"collision_objects": [*request()["world"]["collision_objects"], shelf]}
+    allowed = (
+        ("stick", "panda_link5"),
+        ("post", "shelf"),
+        ("panda_link0", "panda_link5"),
+    )
+    content = request(start_state=stick(), world=world)
+    scene = scene_of(tmp_path, content | {"allowed_collision_matrix": matrix(*allowed)})
+    fingers = "panda_leftfinger", "panda_rightfinger"
+    assert scene.request.attached[0].touch_links == (*fingers, "panda_link5")
+    for pair in (("post", "panda_link5"), ("stick", "post")):
+        with pytest.raises(SceneError, match=f"is '{' and '.join(sorted(pair))}'"):
+            scene_of(tmp_path, content | {"allowed_collision_matrix": matrix(pair)})
 
 
 @pytest.mark.slow

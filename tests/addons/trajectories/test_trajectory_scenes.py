@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 
 import cnpgen
+from cnpgen.addons.scene_files.link_constraints import LinkPosition
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.scene_plans import scene_plans
-from cnpgen.problems.problem_record import as_problem
+from cnpgen.problems.problem_record import as_problem, record_problem
 from cnpgen.problems.scenes.scene_problem import SceneProblem
+from cnpgen.problems.scenes.scene_request import AttachedObject, SceneRequest
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.trajectories import import_trajectories, load_trajectories
 from cnpgen.trajectory.boundary import Boundary
@@ -141,3 +143,58 @@ def test_scenes_of_other_obstacles_and_plans_without_scenes_are_refused(
     cnpgen.save_plans(tmp_path / "free.h5", plans)
     with pytest.raises(UsageError, match=r"free\.h5 has no scenes"):
         load_trajectories(files[0], "panda-3kg", scenes=tmp_path / "free.h5")
+
+
+def demanding(**demands: object) -> SceneProblem:
+    """Return a scene without obstacles, and with demands of its request."""
+    request = SceneRequest(**demands)  # type: ignore[arg-type]
+    return replace(scene(1.2), obstacles=(), request=request)
+
+
+STICK = Obstacle(name="stick", position=(0.0, 0.0, 0.3), size=(0.04, 0.04, 0.4))
+
+
+@pytest.mark.parametrize(
+    ("demands", "reason"),
+    [
+        ({}, ""),
+        ({"velocity_scale": 0.01}, "joint velocity limit"),
+        ({"constraints": (LinkPosition(link="panda_hand", region=(STICK,)),)}, LinkPosition.reason),
+    ],
+)  # fmt: skip
+def test_demands_of_requests_hold_for_trajectories(
+    files: tuple[Path, Path], demands: dict[str, object], reason: str
+) -> None:
+    loaded = load_trajectories(files[0], "panda-3kg", scenes=[demanding(**demands)])
+    found = cnpgen.evaluate_trajectories(loaded.problem, loaded.trajectories)
+    assert [each.reason for each in found.verdicts] == [reason] * 2
+
+
+def test_attached_objects_of_scenes_collide_along_trajectories(
+    files: tuple[Path, Path],
+) -> None:
+    links = ("panda_leftfinger", "panda_rightfinger")
+    stick = AttachedObject(
+        "stick", "panda_hand", (STICK,), ("panda_hand",), links, mass=0.1
+    )
+    below = Obstacle(name="below", position=(0.28, 0.12, 0.08), size=(0.1, 0.1, 0.1))
+    free = replace(scene(1.2), obstacles=(below,))  # within reach of the stick only
+    carrying = replace(free, request=SceneRequest(attached=(stick,)))
+    for each, valid in ((free, True), (carrying, False)):
+        loaded = load_trajectories(files[0], "panda-3kg", scenes=[each])
+        found = cnpgen.evaluate_trajectories(loaded.problem, loaded.trajectories)
+        assert found.valid.tolist() == [valid] * 2
+    part = found.verdicts[0].conditions["robot clearance"].margin.part
+    assert "attached stick" in part
+
+
+def test_plan_files_with_demands_that_the_problem_lacks_are_refused(
+    lines: Plans, files: tuple[Path, Path], tmp_path: Path
+) -> None:
+    problem = as_problem(lines.problem)
+    inside = LinkPosition(link="panda_hand", region=(STICK,))
+    constrained = problem.replaced(constraint=(*problem.constraint, inside))
+    plans = replace(lines, problem=record_problem(constrained))
+    cnpgen.save_plans(tmp_path / "plans.h5", plans)
+    with pytest.raises(UsageError, match="a constraint of the path of 'panda_hand'"):
+        load_trajectories(files[0], "panda-3kg", scenes=tmp_path / "plans.h5")

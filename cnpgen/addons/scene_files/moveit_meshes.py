@@ -1,0 +1,81 @@
+"""Mesh files that MoveIt's scenes name: the vertices of their hulls take the place of the names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from cnpgen.errors import RecipeError
+from cnpgen.problems.scenes.scene_problem import SceneError
+from cnpgen.problems.scenes.yaml_document import vector
+from cnpgen.robots.shape.inline import corners_of, inline_mesh
+
+PACKAGE = "package://"
+
+
+def with_mesh_files(document: Any, scene: Path, packages: Sequence[Path]) -> Any:
+    """Return a document whose meshes have vertices in place of a ``resource`` and its scale, ``dimensions``."""
+    if isinstance(document, list):
+        return [with_mesh_files(entry, scene, packages) for entry in document]
+    if not isinstance(document, dict):
+        return document
+    read = {
+        key: with_mesh_files(value, scene, packages) for key, value in document.items()
+    }
+    if "meshes" in read and isinstance(read["meshes"], list):
+        read["meshes"] = [
+            _with_vertices(mesh, scene, packages) for mesh in read["meshes"]
+        ]
+    return read
+
+
+def _with_vertices(mesh: Any, scene: Path, packages: Sequence[Path]) -> Any:
+    name = mesh.get("resource") if isinstance(mesh, dict) else None
+    if not name:
+        return mesh
+    where = f"{scene}: the mesh {str(name)!r:.100}"
+    scale = vector(mesh.get("dimensions", [1.0] * 3), "xyz", f"{where}: dimensions")
+    if not (np.isfinite(scale).all() and scale.all()):
+        raise SceneError(f"{where}: dimensions are its scale, got {scale.tolist()}")
+    if mesh.get("vertices") or mesh.get("triangles"):
+        raise SceneError(f"{where} has vertices, too: expected one of them")
+    try:
+        corners = corners_of(
+            inline_mesh(_file(str(name), scene, packages, where), scale)
+        )
+    except RecipeError as error:
+        raise SceneError(f"{where}: {error}") from error
+    rest = {
+        key: value
+        for key, value in mesh.items()
+        if key not in {"resource", "dimensions"}
+    }
+    return {**rest, "vertices": corners.tolist()}
+
+
+def _file(name: str, scene: Path, packages: Sequence[Path], where: str) -> Path:
+    """Return a file below the folder of the scene, or below one of the packages."""
+    is_package = name.startswith(PACKAGE)
+    relative = PurePosixPath(name.removeprefix(PACKAGE))
+    if ":" in str(relative) or relative.is_absolute() or ".." in relative.parts:
+        raise SceneError(
+            f"{where}: expected a path below the folder of the scene or below --packages,"
+            " or package://NAME/PATH"
+        )
+    rest = PurePosixPath(*relative.parts[1:])
+    places = [] if is_package else [(scene.parent, scene.parent / relative)]
+    for folder in packages:
+        places.append((folder, folder / relative))
+        if is_package and folder.name == relative.parts[0]:
+            places.append((folder, folder / rest))
+    for folder, place in places:
+        # links out of the folder are not followed
+        if place.is_file() and place.resolve().is_relative_to(folder.resolve()):
+            return place
+    searched = ", ".join(str(place) for _, place in places) or "no folder"
+    raise SceneError(
+        f"{where} is missing: give --packages, or packages in Python; searched {searched}"
+    )

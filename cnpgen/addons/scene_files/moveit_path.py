@@ -1,0 +1,123 @@
+"""Path constraints of MoveIt's motion plan requests, as constraints on every state."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from cnpgen.addons.scene_files.link_constraints import (
+    MIN_LIMIT_RAD,
+    MIN_REGION_M,
+    REGIONS,
+    LinkOrientation,
+    LinkPosition,
+)
+from cnpgen.addons.scene_files.moveit_frames import FrameTable, frame_id, pose_of
+from cnpgen.addons.scene_files.moveit_goals import orientation_of
+from cnpgen.addons.scene_files.moveit_shapes import primitive_kind, primitive_sizes
+from cnpgen.problems.constraints.constraint import LinkConstraint
+from cnpgen.problems.scenes.placement import moved_obstacle
+from cnpgen.problems.scenes.quaternions import quaternion_of, roll_pitch_yaw
+from cnpgen.problems.scenes.scene_problem import SceneError, make_obstacle
+from cnpgen.problems.scenes.yaml_document import part, vector
+from cnpgen.robots.obstacle import Obstacle
+
+PATH = "path_constraints"
+
+
+def read_path_constraints(
+    request: Any, table: FrameTable, where: str
+) -> Iterator[tuple[str, LinkConstraint]]:
+    """Yield the constraints of a path with their frames; those that are not supported are refused."""
+    where = f"{where}: {PATH}"
+    constraints = part(request, PATH, dict, where)
+    for key, text in (
+        ("joint_constraints", "give ranges of joints by 'position' in [limits]"),
+        ("visibility_constraints", "visibility is not supported"),
+    ):
+        if constraints:
+            constraints.refuse(key, text)
+    for entry in part(constraints, "orientation_constraints", list, where):
+        frame, link = _frame_and_link(entry, where)
+        rotation, limits, kind = orientation_of(entry, where)
+        if limits.min() < MIN_LIMIT_RAD:
+            raise SceneError(
+                f"{where}: orientation tolerances must be at least {MIN_LIMIT_RAD:g} rad,"
+                f" got {limits.tolist()}"
+            )
+        frame, pose = table.resolve(frame, (np.zeros(3), rotation))
+        a, b, c = limits.tolist()
+        yield (
+            frame,
+            LinkOrientation(
+                link=link,
+                rpy=roll_pitch_yaw(pose[1]),
+                limits=(a, b, c),
+                parametrization=kind,
+            ),
+        )
+    for entry in part(constraints, "position_constraints", list, where):
+        frame, link = _frame_and_link(entry, where)
+        frame, pose = table.resolve(frame, (np.zeros(3), np.eye(3)))
+        regions = _regions(part(entry, "constraint_region", dict, where), where)
+        placed = tuple(moved_obstacle(each, pose) for each in regions)
+        yield (
+            frame,
+            LinkPosition(link=link, offset=_offset(entry, where), region=placed),
+        )
+
+
+def _frame_and_link(entry: Any, where: str) -> tuple[str, str]:
+    link = part(entry, "link_name", str, where)
+    if not link:
+        raise SceneError(f"{where} has a constraint without link_name")
+    return frame_id(entry, where), link
+
+
+def _offset(entry: Any, where: str) -> tuple[float, float, float]:
+    """Return the point of the link that a position constraint is about [m]."""
+    value = entry.get("target_point_offset")
+    x, y, z = (
+        (0.0, 0.0, 0.0)
+        if value is None
+        else vector(value, "xyz", f"{where}: target_point_offset").tolist()
+    )
+    if not np.isfinite([x, y, z]).all():
+        raise SceneError(f"{where}: target_point_offset must be finite")
+    return x, y, z
+
+
+def _regions(region: Any, where: str) -> list[Obstacle]:
+    """Return the primitives of a constraint region, one of which contains the point."""
+    if part(region, "meshes", list, where) or part(region, "mesh_poses", list, where):
+        raise SceneError(
+            f"{where}: a region must be of primitives, got meshes: give boxes"
+        )
+    primitives = part(region, "primitives", list, where)
+    poses = part(region, "primitive_poses", list, where)
+    if not primitives or len(primitives) != len(poses):
+        raise SceneError(
+            f"{where}: a region must have one pose for each of its primitives, got"
+            f" {len(primitives)} primitives and {len(poses)} poses"
+        )
+    regions = []
+    for primitive, pose in zip(primitives, poses, strict=True):
+        kind = primitive_kind(primitive)
+        if kind not in REGIONS:
+            raise SceneError(
+                f"{where}: a region must be one of {', '.join(REGIONS)}, got {kind!r:.60}"
+            )
+        sizes = primitive_sizes(primitive, where)
+        if not (sizes >= MIN_REGION_M).all():
+            raise SceneError(
+                f"{where}: dimensions of a region must be at least {MIN_REGION_M:g} m,"
+                f" got {sizes.tolist()!r:.60}"
+            )
+        position, rotation = pose_of(pose, where)
+        turn = quaternion_of(rotation)
+        regions.append(
+            make_obstacle("region", kind, sizes, position, turn, place=where)
+        )
+    return regions
