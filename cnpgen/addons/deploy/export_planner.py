@@ -28,7 +28,7 @@ def planner_files(model_file: Path, rows: Path | None = None) -> dict[str, str]:
     names = Names(identifier(model_file.stem), model_file.stem, digest)
     # Only tapes are needed, no compiled kernels: any backend has them.
     with loaded_problem(model.problem, "numpy") as loaded:
-        check_supported(model, loaded.problem)
+        check_supported(model, loaded.problem, loaded.robot)
         parts = planner_parts(model, loaded, input_ranges(model, loaded, rows))
         return {
             f"{names.name}.c": source_text(parts, names),

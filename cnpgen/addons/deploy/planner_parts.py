@@ -123,7 +123,7 @@ class PlannerParts:
         return np.array(low), np.array(high)
 
 
-def check_supported(model: Model, problem: Problem) -> None:
+def check_supported(model: Model, problem: Problem, robot: Robot) -> None:
     """Raise UsageError for a model that cannot be a C file yet, with the reason."""
     reason = ""
     if problem.has_sample_obstacles or SCENE in model.features.blocks:
@@ -132,6 +132,8 @@ def check_supported(model: Model, problem: Problem) -> None:
         reason = "its network corrects its own path, which C files do not support"
     elif model.config.via_points:
         reason = "it plans along lines through via points, which C files do not support"
+    elif robot.drive is not None:
+        reason = "its problem has drives, which C files do not support"
     elif not all(
         np.isfinite(values).all()
         for values in (model.parameters, model.features.mean, model.features.scale)
