@@ -187,7 +187,8 @@ class Drive:
     @cached_property
     def resting_limit(self) -> Array:
         """Limit of the torques of motors at rest, where lines begin [N m], shape (n,)."""
-        return np.min([self.torque_limit, *(line.torque for line in self.lines)], 0)
+        limits = [self.torque_limit, *(line.torque for line in self.lines)]
+        return np.asarray(np.min(limits, axis=0))
 
     @property
     def summary(self) -> str:
