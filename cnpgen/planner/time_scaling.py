@@ -30,7 +30,7 @@ from cnpgen.trajectory.spline_motion import Motion, time_derivatives
 Array = NDArray[np.float64]
 
 MAX_TIME_SCALE = 3.0  # motions that need more are not usable plans
-BISECTIONS = 40  # of a time scale for powers
+POWER_BISECTIONS = 40  # of a time scale
 SCALING_INTERVALS = 128  # between phases
 # Relative; limits may be exceeded by about this between two phases.
 TIME_SCALE_MARGIN = 2e-4
@@ -216,7 +216,7 @@ def _smallest_scale_of_powers(
     b = 8 * slow - fast - 3 * a
     d = fast - a - b
     low, high = np.full(len(fast), 1 / MAX_TIME_SCALE), np.ones(len(fast))  # of 1 / k
-    for _ in range(BISECTIONS):
+    for _ in range(POWER_BISECTIONS):
         x = (low + high) / 2
         within = ((d * x + b) * x + a) * x <= margin
         low, high = np.where(within, x, low), np.where(within, high, x)
