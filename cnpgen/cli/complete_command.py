@@ -50,7 +50,6 @@ def add_options(parser: Parser) -> None:
         help="file of boundary problems to write, .h5",
     )
     option("--force", action="store_true", help="replace OUT")
-    option("--quiet", action="store_true", help="no summary")
     add_json(parser)
 
 

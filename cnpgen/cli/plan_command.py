@@ -77,7 +77,6 @@ def add_options(parser: Parser) -> None:
         action="store_true",
         help="replace PLANS, and discard another run's PLANS.part",
     )
-    option("--quiet", action="store_true", help="no progress and no summary")
     add_json(parser)
     option("--refine", action="store_true", help="optimize the plans")
     refining = parser.add_argument_group("with --refine")

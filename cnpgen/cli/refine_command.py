@@ -1,9 +1,9 @@
 """Optimize the plans of a file.
 
 The plans may come from any planner; 'cnpgen docs plan-format' shows how to write a plan
-file, and how trajectories that are sampled in time become plans. No plan comes back
-worse than it was given: violations count first, then the objective. Plans whose control
-points are no numbers, or that take longer than a minute, are made from nothing.
+file, and how trajectories that are sampled in time become plans. The result is never
+worse than the input: violations count first, then the objective. Plans with NaN control
+points, or that take longer than a minute, are solved without an initial guess.
 """
 
 import argparse
@@ -47,9 +47,9 @@ WORKERS = "processes; default one per available core, or one for up to 60 plans"
 LISTED = 10  # plans without success that are listed
 
 TEXT = """\
-Every plan is handled for itself: --workers and the order of the plans change nothing but the time. Pinocchio and Coal
-decide what is valid, as in 'cnpgen evaluate'. What is finished is written to OUT.part at once, by several workers in
-fours: after Ctrl-C, kill -9 or a full disk the same command goes on. An existing OUT is replaced only with --force,
+Each plan is processed independently: --workers and the order of the plans change nothing but the time. Pinocchio and
+Coal decide what is valid, as in 'cnpgen evaluate'. Workers append finished plans to OUT.part, four at a time: after
+Ctrl-C, kill -9 or a full disk the same command goes on. An existing OUT is replaced only with --force,
 and only if it is a file of plans. The exit code is 0 if every plan is valid, and 1 if any is not; the file is written
 in either case.
 'cnpgen docs refiner' has the formulation.
@@ -84,9 +84,6 @@ def add_refine_options(parser: Parser) -> None:
         "--force",
         action="store_true",
         help="replace OUT, and discard another run's OUT.part",
-    )
-    parser.add_argument(
-        "--quiet", action="store_true", help="no progress and no summary"
     )
     add_json(parser)
 

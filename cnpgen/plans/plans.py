@@ -21,6 +21,7 @@ from cnpgen.problems.problem_record import ProblemRecord, as_record, open_proble
 from cnpgen.robots.scene import Scene
 from cnpgen.schema.argument_types import check_fields, checked_arguments
 from cnpgen.schema.arguments import check_memory, integer, numbers, reject_masked
+from cnpgen.schema.html_table import html_table
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.trajectory.boundary import Boundary
@@ -93,6 +94,16 @@ class Plans:
         known = Counter(names.get(status, "unknown") for status in self.status.tolist())
         counts = ", ".join(f"{count:,} {name}" for name, count in known.most_common())
         return f"<{counted(len(self), 'plan')} of {self.problem.name!r}{counts and ': '}{counts}>"
+
+    def _repr_html_(self) -> str:
+        names = {status: status.name.lower() for status in PlanStatus}
+        rows = (
+            (index, sample, names.get(status, "unknown"), f"{duration:.4g}")
+            for index, (sample, status, duration) in enumerate(
+                zip(self.sample_id, self.status.tolist(), self.duration, strict=True)
+            )
+        )
+        return html_table(repr(self), ("plan", "sample", "status", "T [s]"), rows)
 
     @property
     def motion(self) -> Motion:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import UsageError
+from cnpgen.errors import UsageError, counted
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, Array
 from cnpgen.robots.solid import (
@@ -24,6 +24,7 @@ from cnpgen.robots.solid import (
     solids_of,
 )
 from cnpgen.schema.arguments import integer
+from cnpgen.schema.html_table import html_table
 from cnpgen.store.scene_table import NO_OBSTACLE, OBSTACLE_KINDS, SceneTable
 
 # Of obstacles that a sample with fewer obstacles does not have.
@@ -36,7 +37,7 @@ class SampleIndexError(UsageError, IndexError):
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The obstacles of N samples, created where samples enter and passed along.
+    """The obstacles of N samples.
 
     Attributes:
         obstacles: The obstacles, the same for all samples.
@@ -81,6 +82,17 @@ class Scene:
                 f"samples are selected by numbers, a mask or a slice: {error}",
                 concerns="index",
             ) from error
+
+    def _repr_html_(self) -> str:
+        """Show the obstacles of the first sample."""
+        caption = f"{counted(len(self), 'sample')} with {counted(len(self.obstacles), 'obstacle')}"
+        bodies = zip(self.obstacles, self.bodies(), strict=True) if len(self) else ()
+        rows = (
+            (item.name, item.kind, *np.round((body.position, body.low, body.high), 4))
+            for item, body in bodies
+        )
+        head = "obstacle", "kind", "center [m]", "lower corner [m]", "upper corner [m]"
+        return html_table(caption, head, rows)
 
     def with_poses(self, poses: Array) -> Scene:
         """Return the scene with other poses and sizes of the obstacles; values for a constraint are kept.

@@ -16,7 +16,7 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
-from cnpgen.refine.proof.explain import _limited_torques
+from cnpgen.refine.proof.end_check import _limited_torques
 from cnpgen.refine.refine_plans import solve_plans
 from cnpgen.robots.drive import DriveLine, DriveSpec
 from cnpgen.robots.robot import Robot

@@ -402,7 +402,8 @@ def _draw_views(
             ylabel=f"{'xyz'[up]} [m]",
             title=f"{title} view",
         )
-        axis.set_ylim(bottom=max(axis.get_ylim()[0], -0.25))
+        if up == 2:  # the part of the base below the floor is cut off
+            axis.set_ylim(bottom=max(axis.get_ylim()[0], -0.25))
 
 
 def _links(problem: Problem, world: PathWorld, k: int) -> list[tuple[Array, float]]:

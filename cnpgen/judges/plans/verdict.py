@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.schema.html_table import html_table
+
 # Replaces a tolerance of 0 in relative violations, so that they can be compared.
 ZERO_TOLERANCE = 1e-200
 
@@ -176,6 +178,9 @@ class Verdict:
 
     def __repr__(self) -> str:
         return f"<Verdict: {self}>"
+
+    def _repr_html_(self) -> str:
+        return html_table(repr(self), ("condition", "margin"), self.margins.items())
 
     @property
     def valid(self) -> bool:
