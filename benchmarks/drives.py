@@ -5,15 +5,17 @@ judged at 2,001 phases by Pinocchio's inverse dynamics with rotors, viscous fric
 and by MuJoCo's inverse dynamics with armature and damping (its dry friction is a soft constraint whose sign is wrong near
 a reversal, so it is added as c sign(dq)). A plan exceeds a limit above 1.005 of it, the tolerance of the problems. Columns
 "motor" count motor torques with the exact law, "no friction" those without friction, "joint" torques at the joint.
-Another plant has a Stribeck law and parameters that are 30 % larger. The CPU time of solving is that of calls in
-alternation, with compiled kernels.
+Other plants have a Stribeck law and drives that differ by up to 30 % (benchmarks/drive_plant.py); some plans are also
+executed there. The CPU time of solving is that of batches in alternation, with compiled kernels; that of planning is of
+the shipped planner of the drives, in alternation with the same planner without [drive].
 
     python benchmarks/drives.py
-    python benchmarks/drives.py --problems 300 --repeat 5
+    python benchmarks/drives.py --problems 40 --executed 10
 """
 
 import argparse
 import json
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,12 +23,15 @@ from typing import Any
 
 import numpy as np
 from common import arguments, cpu_of, median, progress, report, table
+from drive_plant import execute, torque_errors
 from scipy.spatial.transform import Rotation
 
 import cnpgen
 from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
+from cnpgen.planner.model_file import load_model
 from cnpgen.planner.time_parametrization import make_time_parametrization
+from cnpgen.plans.join import concatenate
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
 from cnpgen.refine.refine_plans import solve_plans
@@ -36,8 +41,9 @@ from cnpgen.robots.robot import Robot
 PIPELINES = ("heavy-object-drive", "panda-scenes-drive")
 PHASES = 2001  # of every plan
 TOLERANCE = 1.005  # of a limit
-STRIBECK_RATIO, STRIBECK_SPEED = 1.5, 0.1  # breakaway / dry friction; rad/s
-PARAMETER_ERROR = 1.3  # factor of rotors and friction of the other plant
+ERRORS = (-0.3, -0.15, 0.0, 0.15, 0.3)  # of rotors and friction of other plants
+BATCH = 30  # problems that are solved at a time
+MODEL, PLANNED = "heavy-object-drive", 1024  # planner, and problems in a batch
 MOTIONS, CALLS, SLOWER = 512, 9, 0.8  # of the time parametrization; factor of rates
 MOVING = 1e-9  # rad/s, above which dry friction has a direction
 
@@ -130,17 +136,16 @@ def judge(plans: Plans, drive: Drive, robot: Robot) -> dict[str, Any]:
     smooth = rotors + b * states.dq
     other = along(mujoco_torque(robot, drive), states)
     joint = rotors - drive.armature * states.ddq
-    stribeck = 1 + (STRIBECK_RATIO - 1) * np.exp(-np.abs(states.dq) / STRIBECK_SPEED)
-    worse = joint + PARAMETER_ERROR * (
-        drive.armature * states.ddq + b * states.dq + c * sign * stribeck
-    )
+    others = torque_errors(joint, (states.dq, states.ddq, sign), drive, ERRORS)
     rate = np.diff(smooth, axis=1) / (states.duration[:, None, None] / (PHASES - 1))
     return {
         "motor": exceeding(smooth + c * sign, limit),
         "motor, MuJoCo": exceeding(other + c * sign, limit),
         "no friction": exceeding(rotors, limit),
         "joint": exceeding(joint, robot.torque_limit),
-        "other plant": exceeding(worse, limit),
+        "other plants": {
+            f"{error:+.0%}": exceeding(each, limit) for error, each in others.items()
+        },
         "difference of judges [N m]": float(np.abs(other - smooth).max()),
         "torque rate [N m/s]": np.abs(rate).max(axis=(0, 1)).round(1).tolist(),
     }
@@ -152,6 +157,54 @@ def without_drive(problems: Plans) -> Plans:
     content = {key: value for key, value in record.content.items() if key != "drive"}
     rigid = ProblemRecord(json.dumps(content, ensure_ascii=False), record.urdf)
     return replace(problems, problem=rigid)
+
+
+def solve_alternately(sets: dict[str, Plans]) -> tuple[dict, dict]:
+    """Solve the sets in batches, in alternation; return plans and CPU times [s] of the batches."""
+    names, cpu = list(sets), {key: [] for key in sets}
+    parts: dict[str, list[Plans]] = {key: [] for key in sets}
+    for key in names:  # kernels are compiled before
+        solve_plans(sets[key][:2], workers=1)
+    for first in range(0, len(sets[names[0]]), BATCH):
+        for key in names:
+            before = time.process_time()
+            batch = sets[key][first : first + BATCH]
+            parts[key].append(solve_plans(batch, workers=1).plans)
+            cpu[key].append(time.process_time() - before)
+        names.reverse()
+    return {key: concatenate(each) for key, each in parts.items()}, cpu
+
+
+def planning() -> dict[str, Any]:
+    """Return the CPU times of planning a batch with and without drives, by the same planner [s]."""
+    model = load_model(MODEL)
+    problems = draw_boundary_problems(MODEL, PLANNED, seed=17)
+    sets = {"drives": problems, "rigid": without_drive(problems)}
+    planners = {
+        key: cnpgen.Planner(replace(model, problem=each.problem))
+        for key, each in sets.items()
+    }
+    cpu: dict[str, list[float]] = {key: [] for key in sets}
+    for _ in range(1 + 3 * CALLS):
+        for key, each in sets.items():
+            planner = planners[key]
+            cpu[key].append(cpu_of(partial(planner.plan_batch, each.boundary)))
+    cpu = {key: each[1:] for key, each in cpu.items()}  # the first call compiles
+    pairs = zip(cpu["drives"], cpu["rigid"], strict=True)
+    return {"CPU [s]": cpu, "CPU ratio": median([x / y for x, y in pairs])}
+
+
+def executions(plans: Plans, robot: Robot, drive: Drive) -> dict[str, Any]:
+    """Execute plans on plants with late and limited currents."""
+    found = {}
+    for error in (ERRORS[0], 0.0, ERRORS[-1]):
+        runs = execute(plans, robot, drive, error)
+        found[f"{error:+.0%}"] = {
+            "plans": sum(each.use > TOLERANCE for each in runs),
+            "largest": max(each.use for each in runs),
+            "away [rad]": max(each.error for each in runs),
+        }
+    return found
 
 
 def parametrization_us(solved: dict[str, Plans]) -> dict[str, float] | None:
@@ -184,11 +237,7 @@ def measure(name: str, options: argparse.Namespace) -> dict[str, Any]:
     _, robot = open_problem(problems.problem)
     assert robot.drive is not None
     sets = {"rigid": without_drive(problems), "drives": problems}
-    solved = {key: solve_plans(each, workers=1).plans for key, each in sets.items()}
-    cpu: dict[str, list[float]] = {key: [] for key in sets}
-    for _ in range(options.repeat):
-        for key, each in sets.items():
-            cpu[key].append(cpu_of(partial(solve_plans, each, workers=1)))
+    solved, cpu = solve_alternately(sets)
     valid = {
         key: cnpgen.evaluate_plans(each, workers=1).valid
         for key, each in solved.items()
@@ -206,9 +255,14 @@ def measure(name: str, options: argparse.Namespace) -> dict[str, Any]:
             "median": float(np.median(ratios)),
             "largest": float(ratios.max()),
         },
-        "CPU ratio": median(cpu["drives"]) / median(cpu["rigid"]),
+        "CPU ratio": sum(cpu["drives"]) / sum(cpu["rigid"]),
         "CPU [s]": cpu,
         "time parametrization [us]": parametrization_us(solved),
+        "executed": executions(
+            solved["drives"][np.flatnonzero(valid["drives"])[: options.executed]],
+            robot,
+            robot.drive,
+        ),
         **{
             key: judge(each[np.flatnonzero(valid[key])], robot.drive, robot)
             for key, each in solved.items()
@@ -218,14 +272,11 @@ def measure(name: str, options: argparse.Namespace) -> dict[str, Any]:
 
 def tables(results: dict[str, dict[str, Any]]) -> list[str]:
     """Format the results."""
-    counted = ("motor", "motor, MuJoCo", "no friction", "joint", "other plant")
+    counted = ("motor", "motor, MuJoCo", "no friction", "joint")
     head = ["problem", "plans", "valid", *counted]
     rows = [
         [name, key, f"{found['valid'][key]} of {found['problems']}"]
-        + [
-            f"{found[key][c]['plans']} ({found[key][c]['largest']:.3f})"
-            for c in counted
-        ]
+        + [_counted(found[key][c]) for c in counted]
         for name, found in results.items()
         for key in ("rigid", "drives")
     ]
@@ -241,6 +292,16 @@ def tables(results: dict[str, dict[str, Any]]) -> list[str]:
             f"{found['drives']['difference of judges [N m]']:.1e}",
         ]
         for name, found in results.items()
+    ]
+    plants = [
+        [name, key, *(_counted(each) for each in found[key]["other plants"].values())]
+        for name, found in results.items()
+        for key in ("rigid", "drives")
+    ]
+    executed = [
+        [name, error, _counted(each), f"{each['away [rad]']:.4f}"]
+        for name, found in results.items()
+        for error, each in found["executed"].items()
     ]
     rates = [
         [
@@ -258,12 +319,28 @@ def tables(results: dict[str, dict[str, Any]]) -> list[str]:
         table(title, head, rows, left=2),
         table("with drives / rigid", ratio, second),
         table(
+            "other plants, by the error of rotors and friction: plans above 1.005",
+            ["problem", "plans", *(f"{error:+.0%}" for error in ERRORS)],
+            plants,
+            left=2,
+        ),
+        table(
+            "executed on other plants with late and limited currents",
+            ["problem", "error", "above 1.005", "away [rad]"],
+            executed,
+        ),
+        table(
             "largest rate of motor torques by joint [N m/s]",
             ["problem", "rates"],
             rates,
             left=2,
         ),
     ]
+
+
+def _counted(found: dict[str, Any]) -> str:
+    """Format a number of plans and the largest ratio."""
+    return f"{found['plans']} ({found['largest']:.3f})"
 
 
 def _fitting(times: dict[str, float] | None) -> str:
@@ -275,14 +352,22 @@ def main() -> None:
     """Print the figures."""
 
     def add(parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("--problems", type=int, default=40)
+        parser.add_argument("--problems", type=int, default=300)
         parser.add_argument("--seed", type=int, default=11)
-        parser.add_argument("--repeat", type=int, default=3, help="timed calls of each")
+        parser.add_argument("--executed", type=int, default=40, help="plans to execute")
         parser.add_argument("--sets", nargs="+", choices=PIPELINES, default=PIPELINES)
 
     options = arguments(__doc__, add)
     results = {name: measure(name, options) for name in options.sets}
-    report(results, tables(results), as_json=options.json)
+    planned = planning()
+    text = (
+        f"planning {PLANNED} problems with drives / rigid: {planned['CPU ratio']:.2f}"
+    )
+    report(
+        {**results, "planning": planned},
+        [*tables(results), text],
+        as_json=options.json,
+    )
 
 
 if __name__ == "__main__":

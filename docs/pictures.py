@@ -3,6 +3,7 @@
 Each picture shows computed data: plans of the refiner, control points of the boundary layer, obstacles of samples.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,10 @@ from matplotlib.patches import Rectangle
 from scipy.interpolate import BSpline
 
 import cnpgen
+from cnpgen.problems.problem_record import open_problem, record_problem
+from cnpgen.robots.drive import NO_DRIVE
+from cnpgen.robots.robot import Robot
+from cnpgen.world.path import PathWorld
 
 FOLDER = Path(__file__).parent / "images"
 BLUE, RED, GRAY, GREEN = "#1f5fa8", "#c0392b", "#7f8c8d", "#2e8b57"
@@ -236,6 +241,55 @@ def draw_certification() -> None:
     save(drawn, "certification")
 
 
+def torques_of(plan: cnpgen.Plans, robot: Robot) -> tuple[np.ndarray, ...]:
+    """Return times [s], and torques at the joints and lowest and highest ones at the motors [N m], shape (n, K) each."""
+    t = np.linspace(0, plan.duration[0], 600)
+    states = [plan.states_at(np.array([each])) for each in t]
+    q, dq, ddq = (np.concatenate(each).T for each in zip(*states, strict=True))
+    world = PathWorld(robot)
+    world.set_path(q, dq, ddq, np.empty(0))
+    return t, world.torque, *world.motor_torque
+
+
+def draw_drives() -> None:
+    """Draw the torques of one joint by two plans of a problem: solved for the rigid body, and for both sides of the gear."""
+    problems = cnpgen.draw_boundary_problems("heavy-object-drive", 6, seed=11)
+    problem, robot = open_problem(problems.problem)
+    rigid = record_problem(replace(problem, drive=NO_DRIVE))
+    plans = {
+        "plan for the rigid body": replace(problems, problem=rigid),
+        "plan for both sides": problems,
+    }
+    solved = {
+        key: cnpgen.solve_plans(each, workers=1).plans for key, each in plans.items()
+    }
+    first = solved["plan for the rigid body"]
+    limit = robot.drive.torque_limit
+    uses = [
+        np.abs(torques_of(first[[row]], robot)[3]).max(axis=1) / limit
+        for row in range(len(first))
+    ]
+    row, joint = np.unravel_index(np.argmax(uses), (len(first), robot.n))
+    drawn = figure(7.6, 3.2)
+    for axes, (title, each) in zip(
+        drawn.subplots(1, 2, sharey=True), solved.items(), strict=True
+    ):
+        t, tau, low, high = torques_of(each[[row]], robot)
+        for sign in (-1, 1):
+            axes.axhline(sign * limit[joint], color=RED, linewidth=0.9, linestyle="--")
+        axes.fill_between(
+            t, low[joint], high[joint], color=BLUE, alpha=0.35, linewidth=0
+        )
+        axes.plot(t, high[joint], color=BLUE, label="at the motor, with any friction")
+        axes.plot(t, tau[joint], color=GREEN, label="at the joint")
+        axes.set(title=title, xlabel="time [s]")
+    drawn.axes[0].set_ylabel(f"torque of joint {joint + 1} [N m]")
+    drawn.axes[0].plot([], [], color=RED, linestyle="--", label="limit of both")
+    labels = drawn.axes[0].get_legend_handles_labels()
+    drawn.legend(*labels, loc="outside lower center", ncols=3, fontsize=9)
+    save(drawn, "drives")
+
+
 def main() -> None:
     """Draw all pictures."""
     import matplotlib as mpl
@@ -247,6 +301,7 @@ def main() -> None:
     draw_verdict(plans)
     draw_scenes()
     draw_certification()
+    draw_drives()
 
 
 if __name__ == "__main__":

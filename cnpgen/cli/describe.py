@@ -160,10 +160,17 @@ def _drive_rows(robot: Robot, drive: Drive) -> list[tuple[str, ...]]:
         ("dry", "N m", drive.coulomb),
         ("motor torque", "N m", drive.torque_limit),
     ]
+    for number, line in enumerate(drive.lines, 1):
+        columns += [
+            (f"line {number} at rest", "N m", line.torque),
+            ("no torque at", "rad/s", line.torque / line.slope),
+        ]
     shown = [
         (name, *with_units(robot.units(unit), [f"{x:.4g}" for x in values]))
         for name, unit, values in columns
     ]
+    if drive.power_limit is not None:
+        shown.append(("power", "W", *(f"{x:.4g}" for x in drive.power_limit)))
     return list(zip(("joint", "", *robot.joint_names), *shown, strict=True))
 
 

@@ -16,7 +16,7 @@ from cnpgen.problems.conditions import (
     state_of_symbols,
 )
 from cnpgen.problems.constraints.constraint import MIN_TOLERANCE, Condition
-from cnpgen.problems.constraints.joint import JointTorque
+from cnpgen.problems.constraints.joint import POWER_UNIT, JointTorque
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 
@@ -62,10 +62,11 @@ class _FrictionalState(SymbolicState):
 
 
 def _linear_rows(robot: Robot, problem: Problem, p1: Vec, friction_rates: Vec) -> Any:
-    """Return the coefficients of r in the rows of ``speed_residuals``: viscous friction, zero in other rows, as SX.
+    """Return the coefficients of r in the rows of ``speed_residuals``: friction and lines, zero in other rows, as SX.
 
     The torque of a rigid body is quadratic in the velocity without a linear part, so
-    massless links suffice. Friction of a fixed direction is linear in the velocity.
+    massless links suffice. Friction of a fixed direction and torque-speed lines are
+    linear in the velocity.
     """
     import casadi as ca
 
@@ -127,8 +128,8 @@ def speed_coefficients(robot: Robot, problem: Problem) -> Any:
     """Build ``(the column of speed_violation) -> constant, square, mixed``: coefficients of the rate's bounds.
 
     Values of ``speed_residuals`` that are quadratic in dq, without a linear part, and
-    linear in ddq are ``constant + square r^2 + mixed r r'``. With viscous friction of
-    drives a fourth output has the coefficient of r; the direction of friction is that
+    linear in ddq are ``constant + square r^2 + mixed r r'``. With viscous friction or
+    torque-speed lines of drives a fourth output has the coefficient of r; the direction of friction is that
     of the given rates, and both ones near a reversal. Values proportional to dq
     are combined in the last row: the square of the largest fraction of a bound. The
     bounds are those of ``coefficient_bounds``.
@@ -150,8 +151,8 @@ def speed_coefficients(robot: Robot, problem: Problem) -> Any:
         for moving in ((zero, zero), (p1, p2), (zero, p1))
     )
     square, linear = fast - at_rest, []
-    if drive is not None and drive.viscous.any():
-        parts = map(ca.vertsplit, (p1, friction[0]))
+    if drive is not None and (drive.viscous.any() or drive.lines):
+        parts = map(ca.vertsplit, (p1, p1 * rates[0]))
         linear = [_linear_rows(robot, problem, *parts)]
         square = square - linear[0]
     bounds = speed_bounds(robot, problem)
@@ -227,12 +228,14 @@ class SpeedBounds:
         lower: Lower bounds.
         upper: Upper bounds.
         cubic: Mask of the rows that depend on the jerk.
+        power: Mask of the rows that are powers of motors.
         proportional: Mask of the rows proportional to dq whose bounds enclose zero.
     """
 
     lower: Array
     upper: Array
     cubic: NDArray[np.bool_]
+    power: NDArray[np.bool_]
     proportional: NDArray[np.bool_]
 
 
@@ -244,6 +247,7 @@ def speed_bounds(robot: Robot, problem: Problem) -> SpeedBounds:
             low,
             high,
             needs == 3,
+            condition.unit == POWER_UNIT,
             needs == 1 and _is_proportional(value, columns[1], low, high),
         )
         for condition, needs in conditions_with_needs(problem, state, columns[1:-1])
@@ -252,8 +256,8 @@ def speed_bounds(robot: Robot, problem: Problem) -> SpeedBounds:
             condition.g, condition.lower, condition.upper, strict=True
         )
     ]
-    lower, upper, cubic, proportional = np.array(rows, float).reshape(-1, 4).T
-    return SpeedBounds(lower, upper, cubic.astype(bool), proportional.astype(bool))
+    lower, upper, *masks = np.array(rows, float).reshape(-1, 5).T
+    return SpeedBounds(lower, upper, *(mask.astype(bool) for mask in masks))
 
 
 def _is_proportional(value: Any, dq: Any, low: float, high: float) -> bool:

@@ -271,12 +271,17 @@ def make_time_parametrization(
 ) -> TimeParametrization:
     """Load the time parametrization of one problem; ``at_rest`` is whether motions begin and end at rest.
 
-    A problem that bounds the jerk, which is no quadratic of the rate, raises
-    UsageError.
+    A problem that bounds the jerk or the power of motors, which are no quadratics of
+    the rate, raises UsageError.
     """
     if problem.path_orders > 3:
         raise UsageError(
             f"plans of {problem.name!r} cannot be time-parametrized: it bounds the jerk"
+        )
+    bounds = speed_bounds(robot, problem)
+    if bounds.power.any():
+        raise UsageError(
+            f"plans of {problem.name!r} cannot be time-parametrized: it bounds the power of its motors"
         )
     intervals = INTERVALS_AT_REST if at_rest else PARAMETRIZATION_INTERVALS
     library, speeds = (
@@ -288,7 +293,7 @@ def make_time_parametrization(
         function.argtypes, function.restype = (c_void_p, c_long, *[c_void_p] * 5), None
     rows = (
         kernels.load(speed_coefficients),
-        *coefficient_bounds(speed_bounds(robot, problem)),
+        *coefficient_bounds(bounds),
     )
     moves = (
         (0, RATE_MARGIN, MIN_INCREASE_TO_REPEAT)

@@ -4,7 +4,8 @@ At ``r / k`` velocities are 1/k and accelerations 1/k^2 of their values at r. A 
 value g(q, dq, ddq) is then ``g0 + b / k + c / k^2``, exactly so for velocities,
 accelerations and torques with friction of a fixed direction. Values of g at k = 1, at k = 2 and at rest determine b and c,
 and the smallest k at which all g are within their bounds follows in closed form. Values
-that depend on the jerk are ``g0 + d / k^3``.
+that depend on the jerk are ``g0 + d / k^3``. A power of a motor is ``b / k + c / k^2 +
+d / k^3``; a further value, at k = 4, determines it.
 """
 
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ from cnpgen.trajectory.spline_motion import Motion, time_derivatives
 Array = NDArray[np.float64]
 
 MAX_TIME_SCALE = 3.0  # motions that need more are not usable plans
+POWER_BISECTIONS = 40  # of a time scale
 SCALING_INTERVALS = 128  # between phases
 # Relative; limits may be exceeded by about this between two phases.
 TIME_SCALE_MARGIN = 2e-4
@@ -148,15 +150,13 @@ class TimeScaling(PhaseGrid):
         _, *moving = time_derivatives([p, p1, p2, *third], [r, r1, *second])
         # A scaled motion has the direction of friction of the given one, at rest, too.
         friction = [moving[0]] if self.has_friction else []
-        fast, slow, static = (
-            self.residuals(
-                p,
-                *(term / k**order for order, term in enumerate(moving, 1)),
-                obstacle_poses,
-                *friction,
-            )[0]
-            for k in (1.0, 2.0, np.inf)
-        )
+
+        def values(k: float) -> Array:
+            scaled = (term / k**order for order, term in enumerate(moving, 1))
+            return np.array(self.residuals(p, *scaled, obstacle_poses, *friction)[0])
+
+        fast, slow, static = map(values, (1.0, 2.0, np.inf))
+        slowest = values(4.0) if self.bounds.power.any() else static
         needed = np.ones(fast.shape[1])
         # Upper bounds as they are, lower bounds with all signs changed.
         for sign, bounds in ((1.0, self.bounds.upper), (-1.0, self.bounds.lower)):
@@ -171,6 +171,11 @@ class TimeScaling(PhaseGrid):
             scale = _smallest_scale(margin, change - quadratic, quadratic)
             cubic = self.bounds.cubic[row]
             scale[cubic] = _smallest_scale_cubic(margin[cubic], change[cubic])
+            power = self.bounds.power[row]
+            quarter = sign * slowest[row, phase][power]
+            scale[power] = _smallest_scale_of_powers(
+                margin[power], change[power], half[power], quarter
+            )
             np.maximum.at(needed, phase, scale)
         return needed
 
@@ -204,6 +209,21 @@ def _smallest_scale(margin: Array, linear: Array, quadratic: Array) -> Array:
         k = (linear + root) / (2 * margin)
     violated = (linear + quadratic > margin) & (margin > 0) & np.isfinite(k)
     return np.where(violated, np.maximum(k, 1.0), 1.0)
+
+
+def _smallest_scale_of_powers(
+    margin: Array, fast: Array, slow: Array, slowest: Array
+) -> Array:
+    """Return k >= 1 with ``a / k + b / k^2 + d / k^3 = margin > 0`` from values at k = 1, 2 and 4, where 1 is too fast."""
+    a = (64 * slowest - 24 * slow + 2 * fast) / 6
+    b = 8 * slow - fast - 3 * a
+    d = fast - a - b
+    low, high = np.full(len(fast), 1 / MAX_TIME_SCALE), np.ones(len(fast))  # of 1 / k
+    for _ in range(POWER_BISECTIONS):
+        x = (low + high) / 2
+        within = ((d * x + b) * x + a) * x <= margin
+        low, high = np.where(within, x, low), np.where(within, high, x)
+    return np.asarray(1 / low)
 
 
 def _smallest_scale_cubic(margin: Array, change: Array) -> Array:

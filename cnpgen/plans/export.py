@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +15,14 @@ from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan, sample_pla
 from cnpgen.plans.format import PlanStatus
 from cnpgen.plans.join import JoinedPlans
 from cnpgen.plans.plans import Plans, screen
+from cnpgen.problems.problem_record import open_problem
+from cnpgen.robots.drive import Drive
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.store.files.atomic import machine_errors, write_file
 from cnpgen.store.files.written_files import claim_files, record_files
+from cnpgen.world.path import PathWorld
 
 MAX_SAMPLES = 1_000_000  # per plan
 PLAN_FILES = "plan_[0-9]*"  # files of a folder that belong to one export
@@ -122,6 +125,9 @@ def export_plans(
             concerns="out",
         )
     problem, sampled = plans.problem, _sampled(plans, rate, kept)
+    drive = open_problem(problem)[1].drive if "drive" in problem.content else None
+    if drive is not None:
+        sampled = _with_torques(sampled, plans, drive)
     exported = ExportedSet(
         np.array(kept),
         plans.sample_id[kept],
@@ -133,6 +139,7 @@ def export_plans(
         environment=_environment(plans, kept) if exporter.uses_environment else {},
         motion=plans.motion[kept] if isinstance(plans, Plans) else None,
         parameters=problem.parameters.names,
+        has_drives=drive is not None,
     )
     held = None
     folder = out.parent if exporter.single_file else out
@@ -266,6 +273,20 @@ def _sampled(
     for index in kept:
         values = () if parameters is None else tuple(parameters[index].tolist())
         yield sample_plan(motion[[index]], rate, index, values)
+
+
+def _with_torques(
+    sampled: Iterator[SampledPlan], plans: Plans | JoinedPlans, drive: Drive
+) -> Iterator[SampledPlan]:
+    """Yield the plans of a robot with drives with the torques at its joints and motors, by the exact law of friction."""
+    problem, robot = open_problem(plans.problem)
+    world = PathWorld(robot, problem.obstacle, problem.object_size)
+    for plan in sampled:
+        poses = _last(plans).scene.poses[plan.index]
+        world.set_path(plan.q.T, plan.dq.T, plan.ddq.T, poses)
+        friction = drive.coulomb[:, None] * np.sign(world.dq)
+        motor = np.asarray(world.linear_torque + friction).T
+        yield replace(plan, joint_torque=np.array(world.torque.T), motor_torque=motor)
 
 
 def _last(plans: Plans | JoinedPlans) -> Plans:

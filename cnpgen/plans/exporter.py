@@ -12,12 +12,14 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.plans.format import UNITS
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.trajectory.joined import JoinedMotion
 from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
 
+TORQUE_COLUMNS = "joint_torque", "motor_torque"
 # Minimum length of the last step in steps; a shorter one is merged with the step
 # before.
 MIN_LAST_STEP_FRACTION = 0.01
@@ -36,6 +38,8 @@ class SampledPlan:
         jerk: Joint jerks [rad/s^3], shape (K, n).
         parameters: Values of the problem's parameters in SI units.
         phase: Phases at the samples, shape (K,); None for joined plans.
+        joint_torque: Torques at the joints [N m], shape (K, n), of robots with drives.
+        motor_torque: Torques at their motors, seen at the joints, with all friction.
     """
 
     index: int
@@ -46,6 +50,8 @@ class SampledPlan:
     jerk: Array
     parameters: tuple[float, ...] = ()
     phase: Array | None = None
+    joint_torque: Array | None = None
+    motor_torque: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -66,6 +72,7 @@ class ExportedSet:
             shape (N, w); empty for formats that do not use them.
         motion: The N motions as splines; None for joined plans.
         parameters: Names of the problem's parameters.
+        has_drives: Whether the plans have torques at joints and motors.
     """
 
     index: NDArray[np.int64]
@@ -78,6 +85,13 @@ class ExportedSet:
     environment: Mapping[str, Array] = field(default_factory=dict)
     motion: Motion | None = None
     parameters: tuple[str, ...] = ()
+    has_drives: bool = False
+
+    @property
+    def columns(self) -> dict[str, str]:
+        """Names of the sampled values of joints, with the units of revolute ones."""
+        torques = dict.fromkeys(TORQUE_COLUMNS, "N m") if self.has_drives else {}
+        return UNITS | torques
 
 
 @dataclass(frozen=True)

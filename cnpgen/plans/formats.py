@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError, requires_extra
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan, parameter_columns
-from cnpgen.plans.format import JOINT_NAMES_KEY, PHASE_COLUMN, PLAN_COLUMN, UNITS
+from cnpgen.plans.format import JOINT_NAMES_KEY, PHASE_COLUMN, PLAN_COLUMN
 from cnpgen.store.files.atomic import committing, write_file
 from cnpgen.store.files.hdf5 import create_hdf5
 from cnpgen.store.joint_units import unit_of, units_of_joints
@@ -53,7 +53,7 @@ class NumpyArchive(Exporter):
             for name, values in common.items():
                 _add(archive, name, values)
             for plan in plans:
-                for name in ("t", *UNITS):
+                for name in ("t", *exported.columns):
                     _add(archive, f"plan_{plan.index:05d}_{name}", getattr(plan, name))
                 if plan.phase is not None:
                     _add(archive, f"plan_{plan.index:05d}_{PHASE_COLUMN}", plan.phase)
@@ -80,12 +80,12 @@ class CsvTables(Exporter):
         writer = csv.writer(text, lineterminator="\n")
         units = {
             name: units_of_joints(unit, exported.prismatic)
-            for name, unit in UNITS.items()
+            for name, unit in exported.columns.items()
         }
         joints = list(enumerate(exported.joint_names))
         heads = [
             f"{name} {joint} [{unit_of(units[name], i)}]"
-            for name in UNITS
+            for name in exported.columns
             for i, joint in joints
         ]
         (plan,) = plans
@@ -98,7 +98,7 @@ class CsvTables(Exporter):
                 *parameter_columns(exported.parameters),
             ]
         )
-        columns = [getattr(plan, name) for name in UNITS]
+        columns = [getattr(plan, name) for name in exported.columns]
         columns += [*phase, *(np.full(len(plan.t), value) for value in plan.parameters)]
         writer.writerows(np.column_stack([plan.t, *columns]).tolist())
         write_file(path, text.getvalue())
@@ -125,7 +125,7 @@ class ParquetTable(Exporter):
 
         units = {"t": "s"} | {
             name: units_of_joints(unit, exported.prismatic)
-            for name, unit in UNITS.items()
+            for name, unit in exported.columns.items()
         }
         held = json.dumps(exported.held_joints)
         metadata = {
@@ -135,7 +135,7 @@ class ParquetTable(Exporter):
         }
         lists = {
             name: pyarrow.list_(pyarrow.float64(), len(exported.joint_names))
-            for name in UNITS
+            for name in exported.columns
         }
         whole = {PLAN_COLUMN: pyarrow.int64(), "sample_id": pyarrow.int64()}
         parameters = dict.fromkeys(
@@ -161,7 +161,9 @@ class ParquetTable(Exporter):
                     plan.t,
                 ]
                 columns = [pyarrow.array(values) for values in whole_values]
-                columns += [fixed_lists(getattr(plan, name)) for name in UNITS]
+                columns += [
+                    fixed_lists(getattr(plan, name)) for name in exported.columns
+                ]
                 columns += [pyarrow.array(plan.phase)] if phase else []
                 columns += [
                     pyarrow.array(np.full(count, value)) for value in plan.parameters

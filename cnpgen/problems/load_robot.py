@@ -11,7 +11,7 @@ from cnpgen.problems.constraints.link_clearance import ObjectClearance
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem, kept_folder
 from cnpgen.robots.chain import chain_from_model
-from cnpgen.robots.drive import Drive
+from cnpgen.robots.drive import Drive, DriveSpec, SpeedLine
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Attached, Robot, read_model, recipe_errors_in
 from cnpgen.robots.scene import PARKED_POSITION_M
@@ -157,7 +157,10 @@ def _drive(
         "coulomb": _given(spec.coulomb, "coulomb", friction, "drive"),
     }
     limit = scale * _given(spec.torque, "torque", torque, "drive")
-    if spec.torque is None and not any(term.any() for term in terms.values()):
+    if not (
+        any(term.any() for term in terms.values())
+        or any((spec.torque, spec.power, spec.line))
+    ):
         return None
     return Drive(
         **terms,
@@ -165,7 +168,20 @@ def _drive(
         reversal_speed=spec.reversal_speed,
         limits=spec.limits,
         torque_limit=limit,
+        power_limit=scale * _given(spec.power, "power", none, "drive")
+        if spec.power
+        else None,
+        lines=tuple(_lines(spec, none, scale)),
     )
+
+
+def _lines(spec: DriveSpec, none: Array, scale: float) -> Iterator[SpeedLine]:
+    """Yield the torque-speed lines of drives; the scale reduces the torques at all velocities."""
+    for number, line in enumerate(spec.line, 1):
+        table = f"drive.line {number}"
+        torque = scale * _given(line.torque, "torque", none, table)
+        speed = _given(line.speed, "speed", none, table)
+        yield SpeedLine(torque, torque / speed, line.quadrants == "motoring")
 
 
 def _given(
@@ -214,7 +230,7 @@ def _drive_errors(problem: Problem, robot: Robot) -> Iterator[str]:
     if drive is None or not drive.motor_rows:
         return
     for index, name in enumerate(robot.joint_names):
-        friction, limit = drive.resting_friction[index], drive.torque_limit[index]
+        friction, limit = drive.resting_friction[index], drive.resting_limit[index]
         if friction >= limit:
             unit = unit_of(robot.units("N m"), index)
             text = f"friction of {friction:.4g} {unit} at rest leaves nothing of the motor's limit of {limit:.4g} {unit}"

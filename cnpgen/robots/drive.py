@@ -14,11 +14,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.robots.parameter_ranges import optional_key
-from cnpgen.schema.keys import PerJoint
+from cnpgen.schema.keys import PerJoint, field
 
 Array = NDArray[np.float64]
 
 MIN_REVERSAL_SPEED = 0.01  # rad/s; the verdict resolves reversals of 1 ms
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriveLine:
+    """Line of the torque that motors deliver over the velocity, seen at the joint, each number once or one per joint."""
+
+    torque: PerJoint = field("torque at rest", unit="N m", low=1e-6)
+    speed: PerJoint = field(
+        "velocity at which no torque is left", unit="rad/s", low=1e-6
+    )
+    quadrants: str = field(
+        "whether the line also limits torques that brake",
+        default="all",
+        choices=("all", "motoring"),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +88,14 @@ class DriveSpec:
         unit="N m",
         low=1e-6,
     )
+    power: PerJoint | None = optional_key(
+        "largest powers that the motors deliver", unit="W", low=1e-6
+    )
+    line: tuple[DriveLine, ...] = optional_key(
+        "lines of the torques of the motors over the velocity",
+        default=(),
+        form="[[drive.line]] tables",
+    )
 
     def validate(self) -> Iterator[tuple[str, str]]:
         """Yield (key, error) pairs."""
@@ -87,9 +110,30 @@ class DriveSpec:
                 "armature",
                 "is also given by 'rotor_inertia' and 'gear_ratio', expected one of them",
             )
+        for key in ("power", "line"):
+            if self.limits == "joint" and getattr(self, key):
+                yield key, "limits motors, but 'limits' is \"joint\""
 
 
 NO_DRIVE = DriveSpec()
+
+
+@dataclass(frozen=True)
+class SpeedLine:
+    """Limit ``|tau_m| + slope |dq| <= torque`` of motor torques, shape (n,) each.
+
+    If only motoring is limited, the torque in the direction of the motion is; a torque
+    that brakes may be up to ``torque + slope |dq|``.
+    """
+
+    torque: Array
+    slope: Array
+    motoring: bool
+
+    @property
+    def signs(self) -> tuple[float, ...]:
+        """Factors s of the rows ``|tau_m + s slope dq| <= torque``."""
+        return (1.0,) if self.motoring else (1.0, -1.0)
 
 
 @dataclass(frozen=True)
@@ -104,6 +148,8 @@ class Drive:
         reversal_speed: Speed w [rad/s] below which its direction is uncertain.
         limits: "both", "joint" or "motor".
         torque_limit: Symmetric planning limit of motor torques [N m], shape (n,).
+        power_limit: Largest power that motors deliver [W], shape (n,), or None.
+        lines: Torque-speed lines.
     """
 
     armature: Array
@@ -113,6 +159,8 @@ class Drive:
     reversal_speed: float
     limits: str
     torque_limit: Array
+    power_limit: Array | None = None
+    lines: tuple[SpeedLine, ...] = ()
 
     @property
     def limits_joint(self) -> bool:
@@ -136,11 +184,20 @@ class Drive:
         uncertain = 1 - self.friction_help
         return np.asarray(self.coulomb + uncertain * self.viscous * self.reversal_speed)
 
+    @cached_property
+    def resting_limit(self) -> Array:
+        """Limit of the torques of motors at rest, where lines begin [N m], shape (n,)."""
+        limits = [self.torque_limit, *(line.torque for line in self.lines)]
+        return np.asarray(np.min(limits, axis=0))
+
     @property
     def summary(self) -> str:
         """Description of the torque that is judged, in a few words."""
         sides = {"both": "both sides", "joint": "the joint", "motor": "the motor"}
-        return f"rigid body and drives, limits on {sides[self.limits]}"
+        more = [f"{len(self.lines)} torque-speed lines"] if self.lines else []
+        more += ["power"] if self.power_limit is not None else []
+        limits = ", ".join([f"limits on {sides[self.limits]}", *more])
+        return f"rigid body and drives, {limits}"
 
 
 RIGID = "rigid body"  # the torque that is judged without drives

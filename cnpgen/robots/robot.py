@@ -124,7 +124,7 @@ class Robot:
         drive = self.drive
         if drive is None or not drive.motor_rows:
             return self.torque_limit
-        left = drive.torque_limit - drive.resting_friction
+        left = drive.resting_limit - drive.resting_friction
         return np.minimum(self.torque_limit, left) if drive.limits_joint else left
 
     @property

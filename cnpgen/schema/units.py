@@ -49,6 +49,7 @@ _QUANTITIES: dict[str, tuple[str, float, dict[str, str]]] = {
     "N m": ("a torque", 1e5, {"N m": "1", "Nm": "1", "kN m": "1000"}),
     "1/s": ("a rate", math.inf, {"1/s": "1", "Hz": "1"}),
     "kg m^2": ("an inertia", 1e4, {"kg m^2": "1"}),
+    "W": ("a power", 1e6, {"W": "1", "kW": "1000"}),
     "N m s/rad": ("a viscous friction", 1e5, {"N m s/rad": "1", "Nms/rad": "1"}),
 }
 

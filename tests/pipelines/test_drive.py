@@ -1,17 +1,25 @@
-"""Boundary accelerations and proofs of infeasibility with drives, by the torques of the motors."""
+"""Boundary accelerations, proofs of infeasibility and solved plans with drives, by the torques of the motors."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
+import pytest
 
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.pipelines.stages.boundary_motion import table_acceleration, table_velocity
+from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.problem_record import ProblemRecord, open_problem
 from cnpgen.refine.proof.end_check import _limited_torques
-from cnpgen.robots.drive import DriveSpec
+from cnpgen.refine.refine_plans import solve_plans
+from cnpgen.robots.drive import DriveLine, DriveSpec
+from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import PerJoint
 from cnpgen.world.world import World
 
@@ -21,6 +29,16 @@ DRIVE = DriveSpec(
     viscous=PerJoint((3.0,)),
     coulomb=PerJoint((4.0, 5.0, 2.0, 4.0, 5.0, 0.0)),
 )
+
+LINES: dict[str, object] = {
+    "line": (
+        DriveLine(torque=PerJoint((70.0,)), speed=PerJoint((3.0,))),
+        DriveLine(
+            torque=PerJoint((65.0,)), speed=PerJoint((9.0,)), quadrants="motoring"
+        ),
+    ),
+    "power": PerJoint((20.0,)),
+}
 
 
 def table_problem(**changes: object) -> Problem:
@@ -33,8 +51,8 @@ def violations(world: World) -> float:
 
 def test_accelerations_on_the_table_meet_the_limits_of_the_motors() -> None:
     """At either end of the interval along a direction a limit is active, and none is exceeded."""
-    for limits in ("both", "motor", "joint"):
-        problem = table_problem(limits=limits, torque=PerJoint((60.0,)))
+    for limits, more in (("both", {}), ("motor", {}), ("joint", {}), ("motor", LINES)):
+        problem = table_problem(limits=limits, torque=PerJoint((60.0,)), **more)
         robot, random = load_robot(problem), np.random.default_rng(2)
         velocities, accelerations = table_velocity(robot), table_acceleration(robot)
         world, active = World(robot), 0
@@ -62,8 +80,8 @@ def test_accelerations_on_the_table_meet_the_limits_of_the_motors() -> None:
 
 def test_proofs_limit_the_torques_of_the_constraint() -> None:
     """The linear program over accelerations has the rows of the constraint, for any acceleration."""
-    for limits in ("both", "motor", "joint"):
-        robot = load_robot(table_problem(limits=limits))
+    for limits, more in (("both", {}), ("motor", {}), ("joint", {}), ("both", LINES)):
+        robot = load_robot(table_problem(limits=limits, **more))
         world, random = World(robot), np.random.default_rng(3)
         model, data = robot.model, robot.model.createData()
         still = np.zeros(robot.n)
@@ -74,8 +92,9 @@ def test_proofs_limit_the_torques_of_the_constraint() -> None:
             matrix, value, limit = _limited_torques(robot, np.array(units).T, bias, dq)
             world.set_state(q, dq, ddq, np.empty(0))
             conditions = TORQUE.measured(world)
-            rows = np.concatenate([np.array(each.g) for each in conditions])
-            bounds = np.concatenate([each.upper for each in conditions])
+            # Powers have another lower bound: the proof has them about their middle.
+            rows = np.concatenate([each.g - each.middle[0] for each in conditions])
+            bounds = np.concatenate([each.middle[1] for each in conditions])
             order, expected = (
                 np.lexsort((limit, matrix @ ddq + value)),
                 np.lexsort((bounds, rows)),
@@ -84,3 +103,40 @@ def test_proofs_limit_the_torques_of_the_constraint() -> None:
                 (matrix @ ddq + value)[order], rows[expected], atol=1e-9
             )
             np.testing.assert_allclose(limit[order], bounds[expected])
+
+
+@pytest.mark.slow
+def test_solved_plans_are_within_lines_and_powers_by_pinocchio() -> None:
+    """At 2,001 phases of each plan, with the exact sign of dry friction; plans without the limits exceed both."""
+    problems = draw_boundary_problems("heavy-object-drive", 3, seed=3)
+    limits = {
+        "line": [{"torque": [200.0], "speed": [2.0], "quadrants": "motoring"}],
+        "power": [120.0, 120.0, 60.0, 60.0, 60.0, 60.0, 60.0],
+    }
+    content = problems.problem.content
+    content = {**content, "drive": {**content["drive"], **limits}}
+    record = ProblemRecord(json.dumps(content), problems.problem.urdf)
+    _, robot = open_problem(record)
+    free, limited = (
+        largest_use(solve_plans(each, workers=1).plans, robot)
+        for each in (problems, replace(problems, problem=record))
+    )
+    assert (limited < 1.005).all()
+    assert (free > 1.1).all()
+
+
+def largest_use(plans: Plans, robot: Robot) -> np.ndarray:
+    """Largest shares of the line and of the powers."""
+    assert evaluate_plans(plans, workers=1).valid.all()
+    drive, model = robot.drive, robot.model.copy()
+    assert drive is not None
+    model.armature = drive.armature
+    data, largest = model.createData(), np.zeros(2)
+    for share in np.linspace(0, 1, 2001):
+        for q, dq, ddq in zip(*plans.states_at(share * plans.duration), strict=True):
+            friction = drive.viscous * dq + drive.coulomb * np.sign(dq)
+            torque = pin.rnea(model, data, q, dq, ddq) + friction
+            line = torque * np.sign(dq) + 0.8 * 100.0 * np.abs(dq)
+            uses = line / (0.8 * 200), torque * dq / drive.power_limit
+            largest = np.maximum(largest, [each.max() for each in uses])
+    return largest

@@ -6,13 +6,14 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from cnpgen.errors import UsageError
 from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.planner.planner import Planner
 from cnpgen.planner.time_parametrization import advance, make_time_parametrization
-from cnpgen.planner.time_scaling import make_time_scaling
+from cnpgen.planner.time_scaling import TIME_SCALE_MARGIN, make_time_scaling
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_record import record_problem
-from cnpgen.robots.drive import DriveSpec
+from cnpgen.robots.drive import DriveLine, DriveSpec
 from cnpgen.schema.keys import PerJoint
 from cnpgen.trajectory.spline_motion import Motion
 from tests.conftest import columns_of, needs_compiler
@@ -31,6 +32,7 @@ DRIVE = DriveSpec(
         (119.0, 194.0, 90.0, 79.0, 33.0, 33.0)
     ),  # times 0.8; met at the ends
 )
+LINE = DriveLine(torque=PerJoint((250.0,)), speed=PerJoint((2.0,)))
 COUNT = 8
 OBSTACLE_POSES = np.zeros((COUNT, 4))  # without effect on times
 
@@ -85,9 +87,22 @@ def motor_torques(given, p, p1, p2, r, r1, share):
     return np.array([torque + end for end in ends])
 
 
-@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
-def test_coefficients_are_those_of_pinocchio_with_rotors_and_friction(share):
-    given = with_drive(friction_help=share)
+@pytest.mark.parametrize(
+    ("share", "more"),
+    [
+        (0.0, {}),
+        (0.4, {}),
+        (1.0, {}),
+        (0.4, {"line": (LINE,)}),
+        (0.4, {"line": (LINE,), "viscous": PerJoint((0.0,))}),
+        (
+            1.0,
+            {"line": (LINE,), "viscous": PerJoint((0.0,)), "coulomb": PerJoint((0.0,))},
+        ),
+    ],
+)
+def test_coefficients_are_those_of_pinocchio_with_rotors_and_friction(share, more):
+    given = with_drive(friction_help=share, **more)
     random, n, count = np.random.default_rng(7), given.robot.n, 20
     found = make_time_parametrization(
         given.problem, given.robot, interpreted(given).kernels
@@ -107,6 +122,19 @@ def test_coefficients_are_those_of_pinocchio_with_rotors_and_friction(share):
         [upper[list(drive.motor_rows)], lower[list(drive.uncertain_rows)]]
     )
     value = constant + square * r**2 + mixed * r * r1 + linear * r
+    if more:  # |tau_m + s slope dq| for both signs s, after the torques
+        slope = 250 * 0.8 / 2.0 * p1 * r
+        joints = list(drive.motor_rows), list(drive.uncertain_rows)
+        expected = np.concatenate(
+            [
+                expected,
+                *(
+                    end[rows] + sign * slope[rows]
+                    for end, rows in zip((upper, lower), joints, strict=True)
+                    for sign in (1, -1)
+                ),
+            ]
+        )
     rows = slice(2 * n, 2 * n + len(expected))  # after accelerations and torques
     np.testing.assert_allclose(value[rows], expected, rtol=1e-9, atol=1e-9)
     assert not linear[: 2 * n].any()
@@ -156,6 +184,37 @@ def test_scaled_motions_meet_the_limits_of_the_motors(given, motion):
     (violation,) = scaling.violation(scaling.column(quicker, OBSTACLE_POSES))
     scaled = solved & (factor > 1)
     assert (violation.reshape(COUNT, -1).max(axis=1)[scaled] > 0).all()
+
+
+def test_motions_are_scaled_to_powers_and_not_time_parametrized(motion):
+    """The power of a scaled motion is a cubic of 1/k: the exact value is met, and a faster motion exceeds it."""
+    given = with_drive(power=PerJoint((90.0, 60.0, 40.0, 30.0, 20.0, 20.0)))
+    with pytest.raises(UsageError, match="it bounds the power of its motors"):
+        make_time_parametrization(given.problem, given.robot, given.kernels)
+    scaling = make_time_scaling(given.problem, given.robot, interpreted(given).kernels)
+    assert scaling.bounds.power.sum() == 2 * given.robot.n  # both ends of friction
+    alone = replace(
+        scaling,
+        bounds=replace(
+            scaling.bounds,
+            lower=np.full_like(scaling.bounds.lower, -np.inf),
+            upper=np.where(scaling.bounds.power, scaling.bounds.upper, np.inf),
+        ),
+    )
+    factor = alone.factor(motion, OBSTACLE_POSES) / (1 + TIME_SCALE_MARGIN)
+    solved = (factor > 1) & (factor < 2.9)
+    assert solved.sum() > COUNT / 2
+    phases = alone.path.shape[1]
+    for index in np.flatnonzero(solved):
+        column = alone.column(motion[[index]], OBSTACLE_POSES[[index]])
+        p, p1, p2 = column[: 3 * given.robot.n].reshape(3, -1, phases)
+        r, r1 = column[3 * given.robot.n :][:2] / factor[index]
+        upper, lower = motor_torques(given, p, p1, p2, r, r1, 0.0)
+        power = (
+            np.maximum(upper * p1 * r, lower * p1 * r)
+            / given.robot.drive.power_limit[:, None]
+        )
+        assert power.max() == pytest.approx(1.0, abs=1e-6)
 
 
 @needs_compiler

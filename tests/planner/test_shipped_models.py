@@ -25,6 +25,7 @@ STRICT = {
     "airhockey-tables": 0.85,
     "heavy-object": 0.95,
     "heavy-object-anywhere": 0.9,
+    "heavy-object-drive": 0.95,
     "heavy-object-loads": 0.85,
     "panda-cup": 0.9,
     "panda-scenes": 0.6,

@@ -14,10 +14,13 @@ import pytest
 
 from cnpgen.cli.main import main
 from cnpgen.errors import DatasetError, MachineError, UsageError
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
+from cnpgen.planner.planner import Planner
 from cnpgen.plans import Plans, save_plans
 from cnpgen.plans.export import Exported, export_plans
 from cnpgen.plans.exporter import sample_plan
 from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.problem_record import open_problem
 from cnpgen.schema import registry
 from cnpgen.trajectory.spline_motion import Motion
 from tests.examples.installed import installed_kind
@@ -479,3 +482,33 @@ def test_the_highest_rate_still_has_different_stamps(tmp_path: Path) -> None:
     plans = with_duration(draw_plans(n=1), [0.00100049])
     exported = export_plans(plans, tmp_path, to="joint-trajectory", rate=1e6)
     assert len(read_message(exported.files[0])["t"]) in {1001, 1002}
+
+
+def test_plans_of_robots_with_drives_have_torques_of_joints_and_motors(tmp_path):
+    """By Pinocchio with rotors and the exact law of friction; other robots have no such columns."""
+    problems = draw_boundary_problems("heavy-object-drive", 1, seed=2)
+    plans = Planner("heavy-object-drive").plan_batch(problems.boundary)
+    drive, model = (robot := open_problem(plans.problem)[1]).drive, robot.model.copy()
+    model.armature = drive.armature
+    archive = export_plans(plans, tmp_path / "a.npz", to="npz", rate=50).files[0]
+    table = export_plans(plans, tmp_path / "tables", to="csv", rate=50).files[0]
+    with np.load(archive) as data:
+        q, dq, ddq, joint, motor = (
+            data[f"plan_00000_{name}"]
+            for name in ("q", "dq", "ddq", "joint_torque", "motor_torque")
+        )
+    for k in range(len(q)):
+        rigid = pin.rnea(robot.model, robot.model.createData(), q[k], dq[k], ddq[k])
+        np.testing.assert_allclose(joint[k], rigid, atol=1e-9)
+        driven = pin.rnea(model, model.createData(), q[k], dq[k], ddq[k])
+        friction = drive.viscous * dq[k] + drive.coulomb * np.sign(dq[k])
+        np.testing.assert_allclose(motor[k], driven + friction, atol=1e-9)
+    with table.open(newline="", encoding="utf-8") as file:
+        header, *rows = csv.reader(file)
+    first = header.index("motor_torque joint_1 [N m]")
+    np.testing.assert_array_equal(np.array(rows, float)[:, first : first + 7], motor)
+    rigid_plans = draw_plans()
+    with np.load(
+        export_plans(rigid_plans, tmp_path / "b.npz", to="npz").files[0]
+    ) as data:
+        assert not any("torque" in name for name in data)

@@ -19,7 +19,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import open_problem, record_problem
 from cnpgen.problems.robot_model import RobotModel
-from cnpgen.robots.drive import NO_DRIVE, Drive, DriveSpec
+from cnpgen.robots.drive import NO_DRIVE, Drive, DriveLine, DriveSpec
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import PerJoint
 from cnpgen.world.drive import friction_bounds
@@ -29,6 +29,15 @@ from cnpgen.world.world import World
 URDFS = Path(__file__).parents[1] / "data" / "urdf"
 TORQUE = JointTorque(tolerance=5e-3)
 PEAK_SPEED = 1.875 * 2 / 1.9  # rad/s, of a quintic of 2 rad in 1.9 s
+LINES: dict[str, object] = {
+    "line": (
+        DriveLine(torque=PerJoint((150.0,)), speed=PerJoint((6.0,))),
+        DriveLine(
+            torque=PerJoint((300.0,)), speed=PerJoint((2.5,)), quadrants="motoring"
+        ),
+    ),
+    "power": PerJoint((90.0, 80.0, 70.0, 60.0, 50.0, 40.0, 30.0)),
+}
 ARM = """
 name = "arm"
 [robot]
@@ -120,9 +129,13 @@ def test_the_envelope_has_continuous_second_derivatives() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
-@pytest.mark.parametrize("limits", ["both", "joint", "motor"])
-def test_symbolic_and_measured_torques_agree(share: float, limits: str) -> None:
-    _, robot = heavy(friction_help=share, limits=limits)
+@pytest.mark.parametrize(
+    ("limits", "more"), [("both", {}), ("joint", {}), ("motor", {}), ("both", LINES)]
+)
+def test_symbolic_and_measured_torques_agree(
+    share: float, limits: str, more: dict[str, object]
+) -> None:
+    _, robot = heavy(friction_help=share, limits=limits, **more)
     columns, state = SymbolicState.of_symbols(robot, (), None, 0)
     conditions = TORQUE.symbolic(state)
     function = ca.Function("g", columns, [ca.vertcat(*each.g) for each in conditions])
@@ -130,7 +143,7 @@ def test_symbolic_and_measured_torques_agree(share: float, limits: str) -> None:
     q, dq, ddq = states(robot, 40)
     path.set_path(q.T, dq.T, ddq.T, np.empty(0))
     along = TORQUE.measured(path)  # type: ignore[arg-type]
-    expected = {"both": 3, "joint": 1, "motor": 2}[limits]
+    expected = {"both": 3, "joint": 1, "motor": 2}[limits] + 5 * bool(more)
     assert len(conditions) == len(along) == expected
     for k, moving in enumerate(zip(q, dq, ddq, strict=True)):
         world.set_state(*moving, np.empty(0))
@@ -164,8 +177,87 @@ def test_rotors_and_friction_are_those_of_pinocchio_and_the_exact_law() -> None:
         assert (exact <= high + 1e-9).all()
 
 
+def motor_ratio(robot: Robot, torque: np.ndarray, dq: np.ndarray) -> float:
+    """Largest share of the limits of motors that a torque uses, from their definitions (problems with LINES)."""
+    limit = 0.8 * np.array([320, 320, 176, 176, 110, 40, 40])
+    slow, fast = 0.8 * 150 * (1 - np.abs(dq) / 6), 0.8 * 300 * (1 - np.abs(dq) / 2.5)
+    power = 0.8 * np.array([90, 80, 70, 60, 50, 40, 30])
+    assert robot.drive is not None
+    np.testing.assert_allclose(robot.drive.torque_limit, limit)
+    driving = np.where(torque * dq > 0, np.abs(torque), 0.0)
+    ratios = [
+        np.abs(torque) / limit,
+        np.where(slow > 0, np.abs(torque) / slow, np.inf),
+        np.where(driving == 0, 0.0, np.where(fast > 0, driving / fast, np.inf)),
+        torque * dq / power,
+    ]
+    return float(np.max(ratios))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+def test_lines_and_powers_bound_every_torque_that_may_act(share: float) -> None:
+    """A state within the conditions is within lines and powers with any friction; far from a reversal also conversely."""
+    _, robot = heavy(friction_help=share, limits="motor", **LINES)
+    drive, model, random = robot.drive, robot.model.copy(), np.random.default_rng(4)
+    assert drive is not None
+    model.armature = drive.armature
+    world, data, met = World(robot), model.createData(), [0, 0]
+    every = states(robot, 3000, seed=5)
+    slower = every[0], 0.6 * every[1], 0.2 * every[2]  # both verdicts occur
+    for q, dq, ddq in zip(*slower, strict=True):
+        world.set_state(q, dq, ddq, np.empty(0))
+        rotors = pin.rnea(model, data, q, dq, ddq)
+        within = all(each.violation() <= 0 for each in TORQUE.measured(world))
+        sign = np.where(dq == 0, random.uniform(-1, 1, 7), np.sign(dq))
+        exact = drive.viscous * dq + drive.coulomb * sign
+        ratios = [
+            motor_ratio(robot, rotors + part * exact, dq)
+            for part in (share, random.uniform(share, 1, 7), 1.0)
+        ]
+        met[within] += 1
+        if within:
+            assert max(ratios) <= 1 + 1e-9
+        elif share == 1 and (np.abs(dq) > drive.reversal_speed).all():
+            # The second line bounds torques that brake, too, by more than its torque.
+            line = np.abs(rotors + exact) - drive.lines[1].slope * np.abs(dq)
+            assert max(ratios) > 1 or (line > drive.lines[1].torque).any()
+    assert min(met) > 100
+
+
+def test_lines_and_powers_are_part_of_the_record_and_of_resting_limits() -> None:
+    problem, robot = heavy(**LINES)
+    again, same = open_problem(record_problem(problem))
+    assert again.drive == problem.drive
+    drive = same.drive
+    assert drive is not None
+    np.testing.assert_allclose(drive.lines[0].slope, 0.8 * 150 / 6)
+    assert same.drive is not None
+    left = np.minimum(0.8 * 150, drive.torque_limit) - drive.resting_friction
+    np.testing.assert_allclose(
+        robot.holding_limit, np.minimum(robot.torque_limit, left)
+    )
+    text = "both sides, 2 torque-speed lines, power"
+    assert judged_torque(problem.constraint, robot).endswith(text)
+    plain, _ = heavy()
+    assert not {"line", "power"} & record_problem(plain).content["drive"].keys()
+
+
+def test_lines_alone_make_a_drive(tmp_path: Path) -> None:
+    text = '[drive]\nurdf_dynamics = "ignore"\n'
+    line = '[[drive.line]]\ntorque = "60 N m"\nspeed = ["40 rpm", "3 rad/s", 3, 3]\n'
+    drive = load_robot(arm(tmp_path, text + line)).drive
+    assert drive is not None
+    assert not drive.uncertain_rows
+    np.testing.assert_allclose(
+        drive.lines[0].torque / drive.lines[0].slope, [40 * np.pi / 30, 3, 3, 3]
+    )
+    power = load_robot(arm(tmp_path, text + 'power = "0.2 kW"')).drive
+    assert power is not None
+    np.testing.assert_array_equal(power.power_limit, 200.0)
+
+
 def test_derivatives_of_motor_torques_are_differences_across_the_reversal() -> None:
-    _, robot = heavy(friction_help=0.3)
+    _, robot = heavy(friction_help=0.3, **LINES)
     columns, state = SymbolicState.of_symbols(robot, (), None, 0)
     rows = ca.vertcat(*(g for each in TORQUE.symbolic(state) for g in each.g))
     g = ca.Function("g", columns, [rows])
@@ -282,6 +374,15 @@ def test_stated_friction_replaces_that_of_the_urdf(tmp_path: Path) -> None:
         ("friction_help = 2", "friction_help"),
         ('limits = "motors"', "limits"),
         ("coulomb = 20", "j4: friction of 20 N m at rest leaves nothing of the motor"),
+        ("power = 0", "power"),
+        ('power = "5 N m"', "expected a power"),
+        ('limits = "joint"\npower = 9', "power: limits motors, but 'limits' is"),
+        ("[[drive.line]]\ntorque = 30", "drive.line 1.speed: missing key"),
+        (
+            "[[drive.line]]\ntorque = [1, 2]\nspeed = 1",
+            "drive.line 1.torque: needs one",
+        ),
+        ("coulomb = 4\n[[drive.line]]\ntorque = 4\nspeed = 9", "j1: friction of 4 N m"),
         ("inertia = 1", "unknown key"),
     ],
 )

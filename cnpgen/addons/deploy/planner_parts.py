@@ -23,7 +23,6 @@ from cnpgen.planner.control_point_functions import line_change, projected_path
 from cnpgen.planner.expressions import (
     SpeedBounds,
     effective_steps,
-    has_friction,
     speed_bounds,
     speed_coefficients,
     speed_residuals,
@@ -133,10 +132,8 @@ def check_supported(model: Model, problem: Problem, robot: Robot) -> None:
         reason = "its network corrects its own path, which C files do not support"
     elif model.config.via_points:
         reason = "it plans along lines through via points, which C files do not support"
-    elif has_friction(robot) and (
-        model.config.time_parametrized or model.is_rest_to_rest
-    ):
-        reason = "its drives have friction, for which C files do not fit rates"
+    elif robot.drive is not None:
+        reason = "its problem has drives, which C files do not support"
     elif not all(
         np.isfinite(values).all()
         for values in (model.parameters, model.features.mean, model.features.scale)

@@ -33,6 +33,7 @@ from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.joint import JointAcceleration, JointTorque
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
+from cnpgen.world.drive import friction_bounds
 
 Array = NDArray[np.float64]
 
@@ -172,6 +173,12 @@ def _terms(
         square = checker.torques(part, q, dq, ddq) - gravity
         limit = np.broadcast_to(robot.torque_limit, q.shape)
         quantities.append((gravity, square, brake_factor, limit))
+        if (drive := robot.drive) is not None and drive.motor_rows:
+            # Friction of either direction reduces the limit: its sum would not be linear.
+            friction = np.max(np.abs(friction_bounds(drive, dq.T)), axis=0).T
+            left = drive.torque_limit - np.maximum(friction, drive.resting_friction)
+            rotors = square + drive.armature * ddq, brake_factor + drive.armature * dq
+            quantities.append((gravity, *rotors, left))
     if not quantities:
         return (np.zeros((len(q), 0)),) * 4
     return tuple(np.hstack(term) for term in zip(*quantities, strict=True))  # type: ignore[return-value]

@@ -16,7 +16,7 @@ from cnpgen.addons.trajectories.curve_family import UNDEFINED, CurveFamily
 from cnpgen.judges.plans.continuous_collision import is_contact
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
 from cnpgen.judges.plans.measure import MeasuredCondition, measure
-from cnpgen.problems.constraints.joint import JointTorque
+from cnpgen.problems.constraints.joint import POWER_UNIT, JointTorque
 from cnpgen.problems.problem import Problem
 from cnpgen.world.drive import friction_bounds
 from cnpgen.world.path import PathWorld
@@ -126,6 +126,8 @@ def _friction_changes(
         for ends in moved
         for other, bound in zip(ends, nominal, strict=True)
     ]
+    if condition.condition.unit == POWER_UNIT:
+        changes = [change * (np.abs(dq) + error)[joints] for change in changes]
     return np.asarray(np.maximum.reduceat(np.max(changes, axis=0), starts, axis=1))
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError
 from cnpgen.judges.plans.condition_curves import ConditionCurve, condition_curves
 from cnpgen.judges.plans.verdict import Margin, Verdict
+from cnpgen.problems.constraints.joint import MotorTorques, motor_conditions
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
@@ -203,10 +204,21 @@ def _torque_shares(world: PathWorld) -> dict[str, Array]:
     joint = {"torque": world.torque / robot.torque_limit[:, None]}
     if drive is None:
         return joint
-    low, high = world.motor_torque
-    motor = np.where(high > -low, high, low) / drive.torque_limit[:, None]
     shares = joint if drive.limits_joint else {}
-    return shares | ({"motor torque": motor} if drive.motor_rows else {})
+    if not drive.motor_rows:
+        return shares
+    for condition in motor_conditions(
+        robot, drive, MotorTorques(world.dq, world.motor_torque)
+    ):
+        name = condition.name.removeprefix("highest ").removeprefix("lowest ")
+        share = np.array(condition.g) / condition.upper[:, None]
+        joints = [robot.joint_names.index(part) for part in condition.parts]
+        values = shares.setdefault(name, np.zeros_like(world.dq))
+        for row, value in zip(joints, share, strict=True):
+            values[row] = np.where(
+                np.abs(value) > np.abs(values[row]), value, values[row]
+            )
+    return shares
 
 
 def _draw_joints(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.kernels.symbolic.drive import linear_torque, motor_torque
+from cnpgen.kernels.symbolic.drive import motor_torque
 from cnpgen.kernels.symbolic.dynamics import inverse_dynamics
 from cnpgen.kernels.symbolic.kinematics import (
     bias_acceleration,
@@ -30,6 +30,7 @@ from cnpgen.pipelines.stages.stage import (
     StageFunction,
     fraction,
 )
+from cnpgen.problems.constraints.joint import MotorTorques, motor_conditions
 from cnpgen.problems.constraints.table import Table
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
@@ -367,19 +368,23 @@ def _limited_torques(
     limit = [float(x) for x in robot.torque_limit]
     if robot.drive is None:
         return value, change, limit
-    drive, zero = robot.drive, [0.0] * robot.n
-    lowest, highest = motor_torque(drive, value, dq, ddq[0])
-    motor_change = linear_torque(drive, change, zero, ddq[1])
+    drive, (inner, outer) = robot.drive, ddq
     values, changes, bounds = (
-        (value, change, limit) if drive.limits_joint else ([], [], [])
+        (list(value), list(change), limit) if drive.limits_joint else ([], [], [])
     )
-    rows = [(highest, joint) for joint in drive.motor_rows]
-    rows += [(lowest, joint) for joint in drive.uncertain_rows]
-    return (
-        [*values, *(end[joint] for end, joint in rows)],
-        [*changes, *(motor_change[joint] for _, joint in rows)],
-        [*bounds, *(float(drive.torque_limit[joint]) for _, joint in rows)],
+    still, moved = (
+        list(motor_conditions(robot, drive, MotorTorques(dq, torques)))
+        for torques in (
+            motor_torque(drive, value, dq, inner),
+            motor_torque(drive, add(value, change), dq, add(inner, outer)),
+        )
     )
+    for first, second in zip(still, moved, strict=True):
+        centers, halves = first.middle
+        values += [g - x for g, x in zip(first.g, centers.tolist(), strict=True)]
+        changes += [b - a for a, b in zip(first.g, second.g, strict=True)]
+        bounds += halves.tolist()
+    return values, changes, bounds
 
 
 def _project(

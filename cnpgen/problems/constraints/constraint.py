@@ -77,6 +77,11 @@ class Condition:
         """Whether it is an equality."""
         return bool(np.array_equal(self.lower, self.upper))
 
+    @property
+    def middle(self) -> tuple[Array, Array]:
+        """Middle and half width of the bounds, shape (m,) each."""
+        return (self.upper + self.lower) / 2, (self.upper - self.lower) / 2
+
     def tolerance(self, dtype: str) -> Array:
         """Return the tolerance of g on a boundary state stored as ``dtype``, in the unit of g, shape (m,)."""
         exact = BOUNDARY_TOLERANCES[dtype][self.tolerance_kind]

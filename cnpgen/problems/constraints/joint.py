@@ -3,14 +3,14 @@
 Tolerances of all joint limits but the position are fractions of the limit.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from cnpgen.problems.constraints.constraint import Array, Condition, Constraint
-from cnpgen.robots.drive import RIGID
+from cnpgen.robots.drive import RIGID, Drive, SpeedLine
 from cnpgen.schema.keys import field
 from cnpgen.store.joint_units import units_of_joints
 
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.robots.robot import Robot
     from cnpgen.world.world import World
+
+POWER_UNIT = "W"  # of conditions that limit powers, which are cubic in the velocity
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,8 +134,8 @@ class JointJerk(_RelativeLimit):
 class JointTorque(_RelativeLimit):
     """Constraint: joint torques, including the payload, are within their limits: ``|ID(q, dq, ddq)| <= limit``.
 
-    With [drive], the torques of the motors are within theirs, too: the highest and the
-    lowest over all friction that may act.
+    With [drive], the torques and powers of the motors are within theirs, too, for all
+    friction that may act.
     """
 
     reason = "joint torque limit"
@@ -147,28 +149,72 @@ class JointTorque(_RelativeLimit):
         if drive is None:
             return super()._within(state, factor)
         joint = super()._within(state, factor) if drive.limits_joint else ()
-        low, high = state.motor_torque
-        # Both rows have both bounds: the redundant ones never bind, since high >= low.
-        highest = _of_joints(
-            state.robot, "highest motor torque", high, drive.motor_rows
-        )
-        lowest = _of_joints(
-            state.robot, "lowest motor torque", low, drive.uncertain_rows
-        )
-        return (*joint, *highest, *lowest)
+        moving = MotorTorques(state.dq, state.motor_torque)
+        return (*joint, *motor_conditions(state.robot, drive, moving))
 
 
-def _of_joints(
-    robot: "Robot", name: str, torque: Sequence[Any] | Array, joints: tuple[int, ...]
-) -> tuple[Condition, ...]:
-    """Return the condition that motor torques of some joints are within their limits, none without joints."""
-    if robot.drive is None or not joints:
-        return ()
-    limit = robot.drive.torque_limit[list(joints)]
-    unit = units_of_joints("N m", tuple(robot.prismatic[joint] for joint in joints))
-    parts = tuple(robot.joint_names[joint] for joint in joints)
-    g = [torque[joint] for joint in joints]
-    return (Condition(name, unit, g, -limit, limit, "limit", parts),)
+class MotorTorques(NamedTuple):
+    """Joint velocities [rad/s], and the lowest and highest torques at the motors [N m], symbolic or measured."""
+
+    dq: Any
+    torque: tuple[Any, Any]
+
+
+def motor_conditions(
+    robot: "Robot", drive: Drive, state: MotorTorques
+) -> Iterator[Condition]:
+    """Yield the limits of motors: torques, torque-speed lines and powers, for all friction that may act."""
+    low, high = state.torque
+    # Both rows have both bounds: the redundant ones never bind, since high >= low.
+    ends = {
+        "highest": (high, drive.motor_rows),
+        "lowest": (low, drive.uncertain_rows),
+    }
+    flat = SpeedLine(drive.torque_limit, np.zeros(robot.n), motoring=True)
+    for number, line in enumerate((flat, *drive.lines)):
+        for end, (torque, joints) in ends.items():
+            if joints:
+                name = f"{end} motor torque" + (f", line {number}" if number else "")
+                yield _line_condition(robot, name, line, (torque, state.dq), joints)
+    if drive.power_limit is not None:
+        yield _power_condition(robot, drive, drive.power_limit, state)
+
+
+def _line_condition(
+    robot: "Robot", name: str, line: SpeedLine, state: Any, joints: tuple[int, ...]
+) -> Condition:
+    """Return the condition that torques of motors are below a line: ``|tau_m + s slope dq| <= torque``."""
+    torque, dq = state
+    rows = joints * len(line.signs)
+    signs = np.repeat(line.signs, len(joints)).tolist()
+    unit = units_of_joints("N m", tuple(robot.prismatic[joint] for joint in rows))
+    g = [
+        torque[joint] + sign * slope * dq[joint]
+        if (slope := float(line.slope[joint]))
+        else torque[joint]
+        for joint, sign in zip(rows, signs, strict=True)
+    ]
+    limit = line.torque[list(rows)]
+    parts = tuple(robot.joint_names[joint] for joint in rows)
+    return Condition(name, unit, g, -limit, limit, "limit", parts)
+
+
+def _power_condition(
+    robot: "Robot", drive: Drive, power: Array, state: MotorTorques
+) -> Condition:
+    """Return the condition that motors deliver at most their power, ``tau_m dq <= P``; braking is not limited.
+
+    The highest torque bounds the power of forward motion, the lowest that of backward
+    motion. The lower bound is twice what the limits of torque and velocity allow, so
+    that it is finite and never binds.
+    """
+    dq, (low, high) = state
+    rows = [*drive.motor_rows, *drive.uncertain_rows]
+    g = [high[joint] * dq[joint] for joint in drive.motor_rows]
+    g += [low[joint] * dq[joint] for joint in drive.uncertain_rows]
+    lowest = -2 * (np.maximum(drive.torque_limit * robot.velocity_limit, power))[rows]
+    parts = tuple(robot.joint_names[joint] for joint in rows)
+    return Condition("motor power", POWER_UNIT, g, lowest, power[rows], "limit", parts)
 
 
 def judged_torque(constraints: Sequence[Constraint], robot: "Robot") -> str:

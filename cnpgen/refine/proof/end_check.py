@@ -16,7 +16,12 @@ from numpy.typing import NDArray
 
 from cnpgen.problems.conditions import measured_needs
 from cnpgen.problems.constraints.constraint import Condition, Constraint
-from cnpgen.problems.constraints.joint import JointTorque
+from cnpgen.problems.constraints.joint import (
+    POWER_UNIT,
+    JointTorque,
+    MotorTorques,
+    motor_conditions,
+)
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.proof.reachable_positions import joint_limits
 from cnpgen.robots.robot import Robot
@@ -158,15 +163,18 @@ def _limited_torques(
         return inertia, bias, robot.torque_limit
     lowest, highest = friction_bounds(drive, dq)
     with_rotors = inertia + np.diag(drive.armature)
-    rows = [
-        (with_rotors[joint], bias[joint] + highest[joint], drive.torque_limit[joint])
-        for joint in drive.motor_rows
-    ]
-    rows += [
-        (with_rotors[joint], bias[joint] + lowest[joint], drive.torque_limit[joint])
-        for joint in drive.uncertain_rows
-    ]
-    if drive.limits_joint:
-        rows += list(zip(inertia, bias, robot.torque_limit, strict=True))
-    matrices, values, limits = zip(*rows, strict=True)
-    return np.array(matrices), np.array(values), np.array(limits)
+    rows = (
+        [(inertia, bias, robot.torque_limit)]
+        if drive.limits_joint
+        else [(inertia[:0], bias[:0], robot.torque_limit[:0])]
+    )
+    state = MotorTorques(dq, (bias + lowest, bias + highest))
+    for condition in motor_conditions(robot, drive, state):
+        centers, halves = condition.middle
+        joints = [robot.joint_names.index(name) for name in condition.parts]
+        # A power is the torque times the velocity, which does not change.
+        factor = dq[joints] if condition.unit == POWER_UNIT else np.ones(len(joints))
+        matrix = factor[:, None] * with_rotors[joints]
+        rows.append((matrix, np.array(condition.g) - centers, halves))
+    matrices, values, limits = map(np.concatenate, zip(*rows, strict=True))
+    return matrices, values, limits

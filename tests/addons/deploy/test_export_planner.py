@@ -281,6 +281,7 @@ def test_equal_models_give_equal_files():
     [
         ("panda-scenes", "its samples place obstacles"),
         ("heavy-object-anywhere", "via points"),
+        ("heavy-object-drive", "its problem has drives"),
     ],
 )
 def test_models_that_c_files_do_not_support_are_refused(model, reason):

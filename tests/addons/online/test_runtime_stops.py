@@ -14,6 +14,9 @@ from cnpgen.addons.online.stops import earliest_stop
 from cnpgen.addons.online.switches import SwitchOutcome
 from cnpgen.errors import UsageError
 from cnpgen.planner.planner import Planner
+from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.problems.problem_record import open_problem
+from cnpgen.refine.refine_plans import solve_plans
 from tests.conftest import some
 from tests.faults.stop_orders import check_states, run_orders, valid_plans
 
@@ -83,6 +86,46 @@ def test_stops_of_transports_and_among_obstacles_are_valid(name):
                 stops += 1
     assert stops > len(plans)
     assert len(plans) >= 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["heavy-object-drive", "panda-scenes-drive"])
+def test_stops_of_arms_with_drives_are_within_the_limits_of_the_motors(name):
+    """Nearly all stops end before their motion, with the first time law, by Pinocchio with rotors and exact friction."""
+    plans = solve_plans(draw_boundary_problems(name, 5, seed=5), workers=1).plans
+    robot = open_problem(plans.problem)[1]
+    drive, model = robot.drive, robot.model.copy()
+    model.armature = drive.armature
+    data, rng, earlier = model.createData(), np.random.default_rng(1), []
+    for index in np.flatnonzero(evaluate_plans(plans, workers=1).valid):
+        motion, checker = sample_motion(plans[[index]], 0.0), MotionChecker()
+        for at in motion.end_time * np.append(0.05, rng.uniform(0.1, 0.8, 4)):
+            stop = earliest_stop(checker, motion, at, measured=True)
+            earlier.append(stop is not motion)
+            assert not checker.violation(stop, at, stop.end_time)
+            times = np.arange(at, stop.end_time, TICK_S)
+            for q, dq, ddq in zip(*stop.at(times), strict=True):
+                torque = pin.rnea(model, data, q, dq, ddq)
+                torque = torque + drive.viscous * dq + drive.coulomb * np.sign(dq)
+                assert (np.abs(torque) <= 1.006 * drive.torque_limit).all()
+    assert len(earlier) >= 15
+    assert np.mean(earlier) > 0.8
+
+
+def test_the_law_of_a_stop_counts_rotors_and_friction(monkeypatch):
+    """With strong drives, the first time law is within the limits of the motors, and none is measured in vain."""
+    problems = draw_boundary_problems("heavy-object-drive", 2, seed=5)
+    plans, checker = solve_plans(problems, workers=1).plans, MotionChecker()
+    measure, found = checker.violation, []
+    monkeypatch.setattr(
+        checker, "violation", lambda *given: found.append(measure(*given)) or found[-1]
+    )
+    for index in np.flatnonzero(evaluate_plans(plans, workers=1).valid):
+        motion = sample_motion(plans[[index]], 0.0)
+        for share in np.linspace(0.1, 0.75, 8):
+            earliest_stop(checker, motion, share * motion.end_time, measured=True)
+    assert len(found) > 6
+    assert not any(found)
 
 
 def test_a_stop_holds_although_a_replan_was_being_computed(planner, executing):
