@@ -51,23 +51,31 @@ class Variant:
 
     Attributes:
         name: The compiler's name of the processor, the value of ``-march``.
+        zig: The name of ziglang, the value of ``-mcpu``.
         features: Names in Linux of the instruction sets that a processor must have.
     """
 
     name: str
+    zig: str
     features: frozenset[str] = frozenset()
+
+    def flag(self, compiler: str) -> str:
+        """Return the option of a compiler."""
+        is_zig = "ziglang" in shlex.split(compiler)
+        return f"-mcpu={self.zig}" if is_zig else f"-march={self.name}"
 
 
 VARIANTS = {  # of each architecture, the fastest first
     "x86_64": (
         Variant(
             "x86-64-v3",
+            "x86_64_v3",
             frozenset({"avx2", "fma", "bmi1", "bmi2", "f16c", "abm", "movbe"}),
         ),
-        Variant("x86-64"),
+        Variant("x86-64", "x86_64"),
     ),
-    "aarch64": (Variant("armv8-a"),),
-    "arm64": (Variant("armv8-a"),),
+    "aarch64": (Variant("armv8-a", "generic"),),
+    "arm64": (Variant("armv8-a", "generic"),),
 }
 
 
@@ -98,9 +106,9 @@ def build_libraries(libraries: Sequence[Sequence[Path]], folder: Path) -> list[P
             with tempfile.TemporaryDirectory(dir=folder, prefix=".build-") as scratch:
                 source = Path(scratch) / paths[-1].name
                 source.write_text(source_text(paths), encoding="utf-8")
-                flags = (LEVEL, f"-march={variant.name}")
-                library = source.with_suffix(".so")
-                run_compiler(require_compiler(), flags, source, library)
+                library, compiler = source.with_suffix(".so"), require_compiler()
+                flags = LEVEL, variant.flag(compiler)
+                run_compiler(compiler, flags, source, library)
                 library.replace(file)
         built.append(file)
     return built
