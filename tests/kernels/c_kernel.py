@@ -1,7 +1,7 @@
 """C source of a kernel over the vectors of vectors.h: the reference that machine code is compared with."""
 
+from cnpgen.addons.deploy.statements import statements
 from cnpgen.kernels.c_library import VECTORS
-from cnpgen.kernels.emit import statements
 from cnpgen.kernels.tape import GridSpec, Tape
 
 

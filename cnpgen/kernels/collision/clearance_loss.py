@@ -1,6 +1,6 @@
 """Huber's losses of the clearances of a robot's convex parts among the obstacles of samples.
 
-They are computed in compiled code, and without a C compiler by Pinocchio and Coal, the
+They are computed in compiled code, and where there is none by Pinocchio and Coal, the
 reference of that code.
 """
 
