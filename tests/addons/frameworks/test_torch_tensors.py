@@ -10,10 +10,9 @@ import scipy
 
 torch = pytest.importorskip("torch")
 
-from cnpgen.interop.torch.tensor_loss import MAX_KEPT_TABLES
-from cnpgen.interop.torch.tensor_tape import _APPLY, TensorTape
-
 import cnpgen
+from cnpgen.addons.frameworks.torch.tensor_loss import MAX_KEPT_TABLES
+from cnpgen.addons.frameworks.torch.tensor_tape import _APPLY, TensorTape
 from cnpgen.errors import UsageError
 from cnpgen.interop.torch import (
     TensorBoundaryLayer,
