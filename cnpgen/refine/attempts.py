@@ -1,5 +1,7 @@
 """Order of the attempts at a task: the next one is made only if no earlier one was accepted.
 
+No attempt follows if an end is invalid itself (``cnpgen.refine.strategy``): no path helps then.
+
 1. Plans with finer knots than their problem: the levels of step 2 with the problem's own control points.
 2. Coarse level from the input plan or a straight line, uniform time scaling, fine level, strict level.
 3. Other initial guesses, and the best attempt so far after uniform time scaling.
@@ -29,7 +31,6 @@ Array = NDArray[np.float64]
 # Tolerances; attempts with larger violations are left for joint-space paths.
 NEARLY_VALID = 30.0
 MAX_PENETRATION_M = 0.02  # of links in a plan that hull levels continue from
-MIN_END_PENETRATION_M = 1e-5  # of an end: smaller ones may be rounding errors
 # Of the initial line, above which joint-space paths come first.
 MAX_LINE_PENETRATION_M = 0.05
 
@@ -74,12 +75,9 @@ def _all_attempts(
     else:
         limit = NEARLY_VALID if searches_trees else np.inf
         best = yield from run_levels(refiner, task, x, adjusted, max_violation=limit)
-    # Other guesses are other paths, and no path helps an end that is invalid itself.
-    if task.stay_within is not None or refiner.check.ends_are_invalid(task):
+    if task.stay_within is not None:  # other guesses are other paths
         return
     if searches_trees:
-        if ends_penetrate(refiner, task):
-            return
         best = yield from _best_of(along_tree_paths(refiner, task, best), best)
     others = _from_other_guesses(
         refiner, task, x if adjusted is None else adjusted.variables, best
@@ -257,11 +255,6 @@ def _is_deep(refiner: Refiner, task: RefinementTask) -> bool:
     )
 
 
-def ends_penetrate(refiner: Refiner, task: RefinementTask) -> bool:
-    """Return whether an end is inside an obstacle or another link, so that no motion is valid."""
-    return refiner.penetration(task, task.ends) > MIN_END_PENETRATION_M
-
-
 def along_tree_paths(
     refiner: Refiner, task: RefinementTask, best: Attempt
 ) -> Iterator[Attempt]:
@@ -288,8 +281,6 @@ def around_obstacles(
 
     The best attempt comes first if its links hardly penetrate anything.
     """
-    if ends_penetrate(refiner, task):
-        return
     positions = refiner.check.transcription(task).positions(best.variables)
     best_first = (
         refiner.hulls.violation(positions, task.scene.poses[0]) < MAX_PENETRATION_M

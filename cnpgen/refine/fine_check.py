@@ -24,8 +24,6 @@ PENETRATION_SCALE_M = 1e-4  # of violated distances without a tolerance of their
 # Of one motion, each by the factor that its largest violation requires.
 MAX_SCALINGS = 6
 MIN_RESIDUAL_TOLERANCE = 1e-12  # of scaled residuals: below rounding errors
-# Tolerances: the bounds near an end differ slightly from those at it.
-MIN_END_VIOLATION = 1.5
 # A motion that must be slower by more is left to the solver, which finds a better one.
 MAX_SCALING = 1.25
 
@@ -157,10 +155,6 @@ class FineCheck:
         with np.errstate(divide="ignore", invalid="ignore"):
             over = np.nanmax(g[:, self._speeds] / upper[:, self._speeds], axis=0)
         return max(float(np.max(np.maximum(over, 0.0) ** (1 / self._powers))), 1.0)
-
-    def ends_are_invalid(self, task: RefinementTask) -> bool:
-        """Return whether the boundary conditions alone violate a bound by more than its tolerance."""
-        return bool(np.nanmax(self._end_violations(task)) > MIN_END_VIOLATION)
 
     def end_equality_error(self, task: RefinementTask) -> float:
         """Return the largest error of the boundary conditions in an equality, as a multiple of its tolerance."""

@@ -20,6 +20,10 @@ TIP_PATH_STATES, TIP_PATH_STEPS = 24, 4
 # Singular values below this fraction of the largest are ignored.
 TIP_PATH_CONDITION = 1e-3
 SAMPLES_PER_CONTROL_POINT = 20  # of the fit to a joint-space path
+RAMP_PHASE = 0.2  # in which a motion along a path accelerates, and brakes
+# Of the length of a path around a corner that gets more phase.
+CORNER_WIDTH = 0.06
+PLACING_PHASES = 300  # of the integrals below
 
 
 def straight_line(
@@ -94,9 +98,10 @@ def quintic(
 def fit_to_path(
     states: Array, boundary: Boundary, velocity_limit: Array, spec: TrajectorySpec
 ) -> tuple[Array, Array]:
-    """Fit a motion to states (K, n) of a joint-space path by least squares.
+    """Fit a motion to states (K, n) of a joint-space path by least squares: (interior control points, rate).
 
-    See ``straight_line``.
+    See ``straight_line``. A fit that is near the path is near the free space in which
+    trees found it.
     """
     min_duration = float(
         (np.abs(np.diff(states, axis=0)) / velocity_limit).max(axis=1).sum()
@@ -105,16 +110,47 @@ def fit_to_path(
         spec.rate_control_points, 1.0 / (PATH_DURATION_FACTOR * min_duration + 0.1)
     )
     s = np.linspace(0, 1, SAMPLES_PER_CONTROL_POINT * spec.path_control_points)
-    # Starts and ends without velocity.
-    lengths, eased = _arc_lengths(states), s**3 * (10 - 15 * s + 6 * s**2)
-    q = np.stack(
-        [np.interp(eased * lengths[-1], lengths, joint) for joint in states.T], axis=1
-    )
+    q = _states_along(states, s)
     count, n = spec.path_control_points - 3 - boundary.fixed_at_goal, states.shape[1]
     fixed = assemble(boundary, np.zeros((1, count, n)), rate[None], spec)[0]
     table = basis(s, spec.path_control_points, spec.degree)
     inner = slice(3, 3 + count)
     return np.linalg.lstsq(table[:, inner], q - table @ fixed, rcond=None)[0], rate
+
+
+def _states_along(states: Array, s: Array) -> Array:
+    """Return the states of a path (K, n) at phases s, shape (S, n), from rest to rest and slower around corners.
+
+    Let l in [0, 1] be the fraction of the path's length, t_k the unit direction of its
+    edge k, and l_k the corner between the edges k and k + 1. Then l(s) solves
+
+        int_0^l w(l') dl' / int_0^1 w  =  int_0^s v(s') ds' / int_0^1 v,
+        w(l) = 1 + sum_k |t_{k+1} - t_k| exp(-((l - l_k) / CORNER_WIDTH)^2),
+        v(s) = 3 r^2 - 2 r^3  with  r = min(s, 1 - s, RAMP_PHASE) / RAMP_PHASE.
+
+    Splines have few control points. The weight w puts more of them around corners, and
+    with short ramps v the middle of the path has as many of them as its ends.
+    """
+    lengths, grid = _arc_lengths(states), np.linspace(0, 1, PLACING_PHASES)
+    length = max(float(lengths[-1]), np.finfo(float).tiny)
+    edges = np.diff(states, axis=0)
+    directions = edges / np.maximum(np.diff(lengths), np.finfo(float).tiny)[:, None]
+    turns = np.linalg.norm(np.diff(directions, axis=0), axis=1)
+    distances = (grid[:, None] - lengths[1:-1] / length) / CORNER_WIDTH
+    weight = 1 + np.exp(-(distances**2)) @ turns
+    ramp = np.minimum(np.minimum(grid, 1 - grid) / RAMP_PHASE, 1)
+    speed = ramp**2 * (3 - 2 * ramp)
+    weights, distance = _integral(weight), _integral(speed)
+    along = np.interp(np.interp(s, grid, distance), weights, grid)
+    return np.stack(
+        [np.interp(along * length, lengths, joint) for joint in states.T], axis=1
+    )
+
+
+def _integral(values: Array) -> Array:
+    """Return the integral of values on an even grid by trapezoids, scaled to end at 1."""
+    sums = np.append(0.0, np.cumsum((values[1:] + values[:-1]) / 2))
+    return sums / sums[-1]
 
 
 def along_tip_path(

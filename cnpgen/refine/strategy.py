@@ -25,7 +25,7 @@ from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.link_clearance import ObjectClearance, SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.attempts import make_attempts
-from cnpgen.refine.proof.explain import end_violations
+from cnpgen.refine.proof.end_check import EndCheck
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.bounds import PRECISE_FRACTION
 from cnpgen.refine.solver.hull_levels import (
@@ -71,6 +71,7 @@ def refine_task(
         if (
             search.add(attempt)
             or search.found_no_path
+            or search.ends_are_invalid()
             or search.continue_rejected(attempt)
         ):
             break
@@ -87,8 +88,7 @@ def refine_task(
             best = min(best, judged, key=lambda attempt: attempt.rank)
             if judged.valid:
                 break
-    if best.outcome is Outcome.UNSOLVED:
-        best = replace(best, reason=checker.reason_of_ends(task) or best.reason)
+    best = search.explained(best)
     no_path = search.found_no_path and best.outcome is Outcome.UNSOLVED
     return best.result(search.iterations, Outcome.NO_PATH if no_path else None)
 
@@ -123,13 +123,14 @@ def refine_task_until(
     while not late and (attempt := next(attempts, None)) is not None:
         cut |= attempt.outcome is Outcome.NOT_CONVERGED
         if best is None or verdicts.allows(1):
-            ends = search.add(attempt)
+            ends = search.add(attempt) or search.ends_are_invalid()
             best = _better(best, search.best())
             if ends:
                 break
         late = not verdicts.allows(1)
         cut |= late
     assert best is not None  # without an input plan the first attempt is judged
+    best = search.explained(best)
     return best.result(search.iterations, Outcome.OUT_OF_TIME if cut else None)
 
 
@@ -216,11 +217,13 @@ class PlanChecker:
     def _strict_judge(self) -> Judge:
         return Judge(without_contacts(self._problem), self._robot)
 
+    @cached_property
+    def _ends(self) -> EndCheck:
+        return EndCheck(self._problem, self._robot)
+
     def reason_of_ends(self, task: RefinementTask) -> str | None:
         """Return the reason of a constraint that an end violates, so that no plan is valid; None without one."""
-        for constraint, _ in end_violations(
-            self._problem, self._robot, task.boundary, task.scene
-        ):
+        for constraint, _ in self._ends.violations(task.boundary, task.scene):
             return constraint.boundary_reason or constraint.reason
         return None
 
@@ -268,6 +271,26 @@ class RefinementSearch:
         self.judged.append(self._judge_attempt(attempt))
         self.contacts += self.judged[-1].touches
         return found_valid or (self.judged[-1].valid and self.judged[-1].is_precise)
+
+    def ends_are_invalid(self) -> bool:
+        """Return whether no attempt is valid because an end is not, so that no other attempt helps.
+
+        The ends are measured once, after the first attempt that was not accepted: most
+        tasks are solved by their first attempt and pay nothing.
+        """
+        if any(attempt.valid for attempt in self.judged):
+            return False
+        return self._reason_of_ends is not None
+
+    def explained(self, best: Attempt) -> Attempt:
+        """Return the best attempt; without a valid one, with the reason of an invalid end if there is one."""
+        if best.outcome is not Outcome.UNSOLVED:
+            return best
+        return replace(best, reason=self._reason_of_ends or best.reason)
+
+    @cached_property
+    def _reason_of_ends(self) -> str | None:
+        return self.checker.reason_of_ends(self.task)
 
     def continue_rejected(self, attempt: Attempt) -> bool:
         """Continue an attempt whose verdict names a shallow collision; return whether the search ends.

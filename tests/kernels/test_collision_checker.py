@@ -24,7 +24,12 @@ from tests.examples.shaped_robot import WEDGE, write_problem
 
 pytestmark = needs_compiler
 
-KINDS = ("box", "sphere", "cylinder", "capsule", "mesh")
+KINDS = ("box", "sphere", "cylinder", "capsule", "mesh", "large mesh")
+DIRECTIONS = np.random.default_rng(11).normal(size=(500, 3))
+# Of an ellipsoid: all corners of its hull, in many blocks.
+CORNERS = (
+    [0.15, 0.08, 0.03] * DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
+)
 WITHIN = 0.05  # m
 STATES = 400
 
@@ -55,11 +60,12 @@ def random_obstacles(kind: str, count: int) -> list[Obstacle]:
             "length": random.uniform(0.02, 0.4),
         },
         "mesh": lambda: {"mesh": mesh},
+        "large mesh": lambda: {"mesh": address_of(CORNERS)},
     }
     return [
         Obstacle(
-            name=f"{kind}-{index}",
-            kind=kind,
+            name=f"{kind}-{index}".replace(" ", "-"),
+            kind=kind.removeprefix("large "),
             position=tuple(random.uniform([-0.6, -0.6, 0.0], [0.6, 0.6, 0.9])),
             rotation=(0.0, 0.0, 0.0)
             if kind == "sphere"
@@ -82,7 +88,7 @@ def coal_shape(obstacle: Obstacle):
         return coal.Capsule(obstacle.radius, obstacle.length)
     if obstacle.kind == "cylinder":
         return coal.Cylinder(obstacle.radius / np.cos(np.pi / 64), obstacle.length)
-    return coal_hull(1e-3 * WEDGE)
+    return coal_hull(CORNERS if "large" in obstacle.name else 1e-3 * WEDGE)
 
 
 def coal_distance(first, second) -> float:

@@ -10,7 +10,7 @@ from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
-from cnpgen.refine.proof.explain import _limited_torques
+from cnpgen.refine.proof.end_check import _limited_torques
 from cnpgen.robots.drive import DriveSpec
 from cnpgen.schema.keys import PerJoint
 from cnpgen.world.world import World

@@ -142,7 +142,7 @@ def test_huge_boundary_conditions_do_not_change_the_other_plans(
     assert same(found.plans[np.array([1])], solved[np.array([1])])
 
 
-def test_boundary_conditions_that_violate_a_limit_get_the_least_violation_but_no_other_guess(
+def test_boundary_conditions_that_violate_a_limit_get_one_attempt_and_the_reason(
     problems: Plans,
 ) -> None:
     few, b = problems[np.arange(2)], problems.boundary[:2]
@@ -152,28 +152,14 @@ def test_boundary_conditions_that_violate_a_limit_get_the_least_violation_but_no
     )
     found = refine_plans(replace(few, boundary=replace(b, goal_dq=faster)), workers=1)
     assert [result.outcome for result in found.results] == [Outcome.UNSOLVED] * 2
-    assert (
-        max(result.iterations for result in found.results)
-        <= 2 * RefineOptions().max_iterations
-    )  # of the coarse, fine and strict levels
+    assert {result.reason for result in found.results} == {"joint velocity limit"}
+    # of the coarse level alone
+    one_level = RefineOptions().max_iterations
+    assert max(result.iterations for result in found.results) <= one_level
     for verdict in evaluate_plans(found.plans).verdicts:
         velocity = verdict.margins["joint velocity"]
-        unavoidable = (
-            0.02 * abs(velocity.bound) / velocity.tolerance
-        )  # at the goal, in tolerances
-        worst = max(
-            margin.violation / margin.tolerance for margin in verdict.margins.values()
-        )
-        assert (
-            unavoidable * (1 - 1e-6)
-            <= velocity.violation / velocity.tolerance
-            <= worst
-            <= 1.2 * unavoidable
-        )
-    assert {result.reason for result in found.results} <= {
-        "joint velocity limit",
-        "joint acceleration limit",
-    }
+        unavoidable = 0.02 * abs(velocity.bound)  # at the goal
+        assert velocity.violation >= unavoidable * (1 - 1e-6)
 
 
 def test_two_threads_give_the_same_plans_as_one() -> None:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +18,19 @@ Bodies = NDArray[np.void]
 
 HULL, BOX, CYLINDER = 0, 1, 2  # kinds in convex.c
 LANES = 8  # vertices and obstacles are padded to a multiple of the widest vector
+BLOCK = 16  # vertices, as in convex.c
+# Fewer vertices are found as fast without blocks; convex.c has memory for 1024 blocks.
+MIN_BLOCKED, MAX_BLOCKED = 49, 1024 * BLOCK
 BODY = np.dtype(
     [
         *((name, np.int64) for name in ("kind", "count", "first", "frame", "link")),
         *(
+            ("blocks", np.int64),
             ("size", np.float64, 3),
             ("radius", np.float64),
             ("rotation", np.float64, 9),
             ("position", np.float64, 3),
+            ("bound", np.float64),
         ),
     ]
 )
@@ -33,10 +38,61 @@ PADDING_DISTANCE_M = 1e6  # of the bounding boxes that pad the obstacles to full
 _BOX, _CYLINDER = KINDS.index("box"), KINDS.index("cylinder")
 
 
-def hull_vertices(corners: Array) -> Array:
-    """Return corners, shape (V, 3), by coordinates and padded with the first one, shape (3 * padded count,)."""
-    padding = np.repeat(corners[:1], -len(corners) % LANES, axis=0)
-    return np.concatenate([corners, padding]).T.ravel()
+class HullVertices(NamedTuple):
+    """Vertices of a hull for ``convex.c``.
+
+    ``values`` are ``count`` coordinates x, then y, then z. With ``blocks``, center (3) and
+    radius of their bounding spheres follow in the same way.
+    """
+
+    values: Array
+    count: int
+    blocks: int
+
+    def put(self, bodies: Bodies, where: Any, first: int) -> None:
+        """Enter the hull into the bodies at some indices; ``first`` is the index of its values among all."""
+        bodies["kind"][where], bodies["first"][where] = HULL, first
+        bodies["count"][where], bodies["blocks"][where] = self.count, self.blocks
+
+
+def hull_vertices(corners: Array) -> HullVertices:
+    """Return corners, shape (V, 3), padded with the first one to full vectors or blocks."""
+    if not MIN_BLOCKED <= len(corners) <= MAX_BLOCKED:
+        padded = _padded(corners, LANES)
+        return HullVertices(padded.T.ravel(), len(padded), 0)
+    padded = _padded(corners, BLOCK)
+    blocks = padded[_block_order(padded)].reshape(-1, BLOCK, 3)
+    centers = (blocks.min(axis=1) + blocks.max(axis=1)) / 2
+    radii = np.linalg.norm(blocks - centers[:, None], axis=2).max(axis=1)
+    radii = radii * (1 + 1e-12) + 1e-13  # above rounding errors
+    spheres = np.column_stack([centers, radii])
+    spheres = np.pad(spheres, [(0, -len(spheres) % LANES), (0, 0)])
+    spheres[len(radii) :, 3] = -np.inf  # no block: never searched
+    values = np.concatenate([blocks.reshape(-1, 3).T.ravel(), spheres.T.ravel()])
+    return HullVertices(values, len(padded), len(spheres))
+
+
+def _padded(rows: Array, multiple: int) -> Array:
+    return np.concatenate([rows, np.repeat(rows[:1], -len(rows) % multiple, axis=0)])
+
+
+def _block_order(corners: Array) -> NDArray[np.int64]:
+    """Return an order of corners in which those of each block are near each other.
+
+    The corners are split at a multiple of ``BLOCK`` near the median of the coordinate in
+    which they are widest, and so on until one block is left.
+    """
+    order, rest = list[NDArray[np.int64]](), [np.arange(len(corners))]
+    while rest:
+        part = rest.pop()
+        if len(part) == BLOCK:
+            order.append(part)
+            continue
+        widest = np.ptp(corners[part], axis=0).argmax()
+        part = part[np.argsort(corners[part, widest], kind="stable")]
+        half = (len(part) // BLOCK + 1) // 2 * BLOCK
+        rest += [part[half:], part[:half]]
+    return np.concatenate(order)
 
 
 def bounding_boxes(bodies: Bodies, centers: Array, half: Array) -> Array:
@@ -58,21 +114,19 @@ def bounding_boxes(bodies: Bodies, centers: Array, half: Array) -> Array:
 def primitive_bodies(obstacles: Primitives, first: int) -> tuple[Bodies, Array, Array]:
     """Return the obstacles of N samples as bodies, vertices of meshes and boxes, as ``obstacle_bodies`` of one."""
     kinds, sizes = obstacles.kinds, obstacles.sizes
-    blocks = [hull_vertices(mesh.corners) for mesh in obstacles.meshes]
-    ends = np.cumsum([first, *map(len, blocks)])
+    hulls = [hull_vertices(mesh.corners) for mesh in obstacles.meshes]
+    ends = np.cumsum([first, *(len(hull.values) for hull in hulls)])
     box, cylinder, mesh = kinds == _BOX, kinds == _CYLINDER, kinds >= MESH
     rounded = (kinds >= 0) & ~(box | cylinder | mesh)
     bodies = np.zeros(kinds.shape, BODY)
-    bodies["kind"] = np.where(mesh, HULL, np.where(cylinder, CYLINDER, BOX))
+    bodies["kind"] = np.where(cylinder, CYLINDER, BOX)  # and hulls, below
     centers = np.where((kinds >= 0)[..., None], obstacles.centers, PADDING_DISTANCE_M)
     bodies["position"], bodies["rotation"] = (
         centers,
         obstacles.rotations.reshape(*kinds.shape, 9),
     )
-    bodies["first"][mesh], bodies["count"][mesh] = (
-        ends[kinds[mesh] - MESH],
-        np.diff(ends)[kinds[mesh] - MESH] // 3,
-    )
+    for index, hull in enumerate(hulls):
+        hull.put(bodies, kinds == MESH + index, int(ends[index]))
     bodies["size"][box], bodies["size"][cylinder] = (
         sizes[box],
         sizes[cylinder][:, [0, 0, 1]],
@@ -84,7 +138,7 @@ def primitive_bodies(obstacles: Primitives, first: int) -> tuple[Bodies, Array, 
     half = np.where(mesh[..., None], sizes, bodies["size"])
     return (
         bodies,
-        np.concatenate([*blocks, np.empty(0)]),
+        np.concatenate([*(hull.values for hull in hulls), np.empty(0)]),
         bounding_boxes(bodies, centers, half),
     )
 
@@ -115,13 +169,10 @@ def obstacle_bodies(
         body = bodies[index]
         centers[index], halves[index] = _fill(body, obstacle, numbers[part])
         if body["kind"] == HULL:
-            corners = corners_of(obstacle.mesh)
-            vertices.append(hull_vertices(corners))
-            body["count"], body["first"], first = (
-                len(vertices[-1]) // 3,
-                first,
-                first + len(vertices[-1]),
-            )
+            hull = hull_vertices(corners_of(obstacle.mesh))
+            hull.put(bodies, index, first)
+            vertices.append(hull.values)
+            first += len(hull.values)
     (boxes,) = bounding_boxes(bodies[None], centers[None], halves[None])
     return bodies, np.concatenate([*vertices, np.empty(0)]), boxes
 

@@ -174,6 +174,29 @@ static void record(contact_list *list, long pair, const pose *f, const contact *
   list->count++;
 }
 
+/* Whether the bounding spheres of two parts are further apart than `within`, so that the parts are too. */
+static int spheres_are_apart(const body *one, const pose *f, const body *two, const pose *g, double within) {
+  double a[3], b[3], between[3], reach = one->bound + two->bound + within;
+  transform(f, one->position, a), transform(g, two->position, b);
+  less(b, a, between);
+  return reach < 0 || dot(between, between) > reach * reach;
+}
+
+/* Whether the bounding sphere of a part is further from the bounding box of obstacle o than `within`. */
+static int sphere_is_clear(const robot_scene *s, const body *part, const pose *f, long o, double within) {
+  const double *box = s->boxes + o;
+  double center[3], from[3], sum = 0.0, reach = part->bound + box[15 * s->lanes] + within;
+  transform(f, part->position, center);
+  for (int i = 0; i < 3; i++) from[i] = center[i] - box[i * s->lanes];
+  for (int i = 0; i < 3; i++) {
+    double along = 0.0;
+    for (int k = 0; k < 3; k++) along += box[(6 + 3 * k + i) * s->lanes] * from[k];
+    double gap = fabs(along) - box[(3 + i) * s->lanes];
+    sum += gap > 0 ? gap * gap : 0.0;
+  }
+  return reach < 0 || sum > reach * reach;
+}
+
 /* Find the contacts of moving parts and obstacles closer than `limit` plus what the link adds; without a list, return 1 at the
 first one. */
 static int meet_obstacles(const robot_scene *s, memory *m, double limit, contact_list *list) {
@@ -195,6 +218,7 @@ static int meet_obstacles(const robot_scene *s, memory *m, double limit, contact
         memcpy(place.p, obstacle->position, sizeof place.p);
         for (long i = s->first_part[l]; i < s->first_part[l + 1]; i++) {
           long part = s->part_of_link[i];
+          if (sphere_is_clear(s, s->parts + part, m->frame + link->frame, o + lane, within)) continue;
           double *guess = m->obstacle_normal + 3 * (part * s->n_obstacles + o + lane);
           contact found = {0};
           measure_bodies(s, s->parts + part, m->frame + link->frame, obstacle, &place, guess, within, list != 0, m->work, &found);
@@ -216,9 +240,10 @@ static int meet_itself(const robot_scene *s, memory *m, double limit, contact_li
     if (reach < 0 || squared_segment_distance(m->ends + 6 * a, m->ends + 6 * b) > reach * reach) continue;
     for (long k = s->first_pair[i]; k < s->first_pair[i + 1]; k++) {
       const body *one = s->parts + s->pairs[2 * k], *two = s->parts + s->pairs[2 * k + 1];
-      const pose *f = m->frame + one->frame;
+      const pose *f = m->frame + one->frame, *g = m->frame + two->frame;
+      if (spheres_are_apart(one, f, two, g, within)) continue;
       contact found = {0};
-      measure_bodies(s, one, f, two, m->frame + two->frame, m->pair_normal + 3 * k, within, list != 0, m->work, &found);
+      measure_bodies(s, one, f, two, g, m->pair_normal + 3 * k, within, list != 0, m->work, &found);
       if (!(found.distance < within)) continue;
       if (!list) return 1;
       record(list, k, f, &found, m->pair_normal + 3 * k, 0);

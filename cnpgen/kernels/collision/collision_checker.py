@@ -133,7 +133,7 @@ class CollisionChecker:
     Attributes:
         link_pairs: Pairs of convex parts of links that must not touch, the one nearer
             to the base first, shape (M, 2).
-        vertices: Vertices of the convex parts by coordinates, flat [m].
+        vertices: Values of the hulls of all convex parts (``HullVertices``), flat [m].
     """
 
     def __init__(
@@ -159,15 +159,17 @@ class CollisionChecker:
         )
         self._set("sliding", np.array(robot.prismatic, np.int64))
         parts, blocks, first = np.zeros(len(shape.convex_parts), BODY), list[Array](), 0
-        for body, part in zip(parts, shape.convex_parts, strict=True):
-            blocks.append(hull_vertices(part.vertices))
-            body["count"], body["first"], body["radius"] = (
-                len(blocks[-1]) // 3,
-                first,
-                part.radius,
-            )
-            body["frame"], body["link"] = shape.joints[part.link], links[part.link]
-            first += len(blocks[-1])
+        for index, part in enumerate(shape.convex_parts):
+            hull, corners = hull_vertices(part.vertices), part.vertices
+            hull.put(parts, index, first)
+            center = (corners.min(axis=0) + corners.max(axis=0)) / 2
+            reach = np.linalg.norm(corners - center, axis=1).max() + part.radius
+            parts["radius"][index], parts["position"][index] = part.radius, center
+            parts["bound"][index] = reach * (1 + 1e-12)  # above rounding errors
+            parts["frame"][index] = shape.joints[part.link]
+            parts["link"][index] = links[part.link]
+            blocks.append(hull.values)
+            first += len(hull.values)
         self.vertices = np.concatenate(blocks)
         self._set("parts", parts)
         capsules = np.array(

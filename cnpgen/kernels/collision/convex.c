@@ -17,10 +17,14 @@ bodies along the returned normal. It is therefore never above the true distance,
 #define RELATIVE_TOLERANCE 1e-13 /* of distances, whose normals need it */
 #define EPA_TOLERANCE 1e-10 /* m */
 #define MIN_GAP 1e-9 /* m, below which the bodies count as overlapping */
+#define HULL_BLOCK 16 /* vertices of a block; see body_arrays.py */
+#define MAX_BLOCKS 1024 /* of one hull */
 
 typedef struct {
   long kind, count, first, frame, link; /* vertices: count, padded to cache lines, from index first on */
+  long blocks; /* of a hull with many vertices, whose bounding spheres follow the vertices; otherwise 0 */
   double size[3], radius, rotation[9], position[3];
+  double bound; /* of a part of a link: radius of the sphere around `position` that contains it */
 } body;
 
 typedef struct { double w[3], a[3]; } vertex; /* of the Minkowski difference a - b, with its point a */
@@ -76,9 +80,37 @@ static void furthest_vertex(const double *p, long n, const double *d, double *ou
   for (int i = 0; i < 3; i++) out[i] = p[i * n + where[lane]];
 }
 
+/* The furthest of the n vertices p, which are sorted into blocks with bounding spheres (center c, radius r).
+
+No vertex of a block is further than  reach = c . d + r |d|.  The block of the largest reach is searched first; of the
+others only those that reach further than the furthest vertex so far. The result is that of a search through all vertices. */
+static void furthest_vertex_of_blocks(const double *p, long n, long blocks, const double *d, double *out) {
+  const double *sphere = p + 3 * n;
+  double reach[MAX_BLOCKS], furthest = -INFINITY, length = sqrt(dot(d, d));
+  long widest = 0, where = 0;
+  for (long k = 0; k < blocks; k += W)
+    put(reach + k, at(sphere + k) * d[0] + at(sphere + blocks + k) * d[1] + at(sphere + 2 * blocks + k) * d[2] +
+                       at(sphere + 3 * blocks + k) * length);
+  for (long k = 1; k < blocks; k++) widest = reach[k] > reach[widest] ? k : widest;
+  for (long turn = -1; turn < blocks; turn++) {
+    long block = turn < 0 ? widest : turn;
+    if (turn == widest || !(reach[block] >= furthest)) continue;
+    double along[HULL_BLOCK];
+    for (long k = 0; k < HULL_BLOCK; k += W) {
+      const double *x = p + HULL_BLOCK * block + k;
+      put(along + k, at(x) * d[0] + at(x + n) * d[1] + at(x + 2 * n) * d[2]);
+    }
+    for (long k = 0; k < HULL_BLOCK; k++)
+      if (along[k] > furthest) furthest = along[k], where = HULL_BLOCK * block + k;
+  }
+  for (int i = 0; i < 3; i++) out[i] = p[i * n + where];
+}
+
 /* The furthest point of a body in direction d, both in its own frame. */
 I void support(const body *b, const double *vertices, const double *d, double *out) {
-  if (b->kind == HULL) {
+  if (b->kind == HULL && b->blocks) {
+    furthest_vertex_of_blocks(vertices + b->first, b->count, b->blocks, d, out);
+  } else if (b->kind == HULL) {
     furthest_vertex(vertices + b->first, b->count, d, out);
   } else if (b->kind == BOX) {
     for (int i = 0; i < 3; i++) out[i] = d[i] < 0 ? -b->size[i] : b->size[i];
