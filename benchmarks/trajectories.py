@@ -43,6 +43,7 @@ from cnpgen.plans.exporter import SampledPlan, sample_plan
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.refine_plans import refine_plans
 from cnpgen.store.scene_table import OBSTACLE_POSES
+from cnpgen.trajectories import LoadOptions
 from cnpgen.trajectory.spline_motion import Motion
 
 EXCESS = 0.01  # outside a limit with its tolerance, relative to the limit
@@ -254,7 +255,9 @@ def through_degrees(trajectory: Trajectory, plans: Plans) -> Trajectory:
             comments="",
             fmt="%.6f",
         )
-        return load_trajectories(path, plans.problem.name, unit="deg").trajectories[0]
+        return load_trajectories(
+            path, plans.problem.name, options=LoadOptions(unit="deg")
+        ).trajectories[0]
 
 
 def chosen(cases: Sequence[Case], names: Sequence[str]) -> list[Case]:

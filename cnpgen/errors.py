@@ -148,12 +148,13 @@ class MissingAddonError(MachineError, ImportError):
 
 
 @contextmanager
-def requires_extra(extra: str, package: str) -> Iterator[None]:
+def requires_extra(extra: str, package: str, options: str = "") -> Iterator[None]:
     """Raise MissingExtraError if an import in the block fails.
 
     Args:
         extra: Name of the extra in pyproject.toml.
         package: Name of the package, for the message.
+        options: Further options of pip, with a space before them.
     """
     try:
         yield
@@ -163,7 +164,7 @@ def requires_extra(extra: str, package: str) -> Iterator[None]:
         AttributeError,
     ) as error:  # broken installations raise any of them
         raise MissingExtraError(
-            f"{package} cannot be imported ({error}): pip install 'cnpgen[{extra}]'"
+            f"{package} cannot be imported ({error}): pip install 'cnpgen[{extra}]'{options}"
         ) from error
 
 

@@ -1,6 +1,7 @@
 from typing import Any
 
 from cnpgen.loader.batch import BatchObserver as BatchObserver
+from cnpgen.make.solve_scenes import SceneOptions as SceneOptions
 from cnpgen.make.solve_scenes import SolvedScenes as SolvedScenes
 from cnpgen.make.solve_scenes import solve_scenes as solve_scenes
 from cnpgen.pipelines.scene_family import Grasp as Grasp

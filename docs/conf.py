@@ -5,8 +5,8 @@
 
 The source folder is the repository: links to SECURITY.md or to data cards work on the site and in the repository.
 The navigation follows the order of the links in index.md. Pages of the API are written before the build to
-reference/api/, a folder that git ignores. Notebooks of the tutorials are written to the folder notebooks of the site,
-interactive pages to the folder gallery.
+reference/api/, and the pages that `cnpgen docs` makes from the code beside that folder; git ignores both. Notebooks of
+the tutorials are written to the folder notebooks of the site, interactive pages to the folder gallery.
 """
 
 import inspect
@@ -27,6 +27,7 @@ from gallery import CARDS, available, write_gallery  # noqa: E402
 from generate import BRIDGES, bridge_names, public_objects  # noqa: E402
 from notebooks import write_notebooks  # noqa: E402
 
+from cnpgen.cli.docs_command import list_pages, page_text  # noqa: E402
 from cnpgen.machine.versions import DOCUMENTATION_URL, __version__  # noqa: E402
 
 project = "cnpgen"
@@ -42,12 +43,20 @@ include_patterns = [
     "pipelines/*.md",
     "problems/*.md",
 ]
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",  # links from names to their source
+    "sphinx_copybutton",
+]
+copybutton_exclude = ".linenos, .gp"
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 myst_heading_anchors = 4  # the anchors of headings are GitHub's
 smartquotes = False  # they would change --n
 highlight_language = "none"  # blocks without a language
 autodoc_typehints_format = "short"
+maximum_signature_line_length = 60  # longer ones have a parameter per line
 autodoc_mock_imports = list(BRIDGES)  # the pages of the bridges need no framework
 napoleon_use_ivar = True  # attributes in docstrings describe those that autodoc lists
 linkcheck_ignore = [
@@ -72,10 +81,12 @@ CAPTIONS = {
     "reference": "Reference",
     "benchmarks": "Benchmarks",
 }
+MADE = "cli", "keys"  # pages of the reference without a file in the repository
 OTHERS = (
     "README",
     "CHANGELOG",
     "CONTRIBUTING",
+    "CODE_OF_CONDUCT",
     "SECURITY",
     "datasets/**",
     "pipelines/**",
@@ -103,9 +114,15 @@ def add_navigation(_: Sphinx, docname: str, source: list[str]) -> None:
                     f"{kind}/{page}" for kind, page in links if kind == folder
                 )
             )
-            source[0] += toctree(pages, f":caption: {caption}")
+            made = [f"{folder}/{name}" for name in MADE if folder == "reference"]
+            source[0] += toctree([*made, *pages], f":caption: {caption}")
         source[0] += toctree(
             [f"/{name}" for name in OTHERS], ":caption: Project", ":glob:"
+        )
+    for name in MADE:  # a command in the repository, a link on the site
+        command = f"`cnpgen docs {name}`"
+        source[0] = source[0].replace(
+            command, f"[{command}](/docs/reference/{name}.md)"
         )
     if docname.startswith("docs/tutorials/"):
         file = f"../../notebooks/{docname.rpartition('/')[2]}.ipynb"
@@ -136,6 +153,13 @@ def with_pages(text: str) -> str:
             f"<!-- card: {name} -->", picture if find_spec("matplotlib") else ""
         )
     return text
+
+
+def write_made_pages(app: Sphinx) -> None:
+    """Write the pages that ``cnpgen docs`` makes from the code."""
+    for name in MADE:
+        page = Path(app.srcdir) / "docs" / "reference" / f"{name}.md"
+        page.write_text(page_text(list_pages()[name]), encoding="utf-8")
 
 
 def write_api_pages(app: Sphinx) -> None:
@@ -195,6 +219,7 @@ def write_downloads(app: Sphinx, error: Exception | None) -> None:
 def setup(app: Sphinx) -> None:
     """Register the functions above."""
     app.connect("source-read", add_navigation)
+    app.connect("builder-inited", write_made_pages)
     app.connect("builder-inited", write_api_pages)
     app.connect("build-finished", write_downloads)
     app.connect("autodoc-process-docstring", escape_bars)

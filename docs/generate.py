@@ -1,23 +1,20 @@
-"""Write the pages of the reference that follow from the code, and the part of the first page that the README has, too.
+"""Write the page of the reference that lists the public names, and the part of the first page that the README has, too.
 
     python docs/generate.py
 
 ``tests/docs/test_reference.py`` compares the pages with the code.
 """
 
-import argparse
 import ast
 import importlib
 import inspect
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import cnpgen
 import cnpgen.addons.frameworks
-from cnpgen.cli.describe_keys import describe_keys, recipe_types
-from cnpgen.cli.main import build_parser
+from cnpgen.addons.manual.tables import reference_table
 
 FOLDER = Path(__file__).parent
 MODULES = (
@@ -34,14 +31,6 @@ BRIDGES = (
     "torch",
     "jax",
 )  # their modules are read without an import of the framework
-
-COMMANDS_INTRODUCTION = """\
-# Command line
-
-All commands with their arguments and options. `python docs/generate.py` writes this page from the parsers.
-`cnpgen --help` and `cnpgen COMMAND --help` print the same texts.
-
-Every command writes data to stdout and everything else to stderr. `--debug` shows the traceback of an error."""
 
 NAMES_INTRODUCTION = """\
 # Python interface
@@ -108,83 +97,6 @@ def _imported(file: Path) -> set[str]:
     }
 
 
-def describe_commands() -> str:
-    """Describe all commands in Markdown."""
-    parser = build_parser()
-    (commands,) = (
-        action
-        for action in parser._actions
-        if isinstance(action, argparse._SubParsersAction)
-    )
-    parts = [COMMANDS_INTRODUCTION]
-    for name, command in commands.choices.items():
-        parts += [
-            f"## `cnpgen {name}`",
-            _escaped(command.description),
-            *_tables(command),
-        ]
-        parts += [f"```\n{command.epilog.strip()}\n```"] if command.epilog else []
-    codes = str(parser.epilog).partition("Exit codes:\n")[2]
-    rows = [
-        " ".join(row.split()).partition(" ")
-        for row in re.split(r"\n(?=  \d)", codes.strip("\n"))
-    ]
-    return "\n\n".join(
-        [
-            *parts,
-            "## Exit codes",
-            _table(("code", "definition"), [(code, text) for code, _, text in rows]),
-        ]
-    )
-
-
-def _tables(command: argparse.ArgumentParser) -> Iterator[str]:
-    """Yield the tables of the positional arguments and of the options."""
-    shown = [
-        action for action in command._actions if action.help is not argparse.SUPPRESS
-    ]
-    arguments = [action for action in shown if not action.option_strings]
-    options = [
-        action
-        for action in shown
-        if action.option_strings and action.dest not in {"help", "debug"}
-    ]
-    for head, actions in (("argument", arguments), ("option", options)):
-        if actions:
-            yield _table(
-                (head, "description"),
-                [(f"`{_spelling(action)}`", _help(action)) for action in actions],
-            )
-
-
-def _spelling(action: argparse.Action) -> str:
-    """Return an argument as users write it: ``-o FILE, --out FILE``."""
-    value = action.metavar or (
-        "|".join(map(str, action.choices)) if action.choices else action.dest.upper()
-    )
-    value = " ".join(value) if isinstance(value, tuple) else value
-    value = {"+": f"{value}...", "*": f"[{value}...]", "?": f"[{value}]"}.get(
-        str(action.nargs), value
-    )
-    if not action.option_strings:
-        return value
-    return ", ".join(
-        option if action.nargs == 0 else f"{option} {value}"
-        for option in action.option_strings
-    )
-
-
-def _help(action: argparse.Action) -> str:
-    """Return the help of an argument with its choices."""
-    text = (action.help or "") % {**vars(action), "prog": "cnpgen"}
-    hidden = action.choices if action.metavar else None
-    return (
-        text
-        if hidden is None or all(str(choice) in text for choice in hidden)
-        else f"{text} ({', '.join(hidden)})"
-    )
-
-
 def describe_names() -> str:
     """List all public names in Markdown."""
     groups: dict[str, list[tuple[str, str]]] = {}
@@ -197,7 +109,7 @@ def describe_names() -> str:
         groups.setdefault(module, []).append((f"`{short}`", " ".join(summary.split())))
     parts = [NAMES_INTRODUCTION]
     for module, rows in groups.items():
-        parts += [f"## `{module}`", _table(("name", "purpose"), rows)]
+        parts += [f"## `{module}`", reference_table(("name", "purpose"), rows)]
     return "\n\n".join(parts)
 
 
@@ -223,23 +135,7 @@ def describe_index() -> str:
     )
 
 
-def _table(head: tuple[str, str], rows: list[tuple[str, str]]) -> str:
-    lines = [head, ("---", "---"), *((_cell(one), _cell(other)) for one, other in rows)]
-    return "\n".join(f"| {one} | {other} |" for one, other in lines)
-
-
-def _cell(text: str) -> str:
-    return _escaped(" ".join(text.split()).replace("|", r"\|"))
-
-
-def _escaped(text: str | None) -> str:
-    """Return a text without accidental markup."""
-    return re.sub(r"(?<!`)\*", r"\*", re.sub(r"<(?=\w)", r"\<", text or ""))
-
-
 PAGES = {
-    "reference/keys.md": lambda: describe_keys(tuple(recipe_types())),
-    "reference/cli.md": describe_commands,
     "reference/api.md": describe_names,
     "index.md": describe_index,
 }

@@ -30,12 +30,15 @@ from cnpgen.addons.benchmark.simulator import rendering
 from cnpgen.addons.benchmark.simulator.execute import load_mujoco
 from cnpgen.addons.clusters.clusters import joined
 from cnpgen.addons.hub.publish import upload_files
+from cnpgen.addons.manual.completion import complete_words
 from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
 from cnpgen.addons.view import page
+from cnpgen.cli.main import build_parser
 from cnpgen.errors import MissingExtraError
 from cnpgen.kernels.c_library import VARIANTS
 from cnpgen.kernels.compiler import find_compiler
 from cnpgen.loader.dataset import make_frame
+from cnpgen.loader.load import load_dataset
 from cnpgen.machine.versions import DOCUMENTATION_URL
 from cnpgen.store.files.figure_file import new_figure
 
@@ -332,6 +335,8 @@ OPTIONAL = {  # package that cnpgen imports -> extra that installs it, function 
     "pandas": ("pandas", lambda: frame("pandas")),
     "pyarrow": ("parquet", lambda: trajectories(".parquet")),
     "yaml": ("ros", lambda: trajectories(".yaml")),
+    "argcomplete": ("completion", lambda: complete_words(build_parser([]))),
+    "fsspec": ("hub", lambda: load_dataset("memory://hits")),
     "huggingface_hub": (
         "hub",
         lambda: upload_files(Path(), [], "user/name", private=False),

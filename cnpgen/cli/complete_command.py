@@ -50,16 +50,15 @@ def add_options(parser: Parser) -> None:
         help="file of boundary problems to write, .h5",
     )
     option("--force", action="store_true", help="replace OUT")
-    option("--quiet", action="store_true", help="no summary")
     add_json(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from cnpgen.cli.refine_command import check_place
+    from cnpgen.cli.refine_command import check_free
     from cnpgen.make.complete import complete
     from cnpgen.plans import save_plans
 
-    check_place(arguments.out, force=arguments.force)
+    check_free(arguments.out, force=arguments.force)
     found = complete(arguments.pipeline, arguments.tasks)
     if len(found.plans):
         save_plans(arguments.out, found.plans)

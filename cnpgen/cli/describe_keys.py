@@ -1,8 +1,7 @@
 """The keys of recipe files: those of one kind of stage or constraint, or all of them."""
 
 import dataclasses
-import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, get_args
 
 from cnpgen.cli.describe import quantity, title_lines
@@ -16,7 +15,6 @@ from cnpgen.problems.problem import Problem
 from cnpgen.schema import addons, registry
 from cnpgen.schema.keys import Key, Range, keys
 from cnpgen.schema.toml import Kind
-from cnpgen.schema.units import PLAUSIBLE_MAX
 
 _CORE_FILES: dict[str, type] = {
     "problem": Problem,
@@ -31,19 +29,6 @@ GROUPS = {
 }
 """Tables with a key ``use`` that names their kind -> registry of the kinds."""
 
-_INTRODUCTION = f"""\
-# Keys of recipe files
-
-All keys of recipe files, with their values, defaults and meanings.
-`cnpgen show --keys` prints this page, `cnpgen show --keys pipeline` one part of it, and `--json` the same for programs.
-
-A number without a unit is in SI. A string may carry another unit of the same dimension: `"20 ms"`, `"[-170, 170] deg"`,
-`"5 %"`. A range is `"[low, high] unit"`; a single number is a range of one point.
-
-Values that are probably in another unit are refused with a suggestion. The largest absolute values are
-{", ".join(f"{value:,.4g} {unit}" for unit, value in PLAUSIBLE_MAX.items())}. Keys of small
-quantities, such as tolerances, have smaller ones. Limits and sizes are also compared with those of the URDF."""
-
 
 def recipe_types() -> dict[str, type]:
     """Return kind of a file -> type of its recipe, also of add-ons."""
@@ -55,10 +40,10 @@ def recipe_types() -> dict[str, type]:
 
 def kind_summary(kind: type) -> str:
     """Return the first line of a kind's documentation, without markup."""
-    return _first_line(kind).replace("`", "")
+    return first_line(kind).replace("`", "")
 
 
-def _first_line(kind: type) -> str:
+def first_line(kind: type) -> str:
     """Return the first line of a kind's documentation, in Markdown."""
     return (kind.__doc__ or "").strip().partition("\n")[0].replace("``", "`")
 
@@ -68,7 +53,8 @@ def describe_kind(group: str, name: str) -> str:
     kind = registry.load(group, name)
     head = ("key", "default", "description (value)")
     rows = [
-        (key.name, _default(key), f"{key.doc} ({_expected(key)})") for key in keys(kind)
+        (key.name, default_text(key), f"{key.doc} ({expected_text(key)})")
+        for key in keys(kind)
     ]
     text = table([head, *rows], indent="  ") if rows else ["  it has no keys"]
     return "\n".join(
@@ -90,19 +76,6 @@ def kind_to_dict(group: str, name: str) -> dict[str, Any]:
     }
 
 
-def describe_keys(kinds: Sequence[Kind]) -> str:
-    """Describe all keys of files of some kinds, in Markdown."""
-    parts = [_INTRODUCTION] if len(kinds) > 1 else []
-    types = recipe_types()
-    for kind in kinds:
-        parts += [
-            f"## {kind.capitalize()} files",
-            _first_line(types[kind]),
-            *_sections(types[kind], ""),
-        ]
-    return "\n\n".join(parts)
-
-
 def keys_to_dict(kinds: Sequence[Kind]) -> dict[str, Any]:
     """Describe all keys of files of some kinds for JSON.
 
@@ -110,26 +83,6 @@ def keys_to_dict(kinds: Sequence[Kind]) -> dict[str, Any]:
     """
     types = recipe_types()
     return {kind: _table_to_dict(types[kind]) for kind in kinds}
-
-
-def _sections(cls: type, path: str) -> Iterator[str]:
-    """Describe the keys of a table, and then those of every table in it that is written in the same file."""
-    yield _markdown_table(cls)
-    for key in keys(cls):
-        part = part_of(key)
-        name = f"{path}.{key.name}" if path else key.name
-        if part in GROUPS:
-            yield f"### `[[{name}]]`"
-            yield "The key `use` names the kind; the other keys are those of the kind."
-            for use in registry.names(GROUPS[part]):
-                kind = registry.load(GROUPS[part], use)
-                yield f"#### `{use}`"
-                yield _first_line(kind)
-                yield _markdown_table(kind) if keys(kind) else "It has no keys."
-        elif part is not None:
-            yield f"### `[[{name}]]`" if is_array(key) else f"### `[{name}]`"
-            yield _first_line(part)
-            yield from _sections(part, name)
 
 
 def part_of(key: Key) -> type | None:
@@ -155,26 +108,8 @@ def is_array(key: Key) -> bool:
     return bool(args) and dataclasses.is_dataclass(args[0]) and args[0] is not Range
 
 
-def _markdown_table(cls: type) -> str:
-    rows = [
-        (
-            f"`{key.name}`",
-            _escaped(_expected(key)),
-            _escaped(_default(key)),
-            _escaped(key.doc),
-        )
-        for key in keys(cls)
-    ]
-    lines = [("key", "value", "default", "description"), ("---",) * 4, *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def _escaped(text: str) -> str:
-    """Return a text as a cell of a Markdown table may have it."""
-    return re.sub(r"<(?=\w)", r"\<", text.replace("|", r"\|"))
-
-
-def _default(key: Key) -> str:
+def default_text(key: Key) -> str:
+    """Describe the default of a key: ``"20 ms"``, or "required"."""
     if key.required:
         return "required"
     if part_of(key) and key.default not in (None, ()):
@@ -182,7 +117,7 @@ def _default(key: Key) -> str:
     return quantity(key.default, key.unit)
 
 
-def _expected(key: Key) -> str:
+def expected_text(key: Key) -> str:
     """Describe the accepted values: ``"a length [m], at least 0"``."""
     bounds = {"at least": key.low, "at most": key.high}
     given = ((which, bound) for which, bound in bounds.items() if bound is not None)

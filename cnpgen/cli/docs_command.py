@@ -1,7 +1,8 @@
 """Print a page of the documentation as Markdown.
 
-Without PAGE it lists all pages. --search lists the lines that contain TEXT. Pictures
-are on the site and in the repository only.
+Without PAGE it lists all pages. --search lists the lines that contain TEXT. The pages
+cli and keys, with all commands and all keys of recipe files, are made from the code.
+Pictures are on the site and in the repository only.
 """
 
 import argparse
@@ -13,7 +14,9 @@ from typing import Any
 
 from cnpgen.cli.parser import Parser, add_json
 from cnpgen.errors import CnpgenError, MachineError, UsageError, lacks
+from cnpgen.schema import addons
 
+PAGES = "cnpgen.pages"  # functions that return a page of the reference
 KINDS = ("tutorials", "how-to", "concepts", "reference", "benchmarks")
 
 
@@ -44,10 +47,14 @@ def run(arguments: argparse.Namespace) -> int:
         _list(pages, as_json=arguments.json)
     elif arguments.json:
         _print_json(
-            {"page": name, "url": page_url(pages[name]), "markdown": _text(pages[name])}
+            {
+                "page": name,
+                "url": page_url(pages[name]),
+                "markdown": page_text(pages[name]),
+            }
         )
     else:
-        print(_text(pages[name]), end="")
+        print(page_text(pages[name]), end="")
     return 0
 
 
@@ -78,17 +85,23 @@ def list_pages() -> dict[str, Path]:
             f"{folder} has no pages of the documentation: reinstall cnpgen"
         )
     pages = {"index": folder / "index.md"}
-    lists = _text(pages["index"]).partition("## Tutorials")[
+    lists = page_text(pages["index"]).partition("## Tutorials")[
         2
     ]  # the table above it repeats some links
     for kind in KINDS:
         prefix = "benchmarks/" if kind == "benchmarks" else ""
         files = sorted(
-            (folder / kind).glob("*.md"),
+            {*(folder / kind).glob("*.md"), *_rendered(kind, folder)},
             key=lambda file: lists.find(f"{file.parent.name}/{file.name}"),
         )
         pages |= {prefix + file.stem: file for file in files}
     return pages
+
+
+def _rendered(kind: str, folder: Path) -> list[Path]:
+    """Return the paths of the pages of a kind that are made from the code; on the site only, there are such files."""
+    names = [entry.name for entry in addons.installed(PAGES) if kind == "reference"]
+    return [folder / kind / f"{name}.md" for name in names]
 
 
 def page_name(text: str, pages: dict[str, Path]) -> str:
@@ -127,14 +140,28 @@ def mentioned_addresses(text: str) -> list[str]:
     return []
 
 
-def _text(page: Path) -> str:
-    return page.read_text(encoding="utf-8")
+def page_text(page: Path) -> str:
+    """Return the text of a page of ``list_pages``, from its file or from the code."""
+    if page not in _rendered(page.parent.name, docs_folder()):
+        return page.read_text(encoding="utf-8")
+    return rendered_page(page.stem)
+
+
+def rendered_page(name: str) -> str:
+    """Return a page that is made from the code.
+
+    Raises:
+        MissingAddonError: This installation lacks the add-on that makes it.
+    """
+    entry = addons.find(PAGES, name)
+    assert entry is not None, name
+    return f"{addons.load_entry(entry, f'the page {name!r}')()}\n"
 
 
 def _list(pages: dict[str, Path], *, as_json: bool) -> None:
     listed = {name: file for name, file in pages.items() if name != "index"}
     titles = {
-        name: _text(file).partition("\n")[0].removeprefix("# ")
+        name: page_text(file).partition("\n")[0].removeprefix("# ")
         for name, file in listed.items()
     }
     rows = [
@@ -167,7 +194,7 @@ def _search(text: str, pages: dict[str, Path], *, as_json: bool) -> int:
     rows = [
         {"page": name, "line": number, "text": line.strip()}
         for name, file in pages.items()
-        for number, line in enumerate(_text(file).splitlines(), 1)
+        for number, line in enumerate(page_text(file).splitlines(), 1)
         if all(word in line.casefold() for word in words)
     ]
     if as_json:

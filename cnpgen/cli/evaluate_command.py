@@ -82,7 +82,7 @@ def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
         raise UsageError(
             f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0"
         )
-    with Meter(quiet=not sys.stderr.isatty(), noun="plan") as meter:
+    with Meter(quiet=arguments.quiet or not sys.stderr.isatty(), noun="plan") as meter:
         meter.begin(f"judging {arguments.file}", len(plans))
         return evaluate_plans(
             plans,

@@ -68,6 +68,11 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    from cnpgen.cli.finished import (
+        content_sha256,
+        is_finished,
+        record_request,
+    )
     from cnpgen.plans.export import export_plans, load_exporter
     from cnpgen.problems.problem_record import open_problem
 
@@ -75,6 +80,21 @@ def run(arguments: argparse.Namespace) -> int:
     rate = DEFAULT_RATE_HZ if arguments.rate is None else arguments.rate
     plans = _plans(arguments)
     chosen, out = _chosen(plans, arguments), _place(arguments, exporter)
+    target = _target(out, exporter)
+    request = [
+        arguments.to,
+        rate,
+        chosen,
+        arguments.at,
+        [
+            content_sha256(file)
+            for file in (Path(arguments.file), *(arguments.join or ()))
+        ],
+    ]
+    if is_finished(target, request, force=arguments.force):
+        print(f"{target} is there already, of the same request", file=sys.stderr)
+        print(target)
+        return 0
     exported = export_plans(
         plans,
         out,
@@ -94,6 +114,8 @@ def run(arguments: argparse.Namespace) -> int:
     of_all = (
         f" of {exported.count + len(exported.refused):,}" if exported.refused else ""
     )
+    if not exported.refused:
+        record_request(target, request)
     print(
         f"exported {counted(exported.count, 'plan')}{of_all} at {rate:g} Hz",
         file=sys.stderr,
@@ -117,7 +139,7 @@ def _plans(arguments: argparse.Namespace) -> "Plans | JoinedPlans":
 
 
 def _place(arguments: argparse.Namespace, exporter: "Exporter") -> Path:
-    """Return the output path, which must not exist without ``--force``."""
+    """Return the output path, which must be writable."""
     from cnpgen.store.files.atomic import check_writable
 
     file: Path = arguments.file
@@ -129,16 +151,14 @@ def _place(arguments: argparse.Namespace, exporter: "Exporter") -> Path:
     out: Path = arguments.out or Path(name)
     if not out.parent.is_dir():
         raise UsageError(f"{out} must be in a folder that exists")
-    inside = exporter.single_file and out.is_dir() and not exporter.is_folder
-    target = out / f"plans{exporter.suffix}" if inside else out
-    if (
-        target.exists()
-        and not arguments.force
-        and not (target.is_dir() and not any(target.iterdir()))
-    ):
-        raise UsageError(f"{target} exists; --force replaces files of the same name")
     check_writable(out)
     return out
+
+
+def _target(out: Path, exporter: "Exporter") -> Path:
+    """Return the file or folder that an exporter writes."""
+    inside = exporter.single_file and out.is_dir() and not exporter.is_folder
+    return out / f"plans{exporter.suffix}" if inside else out
 
 
 def _chosen(

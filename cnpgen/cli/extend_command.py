@@ -25,7 +25,6 @@ def add_options(parser: Parser) -> None:
         help="total number of samples afterwards",
     )
     add_engine(parser)
-    option("--quiet", action="store_true", help="no progress and no summary")
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -51,37 +51,45 @@ def run(arguments: argparse.Namespace) -> None:
 
 def list_all(what: str) -> list[dict[str, Any]]:
     """List the recipes of one kind, the models, or a group of kinds, of ``WHAT``, with name, title and size."""
-    from cnpgen.schema import registry
-
-    group = f"cnpgen.{what}"
-    if registry.names(group):
-        return [
-            {"name": name, "title": _summary(group, name)}
-            for name in registry.names(group)
-        ]
-    from cnpgen.planner.model_file import shipped_models
-    from cnpgen.schema.catalogue import list_recipes
-
+    files = files_of(what)
+    if files is None:
+        group = f"cnpgen.{what}"
+        return [{"name": name, "title": _summary(group, name)} for name in names(what)]
     describe = {
         "datasets": _dataset,
         "models": _model,
         "pipelines": _pipeline,
         "problems": _problem,
         "suites": _suite,
-    }.get(what)
-    if describe is None:  # the add-on that has all kinds of the group is missing
-        return []
+    }[what]
+    return [
+        {"name": name, **describe(name, file), "file": file}
+        for name, file in files.items()
+    ]
+
+
+def names(what: str) -> list[str]:
+    """List the names of one of ``WHAT``; empty if the add-on that has all of them is missing."""
+    from cnpgen.schema import registry
+
+    files = files_of(what)
+    return list(registry.names(f"cnpgen.{what}") if files is None else files)
+
+
+def files_of(what: str) -> dict[str, Path] | None:
+    """Return the files of recipes of one kind or of the models, by name; None of a group of kinds."""
+    from cnpgen.planner.model_file import shipped_models
+    from cnpgen.schema.catalogue import list_recipes
+
     kinds: dict[str, Kind] = {
         "datasets": "dataset",
         "pipelines": "pipeline",
         "problems": "problem",
         "suites": "suite",
     }
-    files = list_recipes(kinds[what]) if what in kinds else shipped_models()
-    return [
-        {"name": name, **describe(name, file), "file": file}
-        for name, file in files.items()
-    ]
+    if what == "models":
+        return shipped_models()
+    return list_recipes(kinds[what]) if what in kinds else None
 
 
 def _dataset(name: str, _: Path) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from cnpgen.cli.commands import (
     load_command,
 )
 from cnpgen.cli.interruption import Terminated, exit_code, interruptible
-from cnpgen.cli.parser import Parser, add_command, add_debug
+from cnpgen.cli.parser import Parser, add_command, add_common
 from cnpgen.cli.terminal import printing_safely
 from cnpgen.errors import (
     CnpgenError,
@@ -31,6 +31,7 @@ from cnpgen.errors import (
 )
 from cnpgen.machine import versions
 from cnpgen.machine.threads import prefer_one_thread
+from cnpgen.schema import addons
 from cnpgen.schema.foreign_paths import foreign_path_hint
 
 _DESCRIPTION = "Generate and verify datasets for kinodynamic motion planning, train planners and optimize plans."
@@ -61,7 +62,7 @@ documentation: 'cnpgen docs' lists the pages, 'cnpgen docs PAGE' prints one
 
 stdout is data, stderr everything else. Exit codes:
   0    done
-  1    the answer is no: a dataset or a file is damaged, unfinished or of another problem; samples or plans are invalid
+  1    the check failed: a dataset or a file is damaged, unfinished or of another problem; samples or plans are invalid
   2    a wrong argument, such as a missing path or one of another kind, or an error in a recipe
   3    the machine: no permission to read or write a path, a full disk, a broken library; also an internal
        error of cnpgen
@@ -70,6 +71,8 @@ stdout is data, stderr everything else. Exit codes:
   143  terminated (SIGTERM, as SLURM and Docker send it); resumable
 """
 
+COMPLETION = "cnpgen.completion"  # functions that print completions and end the process
+_VERBOSE = {"-v", "--verbose", "--debug"}  # options that show tracebacks
 BROKEN_PIPE = 141  # 128 + SIGPIPE, as shells have it
 _OPTIONS = {
     "discard": "force",
@@ -115,7 +118,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         except BrokenPipeError:
             return _leave_pipe()
         except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the boundary of the process
-            if "--debug" in words:
+            if _VERBOSE.intersection(words):
                 traceback.print_exc()
             return _report(error, vars(given))
     return code
@@ -123,6 +126,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(words: list[str], given: argparse.Namespace) -> int:
     """Parse the words into ``given`` and run the command."""
+    if "_ARGCOMPLETE" in os.environ:  # set by the functions of argcomplete in the shell
+        for entry in addons.installed(COMPLETION):
+            entry.load()(build_parser())
     first = next((word for word in words if not word.startswith("-")), "")
     parser = build_parser([first] if first and is_command(first) else None)
     for before, word in zip(["cnpgen", *words], words, strict=False):
@@ -140,7 +146,8 @@ def _run(words: list[str], given: argparse.Namespace) -> int:
     if chosen is parser:
         parser.print_help(sys.stderr)
         return 2
-    with notices(quiet=getattr(arguments, "quiet", False)):
+    level = "WARNING" if arguments.quiet else "DEBUG" if arguments.verbose else "INFO"
+    with notices(level):
         code: int = arguments.run(arguments) or 0  # most commands return nothing
     return code
 
@@ -154,7 +161,7 @@ def build_parser(names: Sequence[str] | None = None) -> Parser:
     """
     parser = _LinkedParser(prog="cnpgen", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version")
-    add_debug(parser)
+    add_common(parser)
     commands = parser.add_subparsers(
         title="commands", metavar="COMMAND", parser_class=_LinkedParser
     )
@@ -242,11 +249,8 @@ def shell_spelling(options: Container[str]) -> Spelling:
 
 
 @contextmanager
-def notices(*, quiet: bool = False) -> Iterator[None]:
-    """Print the library's log messages of the block on stderr, each one once.
-
-    With ``quiet`` only warnings.
-    """
+def notices(level: str = "INFO") -> Iterator[None]:
+    """Print the library's log messages of the block on stderr, from a level on, each one once."""
     import logging
 
     logger, handler, seen = (
@@ -254,7 +258,9 @@ def notices(*, quiet: bool = False) -> Iterator[None]:
         logging.StreamHandler(sys.stderr),
         set[str](),
     )
-    handler.setFormatter(logging.Formatter("cnpgen: %(message)s"))
+    # Time since the start [ms] and module only with --verbose.
+    text = "%(relativeCreated)d ms, %(name)s: " if level == "DEBUG" else "cnpgen: "
+    handler.setFormatter(logging.Formatter(f"{text}%(message)s"))
 
     def is_new(record: logging.LogRecord) -> bool:
         known = record.getMessage() in seen
@@ -263,7 +269,7 @@ def notices(*, quiet: bool = False) -> Iterator[None]:
 
     handler.addFilter(is_new)
     before = logger.level
-    logger.setLevel(logging.WARNING if quiet else logging.INFO)
+    logger.setLevel(level)
     logger.addHandler(handler)
     try:
         yield

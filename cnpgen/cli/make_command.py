@@ -95,7 +95,6 @@ def add_options(parser: Parser) -> None:
         action="store_true",
         help="print the specification and write nothing",
     )
-    option("--quiet", action="store_true", help="no progress and no summary")
 
 
 def run(arguments: argparse.Namespace) -> None:

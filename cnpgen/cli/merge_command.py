@@ -31,7 +31,6 @@ def add_options(parser: Parser) -> None:
         required=True,
         help="folder of the dataset; may be one of the parts",
     )
-    option("--quiet", action="store_true", help="no progress and no summary")
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -122,7 +122,7 @@ def add_command(
     parser = commands.add_parser(
         name, help=summary, description=title, epilog=text or None
     )
-    add_debug(parser, default=argparse.SUPPRESS)  # keep an option before the command
+    add_common(parser, default=argparse.SUPPRESS)  # keep an option before the command
     module.add_options(parser)
     for alternative in alternatives:
         alternative.add_options(
@@ -147,14 +147,16 @@ def _title_and_text(module: object) -> tuple[str, str]:
     return title, text
 
 
-def add_debug(parser: Parser, *, default: Any = False) -> None:
-    """Add ``--debug``."""
-    parser.add_argument(
-        "--debug",
-        action="store_true",
-        default=default,
-        help="show the traceback of an error",
-    )
+def add_common(parser: Parser, *, default: Any = False) -> None:
+    """Add ``--verbose``, also named ``--debug``, and ``--quiet``."""
+    for names, text in (
+        (
+            ("-v", "--verbose", "--debug"),
+            "print messages with their time and module, and the traceback of an error",
+        ),
+        (("-q", "--quiet"), "print no progress, no notices and no summary"),
+    ):
+        parser.add_argument(*names, action="store_true", default=default, help=text)
 
 
 ENGINE = ("workers", "engine", "address")

@@ -8,14 +8,16 @@ for models that hold the goal's acceleration. Plans meet the boundary conditions
 rounding; 'cnpgen evaluate' checks the constraints. With --refine the plans are
 optimized as by 'cnpgen refine', and the exit code is 1 if a plan is invalid in the end.
 Finished plans are kept in PLANS.part, and the same command resumes. The plan file is
-printed on stdout; an existing one is replaced only with --force.
+printed on stdout; an existing one is replaced only with --force, and is the result of a
+repeated command.
 """
 
 import argparse
 import sys
 import warnings
+from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import ENGINE, Parser, add_engine, add_json, options_of, refuse
@@ -25,12 +27,17 @@ from cnpgen.cli.refine_command import (
     REFINING,
     WORKERS,
     add_refining,
-    check_place,
+    check_free,
     refine_and_save,
+    report_finished,
 )
 from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
     from cnpgen.planner.model import Model
     from cnpgen.planner.plan_requests import Requests
 
@@ -77,7 +84,6 @@ def add_options(parser: Parser) -> None:
         action="store_true",
         help="replace PLANS, and discard another run's PLANS.part",
     )
-    option("--quiet", action="store_true", help="no progress and no summary")
     add_json(parser)
     option("--refine", action="store_true", help="optimize the plans")
     refining = parser.add_argument_group("with --refine")
@@ -89,6 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
     import json
     import time
 
+    from cnpgen.cli.finished import is_finished, record_request
     from cnpgen.planner.model_file import load_model
     from cnpgen.planner.planner import Planner
     from cnpgen.plans import save_plans
@@ -96,6 +103,16 @@ def run(arguments: argparse.Namespace) -> int:
     _complete(arguments)
     model = load_model(arguments.model)
     requests = _requests(arguments, model)
+    request = [
+        model.problem.comparable_sha256,
+        _checksums({"parameters": model.parameters, **requests.boundary.arrays()}),
+        _checksums({**requests.columns, "sample_id": requests.sample_id}),
+        options_of(arguments, "no_time_scaling", "allow_large_angles"),
+    ]
+    if not arguments.refine and is_finished(
+        arguments.out, request, force=arguments.force
+    ):
+        return report_finished(arguments, arguments.out)
     planner = Planner(model, scale_time=not arguments.no_time_scaling)
     begun = time.perf_counter()
     plans = planner.plan_batch(
@@ -118,6 +135,7 @@ def run(arguments: argparse.Namespace) -> int:
             title=f"refining plans of {arguments.model}",
         )
     save_plans(arguments.out, plans)
+    record_request(arguments.out, request)
     duration = float(plans.duration.mean()) if len(plans) else None
     facts = {
         "file": str(arguments.out),
@@ -127,6 +145,13 @@ def run(arguments: argparse.Namespace) -> int:
     }
     print(json.dumps(facts, indent=2) if arguments.json else arguments.out)
     return 0
+
+
+def _checksums(arrays: "Mapping[str, NDArray[Any]]") -> dict[str, str]:
+    """Return the checksums of arrays."""
+    return {
+        name: sha256(values.tobytes()).hexdigest() for name, values in arrays.items()
+    }
 
 
 def _complete(arguments: argparse.Namespace) -> None:
@@ -154,7 +179,7 @@ def _complete(arguments: argparse.Namespace) -> None:
     ]
     if lost and not arguments.refine:
         raise UsageError(f"--{lost[0].replace('_', '-')} needs --refine")
-    check_place(arguments.out, force=arguments.force)
+    check_free(arguments.out, force=arguments.force, unless_finished=True)
 
 
 def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":

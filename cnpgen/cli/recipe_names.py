@@ -85,10 +85,12 @@ def _shipped(*kinds: str) -> list[str]:
 
 def _recipe_or_path(kinds: tuple[str, ...], text: str) -> str:
     """Read a path, or the name of a recipe of one of several kinds."""
+    from cnpgen.loader.remote import local_folder
     from cnpgen.store.files.atomic import check_readable
     from cnpgen.store.files.kind import kind_of_content
     from cnpgen.store.paths import similar_path
 
+    text = str(local_folder(text))
     names, path = _shipped(*kinds), Path(text)
     check_readable(path)
     if (
@@ -155,20 +157,23 @@ def model(text: str) -> str:
 
 
 def dataset(text: str) -> Path:
-    """Read the folder of a dataset."""
+    """Read the folder of a dataset, or its URL: the folder of its copy."""
+    from cnpgen.loader.remote import local_folder
     from cnpgen.store.paths import require_dataset
 
     _refuse_shipped(text)
-    return require_dataset(text)
+    return require_dataset(local_folder(text))
 
 
 def present(text: str) -> Path:
-    """Read the path of a file or a folder."""
+    """Read the path of a file or a folder, or the URL of a dataset: the folder of its copy."""
+    from cnpgen.loader.remote import local_folder
     from cnpgen.store.paths import require_path
 
     _refuse_shipped(text)
-    require_path(Path(text), "a file or a folder")
-    return Path(text)
+    path = Path(local_folder(text))
+    require_path(path, "a file or a folder")
+    return path
 
 
 def present_or_model(text: str) -> Path:

@@ -1,9 +1,9 @@
 """Optimize the plans of a file.
 
 The plans may come from any planner; 'cnpgen docs plan-format' shows how to write a plan
-file, and how trajectories that are sampled in time become plans. No plan comes back
-worse than it was given: violations count first, then the objective. Plans whose control
-points are no numbers, or that take longer than a minute, are made from nothing.
+file, and how trajectories that are sampled in time become plans. The result is never
+worse than the input: violations count first, then the objective. Plans with NaN control
+points, or that take longer than a minute, are solved without an initial guess.
 """
 
 import argparse
@@ -47,11 +47,11 @@ WORKERS = "processes; default one per available core, or one for up to 60 plans"
 LISTED = 10  # plans without success that are listed
 
 TEXT = """\
-Every plan is handled for itself: --workers and the order of the plans change nothing but the time. Pinocchio and Coal
-decide what is valid, as in 'cnpgen evaluate'. What is finished is written to OUT.part at once, by several workers in
-fours: after Ctrl-C, kill -9 or a full disk the same command goes on. An existing OUT is replaced only with --force,
+Each plan is processed independently: --workers and the order of the plans change nothing but the time. Pinocchio and
+Coal decide what is valid, as in 'cnpgen evaluate'. Workers append finished plans to OUT.part, four at a time: after
+Ctrl-C, kill -9 or a full disk the same command goes on. An existing OUT is replaced only with --force,
 and only if it is a file of plans. The exit code is 0 if every plan is valid, and 1 if any is not; the file is written
-in either case.
+in either case. If OUT is there already as the result of the same request, the command says so and ends with 0.
 'cnpgen docs refiner' has the formulation.
 """
 
@@ -84,9 +84,6 @@ def add_refine_options(parser: Parser) -> None:
         "--force",
         action="store_true",
         help="replace OUT, and discard another run's OUT.part",
-    )
-    parser.add_argument(
-        "--quiet", action="store_true", help="no progress and no summary"
     )
     add_json(parser)
 
@@ -127,21 +124,30 @@ def refine_and_save(
     *,
     title: str,
     make: "Callable[..., Refinement | SolvedScenes] | None" = None,
+    request: object = None,
 ) -> int:
     """Refine plans, save them, print a summary; return the exit code.
 
     ``make`` is ``refine_plans`` by default, ``solve_plans``, or a function that solves
-    scenes and has no plans.
+    scenes and has no plans; then ``request`` is all that these depend on.
     """
+    from cnpgen.cli.finished import is_finished, record_request
     from cnpgen.plans import save_plans
     from cnpgen.refine.options import RefineOptions
-    from cnpgen.refine.refine_plans import refine_plans
+    from cnpgen.refine.refine_plans import identity_of_run, refine_plans
 
     given = options_of(arguments, *REFINING)
     options = RefineOptions(
         **{name: value for name, value in given.items() if value is not None}
     )
-    check_place(out, force=arguments.force)
+    request = [
+        request if plans is None else identity_of_run(plans, options),
+        make.__name__ if make is not None and plans is not None else "",
+        options.document(),
+    ]
+    if is_finished(out, request, force=arguments.force):
+        return report_finished(arguments, out)
+    check_place(out)
     journal = out.with_name(out.name + ".part")
     finished = [0, 0]
 
@@ -167,6 +173,7 @@ def refine_and_save(
         ):
             _explain(facts, found, meter)
     save_plans(out, found.plans)
+    record_request(out, request)
     journal.unlink(missing_ok=True)
     if not arguments.quiet:
         lines = _summary(
@@ -177,8 +184,30 @@ def refine_and_save(
     return 0 if found.valid.all() else 1
 
 
-def check_place(out: Path, *, force: bool) -> None:
-    """Refuse an output path before any work if it cannot be written or exists."""
+def report_finished(arguments: argparse.Namespace, out: Path) -> int:
+    """Report that the result of the same request is there; return the exit code."""
+    print(f"{out} is there already, of the same request", file=sys.stderr)
+    facts = {"file": str(out), "already_there": True}
+    print(json.dumps(facts, indent=2) if arguments.json else out)
+    return 0
+
+
+def check_free(out: Path, *, force: bool, unless_finished: bool = False) -> None:
+    """Refuse an output path before any work if it exists or cannot be written.
+
+    ``unless_finished`` accepts an existing one whose request is known and may be the
+    same; ``is_finished`` decides later.
+    """
+    from cnpgen.cli.finished import request_file
+
+    is_result = unless_finished and request_file(out).exists()
+    if out.exists() and not force and not is_result:
+        raise UsageError(f"{out} exists: --force replaces it, -o names another file")
+    check_place(out)
+
+
+def check_place(out: Path) -> None:
+    """Refuse an output path before any work if it cannot be written or has another file."""
     from cnpgen.plans.plan_file import check_replaceable
     from cnpgen.store.files.atomic import check_writable
 
@@ -186,8 +215,6 @@ def check_place(out: Path, *, force: bool) -> None:
         raise UsageError(
             f"{out} must be a file that ends in .h5, in a folder that exists"
         )
-    if out.exists() and not force:
-        raise UsageError(f"{out} exists: --force replaces it, -o names another file")
     check_replaceable(out)
     check_writable(out)
 

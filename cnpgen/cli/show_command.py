@@ -79,21 +79,26 @@ def _about_kinds(arguments: argparse.Namespace) -> str:
     from cnpgen.store.files.documents import plain, render
 
     if arguments.keys:
+        if not arguments.json:
+            return _page_of_keys(arguments.keys)
         kinds = tuple(MARKS) if arguments.keys == "all" else (arguments.keys,)
-        found = (
-            describe_keys.keys_to_dict(kinds)
-            if arguments.json
-            else describe_keys.describe_keys(kinds)
-        )
-    else:
-        group = registry.STAGES if arguments.stage else registry.CONSTRAINTS
-        describe = (
-            describe_keys.kind_to_dict
-            if arguments.json
-            else describe_keys.describe_kind
-        )
-        found = describe(group, arguments.stage or arguments.constraint)
-    return render(plain(found)) if arguments.json else str(found)
+        return render(plain(describe_keys.keys_to_dict(kinds)))
+    group = registry.STAGES if arguments.stage else registry.CONSTRAINTS
+    named = group, arguments.stage or arguments.constraint
+    if arguments.json:
+        return render(plain(describe_keys.kind_to_dict(*named)))
+    return describe_keys.describe_kind(*named)
+
+
+def _page_of_keys(kind: str) -> str:
+    """Return the page of all keys, or its part on one kind of files."""
+    from cnpgen.cli.docs_command import rendered_page
+
+    page = rendered_page("keys").rstrip()
+    if kind == "all":
+        return page
+    head = f"\n## {kind.capitalize()} files\n"
+    return (head + page.partition(head)[2].partition("\n## ")[0]).strip()
 
 
 def load_any(name_or_path: str, kind: Kind | None = None) -> "Recipe":

@@ -19,12 +19,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Parser, refuse
+from cnpgen.cli.parser import Parser, options_of, refuse
 from cnpgen.cli.refine_command import (
     ALLOW_UNUSED,
     LARGE_ANGLES,
     add_refine_options,
-    check_place,
+    check_free,
     refine_and_save,
 )
 from cnpgen.errors import DatasetError, UsageError
@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
     out = arguments.out or Path(
         f"{what.resolve().name if what.is_dir() else what.stem}-plans.h5"
     )
-    check_place(out, force=arguments.force)
+    check_free(out, force=arguments.force, unless_finished=True)
     if arguments.robot is not None:
         return _solve_scenes(arguments, out)
     problems = _problems(arguments)
@@ -97,8 +97,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
-    from cnpgen.make.solve_scenes import solve_scenes
-    from cnpgen.problems.problem_record import as_problem
+    from cnpgen.cli.finished import content_sha256
+    from cnpgen.make.solve_scenes import SceneOptions, solve_scenes
+    from cnpgen.problems.problem_record import as_problem, record_problem
     from cnpgen.problems.scenes.scene_reader import read_scenes
 
     refuse(
@@ -113,12 +114,25 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
         allow_unused=arguments.allow_unused or (),
     )
     problem = as_problem(arguments.robot)
+    request = [
+        content_sha256(Path(arguments.what)),
+        record_problem(problem).comparable_sha256,
+        options_of(arguments, "first", "n", "allow_unused", "payload"),
+    ]
 
     def solve(_: "Plans", **options: Any) -> "SolvedScenes":
-        return solve_scenes(problem, scenes, payload=arguments.payload, **options)
+        names = options.keys() & {"engine", "address", "begin"}
+        own = {name: options.pop(name) for name in names}
+        run = SceneOptions(payload=arguments.payload, **own)
+        return solve_scenes(problem, scenes, run=run, **options)
 
     return refine_and_save(
-        arguments, None, out, title=f"solving {arguments.what}", make=solve
+        arguments,
+        None,
+        out,
+        title=f"solving {arguments.what}",
+        make=solve,
+        request=request,
     )
 
 

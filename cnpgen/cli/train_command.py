@@ -88,7 +88,6 @@ def add_options(parser: Parser) -> None:
         action="store_true",
         help="replace MODEL, its log and another run's checkpoint",
     )
-    option("--quiet", action="store_true", help="no progress and no summary")
 
 
 class Watch:

@@ -38,7 +38,6 @@ def add_options(parser: Parser) -> None:
     text = "make K random blocks again from the seed and compare them"
     option("--regenerate", metavar="K", type=values.natural, default=0, help=text)
     add_engine(parser, "processes for --deep; default one per available core")
-    option("--quiet", action="store_true", help="print findings only")
     add_json(parser)
 
 

@@ -5,7 +5,7 @@ And the plans one by one.
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -63,7 +63,7 @@ def summary_text(file: Path, found: "Evaluation") -> str:
     ]
     tables = (
         (_reasons(found, summary), (1,)),
-        (_figures(summary), range(1, 7)),
+        (_figures(summary, _shown(found)), range(1, 7)),
         (_margins(summary), (1, 2, 3, 5, 6)),
     )
     sections += [
@@ -117,7 +117,17 @@ def _why(verdict: "Verdict") -> str:
     return str(verdict.worst or "")
 
 
-def _figures(summary: dict[str, Any]) -> list[tuple[str, ...]]:
+def _shown(found: "Evaluation") -> list[str]:
+    """Return the metrics that some plan has; that of the jerk only if the problem limits jerks."""
+    constraints = found.plans.problem.content["constraint"]
+    limits_jerk = any(item["use"] == "joint-jerk" for item in constraints)
+    known = {name for item in found.verdicts for name in item.metrics.to_dict()}
+    return [
+        name for name in METRICS if name in known and (name != "jerk" or limits_jerk)
+    ]
+
+
+def _figures(summary: dict[str, Any], names: Sequence[str]) -> list[tuple[str, ...]]:
     """Lay out the metrics: of valid plans, of those valid by the paper's rules, and of all."""
     columns = [("metrics_of_valid", name) for name in ("mean", "median", "p95", "max")]
     columns += [("metrics_of_paper_valid", "mean"), ("metrics_of_all", "mean")]
@@ -133,19 +143,12 @@ def _figures(summary: dict[str, Any]) -> list[tuple[str, ...]]:
             "",
         )
     ]
-    for name, (text, _, form) in METRICS.items():
+    for name in names:
+        text, _, form = METRICS[name]
         values = [summary[group].get(name, {}).get(what) for group, what in columns]
+        cells = ["-" if value is None else _figure(form, value) for value in values]
         if any(value is not None for value in values):
-            rows.append(
-                (
-                    text,
-                    *(
-                        "-" if value is None else _figure(form, value)
-                        for value in values
-                    ),
-                    "",
-                )
-            )
+            rows.append((text, *cells, ""))
     return rows
 
 
@@ -188,9 +191,7 @@ def listing_text(found: "Evaluation") -> str:
         range(len(found.verdicts)), key=lambda index: found.verdicts[index].valid
     )
     metrics = {index: found.verdicts[index].metrics.to_dict() for index in order}
-    shown = [
-        name for name in METRICS if any(name in values for values in metrics.values())
-    ]
+    shown = _shown(found)
     names = [METRICS[name][1] for name in shown]
     rows = [
         ("plan", "sample", "verdict", *names, "smallest margin, or largest violation")

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.errors import MachineError
 from cnpgen.kernels.call_text import CALL, PYTHON_FUNCTIONS
 from cnpgen.kernels.code_cache import (
     MAX_DIRECT,
@@ -27,9 +28,8 @@ from cnpgen.kernels.optimizer import Replacement, replacer
 from cnpgen.kernels.tape import Tape
 
 CACHE_LINE_DOUBLES = 8
-_first: dict[
-    tuple[Path, str], LoadedCode
-] = {}  # code of the first level of this process
+# Code of the first level of this process.
+_first: dict[tuple[Path, str], LoadedCode] = {}
 
 
 def kernel_address(tape: Tape, cache_folder: Path) -> int:
@@ -48,6 +48,8 @@ def kernel_address(tape: Tape, cache_folder: Path) -> int:
     place = cache_folder, key
     if place not in _first:
         note_generation(cache_folder)
+        # Short tapes get final code at once; a longer one starts with code that is
+        # generated ten times faster.
         if len(tape) <= MAX_DIRECT or not sys.executable:
             return make_final(key, final_text(tape), cache_folder).address("kernel")
         code = _first[place] = make_first(tape)
@@ -84,6 +86,8 @@ class CompiledKernel(Kernel):
         """Evaluate the batch; see ``Kernel``."""
         n = arguments[0].shape[-1]
         results = [np.empty((width, n)) for width in self.tape.outputs]
+        # The fast path checks nothing in Python; only a refusal is explained, by a
+        # slower check.
         if not self._call(self._callee, arguments, results):
             check_arguments(self.tape, arguments)
             raise ValueError(f"kernel {self.tape.name}: arguments must be NumPy arrays")
@@ -171,11 +175,22 @@ def aligned_array(count: int) -> Array:
     return memory[-address_of(memory) // memory.itemsize % CACHE_LINE_DOUBLES :][:count]
 
 
+def require_memory(result: Any, *_: Any) -> Any:
+    """Return the result of a function in C, which is negative if it ran out of memory (``errcheck`` of ctypes).
+
+    Raises:
+        MachineError: The result is negative.
+    """
+    if result < 0:
+        raise MachineError("there is no memory left for collision checks or scenes")
+    return result
+
+
 def address_of(array: Any) -> int:
     """Return the address of the first element of an array."""
     try:
-        return ctypes.addressof(
-            ctypes.c_char.from_buffer(array)
-        )  # a third of the time of the array interface
-    except (TypeError, ValueError):  # read-only, strided, or empty
+        # A third of the time of the array interface.
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))
+    except (TypeError, ValueError):
+        # Read-only, strided, or empty.
         return int(array.__array_interface__["data"][0])

@@ -25,9 +25,8 @@ POINTS_PER_BLOCK = 8192
 
 
 def _if_else_zero(condition: Any, value: Any, out: Array) -> None:
-    out[...] = np.where(
-        np.not_equal(condition, 0.0), value, 0.0
-    )  # a product would turn 0 * inf into nan
+    # A product would turn 0 * inf into nan.
+    out[...] = np.where(np.not_equal(condition, 0.0), value, 0.0)
 
 
 _APPLY: dict[str, Callable[..., Any]] = {
@@ -44,9 +43,8 @@ Read = Callable[[int, int], Any]  # component of an argument, for the lanes of a
 Write = Callable[[int, int, Any], None]  # stores a component of a result
 
 
-Step = tuple[
-    str, int, tuple[Any, ...]
-]  # operation; row of its result; rows of its operands, or numbers
+# Operation; row of its result; rows of its operands, or numbers.
+Step = tuple[str, int, tuple[Any, ...]]
 
 
 class _LaneBlock:
@@ -198,13 +196,15 @@ def _allocate(tape: Tape) -> tuple[int, list[Step]]:
     for k, (code, a, b, _) in enumerate(zip(*columns, strict=True)):
         last[[a, b][: OPERATIONS[NAMES[code]]]] = k
     free: list[int] = []
-    place: dict[int, Any] = {}  # value -> row, or the constant itself
+    # Value -> row, or the constant itself.
+    place: dict[int, Any] = {}
     count = 0
     program: list[Step] = []
     for k, (code, a, b, constant) in enumerate(zip(*columns, strict=True)):
         name = NAMES[code]
         if name == "CONST":
-            place[k] = constant  # a Python number does not promote float32
+            # A Python number does not promote float32.
+            place[k] = constant
             continue
         operands = (a, b)[: OPERATIONS[name]]
         places = tuple(place[operand] for operand in operands)

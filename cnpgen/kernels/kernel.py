@@ -60,6 +60,8 @@ def evaluate_lanes(
     for _ in range(tape.loop.limit):
         if len(active) == 0:
             break
+        # Lanes that have converged are left out, so that NumPy does not evaluate them
+        # again.
         inputs = [state, *arguments[1:]]
         if len(active) < n:
             inputs = [np.ascontiguousarray(x[:, active]) for x in inputs]
@@ -134,6 +136,8 @@ def check_grid(
             f" got {len(arguments)} and {len(out)}"
         )
     arrays, axes = (*arguments, *out), (*grid.arguments, *grid.results)
+    # K and N are read from the last array that has the axis; the loop below compares
+    # all.
     size: dict[str, int] = {"nodes": 1, "lanes": 1}
     for array, names in zip(arrays, map(axis_names, axes), strict=True):
         size.update(zip(names, array.shape[1:], strict=False))

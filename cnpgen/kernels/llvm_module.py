@@ -53,6 +53,8 @@ def module_text(tape: Tape, vector_bytes: int, *, replaceable: bool = False) -> 
 
 
 def _dispatch(parameters: str) -> str:
+    # A monotonic load is an ordinary load on the processors at hand, but LLVM may not
+    # keep the address in a register across calls.
     return f"""@target = global ptr @kernel
 define void @dispatch({parameters}) {{
   %function = load atomic ptr, ptr @target monotonic, align 8
@@ -97,6 +99,7 @@ def _lanes(tape: Tape, steps: list[ArithmeticStep], text: StepText) -> str:
 
     def read(k: int, name: str, argument: int, component: int) -> str:
         row = f"%in{argument} %ld{argument}"
+        # A uniform argument is one number for all lanes: load it once and spread it.
         if argument in uniform:
             return (
                 _address(f"a{k}", row, component, "0")
@@ -111,6 +114,7 @@ def _lanes(tape: Tape, steps: list[ArithmeticStep], text: StepText) -> str:
     def write(k: int, value: str, result: int, component: int) -> str:
         lines = _address(f"a{k}", f"%out{result} %lo{result}", component, "%k")
         if result in summed:
+            # Sums over nodes accumulate in the result, in the order of the nodes.
             lines += f"%v{k} = load {text.vector}, ptr %a{k}, align {text.size}\n"
             lines += f"%t{k} = fadd {text.vector} %v{k}, {value}\n"
             value = f"%t{k}"
@@ -132,6 +136,7 @@ def _iterated_lanes(tape: Tape, steps: list[ArithmeticStep], text: StepText) -> 
     """Return the function that iterates full vectors of lanes; converged lanes keep their values."""
     assert tape.loop is not None
     vector, flags, width = text.vector, text.flags, tape.inputs[0]
+    # State and parameters are loaded once; only the state changes between steps.
     names = {
         (argument, component): f"%i{argument}_{component}"
         for argument, count in enumerate(tape.inputs)
@@ -153,10 +158,14 @@ def _iterated_lanes(tape: Tape, steps: list[ArithmeticStep], text: StepText) -> 
         return ""
 
     body = text.body(steps, read, write)
+    # SSA form: the state is a phi of its loaded value and the value after the last
+    # step.
     states = "\n".join(
         f"%state{i} = phi {vector} [{names[0, i]}, %block], [%next{i}, %step]"
         for i in range(width)
     )
+    # next = active ? step(state) : state. The comparison uses the error of the state
+    # before the step, so that a lane takes one more step after the tolerance is met.
     choices = "\n".join(
         f"%next{i} = select {flags} %active, {vector} {results[0, i]}, {vector} %state{i}"
         for i in range(width)
@@ -224,9 +233,13 @@ def _tail(tape: Tape, lanes: int, real: str) -> str:
         _bases("in", "ld", inputs, 1),
         _bases("out", "lo", outputs, 1),
     ]  # fmt: skip
+    # Copies are packed: every row has as many lanes as a vector, whatever its stride
+    # was.
     uniform, summed, position = uniform_arguments(tape), _summed(tape), 0
     for i, width in enumerate(tape.inputs):
         lines.append(_copied("in", "ld", i, f"inputs, i64 {position}", real))
+        # The padding repeats the last lane, so that an iteration ends as soon as the
+        # real lanes have converged.
         if i not in uniform:
             lines.append(
                 f"call void @pad(ptr %inc{i}, ptr %inf{i}, i64 %ld{i}, i64 {width}, i64 %rest)"
@@ -242,6 +255,7 @@ def _tail(tape: Tape, lanes: int, real: str) -> str:
     copies = []
     for i, width in enumerate(tape.outputs):
         lines.append(_copied("out", "lo", i, f"results, i64 {position}", real))
+        # Sums are read before they are written, so their lanes are copied in as well.
         if i in summed:
             lines.append(
                 f"call void @pad(ptr %outc{i}, ptr %outf{i}, i64 %lo{i}, i64 {width}, i64 %rest)"
@@ -311,6 +325,8 @@ def _grid_kernel(tape: Tape, real: str) -> str:
     axes = (*tape.grid.arguments, *tape.grid.results)
     rows = [("in", "ld", i) for i in range(inputs)]
     rows += [("out", "lo", i) for i in range(outputs)]
+    # The strides between components are equal for all nodes: store them once, and move
+    # only the pointers from node to node.
     before, inside = [], []
     for (name, strides, i), kind in zip(rows, axes, strict=True):
         before.append(
@@ -322,6 +338,7 @@ def _grid_kernel(tape: Tape, real: str) -> str:
             f"%{strides}n{i} = load i64, ptr %{strides}q{i}\n"
             f"%{name}t{i} = getelementptr ptr, ptr %{name}_, i64 {i}"
         )
+        # An argument without a node axis is read again at the same address.
         stride = f"%{strides}n{i}" if "nodes" in axis_names(kind) else "0"
         inside.append(
             f"%{name}o{i} = mul i64 %k, {stride}\n%{name}x{i} = getelementptr {real}, ptr %{name}b{i}, i64 %{name}o{i}\n"

@@ -161,6 +161,7 @@ class StepText:
 
     def spread(self, name: str, scalar: str, k: int) -> str:
         """Return the instructions that fill a vector with a scalar."""
+        # A scalar in lane 0, then a shuffle that copies lane 0 to all lanes.
         return (
             f"%w{k} = insertelement {self.vector} poison, {self.real} {scalar}, i64 0\n"
             f"{name} = shufflevector {self.vector} %w{k}, {self.vector} poison, <{self.lanes} x i32> zeroinitializer"

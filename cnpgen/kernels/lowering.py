@@ -31,6 +31,9 @@ ARITHMETIC = {
 
 def lower(tape: Tape) -> list[ArithmeticStep]:
     """Return the steps of a tape, contracted, without those that no result needs."""
+    # Instructions are entered in order, so operands are known when they are read.
+    # ``StepList`` merges equal operations at once, which keeps its work linear in the
+    # length of the tape.
     entered = StepList(single=tape.dtype == "float32")
     uniform = uniform_arguments(tape)
     never_nan: set[int] = set()  # steps
@@ -44,6 +47,9 @@ def lower(tape: Tape) -> list[ArithmeticStep]:
             entered.output(place[a], b, int(constant))
         elif name == "CONST":
             place[k] = entered.number(constant)
+            # ``min(a, b)`` must ignore a nan. If b cannot be nan, the instruction of
+            # the processor does that, without two more comparisons; constants and
+            # uniform arguments qualify.
             never_nan |= set() if np.isnan(constant) else {place[k]}
         elif name == "INPUT":
             place[k] = entered.add("input", a, b)
@@ -53,6 +59,8 @@ def lower(tape: Tape) -> list[ArithmeticStep]:
         else:
             place[k] = _lower_operation(entered, name, place[a], place[b])
     steps = entered.steps
+    # Before unused steps are dropped: whether a product is contracted depends on all of
+    # its uses, and ``_contracted`` counts only those that a result needs.
     if len(tape) <= MAX_CONTRACTED:
         steps = _contracted(tape, steps)
     return _without_unused(steps)
@@ -79,9 +87,12 @@ def _lower_extremum(
 ) -> int:
     """Enter a minimum or maximum: one instruction if the second operand is not nan."""
     if b in never_nan:
+        # The instruction returns its second operand if either is nan: a nan in a gives
+        # b.
         index = steps.add({"FMIN": "lesser", "FMAX": "larger"}[name], a, b)
     else:
         index = steps.add({"FMIN": "min", "FMAX": "max"}[name], a, b)
+    # The result is nan only if both operands are.
     never_nan |= {index} if never_nan & {a, b} else set()
     return index
 
@@ -109,12 +120,17 @@ def _contracted(tape: Tape, steps: list[ArithmeticStep]) -> list[ArithmeticStep]
     steps = list(steps)
     needed = _needed(steps)
     section = _sections(tape, steps, needed)
+    # uses[i] lists the steps that read step i, once for each occurrence as an operand.
     uses: list[list[int]] = [[] for _ in steps]
     for index in needed:
         for operand in value_operands(steps[index]):
             uses[operand].append(index)
     for index in needed:
         sums = uses[index]
+        # A product that anything else reads must be computed anyway; contracting a part
+        # of its uses would save nothing. ``a b - a b`` counts the product twice and
+        # stays as it is, since a fused step would give the rounding error of the
+        # product instead of 0.
         if steps[index].operation == "mul" and all(
             steps[use].operation in ("add", "sub")
             and steps[use].operands.count(index) == 1
@@ -145,11 +161,13 @@ def _sections(
         or (step.operation == "input" and step.operands[0] not in uniform)
         for step in steps
     ]
+    # block[i] is the number of branches at or before step i.
     block = np.cumsum([0, *branches])[1:]
     length = np.zeros(len(steps) + 1)
     for index in needed:
         length[block[index]] += STATEMENTS.get(steps[index].operation, 1)
     # Block 0, before the first branch, is never duplicated.
+    # Two neighboring duplicated blocks run in the same copy and so share a section.
     duplicated = np.append(False, length[1:] <= MAX_DUPLICATED)
     apart = np.append(True, ~(duplicated[1:] & duplicated[:-1]))
     section: NDArray[np.integer[Any]] = np.cumsum(apart)[block]
@@ -172,15 +190,19 @@ def _fused(
 ) -> ArithmeticStep:
     """Return a sum or difference with one product as one fused step."""
     first, second = total.operands
+    # fma(a, b, c) rounds ``a b + c`` once. Negating an operand is exact.
     minus = total.operation == "sub"
-    if first == product:  # a b - c
+    if first == product:
+        # A b - c.
         return ArithmeticStep("fma", (*factors, second), signs=(False, minus))
-    return ArithmeticStep("fma", (*factors, first), signs=(minus, False))  # c - a b
+    # c - a b
+    return ArithmeticStep("fma", (*factors, first), signs=(minus, False))
 
 
 def _needed(steps: list[ArithmeticStep]) -> list[int]:
     """Return the indices of the steps that some result needs, in order."""
     needed = np.array([step.operation == "output" for step in steps], bool)
+    # Backwards, so that all uses of a step are visited before the step itself.
     for index in range(len(steps) - 1, -1, -1):
         if needed[index]:
             needed[list(value_operands(steps[index]))] = True

@@ -14,10 +14,11 @@ from typing import Any
 
 from cnpgen.errors import MachineError
 
+# Levels: generated ten times faster; as fast as an optimizing compiler's code.
 FIRST, FINAL = (
     0,
     1,
-)  # levels: generated ten times faster; as fast as an optimizing compiler's code
+)
 SOURCES = (
     "steps",
     "lowering",
@@ -26,9 +27,8 @@ SOURCES = (
     "llvm_module",
     "machine_code",
 )
-_engines: list[
-    Any
-] = []  # owners of all loaded code, whose addresses other code may have
+# Owners of all loaded code, whose addresses other code may have.
+_engines: list[Any] = []
 LOCK = threading.RLock()  # around every call of LLVM, also of other threads at a fork
 
 os.register_at_fork(
@@ -116,6 +116,8 @@ def generator_version() -> str:
 def generator_digest() -> str:
     """Return a digest of everything but the tape that machine code depends on."""
     digest = hashlib.sha256()
+    # A change of the generator's source, of LLVM or of the processor must not find old
+    # code.
     for name in SOURCES:
         digest.update(Path(__file__).with_name(f"{name}.py").read_bytes())
     digest.update(f"{generator_version()} {this_processor()}".encode())
@@ -160,6 +162,7 @@ def load(code: bytes) -> LoadedCode:
     with LOCK:
         llvm = _llvm()
         try:
+            # An empty module: the object file alone is linked.
             target = llvm.Target.from_triple(this_processor().triple)
             engine = llvm.create_mcjit_compiler(
                 llvm.parse_assembly(""), target.create_target_machine()

@@ -86,6 +86,8 @@ class Replacer:
 
     def _run(self) -> None:
         interval = threading.Event()
+        # The mutex is held at every change, so that a fork never copies half a
+        # replacement.
         while True:
             with self._mutex:
                 self._waiting = [one for one in self._waiting if not self._done(one)]
@@ -96,24 +98,30 @@ class Replacer:
 
     def _done(self, replacement: Replacement) -> bool:
         """Replace code if its final code is there; return whether waiting has ended."""
-        requested = (
-            replacement.request.exists()
-        )  # before the search: it is removed last
+        # Before the search: it is removed last.
+        requested = replacement.request.exists()
         try:
             code = find_final(replacement.key, replacement.cache_folder)
-        except MachineError:  # the cache is not trusted any more
+        except MachineError:
+            # The cache is not trusted any more.
             return True
         if code is not None:
+            # One aligned store of the address: ``dispatch`` loads it atomically, so
+            # calls in other threads run either the first or the final code, which give
+            # equal bits.
             target = ctypes.c_void_p.from_address(replacement.code.address("target"))
             target.value = code.address("kernel")
             self._processes = [one for one in self._processes if _runs(one)]
             return True
+        # Without a request the process has finished or failed; then the first code
+        # stays.
         return not requested or not self._start_process(replacement)
 
     def _start_process(self, replacement: Replacement) -> bool:
         """Start the process unless it runs; return False if it was started too often."""
         if any(map(_runs, self._processes)):
             return True
+        # Another command's process serves the same cache.
         with optimizer_lock(replacement.request.parent) as free:
             if not free:
                 return True
@@ -200,6 +208,8 @@ def fulfil(request: Path, folder: Path) -> None:
     try:
         tape = Tape.from_bytes(request.read_bytes())
         key = request.name.removesuffix(REQUEST)
+        # The name must be the key of the content: a renamed file would otherwise serve
+        # its code to another tape.
         if key == tape_key(tape) and find_final(key, folder) is None:
             store(key, generate(final_text(tape), FINAL), folder)
     except ValueError:  # a damaged request

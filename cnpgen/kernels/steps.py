@@ -37,6 +37,8 @@ class StepList:
 
     def add(self, operation: str, *operands: int) -> int:
         """Return the index of an operation's result."""
+        # Addition and multiplication commute in floating point too, so one order is
+        # enough.
         key = (operation, *operands)
         if operation in COMMUTATIVE and operands[0] > operands[1]:
             key = (operation, operands[1], operands[0])
@@ -45,7 +47,9 @@ class StepList:
     def number(self, value: float) -> int:
         """Return the index of a constant."""
         return self._enter(
-            np.float64(value).tobytes(), ArithmeticStep("constant", (), value)
+            # By bits, since 0.0 == -0.0 and nan != nan.
+            np.float64(value).tobytes(),
+            ArithmeticStep("constant", (), value),
         )
 
     def output(self, value: int, result: int, component: int) -> None:

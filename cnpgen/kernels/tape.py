@@ -40,12 +40,13 @@ class Loop:
 Axes = Literal["point", "lane", "node", "fixed"]
 Dtype = Literal["float64", "float32"]
 DTYPES: tuple[Dtype, ...] = ("float64", "float32")
+# Widest first, so that all are aligned.
 STORED_TYPES = {
     "constant": "<f8",
     "a": "<i4",
     "b": "<i4",
     "operation": "<i2",
-}  # widest first, so that all are aligned
+}
 
 
 @dataclass(frozen=True)
@@ -155,8 +156,33 @@ def tape_from_function(
         ValueError: The function uses an unsupported operation, or the grid does not
             match it.
     """
+    operation, a, b, constant = _columns(function)
+    widths_in = tuple(function.nnz_in(i) for i in range(function.n_in()))
+    widths_out = tuple(function.nnz_out(i) for i in range(function.n_out()))
+    _check_dense(function)
+    _check_grid(function, grid)
+    return Tape(
+        function.name(),
+        widths_in,
+        widths_out,
+        operation,
+        a,
+        b,
+        constant,
+        loop=loop,
+        grid=grid,
+        dtype=dtype,
+    )
+
+
+def _columns(function: Any) -> tuple[NDArray[Any], ...]:
+    """Return the operations, both operands and the constants of all instructions.
+
+    CasADi's instructions work on numbered slots. Here every value keeps its own index.
+    """
     import casadi as ca
 
+    # The codes of operations are those of the installed CasADi: find them by name.
     known = {getattr(ca, f"OP_{name}"): name for name in OPERATIONS}
     count = function.n_instructions()
     operation, a, b = (
@@ -165,9 +191,8 @@ def tape_from_function(
         np.zeros(count, np.int32),
     )
     constant = np.zeros(count)
-    contents: dict[
-        int, int
-    ] = {}  # slot of the work vector -> index of its present value
+    # Slot of the work vector -> index of its present value.
+    contents: dict[int, int] = {}
     for k in range(count):
         code, out, operands = (
             function.instruction_id(k),
@@ -185,28 +210,15 @@ def tape_from_function(
         elif name == "INPUT":
             a[k], b[k] = operands
         elif name == "OUTPUT":
+            # A slot of the work vector is reused: ``contents`` finds the instruction
+            # that wrote it last.
             a[k], b[k], constant[k] = contents[operands[0]], out[0], out[1]
         else:
             a[k] = contents[operands[0]]
             b[k] = contents[operands[1]] if OPERATIONS[name] == 2 else 0
         if name != "OUTPUT":
             contents[out[0]] = k
-    widths_in = tuple(function.nnz_in(i) for i in range(function.n_in()))
-    widths_out = tuple(function.nnz_out(i) for i in range(function.n_out()))
-    _check_dense(function)
-    _check_grid(function, grid)
-    return Tape(
-        function.name(),
-        widths_in,
-        widths_out,
-        operation,
-        a,
-        b,
-        constant,
-        loop=loop,
-        grid=grid,
-        dtype=dtype,
-    )
+    return operation, a, b, constant
 
 
 def _check_dense(function: Any) -> None:

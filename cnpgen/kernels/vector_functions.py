@@ -85,7 +85,8 @@ def sine_and_cosine(steps: StepList, x: int) -> tuple[int, int]:
     shift = steps.number(p.rounding_shift)
     shifted = steps.add("add", steps.add("mul", x, steps.number(p.two_over_pi)), shift)
     n = steps.add("sub", shifted, shift)
-    r = x  # in [-pi/4, pi/4]: x - n pi / 2, one part of pi / 2 after the other
+    # In [-pi/4, pi/4]: x - n pi / 2, one part of pi / 2 after the other.
+    r = x
     for part in p.pi_2:
         r = steps.add("sub", r, steps.add("mul", n, steps.number(part)))
     z = steps.add("mul", r, r)

@@ -141,9 +141,11 @@ I v reduced_exp(v r) {
 I v power_of_two(vi n) { return (v)((n + BIAS) << MANTISSA); }
 I v vexp(v x) {
   v clipped = larger(lesser(x, K(MAX_EXPONENT)), K(-MAX_EXPONENT)), n = clipped * K(LOG2E) + K(ROUNDING_SHIFT);
+  /* 2^n in two factors: for n near the ends of the range, 2^n itself has no normal number. */
   vi whole = (vi)n - (vi)K(ROUNDING_SHIFT), half = whole >> 1;
   n -= K(ROUNDING_SHIFT);
   v y = reduced_exp((clipped - n * K(LN2_HIGH)) - n * K(LN2_LOW));
+  /* A nan must come through: the clipping above has replaced it by a number. */
   return pick(x != x, x, y * power_of_two(half) * power_of_two(whole - half));
 }
 I void vsincos(v x, v *s, v *c) {
@@ -155,6 +157,8 @@ I void vsincos(v x, v *s, v *c) {
   r -= n * K(PI_2_LOWEST);
 #endif
   v z = r * r, sine = reduced_sin(r, z), cosine = reduced_cos(z);
+  /* Odd quadrants exchange sine and cosine; bit 1 of the quadrant is the sign of the sine, that of the next one the sign
+     of the cosine. */
   vi odd = -(quadrant & 1);
   v a = pick(odd, cosine, sine), b = pick(odd, sine, cosine);
   int sign = 8 * (int)sizeof(real) - 2;

@@ -38,6 +38,7 @@ from cnpgen.loader.shard_reader import (
 from cnpgen.robots.observation.observations import Observation
 from cnpgen.robots.scene import Scene
 from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.html_table import html_table
 from cnpgen.schema.old_keywords import with_old_keywords
 from cnpgen.store.checked_shard import Shard
 from cnpgen.store.dataset_spec import DatasetSpec, StoredProblem
@@ -79,6 +80,20 @@ class Dataset:
     def __repr__(self) -> str:
         rows = ", ".join(f"{rows:,} {split}" for split, rows in self.splits.items())
         return f"<{self.spec.name} {self.spec.version} in {self.folder}: {rows}>"
+
+    def _repr_html_(self) -> str:
+        head = ("field", "unit", "columns", "description", "role")
+        rows = (
+            (
+                field.name,
+                field.unit,
+                ", ".join(field.names),
+                field.long_name,
+                field.role,
+            )
+            for field in self.fields.values()
+        )
+        return html_table(repr(self), head, rows)
 
     @cached_property
     def splits(self) -> dict[str, int]:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from cnpgen.errors import DatasetError
 from cnpgen.loader.dataset import Dataset
+from cnpgen.loader.remote import local_folder
 from cnpgen.loader.shard_reader import ShardReader, problem_obstacles
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import flag
@@ -33,21 +34,24 @@ def load_dataset(
     is read for the first time.
 
     Args:
-        folder: Folder of the dataset.
+        folder: Folder of the dataset, or the URL of a published one as text:
+            ``hf://datasets/USER/NAME@REVISION``, ``https://``, ``s3://`` or ``gs://``.
+            It is downloaded once, into a local cache.
         allow_incomplete: Whether to open the existing shards of a dataset that is
             unfinished or has missing shards.
         verify: Whether to verify the sha256 of every shard when it is read for the
             first time.
 
     Raises:
-        UsageError: The folder does not exist or contains no dataset, or an option is
-            not a bool.
+        UsageError: The folder does not exist or contains no dataset, no installed
+            package reads the URL, or an option is not a bool.
         DatasetError: The dataset is unfinished, or a part is missing or damaged.
-        MachineError: A file cannot be read.
+        MachineError: A file cannot be read, or a server cannot be reached.
     """
     verify = flag("verify", verify)
     stored = open_dataset(
-        Path(folder), allow_incomplete=flag("allow_incomplete", allow_incomplete)
+        Path(local_folder(folder)),
+        allow_incomplete=flag("allow_incomplete", allow_incomplete),
     )
     folder = stored.folder.absolute()  # the working folder may change
     stored = replace(stored, folder=folder)

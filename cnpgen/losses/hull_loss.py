@@ -48,7 +48,8 @@ class HullLoss:
         index = problem.constraint.index(constraint)
         inset = float(tightening[len(problem.constraint) + index])
         self._problem, self._losses = problem, load_clearance_loss(kernels, robot)
-        self._term = 1 + index  # the task loss is the first one
+        # The task loss is the first one.
+        self._term = 1 + index
         self._required = constraint.distance + TRAINING_DISTANCE_M + inset  # m
 
     def add(
@@ -68,9 +69,8 @@ class HullLoss:
         """
         terms, by_path, by_rate = results
         nodes, count, stride = len(table.s), len(batch), min(NODE_STRIDE, len(table.s))
-        chosen = slice(
-            int(shift * SHIFTS) % stride, nodes, stride
-        )  # distances take most of the time of a step
+        # Distances take most of the time of a step.
+        chosen = slice(int(shift * SHIFTS) % stride, nodes, stride)
         # Plans with invalid control points get nan, which affects no other plan.
         path = np.where(batch.valid[:, None, None], batch.path, np.nan)
         values, rates = (
@@ -81,6 +81,7 @@ class HullLoss:
         # The chosen nodes stand for all: their weights sum to 1 again.
         node_weights /= node_weights.sum()
         q = np.moveaxis(values @ path, 0, -1)
+        # Only chosen rows of the tables: q and r at these nodes.
         r = rates @ batch.rate.T
         bodies = scene_primitives(
             Scene(self._problem.obstacle, batch.obstacle_poses.astype(float))

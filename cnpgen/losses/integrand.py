@@ -36,9 +36,8 @@ class Term:
     """A step loss."""
 
     value: Any  # an SX scalar
-    parts: list[
-        tuple[Any, Any]
-    ]  # SX scalars with the derivatives of the loss with respect to them
+    # SX scalars with the derivatives of the loss with respect to them
+    parts: list[tuple[Any, Any]]
 
 
 def task_term(state: SymbolicState, objective: Sequence[ObjectiveTerm]) -> Term:
@@ -118,6 +117,8 @@ def _bounded(
                 center, half = (low + high) / 2, (high - low) / 2
                 yield g, center - half * factor, center + half * factor
             else:
+                # A one-sided limit moves towards zero by the fraction (1 - factor) of
+                # its size.
                 reduction = 1 - factor
                 yield (
                     g,
@@ -146,9 +147,8 @@ def relaxation_argument(problem: Problem) -> int:
 class Inputs:
     """The arguments of the kernels as SX columns, in order, with the axes of ``grid_specs``."""
 
-    path: tuple[
-        Any, ...
-    ]  # p, p' and p'' [rad], n each, and p''' if the jerk is constrained
+    # p, p' and p'' [rad], n each, and p''' if the jerk is constrained
+    path: tuple[Any, ...]
     rate: Any  # r and r' [1/s], and r'' if the jerk is constrained
     obstacle_poses: Any  # poses and sizes of the obstacles
     # Relaxation of the conditions with time-varying bounds, in their units.
@@ -196,6 +196,8 @@ def loss_gradient(robot: Robot, problem: Problem, *, form: str) -> Any:
         for weight, term in zip(weights, terms, strict=True)
         for _, partial in term.parts
     ]
+    # Densify: the gradient with respect to an argument that does not occur is zero, not
+    # absent.
     states, width = ca.vertcat(*inputs.path, inputs.rate), len(inputs.path) * n
     gradient = ca.densify(ca.jtimes(ca.vertcat(*g), states, ca.vertcat(*seeds), True))
     total = sum(
@@ -275,29 +277,17 @@ def _stage(
     """Return the inputs, the state as a function of them, and the terms of the task and the constraints."""
     import casadi as ca
 
-    sym, n, m = ca.SX.sym, robot.n, len(problem.constraint)
-    orders = problem.path_orders
-    path = tuple(sym("d" * order + "p", n) for order in range(orders))
-    rate = sym("rate", orders - 1)
-    obstacle_poses, size = (
-        sym("obstacle_poses", problem.scene_width),
-        problem.object_size,
-    )
-    q, *derivatives = (ca.vertsplit(column) for column in path)
-    dq, ddq, jerk = time_derivatives(derivatives, ca.vertsplit(rate))
-    state = FrozenState(
-        robot, q, dq, ddq, ca.vertsplit(obstacle_poses), problem.obstacle, size, jerk
-    )
+    sym, m = ca.SX.sym, len(problem.constraint)
+    path, rate, obstacle_poses, state = _state_on_path(robot, problem)
     pairs = penalized_conditions(problem.constraint, state, form)
+    # Conditions in the order of the constraints; those with time-varying bounds take
+    # the next entries of the argument ``relaxation``.
     sizes = [
         sum(len(condition.g) for condition in conditions) for _, conditions in pairs
     ]
     varying = [has_time_varying_bound(constraint) for constraint, _ in pairs]
-    relaxation = sym(
-        "relaxation",
-        sum(size for size, varies in zip(sizes, varying, strict=True) if varies),
-    )
-    tightening = sym("tightening", 2 * m)
+    width = sum(size for size, varies in zip(sizes, varying, strict=True) if varies)
+    relaxation, tightening = sym("relaxation", width), sym("tightening", 2 * m)
     inputs = Inputs(
         path,
         rate,
@@ -317,6 +307,23 @@ def _stage(
             )
         )
     return inputs, state, terms
+
+
+def _state_on_path(
+    robot: Robot, problem: Problem
+) -> tuple[tuple[Any, ...], Any, Any, FrozenState]:
+    """Return the columns of path, rate and obstacle poses, and the state at one phase as a function of them."""
+    import casadi as ca
+
+    sym, n, orders = ca.SX.sym, robot.n, problem.path_orders
+    path = tuple(sym("d" * order + "p", n) for order in range(orders))
+    rate = sym("rate", orders - 1)
+    obstacle_poses = sym("obstacle_poses", problem.scene_width)
+    q, *derivatives = (ca.vertsplit(column) for column in path)
+    dq, ddq, jerk = time_derivatives(derivatives, ca.vertsplit(rate))
+    poses, size = ca.vertsplit(obstacle_poses), problem.object_size
+    state = FrozenState(robot, q, dq, ddq, poses, problem.obstacle, size, jerk)
+    return path, rate, obstacle_poses, state
 
 
 def _stacked(inputs: Inputs, terms: list[Term]) -> Any:

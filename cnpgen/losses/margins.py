@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError, nearest
 from cnpgen.problems.problem import Problem
+from cnpgen.problems.problem_record import as_problem
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import check_fields, checked_arguments
+from cnpgen.store.dataset_spec import StoredProblem
 
 
 @dataclass(frozen=True)
@@ -79,8 +82,12 @@ class Margins:
 
 
 @checked_arguments
-def suggested_margins(problem: Problem) -> Margins:
-    """Return the margins that the constraint classes suggest: ``training_factor`` and ``training_inset``."""
+def suggested_margins(problem: Problem | StoredProblem | str | Path) -> Margins:
+    """Return the margins that the constraint classes suggest: ``training_factor`` and ``training_inset``.
+
+    The problem is any argument of ``PlanLoss``, such as ``dataset.problem``.
+    """
+    problem = as_problem(problem)
     constraints = dict(zip(constraint_terms(problem), problem.constraint, strict=True))
     factors = {
         name: constraint.training_factor for name, constraint in constraints.items()

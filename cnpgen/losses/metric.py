@@ -90,6 +90,7 @@ class MetricSettings:
     def grown(self, progress: float) -> float:
         """Return the factor of the ramp."""
         begin, end = self.ramp
+        # Geometric between the two ends of the ramp, constant before and after it.
         return float(
             self.growth ** min(max((progress - begin) / (end - begin), 0.0), 1.0)
         )
@@ -149,6 +150,7 @@ def average_loss(terms: ArrayLike, average: Average) -> Array:
     if average == "median":
         return np.asarray(np.median(values, axis=0))
     if average == "trimmed":
+        # The largest losses of each term are left out, whichever plans they belong to.
         values = np.sort(values, axis=0)[
             : len(values) - int(TRIMMED_FRACTION * len(values))
         ]
@@ -225,6 +227,7 @@ class Metric:
                 f"must have shape (N, {count}), got {values.shape}", argument="terms"
             )
         mean = average_loss(values[:, 1:], self.settings.average)
+        # Without a valid plan the mean is nan.
         if np.isfinite(mean).all():
             self._sum, self._count = self._sum + mean, self._count + 1
         if self.settings.every == "batch":
@@ -239,9 +242,8 @@ class Metric:
     def _learn(self, progress: float) -> None:
         settings, count = self.settings, self._count
         if count and progress < settings.frozen:
-            budgets = np.where(
-                np.isfinite(self.alpha), self._budgets, 0.0
-            )  # an omitted term learns nothing
+            # An omitted term learns nothing.
+            budgets = np.where(np.isfinite(self.alpha), self._budgets, 0.0)
             # Shrinking budgets have the effect of the growing weights of the ramped metric.
             budgets = budgets * settings.budget_factor / settings.grown(progress)
             alpha = alpha_step(
@@ -260,9 +262,8 @@ class Metric:
 
     def state(self) -> dict[str, Any]:
         """Return the learned state, JSON-able."""
-        alpha = [
-            value if np.isfinite(value) else None for value in self.alpha.tolist()
-        ]  # None: an omitted term
+        # None: an omitted term
+        alpha = [value if np.isfinite(value) else None for value in self.alpha.tolist()]
         return {"alpha": alpha, "sum": self._sum.tolist(), "count": self._count}
 
     @checked_arguments

@@ -23,12 +23,10 @@ class PlanBatch:
     path: Array  # path control points [rad], shape (N, C, n)
     rate: Array  # rate control points [1/s], shape (N, R)
     obstacle_poses: Array  # poses and sizes of the obstacles, shape (N, width)
-    start_tip: (
-        Array | None
-    )  # positions of the tip at the start [m], shape (N, 3), float64, or None
-    valid: NDArray[
-        np.bool_
-    ]  # mask of the plans that are finite with positive rate control points, shape (N,)
+    # Positions of the tip at the start [m], shape (N, 3), float64, or None.
+    start_tip: Array | None
+    # Mask of the plans that are finite with positive rate control points, shape (N,).
+    valid: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.rate)
@@ -46,6 +44,7 @@ class PlanBatch:
     def lanes(self, values: Array) -> Array:
         """Return values of shape (N, ...) as (..., lanes), with ones for invalid plans and padding."""
         n = len(values)
+        # Whole vectors: kernels have no code for the remaining lanes then.
         out = np.empty(
             (*values.shape[1:], -(-n // MAX_VECTOR_LANES) * MAX_VECTOR_LANES),
             values.dtype,
@@ -93,6 +92,7 @@ def check_batch(
         if values is not None or name in {"path", "rate"}
     }
     check_shapes(problem, {name: array.shape for name, array in arrays.items()})
+    # Sufficient for r(s) > 0, since basis functions are not negative.
     valid = np.asarray((arrays["rate"] > 0).all(axis=1))
     for array in arrays.values():
         valid &= np.isfinite(array).all(axis=tuple(range(1, array.ndim)))

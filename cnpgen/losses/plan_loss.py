@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -40,7 +40,14 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.arguments import check_memory, flag, integer, number, numbers
+from cnpgen.schema.arguments import (
+    check_choice,
+    check_memory,
+    flag,
+    integer,
+    number,
+    numbers,
+)
 from cnpgen.store.dataset_spec import StoredProblem
 
 Array = NDArray[Any]
@@ -124,17 +131,12 @@ class PlanLoss:
         threads: int = 1,
     ) -> None:
         self._threads = integer("threads", threads, least=1, most=MAX_LOSS_THREADS)
-        _check_choice("dtype", dtype, DTYPES)
-        _check_choice("form", form, FORMS)
+        check_choice("dtype", dtype, DTYPES)
+        check_choice("form", form, FORMS)
         check_quadrature(rule, nodes)
         check_memory("nodes", nodes, nodes)
-        self.problem, self.dtype, self.nodes, self.rule, self.form = (
-            as_problem(problem),
-            dtype,
-            nodes,
-            rule,
-            form,
-        )
+        self.problem, self.dtype, self.form = as_problem(problem), dtype, form
+        self.nodes, self.rule = nodes, rule
         self.terms = ("time", *constraint_terms(self.problem))
         self.budgets = np.array(
             [constraint.budget for constraint in self.problem.constraint]
@@ -146,6 +148,7 @@ class PlanLoss:
             _checked_margins(margins).tightening(self.terms[1:]).astype(dtype)
         )
         self._robot = load_robot(self.problem)
+        # Samples that place obstacles have them in ``HullLoss``: the kernels omit them.
         chosen, folder = choose_backend(backend)
         folder = folder if cache_folder is None else Path(cache_folder)
         self._kernels = problem_kernels(
@@ -194,53 +197,53 @@ class PlanLoss:
             self.problem, path, rate, obstacle_poses, start_tip, dtype=self.dtype
         )
         checked = self.checked_weights(weights)
-        orders = self.problem.path_orders
-        table = basis_table(
-            self.problem.trajectory,
-            self.rule,
-            self.nodes,
-            shift,
-            self.dtype,
-            orders=orders,
+        terms, path_gradient, rate_gradient = self._evaluate(
+            batch, checked, shift=shift, gradient=gradient
         )
-        n, selected = len(batch), slice(None) if gradient else slice(0)
-        terms = np.empty((n, len(self.terms)), self.dtype)
-        path_gradient, rate_gradient = (
+        with np.errstate(all="ignore"):
+            total = terms[:, 0] + terms[:, 1:] @ checked
+        return LossValue(total, terms, path_gradient, rate_gradient)
+
+    def _evaluate(
+        self, batch: PlanBatch, weights: Array, *, shift: float, gradient: bool
+    ) -> tuple[Array, Array, Array]:
+        """Return terms and gradients of a batch, block by block; the gradients are empty if they are not requested."""
+        spec, orders = self.problem.trajectory, self.problem.path_orders
+        table = basis_table(
+            spec, self.rule, self.nodes, shift, self.dtype, orders=orders
+        )
+        selected = slice(None) if gradient else slice(0)
+        arrays = (
+            np.empty((len(batch), len(self.terms)), self.dtype),
             np.empty_like(batch.path[selected]),
             np.empty_like(batch.rate[selected]),
         )
-
         # Hulls, kernel and bounds are built on first use: here, before threads start.
         hulls, varying = self._hulls, self._varying(batch, gradient=gradient)
 
         def evaluate_block(rows: slice) -> None:
             part = batch[rows]
-            with (
-                one_thread(),
-                np.errstate(all="ignore"),
-            ):  # an overflow affects its own plan only
+            # An overflow affects its own plan only.
+            with one_thread(), np.errstate(all="ignore"):
                 results = self._integrate(
-                    part, checked, table, varying, gradient=gradient
+                    part, weights, table, varying, gradient=gradient
                 )
                 if hulls is not None:
-                    hulls.add(results, part, checked, table, shift=shift)
-                terms[rows], path_gradient[rows], rate_gradient[rows] = (
-                    part.samples(values) for values in results
-                )
+                    hulls.add(results, part, weights, table, shift=shift)
+                for array, values in zip(arrays, results, strict=True):
+                    array[rows] = part.samples(values)
 
-        self._run(evaluate_block, n)
-        with np.errstate(all="ignore"):
-            total = terms[:, 0] + terms[:, 1:] @ checked
-        return LossValue(total, terms, path_gradient, rate_gradient)
+        self._run(evaluate_block, len(batch))
+        return arrays
 
     def _run(self, evaluate_block: Callable[[slice], None], n: int) -> None:
         """Evaluate blocks of plans.
 
         Compiled kernels release Python's lock, so that threads run in parallel.
         """
-        share = (
-            -(-n // (self._threads * MAX_VECTOR_LANES)) * MAX_VECTOR_LANES
-        )  # whole vectors
+        # Every thread gets a share, in blocks that fit the cache.
+        # Whole vectors.
+        share = -(-n // (self._threads * MAX_VECTOR_LANES)) * MAX_VECTOR_LANES
         size = (
             PLANS_PER_BLOCK
             if self._threads == 1
@@ -268,10 +271,23 @@ class PlanLoss:
         self, batch: PlanBatch, *, gradient: bool
     ) -> list[tuple[Constraint, Condition]]:
         """Return the time-varying bounds; none if the kernel or the plans do without them."""
+        # A kernel without such bounds has an empty argument.
         used = self._kernel(gradient=gradient).tape.inputs[
             relaxation_argument(self.problem)
         ]
         return self._time_varying if used and batch.start_tip is not None else []
+
+    def _splines(self, batch: PlanBatch, table: BasisTable) -> tuple[Array, Array]:
+        """Return the path, shape (orders, nodes, n, N), and the rate, shape (orders - 1, nodes, N)."""
+        nodes, orders = len(table.s), self.problem.path_orders
+        points, n = batch.path.shape[1:]
+        rates = batch.lanes(batch.rate)
+        # Splines at all nodes by one product: rows are p, p', p'' (orders x nodes), columns
+        # are joints x samples.
+        path = (table.path @ batch.lanes(batch.path).reshape(points, -1)).reshape(
+            orders, nodes, n, -1
+        )
+        return path, (table.rate @ rates).reshape(orders - 1, nodes, -1)
 
     def _integrate(
         self,
@@ -286,22 +302,11 @@ class PlanLoss:
 
         The gradients are empty if they are not requested.
         """
-        nodes, orders, (points, n) = (
-            len(table.s),
-            self.problem.path_orders,
-            batch.path.shape[1:],
-        )
-        rates, poses = (
-            batch.lanes(batch.rate),
-            batch.obstacle_poses[:, : self.problem.for_planning.scene_width],
-        )
-        lanes = rates.shape[1]
-        # Splines at all nodes by one product: rows are p, p', p'' (orders x nodes), columns
-        # are joints x samples.
-        path = (table.path @ batch.lanes(batch.path).reshape(points, -1)).reshape(
-            orders, nodes, n, lanes
-        )
-        rate = (table.rate @ rates).reshape(orders - 1, nodes, lanes)
+        points, n = batch.path.shape[1:]
+        # Poses of obstacles that samples place are no argument of the kernels.
+        poses = batch.obstacle_poses[:, : self.problem.for_planning.scene_width]
+        path, rate = self._splines(batch, table)
+        lanes = rate.shape[-1]
         terms = np.zeros((len(self.terms), lanes), self.dtype)
         arguments = (
             *path.swapaxes(1, 2), rate, batch.lanes(poses),
@@ -309,20 +314,18 @@ class PlanLoss:
         )  # fmt: skip
         if not gradient:
             self._values(*arguments, out=[terms])
-            return (
-                terms,
-                np.empty((points, n, 0), self.dtype),
-                np.empty((len(batch.rate[0]), 0), self.dtype),
-            )
+            empty = ((points, n, 0), (batch.rate.shape[1], 0))
+            by_path, by_rate = (np.empty(shape, self.dtype) for shape in empty)
+            return terms, by_path, by_rate
         by_path, by_rate = np.empty_like(path), np.empty_like(rate)
         self._gradient(*arguments, out=[terms, *by_path.swapaxes(1, 2), by_rate])
         # Chain rule through the splines, which are linear in the control points: the
         # transposed products.
-        by_points = table.path.T @ by_path.reshape(orders * nodes, -1)
+        by_points = table.path.T @ by_path.reshape(len(table.path), -1)
         return (
             terms,
             by_points.reshape(points, n, lanes),
-            table.rate.T @ by_rate.reshape((orders - 1) * nodes, -1),
+            table.rate.T @ by_rate.reshape(len(table.rate), -1),
         )
 
     def _relaxation(
@@ -439,14 +442,6 @@ class PlanLoss:
     @cached_property
     def _time_varying(self) -> list[tuple[Constraint, Condition]]:
         return time_varying_conditions(self.problem, self._robot, self.form)
-
-
-def _check_choice(name: str, value: object, known: Sequence[str]) -> None:
-    if value not in known:
-        raise UsageError(
-            f"must be one of {', '.join(known)}, got {value!r}{nearest(str(value), known)}",
-            argument=name,
-        )
 
 
 def _weight(name: str, value: Any) -> float:

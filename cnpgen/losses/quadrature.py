@@ -36,6 +36,7 @@ def quadrature(rule: str, nodes: int, shift: float = 0.0) -> tuple[Array, Array]
     """
     check_quadrature(rule, nodes, shift)
     if rule == "gauss":
+        # Gauss-Legendre on [-1, 1], moved to [0, 1].
         x, weights = np.polynomial.legendre.leggauss(nodes)
         return (1 + x) / 2, weights / 2
     # s = (1 - cos theta) / 2, ds = sin(theta) / 2 dtheta: midpoints in theta, weights
@@ -87,9 +88,8 @@ class BasisTable:
     s: Array  # phases, shape (K,), float64
     weights: NDArray[Any]  # quadrature weights, shape (1, K)
     path: NDArray[Any]  # basis functions of p and its derivatives, shape (orders K, C)
-    rate: NDArray[
-        Any
-    ]  # basis functions of r and its derivatives, shape ((orders - 1) K, R)
+    # Basis functions of r and its derivatives, shape ((orders - 1) K, R).
+    rate: NDArray[Any]
 
 
 @lru_cache(maxsize=64)

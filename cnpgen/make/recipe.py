@@ -19,6 +19,7 @@ from cnpgen.problems.problem import Problem, resolved, without_labels
 from cnpgen.problems.problem_file import (
     missing_kinds,
     missing_kinds_of_problem,
+    names_of_stored_files,
     restoring_reader,
     without_defaults,
 )
@@ -210,7 +211,10 @@ def restored(spec: DatasetSpec) -> Iterator[DatasetRecipe]:
     Its URDF is in a temporary folder for the duration of the block.
     """
     urdf, _ = spec.problem.urdf, spec.stages
-    with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
+    with (
+        tempfile.TemporaryDirectory(prefix="cnpgen-") as folder,
+        names_of_stored_files(Path(folder)),
+    ):
         yield restore_dataset_recipe(dict(spec.recipe), urdf, Path(folder))
 
 

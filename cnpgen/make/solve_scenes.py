@@ -53,7 +53,8 @@ from cnpgen.refine.task import Attempt
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import place_obstacles
-from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.argument_types import check_fields, checked_arguments
+from cnpgen.schema.old_keywords import with_old_keywords
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.world.pose_ik import PoseKinematics
 
@@ -61,6 +62,29 @@ Array = NDArray[np.float64]
 
 TOLERANCE_SEEDS = 256  # random states within the tolerances of a goal in collision
 POSE_EXPLANATION = f"{POSE_SEEDS} searches from random joint positions found none with the goal pose within the limits"
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """Options of ``solve_scenes`` beside those of refining.
+
+    Attributes:
+        payload: Mass of attached objects of unknown weight [kg].
+        engine: Engine that runs the work, see ``refine_plans``.
+        address: Address of the engine's cluster.
+        begin: Called once before the first scene, with the number of scenes and 0.
+
+    Raises:
+        UsageError: A value has another type.
+    """
+
+    payload: float | None = None
+    engine: str | None = None
+    address: str | None = None
+    begin: Callable[[int, int], None] | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,13 +160,11 @@ def solve_scenes(
     *,
     options: RefineOptions = DEFAULT_OPTIONS,
     workers: int | None = None,
-    engine: str | None = None,
-    address: str | None = None,
     journal: str | Path | None = None,
     discard: bool = False,
-    payload: float | None = None,
-    begin: Callable[[int, int], None] | None = None,
     progress: Progress | None = None,
+    run: SceneOptions | None = None,
+    **old_keywords: Any,
 ) -> SolvedScenes:
     """Plan the problems of scenes, which end at rest, with the limits and constraints of a robot's problem.
 
@@ -155,9 +177,10 @@ def solve_scenes(
 
     ``problem`` is the robot's problem, such as "panda"; obstacles of the scenes are
     added to its own. Requests change it: scaling factors multiply its limits, and
-    attached objects become links. ``payload`` is the mass of attached objects of
-    unknown weight [kg]. The other arguments are those of ``refine_plans``. The names of
-    the journals are that of ``journal`` with a number.
+    attached objects become links. ``run`` has the mass of attached objects of unknown
+    weight, the engine and others; its fields are also accepted as keywords of version
+    1.0 (``old_keywords``). The other arguments are those of ``refine_plans``. The names
+    of the journals are that of ``journal`` with a number.
 
     Raises:
         SceneError: A scene does not fit the robot.
@@ -165,14 +188,19 @@ def solve_scenes(
             ``robot-clearance``.
         MachineError: See ``refine_plans``.
     """
+    chosen = with_old_keywords(
+        "solve_scenes", run, SceneOptions(), old_keywords, keyword="run"
+    )
     check_scenes(scenes)
     loaded, scenes = as_problem(problem), [checked_scene(scene) for scene in scenes]
     robot = load_robot(loaded)
     placed = [placed_scene(scene, robot, start_state(scene, robot)) for scene in scenes]
-    loaded, robot, scenes = requested_problem(loaded, robot, placed, payload=payload)
+    loaded, robot, scenes = requested_problem(
+        loaded, robot, placed, payload=chosen.payload
+    )
     goals = [_goals(loaded, robot, scene, index) for index, scene in enumerate(scenes)]
-    if begin is not None:
-        begin(len(scenes), 0)
+    if chosen.begin is not None:
+        chosen.begin(len(scenes), 0)
 
     def report(finished: int, valid: int) -> None:
         if progress is not None and finished:
@@ -189,34 +217,40 @@ def solve_scenes(
             ),
             options=options,
             workers=workers,
-            engine=engine,
-            address=address,
+            engine=chosen.engine,
+            address=chosen.address,
             journal=file,
             discard=discard,
             begin=lambda _, finished: report(finished, finished),
             progress=report,
         )
         times += refinement.times
-        columns = {
-            name: values
-            for name, values in refinement.plans.columns.items()
-            if name != GOAL_OPTION
-        }
-        chosen = replace(refinement.plans, columns=columns)
-        wide = with_wider_capacity(chosen, loaded, own, capacity)
+        wide = with_wider_capacity(_without_options(refinement), loaded, own, capacity)
         for row, (index, attempt) in enumerate(
             zip(indices, refinement.results, strict=True)
         ):
-            without_goal = np.isnan(goals[index]).all()
-            found[index] = (
-                wide[row],
-                replace(attempt, reason=POSE_REASON) if without_goal else attempt,
-            )
+            found[index] = wide[row], _with_reason(attempt, goals[index])
     every, results = zip(*(found[index] for index in range(len(scenes))), strict=True)
     solved = SolvedScenes(tuple(scenes), concatenate(every), results, times)
+    # The journals serve to resume; a finished run needs none.
     for file in journals:
         file.unlink(missing_ok=True)
     return solved
+
+
+def _without_options(refinement: Refinement) -> Plans:
+    """Return the plans without the column that numbers the goal states of one scene."""
+    plans = refinement.plans
+    columns = {
+        name: values for name, values in plans.columns.items() if name != GOAL_OPTION
+    }
+    return replace(plans, columns=columns)
+
+
+def _with_reason(attempt: Attempt, goals: Array) -> Attempt:
+    """Return an attempt, with the reason of a scene whose goal pose has no joint positions."""
+    without_goal = np.isnan(goals).all()
+    return replace(attempt, reason=POSE_REASON) if without_goal else attempt
 
 
 def _groups(scenes: Sequence[SceneProblem]) -> list[tuple[dict[str, int], list[int]]]:

@@ -28,16 +28,17 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.arguments import integer, number, numbers
+from cnpgen.schema.arguments import check_choice, integer, number, numbers
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
 
+# Number of path control points that the goal fixes.
 FIXED_AT_GOAL = {
     "free": 2,
     "given": 3,
-}  # number of path control points that the goal fixes
+}
 
 
 class BoundaryLayer:
@@ -93,16 +94,8 @@ class BoundaryLayer:
         )
         line_steps = integer("line_projection_steps", line_projection_steps, least=0)
         self.projection_steps = integer("projection_steps", projection_steps, least=0)
-        if expected_time not in EXPECTED_TIMES:
-            raise UsageError(
-                f"must be one of {', '.join(EXPECTED_TIMES)}, got {expected_time!r}",
-                argument="expected_time",
-            )
-        if goal_acceleration not in FIXED_AT_GOAL:
-            raise UsageError(
-                f"must be one of {', '.join(FIXED_AT_GOAL)}, got {goal_acceleration!r}",
-                argument="goal_acceleration",
-            )
+        check_choice("expected_time", expected_time, EXPECTED_TIMES)
+        check_choice("goal_acceleration", goal_acceleration, FIXED_AT_GOAL)
         self._config = ModelConfig(
             path_scale=self.path_scale,
             line_projection_steps=line_steps,
@@ -112,6 +105,7 @@ class BoundaryLayer:
         self.goal_acceleration = goal_acceleration
         self._fixed_at_goal = FIXED_AT_GOAL[goal_acceleration]
         spec = self.problem.trajectory
+        # The start fixes three control points, the goal two or three.
         self.path_outputs = (spec.path_control_points - 3 - self._fixed_at_goal) * len(
             self.problem.robot.joints
         )
@@ -134,6 +128,8 @@ class BoundaryLayer:
     def _preprocessor_and_projection(
         self,
     ) -> tuple[TaskPreprocessor, Projection | None]:
+        # Kernels omit the obstacles that samples place; features and losses measure
+        # them.
         robot, problem, kernels = (
             self._kernels.arguments["robot"],
             self.problem.for_planning,
@@ -178,6 +174,8 @@ class BoundaryLayer:
                 ``goal_acceleration``.
             UnitError: A value is probably in degrees or millimetres.
         """
+        # Free accelerations are outputs of the network; given ones fix a third control
+        # point.
         if boundary.fixed_at_goal > self._fixed_at_goal:
             raise UsageError(
                 'goal_acceleration is "free", so goal_ddq must be None; pass goal_acceleration="given"',
@@ -187,25 +185,7 @@ class BoundaryLayer:
             raise UsageError(
                 'goal_ddq is missing: goal_acceleration is "given"', concerns="boundary"
             )
-        arrays = {
-            name: numbers(name, values, differentiable=True)
-            for name, values in boundary.arrays().items()
-        }
-        count, joints = (
-            len(np.atleast_1d(arrays["start_q"])),
-            len(self.problem.robot.joints),
-        )
-        for name, array in arrays.items():
-            shape = (
-                count,
-                len(self.problem.parameters) if name == "parameters" else joints,
-            )
-            if array.shape != shape:
-                raise UsageError(
-                    f"must have shape (N, {shape[1]}), N = {shape[0]}, got {array.shape}",
-                    argument=name,
-                )
-        checked = Boundary(**arrays)
+        checked = self._checked(boundary)
         robot = self._kernels.arguments["robot"]
         check_boundary_units(
             robot, checked, argument="boundary", allow_large_angles=allow_large_angles
@@ -216,6 +196,23 @@ class BoundaryLayer:
             else numbers("obstacle_poses", obstacle_poses)
         )
         return self._preprocessor_and_projection[0](checked, obstacle_poses=poses)
+
+    def _checked(self, boundary: Boundary) -> Boundary:
+        """Return boundary conditions as arrays of the right shapes."""
+        arrays = {
+            name: numbers(name, values, differentiable=True)
+            for name, values in boundary.arrays().items()
+        }
+        count = len(np.atleast_1d(arrays["start_q"]))
+        joints, parameters = len(self.problem.robot.joints), self.problem.parameters
+        for name, array in arrays.items():
+            shape = count, len(parameters) if name == "parameters" else joints
+            if array.shape != shape:
+                raise UsageError(
+                    f"must have shape (N, {shape[1]}), N = {shape[0]}, got {array.shape}",
+                    argument=name,
+                )
+        return Boundary(**arrays)
 
     @checked_arguments
     @one_thread()
@@ -239,7 +236,8 @@ class BoundaryLayer:
         )
         if projection is None:
             return points
-        with np.errstate(all="ignore"):  # an overflow affects its own row only
+        # An overflow affects its own row only.
+        with np.errstate(all="ignore"):
             return replace(
                 points, path=projection.project(points.path, tasks.scene.poses)
             )
@@ -283,6 +281,8 @@ class BoundaryLayer:
             "rate_gradient", rate_gradient, points.rate.shape
         )
         with np.errstate(all="ignore"):
+            # Reverse order of the forward pass: projection first, then the control
+            # points.
             by_path = (
                 projection.vjp(points.path, tasks.scene.poses, path_gradient)
                 if projection
@@ -297,6 +297,7 @@ class BoundaryLayer:
                 scale=self.path_scale,
                 spec=spec,
             )
+        # An overflow of one plan must not stop training: its gradient is left out.
         overflowed = _finite(path_gradient, rate_gradient) & ~_finite(*gradients)
         for gradient in gradients:
             gradient[overflowed] = 0
@@ -331,7 +332,8 @@ class BoundaryLayer:
             rate_control_points=points.rate,
             columns={"start_xyz": tasks.start_xyz, "goal_xyz": tasks.goal_xyz},
             sample_id=sample_id,
-            allow_large_angles=True,  # checked with the tasks
+            # Checked with the tasks.
+            allow_large_angles=True,
         )
 
     @checked_arguments

@@ -125,6 +125,8 @@ def projected_path(
         }
         change = projection_change(robot, problem, points, obstacle_poses, **options)
         points[interior] = _sums(points[interior], change)
+    # Clipping interior points suffices: the path lies in the hull of its control
+    # points.
     elif within_limits:
         change = [
             clipped_to_limits(robot, point, [0.0] * n) for point in points[interior]
@@ -146,10 +148,7 @@ def path_change(robot: Robot, problem: Problem, **options: Any) -> Any:
 
 
 def path_change_adjoint(robot: Robot, problem: Problem, **options: Any) -> Any:
-    """Build ``(path, obstacle_poses, seed) -> gradient`` of ``seed .
-
-    Change`` by the path, in reverse mode.
-    """
+    """Build ``(path, obstacle_poses, seed) -> d(seed . change)/d(path)``, by reverse mode."""
     import casadi as ca
 
     path, obstacle_poses, change = _path_change(robot, problem, options)
@@ -172,15 +171,11 @@ def _path_change(
 
 
 def _points(ends: list[Vec], rates: Vec, spec: TrajectorySpec) -> list[Vec]:
-    """Return all control points of the line (paper, Appendix A.
-
-    ``trajectory.boundary``).
-    """
+    """Return all control points of the line (paper, Appendix A, as ``trajectory.boundary``)."""
     q, dq, ddq, goal_q, goal_dq, *goal_ddq = ends
     first = _end_points(q, dq, ddq, rates[:2], spec)
-    arrival = [
-        -v for v in goal_dq
-    ]  # in reversed phase r' and p' change sign: the goal is a start with -dq
+    # in reversed phase r' and p' change sign: the goal is a start with -dq
+    arrival = [-v for v in goal_dq]
     last = _end_points(
         goal_q, arrival, goal_ddq[0] if goal_ddq else None, rates[:-3:-1], spec
     )[::-1]
@@ -197,10 +192,13 @@ def _end_points(
     q: Vec, dq: Vec, ddq: Vec | None, rates: Vec, spec: TrajectorySpec
 ) -> list[Vec]:
     """Return the control points that an end fixes, from the outermost one: two if its acceleration is free."""
+    # eta and beta are the first and second derivatives of the clamped basis at an end:
+    #   p'(0) = eta (c1 - c0),   r'(0) = eta (r1 - r0),   p''(0) = beta (c2 - 3 c1 + 2 c0).
     path = end_derivatives(spec.path_control_points, spec.degree)
     gradient = end_derivatives(spec.rate_control_points, spec.degree).eta * (
         rates[1] - rates[0]
     )
+    # dq = p' r and ddq = p'' r^2 + p' r' r, solved for p' and p''.
     first = [v / rates[0] for v in dq]
     c1 = [x + v / path.eta for x, v in zip(q, first, strict=True)]
     if ddq is None:
@@ -243,12 +241,14 @@ def projection_change(
     the limits after every step.
     """
     control, interior = list(control), slice(3, len(control) - fixed_at_goal)
+    # Boundary control points stay: they meet the boundary conditions exactly.
     table, response = collocation(problem.trajectory.degree, len(control), interior)
     equality, total = (
         equality_residuals(robot, problem),
         [[0.0] * robot.n for _ in response],
     )
     for _ in range(steps):
+        # Positions at the phases; only interior points move them.
         q = [_combined(row, control) for row in table]
         step = _gauss_newton(equality, q, obstacle_poses, table[:, interior], response)
         if within_limits:
@@ -280,10 +280,10 @@ def clipped_to_limits(robot: Robot, point: Vec, step: Vec) -> Vec:
     ]
 
 
-def _gauss_newton(
-    equality: Any, q: list[Vec], obstacle_poses: Vec, inner: Array, response: Array
-) -> list[Vec]:
-    """Return the change of the interior control points that cancels the residuals at the phases to first order."""
+def _linearized(
+    equality: Any, q: list[Vec], obstacle_poses: Vec
+) -> tuple[Vec, list[Vec], list[int]]:
+    """Return residual, row of the Jacobian and phase of every equation at every phase."""
     import casadi as ca
 
     residuals, rows, phases = [], [], []
@@ -296,6 +296,19 @@ def _gauss_newton(
             residuals.append(residual[equation])
             rows.append(ca.vertsplit(columns[equation, :].T))
             phases.append(phase)
+    return residuals, rows, phases
+
+
+def _gauss_newton(
+    equality: Any, q: list[Vec], obstacle_poses: Vec, inner: Array, response: Array
+) -> list[Vec]:
+    """Return the change of the interior control points that cancels the residuals at the phases to first order."""
+    import casadi as ca
+
+    residuals, rows, phases = _linearized(equality, q, obstacle_poses)
+    # Step of the control points: dC = -M N^T G^T lambda with the basis N at the phases,
+    # the mobility M = (D^T D + w I)^-1 of second differences D, and the Jacobians G.
+    # The multipliers solve (G N M N^T G^T + damping I) lambda = residuals.
     coupling = inner @ response
     lower = [
         [
@@ -307,6 +320,8 @@ def _gauss_newton(
     for i, entries in enumerate(lower):
         entries[i] += PROJECTION_DAMPING
     force = solve(lower, residuals)
+    # Forces of all equations of one phase add up, before they spread over control
+    # points.
     forces: list[Vec] = [[0.0] * len(q[0]) for _ in q]
     for strength, row, phase in zip(force, rows, phases, strict=True):
         forces[phase] = [
@@ -337,10 +352,13 @@ def _combined(factors: Array, points: list[Vec]) -> Vec:
 
 def collocation(degree: int, points: int, interior: slice) -> tuple[Array, Array]:
     """Return the basis at K phases, (K, points), and responses of interior points to forces there, (K - 1, K)."""
+    # Greville abscissae: phases at which the control points have the largest effect.
     knots, indices = clamped_knots(points, degree), range(points)[interior]
     greville = [knots[i + 1 : i + degree + 1].mean() for i in indices]
+    # One more phase before the goal, where fast arrivals leave the manifold most.
     phases = np.array([*greville, (greville[-1] + 1) / 2])
     table = basis(phases, points, degree)
+    # Small second differences: a smooth change; the weight keeps the inverse finite.
     second = np.diff(np.eye(points), 2, axis=0)[:, interior]
     mobility = np.linalg.inv(second.T @ second + CHANGE_WEIGHT * np.eye(len(greville)))
     return table, mobility @ table[:, interior].T

@@ -64,11 +64,13 @@ def control_points(
     the time head (N, R).
     """
     boundary = tasks.boundary
+    # exp keeps rates positive; the expected time is their unit.
     rate = np.exp(log_rate)
     rate /= tasks.expected_time[:, None]
     first, last = start_points(boundary, rate, spec), goal_points(boundary, rate, spec)
     n = boundary.start_q.shape[1]
     interior = (scale * phi).reshape(len(phi), phi.shape[1] // n, n)
+    # line_i + scale phi_i in place, without another array.
     begin = first[:, 2:3]
     interior += begin + (last[:, :1] - begin) * along_line(
         interior.shape[1], interior.dtype.name
@@ -97,16 +99,19 @@ def vjp(
         :, 3 : spec.path_control_points - tasks.boundary.fixed_at_goal
     ]
     along = along_line(interior.shape[1], interior.dtype.name)[:, 0]
+    # The line depends on both of its ends: C_{3+i} = (1 - a_i) first + a_i last + ...
     total = path_gradient.copy()
     total[:, 2] += (1 - along) @ interior
     total[:, spec.path_control_points - tasks.boundary.fixed_at_goal] += (
         along @ interior
     )
     rates = rate_gradient.copy()
+    # Boundary points depend on the rates next to them.
     for effect in boundary_derivatives(tasks.boundary, points.rate, spec):
         rates[:, effect.variable] += np.einsum(
             "ij,ij->i", total[:, effect.point], effect.derivative
         )
+    # d rate / d log_rate = rate.
     rates *= points.rate
     return scale * interior.reshape(len(interior), math.prod(interior.shape[1:])), rates
 
@@ -152,6 +157,8 @@ class Projection:
 
     def vjp(self, path: Array, obstacle_poses: Array, gradient: Array) -> Array:
         """Convert the gradient with respect to the result of ``project`` to that with respect to its argument."""
+        # Chain rule of path + change(path): the gradient itself, and that through the
+        # change.
         (through_change,) = self.adjoint(
             lanes(path), lanes(obstacle_poses), lanes(gradient[:, self.interior])
         )

@@ -37,6 +37,7 @@ def speed_residuals(robot: Robot, problem: Problem) -> Any:
     if has_friction(robot):
         column, rates = symbols("friction_rates", robot.n)
         columns, state = [*columns, column], replace(state, friction_rates=rates)
+    # Values that do not depend on velocity cannot be met by slower motions.
     conditions = conditions_with_needs(problem, state, moving)
     rows = [value for condition, needs in conditions if needs for value in condition.g]
     g = ca.vertcat(*rows) if rows else ca.SX(0, 1)
@@ -71,6 +72,7 @@ def _linear_rows(robot: Robot, problem: Problem, p1: Vec, friction_rates: Vec) -
     columns, state = state_of_symbols(robot, problem)
     zero = [0.0] * robot.n
     q, poses, size = state.q, state.obstacle_poses, problem.object_size
+    # The difference of two states with the same friction direction is linear in dq.
     still, moving = (
         _FrictionalState(robot, q, dq, zero, poses, (), size, None, friction_rates)
         for dq in (zero, p1)
@@ -84,6 +86,7 @@ def _linear_rows(robot: Robot, problem: Problem, p1: Vec, friction_rates: Vec) -
             rows += [x - y for a, b in pairs for x, y in zip(a.g, b.g, strict=True)]
             continue
         alone = replace(problem, constraint=(constraint,))
+        # Rows without torques have no linear part: zeros for each of their values.
         conditions = conditions_with_needs(alone, state, columns[1:-1])
         rows += [0.0] * sum(len(each.g) for each, needs in conditions if needs)
     return ca.vertcat(*rows)
@@ -115,6 +118,7 @@ def speed_violation(robot: Robot, problem: Problem) -> Any:
     for condition, needs in conditions_with_needs(problem, state, moving):
         if needs:
             violations += _violations(condition, np.ones(len(condition.g)))
+    # A constant, if nothing depends on velocity: -1 is no violation.
     worst = reduce(ca.fmax, violations) if violations else ca.SX(-1)
     return ca.Function("speed_violation", [ca.vertcat(*columns)], [worst])
 
@@ -139,6 +143,8 @@ def speed_coefficients(robot: Robot, problem: Problem) -> Any:
     p, p1, p2, rates, obstacle_poses = columns
     drive = robot.drive
     friction = [p1 * rates[0]] if has_friction(robot) else []
+    # Three evaluations determine the coefficients: at rest (constant), at p' and p''
+    # with r = 1 (square), and with ddq = p' alone (mixed).
     at_rest, fast, rising = (
         values(p, *moving, obstacle_poses, *friction)
         for moving in ((zero, zero), (p1, p2), (zero, p1))
@@ -150,6 +156,7 @@ def speed_coefficients(robot: Robot, problem: Problem) -> Any:
         square = square - linear[0]
     bounds = speed_bounds(robot, problem)
     others, fractions = np.flatnonzero(~bounds.proportional).tolist(), []
+    # (dq / bound)^2 <= 1 for both signs of the bound: one row replaces all of them.
     for bound in (bounds.lower, bounds.upper):
         rows = np.flatnonzero(bounds.proportional & np.isfinite(bound)).tolist()
         fractions += [fast[row] * float(1 / bound[row]) for row in rows]
@@ -252,6 +259,7 @@ def speed_bounds(robot: Robot, problem: Problem) -> SpeedBounds:
 def _is_proportional(value: Any, dq: Any, low: float, high: float) -> bool:
     import casadi as ca
 
+    # Linear without a constant part: proportional to dq.
     linear = (
         ca.is_linear(value, dq)
         and ca.substitute(value, dq, ca.SX.zeros(dq.shape)).is_zero()
@@ -260,10 +268,7 @@ def _is_proportional(value: Any, dq: Any, low: float, high: float) -> bool:
 
 
 def _on_path(robot: Robot, problem: Problem) -> tuple[list[Any], list[Vec]]:
-    """Return p, p', p'', ..., r, r', .
-
-    And obstacle poses, as SX columns and as lists of their scalars.
-    """
+    """Return the path, the rate, their derivatives, and obstacle poses, as SX columns and as lists of their scalars."""
     orders = problem.path_orders
     names = (*(f"p{order}" for order in range(orders)), "rates", "obstacle_poses")
     widths = (*[robot.n] * orders, orders - 1, problem.scene_width)

@@ -120,6 +120,7 @@ class Model:
     @cached_property
     def fixed_at_goal(self) -> int:
         """Number of path control points that the goal fixes: 2, or 3 if goal accelerations are given."""
+        # Interior outputs tell how many control points the goal fixes.
         interior = self.architecture.path_outputs // len(self.problem.joint_names)
         return self.problem.trajectory.path_control_points - 3 - interior
 

@@ -47,9 +47,8 @@ from cnpgen.store.paths import ANY_HDF5, require_file
 
 MODEL_KIND, MODEL_VERSION = "cnpgen-model", 2
 MAX_PROJECTION_STEPS = 20  # Gauss-Newton steps; each makes a kernel larger
-_DEFAULTS = {
-    field.name: field.default for field in fields(ModelConfig)
-}  # values that files omit
+# Values that files omit.
+_DEFAULTS = {field.name: field.default for field in fields(ModelConfig)}
 _STRUCTURE = {
     "architecture": {field.name: WHOLE for field in fields(Architecture)},
     "features": [TEXT],
@@ -60,11 +59,12 @@ _STRUCTURE = {
     },
     "zero_conditions": [TEXT],
 }
+# Of the optional keys read.
 _TRAINING_STRUCTURE = {
     "dataset": {ANY_KEY: ANYTHING},
     "stages": [{ANY_KEY: ANYTHING}],
     "input_ranges": {"low": [NUMBER], "high": [NUMBER]},
-}  # of the optional keys read
+}
 
 
 @checked_arguments
@@ -108,6 +108,7 @@ def model_for(problem: Problem | StoredProblem) -> Model:
     Raise UsageError if there is none, or several.
     """
     record = as_record(problem)
+    # Equal digests: the same problem, whatever file it came from.
     models = {name: load_model(path) for name, path in shipped_models().items()}
     matches = [
         name
@@ -236,25 +237,53 @@ def _assembled(content: Content) -> Model:
         content.arrays["feature_scale"],
     )
     stored = description["config"]
+    # JSON has lists where the class has tuples.
     via_points = tuple(tuple(map(float, each)) for each in stored.get("via_points", ()))
     config = ModelConfig(**{**stored, "via_points": via_points})
     _check_sizes(problem, architecture, features)
+    _check_ranges(training, architecture)
+    _check_config(config, problem, features)
+    _check_zero_conditions(set(description["zero_conditions"]))
+    return Model(
+        problem=problem,
+        architecture=architecture,
+        parameters=_parameters(architecture, content.arrays),
+        features=features,
+        config=config,
+        zero_conditions=tuple(description["zero_conditions"]),
+        training=training,
+        log=content.texts["log"],
+    )
+
+
+def _check_ranges(training: Mapping[str, Any], architecture: Architecture) -> None:
+    """Check that the ranges of inputs in the training rows have one number per input."""
     for name, values in training.get("input_ranges", {}).items():
         if len(values) != architecture.inputs:
             text = f"{architecture.inputs} numbers, got {len(values)}"
             raise ValueError(f"input_ranges has {name} of {text}")
+
+
+def _check_zero_conditions(names: set[str]) -> None:
+    """Check the names of boundary conditions that are zero in every row."""
+    if unknown := names - set(CONDITIONS):
+        raise ValueError(f"unknown boundary conditions {', '.join(sorted(unknown))}")
+    if positions := {"start_q", "goal_q"} & names:
+        raise ValueError(
+            f"{', '.join(sorted(positions))}: only velocities and accelerations are zero in every row"
+        )
+
+
+def _check_config(
+    config: ModelConfig, problem: ProblemRecord, features: Features
+) -> None:
+    """Check the definition of the outputs: sizes, ranges and choices."""
     joints = len(problem.joint_names)
     if not all(
         len(each) == joints and np.isfinite(each).all() for each in config.via_points
     ):
         raise ValueError(
             f"via points must be {joints} numbers each, got {config.via_points}"
-        )
-    if unknown := set(description["zero_conditions"]) - set(CONDITIONS):
-        raise ValueError(f"unknown boundary conditions {', '.join(sorted(unknown))}")
-    if positions := {"start_q", "goal_q"} & set(description["zero_conditions"]):
-        raise ValueError(
-            f"{', '.join(sorted(positions))}: only velocities and accelerations are zero in every row"
         )
     steps = max(config.line_projection_steps, config.projection_steps)
     if steps > MAX_PROJECTION_STEPS or not math.isfinite(float(config.path_scale)):
@@ -281,16 +310,6 @@ def _assembled(content: Content) -> Model:
             raise ValueError(
                 f"{name} must be true or false, got {getattr(config, name)!r}"
             )
-    return Model(
-        problem=problem,
-        architecture=architecture,
-        parameters=_parameters(architecture, content.arrays),
-        features=features,
-        config=config,
-        zero_conditions=tuple(description["zero_conditions"]),
-        training=training,
-        log=content.texts["log"],
-    )
 
 
 def _check_sizes(
@@ -315,6 +334,7 @@ def _check_sizes(
         raise ValueError(
             f"its features include {ARRIVAL}, but its outputs leave goal accelerations free"
         )
+    # A wrong size would be found only when the network runs, as an error of NumPy.
     for name in ("mean", "scale"):
         shape = getattr(features, name).shape
         if shape != (architecture.inputs,):
@@ -332,6 +352,7 @@ def _parameters(
             f"{architecture.layers} layers cannot be in {len(arrays)} arrays"
         )
     parts = []
+    # One vector of all parameters, in the order of the layers.
     for layer in architecture.all_layers:
         for name, shape in (
             ("weight", (layer.inputs, layer.outputs)),

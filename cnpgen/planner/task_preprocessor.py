@@ -84,6 +84,7 @@ class TaskPreprocessor:
                 finite, or the problem places them.
         """
         ends = ends_of(boundary) if ends is None else ends
+        # Kernels have samples last, one lane each.
         start_xyz, goal_xyz, *velocity = (tip.T for tip in self.tips(ends))
         parameters = self._parameters(boundary)
         scene = scene_of(
@@ -93,31 +94,17 @@ class TaskPreprocessor:
             velocity[0] if velocity else None,
             parameters,
         )
-        reaching = self.reaching_time
-        if reaching is None:
-            factor = self._factor(parameters)
-            time = expected_time(
-                boundary, self.velocity_limit * factor, least=self.least_time
-            )
+        # Without the kernel of ``reaching_time`` the unit is that of the distance.
+        if self.reaching_time is None:
+            limit = self.velocity_limit * self._factor(parameters)
+            time = expected_time(boundary, limit, least=self.least_time)
         else:
-            time = reaching(ends)[0][0]
-        correction = (
-            None if via_point is None else self._via_offsets(boundary, via_point)
-        )
-        shape = (
-            len(boundary),
-            self._interior_points(boundary),
-            boundary.start_q.shape[1],
-        )
-        kernel, offsets = (
-            (self.line, [])
-            if correction is None
-            else (self.via_line, [lanes(correction)])
-        )
-        if kernel is not None:
-            (change,) = kernel(ends, *offsets, 1 / time[None], scene.lanes)
-            correction = rows(change, shape[2])
+            time = self.reaching_time(ends)[0][0]
+        n = boundary.start_q.shape[1]
+        shape = len(boundary), self._interior_points(boundary), n
+        correction = self._correction(boundary, via_point, ends, time, scene)
         placed = self._placed_scene(len(boundary), obstacle_poses)
+        # Networks that correct their own path take offsets, zero at first.
         if correction is None and self.iterated:
             correction = np.zeros(shape)
         tasks = Tasks(boundary, start_xyz, goal_xyz, time, scene, correction, placed)
@@ -130,8 +117,29 @@ class TaskPreprocessor:
             ),
         )
 
+    def _correction(
+        self,
+        boundary: Boundary,
+        via_point: Array | None,
+        ends: Array,
+        time: Array,
+        scene: Scene,
+    ) -> Array | None:
+        """Return offsets from the straight line [rad], through a via point and projected; None if there are none."""
+        if via_point is None:
+            correction, kernel, offsets = None, self.line, []
+        else:
+            correction = self._via_offsets(boundary, via_point)
+            kernel, offsets = self.via_line, [lanes(correction)]
+        if kernel is None:
+            return correction
+        (change,) = kernel(ends, *offsets, 1 / time[None], scene.lanes)
+        return rows(change, boundary.start_q.shape[1])
+
     def along(self, tasks: Tasks, path: Array) -> Tasks:
         """Return tasks whose lines are the paths of other plans for them: control points [rad], shape (N, C, n)."""
+        # Offsets from the straight line between the control points that the ends
+        # determine.
         fixed = tasks.boundary.fixed_at_goal
         first, last, interior = path[:, 2:3], path[:, -fixed, None], path[:, 3:-fixed]
         along = along_line(interior.shape[1], path.dtype.name)
@@ -194,6 +202,7 @@ class TaskPreprocessor:
 
     def _via_offsets(self, boundary: Boundary, via_point: Array) -> Array:
         """Return offsets of lines through via points from straight ones at interior points [rad], shape (N, m, n)."""
+        # A triangle over the line: zero at its ends, 1 at half its length.
         along = along_line(self._interior_points(boundary))
         offset = via_point - (boundary.start_q + boundary.goal_q) / 2
         return np.asarray((1 - np.abs(2 * along - 1)) * offset[:, None])
@@ -213,6 +222,7 @@ def make_task_preprocessor(
 
     ``observed`` is whether it computes features of placed obstacles.
     """
+    # No steps if the problem has no equalities.
     steps = effective_steps(kernels, config.line_projection_steps)
     load = partial(
         kernels.load,
@@ -220,32 +230,21 @@ def make_task_preprocessor(
         fixed_at_goal=fixed_at_goal,
         within_limits=config.within_limits,
     )
-    line = load(line_change, with_offsets=False) if steps else None
-    tips = kernels.load(tips_at_ends, fixed_at_goal=fixed_at_goal)
-    time = (
-        kernels.load(reaching_time, fixed_at_goal=fixed_at_goal)
-        if config.expected_time == "reach"
-        else None
-    )
-    via_line = (
-        load(line_change, with_offsets=True) if steps and config.via_points else None
-    )
-    least_time = (
-        MIN_TRAVEL_TIME_S if config.expected_time == "travel" else MIN_EXPECTED_TIME_S
-    )
-    features = (
-        make_scene_features(robot, problem.trajectory, kernels)
+    via, reach = steps and config.via_points, config.expected_time == "reach"
+    shortest = config.expected_time == "travel"
+    return TaskPreprocessor(
+        problem,
+        robot.velocity_limit,
+        tips=kernels.load(tips_at_ends, fixed_at_goal=fixed_at_goal),
+        line=load(line_change, with_offsets=False) if steps else None,
+        reaching_time=kernels.load(reaching_time, fixed_at_goal=fixed_at_goal)
+        if reach
+        else None,
+        via_line=load(line_change, with_offsets=True) if via else None,
+        least_time=MIN_TRAVEL_TIME_S if shortest else MIN_EXPECTED_TIME_S,
+        placed=placed,
+        scene_features=make_scene_features(robot, problem.trajectory, kernels)
         if placed and observed
-        else None
+        else None,
+        iterated=config.iterations > 1,
     )
-    parts = (
-        tips,
-        line,
-        time,
-        via_line,
-        least_time,
-        placed,
-        features,
-        config.iterations > 1,
-    )
-    return TaskPreprocessor(problem, robot.velocity_limit, *parts)

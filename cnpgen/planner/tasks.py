@@ -129,14 +129,18 @@ def reaching_time(robot: Robot, *, fixed_at_goal: int) -> Any:
         ca.SX(robot.velocity_limit),
         ca.SX(robot.acceleration_limit),
     )
-    direct = (
-        (dq + goal_dq) * ca.fabs(goal_dq - dq) / (2 * acceleration)
-    )  # distance at constant acceleration from dq to goal_dq
+    # Distance at constant acceleration from dq to goal_dq.
+    direct = (dq + goal_dq) * ca.fabs(goal_dq - dq) / (2 * acceleration)
+    # On this side the joint speeds up first; mirrored, only one case remains.
     side = ca.if_else(goal_q - q >= direct, 1.0, -1.0)
     first, last, distance = side * dq, side * goal_dq, side * (goal_q - q)
+    # Accelerate to a peak, then decelerate: peak^2 = a distance + (first^2 + last^2) /
+    # 2.
     squares = (first**2 + last**2) / 2
     peak = ca.sqrt(ca.fmax(acceleration * distance + squares, 0.0))
+    # An end may be faster than the limit; the joint then cruises at that speed.
     fastest = ca.fmax(velocity, ca.fmax(first, last))
+    # Beyond the velocity limit the peak is cut off, and the rest is cruised.
     cruise = ca.fmax(distance - (fastest**2 - squares) / acceleration, 0.0) / fastest
     joint_times = (
         2 * ca.fmin(peak, fastest) - first - last

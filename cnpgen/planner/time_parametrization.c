@@ -61,6 +61,7 @@ I quadratic along(direction d, const double *a, long size, int has_linear) {
 }
 
 /* Upper bound of the change of a row at a step of at most `up`. */
+/* The change of a row within a step of at most `up`: most rows are far from their bounds, and no root is needed. */
 I v largest_change(quadratic f, double up) { return up * (vabs(f.l) + up * vabs(f.q)); }
 
 /* Largest allowed and smallest required step per lane, and mask of the violated lanes. */
@@ -166,6 +167,7 @@ static double max_violation(const parametrization *p, const workspace *m, const 
   combine_rates(p, c, 0, p->points, m->r, m->r1);
   run(p->violation, p, m, (double *const[]){m->violations});
   double worst = m->violations[0];
+  /* A nan is kept: it fails every comparison of the caller. */
   EACH(k, 1, p->phases) if (!(m->violations[k] <= worst) && worst == worst) worst = m->violations[k];
   return worst;
 }
@@ -180,6 +182,7 @@ static double sweep(const parametrization *p, double *c, const workspace *m) {
     for (long k = from; k < to; k += W) put(b + k, c[j] * at(basis + k)), put(b1 + k, c[j] * at(derivative + k));
     double x = advance(p, m, from, to);
     if (x > 0) x *= p->step_fractions[move];
+    /* r and r' are updated in place: only the phases where the control point acts. */
     add(r + from, x, b + from, to - from), add(r1 + from, x, b1 + from, to - from);
     c[j] += x * c[j];
     if (x > max_change) max_change = x;
@@ -205,6 +208,7 @@ static int parametrize_motion(const parametrization *p, double *c, const workspa
 void parametrize_rates(const parametrization *p, long count, const double *path, const double *obstacle_poses,
                        double *rate, double *violation, double *memory) {
   long phases = p->phases, numbers = 3 * p->joints;
+  /* Aligned to vectors. */
   memory += -((size_t)memory / sizeof(double)) % LANES;
   workspace m = {.column = memory, .r = memory + numbers * phases};
   m.r1 = m.r + phases, m.coefficients = m.r1 + (1 + p->pose_width) * phases;
@@ -218,6 +222,7 @@ void parametrize_rates(const parametrization *p, long count, const double *path,
     double worst = max_violation(p, &m, c);
     if (!(worst <= p->tolerance)) {
       double before = max_violation(p, &m, m.before);
+      /* The fit is taken only if it does not increase the violation. */
       if (!(worst <= before)) memcpy(c, m.before, p->points * sizeof(double)), worst = before;
     }
     violation[motion] = twice ? INFINITY : worst; /* which has larger excesses between the phases */

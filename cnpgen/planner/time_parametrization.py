@@ -149,10 +149,12 @@ class TimeParametrization(PhaseGrid):
         Inf for motions whose control points moved twice.
         """
         rate, column = motion.rate.copy(), self.column(motion, obstacle_poses)
+        # Coefficients depend on the path alone, so they stay valid while rates move.
         twice = self._fit(rate, self.coefficients(column))
         new_column = self.column(
             Motion(motion.path, rate, motion.degree), obstacle_poses
         )
+        # Both violations at the phases: the fit must not make a motion worse.
         before, after = (
             self.violation(states)[0].reshape(len(motion), -1).max(axis=1)
             for states in (column, new_column)
@@ -172,6 +174,8 @@ class TimeParametrization(PhaseGrid):
         ]
         table, movable = self.rate, slice(self.fixed, rate.shape[1] - self.fixed)
         increase = _sweep(rate, shaped, self.relaxed_bounds, table, self.fixed)
+        # A control point that became much larger gives its neighbors room: move all
+        # again.
         again = increase > self.min_increase
         some = rate[again]
         _sweep(
@@ -182,6 +186,7 @@ class TimeParametrization(PhaseGrid):
             self.fixed,
         )
         rate[again] = some
+        # Last, scale all movable points together: the direction is the rate itself.
         along = rate[:, movable] @ table[:, :, movable].swapaxes(1, 2)
         step = advance(shaped, self.relaxed_bounds, rate @ table.swapaxes(1, 2), along)
         rate[:, movable] *= (1 + step[:, None]) * (1 - self.margin)
@@ -190,6 +195,7 @@ class TimeParametrization(PhaseGrid):
     @cached_property
     def relaxed_bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds, relaxed by rounding errors."""
+        # Boundary conditions may be on a limit, up to rounding.
         return self.lower - BOUND_ROUNDING * np.abs(
             self.lower
         ), self.upper + BOUND_ROUNDING * np.abs(self.upper)
@@ -212,6 +218,8 @@ class TimeParametrization(PhaseGrid):
         (phases, path_points), points = self.path.shape[1:], self.rate.shape[2]
         counts = (
             self.joints,
+            # Widths of the column of ``speed_coefficients``: p, p', p'', r and r' come
+            # before poses.
             self.coefficients.tape.inputs[0] - 3 * self.joints - 2,
             path_points,
             points,
@@ -294,6 +302,7 @@ def make_time_parametrization(
 
 def _span_of(table: Array) -> NDArray[np.int64]:
     """Return first and last phase, in whole vectors, at which each control point has an effect, shape (points, 2)."""
+    # Basis functions are local: only these phases change if the point moves.
     nonzero = (table != 0).any(axis=0)
     first, last = nonzero.argmax(axis=0), len(nonzero) - nonzero[::-1].argmax(axis=0)
     return np.stack(
@@ -311,6 +320,7 @@ def _by_point(table: Array) -> Array:
 def moves_of(points: int, fixed: int) -> tuple[NDArray[np.int64], Array]:
     """Return the order in which control points of the rate move, and the fractions of their steps."""
     movable = np.arange(fixed, points - fixed)
+    # Neighbors overlap most, so they move in different halves of a sweep.
     first, second = movable[1::2], movable[::2]
     return np.concatenate([first, second]), np.repeat(
         STEP_FRACTIONS, [len(first), len(second)]
@@ -330,8 +340,11 @@ def _sweep(
     """
     largest = np.zeros(len(rate))
     for point, fraction in zip(*moves_of(rate.shape[1], fixed), strict=True):
+        # Direction of r if control point j is multiplied by 1 + x: x c_j B_j.
         along = rate[:, point, None] * table[:, None, :, point]
         x = advance(coefficients, bounds, rate @ table.swapaxes(1, 2), along)
+        # Steps up are taken in part, so that the points after it can move, too; steps
+        # back in full.
         x = np.where(x > 0, fraction * x, x)
         rate[:, point] *= 1 + x
         largest = np.fmax(largest, x)
@@ -347,18 +360,23 @@ def advance(
     (m, N, K) each, bounds (m,) each, r with r' and their directions (2, N, K).
     """
     (constant, square, mixed, *linear), (r, r1), (b, b1) = coefficients, rates, along
+    # On the ray r + x b each value is a quadratic g + first x + second x^2.
     value = constant + (square * r + mixed * r1) * r
     first = (2 * square * r + mixed * r1) * b + mixed * r * b1
     if linear:
         value, first = value + linear[0] * r, first + linear[0] * b
     second = (square * b + mixed * b1) * b
     low, high = (bound[:, None, None] for bound in bounds)
+    # Both bounds as g <= margin: the lower one with its sign changed.
     margin = np.stack([high - value, value - low])
     first, second = np.stack([first, -first]), np.stack([second, -second])
+    # Where neither term depends on x, a violation cannot be removed by a step.
     violated, depends = margin < 0, (first != 0) | (second != 0)
+    # A violated bound is met by a step back: solve with x -> -x.
     distance = smallest(np.abs(margin), first, np.where(violated, -second, second))
     forwards = np.where(violated, np.inf, distance).min(axis=(0, 1, 3))
     back = np.where(violated & np.isfinite(distance), distance, 0.0).max(axis=(0, 1, 3))
+    # A violation comes first: the largest required step back, else the largest step up.
     goes_back = (violated & depends).any(axis=(0, 1, 3))
     step: Array = np.where(
         goes_back,
@@ -373,6 +391,8 @@ def smallest(margin: Array, linear: Array, square: Array) -> Array:
 
     Infinite if there is none.
     """
+    # 2 margin / (l + sqrt(l^2 + 4 q margin)) instead of (-l + sqrt(...)) / (2 q): it
+    # needs no division by q and does not cancel.
     with np.errstate(all="ignore"):
         below = linear + np.sqrt(linear**2 + 4 * square * margin)
         x: Array = np.where(below > 0, 2 * margin / below, np.inf)

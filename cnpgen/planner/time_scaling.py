@@ -55,12 +55,11 @@ class PhaseGrid:
     rate: Array
 
     def column(self, motion: Motion, obstacle_poses: Array) -> Array:
-        """Return p, p', ..., r, r', .
-
-        And obstacle poses at all phases of N motions, shape (width, N K).
-        """
+        """Return path, rate, their derivatives and obstacle poses at all phases of N motions, shape (width, N K)."""
         (orders, phases, points), (count, _, n) = self.path.shape, motion.path.shape
         first, last = orders * n, orders * n + orders - 1
+        # All phases of one motion are next to each other, so one product evaluates
+        # them.
         out = np.empty((last + obstacle_poses.shape[1], count * phases))
         path = motion.path.transpose(2, 0, 1).reshape(n * count, points)
         np.matmul(
@@ -115,10 +114,13 @@ class TimeScaling(PhaseGrid):
         gravity alone. Obstacle poses have shape (N, width), the scales (N,).
         """
         factor, phases = np.ones(len(motion)), self.path.shape[1]
-        columns, motions = [], []  # of phases with a violation: few
+        # Of phases with a violation: few.
+        columns, motions = [], []
         for block in blocks_of_motions(len(motion)):
             column = self.column(motion[block], obstacle_poses[block])
             (violation,) = self.violation(column)
+            # Most phases meet their limits: only the others are measured at other
+            # speeds.
             violating = np.flatnonzero(violation[0] > 0)
             columns.append(column.take(violating, axis=1))
             motions.append(block.start + violating // phases)
@@ -156,6 +158,7 @@ class TimeScaling(PhaseGrid):
             for k in (1.0, 2.0, np.inf)
         )
         needed = np.ones(fast.shape[1])
+        # Upper bounds as they are, lower bounds with all signs changed.
         for sign, bounds in ((1.0, self.bounds.upper), (-1.0, self.bounds.lower)):
             row, phase = np.nonzero(sign * fast > sign * bounds[:, None])  # few
             at_rest = static[row, phase]
@@ -163,9 +166,8 @@ class TimeScaling(PhaseGrid):
                 sign * (x - at_rest)
                 for x in (bounds[row], fast[row, phase], slow[row, phase])
             )
-            quadratic = 2 * (
-                change - 2 * half
-            )  # c, from g(1) = static + b + c and g(2) = static + b / 2 + c / 4
+            # c, from g(1) = static + b + c and g(2) = static + b / 2 + c / 4
+            quadratic = 2 * (change - 2 * half)
             scale = _smallest_scale(margin, change - quadratic, quadratic)
             cubic = self.bounds.cubic[row]
             scale[cubic] = _smallest_scale_cubic(margin[cubic], change[cubic])
@@ -198,7 +200,8 @@ def _smallest_scale(margin: Array, linear: Array, quadratic: Array) -> Array:
     """
     with np.errstate(all="ignore"):
         root = np.sqrt(np.maximum(linear**2 + 4 * quadratic * margin, 0.0))
-        k = (linear + root) / (2 * margin)  # of margin k^2 - linear k - quadratic = 0
+        # Of margin k^2 - linear k - quadratic = 0.
+        k = (linear + root) / (2 * margin)
     violated = (linear + quadratic > margin) & (margin > 0) & np.isfinite(k)
     return np.where(violated, np.maximum(k, 1.0), 1.0)
 

@@ -22,6 +22,7 @@ from cnpgen.problems.constraints.joint import judged_torque
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import number, numbers
+from cnpgen.schema.html_table import html_table
 
 T = TypeVar("T")
 
@@ -58,6 +59,19 @@ class Evaluation:
     def __repr__(self) -> str:
         plans = f"{counted(len(self.verdicts), 'plan')} of {self.plans.problem.name!r}"
         return f"<{plans} judged, {int(self.valid.sum()):,} valid>"
+
+    def _repr_html_(self) -> str:
+        rows = (
+            (
+                index,
+                verdict.reason,
+                f"{verdict.metrics.duration:.4g}",
+                verdict.worst or "",
+            )
+            for index, verdict in enumerate(self.verdicts)
+        )
+        head = ("plan", "verdict", "T [s]", "smallest margin, or largest violation")
+        return html_table(repr(self), head, rows)
 
     @property
     def valid(self) -> NDArray[np.bool_]:

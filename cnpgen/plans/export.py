@@ -147,17 +147,33 @@ def export_plans(
         exporter.write(files[0], sampled, exported)
     else:
         files = [out / f"plan_{index:05d}{exporter.suffix}" for index in kept]
-        names = [path.name for path in files]
-        held_names = [HELD_JOINTS] if problem.held_joints else []
-        claim_files(out, [*names, *held_names], pattern=PLAN_FILES, force=force)
-        for path, plan in zip(files, sampled, strict=True):
-            exporter.write(path, [plan], exported)
-        held = _write_held_joints(out, problem.held_joints)
-        record_files(out, [*names, *held_names])
+        held = _write_each(exporter, files, sampled, exported, force=force)
     invalid = tuple(
         index for index in kept if plans.status[index] == PlanStatus.INVALID
     )
     return Exported(tuple(files), len(kept), refused, invalid, held)
+
+
+def _write_each(
+    exporter: Exporter,
+    files: list[Path],
+    sampled: Iterator[SampledPlan],
+    exported: ExportedSet,
+    *,
+    force: bool,
+) -> Path | None:
+    """Write one file per plan to a folder, and return the file of held joints, if any."""
+    out = files[0].parent
+    names = [path.name for path in files]
+    names += [HELD_JOINTS] if exported.held_joints else []
+    # Claimed before the first is written, recorded after the last: files of an
+    # interrupted export are then not taken for those of the user.
+    claim_files(out, names, pattern=PLAN_FILES, force=force)
+    for path, plan in zip(files, sampled, strict=True):
+        exporter.write(path, [plan], exported)
+    held = _write_held_joints(out, exported.held_joints)
+    record_files(out, names)
+    return held
 
 
 def _environment(

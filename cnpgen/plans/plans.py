@@ -21,6 +21,7 @@ from cnpgen.problems.problem_record import ProblemRecord, as_record, open_proble
 from cnpgen.robots.scene import Scene
 from cnpgen.schema.argument_types import check_fields, checked_arguments
 from cnpgen.schema.arguments import check_memory, integer, numbers, reject_masked
+from cnpgen.schema.html_table import html_table
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.scene_table import OBSTACLE_POSES
 from cnpgen.trajectory.boundary import Boundary
@@ -93,6 +94,16 @@ class Plans:
         known = Counter(names.get(status, "unknown") for status in self.status.tolist())
         counts = ", ".join(f"{count:,} {name}" for name, count in known.most_common())
         return f"<{counted(len(self), 'plan')} of {self.problem.name!r}{counts and ': '}{counts}>"
+
+    def _repr_html_(self) -> str:
+        names = {status: status.name.lower() for status in PlanStatus}
+        rows = (
+            (index, sample, names.get(status, "unknown"), f"{duration:.4g}")
+            for index, (sample, status, duration) in enumerate(
+                zip(self.sample_id, self.status.tolist(), self.duration, strict=True)
+            )
+        )
+        return html_table(repr(self), ("plan", "sample", "status", "T [s]"), rows)
 
     @property
     def motion(self) -> Motion:
@@ -358,19 +369,41 @@ def _errors(plans: Plans, rows: int | None = None) -> Iterator[tuple[str, str]]:
 
     The default number of plans is that of the paths.
     """
-    path, rate, degree = (
-        plans.path_control_points,
-        plans.rate_control_points,
-        plans.degree,
-    )
+    path = plans.path_control_points
     if path.ndim != 3:
         yield (
             "path_control_points",
             f"path_control_points must have shape (N, C, n), got {path.shape}",
         )
         return
+    rows, n = len(path) if rows is None else rows, path.shape[2]
+    yield from _spline_errors(plans, rows)
+    for name, values in plans.boundary.conditions().items():
+        if values.shape != (rows, n):
+            yield (
+                "boundary",
+                f"{name} must have shape {(rows, n)} (plans, joints), got {values.shape}",
+            )
+    yield from _parameter_errors(plans, rows)
+    for name in ("sample_id", "status"):
+        if getattr(plans, name).shape != (rows,):
+            yield (
+                name,
+                f"{name} must have shape {(rows,)}, got {getattr(plans, name).shape}",
+            )
+    yield from _column_errors(plans, rows)
+    for name in NOTES:
+        if not isinstance(getattr(plans, name), str):
+            yield name, f"{name} must be a text, got {getattr(plans, name)!r:.60}"
+
+
+def _spline_errors(plans: Plans, rows: int) -> Iterator[tuple[str, str]]:
+    path, rate, degree = (
+        plans.path_control_points,
+        plans.rate_control_points,
+        plans.degree,
+    )
     _, points, n = path.shape
-    rows = len(path) if rows is None else rows
     if len(path) != rows:
         yield (
             "path_control_points",
@@ -399,23 +432,6 @@ def _errors(plans: Plans, rows: int | None = None) -> Iterator[tuple[str, str]]:
             "rate_control_points",
             f"rate_control_points must have shape ({rows}, R) with R > {degree}, the degree, got {rate.shape}",
         )
-    for name, values in plans.boundary.conditions().items():
-        if values.shape != (rows, n):
-            yield (
-                "boundary",
-                f"{name} must have shape {(rows, n)} (plans, joints), got {values.shape}",
-            )
-    yield from _parameter_errors(plans, rows)
-    for name in ("sample_id", "status"):
-        if getattr(plans, name).shape != (rows,):
-            yield (
-                name,
-                f"{name} must have shape {(rows,)}, got {getattr(plans, name).shape}",
-            )
-    yield from _column_errors(plans, rows)
-    for name in NOTES:
-        if not isinstance(getattr(plans, name), str):
-            yield name, f"{name} must be a text, got {getattr(plans, name)!r:.60}"
 
 
 def _parameter_errors(plans: Plans, rows: int) -> Iterator[tuple[str, str]]:

@@ -132,9 +132,8 @@ def problem_errors(raw: ProblemTables) -> Iterator[str]:
         else {"robot-clearance"}
     )
     for index, obstacle in tables(table, "obstacle"):
-        if (
-            index == 0 and uses <= BUILT_IN[CONSTRAINTS].keys() - using
-        ):  # plug-ins may use them
+        if index == 0 and uses <= BUILT_IN[CONSTRAINTS].keys() - using:
+            # Plug-ins may use them.
             text = 'no constraint uses it: add a [[constraint]] with use = "robot-clearance" and a tolerance'
             yield (where / "obstacle" / index).message(text)
         if obstacle.get("below") and "object" not in table:
@@ -179,7 +178,8 @@ def _robot_errors(raw: ProblemTables) -> Iterator[str]:
             f"not a file: {path}" if there else f"no such file: {path}{hint}"
         )
         return
-    if raw.urdf is None:  # loading the robot raises the error
+    if raw.urdf is None:
+        # Loading the robot raises the error.
         return
     if text := unread_xacro(raw.urdf, path):
         yield (where / "urdf").message(text)
@@ -259,10 +259,11 @@ def _paper_errors(raw: ProblemTables) -> Iterator[str]:
 def limit_errors(problem: Problem, raw: ProblemTables) -> Iterator[str]:
     """Check that no limit exceeds that of the URDF so far that it must be in another unit or in percent."""
     spec, limits = problem.robot, problem.limits
+    # Effort is often a placeholder.
     per_joint = {
         "velocity": limits.velocity,
         "acceleration": limits.acceleration,
-    }  # effort is often a placeholder
+    }
     given: dict[str, list[tuple[float, ...]]] = {}
     given |= {
         key: [(value,) for value in limit.values]
@@ -274,17 +275,18 @@ def limit_errors(problem: Problem, raw: ProblemTables) -> Iterator[str]:
         if limits.position
         else {}
     )
-    if raw.urdf is None:  # loading the robot raises the error
+    if raw.urdf is None:
+        # Loading the robot raises the error.
         return
-    joints = {
-        joint.get("name"): joint for joint in raw.urdf.findall("joint")
-    }  # others are of transmissions
+    # Others are of transmissions.
+    joints = {joint.get("name"): joint for joint in raw.urdf.findall("joint")}
     try:
         plausible = {
             key: [_plausible_limit(joints[name], key) for name in spec.joints]
             for key in given
         }
-    except (ValueError, KeyError):  # loading the robot raises the error
+    except (ValueError, KeyError):
+        # Loading the robot raises the error.
         return
     for key, rows in given.items():
         per_row = rows * (len(spec.joints) if len(rows) == 1 else 1)
@@ -362,7 +364,8 @@ def _locked_outside(
         )
         if limit is None or not movable or name in planned:
             continue
-        with suppress(ValueError):  # Pinocchio rejects invalid numbers
+        # Pinocchio rejects invalid numbers
+        with suppress(ValueError):
             low, high = (float(limit.get(key, "0")) for key in ("lower", "upper"))
             if not low <= 0 <= high and low <= high:
                 yield name, low, high

@@ -17,10 +17,12 @@ from cnpgen.robots.scene import PARKED_POSITION_M, Scene
 from cnpgen.robots.shape.hull import Array
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.robots.table_frame import TableFrame, table_frame
+from cnpgen.schema.arguments import integer
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
+MAX_CAPACITY = 10_000  # obstacles of one kind
 Capacity = Mapping[str, int]  # kind, or corners of a mesh -> number of obstacles
 # Any rotation: boxes of scenes have rotation matrices.
 _PARKED_ROTATION = 0.1, 0.1, 0.1
@@ -110,7 +112,19 @@ def goal_velocities(
 
 
 def with_capacity(problem: Problem, capacity: Capacity) -> Problem:
-    """Return a problem with further obstacles, which stand far below the robot until a plan places them."""
+    """Return a problem with further obstacles, which stand far below the robot until a plan places them.
+
+    Raises:
+        UsageError: The problem cannot have further obstacles, or a capacity is no
+            number of obstacles up to ``MAX_CAPACITY``.
+    """
+    for shape, count in capacity.items():
+        if not isinstance(shape, str):
+            raise UsageError(
+                f"must be a mapping of kinds to numbers, got the kind {shape!r:.60}",
+                argument="capacity",
+            )
+        integer("capacity", count, least=0, most=MAX_CAPACITY)
     error = ""
     if problem.first(RobotClearance) is None:
         error = "has no constraint robot-clearance: obstacles would be ignored"

@@ -242,8 +242,10 @@ class Problem:
                     "parameters",
                     f"{name} must include {value:g}, the value of samples without parameters",
                 )
-        if not self.parameters.tilts_table and not self.parameters.changes_rectangle:
-            return
+        if self.parameters.tilts_table or self.parameters.changes_rectangle:
+            yield from self._table_errors()
+
+    def _table_errors(self) -> Iterator[tuple[str, str]]:
         tables = [
             constraint
             for constraint in self.constraint

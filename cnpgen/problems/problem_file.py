@@ -1,7 +1,8 @@
 """Problem files, loaded by name or path, and problems restored from records."""
 
+import os
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -44,10 +45,11 @@ def load_problem(
     return load_recipe(("problem",), name_or_path, relative_to, read_problem)
 
 
+# Of the tables with a key ``use``.
 KIND_READERS: dict[type, Reader] = {
     Constraint: partial(read_kind, registry.CONSTRAINTS),
     ObjectiveTerm: partial(read_kind, registry.OBJECTIVES),
-}  # of the tables with a key ``use``
+}
 
 
 def load_problem_behind(name_or_path: str | Path) -> Problem:
@@ -154,6 +156,18 @@ def without_defaults(value: Any) -> Any:
     )
 
 
+@contextmanager
+def names_of_stored_files(folder: Path) -> Iterator[None]:
+    """Name the files of a stored problem in errors without the temporary folder in which they are."""
+    try:
+        yield
+    except RecipeError as error:
+        errors = tuple(line.replace(f"{folder}{os.sep}", "") for line in error.errors)
+        if errors == error.errors:
+            raise
+        raise RecipeError(errors) from error
+
+
 def restore_problem(content: dict[str, Any], urdf: str, folder: Path) -> Problem:
     """Rebuild a problem from its resolved form and the text of its URDF, for whose file there is a folder."""
     if missing := missing_kinds_of_problem(content):
@@ -198,7 +212,8 @@ def _meshes_on_disk(
 ) -> Iterator[str]:
     """Yield error messages for meshes that are not inline."""
     text = "names the mesh {}, expected its corners in the text"
-    with suppress(ValueError):  # loading the robot raises the error
+    # Loading the robot raises the error.
+    with suppress(ValueError):
         for name in mesh_files(urdf)[:1] if problem.uses_link_geometry else ():
             yield (where / "robot" / "urdf").message(text.format(show(name)))
     for index, each in enumerate(problem.obstacle):

@@ -16,7 +16,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.problems.objectives import read_objective
 from cnpgen.problems.problem import FILES, Objective, Problem, resolved
-from cnpgen.problems.problem_file import load_problem_behind, restore_problem
+from cnpgen.problems.problem_file import (
+    load_problem_behind,
+    names_of_stored_files,
+    restore_problem,
+)
 from cnpgen.robots.parameter_ranges import NO_PARAMETERS, ParameterRanges
 from cnpgen.robots.shape.hull import Array
 from cnpgen.robots.urdf import urdf_tree
@@ -68,6 +72,11 @@ _JUDGED_BY = "tolerance", "budget", "weight"
 @dataclass(frozen=True, repr=False)
 class ProblemRecord(StoredProblem):
     """Problem as text, with the properties derived from it."""
+
+    def __post_init__(self) -> None:
+        for name in ("recipe", "urdf"):
+            if not isinstance(text := getattr(self, name), str):
+                raise UsageError(f"must be a text, got {text!r:.60}", argument=name)
 
     def __repr__(self) -> str:
         return f"<ProblemRecord of {self.name!r}: {len(self.joint_names)} joints>"
@@ -175,7 +184,10 @@ class ProblemRecord(StoredProblem):
             RecipeError: The problem needs another version of cnpgen, or a plug-in that
                 is not installed.
         """
-        with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
+        with (
+            tempfile.TemporaryDirectory(prefix="cnpgen-") as folder,
+            names_of_stored_files(Path(folder)),
+        ):
             problem = restore_problem(self.content, self.urdf, Path(folder))
             # The stored text contains meshes and pairs already.
             yield replace(problem, read_urdf_text=self.urdf)
@@ -281,24 +293,35 @@ def as_record(problem: object) -> ProblemRecord:
 @lru_cache(maxsize=8)
 def _rebuilt(record: ProblemRecord) -> Problem:
     """Rebuild a problem in a folder that exists until this process ends, since its URDF is read lazily."""
-    return restore_problem(record.content, record.urdf, temporary_folder())
+    folder = temporary_folder()
+    with names_of_stored_files(folder):
+        return restore_problem(record.content, record.urdf, folder)
 
 
-@lru_cache(maxsize=8)
 def open_problem(record: ProblemRecord) -> tuple[Problem, Robot]:
     """Rebuild a problem and its robot, which both contain the URDF; the files are deleted afterwards.
 
     Raises:
+        UsageError: The argument is not a record.
         RecipeError: The problem needs another version of cnpgen, or a plug-in that is
             not installed.
     """
+    if not isinstance(record, ProblemRecord):
+        raise UsageError(
+            f"must be a ProblemRecord, got {record!r:.60}", argument="record"
+        )
+    return _opened(record)
+
+
+@lru_cache(maxsize=8)
+def _opened(record: ProblemRecord) -> tuple[Problem, Robot]:
+    """Rebuild a problem and its robot; see ``open_problem``."""
     from cnpgen.problems.load_robot import load_robot
 
     with record.restored() as problem:
         if problem.obstacle:
-            with suppress(
-                RecipeError
-            ):  # errors are reported below, with the whole problem
+            # Errors are reported below, with the whole problem.
+            with suppress(RecipeError):
                 content = {**record.content, "obstacle": []}
                 return problem, _robot_of(
                     ProblemRecord(json.dumps(content), record.urdf)

@@ -61,7 +61,8 @@ def warn_of_friction(tree: Element, planned: Sequence[str], path: Path) -> None:
     """Warn that the friction of planned joints is ignored, since a problem file does not state what to do with it."""
     try:
         every = urdf_parameters(tree).joints.values()
-    except RecipeError:  # loading the robot raises it
+    except RecipeError:
+        # Loading the robot raises it.
         return
     if frictions := friction_in([each for each in every if each.name in planned]):
         listing = ", ".join(map(str, frictions))

@@ -149,8 +149,8 @@ def _states_along(states: Array, s: Array) -> Array:
 
 def _integral(values: Array) -> Array:
     """Return the integral of values on an even grid by trapezoids, scaled to end at 1."""
-    sums = np.append(0.0, np.cumsum((values[1:] + values[:-1]) / 2))
-    return sums / sums[-1]
+    sums: Array = np.append(0.0, np.cumsum((values[1:] + values[:-1]) / 2))
+    return sums / float(sums[-1])
 
 
 def along_tip_path(

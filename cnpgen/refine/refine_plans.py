@@ -125,7 +125,9 @@ def refine_plans(
     file = (
         None
         if journal is None
-        else open_journal(Path(journal), _identity(plans, options), discard=discard)
+        else open_journal(
+            Path(journal), identity_of_run(plans, options), discard=discard
+        )
     )
     finished: dict[int, Attempt] = {} if file is None else dict(file.finished)
     if begin is not None:
@@ -225,7 +227,7 @@ def _refinement(
     return Refinement(plans, replace(refined, status=status), tuple(results))
 
 
-def _identity(plans: Plans, options: RefineOptions) -> str:
+def identity_of_run(plans: Plans, options: RefineOptions) -> str:
     """Return the JSON text that identifies a run: version, options and a checksum of the plans."""
     digest = hashlib.sha256(plans.problem.recipe.encode() + plans.problem.urdf.encode())
     boundary = [

@@ -135,7 +135,7 @@ def _pack(indices: Sequence[int], results: Sequence[Attempt]) -> bytes:
 
 def _unpack(record: bytes) -> dict[int, Attempt]:
     # Compressed arrays are refused: a few bytes could expand to gigabytes.
-    arrays = read_arrays(record, max_bytes=len(record), stored=True)
+    arrays = read_arrays(record, max_bytes=8 * len(record), stored=True)
     numbers, reasons = parse_json(arrays["words"].tobytes().decode())
     path, rate, cost = (arrays[name] for name in ("path", "rate", "cost"))
     return {

@@ -72,6 +72,7 @@ class Chain:
         """
         if any(joint.prismatic for joint in self.joints):
             return np.inf
+        # Links can be stretched at most to the sum of their lengths.
         lengths = [
             float(np.linalg.norm(joint.translation)) for joint in self.joints[1:]
         ]
@@ -145,6 +146,7 @@ def _kind(name: str) -> str:
 
 def _joint(model: "pin.Model", data: "pin.Data", index: int) -> Joint:
     placement, inertia = model.jointPlacements[index], model.inertias[index]
+    # The angular part of the motion subspace is zero for a joint that slides.
     subspace = np.asarray(data.joints[index].S, float).ravel()  # (linear, angular)
     prismatic = bool(np.abs(subspace[3:]).max() < 0.5)
     return Joint(

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import UsageError
+from cnpgen.errors import UsageError, counted
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, Array
 from cnpgen.robots.solid import (
@@ -24,6 +24,7 @@ from cnpgen.robots.solid import (
     solids_of,
 )
 from cnpgen.schema.arguments import integer
+from cnpgen.schema.html_table import html_table
 from cnpgen.store.scene_table import NO_OBSTACLE, OBSTACLE_KINDS, SceneTable
 
 # Of obstacles that a sample with fewer obstacles does not have.
@@ -36,7 +37,7 @@ class SampleIndexError(UsageError, IndexError):
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The obstacles of N samples, created where samples enter and passed along.
+    """The obstacles of N samples.
 
     Attributes:
         obstacles: The obstacles, the same for all samples.
@@ -55,9 +56,8 @@ class Scene:
                 f"must be a tuple of obstacles, got {obstacles!r:.60}",
                 argument="obstacles",
             )
-        if poses is None or isinstance(
-            poses, int | float | str
-        ):  # JAX puts other objects in the place of arrays
+        if poses is None or isinstance(poses, int | float | str):
+            # JAX puts other objects in the place of arrays
             raise UsageError(
                 f"must be an array of shape (N, width), got {poses!r:.60}",
                 argument="poses",
@@ -70,10 +70,12 @@ class Scene:
         """Select samples; an integer selects one sample and keeps the first axis."""
         rows: Any = index
         if isinstance(index, int):
-            self._check_sample(index, "index")  # ends a loop over the samples, too
+            # Ends a loop over the samples, too.
+            self._check_sample(index, "index")
             rows = slice(index, index + 1 or None)
         elif isinstance(index, tuple):
-            rows = list(index)  # NumPy reads a tuple as one index of each axis
+            # NumPy reads a tuple as one index of each axis
+            rows = list(index)
         try:
             return Scene(self.obstacles, self.poses[rows])
         except IndexError as error:
@@ -81,6 +83,17 @@ class Scene:
                 f"samples are selected by numbers, a mask or a slice: {error}",
                 concerns="index",
             ) from error
+
+    def _repr_html_(self) -> str:
+        """Show the obstacles of the first sample."""
+        caption = f"{counted(len(self), 'sample')} with {counted(len(self.obstacles), 'obstacle')}"
+        bodies = zip(self.obstacles, self.bodies(), strict=True) if len(self) else ()
+        rows = (
+            (item.name, item.kind, *np.round((body.position, body.low, body.high), 4))
+            for item, body in bodies
+        )
+        head = "obstacle", "kind", "center [m]", "lower corner [m]", "upper corner [m]"
+        return html_table(caption, head, rows)
 
     def with_poses(self, poses: Array) -> Scene:
         """Return the scene with other poses and sizes of the obstacles; values for a constraint are kept.
@@ -99,7 +112,8 @@ class Scene:
                 f"must have shape {expected} for {len(self.obstacles)} obstacles, got {poses.shape}",
                 argument="obstacle_poses",
             )
-        if not (np.abs(poses) <= MAX_COORDINATE_M).all():  # also false for nan
+        if not (np.abs(poses) <= MAX_COORDINATE_M).all():
+            # Also false for nan.
             sample, entry = np.argwhere(~(np.abs(poses) <= MAX_COORDINATE_M))[
                 0
             ].tolist()

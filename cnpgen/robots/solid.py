@@ -63,6 +63,7 @@ class Box(Solid):
 
     def furthest(self, direction: Array) -> float:
         """Return its extent along a unit vector; see ``Solid``."""
+        # Support of a box: the corner in the direction, coordinate by coordinate.
         return float(np.where(direction > 0, self.high, self.low) @ direction)
 
 
@@ -126,6 +127,8 @@ def place_obstacles(
         still = _posed_numbers(obstacle)
         numbers[..., part] = still
         if obstacle.below:
+            # The obstacle is below the held object: lower it until its top meets the
+            # object's bottom.
             numbers[..., part.start + 2] += bottoms[obstacle.below] - (
                 _solid(obstacle, still).high[2] - still[2]
             )
@@ -139,9 +142,8 @@ def _posed_numbers(obstacle: Obstacle) -> Array:
         np.array([values])
         for values in (obstacle.position or _NOTHING, size, turned(*obstacle.rotation))
     )
-    return posed_numbers(obstacle.kind, *poses)[
-        0, : _count(obstacle)
-    ]  # without the rotation of a box that has none
+    # Without the rotation of a box that has none.
+    return posed_numbers(obstacle.kind, *poses)[0, : _count(obstacle)]
 
 
 def posed_numbers(kind: str, position: Array, size: Array, rotation: Array) -> Array:
@@ -157,6 +159,7 @@ def posed_numbers(kind: str, position: Array, size: Array, rotation: Array) -> A
         return np.concatenate([position, turn], axis=1)
     if kind == "sphere":
         return np.concatenate([position, radius], axis=1)
+    # Circumscribed prism: its corners are farther out than the cylinder.
     outer = radius / math.cos(math.pi / PRISM_SIDES) if kind == "cylinder" else radius
     return np.concatenate(
         [position, size[:, 1:2] / 2 * rotation[..., 2], outer], axis=1

@@ -16,9 +16,8 @@ MAX_URDF_BYTES = 1 << 23
 MAX_URDF_ELEMENTS = 1_000
 MAX_DEPTH = 64  # of nested elements
 _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
-_CONTROL = re.compile(
-    "[\t\n\r\x7f-\x9f]"
-)  # others are invalid in XML; parsers replace line ends in attributes by spaces
+# Others are invalid in XML; parsers replace line ends in attributes by spaces.
+_CONTROL = re.compile("[\t\n\r\x7f-\x9f]")
 
 
 class _Builder(ElementTree.TreeBuilder):
@@ -33,9 +32,8 @@ class _Builder(ElementTree.TreeBuilder):
         if self._depth > MAX_DEPTH:
             raise ValueError(f"it has more than {MAX_DEPTH} nested elements")
         for name, value in attrs.items():
-            if _CONTROL.search(
-                value
-            ):  # names appear in output and in comments of recipes
+            if _CONTROL.search(value):
+                # Names appear in output and in comments of recipes.
                 raise ValueError(f"its <{tag} {name}=...> has control characters")
         return super().start(tag, attrs)
 

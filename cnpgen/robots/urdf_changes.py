@@ -124,7 +124,8 @@ def with_point_masses(urdf: str) -> str:
     """
     try:
         robot = urdf_tree(urdf)
-    except ValueError:  # the reader of the robot raises the error
+    except ValueError:
+        # The reader of the robot raises the error.
         return urdf
     inertials = [
         inertial

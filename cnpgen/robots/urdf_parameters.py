@@ -301,9 +301,8 @@ class _Comparison:
         self.joints = {
             name: index for index, name in enumerate(model.names) if index != WORLD
         }
-        self.bodies: dict[
-            str, tuple[int, LinkFrame]
-        ] = {}  # link -> joint that moves it, and its placement in that
+        # Link -> joint that moves it, and its placement in that.
+        self.bodies: dict[str, tuple[int, LinkFrame]] = {}
         for link in parameters.inertias:
             self.bodies[link] = self._body(link)
 
@@ -338,13 +337,11 @@ class _Comparison:
             actual, placement.of(joint.origin)
         ):
             yield _difference(f"joint {joint.name!r}", "its <origin> or parent")
-        if (
-            not joint.limits
-        ):  # of a joint that neither turns nor slides, or without a <limit>
+        if not joint.limits:
+            # Of a joint that neither turns nor slides, or without a <limit>.
             return
-        subspace = np.asarray(
-            model.createData().joints[index].S, float
-        ).ravel()  # (linear, angular)
+        # (linear, angular)
+        subspace = np.asarray(model.createData().joints[index].S, float).ravel()
         axis = subspace[:3] if joint.kind == "prismatic" else subspace[3:]
         if not _same(axis, joint.axis):
             yield _difference(f"joint {joint.name!r}", "its <axis>", axis, joint.axis)
@@ -419,7 +416,8 @@ def _dynamic_parameters(inertia: LinkInertia, link: LinkFrame) -> Array:
 
 def _parameters_about_origin(mass: float, com: Array, inertia: Array) -> Array:
     """Return mass, mass times center and inertia about the origin, which add up, shape (10,)."""
-    with np.errstate(all="ignore"):  # overflow is a difference
+    # Overflow is a difference.
+    with np.errstate(all="ignore"):
         about_origin = inertia + mass * (com @ com * np.eye(3) - np.outer(com, com))
         return np.array([mass, *(mass * com), *about_origin[np.triu_indices(3)]])
 

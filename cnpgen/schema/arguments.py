@@ -3,14 +3,14 @@
 import functools
 import math
 import operator
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.errors import RecipeError, UsageError
+from cnpgen.errors import RecipeError, UsageError, nearest
 from cnpgen.schema.units import suggested_unit
 
 Array = NDArray[Any]
@@ -193,6 +193,15 @@ def flag(name: str, value: Any) -> bool:
     if not isinstance(value, bool | np.bool_):
         raise UnexpectedValueError("True or False", f"{value!r:.100}", argument=name)
     return bool(value)
+
+
+def check_choice(argument: str, value: object, known: Collection[str]) -> None:
+    """Refuse a value that is none of the known ones, with the nearest of them."""
+    if value not in known:
+        raise UsageError(
+            f"must be one of {', '.join(known)}, got {value!r}{nearest(str(value), known)}",
+            argument=argument,
+        )
 
 
 def check_memory(argument: str, value: int, n_floats: int) -> None:

@@ -11,7 +11,13 @@ CALLER = 4  # frames from the warning to the caller of a function with checked a
 
 
 def with_old_keywords(
-    function: str, options: Options | None, default: Options, old: Mapping[str, Any]
+    function: str,
+    options: Options | None,
+    default: Options,
+    old: Mapping[str, Any],
+    *,
+    keyword: str = "options",
+    caller: int = CALLER,
 ) -> Options:
     """Return the options of a call, with the values of old keywords.
 
@@ -20,6 +26,8 @@ def with_old_keywords(
         options: Its options, or None for the default.
         default: Default options.
         old: Keywords that the function had before it had options, and their values.
+        keyword: Keyword of the options.
+        caller: Frames from the warning to the caller, more with further decorators.
 
     Raises:
         TypeError: There is no such keyword, as Python reports it.
@@ -33,10 +41,10 @@ def with_old_keywords(
             raise TypeError(f"{function}() got an unexpected keyword argument {name!r}")
     given = ", ".join(f"{name}=..." for name in old)
     warnings.warn(
-        f"{function}({given}): write options={type(chosen).__name__}({given});"
+        f"{function}({given}): write {keyword}={type(chosen).__name__}({given});"
         " the next version does not accept these keywords",
         DeprecationWarning,
-        stacklevel=CALLER,
+        stacklevel=caller,
     )
     changed: Options = dataclasses.replace(chosen, **old)
     return changed

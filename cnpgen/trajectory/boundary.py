@@ -202,6 +202,7 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
         entry.name: values
         for entry, values in zip(fields(Boundary), conditions, strict=False)
     }
+    # Missing derivatives are zero, a missing goal acceleration is free.
     arrays = {
         name: _rows(name, values, n)
         for name, values in arguments.items()
@@ -212,6 +213,7 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
         arrays["parameters"] = _rows(
             "parameters", values, values.shape[-1] if values.ndim else 0
         )
+    # Conditions of one row are repeated for all motions.
     rows = max(len(values) for values in arrays.values())
     for name, values in arrays.items():
         if len(values) not in {1, rows}:
@@ -238,6 +240,7 @@ def _rows(name: str, values: ArrayLike, n: int) -> Array:
             f"must have shape ({n},) or (N, {n}), got {array.shape}", argument=name
         )
     rows = array.reshape(-1, n)
+    # The sum is finite if all values are, and takes less time than a mask of them.
     if not math.isfinite(rows.sum()) and not np.isfinite(rows).all():
         row = int(np.argmin(np.isfinite(rows).all(axis=1)))
         raise UsageError(f"must be finite, got {rows[row]} in row {row}", argument=name)
@@ -285,6 +288,7 @@ def goal_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
 
 def _check_joints(boundary: Boundary) -> None:
     """Raise an error if the conditions have different numbers of joints."""
+    # Shapes would broadcast otherwise, and one joint would stand for all.
     joints = {
         name: np.shape(values)[-1:] for name, values in boundary.conditions().items()
     }
@@ -299,9 +303,8 @@ def _check_joints(boundary: Boundary) -> None:
 
 def _end_derivatives(spec: TrajectorySpec) -> tuple[EndDerivatives, EndDerivatives]:
     """Return eta and beta of p and of r."""
-    if (
-        spec.path_control_points < spec.degree + 2
-    ):  # with a single span, the second derivative has another factor
+    if spec.path_control_points < spec.degree + 2:
+        # With a single span, the second derivative has another factor.
         raise UsageError(
             f"boundary accelerations need at least {spec.degree + 2} path control points of degree {spec.degree},"
             f" got {spec.path_control_points}"
@@ -316,14 +319,13 @@ def _three(
     """Compute the control points at s = 0 from q, dq, ddq and the first two rate control points, shape (N, 1) each."""
     path, speed = _end_derivatives(spec)
     first, dr = dq / outer, speed.eta * (inner - outer)  # p'(0), r'(0)
-    second = (
-        ddq - first * dr * outer
-    ) / outer**2  # p''(0), from ddq = p'' r^2 + p' r' r
+    # p''(0), from ddq = p'' r^2 + p' r' r
+    second = (ddq - first * dr * outer) / outer**2
     c1 = q + first / path.eta
+    # From p'(0) = eta (c1 - c0) and p''(0) = beta (c2 - 3 c1 + 2 c0).
     c2 = second / path.beta - 2 * q + 3 * c1
-    points = np.empty(
-        (len(q), 3, q.shape[1]), c2.dtype
-    )  # np.stack takes as long as the computation
+    # np.stack takes as long as the computation
+    points = np.empty((len(q), 3, q.shape[1]), c2.dtype)
     points[:, 0], points[:, 1], points[:, 2] = q, c1, c2
     return points
 
@@ -374,6 +376,8 @@ def boundary_derivatives(
     c1, c2, c2_inner = _three_derivatives(
         b.start_dq, b.start_ddq, rate[:, :1], rate[:, 1:2], spec
     )
+    # The outermost point is q itself; the next depends on r0, and the third on r0 and
+    # r1.
     derivatives = [
         BoundaryDerivative(1, 0, c1),
         BoundaryDerivative(2, 0, c2),
@@ -409,6 +413,7 @@ def _three_derivatives(
     """Return dc1/dr0, dc2/dr0 and dc2/dr1 at an end of ``_three``, with ``r' = eta_r (r1 - r0)``."""
     path, speed = _end_derivatives(spec)
     c1 = _first_derivative(dq, outer, spec)
+    # Derivative of p''(0) = (ddq - dq eta_r (r1 - r0)) / r0^2 with respect to r0.
     second = (
         -2 * (ddq - dq * speed.eta * (inner - outer)) / outer + dq * speed.eta
     ) / outer**2

@@ -78,10 +78,13 @@ def fit_motion(
     )
     rates = [fit.mixed_rate(mixture) for mixture in ARC_LENGTH_FRACTIONS]
     errors = [fit.error(rate) for rate in rates]
+    # Of rates that fit equally well, the first: phase proportional to time.
     rate = rates[int(np.argmin(np.maximum(errors, MIN_FIT_ERROR_RAD)))]
+    # More samples than control points, or the fit has no unique minimum.
     if min(errors) > MIN_FIT_ERROR_RAD and len(fit.t) > spec.path_control_points:
         step = -(-len(fit.t) // MAX_RATE_FIT_SAMPLES)
         thinned = replace(fit, t=fit.t[::step], q=fit.q[::step])
+        # The optimum of fewer samples may be worse on all of them.
         rate = min(rate, thinned.improved_rate(rate), key=fit.error)
     return Motion(fit.path(rate).control[None], rate, spec.degree)
 
@@ -161,6 +164,8 @@ class _Fit:
             0.0, np.cumsum(np.linalg.norm(np.diff(self.q, axis=0), axis=1))
         )
         s = time + mixture * (length / length[-1] - time) if length[-1] > 0 else time
+        # Mean rate around each Greville abscissa: (change of phase) / (time that
+        # passes).
         points, degree = self.spec.rate_control_points, self.spec.degree
         greville = sliding_window_view(
             clamped_knots(points, degree)[1:-1], degree
@@ -174,6 +179,7 @@ class _Fit:
         """Minimize the squared errors over log r, starting from a rate of shape (1, R)."""
         from scipy.optimize import least_squares
 
+        # log r keeps rates positive without constraints.
         first = np.log(rate[0])
         bounds = first - MAX_LOG_RATE_CHANGE, first + MAX_LOG_RATE_CHANGE
         solution = least_squares(
@@ -188,11 +194,13 @@ class _Fit:
     def path(self, rate: Array) -> _Path:
         """Fit the path for a rate of shape (1, R)."""
         points, degree = self.spec.path_control_points, self.spec.degree
+        # Phases of the samples follow from r: t(s) is its integral of 1 / r.
         s = self._motion(rate).phase_at(self.t[None])[0]
         smoothing = (
             PATH_SMOOTHNESS * np.sqrt(len(s)) * _third_derivative(points, degree)
         )
         rows = np.concatenate([basis(s, points, degree), smoothing])
+        # Smoothing rows have the target 0: they decide where samples do not.
         target = np.concatenate([self.q, np.zeros((len(smoothing), self.q.shape[1]))])
         control = self._fixed(rate)[0]
         control[self.free] = np.linalg.lstsq(
@@ -232,12 +240,13 @@ class _Fit:
         """Differentiate the residuals without the derivative of the projection (Kaufman 1975)."""
         step = 1e-6
         rate = self._timed(np.exp(log_rate)[None])
+        # One forward difference of log r per control point, all motions in one batch.
         others = self._timed(rate * np.exp(step * np.eye(len(log_rate))))
         path = self.path(rate)
         speed = self._motion(rate).at(path.s).rate[0]
-        shift = (
-            (self.t - self._motion(others).time_at(path.s)) * speed / step
-        )  # of s at equal times, shape (R, K)
+        # A changed r moves the phase of each sample: ds = -r dt at equal times.
+        # Of s at equal times, shape (R, K).
+        shift = (self.t - self._motion(others).time_at(path.s)) * speed / step
         dp = (
             basis(path.s, self.spec.path_control_points, self.spec.degree, 1)
             @ path.control
@@ -246,6 +255,8 @@ class _Fit:
             "kc,rcn->knr", path.rows, (self._fixed(others) - self._fixed(rate)) / step
         )
         changes[: len(self.t)] += dp[:, :, None] * shift.T[:, None]
+        # Variable projection: without the part that a new path would remove (Kaufman
+        # 1975).
         onto, _ = np.linalg.qr(path.rows[:, self.free])
         changes -= np.tensordot(onto, np.tensordot(onto, changes, (0, 0)), 1)
         return np.concatenate(

@@ -16,9 +16,8 @@ Array = NDArray[np.float64]
 # Rad, rad/s and rad/s^2: rounding error between a state and a motion that starts from
 # it.
 MAX_JOINT_GAP = 1e-9
-CONTROL_POINT_ROUNDING = (
-    4 * np.finfo(float).eps
-)  # relative; dominates in accelerations of motions of milliseconds
+# Relative; dominates in accelerations of motions of milliseconds.
+CONTROL_POINT_ROUNDING = 4 * np.finfo(float).eps
 
 
 @dataclass(frozen=True)
@@ -66,6 +65,8 @@ class JoinedMotion:
 
         At a start time, return the state of the later part.
         """
+        # Each part runs on its own clock; times before its start are clipped and
+        # replaced below.
         parts = [
             part.at_times(t - start[:, None])
             for part, start in zip(self.parts, self.start_times, strict=True)
@@ -81,6 +82,7 @@ class JoinedMotion:
 def _check_joint(before: Motion, after: Motion, start: Array, cut_time: Array) -> None:
     """Raise an error for cuts outside the part before, and for parts that do not start in its state at the cut."""
     duration, cut = before.duration(), cut_time - start
+    # Relative rounding of the duration may put a cut at the end slightly behind it.
     outside = ~((cut >= 0) & (cut <= duration * (1 + 1e-12)))
     if outside.any():
         row = int(outside.argmax())
@@ -93,6 +95,8 @@ def _check_joint(before: Motion, after: Motion, start: Array, cut_time: Array) -
         states_at_times(before, cut),
         states_at_times(after, np.zeros_like(cut)),
     )
+    # Control points have rounding errors, which derivatives multiply by eta r and beta
+    # r^2.
     tolerance = MAX_JOINT_GAP + _rounding(before) + _rounding(after)
     for name, unit, end, begin, max_gap in zip(
         ("q", "dq", "ddq"),

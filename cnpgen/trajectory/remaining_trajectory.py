@@ -44,6 +44,7 @@ def remaining_trajectory(
     duration = motion.duration() - t
     times = duration[:, None] * np.linspace(0, 1, COMPARISON_SAMPLES)
     expected = motion.at_times(t[:, None] + times).ddq
+    # The coarsest spline that is accurate enough, so that plans stay small.
     for spans in range(1, MAX_SPAN_DIVISIONS + 1):
         fitted = _fitted(motion, t, duration, boundary, finer(spec, spans))
         error = np.abs(fitted.at_times(times).ddq - expected) / acceleration_limit
@@ -102,11 +103,14 @@ def _fitted(
         motion.path.shape[2],
         slice(3, spec.path_control_points - boundary.fixed_at_goal),
     )
+    # Phases of the remainder from 0 to 1; at these, q and r are those of the motion.
     phases, rate_fit, path_basis, path_fit = _fits(spec, free.stop)
     first = motion.phase_at(t[:, None])
     states = motion.at(first + (1 - first) * phases)
+    # ds'/dt = r / (1 - first), since the remainder's phase s' covers the rest of s.
     rate = scaled_to_duration(states.rate / (1 - first) @ rate_fit.T, duration, spec)
     path = assemble(boundary, np.zeros((len(rate), free.stop - 3, n)), rate, spec)
+    # Interior control points by least squares on what the boundary points leave.
     path[:, free] = path_fit @ (states.q - path_basis @ path)
     return Motion(path, rate, spec.degree)
 
@@ -130,6 +134,7 @@ def _fits(spec: TrajectorySpec, end: int) -> tuple[Array, Array, Array, Array]:
 @cache
 def _refinement(points: int, more: int, degree: int) -> Array:
     """Return the knot refinement matrix of splines with uniform knots, shape (more, points)."""
+    # Exact: splines with uniform knots are contained in those with finer knots.
     phases = chebyshev(4 * more)
     matrix: Array = np.linalg.pinv(basis(phases, more, degree)) @ basis(
         phases, points, degree

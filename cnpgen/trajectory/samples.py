@@ -15,6 +15,7 @@ MAX_SAMPLE = 1e9
 MIN_SAMPLED_DURATION_S = 1e-9
 # Fewer samples are resampled from the cubic through positions and velocities.
 MIN_DENSE_SAMPLES = 400
+# Samples at each end for estimating velocity and acceleration.
 WINDOWS = (
     5,
     8,
@@ -26,7 +27,7 @@ WINDOWS = (
     90,
     135,
     200,
-)  # samples at each end for estimating velocity and acceleration
+)
 # Of the mean speed: smaller velocities are 0; accelerations: ten times, per duration.
 MAX_REST_SPEED_RATIO = 2e-3
 
@@ -62,18 +63,29 @@ def checked_samples(
             f"a trajectory needs at least 2 samples, got {len(times)}", concerns="t"
         )
     for name, values in (("t", times), ("q", positions), ("dq", velocities)):
-        if values is not None and not np.isfinite(values).all():
-            index = int(
-                np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1))
-            )
-            raise UsageError(
-                f"must be finite, got {values[index]} in sample {index}", argument=name
-            )
-        if values is not None and np.abs(values).max() > MAX_SAMPLE:
-            raise UsageError(
-                f"must be at most {MAX_SAMPLE:g}, got {np.abs(values).max():g}",
-                argument=name,
-            )
+        if values is not None:
+            _check_values(name, values)
+    _check_times(times)
+    return times, positions, velocities
+
+
+def _check_values(name: str, values: Array) -> None:
+    """Raise UsageError if a value is not finite, or so large that products overflow."""
+    if not np.isfinite(values).all():
+        index = int(np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1)))
+        raise UsageError(
+            f"must be finite, got {values[index]} in sample {index}", argument=name
+        )
+    if np.abs(values).max() > MAX_SAMPLE:
+        raise UsageError(
+            f"must be at most {MAX_SAMPLE:g}, got {np.abs(values).max():g}",
+            argument=name,
+        )
+
+
+def _check_times(times: Array) -> None:
+    """Raise UsageError if times do not increase, or last too short for derivatives."""
+    # A decreasing time is reported as such, not as a short duration.
     if not (
         times[-1] - times[0] >= MIN_SAMPLED_DURATION_S or np.any(np.diff(times) <= 0)
     ):
@@ -87,7 +99,6 @@ def checked_samples(
             f"must increase, got {times[index]} s in sample {index}, then {times[index + 1]} s",
             argument="t",
         )
-    return times, positions, velocities
 
 
 def resampled(t: Array, q: Array, dq: Array | None) -> tuple[Array, Array]:
@@ -96,6 +107,7 @@ def resampled(t: Array, q: Array, dq: Array | None) -> tuple[Array, Array]:
         return t, q
     from scipy.interpolate import CubicHermiteSpline
 
+    # At least ``MIN_DENSE_SAMPLES`` in all, the same number in every interval.
     between = np.linspace(0, 1, -(-MIN_DENSE_SAMPLES // (len(t) - 1)), endpoint=False)
     finer = np.append(t[:-1, None] + np.diff(t)[:, None] * between, t[-1])
     return finer, CubicHermiteSpline(t, q, dq)(finer)
@@ -128,6 +140,7 @@ def sampled_boundary(
         (None, None) if velocities is None else (velocities[0], -velocities[-1])
     )
     start_dq, start_ddq = _derivatives(times, path, first)
+    # Reversed in time, the goal is a start with the opposite velocity.
     goal_dq, _ = _derivatives(times[-1] - times[::-1], path[::-1], last)
     return Boundary(
         *(part[None] for part in (path[0], start_dq, start_ddq, path[-1], -goal_dq))
@@ -136,6 +149,7 @@ def sampled_boundary(
 
 def _derivatives(t: Array, q: Array, velocity: Array | None) -> tuple[Array, Array]:
     """Estimate the velocity, unless it is known, and the acceleration at t = 0."""
+    # Smaller velocities are noise of a robot at rest.
     min_speed = MAX_REST_SPEED_RATIO * np.abs(q[-1] - q[0]).max() / t[-1]
     travel, first = q[1:] - q[0], 1
     if velocity is None:
@@ -143,6 +157,7 @@ def _derivatives(t: Array, q: Array, velocity: Array | None) -> tuple[Array, Arr
         velocity = np.where(np.abs(velocity) < min_speed, 0.0, velocity)
     if len(t) < 3:
         return velocity, np.zeros_like(velocity)
+    # Without the part that the velocity explains, the travel begins with t^2.
     travel, first = travel - velocity * t[1:, None], 2
     acceleration = 2 * _cubic(t[1:], travel, first)
     return velocity, np.where(
@@ -161,11 +176,14 @@ def _cubic(t: Array, travel: Array, first: int) -> Array:
     ]
     best = np.inf, np.zeros(travel.shape[1])
     for width in widths:
+        # Powers of t / t_max: well conditioned for any unit of time.
         powers = (t[:width, None] / t[width - 1]) ** np.arange(first, min(width, 3) + 1)
         inverse = np.linalg.pinv(powers)
         coefficients = inverse @ travel[:width]
         freedom = max(width - powers.shape[1], 1)
         variance = np.sum((powers @ coefficients - travel[:width]) ** 2) / freedom
+        # Standard error of the first coefficient: residual variance times the row of
+        # the pseudoinverse.
         error = np.sqrt(variance * np.sum(inverse[0] ** 2)) / t[width - 1] ** first
         if error < best[0]:
             best = error, coefficients[0] / t[width - 1] ** first

@@ -33,8 +33,11 @@ def basis(s: Array, points: int, degree: int, order: int = 0) -> Array:
     Phases in [0, 1] have shape (K,), the result (K, C): ``basis(s, C, D, order) @
     control_points`` is the derivative of the spline.
     """
+    # A derivative is a spline of lower degree, whose control points are differences.
     knots, matrix = derivative(points, degree, order)
     degree -= order
+    # Index of the first basis function that is not zero at s; s = 1 is in the last
+    # span.
     first = (
         np.clip(np.searchsorted(knots, s, side="right") - 1, degree, len(matrix) - 1)
         - degree
@@ -53,6 +56,7 @@ def derivative(points: int, degree: int, order: int) -> tuple[Array, Array]:
     """
     knots, matrix = clamped_knots(points, degree), np.eye(points)
     for p in range(degree, degree - order, -1):
+        # c'_i = p (c_{i+1} - c_i) / (t_{i+p+1} - t_{i+1}), as rows of a matrix.
         matrix = (
             np.diff(matrix, axis=0)
             * p
@@ -71,6 +75,8 @@ def _cox_de_boor(s: Array, knots: Array, degree: int, first: NDArray[np.intp]) -
     right = first + degree + 1 + np.arange(degree)[:, None]
     for p in range(1, degree + 1):
         high, low = knots[right[:p]], knots[right[:p] - p]
+        # Each weight is shared between two functions of the next degree, in proportion
+        # to the distances from their knots.
         share = weights / (high - low)
         weights = np.zeros((p + 1, len(s)))
         weights[1:] = share * (s - low)
@@ -86,9 +92,8 @@ def power_coefficients(control: Array, degree: int) -> Array:
     """
     matrices = taylor_coefficients(control.shape[1], degree)[::-1]
     columns = control.reshape(*control.shape[:2], prod(control.shape[2:]))
-    powers = np.ascontiguousarray(
-        (matrices[:, None] @ columns).swapaxes(1, 2)
-    )  # motion by motion
+    # Motion by motion.
+    powers = np.ascontiguousarray((matrices[:, None] @ columns).swapaxes(1, 2))
     return powers.reshape(*matrices.shape[:2], len(control), *control.shape[2:])
 
 
@@ -129,6 +134,7 @@ def horner(selected: Array, offset: Array, order: int = 0) -> Array:
     value = np.zeros(selected.shape[1:])
     powers = range(degree, order - 1, -1)
     for coefficients in (
+        # d^k x^p = p (p - 1) ... (p - k + 1) x^(p - k): the factors are ``perm``.
         [perm(power, order) * selected[degree - power] for power in powers]
         if order
         else selected
@@ -145,10 +151,10 @@ def derivatives_of_each(control: Array, degree: int, s: Array) -> Array:
     spans = control.shape[1] - degree
     span = np.minimum((s * spans).astype(np.intp), spans - 1)
     factor, exponent = _powers(degree)
-    powers = factor * (s - span / spans)[:, None, None] ** exponent  # (N, 3, D + 1)
-    table = taylor_coefficients(control.shape[1], degree)[:, span].swapaxes(
-        0, 1
-    )  # (N, D + 1, C)
+    # (N, 3, D + 1)
+    powers = factor * (s - span / spans)[:, None, None] ** exponent
+    # (N, D + 1, C)
+    table = taylor_coefficients(control.shape[1], degree)[:, span].swapaxes(0, 1)
     return np.asarray((powers @ table @ control).swapaxes(0, 1))
 
 
@@ -164,9 +170,8 @@ def extrema(control: Array, degree: int) -> tuple[Array, Array]:
     """Return the ends and the critical points of one spline on [0, 1], shape (C,) and finite, and its values there."""
     from scipy.interpolate import BSpline, PPoly
 
-    scale = (
-        2.0**-600 if np.abs(control).max() > MAX_UNSCALED else 1.0
-    )  # a power of two, exact in floating point
+    # A power of two, exact in floating point.
+    scale = 2.0**-600 if np.abs(control).max() > MAX_UNSCALED else 1.0
     spline = BSpline(clamped_knots(len(control), degree), control * scale, degree)
     roots = PPoly.from_spline(spline.derivative()).roots(extrapolate=False)
     s = np.clip(np.concatenate([[0.0, 1.0], roots[np.isfinite(roots)]]), 0, 1)

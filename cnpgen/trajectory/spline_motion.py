@@ -28,9 +28,8 @@ from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Array = NDArray[np.float64]
 MAX_BLOCK_VALUES = 16_384  # per temporary array, to fit into the cache
-_NODES, _WEIGHTS = (
-    np.polynomial.legendre.leggauss(8) + np.array([[1.0], [0.0]])
-) / 2  # on [0, 1]
+# On [0, 1].
+_NODES, _WEIGHTS = (np.polynomial.legendre.leggauss(8) + np.array([[1.0], [0.0]])) / 2
 _NODES_AND_END = np.append(_NODES, 1.0)[:, None, None]
 
 
@@ -76,7 +75,8 @@ class Motion:
     def __post_init__(self) -> None:
         try:
             path, rate = np.shape(self.path), np.shape(self.rate)
-        except ValueError as error:  # rows of different lengths
+        except ValueError as error:
+            # Rows of different lengths.
             raise UsageError(
                 f"control points must be arrays: {error}", concerns="path"
             ) from error
@@ -142,7 +142,8 @@ class Motion:
                     for name in parts[0]
                 }
             )
-        with np.errstate(over="ignore", invalid="ignore"):  # invalid inputs give nan
+        # invalid inputs give nan
+        with np.errstate(over="ignore", invalid="ignore"):
             if s.ndim == 1:
                 p = [
                     basis(s, self.path.shape[1], self.degree, i) @ self.path
@@ -170,9 +171,8 @@ class Motion:
     def runs_forward(self) -> NDArray[np.bool_]:
         """Return whether r > 0 over the whole motion, not only at samples, shape (N,); False where r is not finite."""
         forward: NDArray[np.bool_] = np.asarray(np.isfinite(self.rate).all(axis=1))
-        unproven = forward & (self.rate <= 0).any(
-            axis=1
-        )  # convex hull property: r lies between its control points
+        # Convex hull property: r lies between its control points.
+        unproven = forward & (self.rate <= 0).any(axis=1)
         for i in np.flatnonzero(unproven):
             forward[i] = extrema(self.rate[i], self.degree)[1].min() > 0
         return forward
@@ -197,6 +197,8 @@ class Motion:
         """
         points, degree = self.rate.shape[1], self.degree
         knots = clamped_knots(points, degree)
+        # The integral of a basis function is (t_{j+D+1} - t_j) / (D + 1), its weight in
+        # the bound.
         return np.asarray(
             (1 / self.rate) @ ((knots[degree + 1 :] - knots[:points]) / (degree + 1))
         )
@@ -220,6 +222,7 @@ class Motion:
             ).reshape(s.shape)
         times = np.empty((len(self), len(s)))
         for rows, coarse, _ in self._cells():
+            # Cells end at the phases too, so that their times are sums of whole cells.
             edges = np.union1d(coarse, s)
             table = _kept_nodes(edges.tobytes(), self.rate.shape[1], self.degree)
             times[rows] = self[rows]._times_at(edges, table)[
@@ -231,10 +234,10 @@ class Motion:
         """Compute the time at edges of cells, shape (N, edges), from the basis at their Gauss nodes, (R, cells x 8)."""
         width, times = np.diff(edges), np.zeros((len(self), len(edges)))
         for block in self._blocks(table.shape[1]):
-            with np.errstate(all="ignore"):  # invalid inputs give invalid results
-                inverse = 1.0 / (
-                    self.rate[block, None] @ table
-                )  # one product per motion: same bits in any batch
+            # Invalid inputs give invalid results.
+            with np.errstate(all="ignore"):
+                # One product per motion: same bits in any batch.
+                inverse = 1.0 / (self.rate[block, None] @ table)
                 cells = (
                     inverse.reshape(-1, len(width), len(_WEIGHTS)) @ _WEIGHTS * width
                 )
@@ -277,6 +280,8 @@ class Motion:
             cell = np.clip(
                 np.array(index, np.intp).reshape(t.shape) - 1, 0, len(edges) - 2
             )
+            # Start from linear interpolation within the cell; left is the time still to
+            # go.
             low, width = edges[cell], np.diff(edges)[cell]
             rate, offset = select_spans(
                 power_coefficients(self.rate, self.degree), low + width / 2
@@ -285,11 +290,12 @@ class Motion:
             left = t - np.take_along_axis(known, cell, axis=1)
             ahead = width * left / np.take_along_axis(np.diff(known), cell, axis=1)
             done = np.zeros(t.shape, bool)
-            for _ in range(30):  # three or four are enough if r is positive
+            # Three or four are enough if r is positive.
+            for _ in range(30):
                 values = horner(rate, offset + ahead * _NODES_AND_END)
-                taken = ahead * sum(
-                    _WEIGHTS[:, None, None] / values[:-1]
-                )  # node by node: same bits in any batch
+                # Node by node: same bits in any batch.
+                taken = ahead * sum(_WEIGHTS[:, None, None] / values[:-1])
+                # Newton step on t(s) = t with dt/ds = 1 / r, kept within the cell.
                 new = np.minimum(
                     np.maximum(ahead + (left - taken) * values[-1], 0.0), width
                 )
@@ -299,6 +305,7 @@ class Motion:
                 )
                 if done.all():
                     break
+        # Exactly 1 at the end, whatever the rounding of the sum.
         return np.where(t >= known[:, -1:], 1.0, low + ahead)
 
     def at_times(self, t: Array) -> States:
@@ -342,6 +349,7 @@ class Motion:
         """
         points, degree = self.rate.shape[1], self.degree
         shared = _shared_cells(points, degree)
+        # Nodes near a zero of r need cells that shrink towards it.
         near_zero = np.isfinite(self.rate).all(axis=1) & (self.rate <= 0).any(axis=1)
         if not near_zero.any():
             yield slice(None), *shared

@@ -16,9 +16,8 @@ from cnpgen.robots.shape.hull import coal_hull
 from cnpgen.robots.solid import Solid
 
 Array = NDArray[np.float64]
-Pose = tuple[
-    Array, Array
-]  # rotation matrix of shape (3, 3), and origin [m], shape (3,)
+# Rotation matrix of shape (3, 3), and origin [m], shape (3,).
+Pose = tuple[Array, Array]
 
 # Tolerances of GJK and EPA. With both at 1e-9, EPA fails for 2 % of the overlaps of a
 # hull and a round shape; with the first pair 50,000 distances of hulls and boxes are
@@ -114,6 +113,8 @@ class CertifiedDistance:
             transform.setRotation(rotation)
             transform.setTranslation(origin)
         best, normal = -np.inf, np.full(3, np.nan)
+        # From the strictest to the loosest tolerances, until one result agrees with its
+        # certificate.
         for request in self._requests:
             self._result.clear()
             measured = coal.distance(
@@ -125,10 +126,11 @@ class CertifiedDistance:
                 self._result,
             )
             direction = np.array(self._result.normal)
+            # Separation along the direction: min over b of n . x minus max over a of n
+            # . x.
             certified = -b.support(pose_b, -direction) - a.support(pose_a, direction)
-            if (
-                certified > best
-            ):  # False for nan, which means that there is no direction
+            if certified > best:
+                # False for nan, which means that there is no direction
                 best, normal = certified, direction
             if abs(measured - a.radius - b.radius - certified) <= MAX_CERTIFICATE_GAP_M:
                 break

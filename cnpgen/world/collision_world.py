@@ -63,6 +63,8 @@ class CollisionWorld:
         """Set the obstacles."""
         import coal
 
+        # Obstacles of the same shapes keep their functors of Coal: only their positions
+        # change.
         same = len(solids) == len(self._solids) and all(
             map(same_shape, solids, self._solids)
         )
@@ -118,6 +120,7 @@ class CollisionWorld:
 
     def _place_segment(self, a: Point, b: Point) -> None:
         (ax, ay, az), (bx, by, bz) = a, b
+        # A capsule of length |b - a| along z, turned to the segment.
         along = bx - ax, by - ay, bz - az
         length = math.hypot(*along)
         self._capsule.halfLength = length / 2
@@ -155,6 +158,7 @@ class CollisionWorld:
         self, measures: list[Any], obstacle: int
     ) -> tuple[float, Array]:
         distance = self._distance(measures, obstacle)
+        # Coal's normal points from the first shape, here the segment, to the obstacle.
         return distance, self._normal if measures[obstacle] is None else -np.array(
             self._result.normal
         )

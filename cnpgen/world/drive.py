@@ -40,6 +40,8 @@ def _highest_friction(drive: Drive, dq: Array) -> Array:
     _, viscous, dry = _terms(drive, dq)
     width, share = drive.reversal_speed, drive.friction_help
     x = np.clip(dq / width + 1, 0.0, 1.0)
+    # Quintic step S from 0 to 1 over [-w, 0], and its bounds of the friction of either
+    # sign.
     forward = x**3 * (10 - 15 * x + 6 * x**2)
     certain = viscous * dq + dry * (2 * forward - 1)
     uncertain = (dry + viscous * (dq + width)) * forward

@@ -54,13 +54,11 @@ class ForwardKinematics:
         np.sin(q, out=factors[:, 0])
         np.cos(q, out=factors[:, 1])
         factors[self._slides, 0] = q[self._slides]
-        frames = np.empty(
-            (len(q) + 1, 4, 3, count)
-        )  # x, y and z axis and origin of every joint in the world frame
+        # x, y and z axis and origin of every joint in the world frame
+        frames = np.empty((len(q) + 1, 4, 3, count))
         frames[0] = np.eye(4, 3)[..., None]
-        products = np.empty(
-            (12, 3 * count)
-        )  # reused for all joints: allocating new pages dominates the run time
+        # Reused for all joints: allocating new pages dominates the run time.
+        products = np.empty((12, 3 * count))
         constant, moving = (
             products[:4].reshape(4, 3, count),
             products[4:].reshape(2, 4, 3, count),
@@ -68,6 +66,8 @@ class ForwardKinematics:
         for joint, (parent, coefficients) in enumerate(
             zip(self._parents, self._coefficients, strict=True), 1
         ):
+            # One product for all three terms of all states: parent's frame times the
+            # coefficients.
             np.matmul(coefficients, frames[parent].reshape(4, -1), out=products)
             moving *= factors[joint - 1, :, None, None]
             np.add(constant, moving[0], out=frames[joint])
@@ -82,15 +82,18 @@ class ForwardKinematics:
         for prismatic joints. Extents are the largest distances of points of the links
         from the origin of the base or of their joint [m], shape (n + 1,).
         """
+        # Distance of the joint from its parent; a prismatic one adds its largest
+        # position.
         lengths = self._lengths[:, 0] + self._lengths[:, 1] * max_positions
+        # From the tip to the base: the farthest point that a joint moves is at the next
+        # joint's distance plus that joint's bound.
         bounds = extents[1:].copy()
         for joint in range(len(bounds), 1, -1):
             bounds[joint - 2] = max(
                 bounds[joint - 2], lengths[joint - 1] + bounds[joint - 1]
             )
-        if self._parents != list(
-            range(len(bounds))
-        ):  # a tree: two links can move across the whole of it
+        if self._parents != list(range(len(bounds))):
+            # A tree: two links can move across the whole of it.
             bounds[:] = lengths.sum() + 2 * extents.max()
         return np.where(self._slides, 1.0, bounds)
 
@@ -98,6 +101,7 @@ class ForwardKinematics:
         """Compare the first, the central and the last state with Pinocchio."""
         import pinocchio as pin
 
+        # An error of the model would show at any state; three are enough.
         checked = [0, q.shape[1] // 2, -1]
         states, poses = q[:, checked].T.copy(), frames[-1][..., checked]
         expected = np.empty((len(states), 3, 4))
@@ -128,6 +132,7 @@ def _coefficients(model: "pin.Model", joint: int) -> Array:
     motion = joint_motion(model, joint)
     x, y, z = motion[3:]
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    # Rodrigues' formula R = I + [a]x^2 + sin(q) [a]x - cos(q) [a]x^2 for a unit axis a.
     placement, rows = model.jointPlacements[joint], np.zeros((12, 4))
     terms = [np.eye(3) + cross @ cross, cross, -cross @ cross]  # Rodrigues' formula
     rows.reshape(3, 4, 4)[:, :3, :3] = [(placement.rotation @ term).T for term in terms]

@@ -72,6 +72,7 @@ class MeasuredParameters:
         """Return world positions [m], shape (3,) or (3, K), in the frame of the table, by default the world's."""
         if not self._robot.parameters.tilts_table:
             return position
+        # The axes of states come last, so the pivot is repeated for each.
         shape = 3, *[1] * (position.ndim - 1)
         pivot = self._robot.table_origin.reshape(shape)
         return np.asarray(
@@ -95,6 +96,7 @@ class MeasuredParameters:
     def _hold_load(self) -> None:
         """Copy the model, and keep the last body without its load."""
         robot = self._robot
+        # Without the load, so that a sample's load can be added to the bare body.
         bare = reduced_model(
             robot.urdf,
             robot.urdf_text,
@@ -122,6 +124,7 @@ class MeasuredParameters:
             for name, value in zip(PAYLOAD_CENTRE, payload.centre, strict=True)
         ]
         shape = payload.inertia_matrix * self.values.get("payload_inertia", 1.0)
+        # Inertia of a body of the same shape is proportional to its mass.
         body = pin.Inertia(mass, np.array(centre), shape * (mass / payload.mass))
         self.model.inertias[joint] = bare + placement.act(body)
 

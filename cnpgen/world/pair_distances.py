@@ -82,6 +82,7 @@ class PairDistances:
             measured are lower bounds above it. A state that cannot be measured is nan
             and ends the search.
         """
+        # Start from the lower bounds: only states that may be the closest are measured.
         distances, best = self.bounds[pairs], np.inf
         measured: dict[tuple[int, int], float] = {}
         while distances.size:
@@ -97,6 +98,8 @@ class PairDistances:
             if len(closer) and np.isfinite(direction).all():
                 raised = self.separation(pairs[index], direction, closer)
                 distances[index, closer] = np.maximum(distances[index, closer], raised)
+        # Unmeasured values stay strictly above the smallest one, which is then the only
+        # minimum.
         np.maximum(distances, math.nextafter(best, math.inf), out=distances)
         for place, distance in measured.items():
             distances[place] = distance
@@ -115,6 +118,7 @@ class PairDistances:
         bounds the distances at the other unresolved states and usually resolves most of
         them. States whose distance cannot be measured are not clear.
         """
+        # Pairs one after the other, so that a direction serves all states of its pair.
         clear = np.ones(self.bounds.shape[1], bool)
         proven = self.bounds >= min_distance
         for pair in np.flatnonzero(~proven.all(axis=1)).tolist():
@@ -137,6 +141,8 @@ class PairDistances:
         """
         count = self.bounds.shape[1]
         distances, closest = np.full(count, np.inf), np.zeros(count, np.intp)
+        # In the order of the bounds, the search ends at the first bound above the best
+        # distance.
         order = np.argsort(self.bounds, axis=0)
         for k in range(count):
             for pair in order[:, k].tolist():
@@ -156,9 +162,8 @@ class PairDistances:
         distance, closest = self.smallest_per_state()
         for k, pair in enumerate(closest.tolist()):
             (a, pose_a), (b, pose_b) = self.bodies(pair, k)
-            _, normal = certified.between(
-                a, pose_a, b, pose_b
-            )  # nan if Coal finds no direction
+            # Nan if Coal finds no direction.
+            _, normal = certified.between(a, pose_a, b, pose_b)
             point_a, point_b = certified.witnesses()
             points.append(
                 (point_a + (a.radius + radius) * normal, point_b - b.radius * normal)
@@ -182,8 +187,14 @@ class PairDistances:
             deviations: Maximum deviation of its path from the chord [m], shape (K -
                 1,).
         """
+        # Over an interval the margin is at least m_0 - x and m_1 - (displacement - x),
+        # where x is the displacement so far. At the worst x both are
+        #   (m_0 + m_1 - displacement) / 2,
+        # less the deviation from the chord.
         margins = self.bounds - min_distances[:, None]
         intervals = (margins[:, 1:] + margins[:, :-1] - displacements) / 2 - deviations
+        # Only intervals that this does not prove need directions: first the known ones,
+        # then new measurements at both ends.
         for pair in np.flatnonzero(~(intervals >= 0).all(axis=1)).tolist():
             for direction in list(self.directions.get(pair, [])):
                 self._raise(
@@ -209,6 +220,8 @@ class PairDistances:
     ) -> None:
         """Raise the negative interval bounds of a pair, shape (K - 1,), by its separation along a direction."""
         unresolved = np.flatnonzero(~(bounds >= 0))
+        # Separated along one direction at both ends: also at every state between them,
+        # since separation is concave along chords.
         if len(unresolved):
             states = np.concatenate([unresolved, unresolved + 1])
             separations = self.separation(pair, direction, states).reshape(2, -1)

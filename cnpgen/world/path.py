@@ -49,6 +49,7 @@ class PathWorld(RobotWorld[Array]):
         self._pool = pin.ModelPool(self._model, 1)
         frame = self._model.frames[self._tip]
         self._carrier, tip = frame.parentJoint, frame.placement.homogeneous
+        # T_joint_tip is constant, so the tip follows from the joint that carries it.
         self._turn, self._offset = tip[:3, :3], tip[:3, 3].copy()
         self._segment_ends = np.array(self.robot.capsule_axes, np.int64).reshape(-1, 2)
         rest = np.zeros((self.robot.n, 1))
@@ -87,10 +88,10 @@ class PathWorld(RobotWorld[Array]):
             self.__dict__.pop(name, None)
         self._place(obstacle_poses)
         if self.parameters.changes_payload:
-            self._pool = pin.ModelPool(
-                self._model, 1
-            )  # a pool has its own copy of the model
+            # A pool has its own copy of the model.
+            self._pool = pin.ModelPool(self._model, 1)
         self._rotations, self._origins = self._kinematics.poses(self.q)
+        # R offset for all states at once: axes are flattened to 3 x (3 K).
         along = self._offset @ self._axes_of_tip()
         self.tip_position = along.reshape(3, -1) + self._origins[self._carrier]
 
@@ -114,9 +115,8 @@ class PathWorld(RobotWorld[Array]):
             np.asfortranarray(values) for values in (self.q, self.dq, self.ddq)
         )
         torque = pin.rneaInParallel(1, self._pool, q, dq, ddq)
-        return np.array(torque).reshape(
-            self.q.shape
-        )  # for one joint Pinocchio returns a list of numbers
+        # For one joint Pinocchio returns a list of numbers.
+        return np.array(torque).reshape(self.q.shape)
 
     @property
     def tip_velocity(self) -> Array:
@@ -192,6 +192,7 @@ class PathWorld(RobotWorld[Array]):
 
     def _smallest(self, bodies: str, sufficient: float) -> list[Array]:
         pairs = self._pairs_of(bodies)
+        # A state that is not finite has no distances, which is no error of Coal.
         if not (
             np.isfinite(self._origins).all() and np.isfinite(self.tip_position).all()
         ):
@@ -202,6 +203,7 @@ class PathWorld(RobotWorld[Array]):
 
     def _from_segments(self) -> PairDistances:
         segments, solids = self.segments(), self._solids
+        # Boxes around segments: their bounds need no call of Coal.
         pairs = [(segment, solid) for segment in segments for solid in solids]
         low, high = (
             select(segments[:, 0], segments[:, 1])
@@ -307,6 +309,7 @@ def separation(vertices: Array, solid: Solid, direction: Array) -> Array:
     Vertices of the body [m] have shape (V, 3, K); the direction is a unit vector from
     the solid to the body.
     """
+    # Smallest projection of the body minus the largest one of the solid.
     return np.asarray((direction @ vertices).min(axis=0) - solid.furthest(direction))
 
 
@@ -325,12 +328,14 @@ def gaps(low: Array, high: Array, solids: Sequence[Solid]) -> Array:
     vector that they form. Lowest and highest coordinates of the boxes [m] have shape
     (..., 3, K).
     """
+    # Signed gaps along x, y and z; their positive parts form a vector.
     floor, top = _boxes(solids)
     gap = np.maximum(
         low[..., None, :, :] - top[..., None], floor[..., None] - high[..., None, :, :]
     )
     outside = np.maximum(gap, 0.0)
     distance = np.sqrt((outside * outside).sum(axis=-2))
+    # Overlap on all axes: the largest, least negative gap is the bound.
     return np.asarray(np.where(distance > 0, distance, gap.max(axis=-2)))
 
 
@@ -339,11 +344,12 @@ def cuboid_gaps(
 ) -> Array:
     """Bound the signed distances of a cuboid from S solids by its faces and their bounding boxes [m], shape (S, K)."""
     turned, (floor, top) = np.abs(rotation), _boxes(solids)
-    reach = np.einsum(
-        "ijk,j->ik", turned, size / 2
-    )  # of the cuboid along the world axes
+    # Of the cuboid along the world axes.
+    reach = np.einsum("ijk,j->ik", turned, size / 2)
+    # The same test along the axes of the cuboid.
     offset = position - (floor + top)[..., None] / 2
-    center = np.einsum("ijk,sik->sjk", rotation, offset)  # in the frame of the cuboid
+    # In the frame of the cuboid.
+    center = np.einsum("ijk,sik->sjk", rotation, offset)
     own = (
         np.abs(center)
         - (size / 2)[:, None]

@@ -53,6 +53,8 @@ class PoseTolerance:
             three rotations that are within their tolerances, shape (K, 6).
         """
         back = rotations.swapaxes(1, 2)
+        # Shift and rotation from the wanted pose, in its own axes: tolerances are given
+        # in these.
         shift = (back @ (at[0] - positions)[..., None])[..., 0]
         turn = rotation_vectors(back @ at[1])
         error = np.concatenate([shift, turn], axis=1)
@@ -60,6 +62,7 @@ class PoseTolerance:
             [self.position, np.where(self.rotation >= np.pi, np.inf, self.rotation)],
             axis=1,
         )
+        # Aim slightly inside, so that the rounded solution is within the tolerance.
         inner = np.maximum(limit - TOLERANCE_INSET, 0.0)
         nearest = np.clip(error, -inner, inner)
         place = positions + (rotations @ nearest[:, :3, None])[..., 0]
@@ -97,7 +100,8 @@ class PoseKinematics:
             Jacobians of linear and angular velocity in world axes, shape (K, 6, n).
         """
         rotations, origins = self._kinematics.poses(q)
-        turns = rotations.transpose(3, 0, 1, 2)  # (K, n + 1, 3, 3)
+        # (K, n + 1, 3, 3)
+        turns = rotations.transpose(3, 0, 1, 2)
         points = origins.transpose(2, 0, 1)
         position = points[:, self._carrier] + turns[:, self._carrier] @ self._offset
         J = np.zeros((q.shape[1], 6, len(q)))
@@ -105,6 +109,7 @@ class PoseKinematics:
             linear, angular = (
                 turns[:, joint] @ part for part in np.split(self._motions[joint - 1], 2)
             )
+            # v = v_joint + w x (p - o), and w itself, per unit of joint velocity.
             J[:, :3, joint - 1] = linear + np.cross(
                 angular, position - points[:, joint]
             )
@@ -144,22 +149,31 @@ def solve_pose_ik(
             place - position,
             rotation_vectors(facing @ rotation.swapaxes(1, 2)),
         )
+        # Both parts of the pose must be met; the search of the other states goes on.
         met = np.linalg.norm(shift, axis=1) <= POSE_POSITION_TOLERANCE_M
         met &= np.linalg.norm(turn, axis=1) <= POSE_ROTATION_TOLERANCE_RAD
         if step == MAX_POSE_STEPS or met.all():
             break
         error = np.concatenate([shift, METERS_PER_RADIAN * turn], axis=1)
+        # Weighted rows: an angle of 1 rad counts as ``METERS_PER_RADIAN``.
         J = J * np.repeat([1.0, METERS_PER_RADIAN], 3)[:, None]
         if free is not None:
             error, J = _without_free(error, J, rotations, free)
-        damping = POSE_DAMPING * np.square(error).sum(axis=1) + 1e-9
-        square = J @ J.swapaxes(1, 2) + damping[:, None, None] * np.eye(6)
-        move = (J.swapaxes(1, 2) @ np.linalg.solve(square, error[..., None]))[..., 0].T
-        move *= np.minimum(
-            1.0, MAX_POSE_STEP_RAD / np.maximum(np.abs(move).max(axis=0), 1e-12)
-        )
-        q = np.where(met, q, np.clip(q + move, low, high))
+        q = np.where(met, q, np.clip(q + _damped_step(error, J), low, high))
     return q, met
+
+
+def _damped_step(error: Array, J: Array) -> Array:
+    """Return one step of Levenberg and Marquardt from errors (K, 6) and Jacobians (K, 6, n), shape (n, K)."""
+    # dq = J^T (J J^T + lambda I)^-1 e with lambda relative to |e|^2.
+    damping = POSE_DAMPING * np.square(error).sum(axis=1) + 1e-9
+    square = J @ J.swapaxes(1, 2) + damping[:, None, None] * np.eye(6)
+    move = (J.swapaxes(1, 2) @ np.linalg.solve(square, error[..., None]))[..., 0].T
+    # The whole step is shortened, so that its direction stays.
+    move *= np.minimum(
+        1.0, MAX_POSE_STEP_RAD / np.maximum(np.abs(move).max(axis=0), 1e-12)
+    )
+    return move
 
 
 def _without_free(
@@ -178,7 +192,9 @@ def rotation_matrices(vectors: Array) -> Array:
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
-    half = np.sinc(angle / (2 * np.pi))  # sin(angle / 2) / (angle / 2)
+    # sinc avoids 0 / 0: sin(a) / a and (1 - cos(a)) / a^2 = 2 sin(a / 2)^2 / a^2.
+    # sin(angle / 2) / (angle / 2)
+    half = np.sinc(angle / (2 * np.pi))
     return np.asarray(
         np.eye(3) + np.sinc(angle / np.pi) * cross + half**2 / 2 * cross @ cross
     )
@@ -186,8 +202,11 @@ def rotation_matrices(vectors: Array) -> Array:
 
 def rotation_vectors(rotations: Array) -> Array:
     """Return the rotation vectors of rotation matrices [rad], shape (K, 3)."""
+    # Skew part 2 sin(a) u and trace 1 + 2 cos(a): atan2 is accurate at all angles below
+    # pi.
     skew = rotations[:, [2, 0, 1], [1, 2, 0]] - rotations[:, [1, 2, 0], [2, 0, 1]]
     sine = np.linalg.norm(skew, axis=1) / 2
     angle = np.arctan2(sine, (np.trace(rotations, axis1=1, axis2=2) - 1) / 2)
+    # For small angles a / (2 sin a) is 1/2.
     factor = np.where(sine > 1e-9, angle / np.maximum(2 * sine, 1e-12), 0.5)
     return skew * factor[:, None]

@@ -47,6 +47,7 @@ class RigidBodies:
             [convex_body(part.vertices, part.radius) for part in parts],
             list[Solid](),
         )
+        # Obstacles have frames after those of the joints, with the axes of the world.
         self._frames = [shape.joints[part.link] for part in parts] + [
             n_joints + 1 + i for i in range(n_obstacles)
         ]
@@ -137,6 +138,7 @@ class RigidBodies:
         """
         near, contacts = ~(self._bounds(pairs) >= within), list[Any]()
         for pair in np.flatnonzero(near.any(axis=1)).tolist():
+            # Ordered by state; each measured state may exclude later ones.
             (a, b), unresolved = pairs[pair].tolist(), np.flatnonzero(near[pair])
             while len(unresolved):
                 k, unresolved = int(unresolved[0]), unresolved[1:]
@@ -158,6 +160,7 @@ class RigidBodies:
         columns = zip(*contacts, strict=True) if contacts else [()] * 5
         pair, k, distance, direction, points = (np.array(column) for column in columns)
         pair, k = pair.astype(np.intp), k.astype(np.intp)
+        # Coal's direction is in the frame of the first body; contacts are in the world.
         frames = np.array(self._frames, np.intp)[pairs[pair]]
         normal = np.einsum(
             "cij,cj->ci",
@@ -175,6 +178,8 @@ class RigidBodies:
 
     def extent(self, joint: int) -> float:
         """Return the largest distance of a point that is fixed to a joint's frame from its origin [m]."""
+        # A ball contains its part, so |center| + radius bounds the distance of every
+        # point.
         balls = [
             ball
             for frame, ball in zip(self._frames, self._balls, strict=False)
@@ -190,6 +195,7 @@ class RigidBodies:
         first, second = pairs.T
         turned = np.einsum("bijk,bj->bik", self._rotations[self._frames], self._centers)
         centers = turned + self._positions[self._frames]
+        # Gap between a ball's center and a box (half sizes 0 for balls), axis by axis.
         gaps = np.abs(centers[second] - centers[first])
         gaps -= self._half_sizes[first, :, None]
         largest = gaps.max(axis=1)
@@ -226,7 +232,8 @@ class RigidBodies:
             self._rotations[other],
             self._positions[other] - self._positions[frame],
         )
-        if a >= len(self._balls):  # an obstacle, whose frame has the axes of the world
+        if a >= len(self._balls):
+            # An obstacle, whose frame has the axes of the world.
             in_b = (direction @ rotation.reshape(3, -1)).reshape(3, -1)
             shift = direction @ between
         else:
@@ -235,6 +242,7 @@ class RigidBodies:
                 np.einsum("ijk,ik->jk", rotation, along),
                 np.einsum("ik,ik->k", along, between),
             )
+        # Along u: min over b of u . x - max over a of u . x, both with their radii.
         reach = float((first.corners @ direction).max()) + first.radius + second.radius
         return np.asarray(
             lowest_products(second.corners, in_b[:, states]) + shift[states] - reach

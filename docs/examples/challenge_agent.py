@@ -13,7 +13,7 @@ import numpy as np
 from air_hockey_challenge.framework import AgentBase
 
 import cnpgen
-from cnpgen.results import PlanRuntime, PuckModel
+from cnpgen.results import HitOptions, PlanRuntime, PuckModel
 
 TICK_S, TICKS_PER_STEP = 1e-3, 20
 GOAL = np.array([2.49, 0.0])  # m, in the robot's frame
@@ -314,8 +314,7 @@ class HitAgent(AgentBase):
             GOAL,
             puck_velocity=velocity,
             meeting_time=MEETING_TIMES_S,
-            speed_share=share,
-            puck_model=PUCK,
+            options=HitOptions(speed_share=share, puck_model=PUCK),
         )
         rows = hits.plans.sample_id
         meeting = MEETING_TIMES_S[rows]
@@ -386,7 +385,7 @@ class HitAgent(AgentBase):
             (rest, still, still),
             np.tile(position, (len(angles), 1)),
             position + normals,
-            speed_share=shares,
+            options=HitOptions(speed_share=shares),
         )
         rows, speed = hits.plans.sample_id, hits.plans.columns["hit_speed"]
         delay = PUSH_MEETING_S - hits.contact_time
@@ -437,7 +436,7 @@ class HitAgent(AgentBase):
             (rest, still, still),
             goal,
             goal + tip,
-            speed_share=shot["share"],
+            options=HitOptions(speed_share=shot["share"]),
         )
         shot["plans"] += 1
         shot["hits"], shot["normal"], shot["position"], shot["velocity"] = (

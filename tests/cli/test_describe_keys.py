@@ -1,20 +1,19 @@
-"""The keys of recipe files: every one is described, in docs/reference/keys.md as on the command line."""
+"""The keys of recipe files: every one is described, on the page and by a command."""
 
 import dataclasses
 import json
 import re
-from pathlib import Path
 
 import pytest
 
 from cnpgen.cli.describe_keys import (
-    describe_keys,
     describe_kind,
     keys_to_dict,
     kind_summary,
     kind_to_dict,
     recipe_types,
 )
+from cnpgen.cli.docs_command import list_pages, page_text
 from cnpgen.cli.main import main
 from cnpgen.cli.terminal import LINE_WIDTH
 from cnpgen.errors import RecipeError
@@ -23,7 +22,6 @@ from cnpgen.schema.keys import keys
 from cnpgen.schema.toml import MARKS
 from cnpgen.store.files.documents import plain
 
-PAGE = Path(__file__).parents[2] / "docs" / "reference" / "keys.md"
 KINDS = [
     (group, name)
     for group in (registry.STAGES, registry.CONSTRAINTS)
@@ -64,13 +62,13 @@ def test_a_summary_is_the_first_line_without_markup():
 
 def test_the_page_of_all_keys_is_what_the_command_prints(capsys):
     assert main(["show", "--keys"]) == 0
-    assert PAGE.read_text(encoding="utf-8") == capsys.readouterr().out, (
-        "run: python docs/generate.py"
-    )
+    printed = capsys.readouterr().out
+    assert main(["docs", "keys"]) == 0
+    assert capsys.readouterr().out == printed
 
 
 def test_every_key_of_every_table_is_on_the_page_with_a_sentence():
-    page = describe_keys(tuple(recipe_types()))
+    page = page_text(list_pages()["keys"])
     named = [
         *recipe_types().values(),
         *(registry.load(group, name) for group, name in KINDS),
@@ -99,7 +97,7 @@ def test_every_key_of_every_table_is_on_the_page_with_a_sentence():
 
 
 def test_no_default_is_a_python_object():
-    page = describe_keys(tuple(recipe_types()))
+    page = page_text(list_pages()["keys"])
     assert "| `parameters` | a table | those of its keys |" in page
     assert not re.search(r"\w\(\w+=", page)
 
@@ -107,7 +105,7 @@ def test_no_default_is_a_python_object():
 def test_every_row_of_every_table_has_four_cells():
     rows = [
         line
-        for line in describe_keys(tuple(recipe_types())).splitlines()
+        for line in page_text(list_pages()["keys"]).splitlines()
         if line.startswith("|")
     ]
     assert len(rows) > 150
@@ -115,7 +113,7 @@ def test_every_row_of_every_table_has_four_cells():
 
 
 def test_a_key_is_described_with_unit_bounds_and_default():
-    page = describe_keys(["problem"])
+    page = page_text(list_pages()["keys"])
     assert "| `velocity_scale` | a number, at least 0.001, at most 1 | 1 |" in page
     assert "| `radius` | a length [m], at least 1e-06 | none |" in page
     assert "| `urdf` | a string | required |" in page
@@ -126,7 +124,7 @@ def test_the_keys_of_one_kind_of_file_are_a_part_of_all(kind, capsys):
     assert main(["show", "--keys", kind]) == 0
     part = capsys.readouterr().out
     assert part.startswith(f"## {kind.capitalize()} files\n")
-    assert part.strip() in PAGE.read_text(encoding="utf-8")
+    assert part.strip() in page_text(list_pages()["keys"])
 
 
 def test_the_keys_have_a_json_form_with_tables_and_kinds():

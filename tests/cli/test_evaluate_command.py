@@ -5,6 +5,7 @@ import random
 import re
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ import pytest
 
 from cnpgen.cli.main import main
 from cnpgen.plans import Plans, save_plans
+from cnpgen.problems.problem_file import restore_problem
+from cnpgen.problems.problem_record import record_problem
 from tests.examples.plan_files import garbage, plans_of, remove_checksum
 from tests.examples.plans import load, perturbed
 
@@ -82,6 +85,21 @@ def test_what_is_not_valid_is_counted_by_reason_with_the_worst_place(
         )
         == 8
     )
+
+
+@pytest.mark.parametrize("limited", [False, True])
+def test_the_largest_jerk_is_shown_if_the_problem_limits_jerks(
+    run: Run, tmp_path: Path, limited: bool
+) -> None:
+    plans = plans_of(load("hit"))
+    if limited:
+        content = plans.problem.content
+        content = content | {"constraint": [*content["constraint"], {"use": "joint-jerk", "tolerance": 0.005}]}  # fmt: skip
+        plans = replace(plans, problem=record_problem(restore_problem(content, plans.problem.urdf, tmp_path)))  # fmt: skip
+    save_plans(tmp_path / "plans.h5", plans)
+    _, out, _ = run(tmp_path / "plans.h5", "--list")
+    assert ("largest jerk [x limit]" in out) == limited
+    assert (" jerk " in out.partition("plan  sample")[2]) == limited
 
 
 def test_metrics_and_margins_are_those_of_the_verdict(

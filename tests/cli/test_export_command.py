@@ -123,13 +123,16 @@ def test_what_is_there_is_replaced_only_by_force(run: Run, hits: Path) -> None:
         ]
         code, _, err = run(*words, "--rate", 10)
         assert code == 2
-        assert (
-            err
-            == f"cnpgen: error: {out} exists; --force replaces files of the same name\n"
+        assert err == (
+            f"cnpgen: error: {out} exists: --force replaces it, -o names another file"
+            " (it is of another request, or was changed since)\n"
         )
         assert [
             path.read_bytes() for path in sorted(Path().rglob("*")) if path.is_file()
         ] == before
+        code, text, err = run(*words)  # a repeated job
+        assert (code, text) == (0, f"{out}\n")
+        assert err == f"{out} is there already, of the same request\n"
         assert run(*words, "--rate", 10, "--force")[0] == 0
         assert [
             path.read_bytes() for path in sorted(Path().rglob("*")) if path.is_file()

@@ -16,7 +16,8 @@ CHECKED = "FOLDER/plans.h5: the file's checksum is right"
 
 
 @pytest.mark.parametrize(
-    ("options", "lines"), [((), [CHECKED, "cnpgen: building it"]), (("--quiet",), [])]
+    ("options", "lines"),
+    [((), [CHECKED, "cnpgen: building it"]), (("--quiet",), []), (("-q",), [])],
 )
 def test_what_is_said_for_every_kernel_is_printed_once_per_command(
     options: tuple[str, ...],

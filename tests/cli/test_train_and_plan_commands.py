@@ -376,10 +376,11 @@ def test_plans_are_replaced_only_by_force(trained, tiny, tmp_path, capsys):
     assert main(words) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["file"], found["plans"]) == (str(out), 3)
-    code, text = failing(capsys, words)
+    code, text = failing(capsys, [*words, "--first", "1"])
     assert code == 2
     assert "--force replaces it" in text
-    assert main([*words, "--force"]) == 0
+    assert main(words) == 0  # of the same request
+    assert main([*words, "--first", "1", "--force"]) == 0
 
 
 def test_refined_plans_are_those_of_the_refine_command(trained, tiny, tmp_path, capsys):

@@ -26,6 +26,7 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.scenes.scene_problem import SceneProblem
 from cnpgen.robots.obstacle import Obstacle
+from cnpgen.trajectories import LoadOptions
 from tests.examples.plan_files import plans_of, remove_checksum
 from tests.examples.plans import load as stored_plan
 from tests.examples.scene_files import REQUEST, ROBOMETRICS, SCENE
@@ -154,7 +155,7 @@ def read_trajectory(folder: Path, draw: Random) -> None:
     """Read trajectories, judge short ones, and make plans of them."""
     (path,) = folder.iterdir()
     loaded = load_trajectories(
-        path, "airhockey", rate=draw.choice((None, EXPORT_RATE_HZ))
+        path, "airhockey", options=LoadOptions(rate=draw.choice((None, EXPORT_RATE_HZ)))
     )
     short = [
         trajectory

@@ -39,6 +39,8 @@ EXCLUDED = {  # public callables without a valid call, and the reason
     "TrajectoryEvaluation": "made by evaluate_trajectories",
     "TrajectoryVerdict": "made by evaluate_trajectories",
     "ImportedTrajectories": "made by import_trajectories",
+    "ChunkJoin": "made by ChunkExecutor.step",
+    "ChunkSetPoint": "made by ChunkExecutor.set_point",
     "LoadedTrajectories": "made by load_trajectories",
 }
 
@@ -688,7 +690,42 @@ def _of_runtime() -> list[ValidCall]:
     def close(timeout: Any) -> bool:
         return results.PlanRuntime(planner, base).close(timeout=timeout)
 
+    options = {
+        "rate": 30.0,
+        "length": 20,
+        "join": 0.05,
+        "max_distance": 0.1,
+        "tracking_error": 0.03,
+        "stale_after": 0.5,
+    }
+    problem, still = planner.model.problem, np.zeros(len(base))
+    executor = results.ChunkExecutor(problem, **options)
+    executor.reset((base, still))
+
+    def reset(measured: Any) -> None:
+        results.ChunkExecutor(problem, **options).reset(measured)
+
     return [
+        ValidCall(
+            "ChunkExecutor",
+            results.ChunkExecutor,
+            {"problem": problem, **options},
+            frozenset({"length", "rate"}),
+        ),
+        ValidCall("ChunkExecutor.reset", reset, {"measured": (base, still)}),
+        ValidCall("ChunkExecutor.stop", executor.stop),
+        ValidCall("ChunkExecutor.set_point", executor.set_point, {"time": 0.0}),
+        ValidCall(
+            "ChunkExecutor.step",
+            executor.step,
+            {
+                "time": 0.0,
+                "chunk": np.tile(base, (20, 1)),
+                "observed_at": 0.0,
+                "measured": (base, still),
+            },
+        ),
+        ValidCall("PlanRuntime.plan_at", runtime.plan_at, {"time": 0.0}),
         ValidCall("PlanRuntime", results.PlanRuntime, {"planner": planner, "q": base}),
         ValidCall("PlanRuntime.state_at", runtime.state_at, {"time": 0.0}),
         ValidCall(

@@ -172,6 +172,17 @@ def test_the_arm_of_a_transport_is_as_wide_as_its_capsules(drawn):
             )  # a circle of 14 cm at either end
 
 
+def test_the_view_from_above_shows_the_whole_arm(drawn):
+    draw(load("transport"), Path("plan.png"))
+    axis = axes_of(drawn[0])["top view"]
+    points = np.concatenate([area.get_paths()[0].vertices for area in axis.collections])
+    for limits, values in zip(
+        (axis.get_xlim(), axis.get_ylim()), points.T, strict=True
+    ):
+        assert limits[0] <= values.min()
+        assert values.max() <= limits[1]
+
+
 @pytest.mark.slow
 def test_an_arm_with_link_geometry_is_drawn_by_its_parts(drawn, tmp_path):
     problem = load_problem(write_problem(tmp_path))

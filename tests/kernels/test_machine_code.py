@@ -32,7 +32,7 @@ from cnpgen.kernels.machine_code import (
 )
 from cnpgen.kernels.tape import CODES, GridSpec, Loop, Tape, tape_from_function
 from tests.conftest import needs_compiler
-from tests.kernels.c_kernel import c_source
+from tests.kernels.c_reference import emit
 from tests.kernels.test_kernels import BINARY, SPECIAL, UNARY, machine_flags
 
 Array = np.ndarray
@@ -184,7 +184,7 @@ def test_compiled_c_of_a_tape_gives_the_same_bits(case, level, tmp_path, monkeyp
     if level == "-O1":  # of long tapes, whose products are not contracted
         monkeypatch.setattr(lowering, "MAX_CONTRACTED", 0)
     source, built = tmp_path / "kernel.c", tmp_path / "kernel.so"
-    source.write_text(c_source(tape))
+    source.write_text(emit(tape))
     flags = (level, "-ffp-contract=fast", *native_flags())
     run_compiler(require_compiler(), flags, source, built)
     library = ctypes.CDLL(str(built))

@@ -10,11 +10,15 @@ import pytest
 import cnpgen
 from cnpgen.benchmark import BenchmarkOptions, run_benchmark
 from cnpgen.errors import UsageError
+from cnpgen.scenes import SceneOptions, solve_scenes
+from cnpgen.trajectories import LoadOptions, load_trajectories
 
 MOVED = [
     (cnpgen.make_dataset, cnpgen.GenerationOptions, ("no-such-dataset",), {"dtype": 3}),
     (cnpgen.train_model, cnpgen.TrainingOptions, ("missing", "a.h5"), {"epochs": "2"}),
     (run_benchmark, BenchmarkOptions, ("hits-81", "out"), {"time_limit": -1.0}),
+    (load_trajectories, LoadOptions, ("missing.csv", "airhockey"), {"rate": -1.0}),
+    (solve_scenes, SceneOptions, ("panda", ()), {"payload": "2"}),
 ]
 
 

@@ -131,3 +131,11 @@ def test_a_full_disk_is_named_and_no_error(
     monkeypatch.setattr(cache_entry, "write_file", write)
     with pytest.warns(RuntimeWarning, match=r"the disk of the cache .* is full"):
         write_entry(tmp_path / "entry", b"content")
+
+
+def test_arrays_are_counted_as_floats_before_they_are_read() -> None:
+    content = archive(compressed=True, q=np.zeros(1_000_000, np.int8))
+    assert len(content) < 10_000
+    with pytest.raises(ArchiveError, match="it holds 8,000,000 bytes, expected at"):
+        read_arrays(content, max_bytes=7_999_999)
+    assert read_arrays(content, max_bytes=8_000_000)["q"].shape == (1_000_000,)

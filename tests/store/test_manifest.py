@@ -239,37 +239,43 @@ def test_datasets_with_an_empty_split_are_finished_like_any_other(
     assert "validation/*.h5" not in (tmp_path / "README.md").read_text()
 
 
-def test_croissant_lists_the_files_and_has_no_record_sets(dataset: Path) -> None:
+def test_croissant_lists_the_files_of_a_record_set_of_each_split(dataset: Path) -> None:
     croissant = json.loads((dataset / "croissant.json").read_text())
-    assert "recordSet" not in croissant
+    assert [item["name"] for item in croissant["recordSet"]] == list(SPEC.splits)
     assert croissant["license"] == "https://spdx.org/licenses/CC-BY-4.0"
-    assert [item["contentUrl"] for item in croissant["distribution"]] == [
+    files = [
+        item for item in croissant["distribution"] if item["@type"] == "cr:FileObject"
+    ]
+    assert [item["contentUrl"] for item in files] == [
         task.file for task in shards(SPEC)
     ]
-    for item in croissant["distribution"]:
+    for item in files:
         content = (dataset / item["contentUrl"]).read_bytes()
         assert item["encodingFormat"] == "application/x-hdf5"
         assert item["contentSize"] == f"{len(content)} B"
         assert item["sha256"] == hashlib.sha256(content).hexdigest()
 
 
-def test_croissant_contains_the_unit_of_every_field(dataset: Path) -> None:
+def test_croissant_contains_unit_and_limits_of_every_component(dataset: Path) -> None:
     croissant = json.loads((dataset / "croissant.json").read_text())
     vocabulary = croissant["@context"]["@vocab"]
     assert vocabulary == croissant["@context"]["sc"] == "https://schema.org/"
-    variables = croissant["variableMeasured"]
-    assert {item["@type"] for item in variables} == {"sc:PropertyValue"}
-    assert {item["name"]: item["unitText"] for item in variables} == {
-        field.name: field.unit for field in SPEC.fields
+    variables = {item["name"]: item for item in croissant["variableMeasured"]}
+    assert {item["@type"] for item in variables.values()} == {"sc:PropertyValue"}
+    assert {name: item["unitText"] for name, item in variables.items()} == {
+        name: unit
+        for field in SPEC.fields
+        for name, unit in zip(field.columns, field.units, strict=True)
     }
-    start, goal, clearance, number = variables
-    assert start["description"] == "initial joint positions (j1, j2, j3)"
+    start, clearance = variables["start_q.j2"], variables["clearance"]
+    assert start["description"] == "initial joint positions"
     assert (start["minValue"], start["maxValue"]) == (-2.0, 2.0)
     assert (clearance["description"], clearance["minValue"]) == (
         "smallest distance",
         0.0,
     )
-    assert not {"minValue", "maxValue"} & (goal.keys() | number.keys())
+    without = variables["goal_p.x"].keys() | variables["sample_id"].keys()
+    assert not {"minValue", "maxValue"} & without
 
 
 def test_the_card_describes_fields_and_rejections(dataset: Path) -> None:

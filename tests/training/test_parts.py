@@ -13,6 +13,10 @@ from cnpgen.losses.metric import Metric, MetricSettings
 from cnpgen.planner.network.architecture import Architecture
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.problem_record import record_problem
+from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.training.adam import Clipping, learning_rate
 from cnpgen.training.prepare import begin_run
 from cnpgen.training.settings import METRICS, Length, TrainingSettings
@@ -174,16 +178,25 @@ def test_the_papers_metric_uses_the_papers_form_of_the_loss():
 
 def test_every_constraint_of_a_kind_has_the_margin_of_its_kind():
     table, torque = (object.__new__(kind) for kind in (Table, JointTorque))
-    problem = SimpleNamespace(
-        constraint=(table, table, torque, torque, torque, object.__new__(TipSpeed))
-    )
-    margins = suggested_margins(problem)  # type: ignore[arg-type]
+    problem = object.__new__(Problem)
+    constraints = (table, table, torque, torque, torque, object.__new__(TipSpeed))
+    object.__setattr__(problem, "constraint", constraints)
+    margins = suggested_margins(problem)
     assert margins.insets == {"table": 1e-3, "table-2": 1e-3}
     assert margins.factors == {
         "joint-torque": 0.97,
         "joint-torque-2": 0.97,
         "joint-torque-3": 0.97,
     }
+
+
+def test_margins_are_those_of_the_problem_of_a_dataset():
+    problem = load_problem("airhockey")
+    record = record_problem(problem)
+    stored = StoredProblem(record.recipe, record.urdf)  # as of dataset.problem
+    assert suggested_margins(stored) == suggested_margins(problem)
+    assert suggested_margins("airhockey") == suggested_margins(problem)
+    assert suggested_margins(stored).factors
 
 
 def test_margins_tighten_the_limits_that_they_name_and_no_others(

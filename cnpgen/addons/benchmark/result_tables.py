@@ -1,4 +1,4 @@
-"""Tables of a benchmark as text, Markdown, LaTeX and CSV, with machine, versions, date and seed in every file."""
+"""Tables of a benchmark as Markdown and LaTeX, with machine, versions, date and seed, and all results as CSV."""
 
 import csv
 import io
@@ -39,6 +39,9 @@ PRINTED: dict[
 }
 # Planners whose authors' inner loops are in C++.
 PYTHON_LOOPS = "aqp", "cbirrt", "rrtconnect", "sscbirrt"
+# Constraints of the problems that the paper states rules for; they say nothing of others.
+_PAPER_CONSTRAINTS = {"table", "vertical", "object-contact"}
+_PAPER_FLAGS = "paper_valid", "paper_finished"
 TAIL_FIGURES = ("planning_ms", "planning_cpu_ms")  # printed with their tails
 MAX_PRINTED_P = 0.05
 TABLE_FILES = ("results.csv", "tables.md", "tables.tex")
@@ -94,7 +97,7 @@ def table_rows(benchmark: Benchmark, plant: str) -> list[tuple[str, ...]]:
     }
     if missing:
         rows.append(("applicability", *(missing.get(name, "") for name in summary)))
-    for group, texts in (("ratios", FLAGS), ("figures", FIGURES)):
+    for group, texts in (("ratios", flags_of(benchmark)), ("figures", FIGURES)):
         for key, text in texts.items():
             statistics = [summary[name][group].get(key) for name in summary]
             if not any(statistics):
@@ -109,6 +112,20 @@ def table_rows(benchmark: Benchmark, plant: str) -> list[tuple[str, ...]]:
                     (f"{text}: p99, p99.9, maximum", *map(tail_text, statistics))
                 )
     return rows
+
+
+def flags_of(benchmark: Benchmark) -> dict[str, str]:
+    """Return the flags that apply to the problems: those of the paper's rules, if it has rules for the constraints."""
+    applies = not _PAPER_CONSTRAINTS.isdisjoint(_constraints(benchmark))
+    return {
+        key: text for key, text in FLAGS.items() if applies or key not in _PAPER_FLAGS
+    }
+
+
+def _constraints(benchmark: Benchmark) -> set[str]:
+    """Return the kinds of the constraints of the problems."""
+    content = benchmark.problems.problem.content
+    return {constraint["use"] for constraint in content["constraint"]}
 
 
 def _missing_text(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -152,12 +169,21 @@ def notes(benchmark: Benchmark) -> list[str]:
     return [
         f"Ratios with 95 % intervals by Wilson; medians [quartiles]; p: p-value of the difference from {other},"
         f" corrected by Holm for all comparisons of a table, if below {MAX_PRINTED_P:g}.",
-        f"A hit succeeds if it scores without early contact and its mallet stays within"
-        f" {1e3 * benchmark.plane_tolerance:g} mm of the table plane.",
+        *_hit_note(benchmark),
         *_python_note(benchmark),
         *_printed_note(benchmark),
         *(f"Run {run}." for run in benchmark.runs),
     ]
+
+
+def _hit_note(benchmark: Benchmark) -> list[str]:
+    """Return the definition of a successful hit, if the problems are hits."""
+    if "puck-contact" not in _constraints(benchmark):
+        return []
+    text = (
+        "A hit succeeds if it scores without early contact and its mallet stays within"
+    )
+    return [f"{text} {1e3 * benchmark.plane_tolerance:g} mm of the table plane."]
 
 
 def _python_note(benchmark: Benchmark) -> list[str]:
@@ -208,12 +234,11 @@ def failure_summaries(benchmark: Benchmark) -> list[str]:
 
 
 def csv_text(benchmark: Benchmark) -> str:
-    """Write all results as CSV: comments with the runs, then a row per planner, repetition, problem and plant."""
+    """Write all results as CSV: a head, then a row per planner, repetition, problem and plant."""
     suite, seed = benchmark.suite, benchmark.runs[-1].seed if benchmark.runs else 0
     plants = [name for name in benchmark.executions if name]
     text = io.StringIO()
-    text.writelines(f"# {line}\n" for line in notes(benchmark)[1:])
-    columns = (*FLAGS, *FIGURES)
+    columns = (*flags_of(benchmark), *FIGURES)
     writer = csv.DictWriter(
         text, [*_COLUMNS, *columns, "error"], restval="", lineterminator="\n"
     )
@@ -235,6 +260,7 @@ def csv_text(benchmark: Benchmark) -> str:
                 numbers = {
                     name: int(value) if isinstance(value, bool) else value
                     for name, value in values.items()
+                    if name in columns
                 }
                 writer.writerow({**dict(head), **numbers, "error": row["error"]})
     return text.getvalue()
@@ -264,19 +290,31 @@ def markdown_text(benchmark: Benchmark) -> str:
 
 
 def latex_text(benchmark: Benchmark) -> str:
-    """Write the tables of all plants as LaTeX, for the package booktabs."""
+    """Write the tables of all plants as LaTeX, a row per planner, for the packages booktabs and graphicx."""
     lines = [f"% {note}" for note in [*notes(benchmark), *failure_summaries(benchmark)]]
+    suite = benchmark.suite
     for plant in benchmark.executions:
-        head, *rows = (
+        rows = [
             [cell.translate(_LATEX) for cell in row]
-            for row in table_rows(benchmark, plant)
-        )
-        lines += [
-            rf"\begin{{tabular}}{{l{'r' * (len(head) - 1)}}}",
-            r"\toprule",
-            rf"{' & '.join(head)} \\",
-            r"\midrule",
+            for row in zip(*table_rows(benchmark, plant), strict=True)
         ]
-        lines += [rf"{' & '.join(row)} \\" for row in rows]
-        lines += [r"\bottomrule", r"\end{tabular}", ""]
+        (_, *head), *planners = rows
+        caption = f"{suite.title or suite.name}: {len(benchmark.problems)} problems of {suite.name} {suite.version}"
+        caption += f", executed by the {plant} plant." if plant else "."
+        label = f"tab:{suite.name}{f'-{plant}' if plant else ''}"
+        lines += [
+            r"\begin{table}",
+            rf"\caption{{{caption.translate(_LATEX)}}}",
+            rf"\label{{{label}}}",
+            r"\resizebox{\textwidth}{!}{%",
+            rf"\begin{{tabular}}{{l{'r' * len(head)}}}",
+            r"\toprule",
+            rf"{' & '.join(['planner', *head])} \\",
+            r"\midrule",
+            *(rf"{' & '.join(row)} \\" for row in planners),
+            r"\bottomrule",
+            r"\end{tabular}}",
+            r"\end{table}",
+            "",
+        ]
     return "\n".join(lines)

@@ -98,7 +98,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(
             f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0"
         )
-    with Meter(quiet=not sys.stderr.isatty(), noun="plan") as meter:
+    with Meter(quiet=arguments.quiet or not sys.stderr.isatty(), noun="plan") as meter:
         meter.begin(f"executing {arguments.file}", len(plans))
         found = simulate_plans(
             plans,

@@ -62,7 +62,6 @@ def add_options(parser: Parser) -> None:
         help="file (.h5, .hdf5) or folder (default: FAMILY-scenes.h5)",
     )
     option("--force", action="store_true", help="replace OUT")
-    option("--quiet", action="store_true", help="no progress")
     add_json(parser)
 
 

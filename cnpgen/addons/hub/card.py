@@ -6,6 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.addons.hub.card_problem import (
+    constraint_table,
+    describe_frame,
+    limits_table,
+    problem_of,
+    what_samples_prove,
+)
+from cnpgen.addons.hub.markdown import markdown_table
 from cnpgen.problems.constraints.joint import judged_torque
 from cnpgen.problems.problem_record import as_record, open_problem
 from cnpgen.store.dataset_spec import DatasetSpec
@@ -56,6 +64,12 @@ datasets (`pip install datasets h5py`):
 ```text
 datasets.load_dataset("./FOLDER")
 ```
+
+With cnpgen, as batches for training:
+
+```text
+cnpgen.load_dataset("CNPGEN")
+```
 """
 
 _BEFORE_NOTES, _AFTER_NOTES = ("split", "rows", "files"), "## How it was made"
@@ -71,18 +85,26 @@ independently of the code that made the dataset.
 
 
 def card_text(
-    summary: DatasetSummary, *, folder: str, notes: str = "", shards: str = ""
+    summary: DatasetSummary,
+    *,
+    created: str,
+    folder: str,
+    notes: str = "",
+    shards: str = "",
+    picture: str = "",
 ) -> str:
-    """Return the card of a finished dataset; it depends on its rows and specification only, not on time or place.
+    """Return the card of a finished dataset; it depends on its rows, specification and date only.
 
     The folder is that of the dataset or its repository on the Hugging Face Hub, the
     notes are Markdown. A repository with a Parquet view in ``PARQUET`` has the shards
-    in a folder, with a slash at its end.
+    in a folder, with a slash at its end, and the file of a picture.
     """
     spec = summary.spec
     source = f'"{folder}"' if shards else f'"./{folder}"'
-    load = _LOAD.replace('"./FOLDER"', source).replace(
-        'f"{split}/', f'f"{shards}{{split}}/'
+    load = (
+        _LOAD.replace('"./FOLDER"', source)
+        .replace('f"{split}/', f'f"{shards}{{split}}/')
+        .replace("CNPGEN", f"hf://datasets/{folder}@main" if shards else folder)
     )
     split = next(iter(summary.statistics))
     files = (
@@ -92,7 +114,11 @@ def card_text(
         _front_matter(summary, f"{PARQUET}/{{}}/*.parquet" if shards else files),
         f"# {spec.name} {spec.version}\n\n{spec.title or spec.name}\n\n{_contents(summary)}",
         notes.strip(),
-        f"{_AFTER_NOTES}\n\n{_making(summary)}",
+        f"{_AFTER_NOTES}\n\n{_making(summary, created)}",
+        f"![Distributions and positions of the samples]({picture})" if picture else "",
+        f"## What a sample proves\n\n{what_samples_prove(spec)}",
+        _under("Limits", limits_table(spec)),
+        _under("Constraints, in SI units", constraint_table(spec)),
         f"## How to load it\n\n{load.replace('SPLIT', split)}",
         f"## Fields\n\n{_field_table(spec.fields)}",
         f"## Scenes\n\n{_scene_table(spec, shards)}" if spec.scene_obstacles else "",
@@ -159,15 +185,22 @@ def _contents(summary: DatasetSummary) -> str:
         (f"`{split}`", f"{count:,}", len(summary.of_split(split)))
         for split, count in spec.splits.items()
     ]
-    checks = "Every row passed every stage of its pipeline. Constraints were evaluated on the stored values."
-    return f"{checks}\n\n{_table(_BEFORE_NOTES, rows)}"
+    checks = "All rows satisfy all checks of the pipeline, which were made on the stored values."
+    return f"{checks}\n\n{markdown_table(_BEFORE_NOTES, rows)}"
 
 
-def _making(summary: DatasetSummary) -> str:
+def _under(heading: str, text: str) -> str:
+    """Return a section; empty without a text."""
+    return f"## {heading}\n\n{text}" if text else ""
+
+
+def _making(summary: DatasetSummary, created: str) -> str:
     spec = summary.spec
     facts = {
+        "date": created.partition("T")[0],
         "recipe": f"sha256 `{spec.recipe_sha256}`, in full in `manifest.json`",
         "robot": str(spec.robot.get("name", "")),
+        "frame": describe_frame(spec),
         "seed": str(spec.seed),
         "random numbers": spec.generator,
         "kernels": spec.backend,
@@ -187,7 +220,7 @@ def _making(summary: DatasetSummary) -> str:
 
 def _torque(spec: DatasetSpec) -> str:
     """Return which torque the problem limits if it states drives; empty for the rigid body."""
-    if "drive" not in spec.recipe["pipeline"].get("problem", {}):
+    if "drive" not in problem_of(spec):
         return ""
     problem, robot = open_problem(as_record(spec.problem))
     return judged_torque(problem.constraint, robot)
@@ -207,7 +240,7 @@ def _field_table(fields: Sequence[Field]) -> str:
         )
         for f in fields
     ]
-    return _table(head, rows)
+    return markdown_table(head, rows)
 
 
 def _scene_table(spec: DatasetSpec, shards: str) -> str:
@@ -238,7 +271,7 @@ def _scene_table(spec: DatasetSpec, shards: str) -> str:
     return (
         f"Every shard has each of its S scenes once, in arrays for up to O = {spec.scene_obstacles} obstacles."
         " The scene of row `i` is `numpy.searchsorted(scene_ids, scene_id[i])`."
-        f" Poses are in the frame of the robot's base.{where}\n\n{_table(head, rows)}\n\nFamilies: {families}."
+        f" Poses are in the frame of the robot's base.{where}\n\n{markdown_table(head, rows)}\n\nFamilies: {families}."
     )
 
 
@@ -253,7 +286,7 @@ def _yield_table(summary: DatasetSummary) -> str:
         (name, f"{count:,}", f"{100 * count / max(sampling.tried, 1):.3f} %")
         for name, count in counts.items()
     ]
-    text = _table(("outcome", "candidates", "share"), rows)
+    text = markdown_table(("outcome", "candidates", "share"), rows)
     if sampling.verification:
         worst = [
             (f"`{name}`", f"{value:.3g}")
@@ -261,7 +294,7 @@ def _yield_table(summary: DatasetSummary) -> str:
         ]
         text += (
             "\n\nWorst violation in 32 rows of every shard, recomputed with Pinocchio and Coal, in SI units:\n\n"
-            + _table(("constraint", "worst"), worst)
+            + markdown_table(("constraint", "worst"), worst)
         )
     return text
 
@@ -273,7 +306,7 @@ def _range_table(
     rows = [
         row for field in fields for row in _range_rows(field, statistics[field.name])
     ]
-    return _table(head, rows)
+    return markdown_table(head, rows)
 
 
 def _range_rows(field: Field, statistics: FieldStatistics) -> list[tuple[str, ...]]:
@@ -302,12 +335,3 @@ def _range_rows(field: Field, statistics: FieldStatistics) -> list[tuple[str, ..
             )
         )
     return rows
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Format a Markdown table."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(
-        "| " + " | ".join(str(cell).replace("|", "\\|") for cell in line) + " |"
-        for line in lines
-    )

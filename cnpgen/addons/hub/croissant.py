@@ -1,12 +1,12 @@
 """The Croissant description of a dataset: metadata, files and measured variables with units.
 
-Files of HDF5 have no record sets, because no Croissant reader opens them
-(mlcommons/croissant issue 697); Parquet tables have. Fields of Croissant have no unit.
-They are therefore also listed as ``variableMeasured`` of schema.org, which Croissant
-documents may contain.
+Every split has a record set, of HDF5 files or of Parquet tables. No Croissant reader
+opens HDF5 files yet (mlcommons/croissant issue 697); their record sets describe the
+columns. Fields of Croissant have no unit and no limits. Their components are therefore
+also listed as ``variableMeasured`` of schema.org, which Croissant documents may contain.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,8 +41,8 @@ _CONTEXT: dict[str, Any] = {
 
 
 @dataclass(frozen=True)
-class ParquetFile:
-    """A Parquet table of a split: its path in the repository, size [B] and sha256."""
+class SplitFile:
+    """A file of a split: its path in the repository, size [B] and sha256."""
 
     path: str
     bytes: int
@@ -51,51 +51,62 @@ class ParquetFile:
 
 def croissant_document(summary: DatasetSummary, *, created: str) -> dict[str, Any]:
     """Return the content of ``croissant.json`` of a dataset, created at an ISO 8601 time."""
-    files = [
-        _file(item.file, item.bytes, item.sha256, "x-hdf5")
-        for _, item in summary.records
-    ]
-    return _document(summary, created) | {"distribution": files}
+    splits = {
+        split: [
+            SplitFile(item.file, item.bytes, item.sha256)
+            for _, item in summary.of_split(split)
+        ]
+        for split in summary.spec.splits
+    }
+    pattern = "{}/*.h5"
+    return _document(summary, created) | _records(summary, splits, "x-hdf5", pattern)
 
 
 def croissant_of_tables(
     summary: DatasetSummary,
-    tables: Mapping[str, Iterable[ParquetFile]],
+    tables: Mapping[str, Sequence[SplitFile]],
     *,
     created: str,
     url: str,
 ) -> dict[str, Any]:
-    """Return the content of ``croissant.json`` of a repository of Parquet tables, with a record set for each split."""
+    """Return the content of ``croissant.json`` of a repository of Parquet tables."""
+    records = _records(summary, tables, "x-parquet", "*/{}/*.parquet")
+    return _document(summary, created) | {"url": url, **records}
+
+
+def _records(
+    summary: DatasetSummary,
+    splits: Mapping[str, Sequence[SplitFile]],
+    encoding: str,
+    pattern: str,
+) -> dict[str, Any]:
+    """Describe the files of all splits, with a record set for each split; "{}" in the pattern of paths is the split."""
     distribution, records = [], []
-    for split, files in tables.items():
-        objects = [
-            _file(item.path, item.bytes, item.sha256, "x-parquet") for item in files
+    for split, files in splits.items():
+        if not files:
+            continue
+        objects = [_file(item, encoding) for item in files]
+        name = f"{split}-files"
+        distribution += [
+            *objects,
+            {
+                "@type": "cr:FileSet",
+                "@id": name,
+                "name": name,
+                "encodingFormat": f"application/{encoding}",
+                "containedIn": [{"@id": item["@id"]} for item in objects],
+                "includes": pattern.format(split),
+            },
         ]
-        name = f"{split}-tables"
-        chosen = {
-            "containedIn": [{"@id": item["@id"]} for item in objects],
-            "includes": f"*/{split}/*.parquet",
-        }
-        kind = {
-            "@type": "cr:FileSet",
-            "@id": name,
-            "name": name,
-            "encodingFormat": "application/x-parquet",
-        }
-        distribution += [*objects, kind | chosen]
         fields = [_field(field, split, name) for field in summary.spec.fields]
         records.append(
             {"@type": "cr:RecordSet", "@id": split, "name": split, "field": fields}
         )
-    return _document(summary, created) | {
-        "url": url,
-        "distribution": distribution,
-        "recordSet": records,
-    }
+    return {"distribution": distribution, "recordSet": records}
 
 
 def _field(field: Field, split: str, files: str) -> dict[str, Any]:
-    """Describe a column of a split's tables."""
+    """Describe a column of a split's files."""
     source = {"fileSet": {"@id": files}, "extract": {"column": field.name}}
     shape = {"isArray": True, "arrayShape": str(field.width)} if field.width else {}
     return {
@@ -123,24 +134,29 @@ def _document(summary: DatasetSummary, created: str) -> dict[str, Any]:
     }
     if spec.license:
         document["license"] = f"https://spdx.org/licenses/{spec.license}"
-    return document | {"variableMeasured": [_variable(field) for field in spec.fields]}
+    if creator := str(spec.recipe.get("creator", "")).strip():
+        document["creator"] = {"@type": "sc:Organization", "name": creator}
+    if citation := str(spec.recipe.get("citation", "")).strip():
+        document["citeAs"] = citation
+    variables = [item for field in spec.fields for item in _variables(field)]
+    return document | {"variableMeasured": variables}
 
 
-def _variable(field: Field) -> dict[str, Any]:
-    """Describe a field; the limits cover all columns."""
-    columns = f" ({', '.join(field.names)})" if field.names else ""
-    described = {
-        "name": field.name,
-        "description": f"{field.long_name}{columns}",
-        "unitText": field.unit,
-    }
-    lower = {} if field.valid_min is None else {"minValue": min(field.valid_min)}
-    upper = {} if field.valid_max is None else {"maxValue": max(field.valid_max)}
-    return {"@type": "sc:PropertyValue", **described, **lower, **upper}
+def _variables(field: Field) -> Iterator[dict[str, Any]]:
+    """Describe the components of a field, each with its unit and limits."""
+    for index, (name, unit) in enumerate(zip(field.columns, field.units, strict=True)):
+        limits = {"minValue": field.valid_min, "maxValue": field.valid_max}
+        yield {
+            "@type": "sc:PropertyValue",
+            "name": name,
+            "description": field.long_name,
+            "unitText": unit,
+            **{key: limit[index] for key, limit in limits.items() if limit is not None},
+        }
 
 
 def _description(summary: DatasetSummary) -> str:
-    """Describe splits and fields in prose, in place of record sets."""
+    """Describe splits and fields in prose."""
     spec = summary.spec
     rows = ", ".join(f"{count} {split}" for split, count in spec.splits.items())
     fields = "; ".join(
@@ -156,13 +172,13 @@ def _description(summary: DatasetSummary) -> str:
     return f"{text} One entry per scene: {arrays}."
 
 
-def _file(name: str, size: int, sha256: str, encoding: str) -> dict[str, str]:
+def _file(file: SplitFile, encoding: str) -> dict[str, str]:
     return {
         "@type": "cr:FileObject",
-        "@id": name,
-        "name": name,
-        "contentUrl": name,
-        "contentSize": f"{size} B",
+        "@id": file.path,
+        "name": file.path,
+        "contentUrl": file.path,
+        "contentSize": f"{file.bytes} B",
         "encodingFormat": f"application/{encoding}",
-        "sha256": sha256,
+        "sha256": file.sha256,
     }

@@ -19,8 +19,8 @@ class Card(DatasetDocument):
     def render(
         self, summary: DatasetSummary, *, created: str, folder: str, notes: str
     ) -> str:
-        """Return the card; it does not depend on the time."""
-        return card_text(summary, folder=folder, notes=notes)
+        """Return the card."""
+        return card_text(summary, created=created, folder=folder, notes=notes)
 
     def notes(self, text: str) -> str:
         """Return the notes in a card."""

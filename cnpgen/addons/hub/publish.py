@@ -2,6 +2,7 @@
 
 ```
 README.md                        the card
+picture.png                      histograms and positions of the samples, on the card
 croissant.json                   the Parquet view for ML catalogues, with a record set for each split
 parquet/train/00000.parquet      a table per shard, for the viewer, polars and DuckDB
 hdf5/                            the dataset without its croissant.json: cnpgen validate hdf5
@@ -16,24 +17,27 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.addons.hub.card import PARQUET, card_notes, card_text
-from cnpgen.addons.hub.croissant import ParquetFile, croissant_of_tables
+from cnpgen.addons.hub.croissant import SplitFile, croissant_of_tables
+from cnpgen.addons.hub.downloads import HDF5
 from cnpgen.errors import MachineError, UsageError, requires_extra
 from cnpgen.loader.load import load_dataset
 from cnpgen.plans.formats import fixed_lists, write_parquet
 from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.store.dataset_plot import plot_dataset
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shards
 from cnpgen.store.dataset_summary import summarize_dataset
 from cnpgen.store.files.atomic import check_writable, file_sha256, write_file
 from cnpgen.store.files.documents import render
 from cnpgen.store.files.written_files import claim_files, record_files
+from cnpgen.store.inspection import inspect_dataset
 from cnpgen.store.layout import CARD, CROISSANT, DOCUMENTS
 from cnpgen.store.manifest import load_manifest
 from cnpgen.store.shard import read_shard
 from cnpgen.store.shard_record import load_record
 
-HDF5 = "hdf5"  # folder of the dataset in the repository
 HUB = "https://huggingface.co"
 REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}")
+PICTURE = "picture.png"
 SOURCE_KEY = b"cnpgen.sha256"  # metadata of a table: the sha256 of its shard
 
 
@@ -68,7 +72,7 @@ def publish_dataset(
         UsageError: The repository has no valid name or is inside the dataset, its
             folder has files of other origin, or the dataset has no license.
         DatasetError: The dataset is unfinished or damaged.
-        MissingExtraError: pyarrow or huggingface_hub is not installed.
+        MissingExtraError: pyarrow, matplotlib or huggingface_hub is not installed.
         MachineError: The folder cannot be written, or the upload failed.
     """
     if not REPOSITORY.fullmatch(to):
@@ -109,25 +113,31 @@ def write_repository(
     copies = [name for task in tasks for name in (task.file, task.sidecar)]
     copies += [name for name in DOCUMENTS if name != CROISSANT]  # without record sets
     written = [path.relative_to(target).as_posix() for path in tables]
-    written += [f"{HDF5}/{name}" for name in copies] + [CARD, CROISSANT]
+    written += [f"{HDF5}/{name}" for name in copies] + [CARD, CROISSANT, PICTURE]
     claim_files(target, written, force=force)
     for task, path in zip(tasks, tables, strict=True):
         _write_table(source, spec, task, path)
     for name in copies:
-        _copy(source / name, target / HDF5 / name)
+        link_or_copy(source / name, target / HDF5 / name)
     notes = card_notes((source / CARD).read_text(encoding="utf-8"))
     summary = summarize_dataset(source, spec)
-    write_file(
-        target / CARD,
-        card_text(summary, folder=repository, notes=notes, shards=f"{HDF5}/"),
+    created, url = load_manifest(source)["created"], f"{HUB}/datasets/{repository}"
+    plot_dataset(inspect_dataset(source), target / PICTURE)
+    card = card_text(
+        summary,
+        created=created,
+        folder=repository,
+        notes=notes,
+        shards=f"{HDF5}/",
+        picture=PICTURE,
     )
-    files: dict[str, list[ParquetFile]] = {}
+    write_file(target / CARD, card)
+    files: dict[str, list[SplitFile]] = {}
     for task, path in zip(tasks, tables, strict=True):
         name = path.relative_to(target).as_posix()
         files.setdefault(task.split, []).append(
-            ParquetFile(name, path.stat().st_size, file_sha256(path))
+            SplitFile(name, path.stat().st_size, file_sha256(path))
         )
-    created, url = load_manifest(source)["created"], f"{HUB}/datasets/{repository}"
     write_file(
         target / CROISSANT,
         render(croissant_of_tables(summary, files, created=created, url=url)) + "\n",
@@ -169,7 +179,7 @@ def _write_table(source: Path, spec: DatasetSpec, task: ShardTask, path: Path) -
     write_parquet(path, pyarrow.table(arrays, schema=schema))
 
 
-def _copy(source: Path, target: Path) -> None:
+def link_or_copy(source: Path, target: Path) -> None:
     """Link or copy a file, unless the copy has the same size and is not older."""
     if target.exists():
         before, now = target.stat(), source.stat()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import numpy as np
@@ -9,14 +10,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.addons.online.motion_check import MotionChecker
 from cnpgen.addons.online.plan_hits import PlannedHits
-from cnpgen.addons.online.set_points import SampledMotion, SetPoint, sample_motion
+from cnpgen.addons.online.set_points import (
+    MAX_GRID_STEP_S,
+    SampledMotion,
+    SetPoint,
+    sample_motion,
+)
 from cnpgen.addons.online.stops import with_smooth_end
 from cnpgen.addons.online.switches import SwitchOutcome
 from cnpgen.errors import UsageError
-from cnpgen.planner.planner import Planner
-from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.judges.plans import Verdict
+from cnpgen.judges.plans.judge import Judge
 from cnpgen.plans.join import JoinedPlans
 from cnpgen.plans.plans import Plans
+from cnpgen.plans.tips import correct_tips
+from cnpgen.problems.problem_record import ProblemRecord, open_problem
+from cnpgen.robots.robot import Robot
 from cnpgen.schema.arguments import numbers
 
 Array = NDArray[np.float64]
@@ -35,22 +44,27 @@ class Admission:
     """Rules by which a runtime accepts the plans of one robot.
 
     Args:
-        planner: A planner of the robot; its problem defines the limits.
-        judge: Whether plans are judged.
+        record: Problem that defines the limits.
         parameters: Parameters of the problem, shape (width,); nominal by default.
+        judge: Whether plans are judged.
         checker: Memory of measurements.
+        grid_step: Largest step of the grid on which motions are sampled [s].
     """
 
     def __init__(
         self,
-        planner: Planner,
+        record: ProblemRecord,
         parameters: ArrayLike | None,
         *,
         judge: bool,
         checker: MotionChecker,
+        grid_step: float = MAX_GRID_STEP_S,
     ) -> None:
-        self._planner, self._judge, self._checker = planner, judge, checker
-        self._parameters = _checked_parameters(planner, parameters)
+        self._record, self._robot = record, open_problem(record)[1]
+        self._judge, self._checker, self._step = judge, checker, grid_step
+        self._parameters = _checked_parameters(record, self._robot, parameters)
+        self._judges: dict[ProblemRecord, Judge] = {}
+        self._lock = threading.Lock()  # the memory of a judge is that of one thread
 
     def refusal_or_motion(
         self, plan: Plans | JoinedPlans, at: float
@@ -67,9 +81,9 @@ class Admission:
         self, plan: Plans | JoinedPlans, at: float
     ) -> tuple[SwitchOutcome | SampledMotion, str]:
         """Return the motion of a plan, slower at its end if it would end with an acceleration, and a text about it."""
-        motion = sample_motion(plan, at)
-        acceleration = plan.motion.at_times(plan.duration[:, None]).ddq[0, 0]
-        share = np.abs(acceleration / self._planner.robot.acceleration_limit).max()
+        motion = sample_motion(plan, at, step=self._step)
+        _, _, acceleration = _end_of(plan)
+        share = np.abs(acceleration / self._robot.acceleration_limit).max()
         if share <= MAX_END_ACCELERATION:
             return motion, ""
         text = f"it ends with {share:.3g} of the acceleration limit"
@@ -85,7 +99,7 @@ class Admission:
             raise UsageError(
                 f"must be one plan or one sequence, got {len(plan)}", argument="plan"
             )
-        names = self._planner.model.problem.joint_names
+        names = self._record.joint_names
         if plan.problem.joint_names != names:
             raise UsageError(
                 f"the plan is of {plan.problem.name!r} with other joints than {names}",
@@ -116,18 +130,28 @@ class Admission:
         duration = plan.duration
         if not np.isfinite(duration).all():
             return SwitchOutcome.INVALID, "its duration is not finite"
-        speed = np.abs(plan.motion.at_times(duration[:, None]).dq[0, 0])
-        if (speed > MAX_END_SPEED * self._planner.robot.velocity_limit).any():
+        speed = np.abs(_end_of(plan).dq)
+        if (speed > MAX_END_SPEED * self._robot.velocity_limit).any():
             return SwitchOutcome.MOVING, f"up to {speed.max():.3g} rad/s"
         for part in parts if self._judge else ():
-            (verdict,) = evaluate_plans(part).verdicts
-            if not verdict.valid:
+            if not (verdict := self._verdict(part)).valid:
                 return SwitchOutcome.INVALID, str(verdict)
         return None
 
+    def _verdict(self, part: Plans) -> Verdict:
+        """Judge a plan; the memory of Pinocchio and Coal is reused between calls."""
+        part = correct_tips(part)
+        with self._lock:
+            if (judge := self._judges.get(part.problem)) is None:
+                judge = self._judges[part.problem] = Judge(*open_problem(part.problem))
+            goal = part.columns["goal_xyz"]
+            return judge(part.motion, part.boundary, part.scene, goal, early_exit=True)[
+                0
+            ]
+
     def jump(self, before: SetPoint, motion: SampledMotion) -> str:
         """Describe the discontinuity between a state and the start of a motion; empty if there is none."""
-        robot = self._planner.robot
+        robot = self._robot
         after = motion.at(np.array([motion.start]))
         limits = (np.ones(robot.n), robot.velocity_limit, robot.acceleration_limit)
         for name, end, begin, limit, share in zip(
@@ -137,6 +161,13 @@ class Admission:
             if not (gap <= share * limit).all():
                 return f"{name} jumps by {gap.max():.3g}"
         return ""
+
+
+def _end_of(plan: Plans | JoinedPlans) -> SetPoint:
+    """Return the state at the end of one plan or sequence."""
+    last = plan.parts[-1] if isinstance(plan, JoinedPlans) else plan
+    states = last.motion.at(np.ones(1))
+    return SetPoint(states.q[0, 0], states.dq[0, 0], states.ddq[0, 0])
 
 
 def plan_of_request(
@@ -153,14 +184,16 @@ def plan_of_request(
     return hits.plans if hits.return_plans is None else hits.sequences, ""
 
 
-def _checked_parameters(planner: Planner, parameters: ArrayLike | None) -> Array | None:
+def _checked_parameters(
+    record: ProblemRecord, robot: Robot, parameters: ArrayLike | None
+) -> Array | None:
     """Return the parameters of all plans, shape (width,).
 
     None if the problem has none.
     """
-    ranges = planner.model.problem.parameters
+    ranges = record.parameters
     if parameters is None:
-        return planner.robot.nominal_parameters if ranges else None
+        return robot.nominal_parameters if ranges else None
     rows = ranges.checked(numbers("parameters", parameters))
     if len(rows) != 1:
         raise UsageError(

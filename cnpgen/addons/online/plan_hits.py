@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -24,8 +25,9 @@ from cnpgen.plans.join import JoinedPlans, join_plans
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.puck_contact import PuckContact
 from cnpgen.problems.problem_record import as_problem
-from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.argument_types import check_fields, checked_arguments
 from cnpgen.schema.arguments import concerning, number, numbers
+from cnpgen.schema.old_keywords import CALLER, with_old_keywords
 
 Array = NDArray[np.float64]
 
@@ -84,6 +86,32 @@ class PlannedHits:
         return f"<{len(self.plans):,} of {counted(len(self.reasons), 'hit')} of {self.plans.problem.name!r} planned>"
 
 
+@dataclass(frozen=True, eq=False)
+class HitOptions:
+    """Options of ``plan_hits``.
+
+    Attributes:
+        contact_distance: Distance from the puck's centre to the mallet's at the goal
+            [m]; by default that of the problem's constraint ``puck-contact``, or 0.07
+            without one.
+        speed_share: Speed of the hit as a fraction of the highest possible one, a
+            number or shape (N,); by default 1, or 0.98 with ``home``: at the highest
+            speed, joints reach their velocity limits, which the way back then exceeds.
+        puck_model: Drag, restitution and friction of a moving puck; by default those of
+            the simulator.
+
+    Raises:
+        UsageError: A value has another type.
+    """
+
+    contact_distance: float | None = None
+    speed_share: ArrayLike | None = None
+    puck_model: PuckModel | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
 @checked_arguments
 @one_thread()
 def plan_hits(
@@ -92,13 +120,12 @@ def plan_hits(
     puck: ArrayLike,
     target: ArrayLike,
     *,
-    contact_distance: float | None = None,
-    speed_share: ArrayLike | None = None,
     puck_velocity: ArrayLike | None = None,
     meeting_time: ArrayLike | None = None,
-    puck_model: PuckModel | None = None,
     home: ArrayLike | None = None,
     parameters: ArrayLike | None = None,
+    options: HitOptions | None = None,
+    **old_keywords: Any,
 ) -> PlannedHits:
     """Plan hits from a state of the arm that send a puck towards a target.
 
@@ -118,23 +145,17 @@ def plan_hits(
         puck: Position of the puck's centre, x and y [m], shape (2,) or (N, 2); x, y and
             z for problems without table.
         target: Position to hit the puck towards, x and y [m], shape (2,) or (N, 2).
-        contact_distance: Distance from the puck's centre to the mallet's at the goal
-            [m]; by default that of the problem's constraint ``puck-contact``, or 0.07
-            without one.
-        speed_share: Speed of the hit as a fraction of the highest possible one, a
-            number or shape (N,); by default 1, or 0.98 with ``home``: at the highest
-            speed, joints reach their velocity limits, which the way back then exceeds.
         puck_velocity: Velocity of the puck in the state of the arm, x and y [m/s],
             shape (2,) or (N, 2).
         meeting_time: Time from the state of the arm to the contact [s], a number or
             shape (N,); by default as soon as possible. A hit that cannot be in time has
             a reason.
-        puck_model: Drag, restitution and friction of a moving puck; by default those of
-            the simulator.
         home: Joint positions at which the arm rests after the hit [rad], shape (n,) or
             (N, n).
         parameters: Parameters of the problem, shape (width,) or (N, width); nominal by
             default. Positions are those on a table that they move.
+        options: Contact distance, speed, and model of the puck.
+        old_keywords: Fields of the options, as keywords of version 1.0.
 
     Returns:
         Plans of the hits that have an answer, not checked yet, and the reasons why the
@@ -145,6 +166,10 @@ def plan_hits(
             differs from that of the problem, the model was not trained on hits, or
             ``home`` is given for a model without moving starts.
     """
+    chosen = with_old_keywords(
+        "plan_hits", options, HitOptions(), old_keywords, caller=CALLER + 1
+    )
+    speed_share = chosen.speed_share
     if speed_share is None:
         speed_share = 1.0 if home is None else RETURNING_SPEED_SHARE
     completion = _COMPLETIONS.get(planner)
@@ -154,7 +179,7 @@ def plan_hits(
         )
     contact = as_problem(planner.model.problem).first(PuckContact)
     distance, overlap = (
-        _contact_distance(contact, contact_distance),
+        _contact_distance(contact, chosen.contact_distance),
         0.0 if contact is None else contact.overlap,
     )
     if puck_velocity is None and meeting_time is None:
@@ -176,7 +201,7 @@ def plan_hits(
             raise UsageError("must be None for moving pucks", argument="parameters")
         velocity = np.zeros(2) if puck_velocity is None else puck_velocity
         arguments = state, puck, velocity, target, speed_share, meeting_time
-        model = puck_model or PuckModel()
+        model = chosen.puck_model or PuckModel()
         moving = MovingHits(
             planner.robot.n, arguments, model=model, distance=distance, overlap=overlap
         )

@@ -6,6 +6,7 @@ import math
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,14 +15,24 @@ from cnpgen.addons.online.kept_stops import KeptStops
 from cnpgen.addons.online.motion_check import MotionChecker
 from cnpgen.addons.online.plan_admission import Admission, Executable, plan_of_request
 from cnpgen.addons.online.replan_requests import ReplanRequests
-from cnpgen.addons.online.set_points import SampledMotion, SetPoint, at_rest
+from cnpgen.addons.online.set_points import (
+    MAX_GRID_STEP_S,
+    SampledMotion,
+    SetPoint,
+    at_rest,
+)
 from cnpgen.addons.online.stops import earliest_stop
 from cnpgen.addons.online.switches import Stop, Switch, SwitchOutcome
 from cnpgen.addons.online.timeline import Timeline
 from cnpgen.errors import CnpgenError, UsageError
 from cnpgen.planner.planner import Planner
+from cnpgen.plans.join import JoinedPlans
+from cnpgen.plans.plans import Plans
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.problem_record import as_record, open_problem
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.arguments import distinct, number, numbers
+from cnpgen.schema.arguments import concerning, distinct, number, numbers
+from cnpgen.store.dataset_spec import StoredProblem
 
 Array = NDArray[np.float64]
 PlanFunction = Callable[[SetPoint], Executable | None]
@@ -50,7 +61,8 @@ class PlanRuntime:
     ``set_point`` costs microseconds and may run in another thread than planning.
 
     Args:
-        planner: Plans are of its robot; its problem defines the limits.
+        planner: Plans are of its robot; its problem defines the limits. Or the problem,
+            its record, name or path, for plans of other sources.
         q: Joint positions of the arm, which is at rest [rad], shape (n,).
         time: Start time [s].
         judge: Whether to check every plan and stop by the independent verdict, which
@@ -60,6 +72,10 @@ class PlanRuntime:
         history: Time for which ``state_at`` returns the executed motion [s].
         max_step: Largest step from one set point to the next: that of each joint at its
             velocity limit in this time [s].
+        keep_stops: Whether stops are computed in the background before they are needed,
+            which may take all of a processor core after a switch.
+        grid_step: Largest step of the grid on which motions are sampled [s]. Steps of
+            1 ms suit time-optimal motions; slower ones may have longer steps.
 
     Raises:
         UsageError: The positions have another shape or are not finite, or a parameter
@@ -69,7 +85,7 @@ class PlanRuntime:
     @checked_arguments
     def __init__(
         self,
-        planner: Planner,
+        planner: Planner | Problem | StoredProblem | str | Path,
         q: ArrayLike,
         *,
         time: float = 0.0,
@@ -77,18 +93,33 @@ class PlanRuntime:
         parameters: ArrayLike | None = None,
         history: float = HISTORY_S,
         max_step: float = MAX_SET_POINT_STEP_S,
+        keep_stops: bool = True,
+        grid_step: float = MAX_GRID_STEP_S,
     ) -> None:
-        self._robot, self._judge, self._checker = planner.robot, judge, MotionChecker()
+        with concerning("planner"):
+            record = as_record(
+                planner.model.problem if isinstance(planner, Planner) else planner
+            )
+        self._robot = robot = open_problem(record)[1]
+        self._judge, self._checker = judge, MotionChecker()
         self._admission = Admission(
-            planner, parameters, judge=judge, checker=self._checker
+            record,
+            parameters,
+            judge=judge,
+            checker=self._checker,
+            grid_step=positive("grid_step", grid_step),
         )
         self._timeline = Timeline(
-            at_rest(_checked_positions("q", q, planner.robot.n), number("time", time)),
-            history=_positive("history", history),
-            max_step=_positive("max_step", max_step) * planner.robot.velocity_limit,
+            at_rest(_checked_positions("q", q, robot.n), number("time", time)),
+            history=positive("history", history),
+            max_step=positive("max_step", max_step) * robot.velocity_limit,
         )
         self._lock = threading.RLock()
+        # Held while a stop is computed, so that no ``resume`` comes in between, and a
+        # second ``stop`` returns the finished result.
+        self._stopping = threading.RLock()
         self._kept_stops = KeptStops(self._checker, measured=judge)
+        self._keeps_stops = keep_stops
         self._requests = ReplanRequests()
         self._stop: Stop | None = None  # until the runtime is resumed
         self._stops, self._closed = 0, False
@@ -114,12 +145,17 @@ class PlanRuntime:
         with self._lock:
             self._closed = True
         self._kept_stops.follow(None)
-        return self._requests.close(_positive("timeout", timeout))
+        return self._requests.close(positive("timeout", timeout))
 
     @property
     def end_time(self) -> float:
         """Time from which on the arm is at rest, if no other plan follows [s]."""
         return self._timeline.end_time
+
+    @property
+    def now(self) -> float:
+        """Last time of a set point [s]; the start time before the first one."""
+        return self._timeline.now
 
     @property
     def stopped(self) -> bool:
@@ -156,6 +192,17 @@ class PlanRuntime:
         times = _checked_times(time)
         with self._lock:
             return self._timeline.state_at(times)
+
+    @checked_arguments
+    def plan_at(self, time: float) -> tuple[Plans | JoinedPlans | None, float]:
+        """Return the plan whose path is followed at a time [s], and the time since its start at which it is there [s].
+
+        They differ from those of the plan while the arm stops. At rest it is None.
+        """
+        found = number("time", time)
+        with self._lock:
+            part = self._timeline.part_at(found)
+        return part.plan, float(np.interp(found, part.edges, part.plan_times))
 
     @checked_arguments
     def switch(self, plan: Executable | None, at: float) -> Switch:
@@ -210,15 +257,16 @@ class PlanRuntime:
             Begin and end of the stop and the distance that each joint travels.
         """
         at = number("at", at)
-        with self._lock:
-            self._stops += 1  # refuses all plans of earlier requests
-            if self._stop is not None:
-                return self._stop
-            begin = max(at, self._timeline.now)
-            self._stop = _report(self._timeline.part_at(begin), begin)
-            dropped = self._timeline.drop_after(begin)
-        self._requests.refuse_waiting(SwitchOutcome.STOPPED)
-        return self._stop_on_path(begin, dropped)
+        with self._stopping:
+            with self._lock:
+                self._stops += 1  # refuses all plans of earlier requests
+                if self._stop is not None:
+                    return self._stop
+                begin = max(at, self._timeline.now)
+                self._stop = _report(self._timeline.part_at(begin), begin)
+                dropped = self._timeline.drop_after(begin)
+            self._requests.refuse_waiting(SwitchOutcome.STOPPED)
+            return self._stop_on_path(begin, dropped)
 
     @checked_arguments
     def resume(self, measured_q: ArrayLike, *, at: float | None = None) -> None:
@@ -233,7 +281,7 @@ class PlanRuntime:
             UsageError: The runtime was not stopped, or the stop has not ended.
         """
         q = _checked_positions("measured_q", measured_q, self._robot.n)
-        with self._lock:
+        with self._stopping, self._lock:
             time = self._timeline.now if at is None else number("at", at)
             if self._stop is None:
                 raise UsageError("the runtime was not stopped, so it cannot resume")
@@ -286,7 +334,7 @@ class PlanRuntime:
             if jump := self._admission.jump(before, motion):
                 return Switch(SwitchOutcome.JUMP, at, jump)
             replaced = _replaced(self._timeline.append(motion))
-            self._kept_stops.follow(motion)
+            self._kept_stops.follow(motion if self._keeps_stops else None)
         detail = "; ".join(filter(None, (detail, replaced)))
         return Switch(SwitchOutcome.ACCEPTED, at, detail)
 
@@ -326,7 +374,7 @@ def _replaced(starts: list[float]) -> str:
     return f"replaces the motion that was accepted for {times} s"
 
 
-def _positive(name: str, value: float) -> float:
+def positive(name: str, value: float) -> float:
     """Return an argument as a positive number.
 
     Raises:

@@ -37,6 +37,15 @@ class SetPoint(NamedTuple):
     ddq: Array
 
 
+class ChunkSetPoint(NamedTuple):
+    """Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (n,), and the other columns, (D - n,)."""
+
+    q: Array
+    dq: Array
+    ddq: Array
+    others: Array
+
+
 @dataclass(frozen=True, eq=False)
 class SampledMotion:
     """A motion from a start time on, then rest at its end.
@@ -94,13 +103,15 @@ class SampledMotion:
         )
 
 
-def sample_motion(plan: Plans | JoinedPlans, start: float) -> SampledMotion:
-    """Sample one plan, or one sequence of plans, that starts at a time [s]."""
+def sample_motion(
+    plan: Plans | JoinedPlans, start: float, *, step: float = MAX_GRID_STEP_S
+) -> SampledMotion:
+    """Sample one plan, or one sequence of plans, that starts at a time [s], at most a step [s] apart."""
     edges, coefficients, last = [], [], np.zeros(0)
     for part, begin, end in parts_of(plan):
         if end <= begin:
             continue  # the next part replaces it at once
-        times = grid(end - begin)
+        times = grid(end - begin, step)
         states = part.motion.at_times(times[None])
         coefficients.append(
             _cells(times, SetPoint(states.q[0], states.dq[0], states.ddq[0]))
@@ -122,9 +133,9 @@ def parts_of(plan: Plans | JoinedPlans) -> list[tuple[Plans, float, float]]:
     return list(zip(plan.parts, begins, ends, strict=True))
 
 
-def grid(duration: float) -> Array:
-    """Return the edges of equal cells of at most ``MAX_GRID_STEP_S`` from 0 to a duration [s], shape (cells + 1,)."""
-    return np.linspace(0.0, duration, ceil(duration / MAX_GRID_STEP_S) + 1)
+def grid(duration: float, step: float = MAX_GRID_STEP_S) -> Array:
+    """Return the edges of equal cells of at most a step [s] from 0 to a duration [s], shape (cells + 1,)."""
+    return np.linspace(0.0, duration, ceil(duration / step) + 1)
 
 
 def sample_states(

@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 
 class SwitchOutcome(Enum):
-    """Result of a request to switch to another plan; the value is a description."""
+    """Result of a request to switch to another plan or chunk; the value is a description."""
 
     ACCEPTED = "accepted"
     NO_PLAN = "the planner returned no plan"
@@ -24,6 +24,14 @@ class SwitchOutcome(Enum):
     INVALID = "the plan is not valid"
     STOPPED = "the runtime was stopped: call resume() first, and plan again"
     CLOSED = "the runtime was closed"
+    NOT_FINITE = "the chunk has values that are not finite"
+    OUTLIER = "no motion through the chunk meets the limits"
+    SHORT = "too few samples of the chunk are left at the join"
+    FAR = "the motion is too far from the chunk"
+    STALE = "the chunk is too old"
+    REPLAYED = "the chunk is not newer than the last one"
+    CLOCK = "the clock is not continuous"
+    TRACKING = "the arm does not follow the set points"
 
 
 @dataclass(frozen=True)
@@ -60,3 +68,24 @@ class Stop(Switch):
 
     end_time: float = np.nan
     distance: Array = field(default_factory=lambda: np.zeros(0))
+
+
+@dataclass(frozen=True, eq=False)
+class ChunkJoin(Switch):
+    """Result of ``ChunkExecutor.step``.
+
+    Attributes:
+        outcome: The result; only accepted chunks are executed.
+        time: Time of the join [s].
+        detail: Further text, such as the judge's reason; or empty.
+        end_time: Time from which on the arm is at rest without another chunk [s].
+        distance: Largest distance of the motion from the samples of the raw chunk, over
+            all joints [rad]; nan if no motion was computed.
+        speed: Largest speed along the chunk, in units of its own timing.
+        skipped: Number of samples that were due before the join.
+    """
+
+    end_time: float = np.nan
+    distance: float = np.nan
+    speed: float = np.nan
+    skipped: int = 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,6 +36,10 @@ class Timeline:
         self._history, self._max_step = history, max_step
         self._last_q: Array | None = None  # last set point
         self.now = first.start
+
+    def __iter__(self) -> Iterator[SampledMotion]:
+        """Iterate over the kept motions in the order of their starts."""
+        return iter(self._parts)
 
     @property
     def end_time(self) -> float:

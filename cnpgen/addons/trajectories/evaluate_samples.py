@@ -82,7 +82,9 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(
             f"{arguments.file} has no trajectory {arguments.plan}: {count} are numbered from 0"
         )
-    with Meter(quiet=not sys.stderr.isatty(), noun="trajectory") as meter:
+    with Meter(
+        quiet=arguments.quiet or not sys.stderr.isatty(), noun="trajectory"
+    ) as meter:
         meter.begin(f"judging {arguments.file}", count)
         found = evaluate_trajectories(
             loaded.problem,

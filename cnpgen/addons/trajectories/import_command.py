@@ -74,7 +74,7 @@ def add_options(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from cnpgen.addons.trajectories.import_trajectories import import_trajectories
-    from cnpgen.cli.refine_command import check_place
+    from cnpgen.cli.refine_command import check_free
     from cnpgen.plans.plan_file import save_plans
     from cnpgen.store.files.kind import PLANS
     from cnpgen.store.paths import file_kind
@@ -83,7 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(
             f"{arguments.file} is {PLANS} already: 'cnpgen refine' optimizes them"
         )
-    check_place(arguments.out, force=arguments.force)
+    check_free(arguments.out, force=arguments.force)
     problem = problem_of(arguments)
     loaded = load_file(arguments, problem)
     imported = import_trajectories(

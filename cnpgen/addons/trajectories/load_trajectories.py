@@ -7,11 +7,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.addons.trajectories.load_options import LoadOptions
 from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
 from cnpgen.addons.trajectories.table_columns import TIME_NAMES
 from cnpgen.addons.trajectories.table_reader import ReadOptions, TableReader
@@ -27,7 +28,7 @@ from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.robots.plausible_values import UnitError, find_implausible_value
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.arguments import number
+from cnpgen.schema.old_keywords import with_old_keywords
 from cnpgen.store.dataset_spec import StoredProblem
 
 Array = NDArray[np.float64]
@@ -60,15 +61,10 @@ def load_trajectories(
     *,
     joints: Sequence[str] | None = None,
     velocities: Sequence[str] | None = None,
-    time: str | None = None,
-    unit: Literal["rad", "deg"] = "rad",
-    rate: float | None = None,
-    separator: str | None = None,
-    separate_by: str | None = None,
-    unwrap: bool = False,
-    drop_repeats: bool = False,
     parameters: Mapping[str, float] | None = None,
     scenes: str | Path | Sequence[SceneProblem] | None = None,
+    options: LoadOptions | None = None,
+    **old_keywords: Any,
 ) -> LoadedTrajectories:
     """Load sampled trajectories from a file or a folder; 'cnpgen docs trajectories' lists formats and columns.
 
@@ -79,21 +75,12 @@ def load_trajectories(
             default the same names. For arrays without names: indices.
         velocities: Names of the columns with their velocities, in the same order, if
             they have other names.
-        time: Name of the column with the times, and its unit if it has another than s,
-            such as "stamp [ms]".
-        unit: Unit of revolute joints in columns without a unit in their name.
-        rate: Samples per second [Hz] of a file without times.
-        separator: Separator of columns in text files; by default it is found.
-        separate_by: Column whose value differs from trajectory to trajectory. A value
-            that returns after another one begins a new trajectory.
-        unwrap: Whether revolute joints that jump by more than half a turn have passed
-            the end of the range of angles.
-        drop_repeats: Whether to drop rows that repeat the time and the positions of the
-            row before.
         parameters: Values of the problem's parameters that the file does not have, by
             name, in SI units.
         scenes: Obstacles around the trajectories: a file of scenes or of plans, or
             loaded scenes; one for each trajectory in order, or one for all.
+        options: Times, units, separators and repairs.
+        old_keywords: Fields of the options, as keywords of version 1.0.
 
     Raises:
         UsageError: A column is missing, a value is not finite, times do not increase,
@@ -102,33 +89,34 @@ def load_trajectories(
             times in milliseconds.
         MissingExtraError: The format needs a package that is not installed.
     """
+    chosen = with_old_keywords(
+        "load_trajectories", options, LoadOptions(), old_keywords
+    )
     record = problem_of_samples(problem)
     names = _names(record, "joints", record.joint_names if joints is None else joints)
-    if rate is not None and not number("rate", rate) > 0:
-        raise UsageError(f"must be above 0, got {rate}", argument="rate")
     _check_parameters(record, parameters or {})
     robot = open_problem(record)[1]
-    options = ReadOptions(
+    reading = ReadOptions(
         joints=names,
         velocities=()
         if velocities is None
         else _names(record, "velocities", velocities),
-        time=time,
-        degrees=unit == "deg",
-        rate=rate,
-        unwrap=unwrap,
-        drop_repeats=drop_repeats,
-        separated=separate_by is not None,
+        time=chosen.time,
+        degrees=chosen.unit == "deg",
+        rate=chosen.rate,
+        unwrap=chosen.unwrap,
+        drop_repeats=chosen.drop_repeats,
+        separated=chosen.separate_by is not None,
         parameters=parameters or {},
     )
     try:
         tables = [
             part
-            for table in read_trajectory_tables(Path(path), separator=separator)
-            for part in _separated(table, separate_by)
+            for table in read_trajectory_tables(Path(path), separator=chosen.separator)
+            for part in _separated(table, chosen.separate_by)
         ]
         readers = [
-            TableReader(table, record, options, robot.velocity_limit)
+            TableReader(table, record, reading, robot.velocity_limit)
             for table in tables
         ]
         trajectories = tuple(reader.trajectory() for reader in readers)
@@ -137,7 +125,7 @@ def load_trajectories(
         raise
     if not trajectories:
         raise UsageError(f"{path} holds no trajectory", argument="path")
-    if unit == "rad":
+    if chosen.unit == "rad":
         _check_unit(path, robot, [trajectory.q for trajectory in trajectories])
     for reader, trajectory in zip(readers, trajectories, strict=True):
         reader.check_units(trajectory)

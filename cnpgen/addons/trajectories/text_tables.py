@@ -10,7 +10,11 @@ import numpy as np
 
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable, Values
 from cnpgen.errors import UsageError
-from cnpgen.store.files.size_limits import MAX_TABLE_BYTES, MAX_TABLE_COLUMNS
+from cnpgen.store.files.size_limits import (
+    MAX_TABLE_COLUMNS,
+    MAX_TEXT_ARRAY_BYTES,
+    MAX_TEXT_TABLE_BYTES,
+)
 
 TEXT_SUFFIXES = (".csv", ".txt", ".tsv", ".dat")
 _COMMENTS = "#%"  # of NumPy and MATLAB
@@ -56,9 +60,9 @@ def read_text_table(path: Path, separator: str | None) -> TrajectoryTable:
 
 def _lines(path: Path) -> tuple[list[tuple[int, str]], tuple[int, str] | None]:
     """Return the lines with their numbers, and the last comment before them."""
-    if (size := path.stat().st_size) > MAX_TABLE_BYTES:
+    if (size := path.stat().st_size) > MAX_TEXT_TABLE_BYTES:
         raise UsageError(
-            f"{path} has {size:,} bytes, expected a table of at most {MAX_TABLE_BYTES:,}"
+            f"{path} has {size:,} bytes, expected a table of at most {MAX_TEXT_TABLE_BYTES:,}"
         )
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -116,7 +120,21 @@ def _column(cells: Sequence[str]) -> Values:
     try:
         return np.array([float(cell) for cell in cells])
     except ValueError:
-        return np.array(cells, np.str_)
+        return text_array(cells)
+
+
+def text_array(texts: Sequence[str]) -> Values:
+    """Return texts as an array.
+
+    Raises:
+        UsageError: It would be too large, since all texts get the length of the longest.
+    """
+    longest = max(map(len, texts), default=0)
+    if len(texts) * longest * np.dtype("U1").itemsize > MAX_TEXT_ARRAY_BYTES:
+        raise UsageError(
+            f"a column of {len(texts):,} texts has one of {longest:,} characters"
+        )
+    return np.array(texts, np.str_)
 
 
 def _is_number(cell: str) -> bool:

@@ -3,7 +3,7 @@
 import argparse
 import json
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -128,11 +128,14 @@ def load_file(
     arguments: argparse.Namespace, problem: "str | Problem"
 ) -> "LoadedTrajectories":
     """Load the trajectories of a command, and list the columns that are not used on stderr."""
+    from cnpgen.addons.trajectories.load_options import LoadOptions
     from cnpgen.addons.trajectories.load_trajectories import load_trajectories
 
     given = options_of(arguments, *TRAJECTORY_OPTIONS)
     given = {name: value for name, value in given.items() if value is not None}
-    loaded = load_trajectories(arguments.file, problem, **given)
+    names = given.keys() & {entry.name for entry in fields(LoadOptions)}
+    reading = LoadOptions(**{name: given.pop(name) for name in names})
+    loaded = load_trajectories(arguments.file, problem, options=reading, **given)
     if loaded.ignored:
         print(
             f"columns that are not used: {listed(loaded.ignored, MAX_IGNORED)}",

@@ -14,7 +14,11 @@ from cnpgen.addons.trajectories.message_tables import (
     table_of_states,
     tables_of_document,
 )
-from cnpgen.addons.trajectories.text_tables import TEXT_SUFFIXES, read_text_table
+from cnpgen.addons.trajectories.text_tables import (
+    TEXT_SUFFIXES,
+    read_text_table,
+    text_array,
+)
 from cnpgen.addons.trajectories.trajectory_table import TrajectoryTable, Values
 from cnpgen.errors import CnpgenError, DatasetError, UsageError, either, requires_extra
 from cnpgen.plans.format import JOINT_NAMES_KEY, PHASE_COLUMN, PLAN_COLUMN
@@ -25,16 +29,21 @@ from cnpgen.store.files.atomic import machine_error, read_file
 from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.hdf5 import open_hdf5
 from cnpgen.store.files.kind import HDF5_SUFFIXES, is_hdf5, kind_of_content
-from cnpgen.store.files.size_limits import MAX_TABLE_BYTES
+from cnpgen.store.files.size_limits import (
+    MAX_TABLE_BYTES,
+    MAX_TEXT_ARRAY_BYTES,
+    MAX_TEXT_TABLE_BYTES,
+)
 from cnpgen.store.layout import SPECIFICATION
 from cnpgen.store.paths import require_path
 from cnpgen.store.scene_table import OBSTACLE_POSES
 
 JOINT_NAMES = "joint_names"  # array of an archive, dataset or attribute of HDF5
-MAX_ARCHIVE_BYTES = 1 << 30  # of the arrays of an archive
+MAX_ARCHIVE_BYTES = 1 << 29  # of the arrays of an archive as floats
 MAX_PARQUET_VALUES = (
     25_000_000  # of a table: they take up to 50 bytes each while it is read
 )
+MAX_UNPACKED_BYTES = 1 << 30  # of the columns of Parquet
 MAX_FEATURE_WIDTH = 10_000  # values of a feature of LeRobot
 HELD_JOINTS_FILE = "held_joints.yaml"  # beside exported plans; it holds no trajectory
 LEROBOT_INFO = "meta/info.json"  # in a folder of LeRobot
@@ -215,14 +224,13 @@ def read_parquet(path: Path) -> Any:
     try:
         file = pyarrow.parquet.ParquetFile(pyarrow.BufferReader(content))
         groups = [file.metadata.row_group(i) for i in range(file.num_row_groups)]
+        parts = [group.column(i) for group in groups for i in range(group.num_columns)]
         # Values that repeat take no space in the file, so values are counted.
-        size = sum(
-            max(group.column(i).num_values, group.num_rows)
-            for group in groups
-            for i in range(group.num_columns)
-        )
-        if size <= MAX_PARQUET_VALUES:
-            return file.read()
+        size = sum(part.num_values for part in parts)
+        size = max(size, file.metadata.num_rows * file.metadata.num_columns)
+        n_bytes = sum(part.total_uncompressed_size for part in parts)
+        if size <= MAX_PARQUET_VALUES and n_bytes <= MAX_UNPACKED_BYTES:
+            return _parquet_table(pyarrow, content, file.schema)
     except (
         pyarrow.ArrowException,
         OSError,
@@ -232,14 +240,46 @@ def read_parquet(path: Path) -> Any:
             f"{path} is not a Parquet file, or is damaged: {error}"
         ) from error
     raise UsageError(
-        f"{path} holds {size:,} values, expected at most {MAX_PARQUET_VALUES:,}"
+        f"{path} holds {size:,} values in {n_bytes:,} bytes, expected at most"
+        f" {MAX_PARQUET_VALUES:,} in {MAX_UNPACKED_BYTES:,}"
     )
+
+
+def _parquet_table(pyarrow: Any, content: bytes, schema: Any) -> Any:
+    """Read a table whose texts stay in dictionaries, so that repeated long ones take no space.
+
+    Raises:
+        ValueError: A column of texts would be too large as an array.
+    """
+    columns = [schema.column(i) for i in range(len(schema))]
+    texts = [part.path for part in columns if part.physical_type == "BYTE_ARRAY"]
+    table = pyarrow.parquet.ParquetFile(
+        pyarrow.BufferReader(content), read_dictionary=texts
+    ).read()
+    for name in table.column_names:
+        chunks = table.column(name).chunks
+        if texts and any(map(pyarrow.types.is_nested, [table.column(name).type])):
+            chunks = [chunk.flatten() for chunk in chunks]
+        for chunk in chunks:
+            if not pyarrow.types.is_dictionary(chunk.type):
+                continue
+            longest = max(
+                (len(text) for text in chunk.dictionary.to_pylist() if text), default=0
+            )
+            if len(chunk) * longest > MAX_TEXT_ARRAY_BYTES:
+                raise ValueError(
+                    f"column {name!r}: {len(chunk):,} texts of {longest:,}"
+                )
+    return table
 
 
 def _parquet_column(table: Any, name: str, path: Path) -> Values:
     """Return a column of numbers, lists of equal lengths, or texts as an array."""
+    values = table.column(name).to_pylist()
+    if values and all(isinstance(value, str) for value in values):
+        return text_array(values)
     try:
-        return np.array(table.column(name).to_pylist())
+        return np.array(values)
     except ValueError as error:
         raise UsageError(
             f"{path}: column {name!r}: its rows have different lengths"
@@ -336,7 +376,7 @@ def _feature_names(feature: Any) -> list[str]:
 
 def _read_json(path: Path) -> Iterator[TrajectoryTable]:
     try:
-        document = parse_json(read_file(path, max_bytes=MAX_TABLE_BYTES).decode())
+        document = parse_json(read_file(path, max_bytes=MAX_TEXT_TABLE_BYTES).decode())
     except ValueError as error:
         raise UsageError(f"{path} is not JSON: {error}") from error
     yield from tables_of_document(document, str(path))

@@ -50,7 +50,8 @@ def polynomials(motion: Motion, *, jerk: bool = False) -> PiecewisePolynomials:
     # dq = p' r and r' r share one product
     first, r_r = _product(np.concatenate([p1, r1], axis=2), r), _product(r, r)
     dq, r1_r = first[..., :-1], first[..., -1:]
-    ddq = _product(p2, r_r) + _product(p1, r1_r)  # p'' r^2 + p' r' r
+    # p'' r^2 + p' r' r
+    ddq = _product(p2, r_r) + _product(p1, r1_r)
     if not jerk:
         return PiecewisePolynomials(edges, q=p, dq=dq, ddq=ddq)
     # jerk = p''' r^3 + 3 p'' r' r^2 + p' (r'' r + r'^2) r
@@ -80,6 +81,7 @@ def find_maximum(
     # Only spans whose largest coefficient, an upper bound, exceeds what is known matter.
     starts = np.arange(parts)[:, None] / parts
     span, of_row = (rows.max(axis=0) > _search_threshold(best, threshold)).nonzero()
+    # A width of an interval for each coefficient vector; ``of_row`` is its function.
     coefficients, left, width = (
         rows[:, span, of_row],
         edges[span],
@@ -90,28 +92,19 @@ def find_maximum(
             break
         # The coefficients of each part by de Casteljau; the first and the last of them are
         # values at its ends, which raise the known maximum.
-        coefficients = (_subdivision(len(rows), parts) @ coefficients).reshape(
-            len(rows), -1
-        )
+        halved = _subdivision(len(rows), parts) @ coefficients
+        coefficients = halved.reshape(len(rows), -1)
         left = (left + starts * width).ravel()
-        width, of_row = (
-            np.concatenate([width / parts] * parts),
-            np.concatenate([of_row] * parts),
-        )
+        width, of_row = np.tile(width / parts, parts), np.tile(of_row, parts)
         for values, s in ((coefficients[0], left), (coefficients[-1], left + width)):
             top = int(values.argmax())
             if values[top] > best:
                 best, *at = float(values[top]), int(of_row[top]), float(s[top])
         # Parts whose upper bound exceeds the new maximum are subdivided again.
-        (span,) = (
-            coefficients.max(axis=0) > _search_threshold(best, threshold)
-        ).nonzero()
-        coefficients, of_row, left, width = (
-            coefficients[:, span],
-            of_row[span],
-            left[span],
-            width[span],
-        )
+        upper_bounds = coefficients.max(axis=0)
+        (span,) = (upper_bounds > _search_threshold(best, threshold)).nonzero()
+        coefficients, of_row = coefficients[:, span], of_row[span]
+        left, width = left[span], width[span]
     return best, int(at[0]), at[1]
 
 
@@ -130,6 +123,7 @@ def knots(path_points: int, rate_points: int, degree: int) -> Array:
     """Return the knots of both splines of a motion in ascending order."""
     spans = (path_points - degree, rate_points - degree)
     return np.array(
+        # Knots of both splines that agree up to rounding are one knot.
         sorted(
             {
                 round(k / count, 12): k / count
@@ -170,6 +164,8 @@ def _to_bernstein_form(
     for order in orders:
         (knots, matrix), size = derivative_matrix(points, degree, order), degree - order
         for k, (low, high) in product(range(size + 1), pairwise(edges)):
+            # The last knot before the middle of the interval: the polar form of its
+            # span.
             last = int(np.searchsorted(knots, (low + high) / 2)) - 1
             rows.append(_polar(knots, last, [low] * (size - k) + [high] * k) @ matrix)
     return np.array(rows)
@@ -181,6 +177,8 @@ def _polar(knots: Array, last: int, arguments: list[float]) -> Array:
     weights = np.eye(len(knots) - degree - 1)[last - degree : last + 1]
     for p, s in enumerate(arguments, start=1):
         k = np.arange(last - degree + p, last + 1)
+        # de Boor: each step blends neighboring control points by the argument's place
+        # between their knots.
         fraction = ((s - knots[k]) / (knots[k + degree - p + 1] - knots[k]))[:, None]
         weights = (1 - fraction) * weights[:-1] + fraction * weights[1:]
     return np.asarray(weights[0])
@@ -188,6 +186,8 @@ def _polar(knots: Array, last: int, arguments: list[float]) -> Array:
 
 def _product(a: Array, b: Array) -> Array:
     """Multiply functions (i + 1, S, n) by one function (j + 1, S, 1), span by span."""
+    # Order of the axes: one matrix per span, built from b, multiplies all functions of
+    # the span.
     i, j = len(a) - 1, len(b) - 1
     times_b = (b[..., 0].T @ _products(i, j)).reshape(-1, i + j + 1, i + 1)
     result = np.empty((i + j + 1, *a.shape[1:]))

@@ -19,10 +19,11 @@ Array = NDArray[np.float64]
 
 _UPRIGHT = "upright"  # the angle of "tilt" includes this condition
 _COSINE = "tilt cosine"  # drawn as an angle
+# SI unit -> factor and unit of plots
 _SCALES = {
     "m": (1e3, "mm"),
     "rad": (180 / np.pi, "deg"),
-}  # SI unit -> factor and unit of plots
+}
 
 
 @dataclass(frozen=True)
@@ -42,9 +43,8 @@ class ConditionCurve:
     # Closest points of two bodies in the world [m], shape (K, 2, 3); None if no
     # distance.
     points: Array | None = None
-    pairs: tuple[
-        str, ...
-    ] = ()  # names of the closest bodies at every state, empty if it is no distance
+    # Names of the closest bodies at every state, empty if it is no distance.
+    pairs: tuple[str, ...] = ()
 
     @property
     def violated(self) -> NDArray[np.bool_]:
@@ -62,6 +62,7 @@ def condition_curves(
     problem: Problem, world: PathWorld, s: Array
 ) -> list[ConditionCurve]:
     """Measure all conditions that are no limits of joints at phases s, shape (K,), where the robot is."""
+    # A copy, since measuring between samples moves the world.
     start_tip = world.tip_position[:, 0].copy()
     curves: list[ConditionCurve] = []
     for constraint in problem.constraint:
@@ -87,51 +88,60 @@ def _value_curves(
             continue
         if stated.name == _COSINE:
             yield _tilt_curve(condition)
-            continue
-        unit = stated.unit if isinstance(stated.unit, str) else stated.unit[0]
-        factor, shown = plot_unit(unit)
-        tolerance = factor * float(condition.tolerance.min())
-        count = condition.g.shape[1]
-        if len(condition.g) == 1:
-            center = stated.lower[0] if stated.is_equality else 0.0
-            lower, upper = (
-                stated.lower[0] - center - condition.relaxation,
-                stated.upper[0] - center + condition.relaxation,
-            )
-            label = f"{stated.name}, deviation" if center else stated.name
-            values = factor * (condition.g - center)
-            yield ConditionCurve(
-                stated.name,
-                label,
-                shown,
-                ("",),
-                values,
-                factor * lower,
-                factor * upper,
-                tolerance,
-            )
+        elif len(condition.g) == 1:
+            yield _bounded_curve(condition)
         else:
-            parts = tuple(
-                name_part(problem, condition.constraint, stated, i)
-                for i in range(len(condition.g))
-            )
-            inside, unbounded = -factor * condition.violation, np.full(count, np.inf)
-            label = f"{stated.name}, distance inside"
-            yield ConditionCurve(
-                stated.name,
-                label,
-                shown,
-                parts,
-                inside,
-                np.zeros(count),
-                unbounded,
-                tolerance,
-            )
+            yield _distance_inside(problem, condition)
+
+
+def _unit_of(condition: MeasuredCondition) -> tuple[float, str, float]:
+    """Return the factor and the unit of plots, and the accepted violation in this unit."""
+    unit = condition.condition.unit
+    factor, shown = plot_unit(unit if isinstance(unit, str) else unit[0])
+    return factor, shown, factor * float(condition.tolerance.min())
+
+
+def _bounded_curve(condition: MeasuredCondition) -> ConditionCurve:
+    """Convert one value with its bounds; an equality becomes the deviation from its value."""
+    stated, (factor, shown, tolerance) = condition.condition, _unit_of(condition)
+    center = stated.lower[0] if stated.is_equality else 0.0
+    return ConditionCurve(
+        stated.name,
+        f"{stated.name}, deviation" if center else stated.name,
+        shown,
+        ("",),
+        factor * (condition.g - center),
+        factor * (stated.lower[0] - center - condition.relaxation),
+        factor * (stated.upper[0] - center + condition.relaxation),
+        tolerance,
+    )
+
+
+def _distance_inside(problem: Problem, condition: MeasuredCondition) -> ConditionCurve:
+    """Convert several values, whose bounds may differ, to distances from the closer bound, positive inside."""
+    stated, (factor, shown, tolerance) = condition.condition, _unit_of(condition)
+    count = condition.g.shape[1]
+    parts = tuple(
+        name_part(problem, condition.constraint, stated, i)
+        for i in range(len(condition.g))
+    )
+    return ConditionCurve(
+        stated.name,
+        f"{stated.name}, distance inside",
+        shown,
+        parts,
+        -factor * condition.violation,
+        np.zeros(count),
+        np.full(count, np.inf),
+        tolerance,
+    )
 
 
 def _tilt_curve(condition: MeasuredCondition) -> ConditionCurve:
     """Convert the cosine of a tilt to an angle."""
     least = float(condition.condition.lower[0])
+    # The tolerance is on the cosine; the accepted angle follows from the smaller
+    # cosine.
     limit, accepted = (
         float(np.degrees(np.arccos(cosine)))
         for cosine in (least, least - condition.tolerance[0])
@@ -157,6 +167,7 @@ def _distance_curves(
     (stated,) = constraint.judged(cast(World, world))
     if not stated.g:
         return
+    # A robot without link geometry is a chain of segments with the arm's radius.
     radius = (
         (problem.arm_radius or 0.0)
         if constraint.bodies == "robot" and world.robot.shape is None

@@ -59,6 +59,8 @@ class Intervals:
     def unresolved(self) -> NDArray[np.bool_]:
         """Return a mask of intervals that may contain a violation, none if there is one at a sample, shape (I,)."""
         chosen = np.zeros(len(self.s), bool)
+        # A violation at a sample decides the verdict; only the smallest lower bounds
+        # need work.
         if self.margin.min() >= 0:
             chosen[np.argsort(self.lower_bound, kind="stable")[:MAX_INTERVALS]] = True
         return np.asarray(chosen & (self.lower_bound < 0))
@@ -78,9 +80,8 @@ def check_continuous_collision(
     if not contacts:
         return
     motion_bounds = context.world.motion_bounds(context.curve.max_positions())
-    initial = _intervals(
-        context, context.samples.s[None], contacts, motion_bounds
-    )  # before the world is moved
+    # Before the world is moved.
+    initial = _intervals(context, context.samples.s[None], contacts, motion_bounds)
     for contact, intervals in zip(contacts, initial, strict=True):
         for s, measured in _subdivisions(
             context, intervals, contact.constraint, motion_bounds, early_exit=early_exit
@@ -123,13 +124,17 @@ def _intervals(
     world, last = context.world, s.shape[1] - 1
     # |x(q2) - x(q1)| <= sum over joints of (reach of the joint) |q2_j - q1_j|
     displacements = motion_bounds @ np.abs(world.q[:, 1:] - world.q[:, :-1])
-    displacements[last :: last + 1] = -np.inf  # between rows there is no interval
+    # Between rows there is no interval.
+    displacements[last :: last + 1] = -np.inf
+    # The chord deviation h^2 / 8 max |x''| bounds how far a point leaves the segment
+    # between its positions at both ends of an interval.
     deviations = chord_deviation_bounds(context.curve, s.ravel(), motion_bounds)
     results = []
     for contact in contacts:
+        # One, or of each.
         min_distances = (
             contact.condition.lower - contact.tolerance + np.ravel(contact.uncertainty)
-        )  # one, or of each
+        )
         margin = (contact.g - min_distances[:, None]).min(axis=0).reshape(s.shape)
         proven = np.full(s.size, np.nan)
         # With a violation at a sample the verdict is decided, and no bound is needed.
@@ -161,8 +166,13 @@ def chord_deviation_bounds(curve: Curve, s: Array, motion_bounds: Array) -> Arra
     is below its predecessor. Motion bounds of the joints [m] have shape (n,).
     """
     edges, first, second = curve.derivative_bounds()
+    # With P_j = sum over i < j of |p'_i| and joints ordered from the base,
+    #   |x''| <= sum_j reach_j (|p''_j| + |p'_j|^2 + 2 |p'_j| P_j),
+    # since each pair of joints occurs twice and the distal one's reach bounds it.
     proximal = np.cumsum(first, axis=1) - first
     curvature = (second + first * (first + 2 * proximal)) @ motion_bounds
+    # The spans of both neighbors: an interval is at most a part of a span, so it meets
+    # no third one.
     low, high = (
         np.searchsorted(edges[1:-1], s[:-1], "right"),
         np.searchsorted(edges[1:-1], s[1:], "left"),

@@ -69,6 +69,7 @@ def evaluate_at_phases(
     """Evaluate one motion as ``evaluate_trajectory``, up to rounding, with cached bases of the splines."""
     orders = PATH_ORDERS + jerk
     path, rate = motion.path[0].T, motion.rate[0]
+    # One product for all derivatives: bases of orders 0, 1, ... side by side.
     p = (path @ _bases(path.shape[1], motion.degree, orders, phases)).reshape(
         len(path), orders, -1
     )
@@ -118,6 +119,7 @@ class SplineCurve:
     def derivative_bounds(self) -> tuple[Array, Array, Array]:
         """Bound derivatives by Bernstein coefficients of the path."""
         path, degree = self.motion.path[0], self.motion.degree
+        # Shorter parts than spans: coefficients of a part are closer to the function.
         edges = np.linspace(0, 1, BOUND_PARTS * (len(path) - degree) + 1)
         first, second = (
             np.abs(values).max(axis=0)

@@ -59,9 +59,8 @@ class ProvenJointLimits:
     """L limits of n joints that are proven to hold or to be violated."""
 
     constraints: tuple[Constraint, ...]  # constraints of a problem that are proven
-    conditions: tuple[
-        Condition, ...
-    ]  # condition of each constraint, the same at all states
+    # Condition of each constraint, the same at all states.
+    conditions: tuple[Condition, ...]
     joints: tuple[str, ...]  # names of the joints
     tolerance: Array  # accepted violations, shape (L, n)
     bounds: Array  # lower bounds of all joints, then upper ones, shape (L, 2 n)
@@ -71,6 +70,8 @@ class ProvenJointLimits:
 
     def scaled(self, parameters: Mapping[str, float]) -> "ProvenJointLimits":
         """Return the limits of a sample with these parameters, by name."""
+        # Bounds, tolerances and units scale alike, so relative violations stay
+        # comparable.
         factors = np.array(
             [_factor_of(constraint, parameters) for constraint in self.constraints]
         )[:, None]
@@ -98,21 +99,33 @@ class ProvenJointLimits:
         """
         if not self.constraints:
             return []
-        names = [quantity_of(constraint) for constraint in self.constraints]
-        factors = [
-            _factor_of(constraint, world.parameters.values)
-            for constraint in self.constraints
+        # The polynomials are divided by the factor instead of multiplying the bounds, so
+        # that one set of bounds serves all samples.
+        scaled = [
+            (quantity_of(each), _factor_of(each, world.parameters.values))
+            for each in self.constraints
         ]
-        pairs = list(zip(names, factors, strict=True))
         functions = [
-            _per_factor(getattr(polynomials, name), factor) for name, factor in pairs
+            _per_factor(getattr(polynomials, name), factor) for name, factor in scaled
         ]
-        maxima = self._at_samples(
-            np.array(
-                [_per_factor(getattr(world, name), factor) for name, factor in pairs]
-            ),
-            s,
-        )
+        values = [_per_factor(getattr(world, name), factor) for name, factor in scaled]
+        maxima = self._at_samples(np.array(values), s)
+        self._search(functions, polynomials.edges, maxima, early_exit=early_exit)
+        t = times(np.array([phase for *_, phase in maxima]), table).tolist()
+        return [
+            self.margin_at(limit, maximum, t[limit])
+            for limit, maximum in enumerate(maxima)
+        ]
+
+    def _search(
+        self,
+        functions: list[Array],
+        edges: Array,
+        maxima: list[Maximum],
+        *,
+        early_exit: bool,
+    ) -> None:
+        """Replace the maxima at samples by those of the functions where their coefficients prove no smaller ones."""
         # The coefficients bound the function: limits that they meet need no search.
         low = np.array(
             [coefficients.min(axis=0).min(axis=0) for coefficients in functions]
@@ -121,27 +134,16 @@ class ProvenJointLimits:
             [coefficients.max(axis=0).max(axis=0) for coefficients in functions]
         )
         upper_bounds = self._relative_violations(low, high)
-        skippable = np.asarray(
-            (self.tolerance > 0).all(axis=1) & early_exit
-        )  # without a tolerance, rounding decides
-        for limit in np.flatnonzero(
-            ~skippable | ~(upper_bounds.max(axis=1) <= 1)
-        ).tolist():
+        # Without a tolerance, rounding decides.
+        skippable = np.asarray((self.tolerance > 0).all(axis=1) & early_exit)
+        searched = ~skippable | ~(upper_bounds.max(axis=1) <= 1)
+        for limit in np.flatnonzero(searched).tolist():
             threshold = 1.0 if skippable[limit] else -np.inf
+            # Only bounds that the coefficients do not prove are searched.
             (rows,) = (~(upper_bounds[limit] <= threshold)).nonzero()
             maxima[limit] = self._maximum(
-                limit,
-                rows,
-                functions[limit],
-                polynomials.edges,
-                maxima[limit],
-                threshold,
+                limit, rows, functions[limit], edges, maxima[limit], threshold
             )
-        t = times(np.array([phase for *_, phase in maxima]), table).tolist()
-        return [
-            self.margin_at(limit, maximum, t[limit])
-            for limit, maximum in enumerate(maxima)
-        ]
 
     def _at_samples(self, values: Array, s: Array) -> list[Maximum]:
         """Return the maximum relative violation of each limit by values of shape (L, n, K) at phases s."""
@@ -163,6 +165,8 @@ class ProvenJointLimits:
 
     def _relative_violations(self, low: Array, high: Array) -> Array:
         """Return the violations by minima and maxima, shape (L, n), in multiples of ``scale``, shape (L, 2 n)."""
+        # The scale is negative for lower bounds: the quotient is positive outside on
+        # both sides.
         return np.asarray(
             (np.concatenate([low, high], axis=1) - self.bounds) / self.scale
         )
@@ -177,6 +181,8 @@ class ProvenJointLimits:
         threshold: float,
     ) -> Maximum:
         """Search for a larger violation than the known one at some of the bounds of a limit."""
+        # Row r is the lower bound of joint r, or for r >= n the upper bound of joint r
+        # - n.
         values = function[..., rows % len(self.joints)]
         violations = (values - self.bounds[limit, rows]) / self.scale[limit, rows]
         parts = EARLY_EXIT_PARTS if threshold == 1 else 2
@@ -231,6 +237,8 @@ def joint_limits(problem: Problem, world: PathWorld) -> ProvenJointLimits:
     tolerance = np.array(
         [constraint.allowed(condition) for constraint, condition in pairs]
     ).reshape(shape)
+    # The resolution of violations where the tolerance is zero: a billionth of the
+    # bound.
     scale = np.maximum(
         tolerance, MIN_RELATIVE_SCALE * np.maximum(np.abs(lower), np.abs(upper))
     )

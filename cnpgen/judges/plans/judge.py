@@ -58,9 +58,8 @@ Array = NDArray[np.float64]
 
 MAX_STEP_S = 0.01  # with longer steps the samples miss most of the motion
 KINK_OFFSET = 1e-3  # in phase, between samples on either side of a kink
-_REFUTATION_PHASES = Phases(
-    np.linspace(0, 1, 33)
-)  # enough to refute most invalid plans
+# Enough to refute most invalid plans.
+_REFUTATION_PHASES = Phases(np.linspace(0, 1, 33))
 
 
 def judge(  # noqa: PLR0917 - all of them are needed to interpret a plan
@@ -151,7 +150,8 @@ class Judge:
         accurate.
         """
         plans = self._plans(motion, boundary, scene, goal_xyz)
-        with np.errstate(all="ignore"):  # overflows give inf or nan, which are detected
+        # Overflows give inf or nan, which are detected.
+        with np.errstate(all="ignore"):
             return [self._judge(plan, early_exit=early_exit) for plan in plans]
 
     def refutes(
@@ -183,6 +183,8 @@ class Judge:
                 metrics=Metrics(duration=float(samples.t[-1])),
                 samples=len(samples.s),
             )
+        # With early exit, a lower bound that proves a sufficient distance takes the
+        # place of the exact smallest one.
         world.set_path(
             states.q,
             states.dq,
@@ -191,26 +193,32 @@ class Judge:
             states.jerk,
             exact=not early_exit,
         )
-        ends = boundary_margins(states, plan.boundary, samples, world.robot)
         metrics, paper = Metrics(), None if self._paper is None else PaperRule()
         if not early_exit:
-            metrics = metrics_of(
-                plan.problem, world, samples, jerks(plan.motion, samples.s)
-            )
+            jerk = jerks(plan.motion, samples.s)
+            metrics = metrics_of(plan.problem, world, samples, jerk)
             paper = self._judge_by_paper(plan)
-        curve = SplineCurve(plan.motion)
-        context = evaluation_context(
-            plan.problem, curve, plan.obstacle_poses, world, samples, table
-        )
-        context = context if self._tube is None else self._tube.widen(context)
-        motion = polynomials(plan.motion, jerk=plan.problem.uses_jerk)
         margins = [
-            *ends,
-            *_margins(context, motion, self._limits, early_exit=early_exit),
+            *boundary_margins(states, plan.boundary, samples, world.robot),
+            *self._constraint_margins(plan, samples, table, early_exit=early_exit),
         ]
         return Verdict(
             reason_of(margins), by_name(margins), metrics, paper, len(samples.s)
         )
+
+    def _constraint_margins(
+        self, plan: "_Plan", samples: Samples, table: Array, *, early_exit: bool
+    ) -> list[Margin]:
+        """Measure the constraints of the plan whose samples the world has; the world is moved."""
+        # Proven limits use the polynomials of the motion; all other conditions its
+        # samples.
+        curve = SplineCurve(plan.motion)
+        context = evaluation_context(
+            plan.problem, curve, plan.obstacle_poses, self._world, samples, table
+        )
+        context = context if self._tube is None else self._tube.widen(context)
+        motion = polynomials(plan.motion, jerk=plan.problem.uses_jerk)
+        return _margins(context, motion, self._limits, early_exit=early_exit)
 
     def _judge_by_paper(self, plan: "_Plan") -> PaperRule | None:
         """Judge the plan whose samples the world has by the paper's rules, if they are installed."""
@@ -342,6 +350,7 @@ def _margins(
     proven = limits.margins(
         context.world, motion, context.samples.s, context.table, early_exit=early_exit
     )
+    # The worst margin of each condition so far; margins between samples may replace it.
     worst = {
         id(condition): condition.margin(context.problem, context.samples)
         for condition in context.measured
@@ -354,6 +363,7 @@ def _margins(
         worst[id(condition)] = max(
             worst[id(condition)], margin, key=lambda candidate: candidate.severity
         )
+    # In the order of the problem's constraints, whichever check found the margin.
     margins: dict[int, list[Margin]] = {
         id(constraint): [] for constraint in context.problem.constraint
     }
@@ -368,6 +378,7 @@ def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
     """Return whether the ends, or a constraint at one of a few phases, are violated."""
     if _invalid_reason(plan):
         return True
+    # Times do not matter for a refutation, so the phases stand in for them.
     samples = Samples(_REFUTATION_PHASES.s, _REFUTATION_PHASES.s)
     states = evaluate_at_phases(
         plan.motion, _REFUTATION_PHASES, jerk=plan.problem.uses_jerk
@@ -381,6 +392,7 @@ def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
     measured = chain.from_iterable(
         measure(each, world, samples.s, start_tip) for each in plan.problem.constraint
     )
+    # Inverted comparison: a nan counts as a violation.
     if not all((condition.relative_violation <= 1).all() for condition in measured):
         return True
     return not all(
@@ -405,12 +417,12 @@ def _sampled(
             if samples
             else None
         )
+    # A nan duration is too long, too.
     if not table[1, -1] < MAX_DURATION_S:
         return None
     phases = early_exit_phases(plan.spans, plan.corners)
-    if any(
-        constraint.tolerance == 0 for constraint in plan.problem.constraint
-    ):  # needs the rounding of other verdicts
+    if any(constraint.tolerance == 0 for constraint in plan.problem.constraint):
+        # Needs the rounding of other verdicts.
         states = evaluate_trajectory(plan.motion, phases.s, jerk=jerk)
     else:
         states = evaluate_at_phases(plan.motion, phases, jerk=jerk)
@@ -429,6 +441,8 @@ def reason_of(margins: list[Margin]) -> str:
     broken = [margin for margin in margins if not margin.ok]
     if not broken:
         return Reason.OK
+    # A plan that starts elsewhere is not a plan for its problem, whatever else it
+    # violates.
     if any(margin.reason == Reason.BOUNDARY for margin in broken):
         return Reason.BOUNDARY
     return max(broken, key=lambda margin: margin.severity).reason

@@ -52,6 +52,8 @@ class _SampledValues:
         """
         # A maximum matters if it would change the verdict (cross 1), or the printed value
         # by more than its tolerance.
+        # Below 0 a condition is far from its bound in every unit; small changes there
+        # do not matter.
         threshold = np.maximum(largest + PEAK_VALUE_TOLERANCE, 0.0)
         threshold = np.where(
             largest <= 1, np.minimum(threshold, 1 + PEAK_DECISION_TOLERANCE), threshold
@@ -62,6 +64,7 @@ class _SampledValues:
             return row, row, np.empty((0, 2))
         chosen = np.argsort(-maxima[row, k], kind="stable")[:MAX_PEAK_INTERVALS]
         row, k = row[chosen], k[chosen]
+        # Rows share their phases at first; they have their own after a division.
         phases = np.broadcast_to(self.s, self.violation.shape)
         return (
             self.of[row],
@@ -86,6 +89,7 @@ def check_local_maxima(
         if not len(of):
             break
         s = np.linspace(ends[:, 0], ends[:, 1], PEAK_PARTS + 1, axis=1)
+        # All intervals of all conditions at once: one batch of kinematics.
         context.move(s.ravel())
         values = _SampledValues(of, part, s, np.empty_like(s))
         for k in np.unique(of).tolist():
@@ -122,9 +126,10 @@ def _initial_values(s: Array, measured: Sequence[MeasuredCondition]) -> _Sampled
         ]
     )
     if (s[1:] - s[:-1] <= MIN_PHASE_STEP).any():
+        # The first of each cell.
         distinct = np.flatnonzero(
             np.diff(np.floor(s / MIN_PHASE_STEP), prepend=-1.0) > 0
-        )  # the first of each cell
+        )
         distinct = distinct[np.diff(s[distinct], prepend=-1.0) > MIN_PHASE_STEP / 2]
         s, violation = s[distinct], violation[:, distinct]
     return _SampledValues(of, part, s[None], violation)
@@ -144,6 +149,8 @@ def _estimated_maxima(s: Array, values: Array) -> Array:
     )
     # At both ends of an interval and next to it.
     low, high = _of_four(np.minimum, around), _of_four(np.maximum, around)
+    # Curvature estimates are wrong by the spread of the four around an interval: with
+    # low the most negative one, -low + (high - low) bounds the curvature downwards.
     curvature = np.maximum((high - 2 * low) * (step**2 / 2), MIN_CURVATURE)
     excess = np.maximum(curvature - np.abs(rise), 0.0)
     return np.asarray(

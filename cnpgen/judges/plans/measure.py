@@ -58,10 +58,11 @@ def boundary_margins(
             getattr(boundary, f"start_{quantity}"),
             getattr(boundary, f"goal_{quantity}"),
         )
+        # Only the start is prescribed if the goal is free.
         expected = start if goal is None else np.concatenate([start, goal])
-        actual = getattr(states, quantity).T[:: len(samples.s) - 1][
-            : len(expected)
-        ]  # at the start and at the goal
+        # At the start and at the goal.
+        # The last sample is the goal: rows 0 and K - 1.
+        actual = getattr(states, quantity).T[:: len(samples.s) - 1][: len(expected)]
         error = np.abs(actual - expected)
         end, joint = divmod(int(error.argmax()), error.shape[1])
         margins.append(
@@ -74,6 +75,7 @@ def boundary_margins(
                 bound=float(expected[end, joint]),
                 violation=float(error[end, joint]),
                 tolerance=tolerance,
+                # End 0 is sample 0, end 1 is sample -1.
                 time=float(samples.t[-end]),
                 phase=float(samples.s[-end]),
             )
@@ -97,6 +99,7 @@ class MeasuredCondition:
     @cached_property
     def violation(self) -> Array:
         """Signed distances of the values outside their bounds at most, negative inside, shape (m, K)."""
+        # Positive outside. A relaxed bound or an uncertain value shifts the violation.
         below, above = (
             self.condition.lower[:, None] - self.g,
             self.g - self.condition.upper[:, None],
@@ -112,9 +115,8 @@ class MeasuredCondition:
 
     def margin(self, problem: Problem, samples: Samples) -> Margin:
         """Return the margin where the motion comes closest to a violation, or violates the condition most."""
-        part, k = divmod(
-            int(self.relative_violation.argmax()), len(samples.s)
-        )  # argmax returns the first nan, if any
+        # argmax returns the first nan, if any.
+        part, k = divmod(int(self.relative_violation.argmax()), len(samples.s))
         low, high, g = (
             self.condition.lower[part],
             self.condition.upper[part],
@@ -127,6 +129,7 @@ class MeasuredCondition:
             unit_of(self.condition.unit, part),
             name_part(problem, self.constraint, self.condition, part),
             value=float(g),
+            # The bound that is closer, or violated more.
             bound=float(
                 low - self.relaxation[k]
                 if low - g > g - high
@@ -147,11 +150,11 @@ def measure(
     ``start_tip`` is the position of the tip at the start of the motion [m], shape (3,).
     """
     measured = []
-    for condition in constraint.judged(
-        cast(World, world)
-    ):  # PathWorld has the interface of World for K states
+    # PathWorld has the interface of World for K states
+    for condition in constraint.judged(cast(World, world)):
         if condition.g:
             g = np.empty((len(condition.g), len(s)))
+            # A value may be one number for all states.
             for row, value in zip(g, condition.g, strict=True):
                 row[:] = value
             relaxation = constraint.bound_relaxation(condition, s, start_tip)

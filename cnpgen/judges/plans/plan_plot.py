@@ -114,6 +114,12 @@ def draw_path(
         _draw_views(tip, problem, world, scene.bodies())
     else:
         _draw_over_table(tip, table, world, s, t)
+    _draw_legend(tip)
+    save_figure(figure, path)
+
+
+def _draw_legend(tip: "SubFigure") -> None:
+    """Name every kind of line of the tip's views once."""
     named = {
         name: item
         for axis in tip.axes
@@ -126,7 +132,6 @@ def draw_path(
         ncols=len(named),
         fontsize=8,
     )
-    save_figure(figure, path)
 
 
 def along(
@@ -171,6 +176,7 @@ def plot_times(duration: float, samples: int, extra: Sequence[float]) -> Array:
 
 def shares_of_limits(world: PathWorld) -> dict[str, Array]:
     """Return q, dq, ddq, torque and, if constrained, jerk as fractions of their limits, each of shape (n, K)."""
+    # Positions relative to the center of the range, so that both limits are at 100 %.
     robot, factors = world.robot, world.parameters.values
     center, half = (
         (robot.position_upper + robot.position_lower) / 2,
@@ -221,9 +227,8 @@ def _draw_joints(
         axis.set_ylabel(f"{name} [% of limit]", fontsize=9)
     axes[-1].set_xlabel("t [s]")
     axes[-1].set_xlim(t[0], t[-1])
-    columns = max(
-        1, MAX_LEGEND_CHARACTERS // (max(map(len, robot.joint_names)) + 8)
-    )  # with space between entries
+    # With space between entries.
+    columns = max(1, MAX_LEGEND_CHARACTERS // (max(map(len, robot.joint_names)) + 8))
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(
         handles,
@@ -246,34 +251,7 @@ def _draw_conditions(
         curves,
         strict=True,
     ):
-        for values, part in zip(curve.values, curve.parts, strict=True):
-            axis.plot(
-                t,
-                values,
-                linewidth=1.2,
-                color=None if part else "black",
-                label=part or None,
-            )
-            axis.annotate(
-                part, (t[0], values[0]), (2, 3), textcoords="offset points", fontsize=8
-            )
-        low, high = axis.get_ylim()
-        for bound, side in ((curve.lower, -1), (curve.upper, 1)):
-            if np.isfinite(bound).all():
-                axis.plot(t, bound, color=_LIMIT, linewidth=1, linestyle="--")
-                reach = bound + side * 1.5 * curve.tolerance
-                low, high = min(low, float(reach.min())), max(high, float(reach.max()))
-                axis.fill_between(
-                    t,
-                    bound,
-                    bound + side * 1e6,
-                    color="tab:red",
-                    alpha=0.08,
-                    linewidth=0,
-                )
-        axis.set_ylim(low, high)
-        outside = np.where(curve.violated, curve.values, np.nan)
-        axis.plot(t, outside.T, color=_GOAL, linewidth=2.5, label="_violated")
+        _draw_values(axis, curve, t)
         for margin in margins:
             if margin.name == curve.name:
                 k = int(np.abs(t - margin.time).argmin())
@@ -286,6 +264,30 @@ def _draw_conditions(
         axis.grid(axis="x", color="0.9", linewidth=0.6)
     axis.set_xlabel("t [s]")
     axis.set_xlim(t[0], t[-1])
+
+
+def _draw_values(axis: "Axes", curve: ConditionCurve, t: Array) -> None:
+    """Draw the values of one condition, and shade the area outside its bounds."""
+    for values, part in zip(curve.values, curve.parts, strict=True):
+        color, label = None if part else "black", part or None
+        axis.plot(t, values, linewidth=1.2, color=color, label=label)
+        axis.annotate(
+            part, (t[0], values[0]), (2, 3), textcoords="offset points", fontsize=8
+        )
+    # A bound of which the values stay far away is drawn, too.
+    low, high = axis.get_ylim()
+    for bound, side in ((curve.lower, -1), (curve.upper, 1)):
+        if np.isfinite(bound).all():
+            axis.plot(t, bound, color=_LIMIT, linewidth=1, linestyle="--")
+            reach = bound + side * 1.5 * curve.tolerance
+            low, high = min(low, float(reach.min())), max(high, float(reach.max()))
+            outside = bound + side * 1e6
+            axis.fill_between(
+                t, bound, outside, color="tab:red", alpha=0.08, linewidth=0
+            )
+    axis.set_ylim(low, high)
+    violated = np.where(curve.violated, curve.values, np.nan)
+    axis.plot(t, violated.T, color=_GOAL, linewidth=2.5, label="_violated")
 
 
 def _mark(axis: "Axes", time: float, value: float) -> None:
@@ -362,9 +364,8 @@ def _draw_views(
     side = int(np.ptp(world.tip_position[1]) >= np.ptp(world.tip_position[0]))
     colors = [_BETWEEN] * (DRAWN_STATES - 2) + [_START, _GOAL]
     indices = np.linspace(0, world.q.shape[1] - 1, DRAWN_STATES).round().astype(int)
-    indices = np.concatenate(
-        [indices[1:-1], indices[[0, -1]]]
-    )  # the ends are drawn last, in front
+    # The ends are drawn last, in front.
+    indices = np.concatenate([indices[1:-1], indices[[0, -1]]])
     links = [_links(problem, world, k) for k in indices]
     for axis, (across, up), title in zip(
         figure.subplots(2, 1), ((side, 2), (1, 0)), ("side", "top"), strict=True
@@ -390,7 +391,8 @@ def _draw_views(
             ylabel=f"{'xyz'[up]} [m]",
             title=f"{title} view",
         )
-        axis.set_ylim(bottom=max(axis.get_ylim()[0], -0.25))
+        if up == 2:  # the part of the base below the floor is cut off
+            axis.set_ylim(bottom=max(axis.get_ylim()[0], -0.25))
 
 
 def _links(problem: Problem, world: PathWorld, k: int) -> list[tuple[Array, float]]:

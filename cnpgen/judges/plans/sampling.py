@@ -45,6 +45,8 @@ def time_table(rate: Array, degree: int, *, cells: int = TABLE_CELLS) -> Array:
     The rate, of positive r, has control points [1/s] of shape (R,). The table has shape
     (2, C), both rows ascending: phases from 0 to 1, times from 0 to the duration.
     """
+    # The integrand 1 / r has a pole where r is 0 at an end; Gauss nodes avoid the ends.
+    #   t(s) = integral of ds / r(s)
     phases, halves = _table_phases(cells)
     inverse = 1.0 / (_nodes(len(rate), degree, cells) @ rate)
     table = np.zeros((2, len(phases)))
@@ -59,6 +61,7 @@ def _table_phases(cells: int) -> tuple[Array, Array]:
 
     They are uniform, and geometric near the ends, where r may be 0.
     """
+    # Cells that shrink geometrically resolve 1 / r next to a zero at an end.
     near = np.geomspace(1e-9, 12 / cells, 160)
     phases = np.unique(np.concatenate([np.linspace(0, 1, cells + 1), near, 1 - near]))
     return phases, np.diff(phases) / 2
@@ -84,6 +87,7 @@ def sample(
         MIN_SAMPLES,
         min(MAX_TIME_SAMPLES, int(np.ceil(TIME_SAMPLE_FACTOR * duration / step)) + 1),
     )
+    # Times are uniform; interpolation in the table inverts t(s).
     by_time = np.interp(np.linspace(0, duration, count), table[1], table[0])
     s = np.unique(
         np.concatenate(
@@ -120,6 +124,8 @@ def times(s: Array, table: Array) -> Array:
 def _nodes(points: int, degree: int, cells: int) -> Array:
     """Return the basis of r at the Gauss nodes of the table's cells, shape (2 cells, R)."""
     phases, halves = _table_phases(cells)
+    # Two-point Gauss rule: nodes at center +- h / sqrt(3) with weights h, h half the
+    # width.
     centers, offset = (phases[1:] + phases[:-1]) / 2, halves / np.sqrt(3)
     return basis_matrix(
         np.stack([centers - offset, centers + offset], axis=1).ravel(), points, degree

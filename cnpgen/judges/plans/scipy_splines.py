@@ -25,6 +25,8 @@ def _spline(control: Array, degree: int) -> "BSpline":
     """Return the spline with C control points, shape (C, ...), and clamped uniform knots."""
     from scipy.interpolate import BSpline
 
+    # Clamped: the end knots are repeated, so that the spline starts and ends at the
+    # first and last control point.
     spans = len(control) - degree
     return BSpline(
         np.concatenate(
@@ -76,11 +78,14 @@ def spline_derivatives(
     least 3.
     """
     spans = len(control) - degree
+    # The last span is closed: s = 1 belongs to it.
     span = np.clip(s * spans, 0, spans - 1).astype(np.intp)
     offset = s - span / spans
     coefficients = (control.T @ _span_polynomials(len(control), degree)).take(
         span, axis=2
     )
+    # Horner's rule for a polynomial and its derivatives: values[k] is the k-th
+    # derivative over k!.
     values = [
         coefficients[-1],
         *(np.zeros_like(coefficients[-1]) for _ in range(orders - 1)),
@@ -109,16 +114,17 @@ def states_by_chain_rule(p: Sequence[Array], r: Sequence[Array]) -> list[Array]:
 
 def is_positive(control: Array, degree: int) -> bool:
     """Return whether a spline with finite control points, shape (C,), is positive on all of [0, 1]."""
-    if (
-        control.min() > 0
-    ):  # the spline lies between its smallest and its largest control point
+    if control.min() > 0:
+        # The spline lies between its smallest and its largest control point.
         return True
     from scipy.interpolate import PPoly
 
+    # Scaling by a power of two changes no sign and no root, and avoids an overflow.
     spline = _spline(
         control * (2.0**-600 if np.abs(control).max() > MAX_UNSCALED_RATE else 1.0),
         degree,
     )
+    # The minimum is at an end or where the derivative vanishes.
     critical = PPoly.from_spline(spline.derivative()).roots(extrapolate=False)
     s = np.concatenate([[0.0, 1.0], np.clip(critical[np.isfinite(critical)], 0, 1)])
     return bool(spline(s).min() > 0)

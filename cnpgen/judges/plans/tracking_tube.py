@@ -60,10 +60,13 @@ class TrackingTube:
             )
         unit = "m" if all(robot.prismatic) else "rad"
         check_range("tracking_error", values, 0.0, MAX_TRACKING_ERROR, unit)
+        # Motion bounds of the whole tube need positions that include the error.
         self._problem, self._error = problem, np.broadcast_to(values, robot.n).copy()
         self._world = PathWorld(robot, problem.obstacle, problem.object_size)
         world = World(robot, problem.obstacle, problem.object_size)
         self._position_conditions: set[tuple[int, str]] = set()
+        # Derivatives of a condition decide whether the tube concerns it: those that
+        # need no velocity are conditions on positions.
         for constraint in problem.constraint:
             orders = measured_needs([constraint.judged], world, jerk=problem.uses_jerk)
             judged = zip(constraint.judged(world), orders, strict=True)
@@ -83,6 +86,7 @@ class TrackingTube:
 
     def widen(self, context: EvaluationContext) -> EvaluationContext:
         """Return the conditions of a plan with their largest change in the tube, at samples and between them."""
+        # |x(q + e) - x(q)| <= sum over joints of reach_j |e_j|.
         reach = context.world.motion_bounds(context.curve.max_positions() + self._error)
         displacement = float(self._error @ reach)
 
@@ -102,6 +106,8 @@ class TrackingTube:
                 distances = condition.constraint.distances_from_contact_region(
                     cast(World, self._world)
                 )
+                # Near the disc of permitted contact the required change ends at the
+                # distance from it.
                 change = np.minimum(change, distances)
             return replace(condition, uncertainty=change)
 
@@ -140,14 +146,18 @@ class TrackingTube:
                 if each.condition.name == condition.condition.name
             )
 
+        # First-order change: the sum over joints of the larger one of both sides.
         nominal = values(np.zeros_like(self._error))
         total = np.zeros_like(nominal)
         for offset in np.diag(self._error):
             total += np.max(
                 [np.abs(values(sign * offset) - nominal) for sign in (-1, 1)], axis=0
             )
+        # Fixed seed: a verdict must not depend on chance.
         random = np.random.default_rng(0)
         for signs in random.choice([-1.0, 1.0], (TUBE_COMBINATIONS, len(self._error))):
+            # Interactions of joints that exceed the sum are seen by random corners of
+            # the tube.
             np.maximum(total, np.abs(values(signs * self._error) - nominal), out=total)
         return np.asarray(TUBE_CURVATURE_FACTOR * total)
 

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.schema.html_table import html_table
+
 # Replaces a tolerance of 0 in relative violations, so that they can be compared.
 ZERO_TOLERANCE = 1e-200
 
@@ -177,6 +179,9 @@ class Verdict:
     def __repr__(self) -> str:
         return f"<Verdict: {self}>"
 
+    def _repr_html_(self) -> str:
+        return html_table(repr(self), ("condition", "margin"), self.margins.items())
+
     @property
     def valid(self) -> bool:
         """Whether the plan meets its boundary conditions and every constraint, within the problem's tolerances."""
@@ -227,6 +232,7 @@ def summarize_verdicts(verdicts: Sequence[Verdict]) -> dict[str, Any]:
     ]
     counts = {"valid": sum(verdict.valid for verdict in verdicts)}
     rules = [verdict.paper for verdict in verdicts if verdict.paper is not None]
+    # Counts and ratios by the paper's rules only if every plan was judged by them.
     if len(rules) == len(verdicts):
         counts["paper_valid"] = sum(rule.valid for rule in rules)
         counts["finished"] = sum(rule.finished for rule in rules)

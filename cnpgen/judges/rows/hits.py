@@ -31,14 +31,16 @@ from cnpgen.world.measured_parameters import MeasuredParameters
 # Tolerance of the projected gradient of f [m^2/rad]. In float32 the joints have errors
 # of 1e-7 rad.
 STATIONARITY_TOLERANCES = {"float64": 1e-8, "float32": 1e-5}
+# Joints closer to a limit are at the limit.
 ACTIVE_LIMIT_TOLERANCES_RAD = {
     "float64": 1e-9,
     "float32": 1e-6,
-}  # joints closer to a limit are at the limit
+}
+# Between quotients of stored numbers that were equal.
 FRACTION_TOLERANCES = {
     "float64": 4e-16,
     "float32": 2.5e-7,
-}  # between quotients of stored numbers that were equal
+}
 MIN_PROBABILITY = 1e-9  # of equal fractions by chance
 # Relative determinant below which two terms have no vertex that can be computed.
 PARALLEL_TOLERANCE = 1e-9
@@ -59,6 +61,7 @@ class HitRule:
 
 def hit_rule(stages: Iterable[Mapping[str, Any]]) -> HitRule:
     """Read the rule for goals from resolved stages."""
+    # The rule depends on two stages; other ones leave goals as they are.
     by_kind = {stage.get("use"): stage for stage in stages}
     near = by_kind.get("hitting-configuration", {}).get("near", "")
     return HitRule(str(near), by_kind.get("hitting-velocity", {}).get("full_speed"))
@@ -74,48 +77,50 @@ def judge_goals(
     """
     judged = []
     if rule.near and "hit_angle" in columns:
-        q = columns["goal_q"][finite]
-        near_base = np.broadcast_to(robot.home, q.shape)
-        home = near_base if rule.near == "base" else columns[f"{rule.near}_q"][finite]
-        direction = _directions(robot, columns, finite)
-        error = _projected_gradients(
-            robot, q, home, direction, ACTIVE_LIMIT_TOLERANCES_RAD[dtype]
-        )
-        tolerance = STATIONARITY_TOLERANCES[dtype]
-        judged.append(
-            compare(
-                "hitting configuration",
-                "m^2/rad",
-                violation=error,
-                tolerance=tolerance,
-                row=finite,
-            )
-        )
+        judged.append(_judge_configurations(robot, rule, columns, finite, dtype))
     if rule.full_speed is not None and "hit_speed_max" in columns:
-        fraction = speed_fractions(columns)[finite]
-        share = fraction * velocity_factors(robot, columns)[finite]
-        violation = (
-            np.abs(columns["goal_dq"][finite]) - share[:, None] * robot.velocity_limit
-        )
-        too_slow = (
-            np.where(fraction == 1, 0.0, np.inf)
-            if rule.full_speed == 1
-            else np.zeros(len(finite))
-        )
-        error = np.maximum(
-            np.maximum(violation.max(axis=1, initial=0.0), 0.0), too_slow
-        )
-        tolerance = BOUNDARY_TOLERANCES[dtype]["velocity"]
-        judged.append(
-            compare(
-                "hitting velocity",
-                "rad/s",
-                violation=error,
-                tolerance=tolerance,
-                row=finite,
-            )
-        )
+        judged.append(_judge_velocities(robot, rule, columns, finite, dtype))
     return judged
+
+
+def _judge_configurations(
+    robot: Robot, rule: HitRule, columns: Mapping[str, Array], finite: Index, dtype: str
+) -> tuple[Check, Index]:
+    """Check that goals are maxima of f: its gradient vanishes in the directions that the constraints leave free."""
+    q = columns["goal_q"][finite]
+    near_base = np.broadcast_to(robot.home, q.shape)
+    home = near_base if rule.near == "base" else columns[f"{rule.near}_q"][finite]
+    direction = _directions(robot, columns, finite)
+    at_limit = ACTIVE_LIMIT_TOLERANCES_RAD[dtype]
+    return compare(
+        "hitting configuration",
+        "m^2/rad",
+        violation=_projected_gradients(robot, q, home, direction, at_limit),
+        tolerance=STATIONARITY_TOLERANCES[dtype],
+        row=finite,
+    )
+
+
+def _judge_velocities(
+    robot: Robot, rule: HitRule, columns: Mapping[str, Array], finite: Index, dtype: str
+) -> tuple[Check, Index]:
+    """Check that joint velocities are within the fraction of their limits that the speed is of the highest one."""
+    fraction = speed_fractions(columns)[finite]
+    share = fraction * velocity_factors(robot, columns)[finite]
+    velocity = np.abs(columns["goal_dq"][finite])
+    violation = velocity - share[:, None] * robot.velocity_limit
+    # With a full speed of 1 every hit is the fastest one; slower hits were changed
+    # later.
+    slow = np.where(fraction == 1, 0.0, np.inf)
+    too_slow = slow if rule.full_speed == 1 else np.zeros(len(finite))
+    error = np.maximum(violation.max(axis=1, initial=0.0), 0.0)
+    return compare(
+        "hitting velocity",
+        "rad/s",
+        violation=np.maximum(error, too_slow),
+        tolerance=BOUNDARY_TOLERANCES[dtype]["velocity"],
+        row=finite,
+    )
 
 
 def speed_fractions(columns: Mapping[str, Array]) -> Array:
@@ -135,6 +140,8 @@ def repeated_fraction(fractions: Array, dtype: str) -> tuple[int, float]:
     fraction, and the fraction; 0 if there is none.
     """
     drawn = np.sort(fractions[(fractions > 0) & (fractions < 1)])
+    # Chance that m of N uniform numbers lie within the tolerance e: about N (N e)^(m-1)
+    # / (m-1)!. Find the smallest m that chance does not explain.
     expected, count = len(drawn) * FRACTION_TOLERANCES[dtype], 2
     while (
         len(drawn) * expected ** (count - 1) / math.factorial(count - 1)
@@ -163,6 +170,7 @@ def _directions(robot: Robot, columns: Mapping[str, Array], finite: Index) -> Ar
     """Return the unit directions of hits on the tables of finite rows, in the world frame, shape (rows, 3)."""
     angle = columns["hit_angle"][finite, 0]
     direction = np.stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))], axis=1)
+    # The hit is planned in the plane of the table, which may be tilted.
     if robot.parameters.tilts_table:
         table = MeasuredParameters(robot)
         for row, values in enumerate(columns["parameters"][finite]):
@@ -177,6 +185,8 @@ def _projected_gradients(
     """Compute the gradient of f in the directions that the constraints leave free [m^2/rad], shape (rows,)."""
     jacobian, gradient = _gradients(robot, q, home, direction)
     low, high = q - robot.position_lower < at_limit, robot.position_upper - q < at_limit
+    # Joints at a limit are fixed: without their columns, the multiplier explains the
+    # gradient by the rows of J as far as possible.
     free = jacobian * ~(low | high)[:, None]
     multiplier = np.linalg.pinv(free @ free.swapaxes(1, 2)) @ (
         free @ gradient[:, :, None]
@@ -224,8 +234,11 @@ def highest_speed(jacobian: Array, angle: Array, limit: Array) -> Array:
     x, y, z = jacobian.transpose(1, 0, 2)
     cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
     a, b = cosine * x + sine * y, cosine * y - sine * x
+    # Vertices of the dual: y solves a_k = (B' y)_k for two joints i and j (Cramer's
+    # rule).
     i, j = np.array(list(combinations(range(len(limit)), 2))).T
     first, second = b[:, i] * z[:, j], z[:, i] * b[:, j]
+    # A determinant that is rounding error gives no vertex.
     vertex = np.abs(first - second) > PARALLEL_TOLERANCE * (
         np.abs(first) + np.abs(second)
     )
@@ -237,6 +250,8 @@ def highest_speed(jacobian: Array, angle: Array, limit: Array) -> Array:
     residual = np.abs(
         a[:, :, None] - b[:, :, None] * u[:, None] - z[:, :, None] * w[:, None]
     )
+    # The dual function at each vertex; its minimum is the highest speed (strong
+    # duality).
     return np.asarray(
         np.where(vertex, limit @ residual, np.inf).min(axis=1, initial=np.inf)
     )

@@ -108,9 +108,11 @@ def compare(
         np.broadcast_to(tolerance, violation.shape),
         np.broadcast_to(end, violation.shape),
     )
+    # A value that cannot be evaluated fails.
     violation = np.where(np.isnan(violation), np.inf, violation)
     failed = np.unique(row[violation > tolerance])
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        # A tolerance of zero: any violation is infinitely severe.
         severity = np.where(violation > 0, violation / tolerance, 0.0)
     worst = int(np.argmax(severity))
     worst_row, worst_end = int(row[worst]), ENDS[int(end[worst])]
@@ -152,6 +154,8 @@ def _joined(before: Check | None, check: Check, shift: int) -> Check:
     """Add the result for rows that start at ``shift`` to the result for the rows before."""
     row = check.worst_row + shift if check.worst_row >= 0 else -1
     n_failed = check.n_failed + (before.n_failed if before else 0)
+    # The first of equal results stays, so that the report does not depend on the
+    # blocks.
     keep_before = (
         before is not None
         and before.worst_row >= 0

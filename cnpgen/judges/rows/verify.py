@@ -2,7 +2,7 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
@@ -101,6 +101,7 @@ def verify_rows(
     values = _read(columns, robot.n)
     rows = len(values["start_q"])
     world = World(robot, problem.obstacle, problem.object_size)
+    # Blocks bound the memory of the measurements.
     slices = [
         slice(first, first + VERIFICATION_BLOCK_ROWS)
         for first in range(0, max(rows, 1), VERIFICATION_BLOCK_ROWS)
@@ -108,9 +109,8 @@ def verify_rows(
     blocks = (
         {name: column[part] for name, column in values.items()} for part in slices
     )
-    with np.errstate(
-        over="ignore", invalid="ignore"
-    ):  # overflows give inf or nan and fail
+    # Overflows give inf or nan and fail.
+    with np.errstate(over="ignore", invalid="ignore"):
         return merge(
             [_verify_block(problem, world, block, dtype, rule) for block in blocks]
         )
@@ -155,6 +155,8 @@ class _ConditionValues:
             for side in ("lower", "upper")
         )
         count = [len(condition.g) for condition in self.conditions]
+        # One entry per value of each condition, with the row and end that it belongs
+        # to.
         row, end = np.repeat(np.array(self.places, np.int64), count, axis=0).T
         g = np.array(values, float)
         violation = np.maximum(np.maximum(lower - g, g - upper), 0.0)
@@ -204,11 +206,29 @@ class _Measurements:
         default_factory=lambda: defaultdict(_ConditionValues)
     )
 
+    def add_conditions(
+        self, conditions: Iterable[Condition], row: int, end: int
+    ) -> None:
+        """Record the conditions of one state."""
+        for condition in conditions:
+            key = condition.name, condition.unit, condition.tolerance_kind
+            self.conditions[key].conditions.append(condition)
+            self.conditions[key].places.append((row, end))
+
+    def add_hit(self, world: World, row: int, columns: Mapping[str, Array]) -> None:
+        """Record what the hitting speeds of a row need of the world at its goal, along the axes of the table."""
+        along_table = world.parameters.along_table
+        if "hit_speed" in columns:
+            self.hit_velocity[row] = along_table(world.tip_velocity)
+        if "hit_speed_max" in columns:
+            self.hit_jacobian[row] = along_table(world.tip_jacobian)
+
 
 def _verify_block(
     problem: Problem, world: World, columns: dict[str, Array], dtype: str, rule: HitRule
 ) -> RowReport:
     rows = len(columns["start_q"])
+    # A row with a nan would fail every check; it is reported once.
     n_invalid = np.sum(
         [np.sum(~np.isfinite(column), axis=1) for column in columns.values()], axis=0
     )
@@ -265,22 +285,13 @@ def _measure(
     problem: Problem, world: World, columns: dict[str, Array], finite: Index
 ) -> _Measurements:
     """Move the world to both ends of every finite row and record the measurements."""
+    poses = _scene(problem, world.robot, columns)
     rows = len(columns["start_q"])
-    velocity = goal_velocities(
-        problem, world.robot, columns["goal_q"], columns["goal_dq"]
-    )
-    given = {
-        "parameters": columns.get("parameters"),
-        "obstacle_poses": columns.get(OBSTACLE_POSES),
-    }
-    poses = scene_of(
-        problem, columns["start_xyz"], columns["goal_xyz"], velocity, **given
-    ).poses
-    position, velocity, jacobian = (
-        np.full((rows, *shape), np.nan) for shape in ((2, 3), (3,), (3, world.robot.n))
-    )
     measurements = _Measurements(
-        position, velocity, jacobian, _stored_diagnostics(problem, columns)
+        np.full((rows, 2, 3), np.nan),
+        np.full((rows, 3), np.nan),
+        np.full((rows, 3, world.robot.n), np.nan),
+        _stored_diagnostics(problem, columns),
     )
     for index, end in enumerate(ENDS):
         (q, dq, ddq), orders = _states(columns, end)
@@ -288,34 +299,39 @@ def _measure(
             partial(constraint.measured_at, end=end)
             for constraint in problem.constraint
         ]
+        # Highest derivative that each condition reads: 0, 1 or 2.
         needs = measured_needs(forms, world)
         for row in finite.tolist():
             world.set_state(q[row], dq[row], ddq[row], poses[row])
             measurements.position[row, index] = world.tip_position
             measured = chain.from_iterable(form(world) for form in forms)
+            # A row that stores no acceleration knows only conditions on positions and
+            # velocities.
             known = (
                 condition
                 for condition, need in zip(measured, needs, strict=True)
                 if need <= orders[row]
             )
-            for condition in known:
-                values = measurements.conditions[
-                    condition.name, condition.unit, condition.tolerance_kind
-                ]
-                values.conditions.append(condition)
-                values.places.append((row, index))
+            measurements.add_conditions(known, row, index)
             for diagnostic in measurements.diagnostics:
                 if np.isfinite(diagnostic.stored[row, index]):
                     diagnostic.recomputed[row, index] = diagnostic.compute(world)
-            if end == "goal" and "hit_speed" in columns:
-                measurements.hit_velocity[row] = world.parameters.along_table(
-                    world.tip_velocity
-                )
-            if end == "goal" and "hit_speed_max" in columns:
-                measurements.hit_jacobian[row] = world.parameters.along_table(
-                    world.tip_jacobian
-                )
+            if end == "goal":
+                measurements.add_hit(world, row, columns)
     return measurements
+
+
+def _scene(problem: Problem, robot: Robot, columns: dict[str, Array]) -> Array:
+    """Return the obstacle poses of rows: the stored ones, or those that follow from both ends."""
+    velocity = goal_velocities(problem, robot, columns["goal_q"], columns["goal_dq"])
+    return scene_of(
+        problem,
+        columns["start_xyz"],
+        columns["goal_xyz"],
+        velocity,
+        parameters=columns.get("parameters"),
+        obstacle_poses=columns.get(OBSTACLE_POSES),
+    ).poses
 
 
 def _states(columns: dict[str, Array], end: str) -> tuple[list[Array], list[int]]:
@@ -326,6 +342,7 @@ def _states(columns: dict[str, Array], end: str) -> tuple[list[Array], list[int]
     )
     if f"{end}_ddq" in columns:
         return [q, dq, ddq], [2] * len(q)
+    # A row at rest stays at rest: its acceleration is 0, so torques are known.
     return [q, dq, ddq], np.where(np.any(dq != 0, axis=1), 1, 2).tolist()
 
 
@@ -353,33 +370,16 @@ def _judge_hit(
         return
     angle = columns["hit_angle"][finite, 0]
     if "hit_speed" in columns:
-        speed, tolerances = columns["hit_speed"][finite, 0], BOUNDARY_TOLERANCES[dtype]
-        x, y, _ = block.hit_velocity[finite].T
-        along, across = (
-            x * np.cos(angle) + y * np.sin(angle),
-            y * np.cos(angle) - x * np.sin(angle),
-        )
-        moving = speed > 0
-        direction, error = (
-            np.abs(np.arctan2(across, along)[moving]),
-            np.abs(along - speed),
-        )
-        tolerance = tolerances["direction"]
-        yield compare(
-            "hit direction",
-            "rad",
-            violation=direction,
-            tolerance=tolerance,
-            row=finite[moving],
-        )
-        yield compare(
-            "hit speed",
-            "m/s",
-            violation=error,
-            tolerance=tolerances["velocity"],
-            row=finite,
+        yield from _judge_velocity(
+            block.hit_velocity[finite],
+            angle,
+            columns["hit_speed"][finite, 0],
+            finite,
+            dtype,
         )
     if "hit_speed_max" in columns:
+        # Factors scale all velocity limits, and the optimum of the linear program with
+        # them.
         highest = highest_speed(block.hit_jacobian[finite], angle, robot.velocity_limit)
         highest *= velocity_factors(robot, columns)[finite]
         error = np.abs(columns["hit_speed_max"][finite, 0] - highest)
@@ -390,6 +390,32 @@ def _judge_hit(
             tolerance=DIAGNOSTIC_TOLERANCES[dtype],
             row=finite,
         )
+
+
+def _judge_velocity(
+    velocity: Array, angle: Array, speed: Array, rows: Index, dtype: str
+) -> Iterator[tuple[Check, Index]]:
+    """Compare tip velocities on the table, shape (rows, 3), with directions [rad] and speeds [m/s] of hits."""
+    tolerances = BOUNDARY_TOLERANCES[dtype]
+    x, y, _ = velocity.T
+    along = x * np.cos(angle) + y * np.sin(angle)
+    across = y * np.cos(angle) - x * np.sin(angle)
+    # A hit of speed 0 has no direction.
+    moving = speed > 0
+    yield compare(
+        "hit direction",
+        "rad",
+        violation=np.abs(np.arctan2(across, along)[moving]),
+        tolerance=tolerances["direction"],
+        row=rows[moving],
+    )
+    yield compare(
+        "hit speed",
+        "m/s",
+        violation=np.abs(along - speed),
+        tolerance=tolerances["velocity"],
+        row=rows,
+    )
 
 
 @dataclass(frozen=True)

@@ -41,18 +41,18 @@ _BOX, _CYLINDER = KINDS.index("box"), KINDS.index("cylinder")
 class HullVertices(NamedTuple):
     """Vertices of a hull for ``convex.c``.
 
-    ``values`` are ``count`` coordinates x, then y, then z. With ``blocks``, center (3) and
+    ``values`` are ``vertices`` coordinates x, then y, then z. With ``blocks``, center (3) and
     radius of their bounding spheres follow in the same way.
     """
 
     values: Array
-    count: int
+    vertices: int
     blocks: int
 
     def put(self, bodies: Bodies, where: Any, first: int) -> None:
         """Enter the hull into the bodies at some indices; ``first`` is the index of its values among all."""
         bodies["kind"][where], bodies["first"][where] = HULL, first
-        bodies["count"][where], bodies["blocks"][where] = self.count, self.blocks
+        bodies["count"][where], bodies["blocks"][where] = self.vertices, self.blocks
 
 
 def hull_vertices(corners: Array) -> HullVertices:
@@ -73,6 +73,7 @@ def hull_vertices(corners: Array) -> HullVertices:
 
 
 def _padded(rows: Array, multiple: int) -> Array:
+    """Return rows with copies of the first one, which never change a maximum, up to a multiple."""
     return np.concatenate([rows, np.repeat(rows[:1], -len(rows) % multiple, axis=0)])
 
 
@@ -103,6 +104,7 @@ def bounding_boxes(bodies: Bodies, centers: Array, half: Array) -> Array:
     """
     count = bodies.shape[1]
     boxes = np.zeros((len(bodies), 16, count + -count % LANES))
+    # Padding is so far away that its bounding box is never near a capsule.
     boxes[:, :3] = PADDING_DISTANCE_M
     rows = np.concatenate(
         [centers, half, bodies["rotation"], bodies["radius"][..., None]], axis=-1
@@ -117,9 +119,12 @@ def primitive_bodies(obstacles: Primitives, first: int) -> tuple[Bodies, Array, 
     hulls = [hull_vertices(mesh.corners) for mesh in obstacles.meshes]
     ends = np.cumsum([first, *(len(hull.values) for hull in hulls)])
     box, cylinder, mesh = kinds == _BOX, kinds == _CYLINDER, kinds >= MESH
+    # Spheres and capsules: a segment along z, of length 0 or 2 h, with a radius around
+    # it.
     rounded = (kinds >= 0) & ~(box | cylinder | mesh)
     bodies = np.zeros(kinds.shape, BODY)
     bodies["kind"] = np.where(cylinder, CYLINDER, BOX)  # and hulls, below
+    # Absent bodies are boxes of size 0 at the padding distance.
     centers = np.where((kinds >= 0)[..., None], obstacles.centers, PADDING_DISTANCE_M)
     bodies["position"], bodies["rotation"] = (
         centers,
@@ -202,6 +207,7 @@ def _fill(body: Any, obstacle: Obstacle, numbers: Array) -> tuple[Array, Array]:
             corners = corners_of(obstacle.mesh)
             low, high = corners.min(axis=0), corners.max(axis=0)
             body["position"], body["rotation"] = center, rotation.ravel()
+            # The bounding box of a mesh is that of its corners in the mesh's own frame.
             return center + rotation @ (low + high) / 2, (high - low) / 2
         else:
             length = math.hypot(*rest[:3])

@@ -18,7 +18,7 @@ from cnpgen.kernels.collision.collision_checker import (
     CollisionChecker,
     load_collision_library,
 )
-from cnpgen.kernels.compiled_kernel import address_of
+from cnpgen.kernels.compiled_kernel import address_of, require_memory
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.robots.observation.primitives import (
     KINDS,
@@ -61,7 +61,8 @@ class ClearanceLoss:
     """Losses of states of one robot with link geometry among obstacles that differ from sample to sample."""
 
     def __init__(self, library: ctypes.CDLL, robot: Robot) -> None:
-        library.clearance_losses.restype = None
+        library.clearance_losses.restype = c_long
+        library.clearance_losses.errcheck = require_memory
         library.clearance_losses.argtypes = (
             c_void_p,
             c_long,
@@ -147,6 +148,8 @@ class ClearanceLossReference:
         model, data = self._robot.model, self._data
         pin.computeJointJacobians(model, data, q)
         places = [data.oMi[part.joint] for part in self._parts]
+        # Balls around the convex parts are a broad phase: d(part) >= d(center) -
+        # radius.
         centers = np.array(
             [
                 place.act(part.center)
@@ -169,10 +172,15 @@ class ClearanceLossReference:
                     coal.distance(shape, there, part.hull, here, request, result)
                     - part.thickness
                 )
+                # Huber's loss of v = required - d: v^2 / 2 for v < 1, else v - 1/2. Its
+                # derivative is min(v, 1), and d(d)/dq = n . (velocity of the closest
+                # point), with that point fixed in the link (envelope theorem).
                 violation = required - distance
                 if violation > 0:
                     derivative = min(violation, 1.0)
                     loss += derivative * (violation - 0.5 * derivative)
+                    # v(point) = v + omega x arm; the normal of Coal points from the
+                    # obstacle to the link.
                     arm = result.getNearestPoint2() - place.translation
                     velocity = jacobian[:3] + np.cross(jacobian[3:], arm, axis=0)
                     gradient -= derivative * result.normal @ velocity

@@ -31,19 +31,26 @@ typedef struct { /* memory of a batch of checks */
   double *obstacle_normal, *pair_normal; /* last normals in the world frame, the initial guesses */
 } memory;
 
+enum { OUT_OF_MEMORY = -1 }; /* result of functions that allocate memory */
+
+static void free_memory(memory *m) {
+  if (!m) return;
+  free(m->frame), free(m->ends), free(m->work), free(m->obstacle_normal), free(m->pair_normal), free(m);
+}
+
+/* Return memory for a batch of checks; null if there is none left. */
 static memory *make_memory(const robot_scene *s) {
   long pairs = s->first_pair[s->n_link_pairs];
-  memory *m = malloc(sizeof *m);
+  memory *m = calloc(1, sizeof *m);
+  if (!m) return 0;
   m->frame = malloc((s->n + 1) * sizeof *m->frame);
   m->work = malloc(sizeof *m->work);
   m->ends = malloc((6 * s->n_links + 1) * sizeof(double));
   m->obstacle_normal = calloc(3 * s->n_parts * s->n_obstacles + 1, sizeof(double));
   m->pair_normal = calloc(3 * pairs + 1, sizeof(double));
-  return m;
-}
-
-static void free_memory(memory *m) {
-  free(m->frame), free(m->ends), free(m->work), free(m->obstacle_normal), free(m->pair_normal), free(m);
+  if (m->frame && m->work && m->ends && m->obstacle_normal && m->pair_normal) return m;
+  free_memory(m);
+  return 0;
 }
 
 I void transform(const pose *f, const double *x, double *y) {
@@ -66,6 +73,7 @@ static void place_robot(const robot_scene *s, const double *q, memory *m) {
     pose *f = m->frame + j + 1;
     const double *T = s->place + 12 * j, *u = s->axis + 3 * j;
     double base[9], local[9];
+    /* T_j = T_{j-1} Place_j Rot(axis_j, q_j): the fixed place of the joint first. */
     transform(before, T + 9, f->p);
     for (int r = 0; r < 3; r++)
       for (int k = 0; k < 3; k++)
@@ -77,6 +85,7 @@ static void place_robot(const robot_scene *s, const double *q, memory *m) {
       memcpy(f->R, base, sizeof base);
       continue;
     }
+    /* About z only two columns change, which is cheaper than the general formula. */
     if (u[2] == 1.0) {
       for (int r = 0; r < 3; r++) {
         f->R[3 * r] = cosine[j] * base[3 * r] + sine[j] * base[3 * r + 1];
@@ -88,6 +97,7 @@ static void place_robot(const robot_scene *s, const double *q, memory *m) {
     double c = cosine[j], d = sine[j];
     for (int r = 0; r < 3; r++)
       for (int k = 0; k < 3; k++) local[3 * r + k] = (1 - c) * u[r] * u[k] + (r == k ? c : 0.0);
+    /* Rodrigues: c I + (1 - c) u u' + d [u]x with c = cos q, d = sin q; this line adds d [u]x. */
     local[1] -= d * u[2], local[2] += d * u[1], local[3] += d * u[2];
     local[5] -= d * u[0], local[6] -= d * u[1], local[7] += d * u[0];
     for (int r = 0; r < 3; r++)
@@ -106,6 +116,8 @@ I v squared_gaps(const double *boxes, long lanes, long o, const double *center, 
   v sum = K(0), x[3];
   for (int i = 0; i < 3; i++) x[i] = center[i] - at(boxes + i * lanes + o);
   for (int i = 0; i < 3; i++) {
+    /* Separating axes: along a face normal of the box, |x| - (extent of the capsule's axis) - (half size) is a lower
+       bound of the distance. The gaps of three orthogonal normals add up as squares. */
     v along = K(0), reach = at(boxes + (3 + i) * lanes + o);
     for (int k = 0; k < 3; k++) {
       v r = at(boxes + (6 + 3 * k + i) * lanes + o);
@@ -123,6 +135,7 @@ static double squared_segment_distance(const double *a, const double *b) { /* Er
   double one[3], two[3], r[3], s = 0.0, t, sum = 0.0;
   less(a + 3, a, one), less(b + 3, b, two), less(a, b, r);
   double aa = dot(one, one), bb = dot(two, two), ab = dot(one, two), ar = dot(one, r), br = dot(two, r);
+  /* s and t minimize |r + s one - t two|^2; a t that was clamped changes the best s. */
   double whole = aa * bb - ab * ab;
   if (whole > 1e-18) s = (ab * br - ar * bb) / whole, s = s < 0 ? 0 : s > 1 ? 1 : s;
   t = bb > 1e-18 ? (ab * s + br) / bb : 0.0, t = t < 0 ? 0 : t > 1 ? 1 : t;
@@ -145,11 +158,14 @@ static void measure_bodies(const robot_scene *s, const body *a, const pose *fa, 
   for (int i = 0; i < 3; i++)
     for (int k = 0; k < 3; k++)
       c.rotation[3 * i + k] = fa->R[i] * fb->R[k] + fa->R[3 + i] * fb->R[3 + k] + fa->R[6 + i] * fb->R[6 + k];
+  /* The normal of the last state is close to the present one; without one, the line between the origins is as good as
+     any. */
   if (dot(guess, guess) > 0) turn_back(fa->R, guess, out->normal);
   else {
     double length = sqrt(dot(c.position, c.position));
     for (int i = 0; i < 3; i++) out->normal[i] = length > 0 ? c.position[i] / length : 0.0;
   }
+  /* A limit below minus the radii asks for a depth of the bodies without their radii, which only EPA measures. */
   measure(&c, limit, contacts || limit + a->radius + b->radius < 0, out);
   turn(fa->R, out->normal, normal);
   memcpy(guess, normal, sizeof normal);
@@ -200,6 +216,7 @@ static int sphere_is_clear(const robot_scene *s, const body *part, const pose *f
 /* Find the contacts of moving parts and obstacles closer than `limit` plus what the link adds; without a list, return 1 at the
 first one. */
 static int meet_obstacles(const robot_scene *s, memory *m, double limit, contact_list *list) {
+  /* From the tip to the base: the outer links sweep the most space, so an early exit comes soon. */
   for (long l = s->n_links - 1; l >= 0; l--) {
     const capsule *link = s->links + l;
     if (!link->frame) continue;
@@ -209,6 +226,7 @@ static int meet_obstacles(const robot_scene *s, memory *m, double limit, contact
     for (int i = 0; i < 3; i++) center[i] = (e[i] + e[3 + i]) / 2, half[i] = (e[3 + i] - e[i]) / 2;
     for (long o = 0; o < s->lanes; o += W) {
       v range = larger(reach + at(s->boxes + 15 * s->lanes + o), K(0));
+      /* W obstacles at once: only bounding boxes closer than the capsule's radius and the limit are measured. */
       vi near = squared_gaps(s->boxes, s->lanes, o, center, half) <= range * range;
       for (int lane = 0; lane < W && o + lane < s->n_obstacles; lane++) {
         if (!near[lane]) continue;
@@ -237,6 +255,7 @@ static int meet_itself(const robot_scene *s, memory *m, double limit, contact_li
   for (long i = 0; i < s->n_link_pairs; i++) {
     long a = s->link_pairs[2 * i], b = s->link_pairs[2 * i + 1];
     double within = limit + s->pair_added[i], reach = s->links[a].radius + s->links[b].radius + within;
+    /* Two capsules that are farther apart than their radii and the limit contain parts that are so, too. */
     if (reach < 0 || squared_segment_distance(m->ends + 6 * a, m->ends + 6 * b) > reach * reach) continue;
     for (long k = s->first_pair[i]; k < s->first_pair[i + 1]; k++) {
       const body *one = s->parts + s->pairs[2 * k], *two = s->parts + s->pairs[2 * k + 1];
@@ -259,17 +278,20 @@ static int is_clear(const robot_scene *s, memory *m, const double *q, double obs
   return !(self_limit > -INFINITY && meet_itself(s, m, self_limit, 0));
 }
 
-void clear_states(const robot_scene *s, const double *q, long count, double obstacle_limit, double self_limit,
+long clear_states(const robot_scene *s, const double *q, long count, double obstacle_limit, double self_limit,
                   unsigned char *clear) {
   memory *m = make_memory(s);
+  if (!m) return OUT_OF_MEMORY;
   for (long k = 0; k < count; k++) clear[k] = is_clear(s, m, q + k * s->n, obstacle_limit, self_limit);
   free_memory(m);
+  return 0;
 }
 
 /* Contacts of one group within a limit; returns their number, which may exceed the capacity of the arrays. */
 long find_contacts(const robot_scene *s, const double *q, long count, double limit, int of_obstacles, long capacity,
                    long *pair, long *k, double *distance, double *normal, double *points) {
   memory *m = make_memory(s);
+  if (!m) return OUT_OF_MEMORY;
   contact_list list = {0, capacity, 0, pair, k, distance, normal, points};
   for (; list.state < count; list.state++) {
     place_robot(s, q + list.state * s->n, m);
@@ -281,11 +303,13 @@ long find_contacts(const robot_scene *s, const double *q, long count, double lim
 }
 
 /* Poses of the joints' frames, for tests: rotation and position, shape (count, n + 1, 12). */
-void joint_poses(const robot_scene *s, const double *q, long count, double *out) {
+long joint_poses(const robot_scene *s, const double *q, long count, double *out) {
   memory *m = make_memory(s);
+  if (!m) return OUT_OF_MEMORY;
   for (long k = 0; k < count; k++) {
     place_robot(s, q + k * s->n, m);
     memcpy(out + 12 * (s->n + 1) * k, m->frame, (s->n + 1) * sizeof(pose));
   }
   free_memory(m);
+  return 0;
 }

@@ -19,7 +19,7 @@ from cnpgen.kernels.collision.body_arrays import (
     hull_vertices,
     obstacle_bodies,
 )
-from cnpgen.kernels.compiled_kernel import address_of
+from cnpgen.kernels.compiled_kernel import address_of, require_memory
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
@@ -95,7 +95,12 @@ def load_collision_library(kernels: KernelLibrary) -> ctypes.CDLL | None:
     """
     library = kernels.load_source(*SOURCES)
     if library is not None:
-        library.clear_states.restype = library.joint_poses.restype = None
+        for function in (
+            library.clear_states,
+            library.find_contacts,
+            library.joint_poses,
+        ):
+            function.restype, function.errcheck = c_long, require_memory
         library.clear_states.argtypes = (
             c_void_p,
             c_void_p,
@@ -104,7 +109,6 @@ def load_collision_library(kernels: KernelLibrary) -> ctypes.CDLL | None:
             c_double,
             c_void_p,
         )
-        library.find_contacts.restype = c_long
         library.find_contacts.argtypes = (
             c_void_p,
             c_void_p,
@@ -148,16 +152,28 @@ class CollisionChecker:
         assert shape is not None
         self.library, self._n, self._arrays = library, robot.n, dict[str, Any]()
         self._scene = _RobotScene()
-        links = {capsule.link: i for i, capsule in enumerate(shape.capsules)}
+        self._set_chain(robot)
+        parts = self._set_parts(shape)
+        of_link = self._set_links(shape, parts, added or {})
+        self._set_pairs(shape, parts, of_link, pair_added or {})
+        self._set("moving", np.cumsum(parts["frame"] > 0) - 1)
+        self._set("moving_frames", parts["frame"][parts["frame"] > 0])
+        self._scene.n, self._scene.n_parts = robot.n, len(parts)
+        self.place([], np.empty(0))
+
+    def _set_chain(self, robot: Robot) -> None:
+        """Store the fixed places, axes and types of the joints."""
+        joints = robot.chain.joints
         chain = [
-            np.append(joint.rotation.ravel(), joint.translation)
-            for joint in robot.chain.joints
+            np.append(joint.rotation.ravel(), joint.translation) for joint in joints
         ]
         self._set("place", np.array(chain, np.float64))
-        self._set(
-            "axis", np.array([joint.axis for joint in robot.chain.joints], np.float64)
-        )
+        self._set("axis", np.array([joint.axis for joint in joints], np.float64))
         self._set("sliding", np.array(robot.prismatic, np.int64))
+
+    def _set_parts(self, shape: Shape) -> Bodies:
+        """Store and return the convex parts of the links, with their vertices."""
+        links = {capsule.link: i for i, capsule in enumerate(shape.capsules)}
         parts, blocks, first = np.zeros(len(shape.convex_parts), BODY), list[Array](), 0
         for index, part in enumerate(shape.convex_parts):
             hull, corners = hull_vertices(part.vertices), part.vertices
@@ -172,6 +188,12 @@ class CollisionChecker:
             first += len(hull.values)
         self.vertices = np.concatenate(blocks)
         self._set("parts", parts)
+        return parts
+
+    def _set_links(
+        self, shape: Shape, parts: Bodies, added: Mapping[str, float]
+    ) -> list[NDArray[np.intp]]:
+        """Store the capsules of the links; return the parts of each link."""
         capsules = np.array(
             [
                 (shape.joints[c.link], c.first, c.second, c.radius)
@@ -180,23 +202,34 @@ class CollisionChecker:
             CAPSULE,
         )
         self._set("links", capsules)
-        self._set(
-            "added",
-            np.array(
-                [(added or {}).get(capsule.link, 0.0) for capsule in shape.capsules]
-            ),
-        )
+        self._set("added", np.array([added.get(c.link, 0.0) for c in shape.capsules]))
+        # Parts of one link are contiguous in ``part_of_link``, from
+        # ``first_part[link]`` on.
         of_link = [
             np.flatnonzero(parts["link"] == link) for link in range(len(capsules))
         ]
-        self._set(
-            "first_part", np.append(0, np.cumsum([len(each) for each in of_link]))
-        )
+        self._set("first_part", np.append(0, np.cumsum(list(map(len, of_link)))))
         self._set("part_of_link", np.concatenate(of_link))
+        self._scene.n_links = len(capsules)
+        return of_link
+
+    def _set_pairs(
+        self,
+        shape: Shape,
+        parts: Bodies,
+        of_link: list[NDArray[np.intp]],
+        pair_added: Mapping[frozenset[str], float],
+    ) -> None:
+        """Store the pairs of links that must not touch, and of their parts."""
+        links = {capsule.link: i for i, capsule in enumerate(shape.capsules)}
+        # Pairs of links that always touch or never meet were left out when the shape
+        # was made.
         checked = [
             (pair.first, pair.second) for pair in shape.pairs if not pair.left_out
         ]
         kept = [(links[first], links[second]) for first, second in checked]
+        # The part nearer to the base first: only joints between both frames change its
+        # distance.
         pairs = [
             [
                 sorted(both, key=parts["frame"].__getitem__)
@@ -205,18 +238,14 @@ class CollisionChecker:
             for a, b in kept
         ]
         self._set("link_pairs", np.array(kept, np.int64).reshape(-1, 2))
-        more = [(pair_added or {}).get(frozenset(pair), 0.0) for pair in checked]
+        more = [pair_added.get(frozenset(pair), 0.0) for pair in checked]
         self._set("pair_added", np.array(more, np.float64))
-        self._set("first_pair", np.append(0, np.cumsum([len(each) for each in pairs])))
+        self._set("first_pair", np.append(0, np.cumsum(list(map(len, pairs)))))
         self.link_pairs = np.array(
             [both for each in pairs for both in each], np.int64
         ).reshape(-1, 2)
         self._set("pairs", self.link_pairs)
-        self._set("moving", np.cumsum(parts["frame"] > 0) - 1)
-        self._set("moving_frames", parts["frame"][parts["frame"] > 0])
-        self._scene.n, self._scene.n_parts = robot.n, len(parts)
-        self._scene.n_links, self._scene.n_link_pairs = len(capsules), len(kept)
-        self.place([], np.empty(0))
+        self._scene.n_link_pairs = len(kept)
 
     def place(self, obstacles: Sequence[Obstacle], numbers: Array) -> None:
         """Set the obstacles, with their poses and sizes, shape (width,) (``cnpgen.robots.solid``)."""
@@ -261,6 +290,8 @@ class CollisionChecker:
             self_distance: Required distance of links from each other [m]; None for no
                 check.
         """
+        # C reads states one after the other, so the joints of a state must be
+        # contiguous.
         states = np.ascontiguousarray(q.T)
         clear = np.empty(len(states), np.uint8)
         limits = [
@@ -281,6 +312,7 @@ class CollisionChecker:
             of_obstacles: Whether to measure pairs (obstacle, moving part), numbered
                 part by part; else ``link_pairs``.
         """
+        # The number of contacts is not known before; C counts all and stores what fits.
         states, capacity = np.ascontiguousarray(q.T), MIN_CONTACT_CAPACITY
         while True:
             pair, k, distance = (
@@ -320,6 +352,7 @@ class CollisionChecker:
 
     def _set(self, name: str, array: Any) -> None:
         """Keep an array and store its address in the scene."""
+        # The scene holds bare addresses; this dictionary keeps their arrays alive.
         self._arrays[name] = np.ascontiguousarray(array)
         setattr(
             self._scene,

@@ -65,6 +65,7 @@ static void furthest_vertex(const double *p, long n, const double *d, double *ou
   vi where = {0}, index;
   for (int i = 0; i < W; i++) where[i] = i;
   index = where;
+  /* Each lane keeps the best of every W-th vertex; the lanes are compared at the end. */
   for (long k = W; k < n; k += W) {
     index += W;
     v reach = at(p + k) * d[0] + at(p + n + k) * d[1] + at(p + 2 * n + k) * d[2];
@@ -115,6 +116,7 @@ I void support(const body *b, const double *vertices, const double *d, double *o
   } else if (b->kind == BOX) {
     for (int i = 0; i < 3; i++) out[i] = d[i] < 0 ? -b->size[i] : b->size[i];
   } else {
+    /* A point on the rim of an end; its center where d is along the axis. */
     double length = sqrt(d[0] * d[0] + d[1] * d[1]), scale = length > 0 ? b->size[0] / length : 0.0;
     out[0] = scale * d[0], out[1] = scale * d[1], out[2] = d[2] < 0 ? -b->size[2] : b->size[2];
   }
@@ -123,6 +125,7 @@ I void support(const body *b, const double *vertices, const double *d, double *o
 /* The vertex of the difference that is furthest along -d. */
 I void opposite_vertex(const couple *c, const double *d, vertex *p) {
   double back[3] = {-d[0], -d[1], -d[2]}, in_b[3], b[3], turned[3];
+  /* In the Minkowski difference A - B, the support along -d is that of A along -d minus that of B along d. */
   support(c->a, c->vertices, back, p->a);
   turn_back(c->rotation, d, in_b);
   support(c->b, c->vertices, in_b, b);
@@ -134,6 +137,8 @@ I void opposite_vertex(const couple *c, const double *d, vertex *p) {
 static int closest_on_triangle(const double *a, const double *b, const double *c, double *t, double *out) {
   double ab[3], ac[3];
   less(b, a, ab), less(c, a, ac);
+  /* d1 to d6 project the origin, seen from each corner, on ab and ac. va, vb, vc are the barycentric coordinates of its
+     foot times |ab x ac|^2. Their signs give the Voronoi region: a corner, an edge, or the inside. */
   double d1 = -dot(ab, a), d2 = -dot(ac, a), d3 = -dot(ab, b), d4 = -dot(ac, b), d5 = -dot(ab, c), d6 = -dot(ac, c);
   double va = d3 * d6 - d5 * d4, vb = d5 * d2 - d1 * d6, vc = d1 * d4 - d3 * d2;
   t[0] = t[1] = t[2] = 0.0;
@@ -177,6 +182,8 @@ static int reduce(vertex *p, int *n, double *t, double *out) {
       less(p[f[1]].w, p[f[0]].w, ab), less(p[f[2]].w, p[f[0]].w, ac), less(p[f[3]].w, p[f[0]].w, ad);
       cross(ab, ac, normal);
       double origin = -dot(normal, p[f[0]].w), fourth = dot(normal, ad);
+      /* The origin is on the same side of this face as the fourth vertex, so the face is not the closest one. If the
+         fourth vertex is in the plane of the face, the side is unknown and the face is tested. */
       if (origin * fourth > 0 && fourth * fourth > 1e-24 * dot(normal, normal) * dot(ad, ad)) continue;
       outside = 1;
       int kept = closest_on_triangle(p[f[0]].w, p[f[1]].w, p[f[2]].w, s, w);
@@ -205,6 +212,7 @@ static int make_facet(facet *f, const vertex *p, int i, int j, int k, const doub
   less(p[j].w, p[i].w, ab), less(p[k].w, p[i].w, ac);
   cross(ab, ac, f->normal);
   double length = sqrt(dot(f->normal, f->normal));
+  /* The area relative to the edges: slivers have a normal that is rounding error. */
   if (!(length > 1e-14 * sqrt(dot(ab, ab) * dot(ac, ac)) && length > 1e-20)) return 0;
   for (int m = 0; m < 3; m++) f->normal[m] /= length;
   less(p[i].w, inside, from);
@@ -217,6 +225,7 @@ static int make_facet(facet *f, const vertex *p, int i, int j, int k, const doub
 
 /* Extend a simplex of n vertices to a tetrahedron; return whether that is possible. */
 static int make_tetrahedron(const couple *c, vertex *p, int n) {
+  /* Degenerate simplices grow along directions that are perpendicular to what they span, in both senses. */
   for (int guess = 0; n < 4 && guess < 12; guess++) {
     double d[3] = {0};
     if (n < 3) {
@@ -244,6 +253,7 @@ static int make_tetrahedron(const couple *c, vertex *p, int n) {
       cross(ab, from, off);
       height = sqrt(dot(off, off) / dot(ab, ab));
     } else height = fabs(dot(from, d));
+    /* A vertex in the span of the others adds no dimension; try the next direction. */
     if (height > 1e-9) n++, guess = -1;
   }
   return n == 4;
@@ -256,6 +266,7 @@ static void find_points(const polytope *work, int facets, const facet *near, dou
     const facet *f = work->f + k;
     const vertex *p[3] = {work->p + f->p[0], work->p + f->p[1], work->p + f->p[2]};
     double t[3], from[3][3], off[3];
+    /* Coplanar facets have equal distances up to rounding. */
     if (f->distance > near->distance + EPA_TOLERANCE) continue;
     for (int m = 0; m < 3; m++)
       for (int i = 0; i < 3; i++) from[m][i] = p[m]->w[i] - near->distance * near->normal[i];
@@ -264,6 +275,7 @@ static void find_points(const polytope *work, int facets, const facet *near, dou
     least = dot(off, off);
     for (int i = 0; i < 3; i++) {
       out->on_a[i] = t[0] * p[0]->a[i] + t[1] * p[1]->a[i] + t[2] * p[2]->a[i];
+      /* The points of both bodies differ by the depth along the normal. */
       out->on_b[i] = out->on_a[i] - depth * near->normal[i];
     }
   }
@@ -281,6 +293,7 @@ static int penetration(const couple *c, const vertex *simplex, int n, contact *o
   for (int i = 0; i < 3; i++) inside[i] = (p[0].w[i] + p[1].w[i] + p[2].w[i] + p[3].w[i]) / 4;
   for (int i = 0; i < 4; i++) facets += make_facet(f + facets, p, i, (i + 1) % 4, (i + 2) % 4, inside);
   double best = INFINITY;
+  /* Expanding polytope: the facet nearest to the origin bounds the depth from below, its support point from above. */
   while (facets == 4 || points > 4) {
     int least = 0;
     for (int i = 1; i < facets; i++) least = f[i].distance < f[least].distance ? i : least;
@@ -289,12 +302,15 @@ static int penetration(const couple *c, const vertex *simplex, int n, contact *o
     vertex *fresh = p + points;
     opposite_vertex(c, back, fresh);
     double reach = dot(near.normal, fresh->w);
+    /* The separation along any normal is an upper bound of the depth: keep the best one, and its points. */
     if (reach < best || reach - near.distance <= EPA_TOLERANCE) {
       best = reach, out->distance = -reach;
       memcpy(out->normal, near.normal, sizeof near.normal);
       find_points(work, facets, &near, reach, out);
     }
     if (reach - near.distance <= EPA_TOLERANCE || points == MAX_EPA_POINTS - 1) break;
+    /* Remove the facets that see the new vertex. An edge of two removed facets occurs in both directions; the edges that
+       occur once are the outline, which the new facets join to the vertex. */
     int edges = 0, kept = 0, full = 0;
     for (int i = 0; i < facets; i++) {
       if (dot(f[i].normal, fresh->w) - f[i].distance <= 1e-14) { f[kept++] = f[i]; continue; }
@@ -326,18 +342,23 @@ static void measure(const couple *c, double limit, int contacts, contact *out) {
   vertex p[5];
   double d[3], t[4], radii = c->a->radius + c->b->radius, best = -INFINITY, core = limit + radii, old = INFINITY;
   int n = 0, overlap = 0;
+  /* The last normal of this pair starts the iteration: from state to state it changes little, and one step often
+     decides. */
   for (int i = 0; i < 3; i++) d[i] = -out->normal[i];
   if (!(dot(d, d) > 0.5)) d[0] = 1.0, d[1] = d[2] = 0.0;
   for (int step = 0; step < MAX_GJK_STEPS; step++) {
     double size = sqrt(dot(d, d));
     opposite_vertex(c, d, p + n);
+    /* The support plane of d separates the origin from the difference: a lower bound of the distance. */
     double lower = dot(d, p[n].w) / size;
     if (lower > best) {
       best = lower;
       for (int i = 0; i < 3; i++) out->normal[i] = -d[i] / size;
       if (best > core) break;
     }
+    /* Upper bound |d| and lower bound agree. */
     if (n && size - lower <= (contacts ? RELATIVE_TOLERANCE * size : GJK_TOLERANCE)) break;
+    /* A vertex that is known already improves nothing, up to rounding. */
     int known = 0;
     for (int i = 0; i < n; i++) known |= !memcmp(p[i].w, p[n].w, sizeof p[n].w);
     if (known) break;
@@ -345,6 +366,7 @@ static void measure(const couple *c, double limit, int contacts, contact *out) {
     if ((overlap = reduce(p, &n, t, d))) break;
     double now = dot(d, d);
     if ((overlap = now < MIN_GAP * MIN_GAP)) break;
+    /* Only the decision is needed: the upper bound is below the limit. */
     if (!contacts && now <= core * core && core > 0) { best = sqrt(now); break; }
     if (now >= old) break; /* rounding errors */
     old = now;
@@ -360,6 +382,8 @@ static void measure(const couple *c, double limit, int contacts, contact *out) {
   out->distance = overlap && !contacts ? -INFINITY : best - radii;
   if (best > core || !contacts) return;
   memset(out->on_a, 0, sizeof out->on_a);
+  /* The point of A has the weights of the closest point of the simplex; that of B lies the distance farther along the
+     normal. */
   double share = 0.0;
   for (int i = 0; i < n; i++) {
     share += t[i];

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.collision.collision_checker import CollisionChecker
-from cnpgen.kernels.compiled_kernel import address_of
+from cnpgen.kernels.compiled_kernel import address_of, require_memory
 from cnpgen.kernels.kernel import Kernel
 
 Array = NDArray[np.float64]
@@ -82,15 +82,14 @@ class RowKernels:
         checker: CollisionChecker,
         columns: DistanceColumns,
     ) -> None:
-        rows, m, width = (
-            values.tape.outputs[0],
-            len(columns.required),
-            values.tape.inputs[0],
-        )
+        rows, width = values.tape.outputs[0], values.tape.inputs[0]
+        m = len(columns.required)
         limits = [
             -np.inf if x is None else x
             for x in (columns.obstacle_distance, columns.self_distance)
         ]
+        # Scratch memory of one state: its contacts, then values (m) and gradients (m,
+        # width).
         numbers = NUMBERS_PER_CONTACT * MAX_CONTACTS_PER_STATE + m * (1 + width)
         arrays = (
             np.empty(numbers),
@@ -108,17 +107,22 @@ class RowKernels:
             *addresses, *counts, columns.range, columns.scale, *limits
         )
         self._library = checker.library
-        (
-            self._library.set_row_context.argtypes,
-            self._library.set_row_context.restype,
-        ) = (c_void_p,), None
+        activate = self._library.set_row_context
+        activate.argtypes, activate.restype = (c_void_p,), c_long
+        activate.errcheck = require_memory
         self.values = _RowKernel(self, values, "row_values", (rows + m,))
         self.jacobian = _RowKernel(
             self, jacobian, "row_jacobian", (rows + m, (rows + m) * width)
         )
 
     def activate(self) -> None:
-        """Make these kernels those of the thread: their machine code has one context per thread."""
+        """Make these kernels those of the thread: their machine code has one context per thread.
+
+        Raises:
+            MachineError: There is no memory left, or there was none for the last evaluation.
+        """
+        # A thread-local pointer: the interface of compiled kernels has no room for a
+        # context.
         self._library.set_row_context(ctypes.addressof(self._context))
 
 
@@ -149,4 +153,5 @@ class _RowKernel(Kernel):
             for arrays in (arguments, results)
         ]
         self._function(c_long(n), pointers[0], strides, pointers[1])
+        self._kernels.activate()  # raises an error if memory was lacking
         return results

@@ -18,6 +18,7 @@ typedef struct {
   long count, capacity, n;
   double *q;
   long *parent;
+  int lacks_memory; /* a node could not be added */
 } tree;
 
 typedef struct {
@@ -28,6 +29,7 @@ typedef struct {
 } search;
 
 static double uniform(search *h) {
+  /* xorshift64 (Marsaglia 2003); 53 bits make a number in [0, 1). */
   h->random ^= h->random << 13, h->random ^= h->random >> 7, h->random ^= h->random << 17;
   return (h->random >> 11) * (1.0 / 9007199254740992.0);
 }
@@ -47,6 +49,7 @@ static double squared_difference(const double *a, const double *b, long n) {
 static int state_is_clear(search *h, const double *q) {
   const tree_settings *s = h->s;
   long n = s->scene->n;
+  /* At an end the clearance may be as small as the problem permits; the margin rises linearly with the distance from it. */
   double away = fmin(largest_difference(q, s->start, n), largest_difference(q, s->goal, n));
   double margin = s->ramp > 0 ? s->margin * fmin(1.0, away / s->ramp) : s->margin;
   return is_clear(s->scene, h->m, q, s->obstacle_distance + margin, s->self_distance + margin);
@@ -56,6 +59,7 @@ static int state_is_clear(search *h, const double *q) {
 static int line_is_clear(search *h, const double *a, const double *b, int check_last) {
   long n = h->s->scene->n, count = (long)ceil(largest_difference(a, b, n) / h->s->spacing), step = 1;
   if (check_last && !state_is_clear(h, b)) return 0;
+  /* Van der Corput order: the middle first, then the quarters. An edge in collision is often in collision there. */
   while (2 * step < count) step *= 2;
   for (long stride = step; stride >= 1; stride /= 2)
     for (long k = stride; k < count; k += 2 * stride) {
@@ -65,11 +69,24 @@ static int line_is_clear(search *h, const double *a, const double *b, int check_
   return 1;
 }
 
+static tree make_tree(long n) {
+  tree t = {0, 256, n, malloc(256 * n * sizeof(double)), malloc(256 * sizeof(long)), 0};
+  t.lacks_memory = !t.q || !t.parent;
+  return t;
+}
+
+static void free_tree(tree *t) { free(t->q), free(t->parent); }
+
+/* Add a node; return its index, or -1 if there is no memory left. */
 static long add_node(tree *t, const double *q, long parent) {
+  if (t->lacks_memory) return -1;
   if (t->count == t->capacity) {
+    double *states = realloc(t->q, 2 * t->capacity * t->n * sizeof(double));
+    if (states) t->q = states;
+    long *parents = realloc(t->parent, 2 * t->capacity * sizeof(long));
+    if (parents) t->parent = parents;
+    if (!states || !parents) return t->lacks_memory = 1, -1;
     t->capacity *= 2;
-    t->q = realloc(t->q, t->capacity * t->n * sizeof(double));
-    t->parent = realloc(t->parent, t->capacity * sizeof(long));
   }
   memcpy(t->q + t->n * t->count, q, t->n * sizeof(double));
   t->parent[t->count] = parent;
@@ -90,6 +107,7 @@ static long nearest_node(const tree *t, const double *q) {
 static long extend(search *h, tree *t, long node, const double *target, double *fresh, int *reached) {
   const double *from = t->q + t->n * node;
   double distance = sqrt(squared_difference(from, target, t->n));
+  /* A longer edge is cut, so that a collision far away does not reject the part before it. */
   *reached = distance <= h->s->extension;
   for (long j = 0; j < t->n; j++)
     fresh[j] = *reached ? target[j] : from[j] + (target[j] - from[j]) * (h->s->extension / distance);
@@ -102,6 +120,7 @@ static long join(const tree *trees, long a, long b, double *path, long max_point
   for (long i = a; i >= 0; i = trees[0].parent[i]) count++;
   for (long i = b; i >= 0; i = trees[1].parent[i]) points++;
   if (count + points > max_points) return 0;
+  /* From the root to a, so it is written backwards; b repeats the last state of a's branch and is left out. */
   long at_index = count;
   for (long i = a; i >= 0; i = trees[0].parent[i]) memcpy(path + n * --at_index, trees[0].q + n * i, n * sizeof(double));
   for (long i = trees[1].parent[b]; i >= 0; i = trees[1].parent[i]) memcpy(path + n * count++, trees[1].q + n * i, n * sizeof(double));
@@ -114,13 +133,15 @@ static double line_time(const tree_settings *s, const double *a, const double *b
   return most;
 }
 
-/* Replace sections of a path by straight lines between random points on it; return its number of points. */
+/* Replace sections of a path by straight lines between random points on it; return its number of points, or OUT_OF_MEMORY. */
 static long shorten(search *h, double *path, long count, double *copy, long max_points) {
   const tree_settings *s = h->s;
   long n = s->scene->n;
   double *ends = malloc(2 * n * sizeof(double));
+  if (!ends) return OUT_OF_MEMORY;
   for (long trial = 0; trial < s->shortcuts && count > 2 && count + 2 <= max_points; trial++) {
     double whole = 0.0, along[2], section;
+    /* Random points are uniform in estimated time, not in length: slow sections are shortened more often. */
     for (long i = 0; i + 1 < count; i++) whole += line_time(s, path + n * i, path + n * (i + 1));
     along[0] = whole * uniform(h), along[1] = whole * uniform(h);
     if (along[0] > along[1]) { double x = along[0]; along[0] = along[1], along[1] = x; }
@@ -133,8 +154,10 @@ static long shorten(search *h, double *path, long count, double *copy, long max_
       for (long j = 0; j < n; j++) ends[e * n + j] = path[n * i + j] + f * (path[n * (i + 1) + j] - path[n * i + j]);
       index[e] = i;
     }
+    /* Both points on one line: nothing to shorten. */
     if (index[0] == index[1]) continue;
     section = along[1] - along[0] + (index[1] - index[0]) * s->corner_time;
+    /* A shortcut costs its line and the two corners that it makes. */
     double straight = line_time(s, ends, ends + n) + 2 * s->corner_time;
     if (straight >= section || !line_is_clear(h, ends, ends + n, 1)) continue;
     if (!state_is_clear(h, ends)) continue;
@@ -145,6 +168,8 @@ static long shorten(search *h, double *path, long count, double *copy, long max_
     count = kept + count - index[1] - 1;
     memcpy(path, copy, count * n * sizeof(double));
   }
+  /* A corner costs time even on a straight line. After a removal the corner before may have become redundant, so go back
+     one. */
   for (long i = 1; i + 1 < count;) { /* remove points that are not needed */
     double around = line_time(s, path + n * (i - 1), path + n * i) + line_time(s, path + n * i, path + n * (i + 1));
     double straight = line_time(s, path + n * (i - 1), path + n * (i + 1));
@@ -158,39 +183,44 @@ static long shorten(search *h, double *path, long count, double *copy, long max_
   return count;
 }
 
-/* Search for a path from start to goal; return its number of points, at most max_points, or 0 if there is none. */
+/* Search for a path from start to goal; return its number of points, at most max_points, 0 if there is none, or
+OUT_OF_MEMORY. */
 long find_path(const tree_settings *s, double *path, long max_points) {
   long n = s->scene->n, count = 0;
   search h = {s, make_memory(s->scene), s->seed * 0x9E3779B97F4A7C15ull + 88172645463325252ull, malloc(n * sizeof(double))};
   double *target = malloc(n * sizeof(double)), *fresh = malloc(n * sizeof(double));
-  tree trees[2];
+  tree trees[2] = {make_tree(n), make_tree(n)};
+  add_node(trees, s->start, -1), add_node(trees + 1, s->goal, -1);
+  int lacks_memory = !h.m || !h.q || !target || !fresh || trees[0].lacks_memory || trees[1].lacks_memory;
   for (int i = 0; i < 10; i++) uniform(&h);
-  for (int i = 0; i < 2; i++) {
-    trees[i] = (tree){0, 256, n, malloc(256 * n * sizeof(double)), malloc(256 * sizeof(long))};
-    add_node(trees + i, i ? s->goal : s->start, -1);
-  }
-  if (line_is_clear(&h, s->start, s->goal, 0)) {
+  if (lacks_memory) count = OUT_OF_MEMORY;
+  /* Most pairs of states need no tree. */
+  else if (line_is_clear(&h, s->start, s->goal, 0)) {
     memcpy(path, s->start, n * sizeof(double)), memcpy(path + n, s->goal, n * sizeof(double));
     count = 2;
   }
   for (long trial = 0; trial < s->max_extensions && trees[0].count + trees[1].count < s->max_nodes && !count; trial++) {
+    /* Balanced trees: extend the smaller one (Kuffner and LaValle 2000). */
     int own = trees[0].count > trees[1].count, reached;
     for (long j = 0; j < n; j++) target[j] = s->lower[j] + uniform(&h) * (s->upper[j] - s->lower[j]);
     tree *near = trees + own, *other = trees + !own;
     long node = extend(&h, near, nearest_node(near, target), target, fresh, &reached);
+    if (near->lacks_memory) count = OUT_OF_MEMORY;
     if (node < 0) continue;
     memcpy(target, fresh, n * sizeof(double));
     long far = nearest_node(other, target);
+    /* Connect: the other tree is extended towards the new node until it is reached or blocked. */
     do far = extend(&h, other, far, target, fresh, &reached);
     while (far >= 0 && !reached);
     if (far >= 0) count = own ? join(trees, far, node, path, max_points) : join(trees, node, far, path, max_points);
+    if (near->lacks_memory || other->lacks_memory) count = OUT_OF_MEMORY;
   }
   if (count > 2) {
     double *copy = malloc(max_points * n * sizeof(double));
-    count = shorten(&h, path, count, copy, max_points);
+    count = copy ? shorten(&h, path, count, copy, max_points) : OUT_OF_MEMORY;
     free(copy);
   }
-  for (int i = 0; i < 2; i++) free(trees[i].q), free(trees[i].parent);
+  free_tree(trees), free_tree(trees + 1);
   free(target), free(fresh), free(h.q), free_memory(h.m);
   return count;
 }

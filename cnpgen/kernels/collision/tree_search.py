@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.collision.collision_checker import CollisionChecker
-from cnpgen.kernels.compiled_kernel import address_of
+from cnpgen.kernels.compiled_kernel import address_of, require_memory
 from cnpgen.kernels.kernel import Kernel
 
 Array = NDArray[np.float64]
@@ -101,20 +101,36 @@ def find_tree_path(
     Returns:
         Corners of the path [rad], shape (K, n), or None if the trees do not connect.
     """
+    # C reads the arrays by address, so they must be contiguous and outlive the call.
     arrays = [
         np.ascontiguousarray(array, np.float64)
         for array in (*ends, *box, velocity_limit)
     ]
+    # Without a check the required distance is -inf, which every distance exceeds.
     numbers = [-np.inf if value is None else value for value in astuple(settings)]
     native = _TreeSettings(
         checker.address, *map(address_of, arrays), *numbers, CORNER_TIME_S, seed + 1
     )
     path = np.empty((MAX_PATH_POINTS, len(arrays[0])))
+    count = _search(checker, native, manifold, path)
+    return path[:count].copy() if count else None
+
+
+def _search(
+    checker: CollisionChecker,
+    native: _TreeSettings,
+    manifold: EqualityKernel | None,
+    path: Array,
+) -> int:
+    """Write the corners of a path into an array; return their number, 0 if there is no path."""
     if manifold is None:
         search = checker.library.find_path
         search.restype, search.argtypes = c_long, (c_void_p, c_void_p, c_long)
+        search.errcheck = require_memory
         count = search(ctypes.addressof(native), address_of(path), len(path))
     else:
+        # The kernel projects a block of states at once, so the scene is repeated for
+        # each lane.
         search, scene = (
             checker.library.find_manifold_path,
             np.repeat(manifold.scene, STATES_PER_PROJECTION),
@@ -123,6 +139,7 @@ def find_tree_path(
             c_long,
             (*(c_void_p,) * 3, c_long, c_double, c_void_p, c_long),
         )
+        search.errcheck = require_memory
         residuals, rows = manifold.residuals.address, manifold.residuals.tape.outputs[0]
         errors = rows, MAX_PROJECTION_ERROR
         count = search(
@@ -133,10 +150,11 @@ def find_tree_path(
             address_of(path),
             len(path),
         )
-    return path[:count].copy() if count else None
+    return int(count)
 
 
 def estimated_duration(path: Array, velocity_limit: Array) -> float:
     """Estimate the duration along a path [rad], shape (K, n): lines at the velocity limits [rad/s], and its corners."""
+    # The slowest joint of a straight line determines its duration.
     lines = (np.abs(np.diff(path, axis=0)) / velocity_limit).max(axis=1)
     return float(lines.sum() + CORNER_TIME_S * max(len(path) - 2, 0))

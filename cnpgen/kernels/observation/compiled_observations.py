@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.compiled_kernel import address_of
+from cnpgen.kernels.compiled_kernel import address_of, require_memory
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.robots.observation.camera import Camera
 from cnpgen.robots.observation.observations import ObservationBackend
@@ -72,6 +72,8 @@ class CompiledObservations(ObservationBackend):
         library.scene_distances.argtypes = (pointer, pointer, number, flag, pointer)
         library.scene_clouds.argtypes = (pointer, pointer, number, pointer)
         library.scene_depths.argtypes = (pointer, pointer, number, number, pointer)
+        for function in (library.scene_clouds, library.depth_clouds):
+            function.restype, function.errcheck = number, require_memory
         library.depth_clouds.argtypes = (
             number,
             pointer,

@@ -41,6 +41,8 @@ static void triangle_distances(const primitive *b, const float *x, const float *
   EACH(i, 0, n) squared[i] = INFINITY;
   for (long t = 0; t < b->triangles; t++) {
     const float *corner = b->triangle + 9 * t, *e = corner + 3, *f = corner + 6;
+    /* The normal and edges need no square root: side planes of the edges decide whether the foot of a point is in the
+       triangle. */
     float normal[3] = {e[1] * f[2] - e[2] * f[1], e[2] * f[0] - e[0] * f[2], e[0] * f[1] - e[1] * f[0]};
     float starts[3][3], edges[3][3], sides[3][3], lengths[3], area = 0;
     for (int m = 0; m < 3; m++) {
@@ -59,11 +61,13 @@ static void triangle_distances(const primitive *b, const float *x, const float *
         const float *g = edges[k], *s = sides[k];
         float u = x[i] - starts[k][0], v = y[i] - starts[k][1], w = z[i] - starts[k][2];
         float along = least(most((u * g[0] + v * g[1] + w * g[2]) * lengths[k], 0.0f), 1.0f);
+        /* The foot is inside if the point is on the inner side of all three planes through an edge and along the normal. */
         above = u * s[0] + v * s[1] + w * s[2] >= 0 ? above : 0;
         if (k == 0) plane = u * normal[0] + v * normal[1] + w * normal[2];
         u -= along * g[0], v -= along * g[1], w -= along * g[2];
         nearest = least(nearest, u * u + v * v + w * w);
       }
+      /* Inside, the squared distance from the plane is (n . u)^2 / |n|^2; else the nearest edge counts. */
       squared[i] = least(squared[i], above > 0 ? plane * plane / area : nearest);
     }
   }
@@ -81,6 +85,7 @@ static __attribute__((noinline)) void lower_mesh_distances(const primitive *b, c
     LOCAL(i, 0) LOCAL(i, 1) LOCAL(i, 2)
     px[i] = p0, py[i] = p1, pz[i] = p2, depth[i] = -INFINITY;
   }
+  /* Inside the hull the depth is the largest signed distance from a plane, and exact. */
   for (const float *c = b->plane; c < b->plane + 4 * b->planes; c += 4)
     EACH(i, 0, n) depth[i] = most(depth[i], c[0] * px[i] + c[1] * py[i] + c[2] * pz[i] + c[3]);
   EACH(i, 0, n) outside |= depth[i] > 0 && depth[i] < distance[i]; /* planes are never farther than the mesh */
@@ -94,6 +99,8 @@ static void lower_distances(const primitive *b, const float *x, const float *y, 
   if (b->kind == BOX) {
     EACH(i, 0, n) {
       LOCAL(i, 0) LOCAL(i, 1) LOCAL(i, 2)
+      /* |p| - size along each axis: outside, the positive parts are the vector to the box; inside, the largest is the
+         depth. */
       float u = fabsf(p0) - b->s[0], v = fabsf(p1) - b->s[1], w = fabsf(p2) - b->s[2];
       float inside = least(most(most(u, v), w), 0.0f);
       u = most(u, 0.0f), v = most(v, 0.0f), w = most(w, 0.0f);
@@ -102,6 +109,7 @@ static void lower_distances(const primitive *b, const float *x, const float *y, 
   } else if (b->kind == CYLINDER) {
     EACH(i, 0, n) {
       LOCAL(i, 0) LOCAL(i, 1) LOCAL(i, 2)
+      /* A box in the coordinates (distance from the axis, height). */
       float u = sqrtf(p0 * p0 + p1 * p1) - r, w = fabsf(p2) - h, inside = least(most(u, w), 0.0f);
       u = most(u, 0.0f), w = most(w, 0.0f);
       distance[i] = least(distance[i], sqrtf(u * u + w * w) + inside);
@@ -109,6 +117,7 @@ static void lower_distances(const primitive *b, const float *x, const float *y, 
   } else {
     EACH(i, 0, n) {
       LOCAL(i, 0) LOCAL(i, 1) LOCAL(i, 2)
+      /* Distance from the axis segment minus the radius; a sphere has h = 0. */
       float w = most(fabsf(p2) - h, 0.0f);
       distance[i] = least(distance[i], sqrtf(p0 * p0 + p1 * p1 + w * w) - r);
     }
@@ -153,6 +162,7 @@ static int patches_of(const primitive *b, patch *p) {
   for (const float *c = b->triangle; b->kind >= MESH && c < b->triangle + 9 * b->triangles; c += 9, p++) {
     const float *e = c + 3, *f = c + 6;
     double x = e[1] * f[2] - e[2] * f[1], y = e[2] * f[0] - e[0] * f[2], z = e[0] * f[1] - e[1] * f[0];
+    /* Half the length of the cross product of two edges. */
     p->form = 4, p->area = sqrt(x * x + y * y + z * z) / 2;
     for (int m = 0; m < 3; m++) {
       const float *R = b->R + 3 * m;
@@ -178,6 +188,7 @@ static int patches_of(const primitive *b, patch *p) {
   for (int k = 0; k < 3; k++, p++) {
     float side = k == 0 ? 0.0f : k == 1 ? -1.0f : 1.0f;
     p->form = k == 0 ? 1 : b->kind == CYLINDER ? 2 : 3;
+    /* Lateral area 2 pi r (2 h), an end pi r^2, half a sphere 2 pi r^2. */
     p->area = k == 0 ? 4 * pi * r * h : b->kind == CYLINDER ? pi * r * r : 2 * pi * r * r;
     p->r = r, p->h = k == 0 ? 2 * h : side * r;
     for (int m = 0; m < 3; m++) {
@@ -196,19 +207,25 @@ static void scatter(const patch *p, uint64_t start, long n, float *out) {
   for (long done = 0; done < n; done += BLOCK) {
     long count = n - done < BLOCK ? n - done : BLOCK;
     EACH(i, 0, count) {
+      /* Wrapping integers are the fractional parts: alpha = 2^32 / phi and 2^32 / phi^2 of the plastic number (Roberts
+         2018). */
       uint32_t k = done + i;
       float u = (float)(int32_t)((first + k * 3242174889u) >> 8) * UNIT;
       float v = (float)(int32_t)((second + k * 2447445414u) >> 8) * UNIT;
       if (flat) {
+        /* Points in the other half of the parallelogram are reflected into the triangle, which keeps them uniform. */
         int far = u > limit - v;
         u = far ? 1 - u : u, v = far ? 1 - v : v;
         x[i] = p->base[0] + u * p->U[0] + v * p->V[0];
         y[i] = p->base[1] + u * p->U[1] + v * p->V[1];
         z[i] = p->base[2] + u * p->U[2] + v * p->V[2];
       } else {
+        /* cos and sin of half the angle by Taylor polynomials on [-pi/2, pi/2], then the double angle: no call, so the
+           loop vectorizes. */
         float t = 3.14159265f * (u - 0.5f), q = t * t;
         float s = t * (1 + q * (-1 / 6.0f + q * (1 / 120.0f + q * (-1 / 5040.0f + q * (1 / 362880.0f - q / 39916800.0f)))));
         float c = 1 + q * (-0.5f + q * (1 / 24.0f + q * (-1 / 720.0f + q * (1 / 40320.0f - q / 3628800.0f))));
+        /* Uniform in area: radius sqrt(v) on a disc; on a sphere the height is uniform (Archimedes). */
         float scale = p->form == 1 ? 1.0f : p->form == 2 ? sqrtf(v) : sqrtf(1 - v * v);
         float height = p->form == 2 ? 0.0f : v * p->h;
         float a = p->r * scale * (c * c - s * s), b = 2 * p->r * scale * s * c;
@@ -222,8 +239,10 @@ static void scatter(const patch *p, uint64_t start, long n, float *out) {
   }
 }
 
+enum { OUT_OF_MEMORY = -1 }; /* result of functions that allocate memory */
+
 /* Points on the surfaces of each scene, in proportion to the areas of the patches; nan for a scene without bodies. */
-void scene_clouds(const scene_arrays *a, const uint64_t *seed, long count, float *points) {
+long scene_clouds(const scene_arrays *a, const uint64_t *seed, long count, float *points) {
   long most_patches = 0;
   EACH(scene, 0, a->scenes) {
     long sum = 0;
@@ -234,6 +253,7 @@ void scene_clouds(const scene_arrays *a, const uint64_t *seed, long count, float
     most_patches = sum > most_patches ? sum : most_patches;
   }
   patch *p = malloc((most_patches + 1) * sizeof *p);
+  if (!p) return OUT_OF_MEMORY;
   EACH(scene, 0, a->scenes) {
     float *out = points + 3 * count * scene;
     double area = 0, sum = 0, offset = (double)(mixed(seed[scene]) >> 11) / 9007199254740992.0;
@@ -246,6 +266,7 @@ void scene_clouds(const scene_arrays *a, const uint64_t *seed, long count, float
     if (!patches) EACH(i, 0, 3 * count) out[i] = NAN;
     EACH(k, 0, patches) {
       sum += p[k].area;
+      /* Systematic rounding: a random offset shared by all patches, so the counts add up and have the right expectation. */
       long end = k == patches - 1 ? count : (long)(sum / area * count + offset);
       end = end > count ? count : end < before ? before : end;
       scatter(p + k, mixed(seed[scene] + k + 1), end - before, out + 3 * before);
@@ -253,6 +274,7 @@ void scene_clouds(const scene_arrays *a, const uint64_t *seed, long count, float
     }
   }
   free(p);
+  return 0;
 }
 
 typedef struct { double origin[3], axes[9]; /* rows: forward, right, down; the last two times half the image's extent */ } view;
@@ -272,6 +294,7 @@ static void seen(const primitive *b, const double *o, const double *axes, long w
       const double *axis = axes + 3 * k;
       along[k] = (axis[0] * d[0] + axis[1] * d[1] + axis[2] * d[2]) / (axis[0] * axis[0] + axis[1] * axis[1] + axis[2] * axis[2]);
     }
+    /* A corner behind the camera has no projection; the whole image is then in the range. */
     if (along[0] < 1e-6) { behind++; continue; }
     for (int k = 0; k < 2; k++) {
       double place = along[1 + k] / along[0];
@@ -279,6 +302,7 @@ static void seen(const primitive *b, const double *o, const double *axes, long w
     }
   }
   for (int k = 0; k < 2; k++) {
+    /* One pixel more on each side, because pixels are tested at their centers. */
     double first = behind ? 0 : floor((low[k] + 1) / 2 * size[k] - 1), last = behind ? size[k] : ceil((high[k] + 1) / 2 * size[k] + 1);
     range[2 * k] = behind == 8 || first > size[k] ? size[k] : first < 0 ? 0 : first;
     range[2 * k + 1] = last > size[k] ? size[k] : last < 0 ? 0 : last;
@@ -288,11 +312,14 @@ static void seen(const primitive *b, const double *o, const double *axes, long w
 /* Lower the depths of the pixels first to last of a row; o, d: the camera and the ray of pixel 0, e: its change per pixel. */
 static void lower_depths(const primitive *b, const float *o, const float *d, const float *e, long first, long last, float *depth) {
   float r = b->s[0], h = b->s[1];
+/* A ray parallel to a face has no intersection with it; a tiny slope replaces the division by 0. */
 #define RAY(i, k) float d##k = d[k] + (float)(int)(i) * e[k]; d##k = fabsf(d##k) < 1e-9f ? 1e-9f : d##k;
 #define HIT(i, near, far) depth[i] = (near) <= (far) && (near) > 0 && (near) < depth[i] ? (near) : depth[i];
   if (b->kind == BOX) {
     EACH(i, first, last) {
       RAY(i, 0) RAY(i, 1) RAY(i, 2)
+      /* Slab method: the ray is inside a box between the last entry and the first exit. |1 / d| size is half the time of
+         a slab. */
       float x = 1 / d0, y = 1 / d1, z = 1 / d2, mx = -o[0] * x, my = -o[1] * y, mz = -o[2] * z;
       float wx = fabsf(x) * b->s[0], wy = fabsf(y) * b->s[1], wz = fabsf(z) * b->s[2];
       float near = most(most(mx - wx, my - wy), mz - wz), far = least(least(mx + wx, my + wy), mz + wz);
@@ -307,6 +334,7 @@ static void lower_depths(const primitive *b, const float *o, const float *d, con
       for (long k = 0; k < b->planes; k++) {
         const float *c = b->plane + 4 * k;
         float speed = c[0] * d0 + c[1] * d1 + c[2] * d2, height = c[0] * o[0] + c[1] * o[1] + c[2] * o[2] + c[3];
+        /* Planes that the ray enters bound the hit from below, those that it leaves from above. */
         float crossing = -height / (fabsf(speed) < 1e-9f ? (speed < 0 ? -1e-9f : 1e-9f) : speed);
         near = speed < 0 ? most(near, crossing) : near;
         far = speed < 0 ? far : least(far, crossing);
@@ -318,12 +346,15 @@ static void lower_depths(const primitive *b, const float *o, const float *d, con
   EACH(i, first, last) {
     RAY(i, 0) RAY(i, 1) RAY(i, 2)
     float a = d0 * d0 + d1 * d1, f = o[0] * d0 + o[1] * d1, z = 1 / d2, mid = -o[2] * z, width = fabsf(z) * h;
+    /* Quadratic a t^2 + 2 f t + |o|^2 - r^2 = 0. Its discriminant is a r^2 - (o x d)^2, without cancellation for distant
+       cameras. */
     float cross = o[0] * d1 - o[1] * d0, root = a * r * r - cross * cross; /* Lagrange's identity */
     float s = sqrtf(most(root, 0.0f)), enter = (-f - s) / a, leave = (-f + s) / a;
     if (b->kind == CYLINDER) {
       float near = most(enter, mid - width), far = root < 0 ? -1.0f : least(leave, mid + width);
       HIT(i, near, far)
     } else {
+      /* A capsule: its side where the hit lies between the ends, and the spheres around both ends. */
       float there = fabsf(o[2] + enter * d2) <= h && root >= 0 ? enter : -1.0f;
       HIT(i, there, there)
       float whole = a + d2 * d2;
@@ -350,6 +381,7 @@ void scene_depths(const scene_arrays *a, const view *camera, long width, long he
       double from[3], axis[3][3];
       float o[3], d[3], e[3];
       long range[4];
+      /* Camera and rays in the frame of the body, where its faces are coordinate planes. */
       for (int m = 0; m < 3; m++) from[m] = a->center[3 * (scene * a->bodies + body) + m] - camera->origin[m];
       seen(&b, from, camera->axes, width, height, range);
       for (int k = 0; k < 3; k++) {
@@ -371,9 +403,10 @@ void scene_depths(const scene_arrays *a, const view *camera, long width, long he
 }
 
 /* Points of depth images, evenly distributed over the pixels that see a body; nan if there are none. */
-void depth_clouds(long scenes, const view *camera, long width, long height, const float *depth, const uint64_t *seed,
+long depth_clouds(long scenes, const view *camera, long width, long height, const float *depth, const uint64_t *seed,
                   long count, float *points) {
   int *pixel = malloc((width * height + 1) * sizeof *pixel);
+  if (!pixel) return OUT_OF_MEMORY;
   EACH(scene, 0, scenes) {
     const float *image = depth + scene * width * height;
     float *out = points + 3 * count * scene;
@@ -385,6 +418,7 @@ void depth_clouds(long scenes, const view *camera, long width, long height, cons
     }
     if (!hits) EACH(i, 0, 3 * count) out[i] = NAN;
     for (long i = 0; hits && i < count; i++) {
+      /* Stratified: one point in each of `count` equal sections of the list of pixels that see a body. */
       long place = (i + offset) / count * hits, k = pixel[place < hits ? place : hits - 1];
       double x = (2.0 * (k % width) + 1) / width - 1, y = (2.0 * (k / width) + 1) / height - 1;
       for (int m = 0; m < 3; m++)
@@ -392,4 +426,5 @@ void depth_clouds(long scenes, const view *camera, long width, long height, cons
     }
   }
   free(pixel);
+  return 0;
 }

@@ -37,6 +37,10 @@ def segment_distance(
     """
     import casadi as ca
 
+    # Minimize |r + s a - t b|^2 over s and t:
+    #   s = (ab br - ar bb) / (aa bb - ab^2),   t = (ab s + br) / bb.
+    # For parallel lines the denominator is 0 and every s minimizes; the floor gives a
+    # finite one.
     a, b = subtract(first[1], first[0]), subtract(second[1], second[0])
     r = subtract(first[0], second[0])
     aa, bb, ab = dot(a, a), dot(b, b), dot(a, b)
@@ -45,8 +49,10 @@ def segment_distance(
         (ab * br - ar * bb) / ca.fmax(aa * bb - ab * ab, SMOOTHING_M2 * SMOOTHING_M2)
     )
     t = _clamped((ab * s + br) / ca.fmax(bb, SMOOTHING_M2))
+    # Clamping t may have moved it, so s is computed again for the t that is used.
     s, t = freeze(_clamped((ab * t - ar) / ca.fmax(aa, SMOOTHING_M2))), freeze(t)
     difference = subtract(add(r, scale(a, s)), scale(b, t))
+    # The root of the sum with a small constant has a gradient also at distance 0.
     return ca.sqrt(dot(difference, difference) + SMOOTHING_M2)
 
 
@@ -83,18 +89,23 @@ def segment_box_separation(first: Vec, second: Vec, box: Bounds) -> Scalar:
     """
     import casadi as ca
 
+    # A missing side becomes a plane 100 m away, so that center and half sizes exist.
     bounds = [_finite(low, high) for low, high in box]
     center, half = (
         [(low + high) / 2 for low, high in bounds],
         [(high - low) / 2 for low, high in bounds],
     )
     along = [b - a for a, b in zip(first, second, strict=True)]
+    # Signed separation along the axes: face normals first, then e_i x along. On the
+    # normal n the intervals are |n . offset| and sum(half |n|), both divided by |n|.
     offset = [a - m for a, m in zip(first, center, strict=True)]
     separation: Scalar = -UNBOUNDED_EXTENT_M
     for a, b, (low, high) in zip(first, second, bounds, strict=True):
         separation = ca.fmax(
             separation, ca.fmax(low - ca.fmax(a, b), ca.fmin(a, b) - high)
         )
+    # The projection of the segment on a normal of this kind is one point: n . along =
+    # 0.
     for axis in range(3):
         normal = cross([float(i == axis) for i in range(3)], along)
         square = dot(normal, normal)
@@ -102,10 +113,14 @@ def segment_box_separation(first: Vec, second: Vec, box: Bounds) -> Scalar:
         gap = (ca.fabs(dot(normal, offset)) - reach) / ca.sqrt(
             ca.fmax(square, MIN_SQUARED_NORMAL_M2)
         )
+        # For a segment parallel to an edge the cross product vanishes and gives no
+        # axis.
         separation = ca.fmax(
             separation,
             ca.if_else(square > MIN_SQUARED_NORMAL_M2, gap, -UNBOUNDED_EXTENT_M),
         )
+    # Separating axes are exact only inside; outside, the Euclidean distance takes their
+    # place.
     return segment_box_distance(first, second, box) + ca.fmin(separation, 0)
 
 
@@ -121,6 +136,8 @@ def signed_segment_box_distance(
     import casadi as ca
 
     along = [b - a for a, b in zip(first, second, strict=True)]
+    # Envelope theorem: at the closest point the derivative with respect to t is zero,
+    # or t is at an end of the segment.
     t = freeze(_closest_parameter(first, along, box))
     outside = [_outside(first[axis] + t * along[axis], box[axis]) for axis in range(3)]
     midpoint = _overlap_midpoint(first, along, box)
@@ -131,6 +148,7 @@ def signed_segment_box_distance(
             [] if high is None else [x - high]
         ):
             depth = ca.fmax(gap, depth)
+    # On the surface the depth is 0 and the distance is the smoothing, 1e-6 m.
     return ca.sqrt(sum(x * x for x in outside) + SMOOTHING_M2) + ca.fmin(depth, 0)
 
 
@@ -149,6 +167,7 @@ def _overlap_midpoint(first: Vec, along: Vec, box: Bounds) -> Scalar:
     """
     import casadi as ca
 
+    # Slab method: the segment is inside between the last entry and the first exit.
     enter, leave = ca.SX(0), ca.SX(1)
     for axis, (low, high) in enumerate(box):
         faces = [
@@ -168,10 +187,15 @@ def _closest_parameter(first: Vec, along: Vec, box: Bounds) -> Scalar:
         for face in box[axis]
         if face is not None
     ]
+    # The derivative is monotonic in t: the largest knot where it is negative and the
+    # smallest one where it is positive bracket the minimum. Between them it is linear,
+    # so one secant step gives the root.
     low, high = ca.SX(0), ca.SX(1)
     for knot in knots:
         derivative = _derivative(first, along, box, knot)
         low = ca.fmax(low, ca.if_else(derivative <= 0, knot, 0))
+        # ``1 - if_else(..., 1 - knot, 0)`` is the knot, or 1 where the condition does
+        # not hold.
         high = ca.fmin(high, 1 - ca.if_else(derivative >= 0, 1 - knot, 0))
     at_low, at_high = (
         _derivative(first, along, box, low),
@@ -222,17 +246,20 @@ def upright_box_separation(
     half = [edge / 2 for edge in size]
     gaps = []
     for axis, (low, high) in enumerate(box):
+        # Half extent of the cuboid along a world axis: sum over its edges of half
+        # |cosine|.
         spread = sum(half[i] * ca.fabs(rotation[axis][i]) for i in range(3))
         if low is not None:
             gaps.append(low - center[axis] - spread)
         if high is not None:
             gaps.append(center[axis] - high - spread)
+    # The cuboid's horizontal normals only: if it is upright, its third normal is the
+    # vertical one of the box, which was tested above.
     box_center = [(low + high) / 2 for low, high in box[:2]]
     extent = [(high - low) / 2 for low, high in box[:2]]
     for i in range(2):
-        normal = [
-            rotation[axis][i] for axis in range(2)
-        ]  # the horizontal part, which is all of it if upright
+        # The horizontal part, which is all of it if upright.
+        normal = [rotation[axis][i] for axis in range(2)]
         shift = sum(
             (center[axis] - box_center[axis]) * normal[axis] for axis in range(2)
         )
@@ -255,6 +282,8 @@ def cuboid_separation(center: Vec, axes: list[Vec], half: Vec, other: Vec) -> Sc
 
     units = [[float(i == j) for j in range(3)] for i in range(3)]
     best: Scalar = -UNBOUNDED_EXTENT_M
+    # The 15 axes of two boxes: three face normals each and nine cross products of edges
+    # (Gottschalk, Lin and Manocha 1996).
     for normal in [
         *units,
         *axes,
@@ -268,9 +297,12 @@ def cuboid_separation(center: Vec, axes: list[Vec], half: Vec, other: Vec) -> Sc
         reach = reach + sum(
             edge * ca.fabs(x) for edge, x in zip(other, normal, strict=True)
         )
+        # Cross products are no unit vectors: divide by their length to measure in
+        # meters.
         gap = (ca.fabs(dot(normal, center)) - reach) / ca.sqrt(
             ca.fmax(square, MIN_SQUARED_SINE)
         )
+        # Parallel edges have no common normal; the face normals cover that case.
         best = ca.fmax(
             best, ca.if_else(square > MIN_SQUARED_SINE, gap, -UNBOUNDED_EXTENT_M)
         )

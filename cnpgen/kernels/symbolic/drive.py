@@ -61,6 +61,8 @@ def _upper_friction(drive: Drive, joint: int, v: Scalar, step: Scalar) -> Scalar
     h, w = drive.friction_help, drive.reversal_speed
     if not (b or c):
         return 0.0
+    # b v + c F(v) is certain for the fraction h. F is replaced by 2 S+ - 1, which is
+    # never below the sign of v, also while the drive reverses.
     certain = h * (b * v + c * (2 * step - 1)) if h else 0.0
     return certain + ((1 - h) * (c + b * (v + w)) * step if h < 1 else 0.0)
 
@@ -69,6 +71,7 @@ def _steps(drive: Drive, rate: Any, *, is_constant: bool) -> tuple[Scalar, Scala
     """Return S(v / w + 1) and S(-v / w + 1) of one joint."""
     import casadi as ca
 
+    # In units of the reversal speed; the steps rise over [-1, 0] and fall over [0, 1].
     x = rate * (1 / drive.reversal_speed)
     if not is_constant:
         return _quintic(x + 1), _quintic(1 - x)

@@ -48,6 +48,7 @@ def body_motions(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> list[BodyMotion]:
     """
     omega: Vec = [0.0, 0.0, 0.0]
     alpha: Vec = [0.0, 0.0, 0.0]
+    # A base that accelerates against gravity replaces the weight of every body.
     acceleration: Vec = constants(-chain.gravity)
     motions = []
     for joint, angle, rate, rate2 in zip(chain.joints, q, dq, ddq, strict=True):
@@ -59,8 +60,13 @@ def body_motions(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> list[BodyMotion]:
         acceleration, omega, alpha = (
             transposed_times(rotation, x) for x in (acceleration, omega, alpha)
         )
+        # With z the joint's axis and w the angular velocity of the previous link, a
+        # revolute joint has
+        #   w_i = w + z dq,   alpha_i = alpha + w x z dq + z ddq.
         axis = constants(joint.axis)
         if joint.prismatic:
+            # The axis turns with the link: 2 w x v is the Coriolis acceleration of a
+            # sliding joint.
             coriolis = scale(cross(omega, scale(axis, rate)), 2.0)
             acceleration = add(acceleration, add(coriolis, scale(axis, rate2)))
         else:
@@ -104,6 +110,8 @@ def inverse_dynamics(
         for joint, motion in zip(chain.joints, motions, strict=True)
     ]
     for load in loads:
+        # The nominal payload belongs to the last body already; a load adds its
+        # difference.
         assert payload is not None
         (force, torque), (more_force, more_torque) = (
             wrenches[-1],
@@ -113,6 +121,8 @@ def inverse_dynamics(
             add(force, scale(more_force, load.share)),
             add(torque, scale(more_torque, load.share)),
         )
+    # Inward: the joint carries the wrenches of all bodies beyond it. Its torque is the
+    # component along its axis.
     force, torque = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
     torques: Vec = []
     for joint, motion, wrench in zip(
@@ -120,6 +130,8 @@ def inverse_dynamics(
     ):
         force, torque = add(force, wrench[0]), add(torque, wrench[1])
         torques.append(dot(constants(joint.axis), force if joint.prismatic else torque))
+        # Into the frame of the previous joint; the lever arm is the offset of the
+        # frame.
         force = times(motion.rotation, force)
         torque = add(times(motion.rotation, torque), cross(motion.offset, force))
     return torques[::-1]
@@ -138,6 +150,8 @@ def _body_wrench(
     """Return the force and the torque about the joint origin that move a body of a joint."""
     omega = motion.omega
     force = scale(acceleration_at(motion.acceleration, omega, motion.alpha, com), mass)
+    # Newton and Euler: f = m a_com, n = I alpha + w x I w, and com x f about the
+    # origin.
     spin = add(times(inertia, motion.alpha), cross(omega, times(inertia, omega)))
     return force, add(spin, cross(com, force))
 
@@ -151,6 +165,7 @@ def _load_wrench(
     """
     turn = chain.tip_rotation
     com = add(constants(chain.tip_translation), times(rows_of(turn), load.centre))
+    # The inertia tensor turns with the tip frame: R I R^T.
     inertia = [
         scale(row, load.shape)
         for row in rows_of(turn @ payload.inertia_matrix @ turn.T)

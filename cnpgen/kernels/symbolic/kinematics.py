@@ -60,6 +60,7 @@ def forward_kinematics(chain: Chain, q: Vec) -> Kinematics:
             rotation, product(rows_of(joint.rotation), joint_rotation(joint, angle))
         )
         axis = times(rotation, constants(joint.axis))
+        # A prismatic joint moves the origin of its own frame along the axis.
         if joint.prismatic:
             position = add(position, scale(axis, angle))
         axes.append(axis)
@@ -67,6 +68,7 @@ def forward_kinematics(chain: Chain, q: Vec) -> Kinematics:
         frames.append(rotation)
     tip = add(position, times(rotation, constants(chain.tip_translation)))
     revolute = [not joint.prismatic for joint in chain.joints]
+    # dp/dq_i = z_i x (p - o_i) for revolute joints, z_i for prismatic ones.
     jacobian = [
         cross(z, subtract(tip, o)) if turns else z
         for z, o, turns in zip(axes, origins, revolute, strict=True)
@@ -94,6 +96,8 @@ def bias_acceleration(kin: Kinematics, dq: Vec) -> Vec:
     bias: Vec = [0.0, 0.0, 0.0]
     previous: Vec = [0.0, 0.0, 0.0]
     tip = tip_velocity(kin, dq)
+    # dJ_i/dt = (w_{i-1} x z_i) x (p - o_i) + z_i x (dp/dt - do_i/dt): the axis turns
+    # with the links before it, and both ends of the lever arm move.
     for z, o, column, rate, turns in zip(
         kin.axes, kin.origins, kin.jacobian, dq, kin.revolute, strict=True
     ):
@@ -104,6 +108,8 @@ def bias_acceleration(kin: Kinematics, dq: Vec) -> Vec:
             bias = add(bias, scale(add(moving, turning), rate))
             omega = add(omega, scale(z, rate))
         else:
+            # A prismatic axis turns with the links before it, and then moves the
+            # origins behind it.
             bias = add(bias, scale(cross(omega, column), rate))
             velocity = add(velocity, scale(z, rate))
         previous = o
@@ -128,6 +134,8 @@ def joint_rotation(joint: Joint, angle: Scalar) -> list[Vec]:
         return rows_of(np.eye(3))
     a = joint.axis
     skew = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
+    # Each entry is a combination of 1, cos and sin with constant factors, of which
+    # zeros are left out in ``dot``.
     factors = np.stack(
         [np.outer(a, a), np.eye(3) - np.outer(a, a), skew], axis=2
     ).tolist()

@@ -67,11 +67,14 @@ def factorize(
 
     The safeguard is applied to every pivot, for example to keep it positive.
     """
+    # Column by column without pivoting, which is stable for positive definite matrices:
+    #   d_i = a_ii - sum_j l_ij^2 d_j,   l_ij = (a_ij - sum_k l_ik d_k l_jk) / d_j.
     factor: list[list[Scalar]] = []
     inverse: list[Scalar] = []
     for i, entries in enumerate(lower):
         row: list[Scalar] = []
-        scaled: list[Scalar] = []  # row i of L D
+        # Row i of L D.
+        scaled: list[Scalar] = []
         for j in range(i):
             value = entries[j] - dot(scaled, factor[j]) if j else entries[0]
             scaled.append(value)
@@ -86,6 +89,7 @@ def substitute(factor: Matrix, inverse: Vector, right: Vector) -> list[Scalar]:
     """Solve ``L D L^T x = right`` with the result of ``factorize``."""
     x = list(right)
     m = len(x)
+    # Forward with L, divided by D, then backward with L^T.
     for i in range(m):
         for j in range(i):
             x[i] = x[i] - factor[i][j] * x[j]
@@ -103,6 +107,8 @@ def solve(lower: Matrix, right: Vector) -> list[Scalar]:
 
 def inverse3(columns: Matrix) -> list[list[Scalar]]:
     """Return the rows of the inverse of the 3 x 3 matrix with these columns."""
+    # Rows of the adjugate are cross products of columns; the determinant is c0 . (c1 x
+    # c2).
     rows = [
         cross(columns[1], columns[2]),
         cross(columns[2], columns[0]),

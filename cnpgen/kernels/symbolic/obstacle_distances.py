@@ -9,6 +9,7 @@ point: the deepest in a cylinder, the midpoint of the overlap in a box with a po
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from cnpgen.kernels.symbolic.convex_distances import (
     SMOOTHING_M2,
@@ -177,6 +178,8 @@ class SymbolicHull(SymbolicBox):
         """Return the larger one of the distance from the box and the largest separation along a plane's normal."""
         import casadi as ca
 
+        # On one plane the closer end of the segment has the smaller offset. The
+        # distance is at least the largest of these offsets over the planes.
         a, b = self.within(first), self.within(second)
         best: Scalar = -UNBOUNDED_EXTENT_M
         plane = [0.0] * 4
@@ -184,6 +187,7 @@ class SymbolicHull(SymbolicBox):
             gap = ca.fmin(dot(normal, a), dot(normal, b)) - offset
             better = gap > best
             best = ca.fmax(best, gap)
+            # Keep the plane that attains the maximum: the gradient is its normal.
             plane = [
                 ca.if_else(better, new, old)
                 for new, old in zip((*normal, offset), plane, strict=True)
@@ -201,6 +205,7 @@ class SymbolicHull(SymbolicBox):
         best = super().cuboid_separation(center, rotation, size)
         position, axes = self.within(center), self.axes_within(rotation)
         for *normal, offset in self.planes:
+            # Extent of the cuboid along the plane's normal.
             reach = sum(
                 edge / 2 * ca.fabs(dot(normal, axis))
                 for edge, axis in zip(size, axes, strict=True)
@@ -244,6 +249,48 @@ class SymbolicCapsule(SymbolicSolid):
         )
 
 
+class _LineAroundAxis(NamedTuple):
+    """A segment beside a cylinder: squared distance from the axis and height along it at a parameter t.
+
+    rho(t)^2 = c0 + 2 c1 t + c2 t^2,   z(t) = height + t axial
+    """
+
+    c0: Scalar
+    c1: Scalar
+    c2: Scalar
+    height: Scalar
+    axial: Scalar
+    extent: Scalar  # half the length of the cylinder
+    radius: Scalar
+
+    def gaps(self, t: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+        """Return the distance of a point from the axis, and its distances from the lateral surface and the ends."""
+        import casadi as ca
+
+        squared = self.c0 + t * (2 * self.c1 + t * self.c2)
+        from_axis = ca.sqrt(ca.fmax(squared, 0) + SMOOTHING_M2)
+        side = from_axis - self.radius
+        return from_axis, side, ca.fabs(self.height + t * self.axial) - self.extent
+
+    def derivative(self, t: Scalar) -> Scalar:
+        """Return the derivative of the signed distance with respect to t.
+
+        Outside the distance is ``d = sqrt(side+^2 + end+^2)``, so its derivative weights
+        both gaps by their sizes over d. Inside it is the larger gap alone.
+        """
+        import casadi as ca
+
+        from_axis, side, end = self.gaps(t)
+        outside = ca.fmax(side, end) > 0
+        by_side = ca.if_else(outside, ca.fmax(side, 0), side >= end)
+        by_end = ca.if_else(outside, ca.fmax(end, 0), side < end)
+        weighted = (
+            by_side * (self.c1 + t * self.c2) / from_axis
+            + by_end * ca.sign(self.height + t * self.axial) * self.axial
+        )
+        return weighted / ca.sqrt(by_side * by_side + by_end * by_end + SMOOTHING_M2)
+
+
 @dataclass(frozen=True)
 class SymbolicCylinder(SymbolicSolid):
     """A cylinder.
@@ -267,55 +314,40 @@ class SymbolicCylinder(SymbolicSolid):
         """
         import casadi as ca
 
+        line = self._line(first, second)
+        # Bisection of the sign of the derivative: the number of steps is fixed, since
+        # SX has no loops that depend on values.
+        t, width = ca.SX(0.5), 0.5
+        for _ in range(BISECTION_STEPS):
+            width /= 2
+            t = t + ca.if_else(line.derivative(t) < 0, width, -width)
+        t, error_bound = freeze(t), freeze(width * ca.fabs(line.derivative(t)))
+        _, side, end = line.gaps(t)
+        distance = ca.sqrt(ca.fmax(side, 0) ** 2 + ca.fmax(end, 0) ** 2 + SMOOTHING_M2)
+        return distance + ca.fmin(ca.fmax(side, end), 0) - error_bound
+
+    def _line(self, first: Vec, second: Vec) -> "_LineAroundAxis":
+        """Return a segment in coordinates of the cylinder."""
+        import casadi as ca
+
         extent = ca.sqrt(dot(self.half, self.half))
         axis = scale(self.half, 1 / extent)
         from_center, along = subtract(first, self.center), subtract(second, first)
         height, axial = dot(from_center, axis), dot(along, axis)
-        radial, radial_along = (
-            subtract(from_center, scale(axis, height)),
-            subtract(along, scale(axis, axial)),
-        )
-        c0, c1, c2 = (
+        radial = subtract(from_center, scale(axis, height))
+        radial_along = subtract(along, scale(axis, axial))
+        squares = (
             dot(radial, radial),
             dot(radial, radial_along),
             dot(radial_along, radial_along),
         )
-
-        def gaps(t: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-            """Return the distance of a point from the axis, and its distances from the lateral surface and the ends."""
-            from_axis = ca.sqrt(ca.fmax(c0 + t * (2 * c1 + t * c2), 0) + SMOOTHING_M2)
-            return (
-                from_axis,
-                from_axis - self.radius,
-                ca.fabs(height + t * axial) - extent,
-            )
-
-        def derivative(t: Scalar) -> Scalar:
-            from_axis, side, end = gaps(t)
-            outside = ca.fmax(side, end) > 0
-            by_side = ca.if_else(outside, ca.fmax(side, 0), side >= end)
-            by_end = ca.if_else(outside, ca.fmax(end, 0), side < end)
-            weighted = (
-                by_side * (c1 + t * c2) / from_axis
-                + by_end * ca.sign(height + t * axial) * axial
-            )
-            return weighted / ca.sqrt(
-                by_side * by_side + by_end * by_end + SMOOTHING_M2
-            )
-
-        t, width = ca.SX(0.5), 0.5
-        for _ in range(BISECTION_STEPS):
-            width /= 2
-            t = t + ca.if_else(derivative(t) < 0, width, -width)
-        t, error_bound = freeze(t), freeze(width * ca.fabs(derivative(t)))
-        _, side, end = gaps(t)
-        distance = ca.sqrt(ca.fmax(side, 0) ** 2 + ca.fmax(end, 0) ** 2 + SMOOTHING_M2)
-        return distance + ca.fmin(ca.fmax(side, end), 0) - error_bound
+        return _LineAroundAxis(*squares, height, axial, extent, self.radius)
 
     def cuboid_separation(self, center: Vec, rotation: list[Vec], size: Size) -> Scalar:
         """Return the largest separation along the cylinder's axis, directions from it, and the face normals."""
         import casadi as ca
 
+        # In the frame of the cuboid, where its face normals are the coordinate axes.
         position = transposed_times(rotation, subtract(self.center, center))
         half, edges = transposed_times(rotation, self.half), [edge / 2 for edge in size]
         extent = ca.sqrt(dot(half, half))
@@ -329,6 +361,8 @@ class SymbolicCylinder(SymbolicSolid):
         )
         reach = sum(edge * ca.fabs(x) for edge, x in zip(edges, axis, strict=True))
         best = ca.fmax(best, ca.fabs(dot(position, axis)) - extent - reach)
+        # Half extent of the cylinder along a face normal: half length times the cosine
+        # and radius times the sine of the angle to its axis.
         for x, edge, cosine, along in zip(position, edges, axis, half, strict=True):
             extent_of_disk = self.radius * ca.sqrt(
                 ca.fmax(1 - cosine * cosine, 0) + SMOOTHING_M2

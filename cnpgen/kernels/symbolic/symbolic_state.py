@@ -112,6 +112,8 @@ class SymbolicState:
         axes = self._table_axes
         if axes is None:
             return position
+        # The table turns about its pivot and is lifted before: first undo the lift,
+        # then the turn.
         pivot: Vec = constants(self.robot.table_origin)
         relative = subtract(position, pivot)
         relative[2] = relative[2] - self.parameters.get("table_height", 0.0)
@@ -178,9 +180,12 @@ class SymbolicState:
         if payload is None or not self.robot.parameters.changes_payload:
             return inverse_dynamics(chain, self.q, self.dq, ddq)
         mass, nominal = values.get("payload_mass", payload.mass), list(payload.centre)
+        # The torque is linear in mass, first moment and inertia. If only the mass
+        # changes, one multiple of the nominal payload is the difference.
         if values.keys().isdisjoint(PAYLOAD_PARAMETERS[1:]):
             loads = [Load((mass - payload.mass) / payload.mass, nominal, 1.0)]
-        else:  # the load in place of the nominal one
+        else:
+            # The load in place of the nominal one.
             centre = [
                 values.get(name, value)
                 for name, value in zip(PAYLOAD_CENTRE, nominal, strict=True)
@@ -214,10 +219,13 @@ class SymbolicState:
         without_gravity = acceleration_at(
             last.acceleration, last.omega, last.alpha, chain.tip_translation.tolist()
         )
+        # The tip's rotation is R_joint R_tip: R_tip^T turns it back to the last joint's
+        # frame, in which the recursion ends.
         rotation = [
             [dot(row, column) for column in chain.tip_rotation.tolist()]
             for row in self.kinematics.rotation
         ]
+        # The recursion contains -g of the base; adding g leaves the motion alone.
         return [
             dot(row, without_gravity) + g
             for row, g in zip(rotation, chain.gravity.tolist(), strict=True)
@@ -241,6 +249,7 @@ class SymbolicState:
         for z, rate, rate2, turns in zip(
             kin.axes, self.dq, self.ddq, kin.revolute, strict=True
         ):
+            # d(w)/dt = sum of z ddq + w x z dq, joint by joint from the base.
             if turns:
                 alpha = add(alpha, add(scale(z, rate2), scale(cross(omega, z), rate)))
                 omega = add(omega, scale(z, rate))
@@ -271,6 +280,8 @@ class SymbolicState:
         if shape is None:
             return {}
         placed = {}
+        # Capsules are given in the frames of their joints; those of the base do not
+        # move.
         for capsule in shape.capsules:
             first, second, joint = (
                 constants(capsule.first),

@@ -24,9 +24,8 @@ from cnpgen.store.scene_table import OBSTACLE_KINDS, SceneTable
 
 Array = NDArray[np.float64]
 
-_PRISM_FACTOR = 1 / np.cos(
-    np.pi / PRISM_SIDES
-)  # of the radius of a cylinder that contains the prism of judges
+# Of the radius of a cylinder that contains the prism of judges.
+_PRISM_FACTOR = 1 / np.cos(np.pi / PRISM_SIDES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +62,8 @@ class BatchScenes:
             kind == OBSTACLE_KINDS.index(name) for name in ("box", "cylinder")
         )
         half = size / 2
+        # ``OBSTACLE_KINDS`` stores edges of boxes, radii and lengths of the others. In
+        # ``convex.c`` a sphere or capsule is a segment along z with a radius.
         half[~box] = 0.0
         half[..., 2] += np.where(box, 0.0, size[..., 1] / 2)
         half[..., :2] += np.where(cylinder, size[..., 0] * _PRISM_FACTOR, 0.0)[
@@ -87,11 +88,13 @@ def batch_scenes(
         [layout.obstacles for layout in layouts], families, capacity
     ).astype(dtype)
     count = np.array([len(layout.grasps) for layout in layouts], np.int64)
+    # Scenes have different numbers of grasps; further entries are padding.
     real = np.arange(max(count.max(initial=0), 1)) < count[:, None]
     flat = [grasp for layout in layouts for grasp in layout.grasps]
     position, approach, tilt = (
         np.zeros((*real.shape, *tail)) for tail in ((3,), (3,), ())
     )
+    # A unit vector as padding, so that nothing divides by zero.
     approach[..., 2] = 1.0
     if flat:
         position[real] = [grasp.position for grasp in flat]

@@ -141,6 +141,7 @@ class TableVelocity(Stage):
         kernel, n = context.kernels.load(table_velocity), context.robot.n
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            # Numbers are drawn for all candidates, whatever earlier stages rejected.
             direction, length, choice = (
                 2 * candidates.draw(random, n) - 1,
                 candidates.draw(random, 1),
@@ -241,6 +242,7 @@ def onto_table(robot: Robot, *, height: float) -> Any:
         symbols(name, robot.n) for name in ("q", "dq", "ddq")
     )
     limit = [float(x) for x in robot.velocity_limit]
+    # Newton with the vertical row of the Jacobian: the constraint is z(q) = height.
     for _ in range(PROJECTION_STEPS):
         kin = forward_kinematics(robot.chain, q)
         q = _project(
@@ -248,13 +250,17 @@ def onto_table(robot: Robot, *, height: float) -> Any:
         )
     kin = forward_kinematics(robot.chain, q)
     row = [c[2] for c in kin.jacobian]
+    # Only the component along J_z leaves the manifold: J_z dq = 0.
     dq = _project(dq, row, limit)
     over = ca.mmax(
         ca.vertcat(*[ca.fabs(x) / bound for x, bound in zip(dq, limit, strict=True)])
     )
+    # A plan may exceed a limit by its tolerance; larger excess is a fault and stays
+    # visible.
     dq = scale(
         dq, 1.0 / ca.if_else(over <= MAX_VELOCITY_RATIO, ca.fmax(over, 1.0), 1.0)
     )
+    # J_z ddq = -dJ_z dq: the bias acceleration is the prescribed part.
     ddq = _project(
         ddq,
         row,
@@ -289,6 +295,7 @@ def table_velocity(robot: Robot) -> Any:
         [c[2] for c in kin.jacobian],
         limit,
     )
+    # Ray from 0 to the box |dq_i| <= limit_i: divide by the largest ratio.
     ratios = (ca.fabs(x) / bound for x, bound in zip(on_manifold, limit, strict=True))
     dq = scale(on_manifold, s[0] / reduce(ca.fmax, ratios, ca.SX(0)))
     return ca.Function(
@@ -316,6 +323,8 @@ def table_acceleration(robot: Robot) -> Any:
     kin = forward_kinematics(robot.chain, q)
     limit = [float(x) for x in robot.acceleration_limit]
     row = [column[2] for column in kin.jacobian]
+    # Of all ddq with J_z ddq = c, the one with the smallest max_i |ddq_i| / limit_i has
+    # all ratios equal: ddq_i = c / (sum_k limit_k |J_k|) * limit_i sign(J_i).
     size = sum((bound * ca.fabs(x) for bound, x in zip(limit, row, strict=True)), 0.0)
     share = -bias_acceleration(kin, dq)[2] / size
     particular = [
@@ -324,6 +333,7 @@ def table_acceleration(robot: Robot) -> Any:
     direction = _project(
         [x * bound for x, bound in zip(u, limit, strict=True)], row, limit
     )
+    # Torque is affine in ddq, so two evaluations give its value and its change with t.
     torque = inverse_dynamics(robot.chain, q, dq, particular)
     shifted = inverse_dynamics(robot.chain, q, dq, add(particular, direction))
     change = [b - a for a, b in zip(torque, shifted, strict=True)]
@@ -334,6 +344,8 @@ def table_acceleration(robot: Robot) -> Any:
     low, high = _interval([*particular, *torques], [*direction, *changes], bounds)
     t = low + s[0] * (high - low)
     ddq = add(particular, scale(direction, t))
+    # t = 0, the particular solution, must be admissible; otherwise no solution is
+    # sought.
     admissible = ca.logic_and(low <= 0, high >= 0)
     interval_length = ca.if_else(admissible, high - low, -1.0)
     return ca.Function(
@@ -373,10 +385,12 @@ def _limited_torques(
 def _project(
     x: Vec, row: Vec, weight: list[float], *, rest: Scalar = 0.0, at: Vec | None = None
 ) -> Vec:
-    """Project x onto ``{row .
+    """Project x onto the plane ``row . (x - at) + rest = 0`` in the metric ``diag(weight)^-2``.
 
-    (x - at) + rest = 0}`` in the metric ``diag(weight)^-2``; ``at`` is zero by default.
+    ``at`` is zero by default.
     """
+    # x - W J (J x + rest) / (J W J) with W = diag(weight)^2: joints with large limits
+    # move more.
     spread = [bound * bound * r for bound, r in zip(weight, row, strict=True)]
     miss = (dot(row, x if at is None else subtract(x, at)) + rest) / dot(row, spread)
     return [value - s * miss for value, s in zip(x, spread, strict=True)]
@@ -390,6 +404,8 @@ def _interval(
 
     low, high = ca.SX(-1e9), ca.SX(1e9)
     for value, rate, bound in zip(at_zero, gradient, bounds, strict=True):
+        # 1 / 0 is infinite: a component that does not change bounds t only if it is
+        # violated, and then the interval is empty.
         inverse = 1.0 / rate
         one, two = (bound - value) * inverse, (-bound - value) * inverse
         low, high = ca.fmax(low, ca.fmin(one, two)), ca.fmin(high, ca.fmax(one, two))

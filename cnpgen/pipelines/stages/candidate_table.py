@@ -28,6 +28,7 @@ def table_corners(context: Context, candidates: CandidateBatch) -> tuple[Array, 
         zip(context.problem.parameters.names, candidates["parameters"], strict=True)
     )
     low, high = context.constraint(Table).bounds_of(columns)
+    # Corners that do not vary are repeated for every candidate.
     zero = 0 * next(iter(columns.values()))
     return np.array([value + zero for value in low]), np.array(
         [value + zero for value in high]

@@ -117,6 +117,8 @@ class Collision(Stage):
                 remaining = np.ones(q.shape[1], bool)
                 if not with_object:
                     (clearance,) = kernel(q, obstacle_poses)
+                    # Capsules with clearance contain parts with clearance, so only the
+                    # others need Coal.
                     remaining = ~(clearance[0] > distance)
                 hit = np.zeros(q.shape[1], bool)
                 if remaining.any():
@@ -133,6 +135,7 @@ class Collision(Stage):
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             obstacle_poses = candidate_poses(context.problem, candidates)
+            # Both ends of all candidates in one call of Coal.
             hit = judge(
                 np.concatenate(
                     [candidates[f"{end}_q"] for end in self._ends()], axis=1
@@ -163,7 +166,8 @@ def candidate_poses(problem: Problem, candidates: CandidateBatch) -> Array:
     goal, angle = candidates["goal_xyz"].T, candidates.columns.get("hit_angle")
     direction = np.zeros(goal.shape)
     if angle is not None:
-        with np.errstate(invalid="ignore"):  # columns that are not finite are rejected
+        # Columns that are not finite are rejected.
+        with np.errstate(invalid="ignore"):
             direction[:, :2] = np.concatenate([np.cos(angle), np.sin(angle)]).T
     poses = (
         None if candidates.scenes is None else candidates.scenes.poses[candidates.scene]
@@ -251,6 +255,28 @@ def coal_judge(problem: Problem, robot: Robot, radius: float, depth: float) -> A
             "object", frame.parentJoint, 0, frame.placement, coal.Box(*size)
         )
         moving.append(geometry.addGeometryObject(box))
+    heights = _add_obstacles(model, geometry, problem, moving)
+    pool = pin.GeometryPool(model, geometry, 1)
+
+    def judge(q: Array, obstacle_poses: Array) -> NDArray[np.bool_]:
+        states = np.asfortranarray(np.concatenate([q, obstacle_poses[heights]]))
+        return np.asarray(
+            pin.computeCollisionsInParallel(1, pool, states, True)
+        ).astype(bool)
+
+    return judge
+
+
+def _add_obstacles(
+    model: Any, geometry: Any, problem: Problem, moving: list[int]
+) -> list[int]:
+    """Add the obstacles, each on a vertical slide, and their pairs with the moving bodies.
+
+    Return the columns of the scene that are positions of the slides.
+    """
+    import pinocchio as pin
+
+    # Heights are the positions of sliding joints, so one model serves all candidates.
     poses, heights = place_obstacles(problem.obstacle), height_places(problem.obstacle)
     poses[heights] = 0.0
     solids = solids_of(problem.obstacle, poses)
@@ -270,15 +296,7 @@ def coal_judge(problem: Problem, robot: Robot, radius: float, depth: float) -> A
         )
         for body in moving:
             geometry.addCollisionPair(pin.CollisionPair(body, added))
-    pool = pin.GeometryPool(model, geometry, 1)
-
-    def judge(q: Array, obstacle_poses: Array) -> NDArray[np.bool_]:
-        states = np.asfortranarray(np.concatenate([q, obstacle_poses[heights]]))
-        return np.asarray(
-            pin.computeCollisionsInParallel(1, pool, states, True)
-        ).astype(bool)
-
-    return judge
+    return heights
 
 
 def _coal_shape(solid: Solid) -> Any:
@@ -318,6 +336,7 @@ def _add_capsules(geometry: Any, robot: Robot, radius: float) -> list[int]:
     model = robot.model
     data = model.createData()
     pin.framesForwardKinematics(model, data, pin.neutral(model))
+    # At the neutral state: lengths of the links do not depend on it.
     origins = [data.oMi[i].translation.copy() for i in range(1, model.njoints)]
     origins.append(data.oMf[robot.tip_frame].translation.copy())
     added = []

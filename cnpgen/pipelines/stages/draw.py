@@ -125,6 +125,8 @@ def check_reach(
     errors = []
     shoulder = context.robot.chain.joints[0].translation
     for name, box in boxes:
+        # The closest point of the box to the shoulder is out of reach: so is the whole
+        # box.
         nearest = np.clip(
             shoulder, [axis.low for axis in box], [axis.high for axis in box]
         )

@@ -73,6 +73,8 @@ class DrawScenes(Stage):
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             count = max(round(candidates.size / self.per_scene), 1)
+            # Each scene has its own seed: a family that draws more numbers changes no
+            # other scene.
             seeds, families = (
                 random.integers(0, 2**63, count),
                 random.choice(len(shares), count, p=shares),
@@ -85,6 +87,8 @@ class DrawScenes(Stage):
                     )
                 ]
             fits = np.array([self._fits(layout) for layout in layouts], bool)
+            # A scene with too many obstacles is replaced by an empty one and its
+            # candidates rejected.
             kept = [
                 layout if fit else Layout((), ())
                 for layout, fit in zip(layouts, fits, strict=True)
@@ -92,6 +96,8 @@ class DrawScenes(Stage):
             candidates.scenes = batch_scenes(
                 kept, families.tolist(), obstacles, capacity, context.dtype
             )
+            # Consecutive candidates share a scene; indices ascend, as ``are_clear``
+            # requires.
             candidates["scene"] = (candidates.alive * count // candidates.size)[
                 None
             ].astype(float)
@@ -112,6 +118,7 @@ class DrawScenes(Stage):
 
     def _shares(self) -> NDArray[np.float64]:
         shares = np.array([family.share for family in self.family])
+        # A sum of 0 is refused in ``_check``; here it only must not divide by zero.
         return np.asarray(shares / max(shares.sum(), 1e-300))
 
     def _fits(self, layout: Layout) -> bool:
@@ -161,6 +168,8 @@ def _paused_garbage_collection() -> Iterator[None]:
 
 def base_depths(table: SceneTable) -> NDArray[np.float64]:
     """Return the depth of the robot's base, the origin, in the obstacles of each scene [m], negative outside."""
+    # R^T (0 - p): the origin in the frame of each obstacle; by symmetry its absolute
+    # value.
     local = np.abs(
         np.einsum(
             "soji,soj->soi", rotations_of(table), -table.obstacle_position.astype(float)
@@ -169,6 +178,8 @@ def base_depths(table: SceneTable) -> NDArray[np.float64]:
     size, kind = table.obstacle_size.astype(float), table.obstacle_kind
     across, up = np.hypot(local[..., 0], local[..., 1]), local[..., 2]
     radius, half = size[..., 0], size[..., 1] / 2
+    # Depth of a point: box, sphere, cylinder, capsule, in the order of
+    # ``OBSTACLE_KINDS``.
     depths = [
         (size / 2 - local).min(axis=-1),
         radius - np.linalg.norm(local, axis=-1),

@@ -98,6 +98,7 @@ class HitAngleInCone(_HitAngle):
     def prepare(self, context: Context) -> StageFunction:
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            # The cone is about the line from the origin to the goal, in the x-y plane.
             x, y = (candidates["goal_xyz"] - candidates[f"{self.origin}_xyz"])[:2]
             noise = self.half_angle * (2 * candidates.draw(random, 1) - 1)
             candidates["hit_angle"] = wrap(np.arctan2(y, x) + noise)

@@ -102,6 +102,8 @@ class _Search:
     def __init__(self, context: Context) -> None:
         load = context.kernels.load
         self._robot = context.robot
+        # From the initial guess to the position first: Newton needs a start near the
+        # constraint.
         self._first = load(
             ik_step, Loop(IK_TOLERANCE, MAX_IK_STEPS), vertical=False, max_step=0.4
         )
@@ -124,9 +126,8 @@ class _Search:
         """
         where = position, direction, home
         one = self._climb(home, *where)
-        mirrored = np.where(
-            self._free, 2 * home - one[0], one[0]
-        )  # a second optimum has its elbow on the other side
+        # A second optimum has its elbow on the other side.
+        mirrored = np.where(self._free, 2 * home - one[0], one[0])
         q, value, outside_q, outside_value, solved = self._better(
             *one, *self._climb(mirrored, *where)
         )
@@ -155,6 +156,8 @@ class _Search:
         *where: Array,
     ) -> None:
         """Solve again on the limits, in place, if an optimum outside the limits is better than those within."""
+        # An optimum outside the limits is worth another search only if it is better
+        # than the best one within.
         improvable = outside_value > value
         if not np.count_nonzero(improvable):
             return
@@ -195,6 +198,7 @@ def better_optimum(robot: Robot) -> Any:
     columns, (q1, step1, value1, q2, step2, value2) = zip(
         *(symbols(*item) for item in widths.items()), strict=True
     )
+    # The iteration has converged if its last step was below the tolerance.
     solved = step1[0] < NEWTON_TOLERANCE_RAD, step2[0] < NEWTON_TOLERANCE_RAD
     inside = (
         ca.logic_and(solved[0], _within(robot, q1)),
@@ -243,21 +247,23 @@ def within_limits(
     (N,).
     """
     low, high = robot.position_lower[:, None], robot.position_upper[:, None]
-    side = np.where(
-        q > high, 1.0, np.where(q < low, -1.0, 0.0)
-    )  # sign of the limit on which a joint is held, else 0
+    # Sign of the limit on which a joint is held, else 0.
+    side = np.where(q > high, 1.0, np.where(q < low, -1.0, 0.0))
     q, left = np.clip(q, low, high), np.arange(q.shape[1])
     for _ in range(2 * robot.n):
         held = np.take(side, left, axis=1)
         state = np.concatenate([np.take(q, left, axis=1), np.zeros_like(held)])
         arguments = [np.take(values, left, axis=1) for values in parameters]
         state, step = kernel(state, *arguments, np.abs(held))
+        # ``pull`` is the gradient of the Lagrangian: towards the inside it is an
+        # improvement.
         moved, pull = np.split(state, 2)
         q[:, left] = np.clip(moved, low, high)
         change = _change(
             held, np.where(moved > high, 1.0, np.where(moved < low, -1.0, 0.0)), pull
         )
         side[:, left] = held + change
+        # A candidate is finished when no side changes and the last step has converged.
         left = left[(change != 0).any(0) | ~(step[0] < NEWTON_TOLERANCE_RAD)]
         if len(left) == 0:
             break
@@ -268,6 +274,7 @@ def within_limits(
 
 def _change(held: Array, outside: Array, pull: Array) -> Array:
     """Return the change of the held sides: the side of a new hold, minus the side of a released hold, otherwise 0."""
+    # The side is the outward sign, so that an inward gradient is positive here.
     inwards = -held * pull
     released = (inwards == inwards.max(axis=0)) & (inwards > 0) & ~outside.any(axis=0)
     return np.where(released, -held, np.where(held == 0, outside, 0.0))

@@ -59,6 +59,7 @@ def objective(robot: Robot) -> Any:
         symbols("q0", robot.n),
     )
     jacobian = forward_kinematics(robot.chain, q).jacobian
+    # J^T d, the tip's velocity along d per joint velocity.
     gain = [along(d, column) for column in jacobian]
     away = [
         (b - a) / float(rated)
@@ -136,12 +137,13 @@ def expand(robot: Robot, q: Vec, d: Vec, home: Vec) -> Expansion:
     weight = [1.0 / float(value) ** 2 for value in robot.rated_velocity]
     gain = [along(d, column) for column in kin.jacobian]
     pairs = range(robot.n)
+    # z_min x J_max
     upper = {
         (j, k): cross(kin.axes[j], kin.jacobian[k])
         for j in pairs
         for k in pairs
         if j <= k
-    }  # z_min x J_max
+    }
     second = [[upper[min(j, k), max(j, k)] for k in pairs] for j in pairs]
     gain_gradient = [[along(d, entry) for entry in row] for row in second]
     gradient = [
@@ -158,6 +160,7 @@ def _rates(kin: Kinematics, rate: Vec) -> tuple[list[Vec], list[Vec]]:
     previous: Vec = [0.0, 0.0, 0.0]
     # Forward recursion: joint j moves its origin with the angular velocity of the joints
     # before it, and dz/dt = omega x z, dJ/dt = dz/dt x (tip - o) + z x (d tip - d o).
+    # Velocities of the tip and of the joint origins if the joints move at the rates.
     tip_rate = [dot([column[row] for column in kin.jacobian], rate) for row in range(3)]
     axis_rates, column_rates = [], []
     for axis, origin, speed in zip(kin.axes, kin.origins, rate, strict=True):
@@ -194,6 +197,7 @@ def shortened(q: Vec, step: Vec) -> tuple[Any, Scalar]:
     """Return ``q + step`` with the step shortened to ``MAX_NEWTON_STEP_RAD``, and the full length of the step."""
     import casadi as ca
 
+    # A long step leaves the region in which the quadratic model holds.
     length = ca.sqrt(dot(step, step))
     factor = ca.fmin(1.0, MAX_NEWTON_STEP_RAD / ca.fmax(length, 1e-12))
     return ca.vertcat(*add(q, scale(step, factor))), length
@@ -203,6 +207,7 @@ def safeguard(pivot: Scalar) -> Scalar:
     """Return a positive pivot of the negative Hessian, at least ``MIN_PIVOT``."""
     import casadi as ca
 
+    # |pivot| instead of pivot: where f is convex, the step goes uphill all the same.
     return ca.fmax(ca.fabs(pivot), MIN_PIVOT)
 
 
@@ -211,18 +216,22 @@ def _reduced_step(here: Expansion, miss: Vec, basic: tuple[int, int, int]) -> Ve
     import casadi as ca
 
     n, jacobian = here.n, here.kin.jacobian
+    # Basic joints B solve the constraint: J_B s_B = miss - J_F s_F.
     inverse = inverse3([jacobian[j] for j in basic])
+    # Multiplier of the constraint from the basic joints: J_B^T lambda = g_B.
     multiplier = [
         dot([inverse[b][row] for b in range(3)], [here.gradient[j] for j in basic])
         for row in range(3)
     ]
     null = _null_space(jacobian, inverse, basic)
+    # Normal step: the basic joints alone remove the miss.
     normal: Vec = [0.0] * n
     for b, joint in enumerate(basic):
         normal[joint] = dot(inverse[b], miss)
     hessian = here.hessian(multiplier)
     curved = [[dot(row, column) for row in hessian] for column in null]  # H Z
     lower = [[-dot(null[i], curved[j]) for j in range(i + 1)] for i in range(len(null))]
+    # Reduced system Z^T (-H) Z y = Z^T (g + H normal), of size n - 3.
     right = [
         dot(column, here.gradient) + dot(projected, normal)
         for column, projected in zip(null, curved, strict=True)
@@ -242,6 +251,7 @@ def _null_space(
     for j in range(len(jacobian)):
         if j not in basic:
             column: Vec = [0.0] * len(jacobian)
+            # J z = 0: joint j moves by 1, and J_B z_B = -J_j.
             column[j] = 1.0
             for b, joint in enumerate(basic):
                 column[joint] = -dot(inverse[b], jacobian[j])
@@ -276,11 +286,13 @@ def held_step(robot: Robot) -> Any:
 def _held_step(here: Expansion, miss: Vec, free: Vec) -> tuple[Vec, Vec]:
     """Return the Newton step in the joints with ``free`` 1, 0 in the others, and the gradient of the Lagrangian."""
     n, jacobian = here.n, here.kin.jacobian
+    # Columns of held joints are zero: the others must meet the constraint.
     rows = [
         [column[row] * x for column, x in zip(jacobian, free, strict=True)]
         for row in range(3)
     ]
     gradient = [g * x for g, x in zip(here.gradient, free, strict=True)]
+    # Least squares: lambda minimizes |J_F^T lambda - g_F|.
     multiplier = solve(gram(rows), [dot(row, gradient) for row in rows])
     pull = [
         g - dot(column, multiplier)
@@ -293,11 +305,14 @@ def _held_step(here: Expansion, miss: Vec, free: Vec) -> tuple[Vec, Vec]:
             CONSTRAINT_WEIGHT * dot([row[i] for row in rows], [row[j] for row in rows])
             - free[i] * free[j] * hessian[i][j]
         )
+        # A held joint gets the equation s_i = 0.
         return value + (1.0 - free[i]) if i == j else value
 
     factors = factorize(
         [[stiff(i, j) for j in range(i + 1)] for i in range(n)], safeguard
     )
+    # K = w J_F^T J_F - H_F and the right side g + w J_F^T miss; then correct the
+    # constraint by (J_F K^-1 J_F^T) force = J_F step - miss.
     towards = [dot([row[j] for row in rows], miss) for j in range(n)]
     step = substitute(*factors, add(gradient, scale(towards, CONSTRAINT_WEIGHT)))
     spread = [substitute(*factors, row) for row in rows]
@@ -333,6 +348,8 @@ def basic_joints(robot: Robot) -> tuple[int, int, int]:
             for _ in range(64)
         ]
     )
+    # Volume spanned by all columns: the shares of three columns are at most 1
+    # (Cauchy-Binet).
     volume = np.sqrt(np.linalg.det(jacobians @ jacobians.transpose(0, 2, 1)))
 
     def share(joints: tuple[int, ...]) -> float:

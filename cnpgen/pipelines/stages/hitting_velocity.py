@@ -148,7 +148,9 @@ class HittingVelocity(Stage):
             ]
             velocity, speed, found = kernel(candidates["goal_q"], *directions)
             limit = velocity_factor(context, candidates)
-            if limit is not None:  # the solution is proportional to the limits
+            if limit is not None:
+                # The solution is proportional to the limits.
+                # The optimum of the linear program scales with its bounds.
                 velocity, speed = velocity * limit, speed * limit
             factor = share(candidates, random, speed)
             (
@@ -182,6 +184,7 @@ def hitting_velocity(robot: Robot, *, min_speed: float) -> Any:
     )
     jacobian = forward_kinematics(robot.chain, q).jacobian
     forward = [along(d, column) for column in jacobian]
+    # Unit vectors across the hit: in the table's plane, and its normal.
     if robot.parameters.tilts_table:
         side = cross(normal, d)
         across = [[dot(side, column), dot(normal, column)] for column in jacobian]
@@ -192,6 +195,7 @@ def hitting_velocity(robot: Robot, *, min_speed: float) -> Any:
     velocity, speed = maximise(
         forward, across, [float(x) for x in robot.velocity_limit]
     )
+    # A singular Jacobian gives nan, for which every comparison is false.
     found = ca.logic_and(min_speed <= speed, speed < np.inf)
     for rate in velocity:
         found = ca.logic_and(found, ca.fabs(rate) < np.inf)
@@ -213,6 +217,7 @@ def maximise(a: Vec, b: list[Vec], limit: list[float]) -> tuple[Vec, Scalar]:
     n = len(a)
     best: Scalar = ca.SX(np.inf)
     y: Vec = [ca.SX(0), ca.SX(0)]
+    # Vertices of the dual: y solves a_k = b_k . y for two joints (Cramer's rule).
     for i, j in combinations(range(n), 2):
         det = b[i][0] * b[j][1] - b[i][1] * b[j][0]
         size = ca.fabs(b[i][0] * b[j][1]) + ca.fabs(b[i][1] * b[j][0])
@@ -226,17 +231,21 @@ def maximise(a: Vec, b: list[Vec], limit: list[float]) -> tuple[Vec, Scalar]:
         value = sum(
             (limit[k] * ca.fabs(a[k] - dot(b[k], candidate)) for k in others), 0.0
         )
+        # The first of equal vertices stays.
         better = ca.logic_and(usable, value < best)
         best = ca.if_else(better, value, best)
         y = [
             ca.if_else(better, new, old) for new, old in zip(candidate, y, strict=True)
         ]
+    # Complementary slackness: a joint with residual r_k != 0 is at the limit of its
+    # sign.
     residual = [a[k] - dot(b[k], y) for k in range(n)]
     left = [ca.fabs(r) < ZERO_RESIDUAL_M for r in residual]
     fixed = [
         ca.if_else(free, 0.0, bound * ca.sign(r))
         for free, bound, r in zip(left, limit, residual, strict=True)
     ]
+    # The joints with residual 0 must satisfy the equations that the others leave.
     missing = [-dot([b[k][c] for k in range(n)], fixed) for c in range(2)]
     rest = _smallest_ratio(
         [[x * free for x in b_k] for b_k, free in zip(b, left, strict=True)],
@@ -257,6 +266,8 @@ def _smallest_ratio(b: list[Vec], limit: list[float], target: Vec) -> Vec:
     ratio: Scalar = ca.SX(-1)
     z: Vec = [ca.SX(0), ca.SX(0)]
     pivot: Vec = [ca.SX(0), ca.SX(0)]
+    # Dual: maximize target . z / sum_k limit_k |b_k . z|; at the optimum z is
+    # orthogonal to some b_j.
     for j in range(n):
         normal = [-b[j][1], b[j][0]]
         weight = sum(
@@ -275,8 +286,26 @@ def _smallest_ratio(b: list[Vec], limit: list[float], target: Vec) -> Vec:
         pivot = [
             ca.if_else(better, new, old) for new, old in zip(b[j], pivot, strict=True)
         ]
+    # Without a target or without free joints nothing moves.
     ratio = ca.fmax(ratio, 0.0)
+    return _velocities_of_ratio(b, limit, target, ratio=ratio, z=z, pivot=pivot)
+
+
+def _velocities_of_ratio(
+    b: list[Vec],
+    limit: list[float],
+    target: Vec,
+    *,
+    ratio: Scalar,
+    z: Vec,
+    pivot: Vec,
+) -> Vec:
+    """Return the velocities ``v_i = t L_i sign(b_i . z)`` with the smallest t, and the remainder along the pivot."""
+    import casadi as ca
+
     length = ca.sqrt(dot(pivot, pivot))
+    # Joints whose b is parallel to the pivot have b . z = 0: the dual leaves their
+    # velocity open, and they share what the others leave.
     parallel = [
         ca.fabs(dot(x, z)) <= PARALLEL_TOLERANCE * length * ca.sqrt(dot(x, x))
         for x in b
@@ -286,6 +315,8 @@ def _smallest_ratio(b: list[Vec], limit: list[float], target: Vec) -> Vec:
         ca.if_else(same, 0.0, ratio * bound * ca.sign(dot(x, z)))
         for same, bound, x in joints
     ]
+    # The remainder is along the pivot; each parallel joint contributes in proportion to
+    # its limit, so all have the same ratio.
     left = [target[c] - dot([x[c] for x in b], v) for c in range(2)]
     shares = [ca.if_else(same, bound * dot(x, pivot), 0.0) for same, bound, x in joints]
     total = sum(map(ca.fabs, shares), 0.0)

@@ -120,6 +120,8 @@ class GuessedIK(Stage):
                 if self.orientation == "vertical"
                 else []
             )
+            # The error is that of the state before the last step; the step makes it
+            # smaller still.
             q, error = kernel(candidates[initial], candidates[f"{end}_xyz"], *more)
             candidates[f"{end}_q"] = q
             candidates.reject(
@@ -150,6 +152,7 @@ class GuessedIK(Stage):
                     f"guess: needs {n} ranges, one per planned joint, got {len(self.guess)}"
                 ]
             )
+        # A stored problem was checked when it was made.
         for index, each in enumerate(() if context.problem.is_stored else self.guess):
             ends = np.full((2, n), robot.home)
             ends[:, index] = each.low, each.high
@@ -160,6 +163,8 @@ class GuessedIK(Stage):
         guess = self.guess or tuple(Range(float(x), float(x)) for x in robot.home)
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            # Numbers for all joints and the choice are drawn whether they are used or
+            # not.
             candidates["guess_q"] = uniform(candidates.draw(random, n), guess)
             if self.at_limit:
                 choice, joint, side = candidates.draw(random, 3)
@@ -262,6 +267,7 @@ class GoalIK(GuessedIK):
             candidates["guess_q"] = np.where(
                 there, candidates["start_q"], candidates["guess_q"]
             )
+            # A search from the start configuration holds no joint.
             if self.at_limit:
                 candidates["held"] = np.where(there, 0.0, candidates["held"])
             solve(candidates, random)
@@ -294,6 +300,7 @@ def ik_step(
     (q_sx, q), (p_sx, p) = symbols("q", robot.n), symbols("p", 3)
     held_sx, held = symbols("held", robot.n)
     kin = forward_kinematics(robot.chain, q)
+    # Rows of the task: three of position, two of tilt.
     rows = [[column[row] for column in kin.jacobian] for row in range(3)]
     error = subtract(p, kin.tip)
     turned = vertical and robot.parameters.turns_upright
@@ -304,11 +311,30 @@ def ik_step(
         )
         error, rows = [*error, *tilt], [*rows, *tilt_rows]
     if hold:
+        # Columns of held joints are zero, so they do not move.
         rows = [
             [x * (1 - stays) for x, stays in zip(row, held, strict=True)]
             for row in rows
         ]
     square = dot(error, error)
+    following = _saturated(robot, q, rows, error, square=square, max_step=max_step)
+    given = [q_sx, p_sx, *([held_sx] if hold else []), *([axes_sx] if turned else [])]
+    return ca.Function("ik", given, [ca.vertcat(*following), ca.sqrt(square)])
+
+
+def _saturated(
+    robot: Robot,
+    q: Vec,
+    rows: list[Vec],
+    error: Vec,
+    *,
+    square: Scalar,
+    max_step: float,
+) -> Vec:
+    """Return the joint positions after a step that corrects the error, of given square, within the joint limits."""
+    import casadi as ca
+
+    # Least-norm step: s = J^T (J J^T + damping I)^-1 e, shortened as a whole.
     step, factor = clipped_step(rows, error, max_step, IK_DAMPING)
     target = add(q, step)
     free = [
@@ -317,21 +343,17 @@ def ik_step(
             target, robot.position_lower, robot.position_upper, strict=True
         )
     ]
+    # Saturated joints go to their limits; the others make up for what is missing, once.
     moved = [
         ca.if_else(ok, 0.0, x - at)
         for ok, x, at in zip(free, clip_to_limits(target, robot), q, strict=True)
     ]
+    # The remaining error, shortened as the first step was.
     rest = [factor * e - dot(row, moved) for e, row in zip(error, rows, strict=True)]
     left = [[x * ok for x, ok in zip(row, free, strict=True)] for row in rows]
-    again, _ = clipped_step(
-        left,
-        rest,
-        max_step,
-        IK_DAMPING + ca.fmin(MAX_LIMIT_DAMPING, LIMIT_DAMPING_RATE * square),
-    )
-    following = clip_to_limits(add(add(q, moved), again), robot)
-    given = [q_sx, p_sx, *([held_sx] if hold else []), *([axes_sx] if turned else [])]
-    return ca.Function("ik", given, [ca.vertcat(*following), ca.sqrt(square)])
+    more_damping = ca.fmin(MAX_LIMIT_DAMPING, LIMIT_DAMPING_RATE * square)
+    again, _ = clipped_step(left, rest, max_step, IK_DAMPING + more_damping)
+    return clip_to_limits(add(add(q, moved), again), robot)
 
 
 def _tilt(kin: Kinematics, frame: list[Vec] | None) -> tuple[Vec, list[Vec]]:
@@ -343,11 +365,14 @@ def _tilt(kin: Kinematics, frame: list[Vec] | None) -> tuple[Vec, list[Vec]]:
     """
     import casadi as ca
 
+    # Angular velocity about the axes of the frame: components of the joint axes.
     up, turns_about = [row[2] for row in kin.rotation], kin.axes
     if frame is not None:
         up = [dot(axis, up) for axis in frame]
         turns_about = [[dot(axis, turning) for axis in frame] for turning in kin.axes]
+    # At 180 degrees up[2] = -1; the bound keeps the factor finite.
     stretch = 2.0 / ca.fmax(1.0 + up[2], 1e-3)
+    # A prismatic joint does not turn the tip.
     rows = [
         [
             axis[row] if turns else 0.0
@@ -367,6 +392,8 @@ def clipped_step(
     weights = solve(gram(rows, damping), error)
     step = [dot(column, weights) for column in zip(*rows, strict=True)]
     largest = reduce(ca.fmax, map(ca.fabs, step))
+    # The step keeps its direction: clipping single joints would leave the path to the
+    # target.
     factor = ca.fmin(1.0, max_step / ca.fmax(largest, 1e-9))
     return scale(step, factor), factor
 
@@ -426,9 +453,12 @@ class Home(GuessedIK):
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             candidates["home_xyz"] = uniform(candidates.draw(random, 3), self.position)
+            # The choice is drawn in every case, so that the numbers of later stages do
+            # not change.
             candidates["home_choice"] = candidates.draw(random, 1)
             guess_home(candidates, random)
             choice, elsewhere = candidates["home_choice"][0], candidates["home_q"]
+            # Nested choice: start, else base, else the solution for a random position.
             home = np.where(choice < self.at_start + self.at_base, base, elsewhere)
             candidates["home_q"] = np.where(
                 choice < self.at_start, candidates["start_q"], home

@@ -47,9 +47,8 @@ MAX_BRAKING_STEPS = 60
 # Ends whose straight line stays over the table for this time can brake (no failure was
 # observed above 46.4 ms).
 LOOKAHEAD_S = 0.08
-EDGE_SIDES = np.array(
-    [[1.0], [-1.0], [1.0], [-1.0]]
-)  # outward signs of the edges: high and low x, high and low y
+# Outward signs of the edges: high and low x, high and low y.
+EDGE_SIDES = np.array([[1.0], [-1.0], [1.0], [-1.0]])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,6 +140,7 @@ def over_table(*, sides: list[list[float]] | None) -> Any:
     given = [p_sx, d_sx] if sides else [p_sx, d_sx, corners_sx]
     spans: Any = sides or list(zip(corners[:2], corners[2:], strict=True))
 
+    # A closed rectangle: a tip on the edge is over the table.
     def is_over(position: Vec) -> Scalar:
         inside = [
             ca.logic_and(low <= at, at <= high)
@@ -180,6 +180,7 @@ class BrakingReach(Stage):
         )
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
+            # Reversed in time, a goal is a start with the velocity -dq.
             q = np.concatenate([candidates["start_q"], candidates["goal_q"]], axis=1)
             dq = np.concatenate(
                 [candidates["start_dq"], -candidates["goal_dq"]], axis=1
@@ -209,32 +210,25 @@ def overshoot(
     It is -inf if a straight line stays inside by the margin [m] for 80 ms. The states
     (q, dq) [rad, rad/s] have shape (joints, n) each; those of goals are reversed.
     """
-    # for both edges across x and across y
+    # For both edges across x and across y.
     position, velocity = (np.repeat(values[:2], 2, axis=0) for values in tip(q, dq))
     edges = np.array([table.x.high, table.x.low, table.y.high, table.y.low])[:, None]
+    # Only an edge that the tip approaches and may reach within the time is rolled out.
     ahead = EDGE_SIDES * (position + LOOKAHEAD_S * velocity - edges)
     suspects = (ahead > -margin) & (EDGE_SIDES * velocity > 0)
     worst = np.full(q.shape[1], -np.inf)
-    if not np.count_nonzero(
-        suspects
-    ):  # the usual case of single tasks; a fifth of the time of any()
+    if not np.count_nonzero(suspects):
+        # The usual case of single tasks; a fifth of the time of any().
         return worst
     for which in np.flatnonzero(suspects.any(axis=1)):
-        suspect, side, edge = (
-            np.flatnonzero(suspects[which]),
-            EDGE_SIDES[which, 0],
-            edges[which, 0],
-        )
+        suspect = np.flatnonzero(suspects[which])
+        side, edge = EDGE_SIDES[which, 0], edges[which, 0]
         normal = np.zeros((3, len(suspect)))
         normal[which // 2], normal[2] = side, side * edge
-        state = np.concatenate(
-            [
-                np.take(q, suspect, 1),
-                np.take(dq, suspect, 1),
-                np.full((1, len(suspect)), -1.0),
-            ]
-        )
-        final, running = brake(state, normal)
+        unknown = np.full((1, len(suspect)), -1.0)
+        states = np.take(q, suspect, 1), np.take(dq, suspect, 1), unknown
+        final, running = brake(np.concatenate(states), normal)
+        # A roll-out that never stops leaves the table.
         worst[suspect] = np.maximum(
             worst[suspect], np.where(running[0] < 0.5, final[-1], np.inf)
         )
@@ -268,30 +262,37 @@ def braking_step(robot: Robot, *, height: float) -> Any:
     q, dq = state[:n], state[n : 2 * n]
     kin = forward_kinematics(robot.chain, q)
     velocity, bias = tip_velocity(kin, dq), bias_acceleration(kin, dq)
+    # Velocity and vertical row: n . J and J_z.
     along = [edge[0] * column[0] + edge[1] * column[1] for column in kin.jacobian]
     row = [column[2] for column in kin.jacobian]
+    # On the manifold z'' = J_z ddq + dJ_z dq = 0; a stable feedback of vertical speed
+    # and height error removes the rounding of earlier steps:
+    #   z'' = -z' / (2 T) - (z - height) / (10 T^2).
     target = (
         -bias[2]
         - 0.5 * velocity[2] / BRAKING_STEP_S
         - 0.1 * (kin.tip[2] - height) / BRAKING_STEP_S**2
     )
     low, high = _acceleration_box(robot, dq)
+    # The largest deceleration along the normal: maximize -n . J ddq.
     ddq = _knapsack([-x for x in along], row, target, low, high)
     speed = edge[0] * velocity[0] + edge[1] * velocity[1]
     deceleration = -(dot(along, ddq) + edge[0] * bias[0] + edge[1] * bias[1])
+    # Within the step the tip stops if v <= a T; a tip that moves away has stopped
+    # already.
     stops = ca.logic_or(
         speed <= 0,
         ca.logic_and(deceleration > 0, speed <= deceleration * BRAKING_STEP_S),
     )
     now = edge[0] * kin.tip[0] + edge[1] * kin.tip[1] - edge[2]
+    # Stopping distance v^2 / (2 a).
     end = now + ca.if_else(
         speed > 0, 0.5 * speed * speed / ca.fmax(deceleration, 1e-9), 0.0
     )
-    following_q = add(
-        q, scale(add(dq, scale(ddq, 0.5 * BRAKING_STEP_S)), BRAKING_STEP_S)
-    )
+    # Constant acceleration over the step: q + T dq + T^2 ddq / 2.
+    mean_rate = add(dq, scale(ddq, 0.5 * BRAKING_STEP_S))
     following = [
-        *following_q,
+        *add(q, scale(mean_rate, BRAKING_STEP_S)),
         *add(dq, scale(ddq, BRAKING_STEP_S)),
         ca.if_else(stops, end, -1.0),
     ]
@@ -310,6 +311,7 @@ def _acceleration_box(robot: Robot, dq: Vec) -> tuple[Vec, Vec]:
     for rate, most, fastest in zip(
         dq, robot.acceleration_limit, robot.velocity_limit, strict=True
     ):
+        # Both limits hold at the end of the step: |dq + T ddq| <= limit.
         low.append(ca.fmax(-float(most), (-float(fastest) - rate) / BRAKING_STEP_S))
         high.append(ca.fmin(float(most), (float(fastest) - rate) / BRAKING_STEP_S))
     return low, high
@@ -328,6 +330,8 @@ def _knapsack(c: Vec, a: Vec, target: Scalar, low: Vec, high: Vec) -> Vec:
     best: Scalar = ca.SX(1e300)
     x: Vec = [ca.SX(0)] * n
     for i in range(n):
+        # With lambda = c_i / a_i, x_i is the only variable with zero reduced cost; the
+        # others are at the bound that improves the objective.
         ratio = c[i] / a[i]
         others = [
             ca.if_else(c[j] - ratio * a[j] > 0, high[j], low[j]) for j in range(n)
@@ -336,6 +340,7 @@ def _knapsack(c: Vec, a: Vec, target: Scalar, low: Vec, high: Vec) -> Vec:
         for j in range(n):
             if j != i:
                 rest = rest - a[j] * others[j]
+        # The equation determines x_i.
         between = rest / a[i]
         miss = ca.fmax(ca.fmax(low[i] - between, between - high[i]), 0)
         others[i] = ca.fmin(ca.fmax(between, low[i]), high[i])

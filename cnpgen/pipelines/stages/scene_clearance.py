@@ -34,6 +34,7 @@ class _SceneChecker(CollisionChecker):
 
     def place_fixed(self, obstacles: Sequence[Obstacle]) -> None:
         """Set the obstacles that all scenes have."""
+        # Fixed obstacles come first in every scene, followed by those of the sample.
         numbers = place_obstacles(obstacles)
         self.place(obstacles, numbers)
         self._fixed, _, boxes = obstacle_bodies(obstacles, numbers, len(self.vertices))
@@ -52,6 +53,7 @@ class _SceneChecker(CollisionChecker):
                 self._fixed_boxes,
                 box[:, : count - fixed],
             )
+            # Padding is too far away to be near any capsule.
             padded[:3, count:] = PADDING_DISTANCE_M
             self._boxes.append(padded)
         self._places = [
@@ -78,6 +80,8 @@ class _SceneChecker(CollisionChecker):
             address_of(clear),
             states.strides[0],
         )
+        # Only pointers change from scene to scene; the arrays of all scenes were built
+        # at once.
         for scene, first, end in runs:
             native.obstacles, native.n_obstacles = (
                 self._first + scene * self._stride,
@@ -123,6 +127,7 @@ class SceneClearance:
         """
         if not len(scene):
             return np.zeros(0, bool)
+        # Runs of states in one scene: the checker is told the obstacles once per run.
         bounds = [0, *(np.flatnonzero(np.diff(scene)) + 1).tolist(), len(scene)]
         runs = [(int(scene[first]), first, end) for first, end in pairwise(bounds)]
         if self._checker is None:
@@ -134,6 +139,7 @@ class SceneClearance:
                     for run, first, end in runs
                 ]
             )
+        # The arrays belong to a batch of scenes and are built once for it.
         if self._prepared is not scenes:
             self._checker.prepare_scenes(scenes)
             self._prepared = scenes

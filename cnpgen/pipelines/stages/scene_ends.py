@@ -121,7 +121,8 @@ class SceneEnds(Stage):
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             scenes = candidates.scenes
-            if scenes is None:  # a plug-in may write the column "scene" without scenes
+            if scenes is None:
+                # A plug-in may write the column "scene" without scenes.
                 raise RecipeError(
                     [
                         "stage 'scene-ends' needs scenes: expected a stage 'draw-scenes' before it"
@@ -162,11 +163,13 @@ class _Pool(NamedTuple):
         first = self.first_group[scene]
         count = self.first_group[scene + 1] - first
         excluded = np.full(len(scene), -1) if other_than is None else other_than
+        # Skip the excluded group: draw from one less, and shift those at or above it.
         without = count - (excluded >= 0)
         group = first + np.minimum(
             (u * without).astype(np.int64), np.maximum(without - 1, 0)
         )
         group += (excluded >= 0) & (group >= excluded)
+        # Where no group is left, any valid index will do; -1 is returned for it.
         group = np.where(without > 0, group, 0)
         begin = self.first_state[group]
         size = (
@@ -180,6 +183,7 @@ class _Pool(NamedTuple):
 def _make_pool(q: Array, key: Indices, scenes: int, groups: int) -> _Pool:
     """Return a pool of states, sorted by ``key``, which is the scene times ``groups`` plus the group."""
     present, first_state = np.unique(key, return_index=True)
+    # Keys ascend by scene, so the groups of one scene are consecutive.
     first_group = np.searchsorted(present // groups, np.arange(scenes + 1))
     return _Pool(q, np.append(first_state, len(key)), first_group)
 
@@ -200,6 +204,7 @@ class _EndStates:
         """Draw states of all scenes and keep the valid ones."""
         robot, count = self._robot, len(scenes)
         low, high = robot.position_lower[:, None], robot.position_upper[:, None]
+        # All random numbers of a batch are drawn before any check, in a fixed order.
         neutral = robot.home[:, None] + self._stage.spread * random.standard_normal(
             (robot.n, count * NEUTRAL_STATES)
         )
@@ -235,8 +240,10 @@ class _EndStates:
         valid = (
             (q >= robot.position_lower[:, None]) & (q <= robot.position_upper[:, None])
         ).all(axis=0)
+        # Cheap tests first: collisions are checked for states that can be held.
         (ratio,) = self._torque(np.ascontiguousarray(q))
         chosen = np.flatnonzero(valid & (ratio[0] <= 1.0))
+        # Sorted by scene, as ``are_clear`` requires.
         chosen = chosen[np.argsort(scene[chosen], kind="stable")]
         clear = self._clearance.are_clear(
             q[:, chosen], scene[chosen], scenes, self._stage.margin
@@ -253,6 +260,7 @@ class _EndStates:
         Return joint positions and keys of the solved ones.
         """
         stage, robot, count = self._stage, self._robot, len(scenes)
+        # Random order of the grasps of each scene; padding sorts last.
         order = random.random((count, scenes.grasp_tilt.shape[1]))
         order[np.arange(order.shape[1]) >= scenes.grasp_count[:, None]] = np.inf
         chosen = np.argsort(order, axis=1, kind="stable")[:, : stage.grasps]
@@ -260,9 +268,8 @@ class _EndStates:
         exists = np.take_along_axis(order, chosen, axis=1) < 1.0
         scene, grasp = np.nonzero(exists)
         place = chosen[scene, grasp]
-        u = numbers[:, scene, grasp].reshape(
-            len(numbers), -1
-        )  # pose by pose of every grasp
+        # Pose by pose of every grasp.
+        u = numbers[:, scene, grasp].reshape(len(numbers), -1)
         approach, tilt, position = (
             np.repeat(values[scene, place], stage.poses, axis=0)
             for values in (
@@ -271,6 +278,7 @@ class _EndStates:
                 scenes.grasp_position,
             )
         )
+        # Poses within the tilt of the approach, uniform on the spherical cap.
         rotation = _rotations(approach, tilt, u[:3])
         low, high = robot.position_lower[:, None], robot.position_upper[:, None]
         lanes = [
@@ -293,6 +301,8 @@ class _EndStates:
         """Return starts and goals of the candidates [rad], nan without one, shape (n, N) each."""
         stage, size = self._stage, (self._robot.n, len(scene))
         start, goal = np.full(size, np.nan), np.full(size, np.nan)
+        # A share of the samples may have a free straight line; the others must need a
+        # detour.
         may_be_straight, pending = numbers[0] < stage.straight, np.arange(len(scene))
         used = np.empty(0, np.int64)
         for attempt in range(MAX_PAIRS_PER_CANDIDATE):
@@ -302,6 +312,7 @@ class _EndStates:
                 scene[pending],
                 numbers[first : first + NUMBERS_PER_PAIR, pending],
             )
+            # Every pair of states is used once in a batch.
             is_new = _is_first(np.append(used, key))[len(used) :]
             exists = is_new & np.isfinite(q).all(axis=0)
             accepted = exists & may_be_straight[pending]
@@ -336,6 +347,7 @@ class _EndStates:
         )
         state = np.choose(kind, list(chosen.values()))
         goal = _taken(pools["grasp"].q, target)
+        # One number for goal, kind and start, to find repeated pairs.
         key = (target * len(ends) + kind) * 2**31 + state
         return np.where(np.isfinite(goal), start, np.nan), goal, key
 
@@ -347,6 +359,7 @@ class _EndStates:
         A few states are checked.
         """
         collides = np.zeros(len(scene), bool)
+        # Most lines collide in the middle; only the others are checked more densely.
         for phases in (FIRST_PHASES, OTHER_PHASES):
             rest = np.flatnonzero(~collides)
             line = start[:, rest, None] + (goal - start)[:, rest, None] * np.array(
@@ -379,6 +392,7 @@ def _rotations(approach: Array, tilt: Array, u: Array) -> Array:
 
     U are random numbers, shape (3, K).
     """
+    # Uniform on a cap: the cosine is uniform between cos(tilt) and 1 (Archimedes).
     cosine = 1 - u[0] * (1 - np.cos(tilt))
     sine, angle, roll = np.sqrt(1 - cosine**2), 2 * np.pi * u[1], 2 * np.pi * u[2]
     first, second = _across(approach)
@@ -387,6 +401,7 @@ def _rotations(approach: Array, tilt: Array, u: Array) -> Array:
         + (sine * np.sin(angle))[:, None] * second
         + cosine[:, None] * approach
     )
+    # A random roll about the approach completes the frame.
     first, second = _across(z)
     x = np.cos(roll)[:, None] * first + np.sin(roll)[:, None] * second
     y = np.cross(z, x)
@@ -395,6 +410,7 @@ def _rotations(approach: Array, tilt: Array, u: Array) -> Array:
 
 def _across(axis: Array) -> tuple[Array, Array]:
     """Return two unit vectors that form a right-handed frame with unit vectors, shape (K, 3) each."""
+    # An axis that is not nearly parallel, so that the cross product is well defined.
     helper = np.where(np.abs(axis[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     first = np.cross(helper, axis)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -417,16 +433,18 @@ def pose_ik_step(robot: Robot) -> Any:
     )
     kin = forward_kinematics(robot.chain, q)
     target = [r[0:3], r[3:6], r[6:9]]
-    relative = [
-        [dot(a, b) for b in kin.rotation] for a in target
-    ]  # target times the transposed rotation
+    # target times the transposed rotation
+    relative = [[dot(a, b) for b in kin.rotation] for a in target]
     trace = relative[0][0] + relative[1][1] + relative[2][2]
+    # The vector of the skew part is 2 sin(angle) axis and the trace 1 + 2 cos(angle),
+    # so 2 turn / (1 + trace) = 2 tan(angle / 2) axis.
     stretch = METERS_PER_RADIAN * 2.0 / ca.fmax(1.0 + trace, 1e-2)
     turn = [
         relative[2][1] - relative[1][2],
         relative[0][2] - relative[2][0],
         relative[1][0] - relative[0][1],
     ]
+    # Six rows: position [m], and rotation vector times ``METERS_PER_RADIAN``.
     error = [*subtract(p, kin.tip), *scale(turn, stretch)]
     axes = [
         axis if turns else [0.0] * 3
@@ -434,6 +452,8 @@ def pose_ik_step(robot: Robot) -> Any:
     ]
     rows = [[column[row] for column in kin.jacobian] for row in range(3)]
     rows += [[METERS_PER_RADIAN * axis[row] for axis in axes] for row in range(3)]
+    # Levenberg-Marquardt damping by the squared error: small near a solution, so the
+    # convergence there is superlinear.
     square = dot(error, error)
     step, _ = clipped_step(
         rows, error, MAX_POSE_IK_STEP_RAD, POSE_DAMPING * square + MIN_DAMPING

@@ -156,6 +156,8 @@ class CandidateBatch:
 
         Return those of the remaining ones, shape (width, n).
         """
+        # All N numbers are drawn, so that later stages do not depend on earlier
+        # rejections.
         numbers = random.random((width, self.size))
         return (
             numbers
@@ -176,8 +178,10 @@ class CandidateBatch:
             if reason not in self.origins:
                 self.reasons.append(reason)
                 self.origins[reason] = self.stage
-        if np.count_nonzero(met) == met.size:  # a third of the time of all()
+        if np.count_nonzero(met) == met.size:
+            # A third of the time of all().
             return
+        # The reason of a candidate is the first one that it does not meet.
         numbers = np.array([1 + self.reasons.index(reason) for reason in reasons])
         ok = met.all(axis=0)
         self.outcome[self.alive[~ok]] = numbers[met[:, ~ok].argmin(axis=0)]
@@ -316,5 +320,6 @@ class TaskBatch(CandidateBatch):
 
         Empty for solved tasks.
         """
+        # Outcome 0 is no rejection.
         texts = ["", *self.reasons]
         return tuple(texts[outcome] for outcome in self.outcome.tolist())

@@ -64,6 +64,7 @@ def torque_ratio(robot: Robot) -> Any:
         symbols("parameters", len(robot.parameters)),
     )
     zero = [0.0] * robot.n
+    # Friction at rest is in the limit, so torques are those of the rigid body.
     torque = SymbolicState(robot, q, zero, zero, parameters, (), None).torque
     ratios = (
         ca.fabs(value) / limit

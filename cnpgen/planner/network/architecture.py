@@ -130,6 +130,8 @@ def initial_parameters(
     parameters = np.zeros(architecture.n_parameters, np.float32)
     _, path, rate = architecture.heads
     for layer in architecture.all_layers:
+        # Glorot: variance 2 / (inputs + outputs) keeps the size of activations from
+        # layer to layer.
         bound = np.sqrt(6 / (layer.inputs + layer.outputs)) * (
             head_scale if layer in {path, rate} else 1.0
         )
@@ -194,18 +196,22 @@ def backward(
     The gradients are those with respect to ``path`` and ``log_rate`` of the
     activations, and have their shapes.
     """
+    # Reverse order of ``forward``: y = tanh(x W + b), dW = x^T g, dx = g W^T with g
+    # before tanh.
     top, hidden = activations.trunk[-1], activations.path_hidden
     gradient = _through_tanh(path_gradient, activations.path)
     _weight_gradient(hidden, gradient, out[-2])
     gradient = _through_tanh(gradient @ weights[-2][0].T, hidden)
     _weight_gradient(top, gradient, out[-3])
     _weight_gradient(top, log_rate_gradient, out[-1])
+    # Both heads read the top of the trunk, so their gradients add up.
     gradient = gradient @ weights[-3][0].T
     gradient += log_rate_gradient @ weights[-1][0].T
     for index in range(len(weights) - 4, -1, -1):
         gradient = _through_tanh(gradient, activations.trunk[index + 1])
         _weight_gradient(activations.trunk[index], gradient, out[index])
-        if index:  # the gradient of the features is not needed
+        if index:
+            # The gradient of the features is not needed.
             gradient = gradient @ weights[index][0].T
 
 

@@ -117,15 +117,21 @@ def fit_features(parts: Iterable[Tasks], blocks: tuple[str, ...] = USUAL) -> Fea
     for tasks in parts:
         raw = raw_features(tasks, blocks)
         line = 0 if tasks.correction is None else tasks.correction[:1].size
+        # Moments of two groups combine without keeping the rows:
+        #   M2 = M2_a + M2_b + (mean_b - mean_a)^2 n_a n_b / n.
         new, total = raw.mean(axis=0) - mean, count + len(raw)
+        # Chan et al., 1983
         squares = (
             squares + raw.var(axis=0) * len(raw) + new**2 * (count * len(raw) / total)
-        )  # Chan et al., 1983
+        )
         count, mean = total, mean + new * (len(raw) / total)
     deviation = np.sqrt(squares / count)
+    # Constant features carry no information; scaled by rounding errors they would be
+    # noise.
     constant = deviation < MIN_DEVIATION
     scale = np.where(constant, 0.0, 1 / np.where(constant, 1.0, deviation))
-    if LINE in blocks:  # the last one; zero along straight lines
+    if LINE in blocks:
+        # The last one; zero along straight lines.
         mean[-line:], scale[-line:] = 0.0, 1.0
     return Features(blocks, mean, scale)
 
@@ -171,11 +177,13 @@ def _block(tasks: Tasks, name: str) -> tuple[Array, ...]:
     if name in {*STATES, ARRIVAL, PARAMETERS}:
         return (getattr(boundary, name),)
     if name == "sin_cos":
+        # Forward kinematics is a polynomial of these sines and cosines.
         angles = np.concatenate([boundary.start_q, boundary.goal_q], axis=1)
         return np.sin(angles), np.cos(angles)
     if name == "tips":
         return tasks.start_xyz, tasks.goal_xyz
     if name == "expected_time":
+        # Durations differ by factors, so the logarithm is the natural scale.
         return (np.log(tasks.expected_time)[:, None],)
     if name == SCENE and tasks.observation is not None:
         return (tasks.observation,)
@@ -213,6 +221,7 @@ def link_points(robot: Robot) -> Any:
 
 def _shares(capsule: Capsule) -> list[float]:
     """Return the places of the points on a capsule's axis, as shares of its length."""
+    # Points at most ``POINT_SPACING_M`` apart cover the capsule.
     length = float(np.linalg.norm(np.subtract(capsule.second, capsule.first)))
     return (
         np.linspace(0, 1, int(np.ceil(length / POINT_SPACING_M)) + 1).tolist()
@@ -249,6 +258,8 @@ class SceneFeatures:
             rows = slice(first, first + TASKS_PER_BLOCK)
             bodies = scene_primitives(scene[rows])
             along = self._along(path[rows], bodies)
+            # The basis points are fixed in the world, so their distances describe the
+            # scene alone.
             around = self.backend.distances(bodies, BASIS.positions)
             features[rows] = np.concatenate(
                 [along, np.clip(around, MIN_DISTANCE_M, MAX_DISTANCE_M)], axis=1
@@ -258,6 +269,7 @@ class SceneFeatures:
     def _along(self, path: Array, bodies: Primitives) -> Array:
         """Return the features along paths, shape (N, PATH_PHASES * (n + 2))."""
         count, _, n = path.shape
+        # Central differences: the state itself, then each joint moved to both sides.
         steps = STEP_RAD * np.concatenate([np.zeros((1, n)), np.eye(n), -np.eye(n)])
         states = ((self.path @ path)[:, :, None] + steps).reshape(-1, n)
         (columns,) = self.points(np.ascontiguousarray(states.T))
@@ -268,6 +280,7 @@ class SceneFeatures:
             )
             - self.radii
         )
+        # Smooth measure of crowding: clearances below ``RANGE_M`` add up.
         near = np.maximum(RANGE_M - distances, 0).sum(axis=-1)
         smallest = np.clip(
             distances[:, :, 0].min(axis=-1), MIN_DISTANCE_M, MAX_DISTANCE_M
@@ -275,6 +288,7 @@ class SceneFeatures:
         parts = (
             smallest[..., None],
             near[:, :, :1],
+            # Sign of the joint motion that increases the clearance.
             near[:, :, 1 : n + 1] - near[:, :, n + 1 :],
         )
         return np.concatenate(parts, axis=2).reshape(count, -1)

@@ -69,6 +69,7 @@ class TipAxis(Constraint):
     def judged(self, world: "World") -> tuple[Condition, ...]:
         """Evaluate the angle between axis and direction [rad]."""
         tilt, upright = self._held(self._measured_axis(world), {})
+        # atan2(|sine|, cosine): accurate at all angles, unlike the arccosine near 1.
         angle = np.arctan2(np.hypot(*tilt.g), upright.g[0])
         tolerance = world.parameters.values.get(UPRIGHT_TOLERANCE)
         accepted = None if tolerance is None else np.array([float(tolerance)])
@@ -87,6 +88,7 @@ class TipAxis(Constraint):
         """Return the tolerance of the angle, or of each of its components."""
         if condition.accepted is not None:
             return condition.accepted
+        # Each of k equal components may be the angle divided by sqrt(k).
         return np.asarray(super().allowed(condition) / np.sqrt(len(condition.g)))
 
     def _symbolic_axis(self, state: "SymbolicState") -> list[Any]:
@@ -109,6 +111,8 @@ class TipAxis(Constraint):
         """State the tilt of an axis, which is given along axes that turn with the direction."""
         tilt = [along(row, pointing) for row in self.across]
         if (tolerance := parameters.get(UPRIGHT_TOLERANCE)) is not None:
+            # In units of the nominal tolerance: a sample with half of it has twice the
+            # values.
             tilt = [value * (self.tolerance / tolerance) for value in tilt]
         upright = [along(self.directions[1], pointing)]
         return (
@@ -220,6 +224,8 @@ class Axis(TipAxis):
             return super()._held(pointing, parameters)
         cosine, least = along(self.directions[1], pointing), np.cos(self.angle)
         if (angle := parameters.get(UPRIGHT_TOLERANCE)) is not None:
+            # Affine in the cosine, so that bound and accepted violation map to those of
+            # the problem.
             ratio = self._cosine_tolerance(self.angle) / self._cosine_tolerance(angle)
             cosine = least + (cosine - _cosine(angle)) * ratio
         return (
@@ -241,6 +247,8 @@ class Axis(TipAxis):
         self, u: Sequence[Any], omega: Sequence[Any], alpha: Sequence[Any]
     ) -> tuple[Condition, ...]:
         """Return the rates of the axis u orthogonal to the direction, from ``w x u`` and ``a x u + w x (w x u)``."""
+        # du/dt = w x u; its derivative a x u + w x (w x u) is the acceleration of the
+        # axis.
         rate = _cross(omega, u)
         second = [
             a + b for a, b in zip(_cross(alpha, u), _cross(omega, rate), strict=True)

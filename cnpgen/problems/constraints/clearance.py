@@ -110,6 +110,7 @@ class RobotClearance(DistanceConstraint):
         """State the signed distance of every moving segment, or capsule's axis, from every obstacle [m]."""
         from cnpgen.kernels.symbolic.obstacle_distances import symbolic_solids
 
+        # Axes of capsules: the radius is in the bound.
         (segments, radii), solids = self._capsules(state), symbolic_solids(state)
         distances = [
             solid.separation(a, b, state.freeze)
@@ -143,6 +144,8 @@ class RobotClearance(DistanceConstraint):
                 for number, _ in enumerate(world.robot.capsule_axes, 1)
             ]
         else:
+            # Judges stop at the required distance: exact values matter only where it is
+            # not met.
             (found,) = self._clear(world.shape_distances(self.distance), [0.0])
             bodies = [piece.link for piece in shape.moving_convex_parts]
         return (
@@ -190,6 +193,8 @@ class RobotClearance(DistanceConstraint):
         self, distances: list[Any], radii: list[float], *, sufficient: bool = False
     ) -> tuple[Condition, ...]:
         """State that the distance of every capsule axis is at least its radius plus ``distance``."""
+        # Distances are ordered capsule by capsule: each radius is repeated for all
+        # obstacles.
         least = np.repeat(radii, len(distances) // max(len(radii), 1)) + self.distance
         return self._at_least(distances, least, sufficient=sufficient)
 

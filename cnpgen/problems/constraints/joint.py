@@ -55,6 +55,7 @@ class _RelativeLimit(Constraint):
         """Divide rates by the factor of their limits, so that the bounds are the same for all samples."""
         if (rates := getattr(state, self.rates)) is None:
             return ()
+        # A limit times a factor is the same as a rate divided by it.
         g = list(rates) if factor is None else [rate / factor for rate in rates]
         limit, unit = getattr(state.robot, self.limit), state.robot.units(self.unit)
         return (Condition(self.condition_name, unit, g, -limit, limit, "limit"),)
@@ -192,6 +193,7 @@ class TipSpeed(Constraint):
 
     def allowed(self, condition: Condition) -> Array:
         """Return the tolerance of the square of the speed [m^2/s^2]."""
+        # (limit + tolerance)^2 - limit^2 is the tolerance of the square.
         return np.full(
             len(condition.g), (self.limit + self.tolerance) ** 2 - self.limit**2
         )

@@ -200,6 +200,7 @@ class ObjectClearance(LinkClearance):
 def _solver_capsules(robot: "Robot") -> "list[Capsule]":
     """List the capsules of the links that solvers keep away from the object."""
     shape = robot.held_shape
+    # Links that never meet the object need no capsule.
     near = [pair for pair in shape.pairs if pair.colliding > 0] if shape else []
     links = {
         pair.first for pair in near if pair.mistaken <= MAX_HELD_CAPSULE_ERROR_FRACTION

@@ -84,6 +84,7 @@ class Plane(TipManifold):
         if self.along is None:
             return normal, beside(normal)
         given = unit(self.along, "along")
+        # The direction is projected into the plane, so that both axes are orthogonal.
         first = unit(given - normal * (normal @ given), "along, seen in the plane,")
         return normal, np.stack([first, np.cross(normal, first)])
 

@@ -52,6 +52,7 @@ class Pose(TipManifold):
             for row, each in zip(np.eye(3), (self.x, self.y, self.z), strict=True)
             if each
         ]
+        # A range of one point is an equality; the others are bounds.
         held = [(row, each.low) for row, each in given if each.low == each.high]
         free = [(row, each) for row, each in given if each.low < each.high]
         point = sum((row * value for row, value in held), start=np.zeros(3))
@@ -82,6 +83,7 @@ class Pose(TipManifold):
     def judged(self, world: "World") -> tuple[Condition, ...]:
         """Evaluate the position [m] and the angle of the orientation [rad]."""
         *position, sines, cosine = self.measured(world)
+        # |sine| and cosine determine the angle up to half a turn.
         angle = np.arctan2(np.sqrt(sum(sine**2 for sine in sines.g)), cosine.g[0])
         return (
             *position,
@@ -128,6 +130,7 @@ class Pose(TipManifold):
 
     def _turned(self, rotation: Sequence[Any]) -> tuple[Condition, ...]:
         wanted = self.rotation
+        # R_wanted^T R: the rotation that is left.
         relative = [
             [
                 sum(float(wanted[k, i]) * rotation[k][j] for k in range(3))
@@ -135,9 +138,11 @@ class Pose(TipManifold):
             ]
             for i in range(3)
         ]
+        # Vector of the skew part: axis times the sine of the angle.
         sine = [
             (relative[i][j] - relative[j][i]) / 2 for i, j in ((2, 1), (0, 2), (1, 0))
         ]
+        # trace R = 1 + 2 cos(angle).
         cosine = (relative[0][0] + relative[1][1] + relative[2][2] - 1) / 2
         return (
             Condition(

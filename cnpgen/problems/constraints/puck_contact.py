@@ -100,6 +100,7 @@ class PuckContact(Constraint):
         goal, velocity = goal_xyz[:, :2], goal_velocity[:, :2]
         speed = np.hypot(velocity[:, :1], velocity[:, 1:])
         is_hit = speed > MIN_HIT_SPEED_M_S
+        # Ahead of the tip along its velocity; the floor only avoids a division by zero.
         puck = goal + self.contact_distance * velocity / np.maximum(
             speed, MIN_HIT_SPEED_M_S
         )
@@ -117,6 +118,8 @@ class PuckContact(Constraint):
         import casadi as ca
 
         (condition,) = self._cone(*self._symbolic_distances(state), TRAINING_MARGIN_M)
+        # e / sqrt(1 + e / k): like e below the knee k, like sqrt(k e) above, so the
+        # square of it grows linearly.
         violation = ca.fmax(0, condition.lower[0] - condition.g[0])
         return (
             replace(
@@ -172,6 +175,7 @@ class PuckContact(Constraint):
         if not len(values):
             return np.full(np.shape(x), PUCK_OUT_OF_REACH_M)
         goal, puck = np.asarray(values[:2]), np.asarray(values[2:4])
+        # Center of the disc: half its diameter behind the goal, opposite to the hit.
         center = goal - (puck - goal) * (self.last / 2 / self.contact_distance)
         distance = np.hypot(x - center[0], y - center[1])
         return np.asarray(np.maximum(distance - self.last / 2, 0.0))
@@ -239,18 +243,24 @@ class PuckContact(Constraint):
         """
         goal, puck, start = values[:2], values[2:], start_xyz[:2]
         hit = (puck - goal) / self.contact_distance
+        # The straight path is free if it passes the puck's near side outside the
+        # contact range.
         entry = puck - (self.contact_range + self.overlap) * hit
         if distances_from_segments(puck, start, entry) >= self.contact_range:
             return []
         radius = self.contact_range + GUESS_CLEARANCE_M
         offset = start - puck
         distance = max(float(np.hypot(*offset)), radius)
+        # 0 behind the puck
         angle = math.atan2(
             -hit[0] * offset[1] + hit[1] * offset[0], -float(hit @ offset)
-        )  # 0 behind the puck
+        )
         paths = []
+        # Both ways round: by the angle, and by the rest of the full turn.
         for begin in (angle, angle - math.copysign(2 * math.pi, angle)):
             side = math.copysign(1.0, begin)
+            # From the start, a tangent meets the circle at this angle (right triangle
+            # with the radius).
             tangent = abs(begin) - math.acos(radius / distance)
             angles = side * np.linspace(
                 max(tangent, ARC_END_RAD),

@@ -93,6 +93,8 @@ class Table(TipManifold):
         condition = super()._inside(tip, parameters)
         if parameters.keys().isdisjoint(TABLE_BOUNDS):
             return condition
+        # One value per side: a side of the sample is shifted to that of the problem
+        # file.
         sides = [tip[0], tip[0], tip[1], tip[1]]
         shifts = [
             parameters.get(name, bound) - bound for name, bound in self.bounds.items()

@@ -132,6 +132,7 @@ class TipManifold(Constraint):
         """Relax the bounds for a start off the manifold: by ``start_off`` until s = 0.1, by zero from s = 0.3 on."""
         if condition.name != self.held_name:
             return super().bound_relaxation(condition, s, start_tip)
+        # Linear between both kinks.
         open_: Array = np.minimum(
             np.maximum((BOUND_KINKS[1] - s) / (BOUND_KINKS[1] - BOUND_KINKS[0]), 0.0),
             1.0,
@@ -142,6 +143,7 @@ class TipManifold(Constraint):
         """Return the distances of starts, shape (..., 3), from the manifold, at most ``band`` [m]."""
         place = self.place
         pairs = zip(place.held, place.height, strict=True)
+        # The largest of all fixed directions, which is a distance per direction.
         off = reduce(
             np.maximum,
             [np.abs(along(row, start_tip.T).T - height) for row, height in pairs],
@@ -203,6 +205,7 @@ class TipManifold(Constraint):
 def along(direction: Sequence[float], vector: Sequence[Any] | Array) -> Any:
     """Return the component along a unit vector of a vector of SX scalars, numbers or arrays; no term is 0."""
     total = None
+    # Zero shares add no term: SX would keep the product.
     for share, value in zip(direction, vector, strict=True):
         if share:
             term = value if share == 1 else share * value
@@ -224,6 +227,7 @@ def unit(vector: Sequence[float] | Array, what: str) -> Array:
 
 def beside(direction: Array) -> Array:
     """Return two unit vectors orthogonal to a unit vector and to each other, shape (2, 3); x and y for z."""
+    # The coordinate axis that is most orthogonal, made orthogonal (Gram-Schmidt).
     first = np.eye(3)[int(np.argmin(np.abs(direction)))]
     first = first - direction * (direction @ first)
     first = first / np.linalg.norm(first)

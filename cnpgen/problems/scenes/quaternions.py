@@ -46,7 +46,8 @@ def quaternion_of(rotation: Array) -> Array:
 def roll_pitch_yaw(rotation: Array) -> tuple[float, float, float]:
     """Return roll, pitch and yaw about fixed axes [rad] of a rotation matrix, as ``<origin rpy>`` of a URDF."""
     sine, cosine = -rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0])
-    if cosine < 1e-9:  # pitch of 90 degrees: roll and yaw turn about the same axis
+    if cosine < 1e-9:
+        # Pitch of 90 degrees: roll and yaw turn about the same axis.
         return (
             math.atan2(-rotation[1, 2], rotation[1, 1]),
             math.atan2(sine, cosine),

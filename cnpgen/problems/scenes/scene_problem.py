@@ -31,12 +31,13 @@ MAX_SCENES = 100_000  # of one call
 MAX_BASE_DEPTH_M = 0.01
 MIN_OBSTACLE_SIZE_M = 1e-6
 MAX_ROTATION_ERROR = 1e-6  # of the products of the rows of a rotation matrix
+# Edge lengths; radius; radius and length.
 _SIZES = {
     "box": 3,
     "sphere": 1,
     "cylinder": 2,
     "capsule": 2,
-}  # edge lengths; radius; radius and length
+}
 
 
 class SceneError(UsageError):
@@ -156,7 +157,8 @@ def make_obstacle(
             raise SceneError(
                 f"{where}: {what} must have {count} numbers, got {values.tolist()!r:.60}"
             )
-        if not (np.abs(values) <= MAX_COORDINATE_M).all():  # also false for nan
+        if not (np.abs(values) <= MAX_COORDINATE_M).all():
+            # Also false for nan.
             raise SceneError(
                 f"{where}: {what} must be finite and at most {MAX_COORDINATE_M:g}, got {values.tolist()}"
             )

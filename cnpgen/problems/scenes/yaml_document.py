@@ -38,9 +38,8 @@ def read_yaml(path: Path, *, numbers: bool = False) -> list[Any]:
 
 def _documents(path: Path, yaml: Any, events: Any, numbers: bool) -> Iterator[Any]:
     """Build documents from the events of a parser, without recursion."""
-    stack: list[
-        Any
-    ] = []  # open mappings and lists, and the keys that wait for their values, each in a tuple
+    # Open mappings and lists, and the keys that wait for their values, each in a tuple.
+    stack: list[Any] = []
     for event in events:
         if getattr(event, "anchor", None) is not None:
             raise SceneError(

@@ -28,10 +28,7 @@ class TipKinematics:
     axes: Array
 
     def curvature(self, direction: Array) -> Array:
-        """Return second derivatives along a direction, shape (n, n): ``c .
-
-        (axis_i x J_j)`` for i <= j.
-        """
+        """Return second derivatives along a direction, shape (n, n): ``c . (axis_i x J_j)`` for i <= j."""
         upper = np.triu(self.axes.T @ np.cross(self.jacobian.T, direction).T)
         return np.asarray(upper + np.triu(upper, 1).T)
 

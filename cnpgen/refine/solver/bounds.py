@@ -203,12 +203,34 @@ class BoundsTemplate:
         )
         self._tightening = tightening
         self._s, self._bound_phases = s, s * (PHASE_FACTOR if tightening.band else 1.0)
-        self._lower, self._upper = map(
-            np.asfortranarray, tables
-        )  # the layout of residuals
+        # The layout of residuals.
+        self._lower, self._upper = map(np.asfortranarray, tables)
+        self._set_rows(pairs, orders)
+        with np.errstate(invalid="ignore"):
+            # Equalities are solved to a fraction of the tolerance; the bounds of the
+            # others were moved inwards, by which a violation within the interval may be
+            # larger.
+            interval_tolerance = np.where(
+                self.equal, PRECISE_FRACTION, 1.0
+            ) * self.tolerances + np.fmax(
+                untightened[1] - self._upper, self._lower - untightened[0]
+            )
+        self._interval_tolerance = np.asfortranarray(
+            np.where(np.isnan(interval_tolerance), np.inf, interval_tolerance)
+        )
+        self._nonsmooth = np.zeros(self._lower.shape, bool, order="F")
+        self._nonsmooth[[*END_POINTS, *(-1 - point for point in END_POINTS)]] = (
+            self.orders >= 2
+        )
+
+    def _set_rows(
+        self, pairs: list[tuple[Constraint, Condition]], orders: list[int]
+    ) -> None:
+        """Set what is known of each residual, from the constraints with their conditions."""
         self.conditions = [condition for _, condition in pairs]
         self.tolerances = np.concatenate([_tolerances(*pair) for pair in pairs])
         widths = [len(condition.g) for condition in self.conditions]
+        # Bounds that depend on the motion are computed for each of them.
         self._time_varying = [
             (*pair, slice(behind - width, behind))
             for pair, width, behind in zip(
@@ -236,19 +258,6 @@ class BoundsTemplate:
         )
         self.equal = np.repeat(
             [condition.is_equality for condition in self.conditions], widths
-        )
-        with np.errstate(invalid="ignore"):
-            interval_tolerance = np.where(
-                self.equal, PRECISE_FRACTION, 1.0
-            ) * self.tolerances + np.fmax(
-                untightened[1] - self._upper, self._lower - untightened[0]
-            )
-        self._interval_tolerance = np.asfortranarray(
-            np.where(np.isnan(interval_tolerance), np.inf, interval_tolerance)
-        )
-        self._nonsmooth = np.zeros(self._lower.shape, bool, order="F")
-        self._nonsmooth[[*END_POINTS, *(-1 - point for point in END_POINTS)]] = (
-            self.orders >= 2
         )
 
     def bounds_for(self, start_tip: Array, *, ends: Array | None = None) -> Bounds:

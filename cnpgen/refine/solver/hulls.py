@@ -31,7 +31,7 @@ from cnpgen.refine.solver.residuals import DISTANCE_SCALE_M
 from cnpgen.refine.solver.transcription import ResidualKernels
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.convex_part import Contacts
-from cnpgen.robots.shape.shape import HELD_OBJECT, with_held_object
+from cnpgen.robots.shape.shape import HELD_OBJECT, Shape, with_held_object
 from cnpgen.robots.solid import solids_of
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.rigid_bodies import RigidBodies
@@ -95,10 +95,34 @@ class Hulls:
             ForwardKinematics(robot.model),
         )
         self._bodies = RigidBodies(shape, len(problem.obstacle), robot.n)
-        links = [part.link for part in shape.convex_parts]
-        names = [*links, *range(len(problem.obstacle))]
-        columns: dict[Any, int] = {}
         self._groups, self._uncovered = list[_Group](), list[tuple[Pairs, float]]()
+        self._set_distances(constraints, self._make_groups(constraints, shape))
+        # Largest required distances from obstacles and of links from each other [m];
+        # None without such a constraint.
+        self.obstacle_distance, added_to_parts = _largest(
+            constraints, RobotClearance, ObjectContact
+        )
+        self.self_distance, added_to_pairs = _largest(
+            constraints, SelfClearance, ObjectClearance
+        )
+        self.checker = (
+            None
+            if library is None or robot.n > MAX_JOINTS
+            else _make_checker(library, robot, shape, added_to_parts, added_to_pairs)
+        )
+        self._axes = np.array([joint.axis for joint in robot.chain.joints])
+        self._sliding = np.array(robot.prismatic)
+        supports = [list(joints) for joints in robot.model.supports]
+        # Joint j moves body b if it is among the joints between the base and b.
+        self._moves = np.array(
+            [[joint in above for joint in range(1, robot.n + 1)] for above in supports]
+        )
+
+    def _make_groups(self, constraints: list[Any], shape: Shape) -> int:
+        """Set the pairs of every constraint, and return the number of distances."""
+        links = [part.link for part in shape.convex_parts]
+        names = [*links, *range(len(self._obstacles))]
+        columns: dict[Any, int] = {}
         covered = {
             frozenset((pair.first, pair.second))
             for pair in shape.pairs
@@ -110,6 +134,7 @@ class Hulls:
                 _required(constraint),
             )
             pairs, numbers = self._pairs_of(constraint, names, of_links=of_links)
+            # Parts of the same link share a column: its distance is the least of theirs.
             indices = [
                 columns.setdefault((names[a], names[b]), len(columns))
                 for a, b in pairs.tolist()
@@ -125,40 +150,18 @@ class Hulls:
                     for a, b in pairs.tolist()
                 ]
                 self._uncovered.append((pairs[np.array(uncovered, bool)], required))
-        # of pairs of links or of a link and an obstacle [m], shape (m,): required
-        # distances, and accepted violations
-        self.min_distances, accepted = np.full((2, len(columns)), -np.inf)
+        return len(columns)
+
+    def _set_distances(self, constraints: list[Any], count: int) -> None:
+        """Set required distances [m], shape (m,), and how far they may be violated, of links with links or obstacles."""
+        self.min_distances, accepted = np.full((2, count), -np.inf)
+        # Of several constraints of one pair the largest values hold.
         for constraint, group in zip(constraints, self._groups, strict=True):
             np.maximum.at(self.min_distances, group.columns, group.required)
             np.maximum.at(
                 accepted, group.columns, group.required - _tolerance(constraint)
             )
         self.tolerances = self.min_distances - accepted
-        # largest required distances from obstacles and of links from each other [m];
-        # None without such a constraint
-        self.obstacle_distance, (added_to_links, added_to_object) = _largest(
-            constraints, RobotClearance, ObjectContact
-        )
-        self.self_distance, added = _largest(
-            constraints, SelfClearance, ObjectClearance
-        )
-        self.checker = None
-        if library is not None and robot.n <= MAX_JOINTS:
-            of_parts = dict.fromkeys(shape.joints, added_to_links) | {
-                HELD_OBJECT: added_to_object
-            }
-            names_of_pairs = (
-                frozenset((pair.first, pair.second)) for pair in shape.pairs
-            )
-            of_pairs = {pair: added[HELD_OBJECT in pair] for pair in names_of_pairs}
-            self.checker = CollisionChecker(library, robot, shape, of_parts, of_pairs)
-        self._axes = np.array([joint.axis for joint in robot.chain.joints])
-        self._sliding = np.array(robot.prismatic)
-        supports = [list(joints) for joints in robot.model.supports]
-        # Joint j moves body b if it is among the joints between the base and b.
-        self._moves = np.array(
-            [[joint in above for joint in range(1, robot.n + 1)] for above in supports]
-        )
 
     def _pairs_of(
         self, constraint: Any, names: list[Any], *, of_links: bool
@@ -372,6 +375,23 @@ class Hulls:
         self._bodies.place(
             *self._kinematics.poses(q), solids_of(self._obstacles, obstacle_poses)
         )
+
+
+def _make_checker(
+    library: CDLL,
+    robot: Robot,
+    shape: Shape,
+    added_to_parts: list[float],
+    added_to_pairs: list[float],
+) -> CollisionChecker:
+    """Return the compiled checker, with required distances [m] added to (links, held object), of parts and pairs."""
+    added_to_links, added_to_object = added_to_parts
+    of_parts = dict.fromkeys(shape.joints, added_to_links) | {
+        HELD_OBJECT: added_to_object
+    }
+    names = (frozenset((pair.first, pair.second)) for pair in shape.pairs)
+    of_pairs = {pair: added_to_pairs[HELD_OBJECT in pair] for pair in names}
+    return CollisionChecker(library, robot, shape, of_parts, of_pairs)
 
 
 def _required(constraint: Any) -> float:

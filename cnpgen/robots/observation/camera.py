@@ -62,6 +62,7 @@ class Camera:
         """Rows: the unit vector forward, and the vectors from the center to the right and the lower edge at 1 m."""
         forward = np.subtract(self.target, self.position, dtype=float)
         forward /= np.linalg.norm(forward)
+        # Where the camera looks up or down, y takes the place of the vertical.
         up = (
             (0.0, 0.0, 1.0)
             if math.hypot(*forward[:2]) > MIN_VIEW_DISTANCE_M
@@ -84,6 +85,7 @@ def depth_image(primitives: Primitives, camera: Camera) -> Array:
 
     Pixels that see no body have inf. Bodies that contain the camera are not seen.
     """
+    # Centers of pixels in [-1, 1].
     x, y = (
         (2 * np.arange(count) + 1) / count - 1
         for count in (camera.width, camera.height)
@@ -91,11 +93,13 @@ def depth_image(primitives: Primitives, camera: Camera) -> Array:
     forward, right, down = camera.axes
     rays = (forward + x[None, :, None] * right + y[:, None, None] * down).reshape(-1, 3)
     depth = np.full(len(rays), np.inf)
+    # In the frame of each body, where its faces are coordinate planes.
     for index in range(len(primitives)):
         rotation, size = primitives.rotations[index], primitives.sizes[index]
         origin = (np.array(camera.position) - primitives.centers[index]) @ rotation
         mesh, local = primitives.mesh(index), rays @ rotation
-        local[np.abs(local) < MIN_RAY] = MIN_RAY  # rays along a face
+        # Rays along a face.
+        local[np.abs(local) < MIN_RAY] = MIN_RAY
         hits = (
             [mesh.entries(origin, local)]
             if mesh
@@ -115,6 +119,8 @@ def depth_points(depth: Array, camera: Camera, count: int, seed: np.uint64) -> A
     seen = np.flatnonzero(np.isfinite(depth))
     if not len(seen):
         return np.full((count, 3), np.nan)
+    # The same offset for all points: one in each of ``count`` equal sections of the
+    # list.
     places = ((np.arange(count) + unit_offset(seed)) / count * len(seen)).astype(
         np.int64
     )
@@ -130,14 +136,16 @@ def _hits(kind: str, size: Array, origin: Array, ray: Array) -> list[Array]:
     """Return where rays enter the parts of a body, in lengths of the rays, shape (P,) each; nan for none."""
     with np.errstate(all="ignore"):
         if kind == "box":
+            # Slabs: center and half width of the time that a ray spends between two
+            # faces.
             center, width = -origin / ray, np.abs(size / ray)
             return [_entry((center - width).max(axis=1), (center + width).min(axis=1))]
         radius, half = size[0], size[1]
         a = (ray[:, :2] ** 2).sum(axis=1)
         f = ray[:, :2] @ origin[:2]
-        root = np.sqrt(
-            f**2 - a * (origin[:2] @ origin[:2] - radius**2)
-        )  # nan: no intersection
+        # Quadratic a t^2 + 2 f t + |o|^2 - r^2 = 0 in the plane across the axis.
+        # Nan: no intersection.
+        root = np.sqrt(f**2 - a * (origin[:2] @ origin[:2] - radius**2))
         enter, leave = (-f - root) / a, (-f + root) / a
         if kind == "cylinder":
             center, width = -origin[2] / ray[:, 2], np.abs(half / ray[:, 2])

@@ -212,7 +212,8 @@ class BasisPoints(Observation):
     @property
     def positions(self) -> Array:
         """The points, a Kronecker sequence [m], shape (points, 3)."""
-        root = 1.2207440846057596  # of x^4 = x + 1
+        # Of x^4 = x + 1.
+        root = 1.2207440846057596
         steps = np.arange(1, self.points + 1)[:, None] / root ** np.arange(1, 4)
         return np.asarray(
             np.array(self.low) + (steps + 0.5) % 1.0 * np.subtract(self.high, self.low)

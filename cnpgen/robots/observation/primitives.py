@@ -56,6 +56,8 @@ class ConvexMesh:
 
     def distances(self, points: Array) -> Array:
         """Return the signed distances of points [m], shape (P, 3), negative inside, shape (P,)."""
+        # Inside a hull the largest plane distance is the depth; outside it is a lower
+        # bound.
         distances: Array = (points @ self.planes[:, :3].T + self.planes[:, 3]).max(
             axis=1
         )
@@ -68,6 +70,8 @@ class ConvexMesh:
         smallest = np.full(len(points), np.inf)
         for corner, first, second in self.triangles:
             normal = np.cross(first, second)
+            # Edges in order around the triangle, so that ``normal x edge`` points
+            # inwards.
             ends = (
                 (corner, first),
                 (corner + first, second - first),
@@ -78,6 +82,7 @@ class ConvexMesh:
                 offset @ np.cross(normal, edge) >= 0
                 for offset, (_, edge) in zip(offsets, ends, strict=True)
             ]
+            # Over the triangle: distance from its plane; else from the nearest edge.
             to_plane = (offsets[0] @ normal) ** 2 / (normal @ normal)
             to_edges = [
                 _squared_from_segment(offset, edge)
@@ -93,13 +98,14 @@ class ConvexMesh:
         """Return where rays from an origin [m], shape (P, 3), enter, in ray lengths, shape (P,); nan for none."""
         enter, leave = np.full(len(rays), -np.inf), np.full(len(rays), np.inf)
         for plane in self.planes:
+            # A ray enters through planes that it approaches, and leaves through the
+            # others.
             speed = rays @ plane[:3]
             with np.errstate(all="ignore"):
                 crossing = -(plane[:3] @ origin + plane[3]) / speed
             enter = np.where(speed < 0, np.fmax(enter, crossing), enter)
-            leave = np.where(
-                speed < 0, leave, np.fmin(leave, crossing)
-            )  # -inf for rays along a face, outside of it
+            # -inf for rays along a face, outside of it
+            leave = np.where(speed < 0, leave, np.fmin(leave, crossing))
         return np.where(enter <= leave, enter, np.nan)
 
 
@@ -119,6 +125,7 @@ def convex_mesh(address: str) -> ConvexMesh:
         (corners.max(axis=0) + corners.min(axis=0)) / 2,
         np.ptp(corners, axis=0) / 2,
     )
+    # Relative to the center of the bounding box: sizes and centers are then consistent.
     hull = ConvexHull(corners - center)
     first, second, third = (hull.points[index] for index in hull.simplices.T)
     planes = hull.equations[
@@ -128,6 +135,7 @@ def convex_mesh(address: str) -> ConvexMesh:
             ]
         )
     ]
+    # A corner and two edges, the form that distances and areas need.
     triangles = np.stack([first, second - first, third - first], axis=1)
     areas = np.linalg.norm(np.cross(triangles[:, 1], triangles[:, 2]), axis=1) / 2
     return ConvexMesh(center, half, hull.points, triangles[areas > MIN_AREA_M2], planes)
@@ -234,6 +242,8 @@ def _fill(
     else:
         half = np.linalg.norm(rest[:, :3], axis=1)
         rotation[:] = frames_along(rest[:, :3], half)
+        # ``rest[:, 3]`` is the radius of the prism's corners; the cylinder is inside
+        # it.
         size[:, 0] = rest[:, 3] * (
             math.cos(math.pi / PRISM_SIDES) if obstacle.kind == "cylinder" else 1.0
         )
@@ -250,10 +260,12 @@ def scene_primitives(scenes: Scene | Sequence[Sequence[Obstacle]]) -> Primitives
             scenes.obstacles, scenes.poses[:, : pose_width(scenes.obstacles)]
         )
         bodies.kinds[bodies.centers[:, :, 2] <= PARKED_POSITION_M[2] / 2] = (
-            NO_BODY  # meshes have another center
+            # Meshes have another center.
+            NO_BODY
         )
         return bodies
-    known: dict[int, Primitives] = {}  # problems of one scene share its obstacles
+    # Problems of one scene share its obstacles.
+    known: dict[int, Primitives] = {}
     for obstacles in scenes:
         if id(obstacles) not in known:
             known[id(obstacles)] = primitives_of(obstacles, place_obstacles(obstacles))
@@ -269,6 +281,7 @@ def padded(scenes: Sequence[Primitives]) -> Primitives:
     for index, scene in enumerate(scenes):
         count = len(scene)
         codes = [MESH + meshes.setdefault(mesh, len(meshes)) for mesh in scene.meshes]
+        # Codes of meshes are renumbered, since scenes have different lists of meshes.
         kinds[index, :count] = np.array([*range(MESH), *codes, NO_BODY])[scene.kinds]
         centers[index, :count] = scene.centers
         rotations[index, :count], sizes[index, :count] = scene.rotations, scene.sizes
@@ -301,6 +314,7 @@ def signed_distances(primitives: Primitives, points: Array) -> Array:
             int(primitives.kinds[index]),
             primitives.sizes[index],
         )
+        # Chunks of points whose temporary arrays fit the cache.
         for first in range(0, len(points), POINTS_PER_CHUNK):
             part = slice(first, first + POINTS_PER_CHUNK)
             local = (points[part] - primitives.centers[index]) @ primitives.rotations[
@@ -334,7 +348,8 @@ def _distance(kind: int, size: Array, local: Array) -> Array:
         return _outside_or_inside(
             np.stack([radial, np.abs(local[:, 2]) - half], axis=1)
         )
-    along = np.clip(local[:, 2], -half, half)  # half is 0 for a sphere
+    # half is 0 for a sphere
+    along = np.clip(local[:, 2], -half, half)
     return np.asarray(
         np.sqrt(local[:, 0] ** 2 + local[:, 1] ** 2 + (local[:, 2] - along) ** 2)
         - radius
@@ -343,5 +358,6 @@ def _distance(kind: int, size: Array, local: Array) -> Array:
 
 def _outside_or_inside(gaps: Array) -> Array:
     """Return the distance from a product of intervals, or of a disc and an interval, from the gap along each."""
+    # Outside: length of the vector of positive gaps; inside: the largest, negative gap.
     outside = np.linalg.norm(np.maximum(gaps, 0), axis=1)
     return np.asarray(np.where(outside > 0, outside, gaps.max(axis=1)))

@@ -10,9 +10,8 @@ from cnpgen.robots.shape.hull import Array
 
 Seeds = NDArray[np.uint64]
 
-STEPS = np.array(
-    [3242174889, 2447445414], np.uint32
-)  # 2^32 / g and 2^32 / g^2 with g^3 = g + 1: low discrepancy
+# 2^32 / g and 2^32 / g^2 with g^3 = g + 1: low discrepancy
+STEPS = np.array([3242174889, 2447445414], np.uint32)
 _GOLDEN, _FIRST, _SECOND = (
     np.uint64(x) for x in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
 )
@@ -29,6 +28,7 @@ def mixed(values: Seeds) -> Seeds:
 
 def scene_seeds(seed: int, count: int) -> Seeds:
     """Return the seeds of scenes, shape (count,)."""
+    # The seed of a scene depends on its index, not on the number of scenes.
     return mixed(
         mixed(np.full(count, seed, np.uint64)) ^ np.arange(count, dtype=np.uint64)
     )
@@ -63,13 +63,17 @@ class _Patch:
     def points(self, u: Array, v: Array) -> Array:
         """Return points from coordinates in [0, 1), shape (P, 3)."""
         if self.form == "triangle":
-            far = u > 1 - v  # in the other half of the parallelogram
+            # In the other half of the parallelogram.
+            far = u > 1 - v
+            # The other half of the parallelogram is reflected, which keeps the density
+            # uniform.
             u, v = np.where(far, 1 - u, u), np.where(far, 1 - v, v)
         if self.form in ("flat", "triangle"):
             return np.asarray(
                 self.base + u[:, None] * self.axes[0] + v[:, None] * self.axes[1]
             )
         angle = 2 * np.pi * (u - 0.5)
+        # Uniform in area: sqrt on a disc, and height on a sphere (Archimedes).
         scale = {
             "side": np.ones_like(v),
             "disc": np.sqrt(v),
@@ -98,6 +102,8 @@ def surface_points(primitives: Primitives, count: int, seed: np.uint64) -> Array
     if not patches:
         return np.full((count, 3), np.nan)
     total = np.cumsum([patch.area for patch in patches])
+    # Systematic rounding: cumulative areas plus one random offset give numbers of
+    # points that add up to ``count``.
     ends = np.minimum(
         (total / total[-1] * count + unit_offset(seed)).astype(np.int64), count
     )
@@ -111,6 +117,7 @@ def surface_points(primitives: Primitives, count: int, seed: np.uint64) -> Array
             [start >> np.uint64(32), start & np.uint64(0xFFFFFFFF)], np.uint32
         )
         with np.errstate(over="ignore"):
+            # Wrapping 32-bit integers are fractional parts of the Kronecker sequence.
             steps = np.asarray(
                 first + np.arange(number, dtype=np.uint32)[:, None] * STEPS, np.uint32
             )

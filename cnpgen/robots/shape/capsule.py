@@ -57,11 +57,14 @@ def covering_capsule(convex_parts: Sequence[ConvexPart]) -> Capsule:
     normals, offsets = _facets(corners, thickness)
 
     def finished(ends: Array) -> Capsule:
+        # Rounded ends and a radius rounded up: the capsule still covers every corner.
         first, second = np.round(ends / ROUNDING_STEP_M) * ROUNDING_STEP_M
         radius = ROUNDING_STEP_M * np.ceil(
             (_distances(corners, first, second)[0] + thickness).max() / ROUNDING_STEP_M
             + 1e-9
         )
+        # Radius plus the excess of an end over a facet bounds the distance from the
+        # hull.
         excess = (np.array([first, second]) @ normals.T - offsets).max()
         return Capsule(
             convex_parts[0].link, first, second, float(radius), float(radius + excess)
@@ -91,6 +94,8 @@ def _facets(corners: Array, thickness: Array) -> tuple[Array, Array]:
     """Return normals, shape (F, 3), and offsets [m] of the facets of a hull of balls around the corners."""
     from scipy.spatial import ConvexHull
 
+    # Balls around corners as points: their hull is that of the thick part, up to the
+    # grid.
     half = half_sphere(BALL_POINTS // 2)
     directions = np.concatenate([half, -half])
     balls = [
@@ -112,13 +117,18 @@ def _axes(corners: Array) -> Array:
 
 def _along(axis: Array, corners: Array, thickness: Array) -> Array:
     """Return the ends of the minimum capsule along an axis, shape (2, 3), by a circle (Badoiu and Clarkson 2003)."""
-    across = np.linalg.svd(axis[None])[2][1:]  # two unit vectors orthogonal to the axis
+    # Right singular vectors of a row: the first is the axis, the others are across it.
+    across = np.linalg.svd(axis[None])[2][1:]
     projection = corners @ across.T
     center = projection.mean(axis=0)
     for step in range(1, 100):
         away = projection - center
+        # Towards the farthest point by 1 / (k + 1): converges to the center of the
+        # smallest circle.
         center = center + away[np.argmax(np.hypot(*away.T) + thickness)] / (step + 1)
     along, off = corners @ axis, np.hypot(*(projection - center).T)
+    # A ball at height h is covered by a cap whose end is within sqrt(R^2 - off^2) of
+    # it, with R the radius that is left for its center.
     reach = np.sqrt(np.maximum(((off + thickness).max() - thickness) ** 2 - off**2, 0))
     low, high = (along + reach).min(), (along - reach).max()
     low, high = (low, high) if low < high else ((low + high) / 2,) * 2
@@ -130,6 +140,7 @@ def _distances(
 ) -> tuple[Array, Array, Array]:
     """Return distances of points from a segment [m], unit vectors away from it, and phases of the closest points."""
     along = second - first
+    # A segment without length is a point; the floor then gives phase 0.
     where = np.clip((points - first) @ along / max(float(along @ along), 1e-18), 0, 1)
     away = points - first - np.outer(where, along)
     distance = np.linalg.norm(away, axis=1)
@@ -148,6 +159,8 @@ def _improved(
     for _ in range(MAX_CAPSULE_ROUNDS):
         covered = _distances(corners, *ends)[0] + thickness
         excess = (ends @ normals.T - offsets).max(axis=0)
+        # Cutting set: only corners and facets that were violated most so far are
+        # constraints.
         near = np.union1d(near, np.argsort(-covered, kind="stable")[:POINTS_PER_ROUND])
         facets = np.union1d(
             facets, np.argsort(-excess, kind="stable")[:POINTS_PER_ROUND]
@@ -166,11 +179,15 @@ def _solved(
 
     facets, zeros = len(normals), np.zeros_like(normals)
     linear = np.block([[-normals, zeros], [zeros, -normals]])
+    # Unknowns: both ends (6), radius r and excess t. The facets' constraints are
+    # linear.
     facet_gradients = np.concatenate(
         [linear, np.zeros((2 * facets, 1)), np.ones((2 * facets, 1))], axis=1
     )
 
     def margins(x: Array) -> Array:
+        # r - thickness - distance from the segment >= 0, with the gradient of the
+        # closest point.
         near = x[6] - thickness - _distances(corners, x[:3], x[3:6])[0]
         return np.concatenate([near, x[7] + np.tile(offsets, 2) + linear @ x[:6]])
 

@@ -79,6 +79,7 @@ def convex_parts(
         else keep / f"parts-{_identity(points, triangles, most)}.npz"
     )
     if kept is not None:
+        # A damaged entry is computed again.
         with suppress(ValueError):
             return _read(read_entry(kept))
     parts = [
@@ -102,9 +103,11 @@ def _identity(points: Array, triangles: NDArray[np.int64], most: int) -> str:
 
 def cut_parts(mesh: TriangleMesh, most: int) -> list[TriangleMesh]:
     """Cut a mesh into at most so many parts whose convex hulls have a small total volume; triangles are cut, too."""
+    # Splits stop where the hulls get hardly smaller.
     least = MIN_VOLUME_REDUCTION * mesh.hull_volume
     cuts = [_best_cut(mesh)]
     while len(cuts) < most:
+        # Greedy: the part whose best cut removes most volume.
         best = max(range(len(cuts)), key=lambda index: cuts[index].reduction)
         if cuts[best].reduction <= least:
             break
@@ -126,6 +129,7 @@ def _best_cut(part: TriangleMesh) -> _Cut:
 def _cut_positions(coordinates: Array) -> list[float]:
     """Return positions of planes: evenly between both ends, and those of most points, such as faces across the axis."""
     low, high = float(coordinates.min()), float(coordinates.max())
+    # Faces across the axis are natural cuts; evenly spaced planes find the others.
     even = np.linspace(low, high, CUTS_PER_AXIS + 2)[1:-1]
     faces, counts = np.unique(
         np.round(coordinates / FACE_TOLERANCE_M), return_counts=True
@@ -144,13 +148,16 @@ def cut_mesh(
     """Cut a mesh by a plane across axis 0, 1 or 2 at a position [m] into the triangles below and above it."""
     height = mesh.points[:, axis] - position
     upper = height[mesh.triangles] > 0
+    # Triangles on both sides of the plane are cut into one tip and a quadrilateral.
     crossing = upper.any(axis=1) & ~upper.all(axis=1)
     is_tip_upper = upper[crossing].sum(axis=1) == 1
+    # Alone on its side.
     tip = np.where(
         is_tip_upper, upper[crossing].argmax(axis=1), upper[crossing].argmin(axis=1)
-    )  # alone on its side
+    )
     order = (tip[:, None] + np.arange(3)) % 3
     a, b, c = np.take_along_axis(mesh.triangles[crossing], order, axis=1).T
+    # Linear interpolation of the height: the point where an edge meets the plane.
     on_ab, on_ac = (
         mesh.points[a]
         + (height[a] / (height[a] - height[end]))[:, None]
@@ -160,6 +167,7 @@ def cut_mesh(
     points, count = np.concatenate([mesh.points, on_ab, on_ac]), len(mesh.points)
     ab, ac = count + np.arange(len(a)), count + len(a) + np.arange(len(a))
     tips = np.stack([a, ab, ac], axis=1)
+    # The quadrilateral becomes two triangles.
     rests = np.concatenate(
         [np.stack([ab, b, c], axis=1), np.stack([ab, c, ac], axis=1)]
     )

@@ -15,13 +15,11 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-CUBE = np.array(
-    list(product((-0.5, 0.5), repeat=3))
-)  # corners of the unit cube centered at the origin
+# Corners of the unit cube centered at the origin.
+CUBE = np.array(list(product((-0.5, 0.5), repeat=3)))
 MAX_PLANES = 24  # that approximate the faces of a hull
-SIMILAR_PLANES_COSINE = math.cos(
-    math.radians(3)
-)  # of the angle below which planes are equivalent
+# Of the angle below which planes are equivalent.
+SIMILAR_PLANES_COSINE = math.cos(math.radians(3))
 # Coplanar points are extended by this on both sides, so that they have a hull.
 MIN_THICKNESS_M = 1e-6
 MAX_CORNERS = 10_000  # of a body; finer meshes take minutes without benefit
@@ -54,8 +52,10 @@ def hull_corners(points: Array) -> Array:
     """
     from scipy.spatial import ConvexHull
 
+    # Sorted and without repetitions, so the order of the input does not matter.
     points = np.unique(points, axis=0)
     offsets = points - points.mean(axis=0)
+    # Qhull needs a volume: thicken along every principal axis that has no extent.
     for axis in np.linalg.eigh(offsets.T @ offsets)[1].T:
         if np.ptp(offsets @ axis) < MIN_THICKNESS_M:
             points = np.concatenate(
@@ -72,6 +72,7 @@ def outward_triangles(points: Array) -> NDArray[np.int64]:
     hull = ConvexHull(points)
     triangles: NDArray[np.int64] = hull.simplices.astype(np.int64)
     a, b, c = (points[triangles[:, i]] for i in range(3))
+    # Qhull's triangles have either orientation; its facet normals point outwards.
     inwards = np.einsum("fi,fi->f", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
     triangles[inwards] = triangles[inwards][:, ::-1]
     return triangles
@@ -89,6 +90,7 @@ def enclosing_hull(corners: Array) -> tuple[Array, float]:
     center, extent = corners.mean(axis=0), np.ptp(corners, axis=0)
     scaled, half = (corners - center) / extent, half_sphere(ENCLOSING_PLANES // 2)
     normals = np.concatenate([half, -half])
+    # Slightly outside, so that rounding does not cut a corner off.
     offsets = (normals @ scaled.T).max(axis=1) + 1e-9
     found = HalfspaceIntersection(
         np.column_stack([normals, -offsets]), np.zeros(3)
@@ -113,6 +115,7 @@ def enclosing_hull(corners: Array) -> tuple[Array, float]:
 
 def half_sphere(count: int) -> Array:
     """Return unit vectors on a Fibonacci lattice over the upper half of the sphere, shape (count, 3)."""
+    # Equal areas: heights are equidistant and longitudes differ by the golden angle.
     z = (np.arange(count) + 0.5) / count
     angle, level = np.arange(count) * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - z**2)
     return np.stack([level * np.cos(angle), level * np.sin(angle), z], axis=1)
@@ -128,10 +131,13 @@ def supporting_planes(corners: Array) -> Array:
     from scipy.spatial import ConvexHull
 
     normals: Array = ConvexHull(corners).equations[:, :3]
-    nearest = np.abs(normals).max(axis=1)  # cosine of the angle to the nearest axis
+    # Bounding boxes have the planes along the axes already.
+    # Cosine of the angle to the nearest axis.
+    nearest = np.abs(normals).max(axis=1)
     taken: list[Array] = []
     while len(taken) < MAX_PLANES and nearest.min() < SIMILAR_PLANES_COSINE:
         taken.append(normals[np.argmin(nearest)])
+        # Farthest-point sampling of the normals.
         nearest = np.maximum(nearest, normals @ taken[-1])
     found = np.array(taken).reshape(-1, 3)
     return np.column_stack([found, (found @ corners.T).max(axis=1)])
@@ -181,6 +187,7 @@ def frame_along(vector: Sequence[float], length: float) -> Array:
     if length == 0.0:
         return np.eye(3)
     x, y, z = vector[0] / length, vector[1] / length, vector[2] / length
+    # Without a branch at z = -1: the sign of z selects one of two charts.
     sign = math.copysign(1.0, z)
     a = -1.0 / (sign + z)
     b = x * y * a

@@ -100,6 +100,8 @@ def measure_hull_gap(
         poses, _reference_bodies(urdf, path, packages, model), shape.joints
     )
     overlaps = {}
+    # Pairs that always touch are left out by the judge; their meshes show whether they
+    # should be.
     for pair in shape.pairs:
         if pair.left_out in ("", "always"):
             of_parts = parts.of(pair.first, pair.second)
@@ -109,6 +111,7 @@ def measure_hull_gap(
             )
     checked = [overlap for pair, overlap in overlaps.items() if not pair.left_out]
     free, accepted = np.ones(GAP_STATES, bool), np.ones(GAP_STATES, bool)
+    # Over all pairs: free by the meshes, accepted by the convex parts.
     for of_parts, of_meshes in checked:
         free, accepted = free & ~of_meshes, accepted & ~of_parts
     rejected = {
@@ -116,18 +119,9 @@ def measure_hull_gap(
         for pair, (part, _) in overlaps.items()
     }
     gaps = [
-        (
-            pair,
-            PairGap(
-                pair.first,
-                pair.second,
-                float(part.mean()),
-                float(mesh.mean()),
-                rejected[pair],
-            ),
-        )
+        (pair, PairGap(pair.first, pair.second, float(part.mean()), float(mesh.mean()), rejected[pair]))
         for pair, (part, mesh) in overlaps.items()
-    ]
+    ]  # fmt: skip
     return HullGap(
         free=int(free.sum()),
         rejected=int((free & ~accepted).sum()),

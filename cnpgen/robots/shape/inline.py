@@ -58,7 +58,8 @@ def with_inline_meshes(
     """
     try:
         tree = urdf_tree(urdf)
-    except ValueError:  # the reader of the robot raises the error
+    except ValueError:
+        # The reader of the robot raises the error.
         return urdf
     elements = [
         (link, element)
@@ -94,7 +95,8 @@ def with_inline_meshes(
         tree.find(".//collision/geometry/capsule") is not None
         and tree.get("version", "1.0") < _CAPSULES
     )
-    if unversioned:  # the URDF parser would ignore capsules, with warnings on stderr
+    if unversioned:
+        # The URDF parser would ignore capsules, with warnings on stderr.
         tree.set("version", _CAPSULES)
     return (
         ElementTree.tostring(tree, encoding="unicode")

@@ -82,12 +82,14 @@ def find_pairs(
     links; ``joints`` are indices, 0 for fixed links. Adjacent links have only links
     without a shape between them. An SRDF may disable pairs.
     """
+    # A fixed seed: pairs must be the same on every machine.
     rotations, positions = sample_poses(model, SAMPLED_STATES)
     contact = LinkContact(
         (rotations, positions), map(body_of_part, convex_parts), joints
     )
     found = []
     for first, second in combinations(capsules, 2):
+        # Links of one joint do not move relative to each other.
         if joints[first] == joints[second]:
             continue
         names = frozenset((first, second))
@@ -196,6 +198,7 @@ class LinkContact:
     def of(self, first: str, second: str, *, among: Mask | None = None) -> Mask:
         """Return a mask of the states, among all or those of a mask, in which two links overlap, shape (K,)."""
         hit = np.zeros(self._positions.shape[1], bool)
+        # Balls first: only states in which they overlap need Coal.
         for one, other in product(self._of_link[first], self._of_link[second]):
             centers = [
                 self._rotations[self._joints[link]] @ body.center
@@ -206,6 +209,8 @@ class LinkContact:
                 np.linalg.norm(centers[0] - centers[1], axis=1)
                 < one.radius + other.radius
             )
+            # Once two parts overlap, the links do; further parts need only the other
+            # states.
             for k in np.flatnonzero(
                 near & ~hit if among is None else near & ~hit & among
             ):
@@ -254,6 +259,7 @@ def segment_distances(a: Array, b: Array, c: Array, d: Array) -> Array:
         for x, y in ((one, one), (other, other), (one, other))
     )
     ar, br = (np.einsum("ki,ki->k", x, between) for x in (one, other))
+    # Minimize |r + s u - t v|^2; parallel segments keep s = 0 and t follows.
     s = np.clip((ab * br - ar * bb) / np.maximum(aa * bb - ab**2, 1e-18), 0, 1)
     t = np.clip((ab * s + br) / np.maximum(bb, 1e-18), 0, 1)
     s = np.clip((ab * t - ar) / np.maximum(aa, 1e-18), 0, 1)

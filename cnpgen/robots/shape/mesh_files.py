@@ -13,9 +13,8 @@ from cnpgen.schema.units import show
 _PACKAGE = ("package", "model")  # URI schemes that begin with the name of a package
 _SEARCHED = ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH")
 MAX_PACKAGE_DEPTH = 3  # folders above a URDF that may be its package under another name
-_EXTRAS = {
-    "example-robot-data": "robots"
-}  # Python packages of robots -> cnpgen's extra that installs them
+# Python packages of robots -> cnpgen's extra that installs them
+_EXTRAS = {"example-robot-data": "robots"}
 
 
 def find_urdf(name: str, problem: Path, packages: Sequence[Path] = ()) -> Path:
@@ -92,9 +91,8 @@ def _places(name: str, beside: Path, packages: Sequence[Path]) -> Iterator[Path]
             yield folder / package / rest
             if folder.name == package:
                 yield folder / rest
-        for folder in list(beside.parents)[
-            :MAX_PACKAGE_DEPTH
-        ]:  # the package under another name
+        # The package under another name.
+        for folder in list(beside.parents)[:MAX_PACKAGE_DEPTH]:
             yield folder / rest
     elif parts.scheme == "file":
         yield Path(unquote(parts.path))
@@ -119,11 +117,12 @@ def _of_distribution(name: str) -> Iterator[Path]:
         installed = metadata.distribution(name)
     except (metadata.PackageNotFoundError, ValueError):
         return
+    # The first one is used by packages of Pinocchio.
     for folder in (
         "cmeel.prefix/share",
         "share",
         "",
-    ):  # the first one is used by packages of Pinocchio
+    ):
         yield Path(str(installed.locate_file(folder)))
 
 

@@ -146,6 +146,8 @@ def _cached(
     name = f"shape-{hashlib.sha256(json.dumps([SHAPE_REVISION, *numbers]).encode()).hexdigest()[:32]}.json"
     if keep is not None and (entry := read_entry(keep / name)) is not None:
         with suppress(ValueError, KeyError, TypeError, RecursionError):
+            # The cache is not trusted: capsules must cover the parts, or they are
+            # computed again.
             return _read(json.loads(entry), convex_parts)
     capsules, pairs = compute()
     if keep is not None:
@@ -287,6 +289,8 @@ def with_held_object(
         _box(size, chain.tip_rotation, chain.tip_translation),
         np.array(size) / 2,
     )
+    # The capsule along the longest edge has the smallest radius: half the diagonal
+    # across.
     widest = int(np.argmax(half))
     axis, radius = (
         half[widest] * chain.tip_rotation[:, widest],

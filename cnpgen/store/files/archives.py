@@ -36,8 +36,8 @@ def read_arrays(
 
     Args:
         source: Path of the archive, or its bytes.
-        max_bytes: Largest size of the decoded arrays, which is compared before they are
-            read.
+        max_bytes: Largest size of the decoded arrays as floats of 8 bytes, which is
+            compared before they are read.
         stored: Whether compressed arrays are refused.
 
     Raises:
@@ -50,7 +50,8 @@ def read_arrays(
         try:
             with zipfile.ZipFile(file) as archive:
                 members = archive.infolist()
-                size = sum(member.file_size for member in members)
+                _check(sum(member.file_size for member in members), max_bytes)
+                size = sum(_size_as_floats(archive, member) for member in members)
                 is_stored = all(m.compress_type == zipfile.ZIP_STORED for m in members)
                 _check(size, max_bytes, accepted=is_stored or not stored)
                 return {
@@ -64,7 +65,7 @@ def read_arrays(
             raise ArchiveError(f"{text:.300}") from error
 
 
-def _check(size: int, max_bytes: int, *, accepted: bool) -> None:
+def _check(size: int, max_bytes: int, *, accepted: bool = True) -> None:
     """Raise ArchiveError for too many bytes, and for arrays that are compressed if these are not accepted."""
     if size > max_bytes:
         raise ArchiveError(f"it holds {size:,} bytes, expected at most {max_bytes:,}")
@@ -72,8 +73,8 @@ def _check(size: int, max_bytes: int, *, accepted: bool) -> None:
         raise ArchiveError("its arrays are compressed")
 
 
-def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
-    """Read one array whose header states no more values than the archive has."""
+def _size_as_floats(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> int:
+    """Return the bytes of an array with at least 8 per value; its header states no more values than the archive has."""
     with archive.open(member) as content:
         read_header = _HEADERS[np.lib.format.read_magic(content)]
         shape, _, dtype = read_header(content)
@@ -82,5 +83,10 @@ def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[An
             raise ArchiveError(
                 f"array {member.filename!r} states {size:,} values of {dtype}, which it does not hold"
             )
+        return size * max(dtype.itemsize, 8)
+
+
+def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
+    """Read one array."""
     with archive.open(member) as content:
         return np.asarray(np.lib.format.read_array(content, allow_pickle=False))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
-from cnpgen.store.files.size_limits import MAX_TABLE_BYTES, MAX_TABLE_COLUMNS
+from cnpgen.store.files.size_limits import MAX_TABLE_COLUMNS, MAX_TEXT_TABLE_BYTES
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,9 @@ def read_csv_table(path: Path, *, example: str) -> CsvTable:
     A table that is too large, not UTF-8, or has no columns, equal ones, or rows of
     another length raises DatasetError.
     """
-    if (size := path.stat().st_size) > MAX_TABLE_BYTES:
+    if (size := path.stat().st_size) > MAX_TEXT_TABLE_BYTES:
         raise DatasetError(
-            f"{path} has {size:,} bytes, expected a table of at most {MAX_TABLE_BYTES:,}"
+            f"{path} has {size:,} bytes, expected a table of at most {MAX_TEXT_TABLE_BYTES:,}"
         )
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:

@@ -16,8 +16,11 @@ MAX_DIMENSIONS = 4  # of a dataset
 MAX_NAMES = 10_000  # of datasets in a file, or of attributes
 MAX_ATTRIBUTE_BYTES = 1 << 24  # of an attribute; the largest ones are URDFs
 
-# CSV
-MAX_TABLE_BYTES = 1 << 28
+# tables; a laptop with 8 GB reads all of them
+MAX_TABLE_BYTES = 1 << 28  # of binary ones
+# CSV, and JSON with samples: they take up to 40 times their size while they are read.
+MAX_TEXT_TABLE_BYTES = 1 << 26
+MAX_TEXT_ARRAY_BYTES = 1 << 28  # of a column of texts, as wide as the longest one
 MAX_TABLE_COLUMNS = 1_000
 
 # JSON

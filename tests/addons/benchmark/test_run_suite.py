@@ -29,7 +29,9 @@ from cnpgen.addons.benchmark.process import (
     cpu_time_of,
 )
 from cnpgen.addons.benchmark.result_tables import (
+    csv_text,
     failure_summaries,
+    markdown_text,
     notes,
     save_benchmark_tables,
     table_rows,
@@ -416,6 +418,22 @@ def test_an_unsuitable_planner_is_reported_as_not_applicable(tmp_path: Path) -> 
     assert on_a_plant["applicability"] == ["not executed", "not applicable"]
 
 
+@pytest.mark.parametrize("suite", ["hits-81", "heavy-100", "clutter"])
+def test_tables_have_only_what_applies_to_their_suite(suite: str) -> None:
+    problems = load_suite(suite).problems(1)[0]
+    row = {"answer": None, "ending": "no plan", "error": "", "problem": 0}
+    row |= {"planning_s": 1.0, "planning_cpu_s": 1.0}
+    benchmark = Benchmark(load_suite(suite), problems, None, {"some": [row]})
+    heads = [head for head, *_ in table_rows(benchmark, "")]
+    has_rules = suite != "clutter"
+    assert ("planned motion valid by the paper's rules" in heads) == has_rules
+    head = csv_text(benchmark).partition("\n")[0].split(",")
+    assert ("paper_valid" in head) == has_rules
+    assert "valid" in head
+    text = markdown_text(benchmark)
+    assert ("A hit succeeds if" in text) == (suite == "hits-81")
+
+
 def test_answers_are_read_back_exactly(tmp_path: Path) -> None:
     problem = load_suite("hits-81").problems(1)[0]
     trajectory = Trajectory(
@@ -649,7 +667,8 @@ def test_a_report_covers_the_folder_and_nothing_else(
     assert [run.planners for run in benchmark.runs] == [("cnpgen",), (random,)]
     save_benchmark_tables(benchmark, folder)
     lines = (folder / "results.csv").read_text().splitlines()
-    csv_rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
+    assert lines[0].startswith("suite,suite_version,planner,")
+    csv_rows = list(csv.DictReader(lines))
     assert [(row["planner"], row["problem"]) for row in csv_rows] == [
         (random, "0"), (random, "1"), ("cnpgen", "0"), ("cnpgen", "1"), ("cnpgen", "2"),
     ]  # fmt: skip
@@ -657,7 +676,7 @@ def test_a_report_covers_the_folder_and_nothing_else(
         float(csv_rows[2]["planning_ms"])
         == 1e3 * benchmark.results["cnpgen"][0]["planning_s"]
     )
-    for name in ("results.csv", "tables.md", "tables.tex"):
+    for name in ("tables.md", "tables.tex"):
         text = (folder / name).read_text()
         for needed in (
             benchmark.runs[-1].date,
@@ -668,8 +687,12 @@ def test_a_report_covers_the_folder_and_nothing_else(
             assert needed in text, (name, needed)
     assert "| planned | random | cnpgen |" in (folder / "tables.md").read_text()
     latex = (folder / "tables.tex").read_text()
-    assert r"planned & random & cnpgen \\" in latex
-    assert re.search(r"(?<!\\)%", re.sub(r"^%.*$", "", latex, flags=re.M)) is None
+    assert re.search(r"^planner & a plan was found & .*\\\\$", latex, re.MULTILINE)
+    assert re.findall(r"^(random|cnpgen) & 2 of 2|^(cnpgen) & 3 of 3", latex, re.M)
+    assert r"\label{tab:hits-81}" in latex
+    assert r"\caption{" in latex
+    bare = re.sub(r"^%.*$|\{!\}\{%$", "", latex, flags=re.M)
+    assert re.search(r"(?<!\\)%", bare) is None
     with pytest.raises(
         UsageError, match="reference must be one of cnpgen, random, got 'solve'"
     ):

@@ -2,8 +2,10 @@
 
 import hashlib
 import json
+import re
 import sys
 import warnings
+from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,11 +16,14 @@ import numpy as np
 import pytest
 
 import cnpgen
+from cnpgen.addons.hub.card_problem import limits_table, what_samples_prove
 from cnpgen.addons.hub.publish import publish_dataset, upload_files
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
 from cnpgen.make.make_dataset import make_dataset
+from cnpgen.store.field import Field
 from cnpgen.store.files.written_files import LIST
+from tests.examples.store import SPEC
 
 RECIPE = """
 name = "hits"
@@ -65,14 +70,71 @@ def test_a_dry_run_writes_card_tables_and_dataset(
     assert cnpgen.validate_dataset(out / "hdf5").ok
     card = (out / "README.md").read_text()
     for text in ('license: "mit"', 'path: "parquet/train/*.parquet"', "Made by A. Author.", "@misc{hits}",
-                 "Notes of the author.", 'load_dataset("lab/hits")', 'f"hdf5/{split}/shard'):  # fmt: skip
+                 "Notes of the author.", 'load_dataset("lab/hits")', 'f"hdf5/{split}/shard',
+                 'cnpgen.load_dataset("hf://datasets/lab/hits@main")', "](picture.png)"):  # fmt: skip
         assert text in card, text
+    assert (out / "picture.png").read_bytes().startswith(b"\x89PNG")
     before = (out / "parquet" / "train" / "00000.parquet").stat().st_mtime_ns
     assert (
         main(["publish", str(dataset), "--to", "lab/hits", "--dry-run", "-o", str(out)])
         == 0
     )
     assert (out / "parquet" / "train" / "00000.parquet").stat().st_mtime_ns == before
+
+
+def test_the_card_states_limits_constraints_frame_date_and_what_a_sample_proves(
+    dataset: Path,
+) -> None:
+    card = (dataset / "README.md").read_text()
+    robot = cnpgen.load_dataset(dataset).spec.robot
+    for name, limit in zip(
+        robot["joint_names"], robot["limits"]["velocity_limit"], strict=True
+    ):
+        assert re.search(rf"\| `{name}` \|.* \| {limit:.5g} rad/s \|", card)
+    assert "| `table` | tolerance 0.001, x [0.6, 2], y [-0.45, 0.45]" in card
+    assert "- frame: positions in the frame `world`, tip link `striker_tip`" in card
+    created = json.loads((dataset / "manifest.json").read_text())["created"]
+    assert f"- date: {created[:10]}" in card
+    assert "does not prove that a valid motion connects" in card
+    assert "picture.png" not in card  # only a published repository has the file
+
+
+def test_a_card_of_certified_samples_claims_a_plan() -> None:
+    spec = replace(SPEC, recipe={"pipeline": {"stage": [{"use": "certified-plan"}]}})
+    assert "Every sample has a plan" in what_samples_prove(spec)
+    assert "does not prove that a valid motion" not in what_samples_prove(spec)
+
+
+def test_limits_of_sliding_joints_are_in_meters() -> None:
+    fields = [Field("start_q", "rad, m", "positions", 2, ("turn", "slide"))]
+    keys = ["position_lower", "position_upper", "velocity_limit"]
+    keys += ["acceleration_limit", "torque_limit"]
+    limits = {key: [1.0, 2.0] for key in keys}
+    robot = {"joint_names": ["turn", "slide"], "limits": limits}
+    table = limits_table(replace(SPEC, fields=tuple(fields), robot=robot))
+    assert "| `slide` | 2 ... 2 m | 2 m/s | 2 m/s^2 | 2 N |" in table
+
+
+def test_croissant_has_creator_citation_record_sets_and_components_before_publishing(
+    dataset: Path,
+) -> None:
+    croissant = json.loads((dataset / "croissant.json").read_text())
+    assert croissant["creator"]["name"] == "A. Author"
+    assert croissant["citeAs"] == "@misc{hits}"
+    assert [item["name"] for item in croissant["recordSet"]] == ["train", "validation"]
+    names = {item["@id"] for item in croissant["distribution"]}
+    fields = cnpgen.load_dataset(dataset).spec.fields
+    for records in croissant["recordSet"]:
+        assert [item["name"] for item in records["field"]] == [f.name for f in fields]
+        assert {item["source"]["fileSet"]["@id"] for item in records["field"]} <= names
+    measured = {item["name"]: item for item in croissant["variableMeasured"]}
+    field = cnpgen.load_dataset(dataset).fields["start_xyz"]
+    assert field.valid_min is not None
+    assert field.valid_max is not None
+    for name, low, high in zip("xyz", field.valid_min, field.valid_max, strict=True):
+        item = measured[f"start_xyz.{name}"]
+        assert (item["minValue"], item["maxValue"]) == (low, high)
+        assert item["unitText"] == "m"
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from cnpgen.errors import UsageError
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.problems.problem_record import open_problem
+from cnpgen.results import HitOptions
 from tests.conftest import Arm
 
 TARGET = np.array([2.49, 0.0])  # m
@@ -143,7 +144,7 @@ def test_pucks_that_touch_the_mallet_before_the_meeting_have_a_reason(planner, s
         TARGET,
         puck_velocity=crossing[1],
         meeting_time=0.9,
-        puck_model=model,
+        options=HitOptions(puck_model=model),
     )
     assert free.reasons == ("",)
     through = (
@@ -157,7 +158,7 @@ def test_pucks_that_touch_the_mallet_before_the_meeting_have_a_reason(planner, s
         TARGET,
         puck_velocity=through[1],
         meeting_time=2.057,
-        puck_model=model,
+        options=HitOptions(puck_model=model),
     )
     assert met.reasons == ("early contact with the puck",)
 
@@ -179,7 +180,12 @@ def test_the_mallet_meets_moving_pucks_at_the_time_of_the_contact(
     planner, still, pucks
 ):
     hits = plan_hits(
-        planner, still, pucks[0], TARGET, puck_velocity=pucks[1], speed_share=0.95
+        planner,
+        still,
+        pucks[0],
+        TARGET,
+        puck_velocity=pucks[1],
+        options=HitOptions(speed_share=0.95),
     )
     assert len(hits.plans) >= 35
     assert set(hits.reasons) <= {
@@ -241,8 +247,8 @@ def test_ways_back_continue_hits_without_a_jump_and_are_valid(planner, still, pu
         pucks[0],
         TARGET,
         puck_velocity=pucks[1],
-        speed_share=0.95,
         home=planner.robot.home,
+        options=HitOptions(speed_share=0.95),
     )
     assert evaluate_plans(hits.return_plans).valid.all()
     sequences = hits.sequences

@@ -12,6 +12,7 @@ from cnpgen.make.complete import complete
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.planner import Planner
 from cnpgen.problems.problem_record import open_problem
+from cnpgen.results import HitOptions
 from tests.conftest import Arm
 
 PUCKS = np.array(
@@ -31,6 +32,16 @@ def state(planner) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     given = draw_boundary_problems("airhockey-replan", 4, seed=11).boundary
     plans = planner.plan_batch(given)
     return plans.states_at(0.4 * plans.duration)
+
+
+def test_the_speed_is_accepted_as_a_keyword_for_one_version(planner, state):
+    new = plan_hits(planner, state, PUCKS, TARGET, options=HitOptions(speed_share=0.5))
+    with pytest.warns(DeprecationWarning, match="options=HitOptions") as warned:
+        old = plan_hits(planner, state, PUCKS, TARGET, speed_share=0.5)
+    assert warned[0].filename == __file__
+    np.testing.assert_array_equal(
+        old.plans.path_control_points, new.plans.path_control_points
+    )
 
 
 def test_a_hit_equals_pipeline_completion_and_planning(planner, state):
@@ -59,7 +70,9 @@ def test_a_hit_equals_pipeline_completion_and_planning(planner, state):
 
 
 def test_the_mallet_meets_the_puck_on_the_line_to_the_target(planner, state):
-    found = plan_hits(planner, state, PUCKS, TARGET, speed_share=0.5)
+    found = plan_hits(
+        planner, state, PUCKS, TARGET, options=HitOptions(speed_share=0.5)
+    )
     arm = Arm(open_problem(planner.model.problem)[1])
     for row, number in enumerate(found.plans.sample_id):
         q, dq = (
@@ -184,16 +197,20 @@ def test_a_missing_direction_and_numbers_that_are_not_finite_raise_errors(
     ):
         plan_hits(planner, state, PUCKS[3], PUCKS[3])
     with pytest.raises(UsageError, match="speed_share must be finite"):
-        plan_hits(planner, state, PUCKS, TARGET, speed_share=np.nan)
+        plan_hits(planner, state, PUCKS, TARGET, options=HitOptions(speed_share=np.nan))
     with pytest.raises(
         UsageError, match="contact_distance must be a finite number, got nan"
     ):
-        plan_hits(planner, state, PUCKS, TARGET, contact_distance=np.nan)
+        plan_hits(
+            planner, state, PUCKS, TARGET, options=HitOptions(contact_distance=np.nan)
+        )
     with pytest.raises(
         UsageError,
         match=r"contact_distance must be 0.07 m, as in the problem's constraint",
     ):
-        plan_hits(planner, state, PUCKS, TARGET, contact_distance=0.05)
+        plan_hits(
+            planner, state, PUCKS, TARGET, options=HitOptions(contact_distance=0.05)
+        )
 
 
 def test_a_start_that_touches_the_puck_has_this_reason(planner, state):

@@ -16,6 +16,7 @@ from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.join import JoinedPlans, join_plans
 from cnpgen.problems.problem_record import open_problem
+from cnpgen.results import HitOptions
 from tests.conftest import Arm
 
 TARGET = [2.49, 0.0]  # m
@@ -29,7 +30,9 @@ def planner() -> Planner:
 
 def hit_and_return(planner: Planner, state, puck) -> JoinedPlans:
     """A hit and the way back to the base configuration."""
-    hit = plan_hits(planner, state, puck, TARGET, speed_share=SHARE).plans
+    hit = plan_hits(
+        planner, state, puck, TARGET, options=HitOptions(speed_share=SHARE)
+    ).plans
     q, dq, ddq = hit.states_at(hit.duration)
     return join_plans(
         hit, planner.plan(q, planner.robot.home, start_dq=dq, start_ddq=ddq)

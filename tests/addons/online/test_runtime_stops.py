@@ -4,7 +4,6 @@ import threading
 import time
 
 import numpy as np
-import pinocchio as pin
 import pytest
 
 from cnpgen.addons.online.motion_check import MotionChecker
@@ -14,12 +13,9 @@ from cnpgen.addons.online.set_points import sample_motion
 from cnpgen.addons.online.stops import earliest_stop
 from cnpgen.addons.online.switches import SwitchOutcome
 from cnpgen.errors import UsageError
-from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.planner import Planner
-from cnpgen.plans.evaluate import evaluate_plans
-from cnpgen.plans.plans import Plans
-from cnpgen.problems.problem_record import open_problem
 from tests.conftest import some
+from tests.faults.stop_orders import check_states, run_orders, valid_plans
 
 TARGET = [2.49, 0.0]  # m
 TICK_S = 1e-3
@@ -41,36 +37,6 @@ def executing(planner) -> PlanRuntime:
     return runtime
 
 
-def valid_plans(name: str, count: int) -> tuple[Planner, list[Plans]]:
-    """Plans from rest to rest of a shipped model that are valid."""
-    planner = Planner(name)
-    problems = draw_boundary_problems(name, count, seed=7)
-    plans = planner.plan_batch(problems.boundary, columns=problems.columns)
-    valid = np.flatnonzero(evaluate_plans(plans).valid)
-    return planner, [plans[[row]] for row in valid]
-
-
-def check_states(problem, parameters, times, states) -> None:
-    """Check states at equal distances by an integration and by the inverse dynamics of Pinocchio."""
-    robot = open_problem(problem)[1]
-    q, dq, ddq = states
-    step = np.diff(times)[:, None]
-    # The integrals of a cubic through derivatives at both ends: errors of step^4.
-    speed = dq[0] + np.cumsum((ddq[1:] + ddq[:-1]) / 2 * step, axis=0)
-    travel = (dq[1:] + dq[:-1]) / 2 * step - (ddq[1:] - ddq[:-1]) / 12 * step**2
-    np.testing.assert_allclose(speed, dq[1:], atol=2e-3)
-    np.testing.assert_allclose(q[0] + np.cumsum(travel, axis=0), q[1:], atol=1e-6)
-    factors = dict(zip(robot.parameters.names, parameters, strict=True))
-    assert (np.abs(dq) <= 1.002 * robot.velocity_limit).all()
-    assert (np.abs(ddq) <= 1.005 * robot.acceleration_limit).all()
-    model, data = robot.model, robot.model.createData()
-    if "payload_mass" not in factors:
-        for state in zip(q[::5], dq[::5], ddq[::5], strict=True):
-            assert (
-                np.abs(pin.rnea(model, data, *state)) <= 1.006 * robot.torque_limit
-            ).all()
-
-
 def distance_from_path(q, path) -> float:
     """The largest distance of positions from a densely sampled path [rad]."""
     return max(np.abs(path - row).max(axis=1).min() for row in q)
@@ -88,7 +54,7 @@ def test_a_stop_is_on_the_path_within_the_limits_and_never_later_than_the_motion
     assert stop.time == at
     assert at < stop.end_time == executing.end_time <= end
     states = executing.state_at(times)
-    check_states(planner.model.problem, [], times, states)
+    check_states(planner.model.problem, times, states)
     assert distance_from_path(states.q[::10], path) < 1e-3
     travelled = np.abs(np.diff(executing.state_at(times).q, axis=0)).sum(axis=0)
     np.testing.assert_allclose(stop.distance, travelled, atol=1e-4)
@@ -113,7 +79,7 @@ def test_stops_of_transports_and_among_obstacles_are_valid(name):
             assert not checker.violation(stop, at, stop.end_time)
             times = np.arange(at, stop.end_time, TICK_S)
             if stop is not motion and len(times) > 1:
-                check_states(plan.problem, [], times, stop.at(times))
+                check_states(plan.problem, times, stop.at(times))
                 stops += 1
     assert stops > len(plans)
     assert len(plans) >= 3
@@ -185,7 +151,7 @@ def test_a_stop_that_comes_too_late_uses_a_kept_one(planner, executing, monkeypa
     assert 0.34 < stop.time <= 0.34 + 0.1
     assert stop.end_time < end
     times = np.arange(0.34, stop.end_time, TICK_S)
-    check_states(planner.model.problem, [], times, executing.state_at(times))
+    check_states(planner.model.problem, times, executing.state_at(times))
 
 
 def test_an_accepted_switch_is_not_dropped_silently(planner):
@@ -213,7 +179,7 @@ def test_motions_end_without_an_acceleration_and_report_the_additional_time(
     share = np.abs(states.ddq / planner.robot.acceleration_limit).max(axis=1)
     assert (share < [1.01, 0.3, 0.03, 0.003]).all()
     times = np.arange(0.0, end, TICK_S)
-    check_states(planner.model.problem, [], times, executing.state_at(times))
+    check_states(planner.model.problem, times, executing.state_at(times))
 
 
 def test_hits_with_a_way_back_are_accepted_by_default(planner):
@@ -309,66 +275,50 @@ def test_descending_times_booleans_and_nan_are_refused(executing, time):
         executing.stop(True)
 
 
-@pytest.fixture(scope="module")
-def transport() -> tuple[Planner, Plans]:
-    planner, plans = valid_plans("heavy-object", 4)
-    return planner, plans[0]
+def test_nothing_changes_after_a_stop_in_any_order_of_requests():
+    outcome = run_orders(5, seed=2026)
+    assert outcome.findings == []
+    assert outcome.requests["stop, ACCEPTED"] >= 2
 
 
-@pytest.mark.parametrize("seed", some(range(400), kept=4))
-def test_nothing_changes_after_a_stop_in_any_order_of_requests(transport, seed):
-    planner, there = transport
-    rng = np.random.default_rng(seed)
-    runtime = PlanRuntime(planner, there.boundary.start_q[0])
-    assert runtime.switch(there, 0.0).accepted
-    delays = rng.uniform(0.0, 0.02, 8)
+def test_a_stop_that_is_being_computed_is_finished_before_the_runtime_resumes(
+    planner, executing, monkeypatch
+):
+    from cnpgen.addons.online import plan_runtime
 
-    def make_plan(state):
-        time.sleep(float(rng.uniform(0.0, 0.03)))
-        if not state.dq.any():
-            return planner.plan(state.q, there.boundary.start_q[0])
-        return there if rng.uniform() < 0.5 else None
+    computing, go_on = threading.Event(), threading.Event()
 
-    at = rng.uniform(0.02, runtime.end_time, 6)
-    requests = [
-        lambda: runtime.replan(make_plan, at[0]),
-        lambda: runtime.replan(make_plan, runtime.end_time + at[1]),
-        lambda: runtime.switch(make_plan(runtime.state_at(at[2])), at[2]),
-        lambda: runtime.stop(at[3]),
-        lambda: runtime.stop(at[4]),
-        lambda: runtime.set_point(0.5 * at.min()),
-        lambda: runtime.close(timeout=0.01),
-    ]
-    if rng.uniform() < 0.5:
-        requests.pop()  # without a close
-    rng.shuffle(requests)
+    def slow(*arguments, **named):
+        computing.set()
+        assert go_on.wait(60)
+        return earliest_stop(*arguments, **named)
 
-    def later(request, delay):
-        time.sleep(delay)
-        try:
-            request()
-        except UsageError as error:
-            # A closed runtime refuses requests; a clock may be ahead of a request.
-            assert "closed" in str(error) or "must not be before" in str(error)  # noqa: PT017
-
+    monkeypatch.setattr(plan_runtime, "earliest_stop", slow)
+    end, home, stops = executing.end_time, planner.robot.home, []
     threads = [
-        threading.Thread(target=later, args=pair)
-        for pair in zip(requests, delays, strict=False)
+        threading.Thread(target=lambda: stops.append(executing.stop(0.2))),
+        threading.Thread(target=lambda: stops.append(executing.stop(0.3))),
+        threading.Thread(target=executing.resume, args=(home,), kwargs={"at": 9.0}),
     ]
-    for thread in threads:
+    threads[0].start()
+    assert computing.wait(60)
+    for thread in threads[1:]:
         thread.start()
+    time.sleep(0.1)
+    assert threads[2].is_alive()
+    assert executing.stopped
+    go_on.set()
     for thread in threads:
         thread.join(60)
-        assert not thread.is_alive()
-    stop = runtime.stop(9.9)  # the one that was accepted
-    times = np.arange(0.0, stop.end_time + 0.1, TICK_S)
-    first = runtime.state_at(times)
-    check_states(there.problem, [], times, first)
-    assert runtime.switch(there, 0.0).outcome in {
-        SwitchOutcome.STOPPED,
-        SwitchOutcome.CLOSED,
-    }
-    time.sleep(0.05)
-    for before, after in zip(first, runtime.state_at(times), strict=True):
-        np.testing.assert_array_equal(before, after)
-    runtime.close()
+    # The first stop is complete, whatever came after it.
+    assert stops[0].end_time < end
+    np.testing.assert_array_equal(executing.state_at(9.0).q, home)
+    at_end, later = executing.state_at([stops[0].end_time, 8.9]).q
+    np.testing.assert_array_equal(at_end, later)
+
+
+def test_the_motions_of_a_runtime_are_those_until_and_after_a_stop(planner, executing):
+    executing.stop(0.25)
+    starts = [motion.start for motion in executing._timeline]
+    assert starts == sorted(starts)
+    assert [motion.end_time for motion in executing._timeline][-1] == executing.end_time

@@ -1,6 +1,7 @@
 """Tables of other programs: names, times, units and separators, each read in one way or refused."""
 
 import json
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,14 @@ import pytest
 
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
-from cnpgen.trajectories import LoadedTrajectories, Trajectory, load_trajectories
+from cnpgen.trajectories import (
+    LoadedTrajectories,
+    LoadOptions,
+    Trajectory,
+    load_trajectories,
+)
 
+READING = {entry.name for entry in fields(LoadOptions)}
 HOME = np.array([-0.3, 0.6975, 0, -0.5049, 0, 1.9286])
 T = np.arange(0, 0.6001, 0.01)
 SHARE = 10 * (T / 0.6) ** 3 - 15 * (T / 0.6) ** 4 + 6 * (T / 0.6) ** 5
@@ -39,8 +46,9 @@ def table(
     return path
 
 
-def loaded(path: Path, **options: Any) -> LoadedTrajectories:
-    return load_trajectories(path, "airhockey", **options)
+def loaded(path: Path, **given: Any) -> LoadedTrajectories:
+    own = {name: given.pop(name) for name in READING & given.keys()}
+    return load_trajectories(path, "airhockey", options=LoadOptions(**own), **given)
 
 
 def only(path: Path, **options: Any) -> Trajectory:

@@ -17,7 +17,7 @@ from cnpgen.plans import Plans
 from cnpgen.plans.export import export_plans
 from cnpgen.plans.exporter import sample_plan
 from cnpgen.problems.scenes.yaml_document import MAX_YAML_DEPTH, read_yaml
-from cnpgen.trajectories import Decision, Trajectory, load_trajectories
+from cnpgen.trajectories import Decision, LoadOptions, Trajectory, load_trajectories
 from tests.examples.plan_files import plans_of
 from tests.examples.plans import load, perturbed
 
@@ -321,7 +321,10 @@ def test_a_table_in_degrees_with_a_rate_and_other_names(tmp_path: Path) -> None:
         [*np.rad2deg(Q).T, T],
     )
     loaded = load_trajectories(
-        file, "airhockey", joints=[f"axis{k}" for k in range(6)], unit="deg", rate=10
+        file,
+        "airhockey",
+        joints=[f"axis{k}" for k in range(6)],
+        options=LoadOptions(unit="deg", rate=10),
     )
     assert np.allclose(loaded.trajectories[0].q, Q)
     assert np.allclose(loaded.trajectories[0].t, np.arange(4) / 10)
@@ -332,15 +335,19 @@ def test_a_rate_must_agree_with_the_times_of_the_file(tmp_path: Path) -> None:
     """Otherwise a motion would be judged at another speed."""
     file = write_csv(tmp_path / "a.csv", ["t", *JOINTS], [T, *Q.T])
     rate = 1 / (T[1] - T[0])
-    (trajectory,) = load_trajectories(file, "airhockey", rate=rate).trajectories
+    (trajectory,) = load_trajectories(
+        file, "airhockey", options=LoadOptions(rate=rate)
+    ).trajectories
     assert np.allclose(trajectory.t, T)
     with pytest.raises(
         UsageError,
         match=r"rate must agree with the times of the file, got .*; t of .*a\.csv.* has steps",
     ):
-        load_trajectories(file, "airhockey", rate=2 * rate)
+        load_trajectories(file, "airhockey", options=LoadOptions(rate=2 * rate))
     without = write_csv(tmp_path / "b.csv", ["t", *JOINTS], [0 * T, *Q.T])
-    (trajectory,) = load_trajectories(without, "airhockey", rate=50).trajectories
+    (trajectory,) = load_trajectories(
+        without, "airhockey", options=LoadOptions(rate=50)
+    ).trajectories
     assert np.allclose(trajectory.t, np.arange(len(T)) / 50)
 
 
@@ -409,7 +416,7 @@ def test_a_column_separates_trajectories(tmp_path: Path) -> None:
     loaded = load_trajectories(
         write_csv(tmp_path / "a.csv", heads, columns),
         "airhockey",
-        separate_by="episode",
+        options=LoadOptions(separate_by="episode"),
     )
     first, second = loaded.trajectories
     assert np.allclose(first.q, Q)
@@ -422,7 +429,9 @@ def test_arrays_of_several_trajectories_and_wrapped_angles(tmp_path: Path) -> No
     turned = Q.copy()
     turned[2:, 0] -= 2 * np.pi
     np.savez(tmp_path / "a.npz", q=np.stack([Q, turned]), t=T)
-    loaded = load_trajectories(tmp_path / "a.npz", "airhockey", unwrap=True)
+    loaded = load_trajectories(
+        tmp_path / "a.npz", "airhockey", options=LoadOptions(unwrap=True)
+    )
     assert [np.allclose(trajectory.q, Q) for trajectory in loaded.trajectories] == [
         True,
         True,
@@ -524,7 +533,9 @@ def test_positions_in_degrees_are_refused_with_a_suggestion(tmp_path: Path) -> N
     message = r"median position of joint_2 must be from .* 40 deg = 0\.698 rad\? unit='deg' reads degrees"
     with pytest.raises(UsageError, match=message):
         load_trajectories(path, "airhockey")
-    (trajectory,) = load_trajectories(path, "airhockey", unit="deg").trajectories
+    (trajectory,) = load_trajectories(
+        path, "airhockey", options=LoadOptions(unit="deg")
+    ).trajectories
     assert trajectory.q[0, 1] == pytest.approx(np.deg2rad(40))
 
 
@@ -587,7 +598,9 @@ def test_a_file_with_a_stack_of_no_trajectories_is_an_error(
 ) -> None:
     np.savez(tmp_path / "none.npz", t=np.zeros((0, 5)), q=np.zeros((0, 5, 6)))
     with pytest.raises(UsageError, match="holds no trajectory"):
-        load_trajectories(tmp_path / "none.npz", "airhockey", unit=unit)
+        load_trajectories(
+            tmp_path / "none.npz", "airhockey", options=LoadOptions(unit=unit)
+        )
 
 
 def test_a_table_without_rows_is_an_error(tmp_path: Path) -> None:

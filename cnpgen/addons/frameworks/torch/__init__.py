@@ -2,7 +2,10 @@
 
 from cnpgen.errors import requires_extra
 
-with requires_extra("torch", "torch"):
+# Without this index, pip installs 4 GB of libraries for CUDA.
+_CPU_INDEX = " --extra-index-url https://download.pytorch.org/whl/cpu"
+
+with requires_extra("torch", "torch", _CPU_INDEX):
     from cnpgen.addons.frameworks.torch.tensor_boundary_layer import TensorBoundaryLayer
     from cnpgen.addons.frameworks.torch.tensor_loss import TensorLoss
     from cnpgen.addons.frameworks.torch.tensor_robot import TensorRobot

@@ -1,11 +1,11 @@
-"""C source of a kernel over the vectors of vectors.h: the reference that machine code is compared with."""
+"""C source of complete kernels, the reference of machine code: the same steps over vector types, by a C compiler."""
 
 from cnpgen.addons.deploy.statements import statements
 from cnpgen.kernels.c_library import VECTORS
 from cnpgen.kernels.tape import GridSpec, Tape
 
 
-def c_source(tape: Tape) -> str:
+def emit(tape: Tape) -> str:
     """Return the C source of a kernel.
 
     Without a grid the function is ``void kernel(long n, const real *const *in, const
@@ -63,6 +63,8 @@ def _emit_loop(tape: Tape) -> str:
             f"y[{component}]={value};" if result == 0 else f"e={value};"
         ),
     )
+    # Lanes that have converged must not change any more: a further step would round the
+    # state again, and the result would depend on the other lanes of the vector.
     return f"""void kernel(long n,const real*const*in,const long*ld,real*const*out){{
 const v one=K(1);
 for(long k=0;k<n;k+=W){{

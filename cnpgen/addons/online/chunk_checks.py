@@ -1,0 +1,122 @@
+"""Checks of raw action chunks: a chunk that no motion within the limits can follow is refused, not smoothed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cnpgen.addons.trajectories.refuted_limits import refuted_limits
+from cnpgen.addons.trajectories.sample_errors import SampleErrors
+from cnpgen.addons.trajectories.sampled_trajectory import Trajectory
+from cnpgen.errors import UsageError
+from cnpgen.judges.plans.joint_limits import joint_limits
+from cnpgen.problems.constraints.joint import JointPosition
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
+from cnpgen.schema.arguments import number, numbers
+from cnpgen.world.path import PathWorld
+
+Array = NDArray[np.float64]
+
+MIN_CHUNK_SAMPLES = 8  # of a chunk after the join: fewer have no reliable velocity
+MAX_DURATION = 1.2  # of a motion, in chunk lengths
+SAMPLE_ROUNDING = 1e-6  # samples
+
+
+class ChunkChecks:
+    """Checks of the chunks of one problem.
+
+    Args:
+        problem: The problem; its limits of velocities, accelerations and jerks apply.
+        robot: Its robot.
+        length: Number of samples of a chunk.
+        rate: Samples per second [Hz].
+        noise: Largest random error of the positions [rad].
+    """
+
+    def __init__(
+        self, problem: Problem, robot: Robot, *, length: int, rate: float, noise: float
+    ) -> None:
+        speeds = tuple(c for c in problem.constraint if type(c) is not JointPosition)
+        limited = replace(problem, constraint=speeds)
+        world = PathWorld(robot, problem.obstacle, problem.object_size)
+        self._limits = joint_limits(limited, world)
+        self._errors = SampleErrors(noise, 0.0, 0.0, 0.0, "")
+        self._times = np.arange(length) / rate
+        self._n, self._columns = robot.n, 0
+
+    def read(self, chunk: ArrayLike) -> tuple[Array, Array]:
+        """Return positions, shape (K, n), and the other columns, shape (K, D - n).
+
+        Raises:
+            UsageError: The shape is wrong, or differs from that of earlier chunks.
+        """
+        values = numbers("chunk", chunk)
+        length, n = len(self._times), self._n
+        if values.ndim != 2 or len(values) != length or values.shape[1] < n:
+            raise UsageError(
+                f"must have shape ({length}, D) with at least {n} columns, the joints,"
+                f" got {values.shape}",
+                argument="chunk",
+            )
+        if self._columns not in {0, values.shape[1]}:
+            raise UsageError(
+                f"has {values.shape[1]} columns, earlier ones have {self._columns}",
+                argument="chunk",
+            )
+        self._columns = values.shape[1]
+        return values[:, :n], values[:, n:]
+
+    def refuted(self, q: Array) -> str:
+        """Return a limit that no motion within the noise of samples, shape (K, n), meets; empty if none is proven."""
+        found = refuted_limits(self._limits, Trajectory(self._times, q), self._errors)
+        return f"{found[0].margin.name}: {found[0].detail}" if found else ""
+
+
+def bounded(name: str, value: float, low: float, high: float) -> float:
+    """Return an argument as a number from a least to a largest value."""
+    if not low <= (found := number(name, value)) <= high:
+        raise UsageError(
+            f"must be from {low:g} to {high:g}, got {found:g}", argument=name
+        )
+    return found
+
+
+def checked_state(measured: tuple[ArrayLike, ArrayLike], n: int) -> tuple[Array, Array]:
+    """Return measured positions and velocities, shape (n,) each; they may be nan."""
+    state = [numbers("measured", values) for values in measured]
+    shapes = [values.shape for values in state]
+    if shapes != [(n,), (n,)]:
+        raise UsageError(
+            f"must be positions and velocities of shape ({n},), got shapes {shapes}",
+            argument="measured",
+        )
+    return state[0], state[1]
+
+
+def checked_errors(tracking_error: ArrayLike, n: int) -> Array:
+    """Return positive tracking errors, shape (n,)."""
+    errors = numbers("tracking_error", tracking_error)
+    if errors.shape not in {(), (n,)} or not (errors > 0).all():
+        raise UsageError(
+            f"must be one positive number or {n} of them, got {tracking_error!r:.100}",
+            argument="tracking_error",
+        )
+    return np.broadcast_to(errors, (n,))
+
+
+def horizon(stop_after: float | None, length: int, rate: float) -> int:
+    """Return the number of samples that a motion follows, so that it rests after a time [s]."""
+    if stop_after is None:
+        return length
+    samples = int(stop_after / MAX_DURATION * rate + SAMPLE_ROUNDING) + 1
+    if samples < MIN_CHUNK_SAMPLES:
+        least = MAX_DURATION * (MIN_CHUNK_SAMPLES - 1) / rate
+        raise UsageError(
+            f"must be at least {least:.3g} s, the time of {MIN_CHUNK_SAMPLES} samples,"
+            f" got {stop_after:g}",
+            argument="stop_after",
+        )
+    return min(samples, length)
