@@ -3,6 +3,7 @@
 import ast
 import importlib.metadata
 import os
+import platform
 import re
 import shutil
 import subprocess
@@ -34,6 +35,8 @@ from cnpgen.addons.trajectories.trajectory_tables import read_trajectory_tables
 from cnpgen.addons.view import page
 from cnpgen.cli.main import build_parser
 from cnpgen.errors import MissingExtraError
+from cnpgen.kernels.c_library import VARIANTS
+from cnpgen.kernels.compiler import find_compiler
 from cnpgen.loader.dataset import make_frame
 from cnpgen.loader.load import load_dataset
 from cnpgen.machine.versions import DOCUMENTATION_URL
@@ -61,7 +64,9 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
     copy, out = tmp_path_factory.mktemp("copy"), tmp_path_factory.mktemp("wheel")
     for name in ("cnpgen", "problems", "pipelines", "datasets", "docs"):
         shutil.copytree(
-            ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__")
+            ROOT / name,
+            copy / name,
+            ignore=shutil.ignore_patterns("__pycache__", "built"),
         )
     for name in ("pyproject.toml", "hatch_build.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, copy)
@@ -113,6 +118,7 @@ def test_the_wheel_carries_every_recipe_and_robot(wheel: zipfile.ZipFile) -> Non
 def test_the_wheel_has_no_stray_files(wheel: zipfile.ZipFile) -> None:
     shipped = {name.removeprefix("cnpgen/_recipes/") for name in wheel.namelist()}
     assert not shipped.intersection(STRAY)
+    built = {name for name in shipped if name.startswith("cnpgen/kernels/built/")}
     tracked = (
         path
         for folder in ("cnpgen", "problems", "pipelines", "datasets", "docs")
@@ -123,7 +129,32 @@ def test_the_wheel_has_no_stray_files(wheel: zipfile.ZipFile) -> None:
         for path in tracked
         if path.is_file() and path.suffix != ".pyc"
     }
-    assert {name for name in shipped if ".dist-info/" not in name} <= expected
+    assert {name for name in shipped - built if ".dist-info/" not in name} <= expected
+
+
+def test_the_wheel_has_compiled_c_code_if_there_is_a_compiler(
+    wheel: zipfile.ZipFile,
+) -> None:
+    built = [
+        name.rpartition("/")[2]
+        for name in wheel.namelist()
+        if name.startswith("cnpgen/kernels/built/")
+    ]
+    (tag,) = re.findall(
+        r"^Tag: (.*)$",
+        wheel.read(f"cnpgen-{cnpgen.__version__}.dist-info/WHEEL").decode(),
+        re.MULTILINE,
+    )
+    if find_compiler() is None or platform.machine() not in VARIANTS:
+        assert built == []
+        assert tag == "py3-none-any"
+        return
+    names = "hull_rows", "observe", "step", "time_parametrization"
+    variants = VARIANTS[platform.machine()]
+    expected = [f"{name}-{one.name}" for name in names for one in variants]
+    assert sorted(name.rpartition("-")[0] for name in built) == sorted(expected)
+    assert tag.startswith("py3-none-")
+    assert tag != "py3-none-any"
 
 
 INSTALLED = """
@@ -451,7 +482,7 @@ def test_the_release_is_built_and_the_install_command_of_the_readme_works_with_i
         home,
     )
     (built,), (archive,) = dist.glob("*.whl"), dist.glob("*.tar.gz")
-    assert built.name == f"cnpgen-{cnpgen.__version__}-py3-none-any.whl"
+    assert built.name.startswith(f"cnpgen-{cnpgen.__version__}-py3-none-")
     assert archive.name == f"cnpgen-{cnpgen.__version__}.tar.gz"
     if importlib.util.find_spec("twine"):
         _checked(

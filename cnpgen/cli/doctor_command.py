@@ -2,8 +2,7 @@
 
 The report on stdout has all results, warnings and problems with their remedies;
 problems are also printed on stderr. The exit code is 3 if a required library does not
-work. Without a C compiler collisions, trees and refining are slower. 'cnpgen docs
-troubleshooting' has more remedies.
+work. 'cnpgen docs troubleshooting' has more remedies.
 """
 
 import argparse
@@ -55,6 +54,7 @@ def machine_text(report: "MachineReport") -> str:
         "HDF5": report.hdf5,
         "variables": settings or "no variable that changes cnpgen is set",
         "code generator": report.generator or "none",
+        "handwritten C": report.handwritten,
         "compiler": report.compiler or "none",
         "backend": f"{report.backend or 'none'}: {report.backend_reason}",
         "cache": f"{report.cache_folder} ({_cache(report)})",

@@ -32,6 +32,7 @@ from cnpgen.errors import (
 from cnpgen.machine import versions
 from cnpgen.machine.threads import prefer_one_thread
 from cnpgen.schema import addons
+from cnpgen.schema.foreign_paths import foreign_path_hint
 
 _DESCRIPTION = "Generate and verify datasets for kinodynamic motion planning, train planners and optimize plans."
 
@@ -207,9 +208,10 @@ def _explain(
         return [" ".join(error.text(shell_spelling(options)).split())], error.exit_code
     code = MachineError.exit_code
     if isinstance(error, ImportError):
-        return [
-            f"{error}; 'cnpgen doctor' checks this installation, 'cnpgen docs troubleshooting' lists causes"
-        ], code
+        causes = "'cnpgen doctor' checks this installation, 'cnpgen docs troubleshooting' lists causes"
+        hint = foreign_path_hint()
+        remedy = hint if hint and hint not in str(error) else causes
+        return [" ".join(f"{error}; {remedy}".split())], code
     if isinstance(error, MemoryError):
         return ["out of memory; fewer --workers need less"], code
     if isinstance(error, OSError) and error.strerror:

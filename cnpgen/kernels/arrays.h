@@ -1,7 +1,12 @@
 /* Arrays of doubles and compiled kernels, for handwritten C source; vectors.h precedes this file. A spline and its
-derivatives at the phases of a grid are sums of basis functions times control points: calls of `add`. */
+derivatives at the phases of a grid are sums of basis functions times control points: calls of `add`.
+
+Results have the same bits on every processor: products and sums are rounded one by one (-ffp-contract=off), and sums
+are formed in LANES lanes, of one vector or of PARTS vectors. */
 
 #define EACH(i, from, to) for (long i = (from); i < (to); i++)
+#define LANES 4
+#define PARTS (LANES / W)
 
 typedef void kernel(long n, const double *const *in, const long *distances, double *const *out);
 
@@ -10,9 +15,7 @@ I void put(double *p, v x) { *(vu *)p = x; }
 
 /* Whether a lane of a mask is set. */
 I int any_lane(vi mask) {
-#if defined(HAVE_BUILTINS) && defined(__AVX512F__)
-  return __builtin_ia32_ptestmq512(mask, mask, -1) != 0;
-#elif defined(HAVE_BUILTINS)
+#ifdef HAVE_BUILTINS
   return !__builtin_ia32_ptestz256(mask, mask);
 #else
   integer set = 0;

@@ -22,8 +22,8 @@ from cnpgen.store.files.cache_folder import default_cache_folder, temporary_fold
 _LINKER_FLAGS = (
     ("-Wl,-undefined,dynamic_lookup",) if platform.system() == "Darwin" else ()
 )  # for Python's C API
-COMPILER_FLAGS = (
-    "-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-w",
+COMPILER_FLAGS = (  # no contraction to fused operations: equal bits on all processors
+    "-std=gnu11", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-w",
     *_LINKER_FLAGS,
 )  # fmt: skip
 # The largest kernels, of some MB of source, take minutes on a busy machine.
@@ -183,7 +183,7 @@ def target() -> str:
     return f"{platform.system()}-{platform.machine()}-{hashlib.sha256(flags.encode()).hexdigest()[:8]}"
 
 
-def vector_flags() -> tuple[str, ...]:
+def native_flags() -> tuple[str, ...]:
     """Return the flags for the vector instructions of this machine."""
     return (
         "-mcpu=native"
@@ -192,18 +192,15 @@ def vector_flags() -> tuple[str, ...]:
     )
 
 
-def flags_of(level: str) -> tuple[str, ...]:
-    """Return all compiler flags at an optimization level."""
-    return (*COMPILER_FLAGS, level, *vector_flags())
-
-
-def run_compiler(compiler: str, level: str, source: Path, built: Path) -> None:
-    """Compile C source to a shared library.
+def run_compiler(
+    compiler: str, flags: tuple[str, ...], source: Path, built: Path
+) -> None:
+    """Compile C source to a shared library with ``COMPILER_FLAGS`` and further flags.
 
     Raises:
         MachineError: The compiler fails, or takes too long for the size of the source.
     """
-    options = [*flags_of(level), str(source), "-o", str(built), "-lm"]
+    options = [*COMPILER_FLAGS, *flags, str(source), "-o", str(built), "-lm"]
     seconds = min(
         MIN_COMPILE_LIMIT_S + round(LIMIT_S_PER_BYTE * source.stat().st_size),
         MAX_COMPILE_TIME_S,

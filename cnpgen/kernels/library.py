@@ -15,7 +15,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from cnpgen.errors import MachineError, UsageError
-from cnpgen.kernels.c_library import load_library
+from cnpgen.kernels.c_library import ARRAYS, load_library
 from cnpgen.kernels.compiled_kernel import CompiledGridKernel, CompiledKernel
 from cnpgen.kernels.interpreted_kernel import (
     InterpretedGridKernel,
@@ -41,7 +41,6 @@ from cnpgen.store.files.cache_folder import (
 Backend = Literal["compiled", "numpy", "casadi"]
 BACKENDS: tuple[Backend, ...] = ("compiled", "numpy", "casadi")
 PACKAGE_FOLDER = Path(__file__).parents[1]
-ARRAYS = Path(__file__).with_name("arrays.h")
 # Imported by builders of any package.
 BUILDER_PACKAGES = "robots", "kernels", "problems", "trajectory"
 # Benchmarks/generator.py: 9 to 24.
@@ -122,7 +121,8 @@ class KernelLibrary:
     def load_source(self, *paths: Path) -> ctypes.CDLL | None:
         """Return the library of C source that follows ``arrays.h``.
 
-        None if the backend is not "compiled", or, after a warning, without a C compiler.
+        None if the backend is not "compiled", or, after a warning, if the package lacks the
+        library and there is no C compiler.
         """
         if self.backend != "compiled":
             return None

@@ -46,11 +46,7 @@ typedef long long integer;
 
 /* GCC's builtin functions, if available: reading immintrin.h takes longer than compiling a small kernel. */
 #if defined(__has_builtin) && !defined(__clang__)
-#ifdef __AVX512F__
-#if __has_builtin(__builtin_ia32_sqrtpd512_mask) && __has_builtin(__builtin_ia32_maxpd512_mask)
-#define HAVE_BUILTINS
-#endif
-#elif defined(__AVX__)
+#ifdef __AVX__
 #if __has_builtin(__builtin_ia32_sqrtpd256) && __has_builtin(__builtin_ia32_maxpd256)
 #define HAVE_BUILTINS
 #endif
@@ -62,14 +58,7 @@ typedef long long integer;
 #if defined(__AVX__) && !defined(HAVE_BUILTINS)
 #include <immintrin.h>
 #endif
-#ifdef __AVX512F__
-#define BYTES 64
-#ifdef HAVE_BUILTINS
-#define WIDE(name, ...) ({ v none = none; FUNCTION(__builtin_ia32_, name, SUFFIX, 512_mask)(__VA_ARGS__, none, -1, 4); })
-#else
-#define WIDE(name, ...) (v)FUNCTION(_mm512_, name, _, SUFFIX)(__VA_ARGS__)
-#endif
-#elif defined(__AVX__)
+#ifdef __AVX__
 #define BYTES 32
 #ifdef HAVE_BUILTINS
 #define WIDE(name, ...) FUNCTION(__builtin_ia32_, name, SUFFIX, 256)(__VA_ARGS__)

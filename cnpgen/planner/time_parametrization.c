@@ -5,7 +5,7 @@ of drives, + linear r. */
 typedef struct {
   long joints, pose_width, path_points, points; /* numbers; control points of p and of r */
   long linear;                                  /* whether rows have linear coefficients */
-  long phases, rows, first, last, moves;        /* phases in full vectors; movable control points */
+  long phases, rows, first, last, moves;        /* phases in full blocks of LANES; movable control points */
   const double *path, *rate;                    /* bases of p and r, (orders, control points, phases) */
   const double *lower, *upper;                  /* (rows,) */
   const long *path_span, *span;                 /* phases where a point is active, (control points, 2) */
@@ -22,7 +22,7 @@ typedef struct {
   double *coefficients;         /* constant, square, mixed, maybe linear, (3 or 4, rows, K) */
   double *b, *b1;               /* direction of r and r', (K,) */
   double *violations, *before;  /* (K,); control points of r, (points,) */
-  double *critical;             /* (rows, W) */
+  double *critical;             /* (rows, LANES) */
 } workspace;
 
 /* The smallest x > 0 with q x^2 + l x = margin; infinite if there is none. */
@@ -31,12 +31,9 @@ I v smallest(v margin, v l, v q) {
   return pick(below > K(0), 2 * margin / below, K(INFINITY));
 }
 
-I double largest(v x) {
-  double values[W];
-  put(values, x);
-  for (int half = W / 2; half; half /= 2)
-    EACH(i, 0, half) values[i] = values[i] > values[i + half] ? values[i] : values[i + half];
-  return values[0];
+I double smallest_of(double x, v y) {
+  EACH(l, 0, W) x = x < y[l] ? x : y[l];
+  return x;
 }
 
 /* r^2, r r' and r at W phases as quadratics of the step of r along b. */
@@ -79,35 +76,57 @@ I limits with_bound(limits found, v margin, v l, v q) {
   return found;
 }
 
+/* Which of the bounds of a row may be exceeded at LANES phases within steps of `up`: 1 above, 2 below. */
+I int may_exceed(const direction *d, const double *a, long size, int has_linear, double low, double high, double up) {
+  int bounds = 0;
+  EACH(part, 0, PARTS) {
+    quadratic f = along(d[part], a + part * W, size, has_linear);
+    v change = largest_change(f, up);
+    if (any_lane(f.g - high + change > K(0))) bounds |= 1;
+    if (any_lane(low - f.g + change > K(0))) bounds |= 2;
+  }
+  return bounds;
+}
+
 /* Largest step of r along b within the bounds, or the required step back: `advance` of time_parametrization.py. The
 compiler makes one function for each value of has_linear. */
 I double advance_rows(const parametrization *p, const workspace *m, long from, long to, int has_linear) {
   const double *restrict lower = p->lower, *restrict upper = p->upper, *restrict coefficients = m->coefficients;
-  double *restrict critical = m->critical, up = p->max_increase;
-  long rows = p->rows, phases = p->phases, size = rows * phases, steps = (to - from) / W;
-  limits found = {K(up), K(0), K(0) != K(0)};
+  double *restrict critical = m->critical, up = p->max_increase, back = 0;
+  long rows = p->rows, phases = p->phases, size = rows * phases, steps = (to - from) / LANES;
+  limits found[PARTS];
+  EACH(part, 0, PARTS) found[part] = (limits){K(up), K(0), K(0) != K(0)};
   EACH(i, 0, steps) { /* from the centre outwards: outer phases rarely limit the step further */
-    long k = from + (steps / 2 + (i % 2 ? -(i + 1) / 2 : i / 2)) * W;
-    direction d = direction_at(m, k);
+    long k = from + (steps / 2 + (i % 2 ? -(i + 1) / 2 : i / 2)) * LANES;
+    direction d[PARTS];
     v worst = K(-1);
-    EACH(row, 0, rows) {
-      quadratic f = along(d, coefficients + row * phases + k, size, has_linear);
-      v violation = larger(f.g - upper[row], lower[row] - f.g) + largest_change(f, up);
-      put(critical + row * W, violation);
-      worst = larger(violation, worst);
+    EACH(part, 0, PARTS) {
+      d[part] = direction_at(m, k + part * W);
+      EACH(row, 0, rows) {
+        quadratic f = along(d[part], coefficients + row * phases + k + part * W, size, has_linear);
+        v violation = larger(f.g - upper[row], lower[row] - f.g) + largest_change(f, up);
+        put(critical + row * LANES + part * W, violation);
+        worst = larger(violation, worst);
+      }
     }
     if (!any_lane(worst > K(0))) continue;
-    EACH(row, 0, rows) if (any_lane(at(critical + row * W) > K(0))) { /* few: roots and divisions take most of the time */
-      quadratic f = along(d, coefficients + row * phases + k, size, has_linear);
-      v above = f.g - upper[row], below = lower[row] - f.g, change = largest_change(f, up);
-      if (any_lane(above + change > K(0))) found = with_bound(found, -above, f.l, f.q);
-      if (any_lane(below + change > K(0))) found = with_bound(found, -below, -f.l, -f.q);
-      /* The step found so far bounds later ones: fewer rows can be critical. */
-      up = -largest(-found.up);
+    EACH(row, 0, rows) { /* few are critical: roots and divisions take most of the time */
+      const double *a = coefficients + row * phases + k;
+      int is_critical = 0;
+      EACH(part, 0, PARTS) is_critical |= any_lane(at(critical + row * LANES + part * W) > K(0));
+      if (!is_critical) continue;
+      int bounds = may_exceed(d, a, size, has_linear, lower[row], upper[row], up);
+      EACH(part, 0, PARTS) {
+        quadratic f = along(d[part], a + part * W, size, has_linear);
+        if (bounds & 1) found[part] = with_bound(found[part], upper[row] - f.g, f.l, f.q);
+        if (bounds & 2) found[part] = with_bound(found[part], f.g - lower[row], -f.l, -f.q);
+        up = smallest_of(up, found[part].up);
+      }
     }
   }
-  if (!any_lane(found.violated)) return up;
-  double back = -largest(found.back);
+  int violated = 0;
+  EACH(part, 0, PARTS) violated |= any_lane(found[part].violated), back = smallest_of(back, -found[part].back);
+  if (!violated) return up;
   return back > p->max_decrease ? back : p->max_decrease;
 }
 
@@ -190,11 +209,11 @@ void parametrize_rates(const parametrization *p, long count, const double *path,
                        double *rate, double *violation, double *memory) {
   long phases = p->phases, numbers = 3 * p->joints;
   /* Aligned to vectors. */
-  memory += -((size_t)memory / sizeof(double)) % W;
+  memory += -((size_t)memory / sizeof(double)) % LANES;
   workspace m = {.column = memory, .r = memory + numbers * phases};
   m.r1 = m.r + phases, m.coefficients = m.r1 + (1 + p->pose_width) * phases;
   m.b = m.coefficients + (3 + p->linear) * p->rows * phases, m.b1 = m.b + phases, m.violations = m.b1 + phases;
-  m.critical = m.violations + phases, m.before = m.critical + p->rows * W;
+  m.critical = m.violations + phases, m.before = m.critical + p->rows * LANES;
   EACH(motion, 0, count) {
     double *c = rate + motion * p->points;
     memcpy(m.before, c, p->points * sizeof(double));

@@ -12,6 +12,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from cnpgen.schema.foreign_paths import import_errors_with_hint
+
 NAMES = "cnpgen.names"
 
 
@@ -29,7 +31,8 @@ def lazy_exports(
         if name == "__all__":
             return names()
         if name in modules:
-            value = getattr(import_module(modules[name]), name)
+            with import_errors_with_hint():
+                value = getattr(import_module(modules[name]), name)
         elif name.startswith(
             "_"
         ):  # tools look up special names, for which the metadata need not be read

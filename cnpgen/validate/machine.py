@@ -18,6 +18,7 @@ from typing import Any
 from cnpgen.errors import PluginError, counted
 from cnpgen.machine.threads import users_environment
 from cnpgen.machine.versions import installed_version, processor_entry
+from cnpgen.schema.foreign_paths import foreign_path_hint
 
 REQUIRED_MODULES = (
     "numpy", "scipy", "casadi", "pinocchio", "coal", "h5py", "joblib", "psutil", "tqdm", "daqp", "threadpoolctl",
@@ -28,7 +29,7 @@ PROJECTS = {"pinocchio": "pin"}  # on PyPI, where it is not called like its modu
 
 VARIABLES = (
     "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "LOKY_MAX_CPU_COUNT",
-    "CC", "CNPGEN_CACHE", "XDG_CACHE_HOME", "PYTHONPATH",
+    "CC", "CNPGEN_CACHE", "XDG_CACHE_HOME", "PYTHONPATH", "LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH",
 )  # fmt: skip
 
 MIN_DISK_BYTES = 10**9
@@ -71,7 +72,9 @@ class MachineReport:
         environment: Relevant environment variables set by the user.
         generator: Generator of machine code and its processor; empty if it does not
             work.
-        compiler: C compiler of handwritten code and its version; empty if there is none.
+        handwritten: Origin of the handwritten C code: the package, a compiler at first
+            use, or "NumPy" in its place.
+        compiler: C compiler and its version; empty if there is none.
         backend: Backend of the kernels; empty if none works.
         backend_reason: Reason for the choice of the backend.
         cache_folder: Folder of cached kernels.
@@ -96,6 +99,7 @@ class MachineReport:
     hdf5: str
     environment: dict[str, str]
     generator: str
+    handwritten: str
     compiler: str
     backend: str
     backend_reason: str
@@ -126,6 +130,7 @@ def check_machine() -> MachineReport:
     cache = _value_or(_cache_folder, "")
     backend, reason, writable = _check_backend(findings, cache)
     cache_used = _check_cache(findings, cache)
+    handwritten, compiler = _check_handwritten(findings)
     return MachineReport(
         cnpgen=_version_of("cnpgen"),
         python=platform.python_version(),
@@ -140,7 +145,8 @@ def check_machine() -> MachineReport:
             name: environment[name] for name in VARIABLES if environment.get(name)
         },
         generator=_value_or(_generator, ""),
-        compiler=_check_compiler(findings),
+        handwritten=handwritten,
+        compiler=compiler,
         backend=backend,
         backend_reason=reason,
         cache_folder=cache,
@@ -180,6 +186,8 @@ def _check_libraries(findings: _Findings) -> dict[str, str]:
         findings.notes += (
             [f"{problem}, for 'cnpgen inspect --plot' only"] if problem else []
         )
+    if hint := foreign_path_hint():
+        (findings.problems if findings.problems else findings.notes).insert(0, hint)
     return versions
 
 
@@ -248,18 +256,41 @@ def _generator() -> str:
     return f"{generator_version()}, for {this_processor().name}"
 
 
-def _check_compiler(findings: _Findings) -> str:
-    """Return the C compiler and its version, or an empty text and a note on what is slower."""
+def _check_handwritten(findings: _Findings) -> tuple[str, str]:
+    """Return the origin of handwritten C, and the compiler; note what is slower without both."""
+    built = _value_or(_built_variant, "")
     try:
         from cnpgen.kernels.compiler import compiler_version, require_compiler
 
         path = require_compiler()
-        return f"{path}, {compiler_version(path)}"
+        compiler = f"{path}, {compiler_version(path)}"
     except Exception as error:  # noqa: BLE001 - broken libraries raise anything
-        findings.notes.append(
-            f"{error}; collisions, trees, refining and observations run in NumPy, which is slower"
-        )
-        return ""
+        compiler = ""
+        if not built:
+            findings.notes.append(
+                f"{error}; collisions, trees, refining and observations run in NumPy, which is slower"
+            )
+    if built:
+        return f"compiled with the package for {built}", compiler
+    return ("compiled at its first use" if compiler else "NumPy in its place"), compiler
+
+
+def _built_variant() -> str:
+    """Return the processor that the package's libraries are compiled for, or an empty text if one is missing."""
+    from cnpgen.kernels import c_library
+    from cnpgen.kernels.collision import collision_checker
+    from cnpgen.kernels.observation import compiled_observations
+    from cnpgen.planner import time_parametrization
+    from cnpgen.refine.solver import compiled_backend
+
+    libraries = (
+        collision_checker.SOURCES,
+        compiled_backend.SOURCES,
+        [compiled_observations.SOURCE],
+        [time_parametrization.SOURCE],
+    )
+    files = [c_library.find_built((c_library.ARRAYS, *paths)) for paths in libraries]
+    return c_library.this_variants()[0].name if all(files) else ""
 
 
 def _cache_folder() -> str:

@@ -1,6 +1,7 @@
 """C source of complete kernels, the reference of machine code: the same steps over vector types, by a C compiler."""
 
-from cnpgen.kernels.emit import prelude, statements
+from cnpgen.addons.deploy.statements import statements
+from cnpgen.kernels.c_library import VECTORS
 from cnpgen.kernels.tape import GridSpec, Tape
 
 
@@ -21,7 +22,8 @@ def emit(tape: Tape) -> str:
         if tape.grid
         else _emit_once(tape)
     )
-    return prelude(tape.dtype) + body
+    single = "#define SINGLE\n" if tape.dtype == "float32" else ""
+    return single + VECTORS.read_text(encoding="utf-8") + body
 
 
 def _emit_once(tape: Tape) -> str:

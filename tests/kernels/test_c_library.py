@@ -11,9 +11,13 @@ import pytest
 
 from cnpgen.errors import MachineError
 from cnpgen.kernels import c_library, compiler
-from cnpgen.kernels.c_library import compile_source, library_file_stem, load_library
+from cnpgen.kernels.c_library import (
+    compile_source,
+    library_file_stem,
+    load_library,
+    source_text,
+)
 from cnpgen.kernels.compiler import find_compiler
-from cnpgen.kernels.emit import prelude
 from cnpgen.store.files.cache_folder import exclusive_lock, make_private_folder
 from tests.conftest import HANGING, needs_compiler
 from tests.machine.test_workers import alive
@@ -44,9 +48,9 @@ def compiled(monkeypatch) -> list[Path]:
     sources: list[Path] = []
     real = c_library.run_compiler
 
-    def run(compiler: str, level: str, source: Path, built: Path) -> None:
+    def run(compiler: str, flags: tuple[str, ...], source: Path, built: Path) -> None:
         sources.append(source)
-        real(compiler, level, source, built)
+        real(compiler, flags, source, built)
 
     monkeypatch.setattr(c_library, "run_compiler", run)
     return sources
@@ -80,8 +84,7 @@ def test_a_damaged_library_is_compiled_again(source, tmp_path, compiled, kept):
 def test_the_wait_for_a_stopped_compilation_ends_at_the_time_limit(
     source, tmp_path, monkeypatch
 ):
-    text = prelude("float64") + source.read_text()
-    stem = library_file_stem("answer", text, find_compiler() or "")
+    stem = library_file_stem("answer", source_text([source]), find_compiler() or "")
     lock = tmp_path / "lib" / f".{stem}.lock"
     make_private_folder(lock.parent)
     monkeypatch.setattr("cnpgen.store.files.cache_folder.MAX_LOCK_WAIT_S", 0.1)

@@ -18,7 +18,7 @@ from cnpgen.errors import MachineError
 from cnpgen.kernels import code_cache, compiled_kernel, lowering, machine_code
 from cnpgen.kernels.code_cache import tape_key
 from cnpgen.kernels.compiled_kernel import CompiledGridKernel, CompiledKernel
-from cnpgen.kernels.compiler import require_compiler, run_compiler
+from cnpgen.kernels.compiler import native_flags, require_compiler, run_compiler
 from cnpgen.kernels.interpreted_kernel import InterpretedKernel
 from cnpgen.kernels.llvm_module import module_text
 from cnpgen.kernels.lowering import lower
@@ -185,7 +185,8 @@ def test_compiled_c_of_a_tape_gives_the_same_bits(case, level, tmp_path, monkeyp
         monkeypatch.setattr(lowering, "MAX_CONTRACTED", 0)
     source, built = tmp_path / "kernel.c", tmp_path / "kernel.so"
     source.write_text(emit(tape))
-    run_compiler(require_compiler(), level, source, built)
+    flags = (level, "-ffp-contract=fast", *native_flags())
+    run_compiler(require_compiler(), flags, source, built)
     library = ctypes.CDLL(str(built))
     address = ctypes.cast(library.kernel, ctypes.c_void_p).value
     assert address is not None

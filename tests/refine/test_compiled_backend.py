@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cnpgen.kernels import compiler
+from cnpgen.kernels import c_library
 from cnpgen.kernels.library import KernelLibrary, problem_kernels
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.refine.refiner import Refiner
@@ -147,7 +147,8 @@ def test_no_memory_is_overwritten_with_narrower_vectors_and_all_residuals(
     march: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     use_tight_tolerance(monkeypatch)
-    monkeypatch.setattr(compiler, "vector_flags", lambda: (f"-march={march}",))
+    monkeypatch.setattr(c_library, "native_flags", lambda: (f"-march={march}",))
+    monkeypatch.setattr(c_library, "BUILT_FOLDER", tmp_path / "none")
     plan, guards, allocate = load("replan"), [], CompiledBackend._allocate
 
     def guarded(self: CompiledBackend, sizes: Sequence[int]) -> list[int]:

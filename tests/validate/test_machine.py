@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from cnpgen.cli.doctor_command import machine_text
-from cnpgen.kernels.c_library import compile_source
+from cnpgen.kernels import c_library
+from cnpgen.kernels.c_library import compile_source, this_variants
 from cnpgen.kernels.compiler import find_compiler
 from cnpgen.machine import threads
 from cnpgen.validate import machine
@@ -130,15 +131,25 @@ def test_a_missing_plotting_library_is_only_a_note(monkeypatch):
     assert any("--plot" in note for note in report.notes)
 
 
-def test_without_a_compiler_kernels_are_generated(monkeypatch, fresh_compiler):
+@pytest.mark.parametrize("built", [False, True])
+def test_without_a_compiler_kernels_are_generated(
+    monkeypatch, fresh_compiler, tmp_path, built
+):
     monkeypatch.setenv("CC", "no-such-compiler")
+    monkeypatch.setattr(c_library, "BUILT_FOLDER", tmp_path)
+    if built:  # files that look like the libraries of the package
+        names = c_library.built_file_name
+        monkeypatch.setattr(
+            c_library, "find_built", lambda p: tmp_path / names(p, this_variants()[0])
+        )
     report = check_machine()
     assert report.ok
     assert report.backend == "compiled"
     assert report.generator.startswith("llvmlite ")
     assert report.compiler == ""
     assert report.environment["CC"] == "no-such-compiler"
-    assert any("no C compiler" in note for note in report.notes)
+    assert any("no C compiler" in note for note in report.notes) is not built
+    assert ("compiled with the package" in report.handwritten) is built
 
 
 @needs_compiler

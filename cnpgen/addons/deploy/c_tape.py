@@ -3,7 +3,7 @@
 import re
 from itertools import accumulate
 
-from cnpgen.kernels.emit import statements
+from cnpgen.addons.deploy.statements import statements
 from cnpgen.kernels.tape import Tape
 
 _NAME = re.compile(r"\b[tsc][0-9]+\b")  # values of ``statements``

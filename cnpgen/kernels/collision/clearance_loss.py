@@ -1,12 +1,11 @@
 """Huber's losses of the clearances of a robot's convex parts among the obstacles of samples.
 
-They are computed in compiled code, and without a C compiler by Pinocchio and Coal, the
+They are computed in compiled code, and where there is none by Pinocchio and Coal, the
 reference of that code.
 """
 
 import ctypes
 from ctypes import c_double, c_long, c_void_p
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -38,11 +37,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-SOURCES = [
-    Path(__file__).with_name(name)
-    for name in ("convex.c", "collision.c", "clearance_loss.c")
-]
-
 
 def load_clearance_loss(
     kernels: KernelLibrary, robot: Robot
@@ -55,7 +49,7 @@ def load_clearance_loss(
     if robot.shape is None or robot.n > MAX_JOINTS:
         text = f"losses of the distances of hulls need link geometry and at most {MAX_JOINTS} joints"
         raise UsageError(text, concerns="problem")
-    library = load_collision_library(kernels, SOURCES)
+    library = load_collision_library(kernels)
     return (
         ClearanceLossReference(robot)
         if library is None

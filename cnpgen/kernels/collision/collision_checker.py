@@ -33,6 +33,7 @@ _NAMES = (
     "collision.c",
     "tree_search.c",
     "manifold_search.c",
+    "clearance_loss.c",
     "hull_rows.c",
 )
 SOURCES = [Path(__file__).with_name(name) for name in _NAMES]
@@ -87,14 +88,12 @@ class _RobotScene(ctypes.Structure):
     )
 
 
-def load_collision_library(
-    kernels: KernelLibrary, sources: Sequence[Path] = SOURCES
-) -> ctypes.CDLL | None:
+def load_collision_library(kernels: KernelLibrary) -> ctypes.CDLL | None:
     """Return the library of collision checks, the same for all robots.
 
     None where kernels are not compiled.
     """
-    library = kernels.load_source(*sources)
+    library = kernels.load_source(*SOURCES)
     if library is not None:
         for function in (
             library.clear_states,

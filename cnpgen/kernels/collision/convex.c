@@ -73,8 +73,11 @@ static void furthest_vertex(const double *p, long n, const double *d, double *ou
     best = pick(more, reach, best);
     where = (more & index) | (~more & where);
   }
-  int lane = 0;
-  for (int i = 1; i < W; i++) lane = best[i] > best[lane] ? i : lane;
+  int lane = 0; /* of equal ones the first vertex is taken, whatever the number of lanes */
+  for (int i = 1; i < W; i++) {
+    int first = best[i] == best[lane] && where[i] < where[lane];
+    lane = best[i] > best[lane] || first ? i : lane;
+  }
   for (int i = 0; i < 3; i++) out[i] = p[i * n + where[lane]];
 }
 

@@ -31,7 +31,7 @@ def observe(
     seed: int = 0,
     backend: str | None = None,
 ) -> dict[str, NDArray[Any]]:
-    """Observe N scenes, in compiled code if there is a C compiler.
+    """Observe N scenes, in compiled code where there is such.
 
     Args:
         scenes: N scene problems or sequences of obstacles, one scene problem, the

@@ -4,24 +4,26 @@ once; DAQP adds its rows one after the other. Requires arrays.h.
 
 Arrays of rows are padded with zeros to `stride`, with memory for B more numbers. */
 
-#define B (4 * W) /* rows in a block, stored column by column */
+#define B 16 /* rows in a block, stored column by column */
+#define VECTORS (B / W) /* of a column of a block */
 #define MIN_INDEPENDENCE 1e-11 /* fraction of its square that remains of a row that depends on active ones */
 #define MAX_ROUNDS 4 /* of repairs; one and a check are nearly always enough */
 #define SERIOUS_FRACTION 0.1 /* of the largest violation: rows with smaller ones are added later */
 
-I double sum(v x) {
-  double s[W];
-  put(s, x);
-  for (int half = W / 2; half; half /= 2) EACH(i, 0, half) s[i] += s[i + half];
-  return s[0];
+I double sum(const v *x) {
+  double s[LANES];
+  EACH(part, 0, PARTS) put(s + part * W, x[part]);
+  return (s[0] + s[2]) + (s[1] + s[3]);
 }
-I long padded(long n) { return (n + W - 1) / W * W; }
+I long padded(long n) { return (n + LANES - 1) / LANES * LANES; }
+I void clear(v *x, long n) { EACH(i, 0, n) x[i] = K(0); }
 
 static double dot(const double *a, const double *b, long n) {
-  v s = K(0);
+  v s[PARTS];
   double rest = 0;
   long i = 0;
-  for (; i + W <= n; i += W) s += at(a + i) * at(b + i);
+  clear(s, PARTS);
+  for (; i + LANES <= n; i += LANES) EACH(part, 0, PARTS) s[part] += at(a + i + part * W) * at(b + i + part * W);
   for (; i < n; i++) rest += a[i] * b[i];
   return sum(s) + rest;
 }
@@ -29,8 +31,10 @@ static double dot(const double *a, const double *b, long n) {
 /* out = rows a, of `length` numbers, padded with zeros. */
 static void products(const double *rows, long stride, long count, const double *a, long length, double *out) {
   for (long i = 0; i < count; i += 4) {
-    v s[4] = {K(0), K(0), K(0), K(0)};
-    for (long j = 0; j < length; j += W) EACH(l, 0, 4) s[l] += at(rows + (i + l) * stride + j) * at(a + j);
+    v s[4][PARTS];
+    clear(s[0], 4 * PARTS);
+    for (long j = 0; j < length; j += LANES) EACH(part, 0, PARTS) EACH(l, 0, 4)
+      s[l][part] += at(rows + (i + l) * stride + j + part * W) * at(a + j + part * W);
     EACH(l, 0, 4) out[i + l] = sum(s[l]);
   }
   EACH(i, count, padded(count)) out[i] = 0;
@@ -39,9 +43,10 @@ static void products(const double *rows, long stride, long count, const double *
 /* out = the first `length` numbers of a transposed times rows. */
 static void combine(const double *rows, long stride, long count, const double *a, long length, double *out) {
   for (long j = 0; j < length; j += B) {
-    v s[4] = {K(0), K(0), K(0), K(0)};
-    EACH(i, 0, count) EACH(l, 0, 4) s[l] += a[i] * at(rows + i * stride + j + l * W);
-    EACH(l, 0, 4) put(out + j + l * W, s[l]);
+    v s[VECTORS];
+    clear(s, VECTORS);
+    EACH(i, 0, count) EACH(l, 0, VECTORS) s[l] += a[i] * at(rows + i * stride + j + l * W);
+    EACH(l, 0, VECTORS) put(out + j + l * W, s[l]);
   }
 }
 
@@ -159,9 +164,10 @@ static void find_violated(const polyhedron *p, working_set *set, const double *x
   set->n_candidates = 0;
   for (long first = 0; first < p->count; first += B) {
     const double *block = entry(p, first, 0);
-    v sums[4] = {K(0), K(0), K(0), K(0)};
-    EACH(i, p->leading_zeros[first / B], p->dim) EACH(l, 0, 4) sums[l] += x[i] * at(block + i * B + l * W);
-    EACH(l, 0, 4) put(r + l * W, sums[l]);
+    v sums[VECTORS];
+    clear(sums, VECTORS);
+    EACH(i, p->leading_zeros[first / B], p->dim) EACH(l, 0, VECTORS) sums[l] += x[i] * at(block + i * B + l * W);
+    EACH(l, 0, VECTORS) put(r + l * W, sums[l]);
     EACH(i, first, first + B < p->count ? first + B : p->count) {
       double amount = row_violation(p, i, r[i - first]);
       if (!(amount > threshold)) continue;
@@ -226,12 +232,13 @@ static int add_violated(const polyhedron *p, working_set *set, double *x, long c
 /* Compute the inverse lengths of the rows. */
 static void compute_norms(const polyhedron *p) {
   for (long first = 0; first < p->count; first += B) {
-    v squares[4] = {K(0), K(0), K(0), K(0)};
-    EACH(i, p->leading_zeros[first / B], p->dim) EACH(l, 0, 4) {
+    v squares[VECTORS];
+    clear(squares, VECTORS);
+    EACH(i, p->leading_zeros[first / B], p->dim) EACH(l, 0, VECTORS) {
       v x = at(entry(p, first, i) + l * W);
       squares[l] += x * x;
     }
-    EACH(l, 0, 4) put(p->norm + first + l * W, K(1) / vsqrt(squares[l]));
+    EACH(l, 0, VECTORS) put(p->norm + first + l * W, K(1) / vsqrt(squares[l]));
   }
 }
 

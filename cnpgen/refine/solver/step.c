@@ -65,7 +65,7 @@ static void end(motion *s, const double *q, const double *dq, const double *ddq,
 
 static void unpack(motion *s, const double *x) {
   long split = s->nx - s->rate;
-  EACH(i, 0, s->rate) s->rates[i] = exp(x[split + i]);
+  EACH(i, 0, s->rate) s->rates[i] = vexp(K(x[split + i]))[0];
   memcpy(s->control + 3 * s->n, x, split * sizeof(double));
   s->n_derivatives = 0;
   memset(s->derivative, 0, 6 * padded(s->n) * sizeof(double));
@@ -95,7 +95,7 @@ I const double *rate_at(const motion *s, const bases *b, long k, long order) {
 }
 
 /* Gradient in the variables of a function with gradient J in w at phase k. J is padded with zeros, so that numbers
-written after a control point are 0; `row` has memory for W more. */
+written after a control point are 0; `row` has memory for LANES more. */
 static void chain(const motion *s, const bases *b, long k, const double *J, double *restrict row) {
   long n = s->n, orders = b->orders, split = s->nx - s->rate, stride = padded(n);
   long first = b->path_from[k], behind = first + s->support, from = b->rate_from[k];
@@ -114,8 +114,11 @@ static void chain(const motion *s, const bases *b, long k, const double *J, doub
   EACH(e, 0, s->n_derivatives) {
     long c = s->point[e] < 3 ? s->point[e] : s->point[e] - s->fixed + 3;
     if (s->point[e] < first || s->point[e] >= behind) continue;
-    v x = K(0);
-    for (long j = 0; j < n; j += W) x += at(ends + c * stride + j) * at(s->derivative + e * stride + j);
+    const double *control = ends + c * stride, *derivative = s->derivative + e * stride;
+    v x[PARTS];
+    clear(x, PARTS);
+    for (long j = 0; j < n; j += LANES) EACH(part, 0, PARTS)
+      x[part] += at(control + j + part * W) * at(derivative + j + part * W);
     row[split + s->variable[e]] += sum(x) * s->rates[s->variable[e]];
   }
 }
@@ -143,7 +146,7 @@ static double cost_term(motion *s, int derivatives) {
   long nx = s->nx, stride = s->stride;
   double *w = s->scratch, *e = w + width * points, *jacobian = e + count * points;
   double *weighted = jacobian + width * count * points, *rows = weighted + count * points, *gradient = rows;
-  double J[width + b->orders * W], cost = 0;
+  double J[width + b->orders * LANES], cost = 0;
   memset(J, 0, sizeof J);
   states(s, b, w);
   s->cost_residuals(points, (const double *const[]){w}, &points, (double *const[]){e, jacobian});
@@ -254,14 +257,14 @@ static int factor(motion *s, double proximal) {
 static void whiten(const motion *s, double *block, long from) {
   for (long i = from; i < s->nx; i += 2) {
     const double *row = s->factor + i * s->stride, *other = row + (i + 1 < s->nx ? s->stride : 0);
-    v x[4], y[4];
-    EACH(l, 0, 4) x[l] = at(block + i * B + l * W), y[l] = at(block + (i + 1) * B + l * W);
-    EACH(j, from, i) EACH(l, 0, 4) {
+    v x[VECTORS], y[VECTORS];
+    EACH(l, 0, VECTORS) x[l] = at(block + i * B + l * W), y[l] = at(block + (i + 1) * B + l * W);
+    EACH(j, from, i) EACH(l, 0, VECTORS) {
       v above = at(block + j * B + l * W);
       x[l] -= row[j] * above;
       y[l] -= other[j] * above;
     }
-    EACH(l, 0, 4) {
+    EACH(l, 0, VECTORS) {
       put(block + i * B + l * W, x[l] *= row[i]);
       if (other != row) put(block + (i + 1) * B + l * W, (y[l] - other[i] * x[l]) * other[i + 1]);
     }
@@ -338,7 +341,7 @@ void build_subproblem(motion *s, const double *x, const double *g, double proxim
   polyhedron *p = &s->program;
   if (!(p->count = objective(s, x, proximal))) return;
   double *violations = s->scratch, *values = violations + m * points, *jacobian = values + m * TILE;
-  double *row = jacobian + width * m * TILE, J[width + s->grid.orders * W];
+  double *row = jacobian + width * m * TILE, J[width + s->grid.orders * LANES];
   memset(J, 0, sizeof J);
   EACH(i, 0, m * points) violations[i] = residual_violation(s, g, i);
   EACH(i, 0, m) {

@@ -1,13 +1,10 @@
-"""C statements of a tape over the vector types of ``vectors.h``: one lane per sample, for GCC or Clang."""
+"""Statements of a tape in C, over the types and functions of ``vectors.h`` or others of these names."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
 from cnpgen.kernels.tape import NAMES, Tape
-
-VECTORS = Path(__file__).with_name("vectors.h")
 
 _EXPRESSIONS = {  # of one operand or two
     "NEG": "-{}", "SQ": "{0}*{0}", "TWICE": "{0}+{0}", "INV": "one/{}", "SQRT": "vsqrt({})", "FABS": "vabs({})",
@@ -16,18 +13,10 @@ _EXPRESSIONS = {  # of one operand or two
     "LT": "vlt({},{})", "LE": "vle({},{})", "EQ": "veq({},{})", "NE": "vne({},{})", "AND": "vand({},{})",
     "OR": "vor({},{})", "IF_ELSE_ZERO": "vsel({},{})",
 }  # fmt: skip
-# One instruction if the second is not nan.
 _WITHOUT_NAN = {
     "FMIN": "lesser({},{})",
     "FMAX": "larger({},{})",
-}
-
-
-def prelude(dtype: str) -> str:
-    """Return the C source that defines vectors of ``dtype`` and their functions."""
-    return ("#define SINGLE\n" if dtype == "float32" else "") + VECTORS.read_text(
-        encoding="utf-8"
-    )
+}  # one instruction if the second is not nan
 
 
 def statements(
@@ -46,10 +35,13 @@ def statements(
     names: dict[int, str] = {}
     angles: set[int] = set()
     never_nan: set[int] = set()
-    columns = (tape.operation, tape.a, tape.b, tape.constant)
-    for k, (code, a, b, constant) in enumerate(
-        zip(*(column.tolist() for column in columns), strict=True)
-    ):
+    columns = (
+        tape.operation.tolist(),
+        tape.a.tolist(),
+        tape.b.tolist(),
+        tape.constant.tolist(),
+    )
+    for k, (code, a, b, constant) in enumerate(zip(*columns, strict=True)):
         name = NAMES[code]
         if name == "CONST":
             names[k] = f"K({_literal(constant)})"
@@ -68,8 +60,11 @@ def statements(
             expression = read(a, b)
             never_nan |= {k} if a in numbers else set()
         else:
-            plain = name not in _WITHOUT_NAN or b not in never_nan
-            templates = _EXPRESSIONS if plain else _WITHOUT_NAN
+            templates = (
+                _WITHOUT_NAN
+                if name in _WITHOUT_NAN and b in never_nan
+                else _EXPRESSIONS
+            )
             expression = templates[name].format(names[a], names[b])
             never_nan |= {k} if name in _WITHOUT_NAN and never_nan & {a, b} else set()
         names[k] = f"t{k}"
