@@ -86,7 +86,9 @@ def _controller(robot: Robot, drive: Drive) -> Callable[..., np.ndarray]:
     model.armature = drive.armature
     data = model.createData()
 
-    def command(q: np.ndarray, dq: np.ndarray, desired: tuple) -> np.ndarray:
+    def command(
+        q: np.ndarray, dq: np.ndarray, desired: tuple[np.ndarray, ...]
+    ) -> np.ndarray:
         q0, dq0, ddq0 = (each[0] for each in desired)
         ddq = ddq0 + GAIN_RAD_S**2 * (q0 - q) + 2 * GAIN_RAD_S * (dq0 - dq)
         known = drive.viscous * dq0 + drive.coulomb * np.tanh(dq0 / SMOOTH_SPEED)

@@ -159,9 +159,12 @@ def without_drive(problems: Plans) -> Plans:
     return replace(problems, problem=rigid)
 
 
-def solve_alternately(sets: dict[str, Plans]) -> tuple[dict, dict]:
+def solve_alternately(
+    sets: dict[str, Plans],
+) -> tuple[dict[str, Plans], dict[str, list[float]]]:
     """Solve the sets in batches, in alternation; return plans and CPU times [s] of the batches."""
-    names, cpu = list(sets), {key: [] for key in sets}
+    names = list(sets)
+    cpu: dict[str, list[float]] = {key: [] for key in sets}
     parts: dict[str, list[Plans]] = {key: [] for key in sets}
     for key in names:  # kernels are compiled before
         solve_plans(sets[key][:2], workers=1)

@@ -4,6 +4,7 @@ import threading
 import time
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from cnpgen.addons.online.motion_check import MotionChecker
@@ -13,6 +14,7 @@ from cnpgen.addons.online.set_points import sample_motion
 from cnpgen.addons.online.stops import earliest_stop
 from cnpgen.addons.online.switches import SwitchOutcome
 from cnpgen.errors import UsageError
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.problems.problem_record import open_problem
